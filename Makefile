@@ -1,0 +1,75 @@
+# One entrance for people and for continuous integration; `make` alone lists the targets.
+# Everything happens in .venv, which is made on first use and renewed when the requirements change.
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+MAKEFLAGS += --no-print-directory
+
+VENV := .venv
+BIN := $(VENV)/bin
+NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
+
+# The first interpreter on PATH that runs and is new enough; `make PYTHON=...` overrules it.
+CANDIDATES := python3.11 python3.12 python3.13 python3.14 python3 python
+PYTHON ?= $(shell for p in $(CANDIDATES); do \
+	$$p -c "$(NEW_ENOUGH)" 2>/dev/null && echo $$p && break; done)
+
+.PHONY: help demo test lint typecheck check format bench docs notebooks clean
+
+help: ## List the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
+
+demo: $(VENV)/.with-base ## Run a UGV mission, print its table, draw its figure (a few minutes)
+	@$(BIN)/afm-rl hydra.run.dir=outputs/demo
+
+test: $(VENV)/.with-test ## Run all tests with coverage (at least 95 %)
+	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 \
+		--cov --cov-report=term-missing:skip-covered --cov-fail-under=95
+
+lint: $(VENV)/.with-test ## Check style, format and spelling
+	@$(BIN)/ruff check --quiet . && $(BIN)/ruff format --quiet --check . && $(BIN)/codespell
+	@echo "lint: clean"
+
+# Tools that read sources follow folders, not the map that turns envs/ into afm_rl.envs. They get a
+# copy laid out as the wheel is; tests/test_packaging.py keeps the wheel itself true to the sources.
+.PHONY: build/package
+build/package:
+	@rm -rf $@ && mkdir -p $@ && cp -R afm_rl $@ && cp -R envs conf $@/afm_rl
+
+typecheck: $(VENV)/.with-test build/package ## Check types
+	@cd build/package && $(CURDIR)/$(BIN)/mypy --config-file $(CURDIR)/pyproject.toml \
+		--cache-dir $(CURDIR)/.mypy_cache --package afm_rl
+
+check: lint typecheck test ## All of lint, typecheck and test
+
+format: $(VENV)/.with-test ## Put the code in shape
+	@$(BIN)/ruff check --quiet --fix-only . && $(BIN)/ruff format .
+
+bench: $(VENV)/.with-base ## Run every benchmarks/bench_*.py, one after the other
+	@for f in $(sort $(wildcard benchmarks/bench_*.py)); do \
+		echo "== $$f"; OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/python $$f || exit 1; done
+
+docs: $(VENV)/.with-docs build/package ## Build the documentation into site/
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict && echo "docs: site/index.html"
+
+notebooks: $(VENV)/.with-test $(VENV)/.with-notebooks ## Run every notebook from top to bottom
+	@MPLBACKEND=Agg $(BIN)/pytest -q --nbmake --nbmake-timeout=600 --timeout=0 notebooks
+
+clean: ## Remove build products and caches; .venv and outputs/ stay
+	@rm -rf build dist site *.egg-info .coverage .coverage.* htmlcov .hypothesis \
+		.pytest_cache .mypy_cache .ruff_cache
+	@find afm_rl envs conf tests -name __pycache__ -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@"$(PYTHON)" -c "$(NEW_ENOUGH)" 2>/dev/null || { \
+		echo "afm-rl needs Python 3.11 or newer: put one on PATH or name it, make PYTHON=..." >&2; \
+		exit 1; }
+	@echo "making $(VENV) with $(PYTHON)"
+	@"$(PYTHON)" -m venv $(VENV)
+
+# .with-base holds the package alone, .with-X adds the extra X.
+$(VENV)/.with-%: pyproject.toml setup.py constraints.txt | $(BIN)/python
+	@echo "installing afm-rl ($*) into $(VENV); the first time takes some minutes"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check \
+		-c constraints.txt -e ".$(if $(filter-out base,$*),[$*])"
+	@touch $@

@@ -1,0 +1,118 @@
+"""Trained parts on disk: safetensors, written whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor, nn
+
+from afm_rl.errors import ArtefactError, ConfigurationError
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file so that readers see the old content or the new, never a part.
+
+    Raises:
+        ConfigurationError: if the folder cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(name, path)
+        except BaseException:
+            os.unlink(name)
+            raise
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {path}: {error.strerror}") from error
+
+
+def save_artefact(path: Path, module: nn.Module, description: Mapping[str, Any]) -> None:
+    """Save a module's state with a JSON description and a checksum of both."""
+    tensors = {name: value.contiguous() for name, value in module.state_dict().items()}
+    text = json.dumps(description, sort_keys=True)
+    metadata = {"description": text, "sha256": _digest(tensors, text)}
+    write_whole(Path(path), save(tensors, metadata))
+
+
+def load_artefact(path: Path, module: nn.Module, description: Mapping[str, Any]) -> None:
+    """Load a module's state, if it is whole and fits.
+
+    Args:
+        path: file written by :func:`save_artefact`.
+        module: receives the state.
+        description: entries that the file's description must have.
+
+    Raises:
+        ConfigurationError: if there is no such file.
+        ArtefactError: if it is damaged, or belongs to something else.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ConfigurationError(f"{path}: no such file")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ArtefactError(f"{path}: damaged, or no safetensors file ({error})") from error
+    text = metadata.get("description", "")
+    if metadata.get("sha256") != _digest(tensors, text):
+        raise ArtefactError(f"{path}: damaged: its checksum does not match; delete it")
+    stored = json.loads(text)
+    for name, wanted in description.items():
+        if stored.get(name) != wanted:
+            raise ArtefactError(
+                f"{path}: was made for {name}={stored.get(name)}, expected {name}={wanted}"
+            )
+    module.load_state_dict(tensors)
+
+
+def cached(
+    folder: Path,
+    module: nn.Module,
+    description: Mapping[str, Any],
+    train: Callable[[], float],
+) -> tuple[float, bool]:
+    """Load a trained module from the cache, or train and store it.
+
+    Args:
+        folder: the cache.
+        module: what is trained, in place.
+        description: everything the result depends on; its hash names the file. Its ``name``
+            begins the file name.
+        train: trains ``module`` and returns its held-out error.
+
+    Returns:
+        The held-out error, and whether it came from the cache.
+    """
+    text = json.dumps(description, sort_keys=True)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+    path = Path(folder) / f"{description['name']}-{digest}.safetensors"
+    if path.exists():
+        load_artefact(path, module, description)
+        with safe_open(path, framework="pt") as file:
+            return float(json.loads(file.metadata()["description"])["held_out_error"]), True
+    error = train()
+    save_artefact(path, module, {**description, "held_out_error": error})
+    return error, False
+
+
+def _digest(tensors: Mapping[str, Tensor], text: str) -> str:
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        digest.update(f"{name}{tensors[name].dtype}{tuple(tensors[name].shape)}".encode())
+        digest.update(tensors[name].cpu().numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,91 @@
+"""The contract that every dynamics model keeps."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+
+from afm_rl.manifold import Manifold
+
+
+class DynamicsModel(nn.Module, ABC):
+    r"""One-step dynamics :math:`s_{t+1} = f_\theta(s_t, a_t)`, batched.
+
+    ``forward`` takes states ``(*L, *N, S)`` and actions ``(*L, *N, A)``. ``L`` are the
+    leading dimensions of missions that own parameters (:attr:`lead`, empty for a shared
+    model); ``N`` is any number of further dimensions, such as candidates. The random part of
+    the prediction is described by :meth:`moments`, for losses, and :meth:`noise_scale`, for
+    whoever asks whether an error is surprising.
+
+    Args:
+        manifold: the state space.
+        action_size: number of action components, A.
+    """
+
+    def __init__(self, manifold: Manifold, action_size: int) -> None:
+        super().__init__()
+        self.manifold = manifold
+        self.action_size = action_size
+
+    @property
+    def state_size(self) -> int:
+        """Number of state coordinates, S."""
+        return self.manifold.size
+
+    @property
+    def lead(self) -> torch.Size:
+        """Leading mission dimensions of the parameters."""
+        return torch.Size(())
+
+    @abstractmethod
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the expected next state ``(*L, *N, S)``."""
+
+    @abstractmethod
+    def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and log-variance ``(*L, *N, M, D)`` of the standardised state change.
+
+        ``M`` counts ensemble members, 1 for a single model. Only mean, log-variance and
+        :meth:`standardise` together mean something: the scale is the model's own.
+        """
+
+    def standardise(self, change: Tensor) -> Tensor:
+        """Express a state change ``(*B, D)`` in the units of :meth:`moments`."""
+        return change
+
+    @abstractmethod
+    def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the predicted standard deviation ``(*L, *N, D)`` of the state change."""
+
+    def forecast(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return expected next state and noise scale together, in one pass if possible."""
+        return self(state, action), self.noise_scale(state, action)
+
+    def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
+        r"""Return :math:`\partial f / \partial a` ``(*L, *N, D, A)`` on the tangent space.
+
+        Forward differentiation, one column per action axis; models with a closed form
+        override this.
+        """
+
+        def change(act: Tensor) -> Tensor:
+            return self.manifold.difference(self(state, act), state)
+
+        columns = [
+            torch.func.jvp(change, (action,), (axis.expand_as(action),))[1]
+            for axis in torch.eye(self.action_size, device=action.device, dtype=action.dtype)
+        ]
+        return torch.stack(columns, -1)
+
+    def expand_(self, missions: int) -> DynamicsModel:
+        """Give each of ``missions`` parameters of its own, in place.
+
+        A model without learnable parameters has nothing to give and stays as it is.
+        """
+        return self
+
+    def select_(self, index: Tensor) -> DynamicsModel:
+        """Keep the missions in ``index`` only, in place (see :meth:`expand_`)."""
+        return self

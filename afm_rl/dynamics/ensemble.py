@@ -1,0 +1,220 @@
+"""The probabilistic ensemble."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.dynamics.stacked import stacked_mlp, stacked_mlp_tangent
+from afm_rl.errors import ConfigurationError, check_choice, check_count
+from afm_rl.manifold import Manifold
+
+CHUNK = 2**18  # activations per layer and chunk: 1 MiB in float32, so that they stay in cache
+
+
+class Ensemble(DynamicsModel):
+    r"""Probabilistic ensemble of E networks (Chua et al. 2018; paper, section V-A).
+
+    Each member maps the standardised features of state and action to mean and
+    log-variance of the standardised state change,
+    :math:`(s_{t+1} \ominus s_t - m) / c`. The prediction is the mean over members of their
+    means (``propagation="mean"``), or of one sample each (``"sample"``, as published).
+
+    Parameters are stacked, ``(*L, E, in, out)``: no loop over members. :meth:`expand_`
+    gives every mission a copy of its own to learn with.
+
+    Args:
+        manifold: state space.
+        action_size: number of action components, A.
+        features: indices of the state coordinates that the dynamics depend on.
+        members: number of networks, E.
+        hidden: units of the hidden layers.
+        log_variance: soft lower and upper bound of the log-variance.
+        propagation: ``"mean"`` or ``"sample"``.
+        seed: seed of the initial weights.
+
+    >>> model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], hidden=[16])
+    >>> model(torch.zeros(7, 3), torch.zeros(7, 2)).shape
+    torch.Size([7, 3])
+    """
+
+    input_mean: Tensor
+    input_std: Tensor
+    target_mean: Tensor
+    target_std: Tensor
+
+    def __init__(
+        self,
+        manifold: Manifold,
+        action_size: int,
+        features: Sequence[int],
+        members: int = 5,
+        hidden: Sequence[int] = (200, 200, 200),
+        log_variance: Sequence[float] = (-10.0, 0.5),
+        propagation: str = "mean",
+        seed: int = 0,
+    ) -> None:
+        super().__init__(manifold, action_size)
+        self.features = list(features)
+        if not all(0 <= i < manifold.size for i in self.features):
+            raise ConfigurationError(
+                f"dynamics.features={self.features}: expected indices in 0..{manifold.size - 1}"
+            )
+        self.members = check_count("dynamics.members", members)
+        self.hidden = [check_count("dynamics.hidden", units) for units in hidden]
+        low, high = log_variance
+        if not low < high:
+            raise ConfigurationError(f"dynamics.log_variance=[{low}, {high}]: expected low < high")
+        self.log_variance = (float(low), float(high))
+        self.propagation = check_choice("dynamics.propagation", propagation, ("mean", "sample"))
+        self._generator = torch.Generator().manual_seed(seed)
+        inputs, targets = len(self.features) + action_size, manifold.tangent_size
+        sizes = [inputs, *self.hidden, 2 * targets]
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+            bound = 1 / math.sqrt(fan_in)  # nn.Linear's own
+            uniform = torch.rand(members, fan_in + 1, fan_out, generator=self._generator)
+            drawn = (2 * uniform - 1) * bound
+            self.weights.append(nn.Parameter(drawn[:, :fan_in].clone()))
+            self.biases.append(nn.Parameter(drawn[:, fan_in:].clone()))
+        for name, size in (("input", inputs), ("target", targets)):
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_std", torch.ones(size))
+
+    @property
+    def lead(self) -> torch.Size:
+        """Leading mission dimensions, () or (B,)."""
+        return self.weights[0].shape[:-3]
+
+    def normalise_(self, inputs: Tensor, targets: Tensor) -> None:
+        """Set the statistics of inputs ``(N, in)`` and state changes ``(N, D)``."""
+        for name, data in (("input", inputs), ("target", targets)):
+            getattr(self, f"{name}_mean").copy_(data.mean(0))
+            getattr(self, f"{name}_std").copy_(data.std(0).clamp_min(1e-8))
+
+    def inputs(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the raw network inputs ``(*B, in)``."""
+        return torch.cat([state[..., self.features], action], -1)
+
+    def standardise(self, change: Tensor) -> Tensor:
+        """Express a state change in standard deviations of the training data."""
+        return (change - self.target_mean) / self.target_std
+
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the expected next state ``(*L, *N, S)``."""
+        if self.propagation == "sample":
+            mean, log_variance = self.moments(state, action)
+            noise = torch.randn(
+                mean.shape, generator=self._generator, dtype=mean.dtype, device="cpu"
+            ).to(mean.device)
+            change = (mean + noise * (0.5 * log_variance).exp()).mean(-2)
+        else:
+            change = self._run(state, action, self.manifold.tangent_size).mean(-2)
+        return self.manifold.add(state, change * self.target_std + self.target_mean)
+
+    def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return standardised mean and log-variance ``(*L, *N, E, D)``."""
+        return self._moments(self._run(state, action, 2 * self.manifold.tangent_size))
+
+    def member_moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return each member's moments on inputs of its own: ``(E, N, S)`` in, ``(E, N, D)`` out.
+
+        For training the members of a shared ensemble on different samples.
+        """
+        rows = (self.inputs(state, action) - self.input_mean) / self.input_std
+        return self._moments(stacked_mlp(rows, list(self.weights), list(self.biases)))
+
+    def _moments(self, out: Tensor) -> tuple[Tensor, Tensor]:
+        """Split raw outputs into mean and softly bounded log-variance."""
+        mean, raw = out.chunk(2, -1)
+        low, high = self.log_variance
+        raw = high - F.softplus(high - raw)
+        return mean, low + F.softplus(raw - low)
+
+    def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the standard deviation of the mixture of members ``(*L, *N, D)``."""
+        return self.forecast(state, action)[1]
+
+    def forecast(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the mean next state and the mixture's standard deviation in one pass."""
+        mean, log_variance = self.moments(state, action)
+        variance = log_variance.exp().mean(-2) + mean.var(-2, correction=0)
+        change = mean.mean(-2) * self.target_std + self.target_mean
+        return self.manifold.add(state, change), variance.sqrt() * self.target_std
+
+    def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the mean Jacobian of the members ``(*L, *N, D, A)``, in closed form."""
+        rows, shape = self._rows(state, action)
+        axes = torch.eye(rows.shape[-1], device=rows.device, dtype=rows.dtype)
+        axes = (axes / self.input_std)[len(self.features) :]
+        size = self.manifold.tangent_size
+        weights, biases = self._stacked(slice(None), size)
+        moved = stacked_mlp_tangent(self._per_member(rows), axes, weights, biases)
+        mean = moved.unflatten(0, (-1, self.members)).mean(1)  # (l, n, A, D)
+        return (mean * self.target_std).mT.reshape(*shape, size, self.action_size)
+
+    def expand_(self, missions: int) -> Ensemble:
+        """Give each of ``missions`` parameters of its own, in place."""
+        if self.lead:
+            raise ConfigurationError(f"dynamics: already expanded to {tuple(self.lead)} missions")
+        for parameter in self.parameters():
+            parameter.data = parameter.data.expand(missions, *parameter.shape).clone()
+            parameter.grad = None
+        return self
+
+    def select_(self, index: Tensor) -> Ensemble:
+        """Keep the missions in ``index``, in place; a shared ensemble stays as it is."""
+        if self.lead:
+            for parameter in self.parameters():
+                parameter.data = parameter.data[index]
+                parameter.grad = None
+        return self
+
+    def _rows(self, state: Tensor, action: Tensor) -> tuple[Tensor, torch.Size]:
+        """Return standardised inputs ``(l, n, in)``, l = prod(lead), and ``(*L, *N)``."""
+        lead = self.lead
+        if state.shape[: len(lead)] != lead:
+            raise ConfigurationError(
+                f"dynamics: the ensemble holds {tuple(lead)} missions, got states of shape "
+                f"{tuple(state.shape)}; expected ({', '.join(map(str, lead))}, ..., "
+                f"{self.state_size})"
+            )
+        raw = self.inputs(state, action)
+        rows = (raw - self.input_mean) / self.input_std
+        return rows.reshape(max(1, math.prod(lead)), -1, rows.shape[-1]), raw.shape[:-1]
+
+    def _per_member(self, rows: Tensor) -> Tensor:
+        """Repeat ``(l, n, in)`` for every member: ``(l * E, n, in)``."""
+        return rows.unsqueeze(1).expand(-1, self.members, -1, -1).flatten(0, 1)
+
+    def _stacked(self, missions: slice, size: int) -> tuple[list[Tensor], list[Tensor]]:
+        """Return flattened parameters of some missions, the last layer cut to ``size``."""
+        stacks = []
+        for parameters in (self.weights, self.biases):
+            parts = [p if self.lead else p.unsqueeze(0) for p in parameters]
+            stack = [p[missions].flatten(0, 1) for p in parts]
+            stack[-1] = stack[-1][..., :size]
+            stacks.append(stack)
+        return stacks[0], stacks[1]
+
+    def _run(self, state: Tensor, action: Tensor, size: int) -> Tensor:
+        """Return the first ``size`` outputs of every member ``(*L, *N, E, size)``."""
+        rows, shape = self._rows(state, action)
+        per_row = self.members * max(self.hidden, default=1)
+        width = min(rows.shape[1], max(1, CHUNK // per_row))
+        height = max(1, CHUNK // (per_row * width))
+        pieces = []
+        for top in range(0, rows.shape[0], height):
+            missions = slice(top, top + height)
+            weights, biases = self._stacked(missions, size)
+            wide = self._per_member(rows[missions])
+            parts = [stacked_mlp(part, weights, biases) for part in wide.split(width, 1)]
+            pieces.append(torch.cat(parts, 1) if len(parts) > 1 else parts[0])
+        out = torch.cat(pieces) if len(pieces) > 1 else pieces[0]
+        out = out.unflatten(0, (-1, self.members)).transpose(1, 2)  # (l, n, E, size)
+        return out.reshape(*shape, self.members, size)

@@ -1,0 +1,74 @@
+"""A model that is told the regime: the yardstick, not a method."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.regimes import Regime
+
+
+class Oracle(DynamicsModel):
+    """Nominal dynamics seen through the true regime. For comparison only.
+
+    Args:
+        model: the nominal dynamics.
+        regime: the regime family of the environment.
+
+    :meth:`tell` sets the parameters ``(F,)`` or, per mission, ``(*L, F)``.
+
+    >>> from afm_rl.dynamics import Dubins
+    >>> from afm_rl.regimes import ActionGain
+    >>> gains = ActionGain(["v_gain", "omega_gain"])
+    >>> oracle = Oracle(Dubins(), gains)
+    >>> oracle.tell(gains.encode({"v_gain": -1.0}))
+    >>> oracle(torch.zeros(3), torch.tensor([1.0, 0.0]))
+    tensor([-0.2000,  0.0000,  0.0000])
+    """
+
+    parameters_now: Tensor
+
+    def __init__(self, model: DynamicsModel, regime: Regime) -> None:
+        super().__init__(model.manifold, model.action_size)
+        self.model = model
+        self.regime = regime
+        self.register_buffer("parameters_now", torch.tensor(regime.identity), persistent=False)
+
+    @property
+    def lead(self) -> torch.Size:
+        """Leading dimensions of the parameters last told."""
+        return self.parameters_now.shape[:-1]
+
+    def tell(self, parameters: Tensor) -> None:
+        """Set the regime parameters that hold from now on."""
+        self.parameters_now = parameters.detach()
+
+    def effective(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return what ``action`` is worth under the present regime."""
+        told = self.parameters_now
+        extra = action.dim() - told.dim()
+        told = told.reshape(*told.shape[:-1], *(1,) * extra, told.shape[-1])
+        return self.regime.apply(action, told, state)
+
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the true expected next state."""
+        return self.model(state, self.effective(state, action))
+
+    def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the nominal model's moments at the effective action."""
+        return self.model.moments(state, self.effective(state, action))
+
+    def standardise(self, change: Tensor) -> Tensor:
+        """Use the nominal model's units."""
+        return self.model.standardise(change)
+
+    def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the nominal model's noise scale at the effective action."""
+        return self.model.noise_scale(state, self.effective(state, action))
+
+    def select_(self, index: Tensor) -> Oracle:
+        """Keep the missions in ``index``."""
+        if self.lead:
+            self.tell(self.parameters_now[index])
+        return self

@@ -1,0 +1,75 @@
+"""Errors that say what was given, what was expected and what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+
+class AFMError(Exception):
+    """Base class of every error this library raises on purpose."""
+
+
+class ConfigurationError(AFMError, ValueError):
+    """A setting, argument or file that cannot be used."""
+
+
+class ArtefactError(AFMError, ValueError):
+    """A stored model that is damaged or belongs to something else."""
+
+
+class NonFiniteError(AFMError, ValueError):
+    """NaN or infinity where a finite number is needed."""
+
+
+def check_number(
+    name: str,
+    value: float,
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    open_low: bool = False,
+) -> float:
+    """Return ``value`` as a float in ``[low, high]`` (``(low, high]`` if ``open_low``).
+
+    Raises:
+        ConfigurationError: if it is not a finite number in that range.
+
+    >>> check_number("temperature", 0.5, low=0, open_low=True)
+    0.5
+    """
+    allowed = f"a finite number in {'(' if open_low else '['}{low:g}, {high:g}]"
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ConfigurationError(f"{name}={value!r}: expected {allowed}")
+    if value > high or value < low or (open_low and value == low):
+        raise ConfigurationError(f"{name}={value!r}: expected {allowed}")
+    return float(value)
+
+
+def check_count(name: str, value: int, *, low: int = 1) -> int:
+    """Return ``value`` if it is a whole number of at least ``low``.
+
+    Raises:
+        ConfigurationError: otherwise.
+
+    >>> check_count("horizon", 5)
+    5
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < low:
+        raise ConfigurationError(f"{name}={value!r}: expected a whole number of at least {low}")
+    return value
+
+
+def check_choice(name: str, value: str, allowed: Iterable[str]) -> str:
+    """Return ``value`` if it is one of ``allowed``.
+
+    Raises:
+        ConfigurationError: otherwise, listing what is allowed.
+
+    >>> check_choice("by", "step", ("progress", "step"))
+    'step'
+    """
+    allowed = tuple(allowed)
+    if value not in allowed:
+        raise ConfigurationError(f"{name}={value!r}: expected one of {', '.join(allowed)}")
+    return value

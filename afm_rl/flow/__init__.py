@@ -1,0 +1,21 @@
+"""Flows: from the planned action to the action that has its effect."""
+
+from afm_rl.flow.base import Context, Examples, Flow, Window
+from afm_rl.flow.cfm import CFMLoss, train_flow
+from afm_rl.flow.context_flow import ContextFlow
+from afm_rl.flow.effective import effective_action
+from afm_rl.flow.paper_flow import PaperFlow
+from afm_rl.flow.solver import midpoint
+
+__all__ = [
+    "CFMLoss",
+    "Context",
+    "ContextFlow",
+    "Examples",
+    "Flow",
+    "PaperFlow",
+    "Window",
+    "effective_action",
+    "midpoint",
+    "train_flow",
+]

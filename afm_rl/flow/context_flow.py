@@ -1,0 +1,175 @@
+"""Action flow matching on a window of effective actions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import check_count, check_number
+from afm_rl.flow.base import Context, Examples, Flow, Window
+from afm_rl.flow.effective import effective_action
+from afm_rl.flow.network import mlp
+from afm_rl.flow.solver import midpoint
+from afm_rl.regimes import Regime
+from afm_rl.sampling import uniform
+
+LIMIT = 4.0  # effective actions beyond 4 half ranges are clamped: they carry no more news
+
+
+class ContextFlow(Flow):
+    r"""A flow from noise around the planned action to the action that has its effect.
+
+    The regime is described by K pairs (executed, effective action), which mean the same for
+    any model and robot (:func:`~afm_rl.flow.effective.effective_action`). The network learns
+    the velocity of the straight path
+
+    .. math:: x_\tau = (1-\tau)(u_0 + \sigma\epsilon) + \tau u_1
+
+    from the planned action :math:`u_0` to the inverse :math:`u_1 = T^{-1}(u_0)` under the
+    regime T, all in half ranges. The source is noisy so that the answer does not leak and
+    paths of a reflection do not cross; a fixed, antithetic set of source points makes the
+    correction deterministic. The model counts as misaligned while the largest surprise in
+    the window exceeds ``gate`` standard deviations of the model's own noise.
+
+    Args:
+        action_low: lowest action, ``(A,)``.
+        action_high: highest action, ``(A,)``.
+        window: transitions in the context, K.
+        gate: in standard deviations of the model.
+        samples: source points, averaged; even.
+        source_std: :math:`\sigma`, in half ranges.
+        steps: midpoint steps.
+        hidden: units of the hidden layers of encoder and velocity network.
+        latent: size of the encoded context.
+
+    >>> flow = ContextFlow(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
+    >>> flow.feature_size
+    30
+    """
+
+    source_points: Tensor
+
+    def __init__(
+        self,
+        action_low: Tensor,
+        action_high: Tensor,
+        window: int = 6,
+        gate: float = 5.0,
+        samples: int = 8,
+        source_std: float = 0.3,
+        steps: int = 3,
+        hidden: Sequence[int] = (128, 128),
+        latent: int = 64,
+    ) -> None:
+        super().__init__(action_low, action_high, gate, check_count("flow.window", window))
+        self.samples = check_count("flow.samples", samples)
+        self.source_std = check_number("flow.source_std", source_std, low=0.0)
+        self.steps = check_count("flow.steps", steps)
+        size = self.action_size
+        self.encoder = mlp([self.feature_size, *hidden, latent])
+        self.velocity = mlp([latent + 2 * size + 1, *hidden, size])
+        half = torch.randn((samples + 1) // 2, size, generator=torch.Generator().manual_seed(0))
+        points = torch.cat([half, -half])[:samples]
+        self.register_buffer("source_points", points, persistent=False)
+
+    @property
+    def feature_size(self) -> int:
+        """K (executed, effective, valid)."""
+        return self.window * (2 * self.action_size + 1)
+
+    def features(self, executed: Tensor, effective: Tensor, valid: Tensor) -> Tensor:
+        """Return the context features ``(*B, C)`` of pairs ``(*B, K, A)``, ``(*B, K)``."""
+        pairs = torch.cat([self.normalise(executed), self.normalise(effective)], -1)
+        kept = torch.where(valid.unsqueeze(-1), pairs.clamp(-LIMIT, LIMIT), 0.0)
+        return torch.cat([kept, valid.unsqueeze(-1).to(kept)], -1).flatten(-2)
+
+    def context(self, window: Window, model: DynamicsModel, last: Context) -> Context:
+        """Describe the window under the present model."""
+        seen = effective_action(
+            model, window.state, window.executed, window.next_state, self.half_range
+        )
+        valid = window.valid & seen.effective.isfinite().all(-1) & seen.surprise.isfinite()
+        surprise = torch.where(valid, seen.surprise, 0.0).amax(-1)
+        features = self.features(window.executed, seen.effective, valid)
+        return Context(features, surprise, surprise > self.gate)
+
+    def source(self, planned: Tensor, noise: Tensor) -> Tensor:
+        """Return a point near the planned action."""
+        return planned + self.source_std * noise
+
+    def forward(self, features: Tensor, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:
+        """Return the velocity ``(*B, A)`` at ``point``, all actions in half ranges."""
+        return self.velocity(torch.cat([self.encoder(features), planned, point, tau], -1))
+
+    def examples(
+        self,
+        model: DynamicsModel,
+        regime: Regime,
+        state_box: tuple[Tensor, Tensor],
+        count: int,
+        generator: torch.Generator,
+    ) -> Examples:
+        """Draw regimes from the prior and show the model's world to the flow through them.
+
+        The newest rows of each window come from the regime to correct, the older ones from
+        the regime before; some windows are not full yet.
+        """
+        size = (count, self.window)
+        now, before = regime.sample((2, count), generator)
+        row = torch.arange(self.window).expand(size)
+        newest = _newest(count, self.window, generator)
+        fresh = row >= self.window - newest
+        parameters = torch.where(fresh.unsqueeze(-1), now.unsqueeze(1), before.unsqueeze(1))
+        valid = row >= _missing(self.window, newest, generator)
+        state = uniform(*state_box, count * self.window, generator).view(*size, -1)
+        executed = self.denormalise(_excite(*size, self.action_size, generator))
+        realised, noise = model.forecast(state, regime.apply(executed, parameters, state))
+        error = noise * torch.randn(noise.shape, generator=generator)
+        realised = model.manifold.add(realised, error)
+        seen = effective_action(model, state, executed, realised, self.half_range)
+        planned = self.denormalise(2 * torch.rand(count, self.action_size, generator=generator) - 1)
+        low, high = self.centre - self.half_range, self.centre + self.half_range
+        intended = regime.inverse(planned, now, state[:, -1], low, high)
+        return Examples(self.features(executed, seen.effective, valid), planned, intended)
+
+    def correct(self, context: Context, state: Tensor, planned: Tensor) -> tuple[Tensor, Tensor]:
+        """Integrate the flow from every source point; return mean and spread."""
+        unit = self.normalise(planned).unsqueeze(-2)
+        start = self.source(unit, self.source_points)
+        latent = self.encoder(context.features).unsqueeze(-2).expand(*start.shape[:-1], -1)
+        unit = unit.expand_as(start)
+
+        def velocity(tau: float, point: Tensor) -> Tensor:
+            time = torch.full_like(point[..., :1], tau)
+            return self.velocity(torch.cat([latent, unit, point, time], -1))
+
+        end = midpoint(velocity, start, self.steps)
+        spread = end.std(-2, correction=0) * self.half_range
+        return self.denormalise(end.mean(-2)), spread
+
+
+def _newest(count: int, window: int, generator: torch.Generator) -> Tensor:
+    """How many rows are from the present regime ``(N, 1)``: all in half of the windows."""
+    some = torch.randint(1, window + 1, (count, 1), generator=generator)
+    full = torch.rand(count, 1, generator=generator) < 0.5
+    return torch.where(full, window, some)
+
+
+def _missing(window: int, newest: Tensor, generator: torch.Generator) -> Tensor:
+    """How many of the oldest rows are missing ``(N, 1)``: some in one window of ten."""
+    drawn = torch.rand(newest.shape, generator=generator)
+    most = torch.where(newest == window, window, window - newest + 1)
+    few = (torch.rand(newest.shape, generator=generator) * most).long()
+    return torch.where(drawn < 0.1, few, 0)
+
+
+def _excite(count: int, window: int, size: int, generator: torch.Generator) -> Tensor:
+    """Executed actions ``(N, K, A)`` in u: half the windows move about one action only."""
+    wide = 2 * torch.rand(count, window, size, generator=generator) - 1
+    around = 2 * torch.rand(count, 1, size, generator=generator) - 1
+    reach = 0.4 * torch.rand(count, 1, size, generator=generator)
+    narrow = (around + reach * wide).clamp(-1, 1)
+    return torch.where(torch.rand(count, 1, 1, generator=generator) < 0.5, wide, narrow)

@@ -1,0 +1,28 @@
+"""TensorDict keys, as written in Python or in YAML."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from tensordict import NestedKey
+
+
+def as_key(key: str | Iterable[str]) -> NestedKey:
+    """Return ``key`` as tensordict wants it: a string, or a tuple of strings.
+
+    YAML has no tuples, so nested keys arrive as lists.
+
+    >>> as_key(["afm", "executed_action"])
+    ('afm', 'executed_action')
+    >>> as_key("action")
+    'action'
+    """
+    if isinstance(key, str):
+        return key
+    parts = tuple(key)
+    return parts[0] if len(parts) == 1 else parts
+
+
+def as_keys(keys: Iterable[str | Iterable[str]]) -> list[NestedKey]:
+    """Apply :func:`as_key` to each of ``keys``."""
+    return [as_key(key) for key in keys]

@@ -1,0 +1,16 @@
+"""Learning: losses, updaters, optimisers, pre-training."""
+
+from afm_rl.learning.fresh_adam import FreshAdam
+from afm_rl.learning.nll import GaussianNLLLoss, gaussian_nll
+from afm_rl.learning.pretrain import pretrain_ensemble
+from afm_rl.learning.updater import OnlineUpdater, OracleUpdater, Updater
+
+__all__ = [
+    "FreshAdam",
+    "GaussianNLLLoss",
+    "OnlineUpdater",
+    "OracleUpdater",
+    "Updater",
+    "gaussian_nll",
+    "pretrain_ensemble",
+]

@@ -1,0 +1,52 @@
+"""The optimiser of the published online update."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import torch
+from torch import nn
+from torch.optim import Optimizer
+
+from afm_rl.errors import check_number
+
+
+class FreshAdam(Optimizer):
+    r"""Adam that is created anew at every step, as in the published runs.
+
+    The first step of Adam is :math:`w \leftarrow w - \eta\, g / (|g| + \epsilon)`, a sign
+    step. It is elementwise and zero gradients do not move, so stacked missions stay
+    independent and are masked by masking their loss.
+
+    Args:
+        params: parameters.
+        lr: step size, > 0.
+        eps: keeps the quotient finite, > 0.
+
+    >>> w = nn.Parameter(torch.tensor([1.0, 1.0]))
+    >>> w.grad = torch.tensor([5.0, 0.0])
+    >>> FreshAdam([w], lr=0.1).step()
+    >>> w.data
+    tensor([0.9000, 1.0000])
+    """
+
+    def __init__(
+        self, params: Iterable[nn.Parameter], lr: float = 1e-3, eps: float = 1e-8
+    ) -> None:
+        check_number("updater.lr", lr, low=0.0, open_low=True)
+        check_number("updater.eps", eps, low=0.0, open_low=True)
+        super().__init__(params, {"lr": lr, "eps": eps})
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:
+        """Take one step."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    size = parameter.grad.abs().add_(group["eps"])
+                    parameter.addcdiv_(parameter.grad, size, value=-group["lr"])
+        return loss

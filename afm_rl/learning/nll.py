@@ -1,0 +1,102 @@
+"""How well a dynamics model explains transitions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import check_choice
+
+REDUCTIONS = ("mean", "sum", "none")
+
+
+def gaussian_nll(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
+    r"""Return :math:`(\mu - y)^2 e^{-\ell} + \ell`, elementwise.
+
+    Twice the Gaussian negative log-likelihood without its constant, :math:`\ell` the
+    log-variance (Chua et al. 2018, eq. 1).
+
+    >>> import torch
+    >>> gaussian_nll(torch.zeros(1), torch.zeros(1), torch.full((1,), 3.0))
+    tensor([9.])
+    """
+    return (mean - target) ** 2 * (-log_variance).exp() + log_variance
+
+
+class GaussianNLLLoss(LossModule):
+    """Gaussian negative log-likelihood of the state change under a dynamics model.
+
+    The mean is taken over ensemble members and coordinates, the ``reduction`` over the
+    batch. Parameters stay where they are (the loss is not functional): planner, transform
+    and optimiser go on sharing one model.
+
+    Args:
+        model: any :class:`~afm_rl.dynamics.DynamicsModel`.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (one value per transition).
+
+    Keys (change them with ``set_keys``): ``state`` ("observation"), ``action`` ("action"),
+    ``next_state`` (("next", "observation")). ``loss_mask_key`` is honoured.
+
+    >>> import torch
+    >>> from afm_rl.dynamics import Dubins
+    >>> loss = GaussianNLLLoss(Dubins())
+    >>> s, a = torch.zeros(4, 3), torch.ones(4, 2)
+    >>> td = TensorDict({"observation": s, "action": a}, [4])
+    >>> loss(td.set(("next", "observation"), Dubins()(s, a)))["loss_nll"]
+    tensor(0.)
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Default keys."""
+
+        state: NestedKey = "observation"
+        action: NestedKey = "action"
+        next_state: NestedKey = ("next", "observation")
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    model: DynamicsModel
+    model_params: None
+    target_model_params: None
+    out_keys = ["loss_nll"]
+
+    def __init__(self, model: DynamicsModel, reduction: str = "mean") -> None:
+        self._in_keys = None
+        super().__init__()
+        self.model = model
+        self.reduction = check_choice("loss.reduction", reduction, REDUCTIONS)
+
+    @property
+    def functional(self) -> bool:
+        """The loss works on the model itself."""
+        return False
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The three keys read."""
+        keys = self.tensor_keys
+        return self._in_keys or [keys.state, keys.action, keys.next_state]
+
+    @in_keys.setter
+    def in_keys(self, keys: list[NestedKey]) -> None:
+        self._in_keys = keys
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        """There is no value estimator."""
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return ``loss_nll`` for transitions ``(*L, *N)``."""
+        state, action, next_state = (tensordict.get(key) for key in self.in_keys)
+        change = self.model.manifold.difference(next_state, state)
+        target = self.model.standardise(change).unsqueeze(-2)
+        mean, log_variance = self.model.moments(state, action)
+        loss = gaussian_nll(mean, log_variance, target).mean((-2, -1))
+        loss = self._reduce_loss(loss, tensordict=tensordict)
+        return TensorDict({"loss_nll": loss}, loss.shape)

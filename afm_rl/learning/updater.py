@@ -1,0 +1,124 @@
+"""Learning from the latest transition, or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from afm_rl.dynamics import Oracle
+from afm_rl.keys import as_key
+from afm_rl.learning.nll import GaussianNLLLoss
+
+
+class Updater(nn.Module):
+    """What happens to the dynamics model after each step: here, nothing (frozen).
+
+    Called with one transition per mission, ``(*B)``; returns a tensordict with ``loss``
+    ``(*B)``, measured before any update. Updaters know nothing of the transform and work in
+    any loop; :attr:`loss` says which keys are read.
+
+    Args:
+        loss: how well the model explains a transition.
+
+    >>> from afm_rl.dynamics import Dubins
+    >>> updater = Updater(GaussianNLLLoss(Dubins(), reduction="none"))
+    >>> td = TensorDict({"observation": torch.zeros(4, 3), "action": torch.ones(4, 2)}, [4])
+    >>> updater(td.set(("next", "observation"), torch.zeros(4, 3)))["loss"].shape
+    torch.Size([4])
+    """
+
+    def __init__(self, loss: GaussianNLLLoss) -> None:
+        super().__init__()
+        loss.reduction = "none"
+        self.loss = loss
+
+    def start(self, tensordict: TensorDictBase) -> None:
+        """Look at the tensordict of a reset, before the first plan."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Measure the loss."""
+        with torch.no_grad():
+            return _as_loss(self.loss(tensordict))
+
+    def select_(self, index: Tensor) -> None:
+        """Keep the missions in ``index``: the model keeps them itself."""
+
+
+class OnlineUpdater(Updater):
+    """One gradient step on the latest transition, per mission.
+
+    Losses are summed, so with parameters per mission (see ``DynamicsModel.expand_``) every
+    mission learns from its own transition only. Transitions that are not finite, or that
+    ``mask_key`` excludes, have no influence; how many were refused is in :attr:`refused`.
+
+    Args:
+        loss: the loss to descend.
+        optimizer: makes the optimiser of the model's parameters.
+        mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
+    """
+
+    def __init__(
+        self,
+        loss: GaussianNLLLoss,
+        optimizer: Callable[..., Optimizer],
+        mask_key: NestedKey | None = None,
+    ) -> None:
+        super().__init__(loss)
+        self.optimizer = optimizer(loss.model.parameters())
+        self.mask_key = None if mask_key is None else as_key(mask_key)
+        self.refused = 0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Measure the loss, then take one step."""
+        batch = tensordict.batch_size
+        kept = tensordict.select(*self.loss.in_keys).detach()
+        learn = torch.ones(batch, dtype=torch.bool, device=kept.device)
+        for key in self.loss.in_keys:
+            learn &= kept.get(key).isfinite().all(-1)
+        self.refused += int((~learn).sum())
+        if self.mask_key is not None:
+            learn = learn & tensordict.get(self.mask_key).reshape(batch)
+        for key in self.loss.in_keys:  # NaN times zero is NaN: take it out before the loss
+            kept.set(key, torch.where(learn.unsqueeze(-1), kept.get(key), 0.0))
+        with torch.enable_grad():
+            result = self.loss(kept)["loss_nll"]
+            self.optimizer.zero_grad(set_to_none=True)
+            torch.where(learn, result, 0.0).sum().backward()
+        self.optimizer.step()
+        return TensorDict({"loss": result.detach()}, batch)
+
+
+class OracleUpdater(Updater):
+    """Tell the oracle the regime that holds for the next action.
+
+    Args:
+        loss: a loss over an :class:`~afm_rl.dynamics.Oracle`.
+        regime_key: where the environment publishes the regime's parameters.
+    """
+
+    def __init__(self, loss: GaussianNLLLoss, regime_key: NestedKey = "regime") -> None:
+        super().__init__(loss)
+        self.regime_key = as_key(regime_key)
+
+    @property
+    def oracle(self) -> Oracle:
+        """The model to tell."""
+        return self.loss.model
+
+    def start(self, tensordict: TensorDictBase) -> None:
+        """Tell the first regime."""
+        self.oracle.tell(tensordict.get(self.regime_key))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Measure the loss, then tell the next regime."""
+        result = super().forward(tensordict)
+        self.start(tensordict.get("next"))
+        return result
+
+
+def _as_loss(result: TensorDictBase) -> TensorDictBase:
+    return TensorDict({"loss": result["loss_nll"]}, result.batch_size)

@@ -1,0 +1,8 @@
+"""Planners, and the world in which they imagine."""
+
+from afm_rl.planning.costs import Cost, GoalDistance
+from afm_rl.planning.mppi import MPPI
+from afm_rl.planning.planning_env import PlanningEnv
+from afm_rl.planning.shooting import CEM, TorchRLMPPI
+
+__all__ = ["CEM", "MPPI", "Cost", "GoalDistance", "PlanningEnv", "TorchRLMPPI"]

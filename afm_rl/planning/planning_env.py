@@ -1,0 +1,106 @@
+"""The world as the planner imagines it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import ModelBasedEnvBase
+
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import ConfigurationError
+from afm_rl.keys import as_key
+from afm_rl.planning.costs import Cost
+
+
+class PlanningEnv(ModelBasedEnvBase):
+    """Dynamics model and cost as a batch-unlocked TorchRL environment.
+
+    ``step`` is what any TorchRL planner needs; :meth:`returns` is the same computation for
+    whole action sequences without tensordicts, for planners that know it.
+
+    Args:
+        dynamics: the model; shared, not copied.
+        cost: cost of a step; the reward is its negative.
+        action_low: lowest action, ``(A,)``.
+        action_high: highest action, ``(A,)``.
+        observation_key: where the state is.
+        action_key: where the action is.
+
+    >>> from afm_rl.dynamics import Dubins
+    >>> from afm_rl.planning import GoalDistance
+    >>> env = PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5])
+    >>> plans = torch.zeros(7, 5, 2)  # 7 candidates, 5 steps
+    >>> env.returns(torch.zeros(3), plans, torch.ones(2)).shape
+    torch.Size([7])
+    """
+
+    def __init__(
+        self,
+        dynamics: DynamicsModel,
+        cost: Cost,
+        action_low: Sequence[float],
+        action_high: Sequence[float],
+        observation_key: NestedKey = "observation",
+        action_key: NestedKey = "action",
+    ) -> None:
+        super().__init__(dynamics, batch_size=torch.Size([]))
+        self.dynamics = dynamics
+        self.cost = cost
+        self.observation_key = as_key(observation_key)
+        low, high = torch.as_tensor(action_low), torch.as_tensor(action_high)
+        if low.shape != (dynamics.action_size,) or high.shape != low.shape or (low >= high).any():
+            raise ConfigurationError(
+                f"action bounds {low.tolist()}, {high.tolist()}: expected {dynamics.action_size} "
+                "numbers each, low < high"
+            )
+        sizes = {self.observation_key: dynamics.state_size}
+        sizes.update(zip(cost.in_keys, cost.in_sizes, strict=True))
+        self.observation_spec = Composite()
+        self.state_spec = Composite()
+        for key, size in sizes.items():
+            self.observation_spec[key] = Unbounded((size,))
+            self.state_spec[key] = Unbounded((size,))
+        spec = Bounded(low, high, shape=low.shape, dtype=low.dtype)
+        self.full_action_spec = Composite({as_key(action_key): spec})
+        self.reward_spec = Unbounded((1,))
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
+        batch = tensordict.batch_size if tensordict is not None else self.batch_size
+        start = self.observation_spec.zero(batch)
+        if tensordict is not None:
+            start.update(tensordict.select(*start.keys(True, True), strict=False))
+        return start
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        state, action = tensordict.get(self.observation_key), tensordict.get(self.action_key)
+        task = {key: tensordict.get(key) for key in self.cost.in_keys}
+        next_state = self.dynamics(state, action)
+        cost = self.cost(state, action, next_state, *task.values())
+        done = torch.zeros((*cost.shape, 1), dtype=torch.bool, device=cost.device)
+        out = TensorDict({"done": done, "terminated": done.clone()}, tensordict.batch_size)
+        out.set(self.observation_key, next_state)
+        out.set("reward", -cost.unsqueeze(-1))
+        for key, value in task.items():
+            out.set(key, value)
+        return out
+
+    def returns(self, state: Tensor, actions: Tensor, *task: Tensor) -> Tensor:
+        """Return the summed reward ``(*B, N)`` of each candidate plan.
+
+        Args:
+            state: ``(*B, S)``.
+            actions: ``(*B, N, H, A)``.
+            task: the cost's task entries, each ``(*B, size)``.
+        """
+        state = state.unsqueeze(-2).expand(*actions.shape[:-2], -1)
+        wide = [entry.unsqueeze(-2) for entry in task]
+        total: Tensor | float = 0.0
+        for action in actions.unbind(-2):
+            next_state = self.dynamics(state, action)
+            total = total + self.cost(state, action, next_state, *wide)
+            state = next_state
+        return -torch.as_tensor(total)

@@ -1,0 +1,55 @@
+"""When a regime starts and ends."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from afm_rl.errors import ConfigurationError, check_choice, check_number
+
+
+class Schedule:
+    """Breakpoints between the phases of a mission, by progress or by step.
+
+    With K breakpoints a mission has K + 1 phases; phase k + 1 begins once the measure is
+    *greater than* breakpoint k.
+
+    Args:
+        at: increasing breakpoints: fractions of the targets reached (``by="progress"``), or
+            step numbers (``by="step"``).
+        by: ``"progress"`` or ``"step"``.
+
+    >>> schedule = Schedule([0.15, 0.80])
+    >>> schedule.phase(torch.tensor([0.1, 0.5, 0.9]), torch.zeros(3))
+    tensor([0, 1, 2])
+    """
+
+    def __init__(self, at: Sequence[float] = (0.15, 0.80), by: str = "progress") -> None:
+        self.by = check_choice("schedule.by", by, ("progress", "step"))
+        high = 1.0 if by == "progress" else float("inf")
+        self.at = tuple(check_number("schedule.at", value, low=0.0, high=high) for value in at)
+        if list(self.at) != sorted(self.at):
+            raise ConfigurationError(f"schedule.at={list(at)}: expected increasing breakpoints")
+
+    @property
+    def phases(self) -> int:
+        """Number of phases, K + 1."""
+        return len(self.at) + 1
+
+    def phase(self, progress: Tensor, step: Tensor, at: Tensor | None = None) -> Tensor:
+        """Return the phase index ``(*B)`` for progress in [0, 1] and step number.
+
+        ``at`` ``(*B, K)`` gives each mission breakpoints of its own; pad with ``inf``.
+        """
+        measure = progress if self.by == "progress" else step
+        if at is None:
+            at = torch.tensor(self.at, device=measure.device)
+        return (measure.unsqueeze(-1) > at).sum(-1)
+
+
+def phase_parameters(parameters: Tensor, phase: Tensor) -> Tensor:
+    """Pick each mission's row ``(*B, F)`` out of ``(*B, P, F)`` by phase ``(*B)``."""
+    index = phase[..., None, None].expand(*phase.shape, 1, parameters.shape[-1])
+    return parameters.gather(-2, index).squeeze(-2)

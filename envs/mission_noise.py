@@ -1,0 +1,64 @@
+"""The noise of missions: one stream per seed, in the order of its own events."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from afm_rl.streams import Streams
+
+_SALTS = {"start": 0x55475653, "process": 0x55475650}
+
+
+class MissionNoise:
+    """Start and process noise that depend on a mission's seed alone.
+
+    Starts and steps draw from streams of their own, so a reset does not shift the noise of the
+    steps, and rows that are left out of a call draw nothing.
+
+    >>> noise = MissionNoise()
+    >>> seeds = torch.tensor([3, 4, 3])
+    >>> drawn = noise.normal("start", seeds, torch.tensor([True, False, True]))
+    >>> bool((drawn[0] == drawn[2]).all()), drawn[1]
+    (True, tensor([0., 0., 0.]))
+    """
+
+    def __init__(self) -> None:
+        self.streams = {name: Streams(salt=salt) for name, salt in _SALTS.items()}
+
+    def normal(
+        self,
+        event: str,
+        seeds: Tensor,
+        rows: Tensor | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> Tensor:
+        """Draw N(0, 1) numbers ``(*B, 3)``.
+
+        Args:
+            event: ``"start"`` or ``"process"``.
+            seeds: seed of each mission, ``(*B)``.
+            rows: missions that draw, booleans ``(*B)``; the others get zeros. All if None.
+            dtype: floating-point type.
+        """
+        noise = torch.zeros(*seeds.shape, 3, device=seeds.device, dtype=dtype)
+        rows = torch.ones_like(seeds, dtype=torch.bool) if rows is None else rows
+        if rows.any():
+            noise[rows] = self.streams[event].normal(
+                (3,), seeds=seeds[rows], device=seeds.device, dtype=dtype
+            )
+        return noise
+
+    def restart(self) -> None:
+        """Let every stream begin again."""
+        for stream in self.streams.values():
+            stream.manual_seed(stream.seed)
+
+    def state_dict(self) -> dict[str, dict[str, Tensor]]:
+        """Return the states of all generators, per event."""
+        return {name: stream.state_dict() for name, stream in self.streams.items()}
+
+    def load_state_dict(self, state: dict[str, dict[str, Tensor]]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        for name, stream in self.streams.items():
+            stream.load_state_dict(state[name])

@@ -1,0 +1,142 @@
+"""What one mission is made of, as entries of a tensordict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+
+from afm_rl.errors import ConfigurationError, check_choice, check_count
+from afm_rl.regimes import Regime, Schedule
+
+
+class MissionFormat:
+    """The entries under ``"mission"``: which track, which noise, which regime, and when.
+
+    ============== ======= ===========================================================
+    ``track``      int64   index of the track, ``(*B)``
+    ``seed``       int64   seed of the mission's noise, ``(*B)``
+    ``parameters`` float   regime parameters per phase, ``(*B, P, F)``
+    ``at``         float   breakpoints of the schedule, ``(*B, K)``, padded with ``inf``
+    ============== ======= ===========================================================
+
+    Because they travel with the state, one tensordict holds any mix of missions.
+
+    Args:
+        tracks: names of the tracks.
+        regime: the regime family, with F parameters.
+        schedule: the schedule, with K breakpoints and P = K + 1 phases.
+        dtype: floating-point type.
+
+    >>> from afm_rl.regimes import ActionGain
+    >>> form = MissionFormat(("a", "b"), ActionGain(["v_gain", "omega_gain"]), Schedule())
+    >>> form.build("b", regime={"v_gain": -1.0})["mission", "parameters"][1]
+    tensor([-1.,  1.])
+    """
+
+    def __init__(
+        self,
+        tracks: Sequence[str],
+        regime: Regime,
+        schedule: Schedule,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        self.tracks = tuple(tracks)
+        self.regime = regime
+        self.schedule = schedule
+        self.dtype = dtype
+        self._shapes: dict[str, tuple[int, ...]] = {
+            "track": (),
+            "seed": (),
+            "parameters": (schedule.phases, len(regime.names)),
+            "at": (len(schedule.at),),
+        }
+
+    def spec(self, batch: torch.Size, device: torch.device | None) -> Composite:
+        """Return the spec of the ``"mission"`` entry."""
+        last = len(self.tracks) - 1
+        leaves = {
+            "track": Bounded(0, last, shape=batch, dtype=torch.int64, device=device),
+            "seed": Unbounded(shape=batch, dtype=torch.int64, device=device),
+        }
+        for name in ("parameters", "at"):
+            shape = (*batch, *self._shapes[name])
+            leaves[name] = Unbounded(shape=shape, dtype=self.dtype, device=device)
+        return Composite(leaves, shape=batch, device=device)
+
+    def build(
+        self,
+        track: int | str = 0,
+        seed: int | None = None,
+        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+    ) -> TensorDict:
+        """Describe one mission: ``env.reset(torch.stack([...]), set_state=False)`` runs many.
+
+        Args:
+            track: index or name.
+            seed: seed of its noise; if None, the environment numbers its missions.
+            regime: parameters that are not nominal: one mapping for the second phase (the
+                only one, if the schedule has no breakpoint), or one mapping per phase.
+        """
+        if isinstance(track, str):
+            track = self.tracks.index(check_choice("missions: track", track, self.tracks))
+        phases = self.schedule.phases
+        if regime is None or isinstance(regime, Mapping):
+            changed = min(1, phases - 1)
+            regime = [(regime or {}) if phase == changed else {} for phase in range(phases)]
+        rows = [self.regime.encode(values) for values in regime]
+        if len(rows) != phases:
+            raise ConfigurationError(
+                f"regimes: {len(rows)} phases given, the schedule has {phases}"
+            )
+        entries = {"track": torch.tensor(track), "parameters": torch.stack(rows)}
+        if seed is not None:
+            entries["seed"] = torch.tensor(check_count("missions: seed", seed, low=0))
+        return TensorDict({"mission": entries})
+
+    def complete(
+        self, given: TensorDictBase | None, batch: torch.Size, seed: int, device
+    ) -> TensorDict:
+        """Check what is ``given`` of a batch of missions and add what is missing.
+
+        Missing are: the first track, nominal dynamics, the schedule's breakpoints, and the
+        seeds ``seed, seed + 1, ...`` so that no two missions share their noise.
+
+        Raises:
+            ConfigurationError: for an unknown entry, a wrong shape or an impossible value.
+        """
+        entries = {} if given is None else {key: given.get(key) for key in given.keys()}
+        for name, value in entries.items():
+            check_choice("missions: entry", name, self._shapes)
+            if value.shape != (*batch, *self._shapes[name]):
+                raise ConfigurationError(
+                    f"missions: {name} {tuple(value.shape)}: expected "
+                    f"{(*batch, *self._shapes[name])}"
+                )
+        index = torch.arange(batch.numel(), device=device).reshape(batch)
+        nominal = torch.tensor(self.regime.identity).expand(self._shapes["parameters"])
+        default: dict[str, Tensor] = {
+            "track": torch.zeros_like(index),
+            "seed": seed + index,
+            "parameters": nominal.expand(*batch, *nominal.shape),
+            "at": torch.tensor(self.schedule.at).expand(*batch, -1),
+        }
+        mission = {}
+        for name, value in default.items():
+            whole = name in ("track", "seed")
+            value = entries.get(name, value)
+            mission[name] = value.to(device, torch.int64 if whole else self.dtype, copy=True)
+        self._check_values(mission)
+        return TensorDict(mission, batch, device=device)
+
+    def _check_values(self, mission: Mapping[str, Tensor]) -> None:
+        last = len(self.tracks) - 1
+        if ((mission["track"] < 0) | (mission["track"] > last)).any():
+            raise ConfigurationError(f"missions: track: expected indices 0..{last}")
+        if not mission["parameters"].isfinite().all():
+            raise ConfigurationError("missions: parameters: expected finite numbers")
+        if mission["at"].isnan().any():
+            raise ConfigurationError("missions: at: expected numbers; pad with inf")

@@ -1,0 +1,91 @@
+"""Pictures of a robot on a track, without a screen."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon
+from torch import Tensor
+
+from afm_rl.envs.track import Track
+from afm_rl.errors import check_count
+
+ROAD, LINE, ROBOT, GOAL, TRAIL = "#dddddd", "#999999", "#0072b2", "#d55e00", "#56b4e9"
+MARGIN = 2.0  # m between the course and the edge of the picture
+OUTLINE = torch.tensor([[0.6, 0.0], [-0.4, 0.35], [-0.2, 0.0], [-0.4, -0.35]])  # robot (m)
+
+
+def robot_outline(pose: Tensor) -> Tensor:
+    """Return the corners ``(4, 2)`` of the arrow drawn for a robot at ``pose`` ``(3,)``.
+
+    >>> robot_outline(torch.zeros(3))[0]
+    tensor([0.6000, 0.0000])
+    """
+    cos, sin = pose[2].cos(), pose[2].sin()
+    turn = torch.stack([torch.stack([cos, sin]), torch.stack([-sin, cos])])
+    return pose[:2] + OUTLINE.to(pose) @ turn
+
+
+class TrackCanvas:
+    """A track that is drawn once, and again and again with the robot elsewhere.
+
+    Built on matplotlib's objects, so no window opens and no global figure is left behind.
+
+    Args:
+        track: what to draw.
+        pixels: length of the longer side of the picture.
+
+    >>> from afm_rl.envs.tracks import load_track
+    >>> frame = TrackCanvas(load_track("ethz_2"), pixels=120).draw(torch.zeros(3), torch.ones(2))
+    >>> frame.dtype, frame.shape[2], max(frame.shape)
+    (dtype('uint8'), 3, 120)
+    """
+
+    def __init__(self, track: Track, pixels: int = 480) -> None:
+        self.pixels = check_count("pixels", pixels, low=16)
+        points = torch.cat([track.centerline, track.waypoints])
+        edge = MARGIN + track.width / 2
+        low, high = (points.amin(0) - edge).numpy(), (points.amax(0) + edge).numpy()
+        span = high - low
+        dpi = 100
+        metre = self.pixels / float(span.max())  # in pixels
+        width, height = (max(1, round(float(side) * metre)) for side in span)
+        self.figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi)
+        self.canvas = FigureCanvasAgg(self.figure)
+        axes = self.figure.add_axes((0, 0, 1, 1), xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axes.set_axis_off()
+        x, y = torch.cat([track.centerline, track.centerline[:1]]).unbind(-1)
+        axes.plot(x, y, color=ROAD, linewidth=track.width * metre * 72 / dpi)
+        axes.plot(x, y, color=LINE, linewidth=1, linestyle="--")
+        axes.plot(*track.waypoints.unbind(-1), color=LINE, linestyle="", marker="o", markersize=3)
+        (self._trail,) = axes.plot([], [], color=TRAIL, linewidth=1.5)
+        self._goal = axes.add_patch(Circle((0, 0), 0.5, fill=False, edgecolor=GOAL, linewidth=2))
+        self._robot = axes.add_patch(Polygon(OUTLINE.numpy(), color=ROBOT))
+
+    def draw(
+        self, pose: Tensor, goal: Tensor, trail: Tensor | None = None, reach: float = 0.5
+    ) -> np.ndarray:
+        """Return a picture ``(H, W, 3)`` of bytes.
+
+        Args:
+            pose: x, y (m), theta (rad) of the robot, ``(3,)``.
+            goal: its target (m), ``(2,)``.
+            trail: where it has been (m), ``(M, 2)`` or more columns.
+            reach: radius around the target (m).
+        """
+        self._robot.set_xy(robot_outline(pose.detach().cpu()).numpy())
+        self._goal.set(center=goal.detach().cpu().tolist(), radius=reach)
+        where = torch.zeros(0, 2) if trail is None else trail.detach().cpu()
+        self._trail.set_data(where[:, 0].numpy(), where[:, 1].numpy())
+        self.canvas.draw()
+        return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
+
+
+@lru_cache(maxsize=8)
+def canvas_of(track: Track, pixels: int = 480) -> TrackCanvas:
+    """Return the canvas of a track, the same one each time."""
+    return TrackCanvas(track, pixels)

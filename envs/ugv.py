@@ -1,0 +1,293 @@
+"""The ground robot on a track, under regimes it is not told of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from afm_rl.dynamics import dubins_step
+from afm_rl.envs import ugv_settings as settings
+from afm_rl.envs import ugv_specs as specs
+from afm_rl.envs.course import Course
+from afm_rl.envs.mission_noise import MissionNoise
+from afm_rl.envs.missions import MissionFormat
+from afm_rl.envs.rendering import canvas_of
+from afm_rl.envs.track import Track
+from afm_rl.errors import (
+    AFMError,
+    ConfigurationError,
+    NonFiniteError,
+    check_choice,
+    check_count,
+    check_number,
+)
+from afm_rl.manifold import wrap_angle
+from afm_rl.regimes import Regime, Schedule, phase_parameters
+
+
+class UGVTrack(EnvBase):
+    r"""Dubins robots that drive along tracks, waypoint by waypoint, batched.
+
+    .. math:: s_{t+1} = f(s_t, g(\mathrm{clamp}(a_t); \rho_t)) + \sigma \epsilon_t,
+              \quad \epsilon_t \sim N(0, I)
+
+    with the pose :math:`s = (x, y, \theta)` in m and rad, the action :math:`a = (v, \omega)` in
+    m/s and rad/s, Dubins dynamics :math:`f`, and a regime :math:`g` whose parameters
+    :math:`\rho_t` follow the mission's progress (paper, section V-B). The next target becomes
+    the goal once the robot is nearer than ``reach``, at most one per step. The reward is the
+    distance gained on the current target in metres, plus 1 for a target reached. An episode
+    terminates with the last target and is truncated after ``max_steps``.
+
+    ================== ============ =====================================================
+    ``observation``    ``(*B, 3)``  the pose, for policies: x, y (m), theta (rad)
+    ``goal``           ``(*B, 2)``  current target (m)
+    ``reached``        ``(*B)``     number of targets reached
+    ``step``           ``(*B)``     number of steps taken
+    ``pose``           ``(*B, 3)``  the state itself; transforms should leave it alone
+    ``mission``        nested       see :class:`~afm_rl.envs.missions.MissionFormat`
+    ``regime``         ``(*B, F)``  parameters that act on the next action: hidden truth,
+                                    for oracles and logs only
+    ``regime_active``  ``(*B)``     whether they differ from nominal; hidden truth as well
+    ================== ============ =====================================================
+
+    The whole state travels in the tensordict. With ``batch_size=()`` the environment accepts
+    tensordicts of any batch shape, also one that shrinks from step to step. ``reset`` keeps the
+    ``mission`` entries it is given; an automatic reset repeats the mission. Noise comes from
+    one stream per mission seed: a mission meets the same noise alone as in a batch. Only the
+    streams live in the environment, and ``state_dict`` holds them.
+
+    Args:
+        tracks: names, CSV paths (see :func:`~afm_rl.envs.tracks.load_track`) or tracks.
+        regime: regime family; gains on v and omega by default.
+        schedule: when regimes change; by default at 0.15 and 0.80 of the targets.
+        process_noise: standard deviation per step of each pose component (m, m, rad).
+        start_noise: the same for the start pose.
+        dt: time step (s).
+        reach: distance at which a target counts as reached (m).
+        max_steps: steps after which an episode is truncated.
+        action_low: lower bounds of v (m/s) and omega (rad/s).
+        action_high: upper bounds. Actions are clamped before the regime acts on them.
+        batch_size: number of missions, or ``()`` for any.
+        seed: missions without a seed of their own get ``seed, seed + 1, ...``.
+        device: where the tensors live.
+        missions: default missions, tensordict with a ``mission`` entry that broadcasts to
+            ``batch_size``; see :meth:`mission`.
+        dtype: floating-point type, torch's default if None.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+        NonFiniteError: at a step whose action is NaN or infinite.
+
+    >>> env = UGVTrack(tracks=["ethz_1", "ethz_2"])
+    >>> missions = [env.mission("ethz_2", seed, {"v_gain": -1.0}) for seed in range(5)]
+    >>> data = env.reset(torch.stack(missions), set_state=False)
+    >>> data["action"] = torch.ones(5, 2)
+    >>> env.step(data)["next", "reached"]
+    tensor([1, 1, 1, 1, 1])
+    """
+
+    _supports_set_state = True
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self,
+        tracks: Sequence[str | Path | Track] = ("ethz_2",),
+        regime: Regime | None = None,
+        schedule: Schedule | None = None,
+        process_noise: float = 1e-5,
+        start_noise: float = 0.02,
+        dt: float = 0.2,
+        reach: float = 0.5,
+        max_steps: int = 5000,
+        action_low: Sequence[float] = (-1.0, -math.pi / 2),
+        action_high: Sequence[float] = (1.0, math.pi / 2),
+        batch_size: Sequence[int] = (),
+        seed: int = 0,
+        device: torch.device | str | None = None,
+        missions: TensorDictBase | None = None,
+        *,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        batch = torch.Size([check_count("batch_size", size) for size in batch_size])
+        super().__init__(device=device, batch_size=batch)
+        self._batch_locked = bool(batch)
+        self.dtype = torch.get_default_dtype() if dtype is None else dtype
+        self.tracks = settings.load_tracks(tracks)
+        self.regime = settings.check_regime(regime)
+        self.schedule = settings.check_schedule(schedule)
+        self.process_noise = check_number("process_noise", process_noise, low=0.0)
+        self.start_noise = check_number("start_noise", start_noise, low=0.0)
+        self.dt = check_number("dt", dt, low=0.0, open_low=True)
+        self.reach = check_number("reach", reach, low=0.0, open_low=True)
+        self.max_steps = check_count("max_steps", max_steps)
+        self.seed = check_count("seed", seed, low=0)
+        self.noise = MissionNoise()
+        self.course = Course(self.tracks, self.dtype).to(self.device)
+        low, high = settings.action_box(action_low, action_high)
+        self.register_buffer("low", low.to(self.device, self.dtype), persistent=False)
+        self.register_buffer("high", high.to(self.device, self.dtype), persistent=False)
+
+        names = [track.name for track in self.tracks]
+        self.mission_format = MissionFormat(names, self.regime, self.schedule, self.dtype)
+        self._default = settings.check_missions(missions, batch)
+        self._last: TensorDictBase | None = None
+        self._missions_of(None, batch)  # a wrong default fails here, not at the first reset
+
+        state = specs.state_spec(self.mission_format.spec(batch, self.device), self.dtype)
+        self.state_spec = state
+        self.observation_spec = specs.observation_spec(state, len(self.regime.names))
+        self.full_action_spec = specs.action_spec(self.low, self.high, batch, self.device)
+        self.full_reward_spec = specs.reward_spec(state)
+        self.full_done_spec = specs.done_spec(state)
+
+    def mission(
+        self,
+        track: int | str = 0,
+        seed: int | None = None,
+        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+    ) -> TensorDict:
+        """Describe one mission; see :meth:`~afm_rl.envs.missions.MissionFormat.build`."""
+        return self.mission_format.build(track, seed, regime).to(self.device)
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs
+    ) -> TensorDictBase:
+        batch = self.batch_size if tensordict is None else tensordict.batch_size
+        given = TensorDict({}, batch) if tensordict is None else tensordict
+        mission = self._missions_of(given, batch)
+        reached = step = torch.zeros_like(mission["track"])
+        if set_state and "pose" in given.keys():
+            pose = given["pose"].to(self.dtype)
+            reached, step = given.get("reached", reached), given.get("step", step)
+        else:
+            rows = given.get("_reset", None)
+            rows = None if rows is None else rows.reshape(batch)
+            noise = self.noise.normal("start", mission["seed"], rows, self.dtype)
+            pose = _wrapped(self.course.starts[mission["track"]] + self.start_noise * noise)
+        return self._remembered(self._emit(mission, pose, reached, step.clone()))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if "mission" not in tensordict.keys() or "pose" not in tensordict.keys():
+            raise ConfigurationError("the tensordict has no mission or pose: start with reset()")
+        running = tensordict.get("_step", None)
+        if running is None:
+            return self._remembered(self._advance(tensordict))
+        # Some missions of a locked batch wait while others go on.
+        running = running.reshape(tensordict.batch_size)
+        out = tensordict.select(*self.observation_keys, *self.done_keys).clone()
+        out.update(self.full_reward_spec.zero())
+        out[running] = self._advance(tensordict[running])
+        return self._remembered(out)
+
+    def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Take one step with every mission."""
+        mission, pose, before = (tensordict[key] for key in ("mission", "pose", "reached"))
+        action = _finite(tensordict["action"]).to(self.dtype).clamp(self.low, self.high)
+        parameters = self._regime_now(mission, before, tensordict["step"])
+        effective = self.regime.apply(action, parameters, pose)
+        noise = self.noise.normal("process", mission["seed"], dtype=self.dtype)
+        moved = _wrapped(dubins_step(pose, effective, self.dt) + self.process_noise * noise)
+
+        track, goal = mission["track"], self.course.goal(mission["track"], before)
+        gap = (moved[..., :2] - goal).norm(dim=-1)
+        hit = (gap < self.reach) & ~self.course.finished(track, before)
+        reached, step = before + hit, tensordict["step"] + 1
+        out = self._emit(mission, moved, reached, step)
+        gained = (pose[..., :2] - goal).norm(dim=-1) - gap
+        out["reward"] = (gained + hit).unsqueeze(-1)
+        out["terminated"] = self.course.finished(track, reached).unsqueeze(-1)
+        out["truncated"] = (step >= self.max_steps).unsqueeze(-1)
+        out["done"] = out["terminated"] | out["truncated"]
+        return out
+
+    def _emit(self, mission, pose: Tensor, reached: Tensor, step: Tensor) -> TensorDict:
+        """Return the state and what is seen of it."""
+        parameters = self._regime_now(mission, reached, step)
+        entries = {
+            "pose": pose,
+            "reached": reached,
+            "step": step,
+            "mission": mission.clone(),
+            "observation": pose.clone(),
+            "goal": self.course.goal(mission["track"], reached),
+            "regime": parameters,
+            "regime_active": ~self.regime.is_identity(parameters),
+        }
+        return TensorDict(entries, mission.batch_size, device=self.device)
+
+    def _regime_now(self, mission: TensorDictBase, reached: Tensor, step: Tensor) -> Tensor:
+        """Return the regime parameters ``(*B, F)`` of the next action."""
+        progress = self.course.progress(mission["track"], reached)
+        phase = self.schedule.phase(progress, step, mission["at"])
+        return phase_parameters(mission["parameters"], phase)
+
+    def _remembered(self, out: TensorDictBase) -> TensorDictBase:
+        self._last = out.select("pose", "goal", "mission")
+        return out
+
+    def _missions_of(self, given: TensorDictBase | None, batch: torch.Size) -> TensorDictBase:
+        """Return the missions to reset: those given, else the last ones, else the default."""
+        mission = None if given is None else given.get("mission", None)
+        automatic = given is not None and "_reset" in given.keys()
+        if mission is None and automatic and self._last is not None:
+            if self._last.batch_size == batch:
+                return self._last["mission"]
+        if self._default is not None:
+            default = self._default.expand(batch)
+            mission = default if mission is None else default.clone().update(mission)
+        return self.mission_format.complete(mission, batch, self.seed, self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.seed = check_count("seed", seed, low=0)
+        self.noise.restart()
+
+    def get_extra_state(self) -> dict[str, dict[str, Tensor]]:
+        """Return the state of the noise streams, which ``state_dict`` contains."""
+        return self.noise.state_dict()
+
+    def set_extra_state(self, state: dict[str, dict[str, Tensor]]) -> None:
+        """Restore what :meth:`get_extra_state` returned."""
+        self.noise.load_state_dict(state)
+
+    def render(
+        self, tensordict: TensorDictBase | None = None, mode: str = "rgb_array"
+    ) -> np.ndarray:
+        """Draw the first mission, ``(H, W, 3)`` bytes.
+
+        Args:
+            tensordict: what to draw; the outcome of the last step or reset if None.
+            mode: only ``"rgb_array"``.
+
+        Raises:
+            AFMError: if there is nothing to draw yet.
+        """
+        check_choice("mode", mode, ["rgb_array"])
+        data = self._last if tensordict is None else tensordict
+        if data is None or not data.numel():
+            raise AFMError("nothing to render: call reset() first")
+        first = data.reshape(-1)[0]
+        canvas = canvas_of(self.tracks[int(first["mission", "track"])])
+        return canvas.draw(first["pose"], first["goal"], reach=self.reach)
+
+
+def _wrapped(pose: Tensor) -> Tensor:
+    return torch.cat([pose[..., :2], wrap_angle(pose[..., 2:])], -1)
+
+
+def _finite(action: Tensor) -> Tensor:
+    rows = (~action.isfinite().all(-1)).reshape(-1)
+    if rows.any():
+        where = rows.nonzero().flatten().tolist()
+        raise NonFiniteError(
+            f"`action` is NaN or infinite in missions {where}: the planner or policy broke down"
+        )
+    return action

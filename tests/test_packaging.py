@@ -1,0 +1,120 @@
+"""`envs/` is `afm_rl.envs`, `conf/` is `afm_rl.conf`, and the wheel holds all there is."""
+
+import doctest
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+INSTALLED_AS = {"afm_rl": "afm_rl", "envs": "afm_rl/envs", "conf": "afm_rl/conf"}
+NOT_INSTALLED = {".md", ".pyc"}  # notes for readers of the tree, caches
+
+
+def sources(*folders: str) -> set[str]:
+    """Files of the source folders, named as they are to stand in site-packages."""
+    return {
+        f"{INSTALLED_AS[folder]}/{path.relative_to(ROOT / folder).as_posix()}"
+        for folder in folders
+        for path in (ROOT / folder).rglob("*")
+        if path.is_file() and path.suffix not in NOT_INSTALLED and not path.name.startswith(".")
+    }
+
+
+def modules() -> list[str]:
+    """Import names of all modules but `__main__`, which would start a program."""
+    files = sorted(name for name in sources("afm_rl", "envs") if name.endswith(".py"))
+    names = [name.removesuffix(".py").replace("/", ".") for name in files]
+    return [name.removesuffix(".__init__") for name in names if not name.endswith("__main__")]
+
+
+@pytest.mark.parametrize("name", modules())
+def test_examples_in_docstrings(name):
+    # By import name: a run by path would load envs/ a second time, as `envs`.
+    flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    assert doctest.testmod(importlib.import_module(name), optionflags=flags).failed == 0
+
+
+def run(*command: str | Path, cwd: Path, **env: str) -> str:
+    done = subprocess.run(
+        [str(part) for part in command],
+        cwd=cwd,
+        env=os.environ | env,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory):
+    """A new environment that holds the wheel and nothing else."""
+    folder = tmp_path_factory.mktemp("wheel")
+    for name in INSTALLED_AS:
+        shutil.copytree(
+            ROOT / name, folder / "source" / name, ignore=shutil.ignore_patterns("__pycache__")
+        )
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, folder / "source")
+
+    python = folder / "venv" / "bin" / "python"
+    build = ["build", "--wheel", "--no-isolation", "--outdir", folder, folder / "source"]
+    run(sys.executable, "-m", *build, cwd=folder)
+    run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder)
+    install = ["pip", "--python", python, "install", "--no-deps", "--no-index", "--no-compile"]
+    run(sys.executable, "-m", *install, *folder.glob("*.whl"), cwd=folder)
+    return python
+
+
+@pytest.fixture
+def site_packages(environment):
+    (folder,) = environment.parents[1].glob("lib/python*/site-packages")
+    return folder
+
+
+@pytest.fixture
+def run_there(environment, tmp_path):
+    """Runs a command in the new environment, from a folder outside the repository.
+
+    It borrows the libraries of this environment, by a path on which `.pth` files have no effect: an
+    editable installation works through one, and would lend the wheel the modules that it lacks.
+    """
+    libraries = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
+    path = {"PYTHONPATH": os.pathsep.join(libraries), "PYTHONDONTWRITEBYTECODE": "1"}
+    return lambda *command: run(environment.parent / command[0], *command[1:], cwd=tmp_path, **path)
+
+
+patient = pytest.mark.timeout(300)  # whichever test comes first builds the wheel
+
+
+@patient
+def test_the_wheel_holds_every_source_file_and_no_other(site_packages):
+    installed = (p.relative_to(site_packages) for p in site_packages.rglob("*") if p.is_file())
+    assert {p.as_posix() for p in installed if p.parts[0] == "afm_rl"} == sources(*INSTALLED_AS)
+
+
+@patient
+def test_the_wheel_takes_one_top_level_name(site_packages):
+    names = {path.name for path in site_packages.iterdir() if path.suffix != ".dist-info"}
+    assert names == {"afm_rl"}
+
+
+@patient
+def test_the_wheel_imports_from_anywhere(run_there, site_packages):
+    for folder in INSTALLED_AS.values():
+        code = f"import {folder.replace('/', '.')} as package; print(package.__file__)"
+        assert str(site_packages / folder / "__init__.py") in run_there("python", "-c", code)
+
+
+@patient
+@pytest.mark.parametrize("command", [["afm-rl"], ["python", "-m", "afm_rl.cli"]], ids=" ".join)
+def test_the_command_line_runs_from_anywhere(run_there, command):
+    assert "planner" in run_there(*command, "--help")  # the help shows the composed configuration
