@@ -7,6 +7,8 @@ from afm_rl.envs.rendering import TrackCanvas
 from afm_rl.envs.track import Track
 from afm_rl.envs.tracks import load_track
 from afm_rl.envs.ugv import UGVTrack
+from afm_rl.envs.ugv_gym import UGVTrackGym
+from afm_rl.envs.ugv_vector import UGVTrackVectorEnv
 
 __all__ = [
     "Course",
@@ -15,5 +17,7 @@ __all__ = [
     "Track",
     "TrackCanvas",
     "UGVTrack",
+    "UGVTrackGym",
+    "UGVTrackVectorEnv",
     "load_track",
 ]

@@ -14,7 +14,8 @@ class MissionNoise:
     """Start and process noise that depend on a mission's seed alone.
 
     Starts and steps draw from streams of their own, so a reset does not shift the noise of the
-    steps, and rows that are left out of a call draw nothing.
+    steps, and rows that are left out of a call draw nothing. Rows with equal seeds share their
+    numbers call by call: step them together, and they are paired.
 
     >>> noise = MissionNoise()
     >>> seeds = torch.tensor([3, 4, 3])

@@ -83,16 +83,18 @@ class MissionFormat:
         """
         if isinstance(track, str):
             track = self.tracks.index(check_choice("missions: track", track, self.tracks))
+        elif check_count("missions: track", track, low=0) >= len(self.tracks):
+            raise ConfigurationError(f"missions: track={track}: there are {len(self.tracks)}")
         phases = self.schedule.phases
         if regime is None or isinstance(regime, Mapping):
             changed = min(1, phases - 1)
             regime = [(regime or {}) if phase == changed else {} for phase in range(phases)]
-        rows = [self.regime.encode(values) for values in regime]
-        if len(rows) != phases:
+        if len(regime) != phases or not all(isinstance(values, Mapping) for values in regime):
             raise ConfigurationError(
-                f"regimes: {len(rows)} phases given, the schedule has {phases}"
+                f"regimes: {regime!r}: expected one mapping, or one for each of {phases} phases"
             )
-        entries = {"track": torch.tensor(track), "parameters": torch.stack(rows)}
+        rows = torch.stack([self.regime.encode(values) for values in regime])
+        entries = {"track": torch.tensor(track), "parameters": rows}
         if seed is not None:
             entries["seed"] = torch.tensor(check_count("missions: seed", seed, low=0))
         return TensorDict({"mission": entries})

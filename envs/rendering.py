@@ -15,6 +15,7 @@ from afm_rl.envs.track import Track
 from afm_rl.errors import check_count
 
 ROAD, LINE, ROBOT, GOAL, TRAIL = "#dddddd", "#999999", "#0072b2", "#d55e00", "#56b4e9"
+DPI = 64  # a power of two, so that sizes in inches are exact
 MARGIN = 2.0  # m between the course and the edge of the picture
 OUTLINE = torch.tensor([[0.6, 0.0], [-0.4, 0.35], [-0.2, 0.0], [-0.4, -0.35]])  # robot (m)
 
@@ -37,34 +38,36 @@ class TrackCanvas:
 
     Args:
         track: what to draw.
-        pixels: length of the longer side of the picture.
+        pixels: length of the longer side. Either side becomes a multiple of 16, the block of
+            video encoders.
 
     >>> from afm_rl.envs.tracks import load_track
-    >>> frame = TrackCanvas(load_track("ethz_2"), pixels=120).draw(torch.zeros(3), torch.ones(2))
+    >>> frame = TrackCanvas(load_track("ethz_2"), pixels=128).draw(torch.zeros(3), torch.ones(2))
     >>> frame.dtype, frame.shape[2], max(frame.shape)
-    (dtype('uint8'), 3, 120)
+    (dtype('uint8'), 3, 128)
     """
 
     def __init__(self, track: Track, pixels: int = 480) -> None:
         self.pixels = check_count("pixels", pixels, low=16)
         points = torch.cat([track.centerline, track.waypoints])
         edge = MARGIN + track.width / 2
-        low, high = (points.amin(0) - edge).numpy(), (points.amax(0) + edge).numpy()
-        span = high - low
-        dpi = 100
-        metre = self.pixels / float(span.max())  # in pixels
-        width, height = (max(1, round(float(side) * metre)) for side in span)
-        self.figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi)
+        low, high = points.amin(0) - edge, points.amax(0) + edge
+        metre = self.pixels / float((high - low).max())  # in pixels
+        size = 16 * torch.ceil((high - low) * metre / 16)
+        middle, half = (low + high) / 2, size / metre / 2
+        low, high = (middle - half).tolist(), (middle + half).tolist()
+        self.figure = Figure(figsize=(size / DPI).tolist(), dpi=DPI)
         self.canvas = FigureCanvasAgg(self.figure)
         axes = self.figure.add_axes((0, 0, 1, 1), xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.set_axis_off()
         x, y = torch.cat([track.centerline, track.centerline[:1]]).unbind(-1)
-        axes.plot(x, y, color=ROAD, linewidth=track.width * metre * 72 / dpi)
+        ends = {"solid_capstyle": "round", "solid_joinstyle": "round"}
+        axes.plot(x, y, color=ROAD, linewidth=track.width * metre * 72 / DPI, **ends)
         axes.plot(x, y, color=LINE, linewidth=1, linestyle="--")
         axes.plot(*track.waypoints.unbind(-1), color=LINE, linestyle="", marker="o", markersize=3)
         (self._trail,) = axes.plot([], [], color=TRAIL, linewidth=1.5)
-        self._goal = axes.add_patch(Circle((0, 0), 0.5, fill=False, edgecolor=GOAL, linewidth=2))
-        self._robot = axes.add_patch(Polygon(OUTLINE.numpy(), color=ROBOT))
+        self._goal = axes.add_patch(Circle((0, 0), fill=False, edgecolor=GOAL, lw=2, zorder=3))
+        self._robot = axes.add_patch(Polygon(OUTLINE.numpy(), color=ROBOT, zorder=3))
 
     def draw(
         self, pose: Tensor, goal: Tensor, trail: Tensor | None = None, reach: float = 0.5

@@ -42,7 +42,7 @@ def load_track(source: str | Path) -> Track:
     """
     if str(source) in CATALOGUE:
         return _from_catalogue(str(source))
-    path = Path(source)
+    path = Path(source if isinstance(source, (str, Path)) else "")
     if path.suffix.lower() != ".csv":
         raise ConfigurationError(
             f"tracks={str(source)!r}: expected one of {', '.join(CATALOGUE)}, or the path of a "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +13,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from afm_rl.dynamics import dubins_step
 from afm_rl.envs import ugv_settings as settings
 from afm_rl.envs import ugv_specs as specs
 from afm_rl.envs.course import Course
@@ -20,6 +20,7 @@ from afm_rl.envs.mission_noise import MissionNoise
 from afm_rl.envs.missions import MissionFormat
 from afm_rl.envs.rendering import canvas_of
 from afm_rl.envs.track import Track
+from afm_rl.envs.ugv_simulation import UGVSimulation
 from afm_rl.errors import (
     AFMError,
     ConfigurationError,
@@ -28,8 +29,7 @@ from afm_rl.errors import (
     check_count,
     check_number,
 )
-from afm_rl.manifold import wrap_angle
-from afm_rl.regimes import Regime, Schedule, phase_parameters
+from afm_rl.regimes import Regime, Schedule
 
 
 class UGVTrack(EnvBase):
@@ -57,11 +57,13 @@ class UGVTrack(EnvBase):
     ``regime_active``  ``(*B)``     whether they differ from nominal; hidden truth as well
     ================== ============ =====================================================
 
-    The whole state travels in the tensordict. With ``batch_size=()`` the environment accepts
-    tensordicts of any batch shape, also one that shrinks from step to step. ``reset`` keeps the
-    ``mission`` entries it is given; an automatic reset repeats the mission. Noise comes from
-    one stream per mission seed: a mission meets the same noise alone as in a batch. Only the
-    streams live in the environment, and ``state_dict`` holds them.
+    The state travels in the tensordict. With ``batch_size=()`` the environment accepts
+    tensordicts of any batch shape, also one that loses rows from step to step. ``reset`` keeps
+    the ``mission`` entries it is given (say ``set_state=False`` for a fresh start and
+    ``set_state=True`` to go on from ``pose``, ``reached`` and ``step``); an automatic reset
+    repeats the mission. Noise comes from one stream per mission seed, so a mission meets the
+    same noise alone as in a batch. The streams live in the environment: ``set_seed`` restarts
+    them, a reset continues them, ``state_dict`` holds them.
 
     Args:
         tracks: names, CSV paths (see :func:`~afm_rl.envs.tracks.load_track`) or tracks.
@@ -77,8 +79,8 @@ class UGVTrack(EnvBase):
         batch_size: number of missions, or ``()`` for any.
         seed: missions without a seed of their own get ``seed, seed + 1, ...``.
         device: where the tensors live.
-        missions: default missions, tensordict with a ``mission`` entry that broadcasts to
-            ``batch_size``; see :meth:`mission`.
+        missions: what missions are unless ``reset`` is told otherwise: a tensordict that
+            broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
         dtype: floating-point type, torch's default if None.
 
     Raises:
@@ -94,8 +96,6 @@ class UGVTrack(EnvBase):
     """
 
     _supports_set_state = True
-    low: Tensor
-    high: Tensor
 
     def __init__(
         self,
@@ -112,31 +112,39 @@ class UGVTrack(EnvBase):
         batch_size: Sequence[int] = (),
         seed: int = 0,
         device: torch.device | str | None = None,
-        missions: TensorDictBase | None = None,
+        missions: TensorDictBase | Mapping[str, Any] | None = None,
         *,
         dtype: torch.dtype | None = None,
     ) -> None:
-        batch = torch.Size([check_count("batch_size", size) for size in batch_size])
+        batch = settings.check_batch(batch_size)
         super().__init__(device=device, batch_size=batch)
         self._batch_locked = bool(batch)
-        self.dtype = torch.get_default_dtype() if dtype is None else dtype
+        self.dtype = settings.check_dtype(dtype)
         self.tracks = settings.load_tracks(tracks)
         self.regime = settings.check_regime(regime)
         self.schedule = settings.check_schedule(schedule)
         self.process_noise = check_number("process_noise", process_noise, low=0.0)
         self.start_noise = check_number("start_noise", start_noise, low=0.0)
-        self.dt = check_number("dt", dt, low=0.0, open_low=True)
-        self.reach = check_number("reach", reach, low=0.0, open_low=True)
-        self.max_steps = check_count("max_steps", max_steps)
         self.seed = check_count("seed", seed, low=0)
         self.noise = MissionNoise()
-        self.course = Course(self.tracks, self.dtype).to(self.device)
         low, high = settings.action_box(action_low, action_high)
-        self.register_buffer("low", low.to(self.device, self.dtype), persistent=False)
-        self.register_buffer("high", high.to(self.device, self.dtype), persistent=False)
+        self.simulation = UGVSimulation(
+            Course(self.tracks, self.dtype),
+            regime=self.regime,
+            schedule=self.schedule,
+            low=low.to(self.dtype),
+            high=high.to(self.dtype),
+            dt=check_number("dt", dt, low=0.0, open_low=True),
+            reach=check_number("reach", reach, low=0.0, open_low=True),
+            max_steps=check_count("max_steps", max_steps),
+        ).to(self.device)
 
         names = [track.name for track in self.tracks]
         self.mission_format = MissionFormat(names, self.regime, self.schedule, self.dtype)
+        if isinstance(missions, Mapping) and not isinstance(missions, TensorDictBase):
+            for key in missions:
+                check_choice("missions", key, ("track", "seed", "regime"))
+            missions = self.mission(**missions)
         self._default = settings.check_missions(missions, batch)
         self._last: TensorDictBase | None = None
         self._missions_of(None, batch)  # a wrong default fails here, not at the first reset
@@ -144,9 +152,16 @@ class UGVTrack(EnvBase):
         state = specs.state_spec(self.mission_format.spec(batch, self.device), self.dtype)
         self.state_spec = state
         self.observation_spec = specs.observation_spec(state, len(self.regime.names))
-        self.full_action_spec = specs.action_spec(self.low, self.high, batch, self.device)
+        self.full_action_spec = specs.action_spec(
+            self.simulation.low, self.simulation.high, batch, self.device
+        )
         self.full_reward_spec = specs.reward_spec(state)
         self.full_done_spec = specs.done_spec(state)
+
+    @property
+    def course(self) -> Course:
+        """The targets of all tracks."""
+        return self.simulation.course
 
     def mission(
         self,
@@ -165,14 +180,16 @@ class UGVTrack(EnvBase):
         mission = self._missions_of(given, batch)
         reached = step = torch.zeros_like(mission["track"])
         if set_state and "pose" in given.keys():
-            pose = given["pose"].to(self.dtype)
+            pose = given["pose"].to(self.dtype, copy=True)
             reached, step = given.get("reached", reached), given.get("step", step)
         else:
             rows = given.get("_reset", None)
             rows = None if rows is None else rows.reshape(batch)
             noise = self.noise.normal("start", mission["seed"], rows, self.dtype)
-            pose = _wrapped(self.course.starts[mission["track"]] + self.start_noise * noise)
-        return self._remembered(self._emit(mission, pose, reached, step.clone()))
+            pose = self.simulation.start(mission, self.start_noise * noise)
+        return self._remembered(
+            self.simulation.describe(mission, pose, reached.clone(), step.clone())
+        )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if "mission" not in tensordict.keys() or "pose" not in tensordict.keys():
@@ -188,46 +205,10 @@ class UGVTrack(EnvBase):
         return self._remembered(out)
 
     def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Take one step with every mission."""
-        mission, pose, before = (tensordict[key] for key in ("mission", "pose", "reached"))
-        action = _finite(tensordict["action"]).to(self.dtype).clamp(self.low, self.high)
-        parameters = self._regime_now(mission, before, tensordict["step"])
-        effective = self.regime.apply(action, parameters, pose)
-        noise = self.noise.normal("process", mission["seed"], dtype=self.dtype)
-        moved = _wrapped(dubins_step(pose, effective, self.dt) + self.process_noise * noise)
-
-        track, goal = mission["track"], self.course.goal(mission["track"], before)
-        gap = (moved[..., :2] - goal).norm(dim=-1)
-        hit = (gap < self.reach) & ~self.course.finished(track, before)
-        reached, step = before + hit, tensordict["step"] + 1
-        out = self._emit(mission, moved, reached, step)
-        gained = (pose[..., :2] - goal).norm(dim=-1) - gap
-        out["reward"] = (gained + hit).unsqueeze(-1)
-        out["terminated"] = self.course.finished(track, reached).unsqueeze(-1)
-        out["truncated"] = (step >= self.max_steps).unsqueeze(-1)
-        out["done"] = out["terminated"] | out["truncated"]
-        return out
-
-    def _emit(self, mission, pose: Tensor, reached: Tensor, step: Tensor) -> TensorDict:
-        """Return the state and what is seen of it."""
-        parameters = self._regime_now(mission, reached, step)
-        entries = {
-            "pose": pose,
-            "reached": reached,
-            "step": step,
-            "mission": mission.clone(),
-            "observation": pose.clone(),
-            "goal": self.course.goal(mission["track"], reached),
-            "regime": parameters,
-            "regime_active": ~self.regime.is_identity(parameters),
-        }
-        return TensorDict(entries, mission.batch_size, device=self.device)
-
-    def _regime_now(self, mission: TensorDictBase, reached: Tensor, step: Tensor) -> Tensor:
-        """Return the regime parameters ``(*B, F)`` of the next action."""
-        progress = self.course.progress(mission["track"], reached)
-        phase = self.schedule.phase(progress, step, mission["at"])
-        return phase_parameters(mission["parameters"], phase)
+        _check_finite(tensordict["action"])
+        seeds = tensordict["mission", "seed"]
+        noise = self.noise.normal("process", seeds, dtype=self.dtype)
+        return self.simulation.advance(tensordict, self.process_noise * noise)
 
     def _remembered(self, out: TensorDictBase) -> TensorDictBase:
         self._last = out.select("pose", "goal", "mission")
@@ -276,18 +257,13 @@ class UGVTrack(EnvBase):
             raise AFMError("nothing to render: call reset() first")
         first = data.reshape(-1)[0]
         canvas = canvas_of(self.tracks[int(first["mission", "track"])])
-        return canvas.draw(first["pose"], first["goal"], reach=self.reach)
+        return canvas.draw(first["pose"], first["goal"], reach=self.simulation.reach)
 
 
-def _wrapped(pose: Tensor) -> Tensor:
-    return torch.cat([pose[..., :2], wrap_angle(pose[..., 2:])], -1)
-
-
-def _finite(action: Tensor) -> Tensor:
+def _check_finite(action: Tensor) -> None:
     rows = (~action.isfinite().all(-1)).reshape(-1)
     if rows.any():
         where = rows.nonzero().flatten().tolist()
         raise NonFiniteError(
             f"`action` is NaN or infinite in missions {where}: the planner or policy broke down"
         )
-    return action

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from afm_rl.envs.track import Track
 from afm_rl.envs.tracks import load_track
-from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.regimes import ActionGain, Regime, Schedule
 
 
@@ -24,7 +24,8 @@ def load_tracks(tracks: Sequence[str | Path | Track] | str | Path | Track) -> tu
     >>> [track.name for track in load_tracks(["ethz_1", "ethz_2"])]
     ['ethz_1', 'ethz_2']
     """
-    several = (tracks,) if isinstance(tracks, (str, Path, Track)) else tuple(tracks)
+    single = isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable)
+    several = (tracks,) if single else tuple(tracks)
     loaded = tuple(one if isinstance(one, Track) else load_track(one) for one in several)
     names = [track.name for track in loaded]
     if not names or len(set(names)) < len(names):
@@ -43,8 +44,8 @@ def action_box(low: Sequence[float], high: Sequence[float]) -> tuple[Tensor, Ten
     """
     bounds = []
     for name, values in (("action_low", low), ("action_high", high)):
-        if len(values) != 2:
-            raise ConfigurationError(f"{name}={list(values)}: expected two numbers, v and omega")
+        if not isinstance(values, Iterable) or len(values) != 2:
+            raise ConfigurationError(f"{name}={values!r}: expected two numbers, v and omega")
         bounds.append([check_number(name, value) for value in values])
     if any(below >= above for below, above in zip(*bounds, strict=True)):
         raise ConfigurationError(
@@ -115,3 +116,31 @@ def check_missions(missions: TensorDictBase | None, batch: torch.Size) -> Tensor
             f"missions: batch {tuple(missions.batch_size)} does not broadcast to batch_size="
             f"{tuple(batch)}"
         ) from error
+
+
+def check_batch(batch_size: Sequence[int] | int) -> torch.Size:
+    """Return the batch shape; a number counts as one dimension.
+
+    Raises:
+        ConfigurationError: unless every size is a whole number of at least 1.
+
+    >>> check_batch(4)
+    torch.Size([4])
+    """
+    sizes = batch_size if isinstance(batch_size, Iterable) else (batch_size,)
+    return torch.Size([check_count("batch_size", size) for size in sizes])
+
+
+def check_dtype(dtype: torch.dtype | None) -> torch.dtype:
+    """Return the floating-point type, by default torch's.
+
+    Raises:
+        ConfigurationError: if it is not torch.float32 or torch.float64.
+
+    >>> check_dtype(None)
+    torch.float32
+    """
+    dtype = torch.get_default_dtype() if dtype is None else dtype
+    if dtype not in (torch.float32, torch.float64):
+        raise ConfigurationError(f"dtype={dtype!r}: expected torch.float32 or torch.float64")
+    return dtype

@@ -89,6 +89,15 @@ class Flow(nn.Module, ABC):
     def feature_size(self) -> int:
         """Number of context features, C."""
 
+    @property
+    def signature(self) -> dict[str, object]:
+        """What a stored flow must agree in to be loaded."""
+        return {
+            "kind": type(self).__name__,
+            "action_size": self.action_size,
+            "feature_size": self.feature_size,
+        }
+
     def normalise(self, action: Tensor) -> Tensor:
         """Return u for an action in its own units."""
         return (action - self.centre) / self.half_range

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import nn
 from torch.optim import Optimizer
 
 from afm_rl.dynamics import Oracle
@@ -31,6 +31,9 @@ class Updater(nn.Module):
     torch.Size([4])
     """
 
+    learns = False
+    """Do missions need parameters of their own?"""
+
     def __init__(self, loss: GaussianNLLLoss) -> None:
         super().__init__()
         loss.reduction = "none"
@@ -42,10 +45,8 @@ class Updater(nn.Module):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Measure the loss."""
         with torch.no_grad():
-            return _as_loss(self.loss(tensordict))
-
-    def select_(self, index: Tensor) -> None:
-        """Keep the missions in ``index``: the model keeps them itself."""
+            loss = self.loss(tensordict)["loss_nll"]
+        return TensorDict({"loss": loss}, loss.shape)
 
 
 class OnlineUpdater(Updater):
@@ -60,6 +61,8 @@ class OnlineUpdater(Updater):
         optimizer: makes the optimiser of the model's parameters.
         mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
     """
+
+    learns = True
 
     def __init__(
         self,
@@ -118,7 +121,3 @@ class OracleUpdater(Updater):
         result = super().forward(tensordict)
         self.start(tensordict.get("next"))
         return result
-
-
-def _as_loss(result: TensorDictBase) -> TensorDictBase:
-    return TensorDict({"loss": result["loss_nll"]}, result.batch_size)

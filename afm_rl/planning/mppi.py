@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import EnvBase, TensorDictPrimer
+from torchrl.envs import EnvBase
 from torchrl.modules.planners.common import (
     MPCPlannerBase,
     _mask_post_done_reward,
@@ -17,6 +17,7 @@ from torchrl.modules.planners.common import (
 
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
 from afm_rl.keys import as_key
+from afm_rl.planning.primer import ZeroPrimer
 from afm_rl.streams import Streams
 
 BOUND = 2.0  # exploration noise is truncated at two standard deviations
@@ -154,11 +155,11 @@ class MPPI(MPCPlannerBase):
         self.register_buffer("scale", sigma * half if noise == "scaled" else torch.ones_like(half))
         self._told = False
 
-    def make_tensordict_primer(self) -> TensorDictPrimer:
+    def make_tensordict_primer(self) -> ZeroPrimer:
         """Return the transform that puts a zero mean plan into every reset."""
         shape = (self.horizon, *self.action_spec.shape)
         spec = Composite({self.mean_key: Unbounded(shape, dtype=self.action_spec.dtype)})
-        return TensorDictPrimer(spec, default_value=0.0, expand_specs=True)
+        return ZeroPrimer(spec)
 
     def forward(
         self,

@@ -1,0 +1,116 @@
+"""From a configuration to a robot, its agent and its missions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+
+from afm_rl.dynamics import DynamicsModel, Oracle
+from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.learning import GaussianNLLLoss, OracleUpdater, Updater
+from afm_rl.missions.parts import Training
+from afm_rl.missions.robot import Robot
+from afm_rl.missions.selection import (
+    build_missions,
+    select_regimes,
+    select_seeds,
+    select_tracks,
+)
+from afm_rl.planning import PlanningEnv
+from afm_rl.transforms import ActionFlowTransform
+
+
+@dataclass
+class Agent:
+    """Everything that runs the missions of one method.
+
+    Planner, transform and updater share :attr:`model`.
+    """
+
+    label: str
+    robot: Robot
+    env: TransformedEnv
+    missions: TensorDictBase
+    model: DynamicsModel
+    planner: TensorDictModuleBase
+    updater: Updater
+    transform: ActionFlowTransform | None
+    executed_key: NestedKey
+    trainings: Sequence[Training]
+
+    @property
+    def base_env(self) -> EnvBase:
+        """The robot's environment without transforms."""
+        return self.env.base_env
+
+
+def build(cfg: DictConfig) -> Agent:
+    """Compose an agent and check every setting; nothing is trained yet.
+
+    Args:
+        cfg: a configuration composed from ``afm_rl.conf``.
+
+    Raises:
+        ConfigurationError: for settings that cannot be used, naming the key.
+    """
+    settings = OmegaConf.to_container(cfg, resolve=True)
+    robot: Robot = instantiate(cfg.robot, _convert_="all")
+    tracks = select_tracks(settings["tracks"], robot)
+    regimes = select_regimes(settings["regimes"], robot)
+    seeds = select_seeds(settings["seeds"])
+    env = robot.env(
+        tracks=tracks,
+        regime=robot.regime,
+        schedule=robot.schedule,
+        max_steps=check_count("budget", settings["budget"]),
+        action_low=robot.action_low,
+        action_high=robot.action_high,
+    )
+    missions = build_missions(env, tracks, regimes, seeds)
+
+    def make(group: str, *args: Any) -> Any:
+        return instantiate(cfg[group], _convert_="all")(*args)
+
+    dynamics = make("dynamics", robot)
+    base = dynamics.module
+    flow = make("flow", robot, base)
+    trainings = [
+        part.training._replace(settings={key: settings[key] for key in ("robot", *groups)})
+        for part, groups in ((dynamics, ["dynamics"]), (flow, ["dynamics", "flow"]))
+        if part.training is not None
+    ]
+    model = base
+    cost = instantiate(cfg.cost, _convert_="all")
+    planner = make("planner", PlanningEnv(model, cost, *robot.action_box))
+    transform = make("transform", model, flow.module)
+    executed_key = "action" if transform is None else ("next", transform.key("executed_action"))
+    loss = GaussianNLLLoss(model)
+    loss.set_keys(action=executed_key)
+    updater = make("updater", loss)
+    if isinstance(model, Oracle) != isinstance(updater, OracleUpdater):
+        raise ConfigurationError(
+            "dynamics=oracle and updater=oracle belong together: choose both or neither"
+        )
+    chain = [] if transform is None else [transform]
+    if hasattr(planner, "make_tensordict_primer"):
+        chain.append(planner.make_tensordict_primer())
+    return Agent(
+        label=settings["label"] or "unnamed",
+        robot=robot,
+        env=TransformedEnv(env, Compose(*chain)),
+        missions=missions,
+        model=model,
+        planner=planner,
+        updater=updater,
+        transform=transform,
+        executed_key=executed_key,
+        trainings=trainings,
+    )
+

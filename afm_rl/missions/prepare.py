@@ -1,0 +1,33 @@
+"""Training of an agent's parts before the missions, cached."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from afm_rl._version import __version__
+from afm_rl.artefacts import cached
+from afm_rl.missions.build import Agent
+
+
+def prepare(
+    agent: Agent, cache: str | Path, progress: bool = False, echo: Callable[[str], None] = print
+) -> None:
+    """Train what needs training, or take it from the cache; say the held-out errors.
+
+    Args:
+        agent: its parts are trained in place.
+        cache: folder of trained parts.
+        progress: show progress bars.
+        echo: receives one line per part.
+    """
+    for part in agent.trainings:
+        description = {"name": part.title, "version": __version__, "settings": part.settings}
+        description.update(getattr(part.module, "signature", {}))
+        start = time.perf_counter()
+        error, found = cached(
+            Path(cache).expanduser(), part.module, description, lambda p=part: p.train(progress)
+        )
+        spent = "from the cache" if found else f"trained in {time.perf_counter() - start:.0f} s"
+        echo(f"{part.title}: held-out error {error:.4f} {part.unit} ({spent})")

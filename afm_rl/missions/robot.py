@@ -1,0 +1,79 @@
+"""What the library must know of a robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import ConfigurationError
+from afm_rl.regimes import Regime, Schedule
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot: its environment, nominal physics, regimes and boxes.
+
+    Args:
+        name: short name.
+        state_names: names of the state coordinates, for tables.
+        goal_names: names of the goal's coordinates.
+        action_names: names of the action components.
+        action_low: lowest action.
+        action_high: highest action.
+        state_low: lowest corner of the box from which training states are drawn.
+        state_high: its highest corner.
+        features: indices of the state coordinates that the dynamics depend on.
+        env: makes the environment from ``tracks``, ``regime``, ``schedule``, ``max_steps``
+            and the action bounds.
+        model: nominal physics.
+        regime: family of regimes.
+        schedule: when regimes start and end.
+        tracks: all tracks.
+        paper_regimes: the regimes of the published study.
+    """
+
+    name: str
+    state_names: Sequence[str]
+    goal_names: Sequence[str]
+    action_names: Sequence[str]
+    action_low: Sequence[float]
+    action_high: Sequence[float]
+    state_low: Sequence[float]
+    state_high: Sequence[float]
+    features: Sequence[int]
+    env: Callable[..., EnvBase]
+    model: DynamicsModel
+    regime: Regime
+    schedule: Schedule
+    tracks: Sequence[str]
+    paper_regimes: Sequence[Mapping[str, float]]
+
+    def __post_init__(self) -> None:
+        """Check that the boxes fit the model.
+
+        Raises:
+            ConfigurationError: if a box has the wrong size or is turned inside out.
+        """
+        for kind, size in (("action", self.model.action_size), ("state", self.model.state_size)):
+            low, high = getattr(self, f"{kind}_low"), getattr(self, f"{kind}_high")
+            fits = len(low) == len(high) == size
+            if not fits or any(a > b for a, b in zip(low, high, strict=True)):
+                raise ConfigurationError(
+                    f"robot.{kind}_low={list(low)}, robot.{kind}_high={list(high)}: expected "
+                    f"{size} numbers each, low <= high"
+                )
+
+    @property
+    def action_box(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest action, ``(A,)`` each."""
+        return torch.tensor(self.action_low), torch.tensor(self.action_high)
+
+    @property
+    def state_box(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest training state, ``(S,)`` each."""
+        return torch.tensor(self.state_low), torch.tensor(self.state_high)

@@ -1,0 +1,1 @@
+"""Hydra configuration groups, importable as ``pkg://afm_rl.conf``."""

@@ -1,0 +1,103 @@
+"""The ground robot as a gymnasium environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+
+from afm_rl.envs.gym_adapter import build_native, observe, spaces
+from afm_rl.envs.rendering import canvas_of
+from afm_rl.envs.track import Track
+from afm_rl.envs.ugv_vector import UGVTrackVectorEnv
+from afm_rl.errors import check_choice
+from afm_rl.regimes import Schedule
+
+__all__ = ["UGVTrackGym", "UGVTrackVectorEnv"]
+
+
+class UGVTrackGym(gymnasium.Env):
+    """One mission of :class:`~afm_rl.envs.UGVTrack`.
+
+    The observation is (x, y, theta, goal x, goal y) in m and rad, the action (v, omega) in m/s
+    and rad/s. ``gymnasium.make`` adds the time limit of 5000 steps; the class itself has none.
+
+    Args:
+        track: ``ethz_1``, ``ethz_2``, the path of a CSV file, or a track.
+        regime: regime parameters of the changed phase, or one mapping per phase.
+        schedule: a schedule, or breakpoints of the progress; by default 0.15 and 0.80.
+        render_mode: None or ``"rgb_array"``.
+        v_gain: short for ``regime={"v_gain": ...}``.
+        omega_gain: short for ``regime={"omega_gain": ...}``.
+        settings: further arguments of :class:`~afm_rl.envs.UGVTrack`.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+        NonFiniteError: at a step whose action is NaN or infinite.
+
+    >>> import afm_rl  # registers the name
+    >>> env = gymnasium.make("afm_rl/UGVTrack-v0", track="ethz_2", v_gain=-1.0)
+    >>> observation, info = env.reset(seed=0)
+    >>> observation.shape, info["reached"]
+    ((5,), 0)
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
+
+    def __init__(
+        self,
+        track: str | Path | Track = "ethz_2",
+        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+        schedule: Schedule | Sequence[float] | None = None,
+        render_mode: str | None = None,
+        v_gain: float | None = None,
+        omega_gain: float | None = None,
+        **settings: Any,
+    ) -> None:
+        if render_mode is not None:
+            check_choice("render_mode", render_mode, self.metadata["render_modes"])
+        self.render_mode = render_mode
+        gains = {"v_gain": v_gain, "omega_gain": omega_gain}
+        settings.setdefault("max_steps", 2**62)  # gymnasium limits time by a wrapper
+        self.native = build_native(track, regime, gains, schedule, (), settings)
+        self.observation_space, self.action_space = spaces(self.native)
+        self._data = None
+        self._trail: list[torch.Tensor] = []
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Begin an episode; ``seed`` restarts the noise, no seed continues it."""
+        super().reset(seed=seed)
+        if seed is not None or self._data is None:
+            chosen = int(self.np_random.integers(2**31)) if seed is None else seed
+            self.native.set_seed(chosen, static_seed=True)
+        self._data = self.native.reset()
+        self._trail = [self._data["pose"]]
+        return self._described(self._data)
+
+    def step(self, action: np.ndarray):
+        """Apply (v, omega) for one time step."""
+        self._data["action"] = torch.as_tensor(np.asarray(action), device=self.native.device)
+        following = self.native.step(self._data)["next"]
+        self._data = self.native.step_mdp(self._data)
+        if self.render_mode is not None:
+            self._trail.append(following["pose"])
+        observation, info = self._described(following)
+        ends = (bool(following[name]) for name in ("terminated", "truncated"))
+        return observation, float(following["reward"]), *ends, info
+
+    def render(self) -> np.ndarray | None:
+        """Draw the robot, its goal and its trail, ``(H, W, 3)`` bytes."""
+        if self.render_mode is None:
+            gymnasium.logger.warn('render() draws nothing: make it with render_mode="rgb_array"')
+            return None
+        trail = torch.stack(self._trail)
+        canvas = canvas_of(self.native.tracks[0])
+        return canvas.draw(trail[-1], self._data["goal"], trail, self.native.simulation.reach)
+
+    def _described(self, data):
+        observation, info = observe(self.native, data)
+        return observation, {name: value.item() for name, value in info.items()}
