@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from tensordict import TensorDictBase
 
@@ -62,6 +63,17 @@ def spaces(env: UGVTrack) -> tuple[Box, Box]:
         for bound in (env.simulation.low, env.simulation.high)
     )
     return Box(-bounds, bounds, dtype=np.float32), Box(low, high, dtype=np.float32)
+
+
+def require_reset(data: TensorDictBase | None) -> TensorDictBase:
+    """Return ``data``, which is None before the first reset.
+
+    Raises:
+        gymnasium.error.ResetNeeded: if it is None.
+    """
+    if data is None:
+        raise ResetNeeded("call reset() before step() or render()")
+    return data
 
 
 def observe(env: UGVTrack, data: TensorDictBase) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -89,7 +89,8 @@ class MissionFormat:
         if regime is None or isinstance(regime, Mapping):
             changed = min(1, phases - 1)
             regime = [(regime or {}) if phase == changed else {} for phase in range(phases)]
-        if len(regime) != phases or not all(isinstance(values, Mapping) for values in regime):
+        whole = isinstance(regime, Sequence) and len(regime) == phases
+        if not whole or not all(isinstance(values, Mapping) for values in regime):
             raise ConfigurationError(
                 f"regimes: {regime!r}: expected one mapping, or one for each of {phases} phases"
             )

@@ -55,19 +55,21 @@ class TrackCanvas:
         metre = self.pixels / float((high - low).max())  # in pixels
         size = 16 * torch.ceil((high - low) * metre / 16)
         middle, half = (low + high) / 2, size / metre / 2
-        low, high = (middle - half).tolist(), (middle + half).tolist()
-        self.figure = Figure(figsize=(size / DPI).tolist(), dpi=DPI)
+        (left, bottom), (right, top) = (middle - half).tolist(), (middle + half).tolist()
+        self.figure = Figure(figsize=(float(size[0]) / DPI, float(size[1]) / DPI), dpi=DPI)
         self.canvas = FigureCanvasAgg(self.figure)
-        axes = self.figure.add_axes((0, 0, 1, 1), xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axes = self.figure.add_axes((0, 0, 1, 1), xlim=(left, right), ylim=(bottom, top))
         axes.set_axis_off()
         x, y = torch.cat([track.centerline, track.centerline[:1]]).unbind(-1)
-        ends = {"solid_capstyle": "round", "solid_joinstyle": "round"}
-        axes.plot(x, y, color=ROAD, linewidth=track.width * metre * 72 / DPI, **ends)
+        (road,) = axes.plot(x, y, color=ROAD, linewidth=track.width * metre * 72 / DPI)
+        road.set(solid_capstyle="round", solid_joinstyle="round")
         axes.plot(x, y, color=LINE, linewidth=1, linestyle="--")
         axes.plot(*track.waypoints.unbind(-1), color=LINE, linestyle="", marker="o", markersize=3)
         (self._trail,) = axes.plot([], [], color=TRAIL, linewidth=1.5)
-        self._goal = axes.add_patch(Circle((0, 0), fill=False, edgecolor=GOAL, lw=2, zorder=3))
-        self._robot = axes.add_patch(Polygon(OUTLINE.numpy(), color=ROBOT, zorder=3))
+        self._goal = Circle((0, 0), fill=False, edgecolor=GOAL, linewidth=2, zorder=3)
+        self._robot = Polygon(OUTLINE.numpy(), color=ROBOT, zorder=3)
+        axes.add_patch(self._goal)
+        axes.add_patch(self._robot)
 
     def draw(
         self, pose: Tensor, goal: Tensor, trail: Tensor | None = None, reach: float = 0.5

@@ -253,7 +253,7 @@ class UGVTrack(EnvBase):
         """
         check_choice("mode", mode, ["rgb_array"])
         data = self._last if tensordict is None else tensordict
-        if data is None or not data.numel():
+        if data is None or 0 in data.batch_size:
             raise AFMError("nothing to render: call reset() first")
         first = data.reshape(-1)[0]
         canvas = canvas_of(self.tracks[int(first["mission", "track"])])

@@ -9,8 +9,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 
-from afm_rl.envs.gym_adapter import build_native, observe, spaces
+from afm_rl.envs.gym_adapter import build_native, observe, require_reset, spaces
 from afm_rl.envs.rendering import canvas_of
 from afm_rl.envs.track import Track
 from afm_rl.envs.ugv_vector import UGVTrackVectorEnv
@@ -65,7 +66,7 @@ class UGVTrackGym(gymnasium.Env):
         settings.setdefault("max_steps", 2**62)  # gymnasium limits time by a wrapper
         self.native = build_native(track, regime, gains, schedule, (), settings)
         self.observation_space, self.action_space = spaces(self.native)
-        self._data = None
+        self._data: TensorDictBase | None = None
         self._trail: list[torch.Tensor] = []
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -80,9 +81,10 @@ class UGVTrackGym(gymnasium.Env):
 
     def step(self, action: np.ndarray):
         """Apply (v, omega) for one time step."""
-        self._data["action"] = torch.as_tensor(np.asarray(action), device=self.native.device)
-        following = self.native.step(self._data)["next"]
-        self._data = self.native.step_mdp(self._data)
+        data = require_reset(self._data)
+        data["action"] = torch.as_tensor(np.asarray(action), device=self.native.device)
+        following = self.native.step(data)["next"]
+        self._data = self.native.step_mdp(data)
         if self.render_mode is not None:
             self._trail.append(following["pose"])
         observation, info = self._described(following)
@@ -94,10 +96,10 @@ class UGVTrackGym(gymnasium.Env):
         if self.render_mode is None:
             gymnasium.logger.warn('render() draws nothing: make it with render_mode="rgb_array"')
             return None
-        trail = torch.stack(self._trail)
+        goal, trail = require_reset(self._data)["goal"], torch.stack(self._trail)
         canvas = canvas_of(self.native.tracks[0])
-        return canvas.draw(trail[-1], self._data["goal"], trail, self.native.simulation.reach)
+        return canvas.draw(trail[-1], goal, trail, self.native.simulation.reach)
 
-    def _described(self, data):
+    def _described(self, data: TensorDictBase) -> tuple[np.ndarray, dict[str, Any]]:
         observation, info = observe(self.native, data)
         return observation, {name: value.item() for name, value in info.items()}

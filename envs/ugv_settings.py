@@ -24,9 +24,9 @@ def load_tracks(tracks: Sequence[str | Path | Track] | str | Path | Track) -> tu
     >>> [track.name for track in load_tracks(["ethz_1", "ethz_2"])]
     ['ethz_1', 'ethz_2']
     """
-    single = isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable)
-    several = (tracks,) if single else tuple(tracks)
-    loaded = tuple(one if isinstance(one, Track) else load_track(one) for one in several)
+    if isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable):
+        tracks = (tracks,)
+    loaded = tuple(one if isinstance(one, Track) else load_track(one) for one in tracks)
     names = [track.name for track in loaded]
     if not names or len(set(names)) < len(names):
         raise ConfigurationError(f"tracks={names}: expected at least one, with distinct names")

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from tensordict import TensorDictBase
 
-from afm_rl.envs.gym_adapter import build_native, observe, spaces
+from afm_rl.envs.gym_adapter import build_native, observe, require_reset, spaces
 from afm_rl.envs.rendering import canvas_of
 from afm_rl.envs.track import Track
 from afm_rl.errors import ConfigurationError, check_choice, check_count
@@ -76,13 +77,13 @@ class UGVTrackVectorEnv(VectorEnv):
         self.autoreset_mode = autoreset_mode
         self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
         self.num_envs = check_count("num_envs", num_envs)
-        settings["max_steps"] = max_episode_steps
+        settings.setdefault("max_steps", max_episode_steps)
         gains = {"v_gain": v_gain, "omega_gain": omega_gain}
         self.native = build_native(track, regime, gains, schedule, (num_envs,), settings)
         self.single_observation_space, self.single_action_space = spaces(self.native)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._data = None
+        self._data: TensorDictBase | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Reset all missions, or those in ``options["reset_mask"]`` (booleans ``(N,)``)."""
@@ -94,14 +95,15 @@ class UGVTrackVectorEnv(VectorEnv):
         if mask is None or self._data is None:
             self._data = self.native.reset()
         else:
-            self._restart(np.asarray(mask))
+            self._data = self._restarted(self._data, np.asarray(mask))
         return self._described(self._data)
 
     def step(self, actions: np.ndarray):
         """Apply the actions ``(N, 2)`` for one time step."""
-        self._data["action"] = torch.as_tensor(np.asarray(actions), device=self.native.device)
-        following = self.native.step(self._data)["next"]
-        self._data = self.native.step_mdp(self._data)
+        data = require_reset(self._data)
+        data["action"] = torch.as_tensor(np.asarray(actions), device=self.native.device)
+        following = self.native.step(data)["next"]
+        self._data = self.native.step_mdp(data)
         observation, info = self._described(following)
         reward, terminated, truncated, done = (
             following[name].squeeze(-1).cpu().numpy()
@@ -113,7 +115,7 @@ class UGVTrackVectorEnv(VectorEnv):
                 final[mission] = observation[mission]
             masked = {name: done.copy() for name in info if name.startswith("_")}
             final_info = info | masked
-            self._restart(done)
+            self._data = self._restarted(self._data, done)
             observation, info = self._described(self._data)
             info |= {"final_obs": final, "_final_obs": done.copy()}
             info |= {"final_info": final_info, "_final_info": done.copy()}
@@ -124,18 +126,19 @@ class UGVTrackVectorEnv(VectorEnv):
         if self.render_mode is None:
             return None
         canvas, reach = canvas_of(self.native.tracks[0]), self.native.simulation.reach
-        pairs = zip(self._data["pose"], self._data["goal"], strict=True)
+        data = require_reset(self._data)
+        pairs = zip(data["pose"], data["goal"], strict=True)
         return tuple(canvas.draw(pose, goal, reach=reach) for pose, goal in pairs)
 
-    def _restart(self, mask: np.ndarray) -> None:
+    def _restarted(self, data: TensorDictBase, mask: np.ndarray) -> TensorDictBase:
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
             raise ConfigurationError(
                 f"reset_mask {mask.dtype}{mask.shape}: expected booleans ({self.num_envs},)"
             )
-        self._data["_reset"] = torch.as_tensor(mask, device=self.native.device).unsqueeze(-1)
-        self._data = self.native.reset(self._data, set_state=False)
+        data["_reset"] = torch.as_tensor(mask, device=self.native.device).unsqueeze(-1)
+        return self.native.reset(data, set_state=False)
 
-    def _described(self, data):
+    def _described(self, data: TensorDictBase) -> tuple[np.ndarray, dict[str, Any]]:
         """Return observation and info, with gymnasium's mask for each entry of the info."""
         observation, info = observe(self.native, data)
         everyone = {f"_{name}": np.ones(self.num_envs, dtype=np.bool_) for name in info}

@@ -1,0 +1,115 @@
+"""The entries that make up a mission."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from afm_rl.envs import MissionFormat, MissionNoise
+from afm_rl.errors import ConfigurationError
+from afm_rl.regimes import ActionGain, Schedule
+
+GAINS = ActionGain(["v_gain", "omega_gain"])
+
+
+@pytest.fixture
+def form():
+    return MissionFormat(("a", "b"), GAINS, Schedule())
+
+
+def complete(form, **entries):
+    given = TensorDict(entries, [3])
+    return form.complete(given, torch.Size([3]), 10, "cpu")
+
+
+def test_missing_entries_are_nominal_and_numbered(form):
+    mission = form.complete(None, torch.Size([3]), 10, "cpu")
+    assert mission["track"].tolist() == [0, 0, 0]
+    assert mission["seed"].tolist() == [10, 11, 12]
+    assert (mission["parameters"] == torch.ones(3, 3, 2)).all()
+    torch.testing.assert_close(mission["at"], torch.tensor([[0.15, 0.8]]).expand(3, 2))
+
+
+def test_given_entries_are_kept_and_copied(form):
+    track = torch.tensor([1, 0, 1], dtype=torch.int32)
+    mission = complete(form, track=track)
+    track[:] = 0
+    assert mission["track"].tolist() == [1, 0, 1]
+    assert mission["track"].dtype is torch.int64
+
+
+def test_what_is_completed_fits_the_spec(form):
+    batch = torch.Size([2, 3])
+    mission = form.complete(None, batch, 0, "cpu")
+    assert form.spec(batch, torch.device("cpu")).is_in(mission)
+
+
+@pytest.mark.parametrize(
+    ("entries", "complaint"),
+    [
+        ({"trak": torch.zeros(3)}, "missions: entry='trak'"),
+        ({"seed": torch.zeros(3, 1)}, r"missions: seed \(3, 1\): expected \(3,\)"),
+        ({"parameters": torch.ones(3, 2, 2)}, r"expected \(3, 3, 2\)"),
+        ({"parameters": torch.full((3, 3, 2), torch.nan)}, "parameters: expected finite"),
+        ({"at": torch.full((3, 2), torch.nan)}, "at: expected numbers"),
+        ({"track": torch.tensor([0, 2, 0])}, r"track: expected indices 0\.\.1"),
+        ({"track": torch.tensor([0, -1, 0])}, r"track: expected indices 0\.\.1"),
+    ],
+)
+def test_impossible_entries_are_refused(form, entries, complaint):
+    with pytest.raises(ConfigurationError, match=complaint):
+        complete(form, **entries)
+
+
+def test_a_mapping_describes_the_phase_between_the_breakpoints(form):
+    mission = form.build("b", 4, {"v_gain": -2.0})["mission"]
+    assert mission["track"].item() == 1
+    assert mission["seed"].item() == 4
+    assert mission["parameters"].tolist() == [[1, 1], [-2, 1], [1, 1]]
+
+
+def test_several_mappings_describe_every_phase(form):
+    phases = [{"v_gain": 2.0}, {}, {"omega_gain": 3.0}]
+    assert form.build(regime=phases)["mission", "parameters"].tolist() == [[2, 1], [1, 1], [1, 3]]
+
+
+def test_a_schedule_without_breakpoints_has_one_phase():
+    form = MissionFormat(("a",), GAINS, Schedule([]))
+    assert form.build(regime={"v_gain": 2.0})["mission", "parameters"].tolist() == [[2, 1]]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ({"track": "c"}, "missions: track='c': expected one of a, b"),
+        ({"track": 2}, "missions: track=2"),
+        ({"track": -1}, "missions: track=-1"),
+        ({"seed": -1}, "missions: seed=-1"),
+        ({"regime": {"gain": 1.0}}, "unknown parameter 'gain'; allowed: v_gain, omega_gain"),
+        ({"regime": {"v_gain": float("nan")}}, "v_gain=nan"),
+        ({"regime": -1.0}, "expected one mapping"),
+        ({"regime": [{}, {}]}, "expected one mapping, or one for each of 3 phases"),
+        ({"regime": [1.0, 2.0, 3.0]}, "expected one mapping"),
+    ],
+)
+def test_impossible_descriptions_are_refused(form, arguments, complaint):
+    with pytest.raises(ConfigurationError, match=complaint):
+        form.build(**arguments)
+
+
+def test_rows_that_do_not_draw_leave_their_streams_alone():
+    seeds = torch.tensor([1, 2])
+    partly, alone = MissionNoise(), MissionNoise()
+    partly.normal("process", seeds, torch.tensor([True, False]))
+    both = partly.normal("process", seeds)
+    assert (both[1] == alone.normal("process", seeds[1:])[0]).all()
+    nobody = partly.normal("process", seeds, torch.tensor([False, False]))
+    assert (nobody == 0).all()
+    assert partly.normal("process", seeds[:0]).shape == (0, 3)
+
+
+def test_starts_and_steps_draw_from_different_streams():
+    seeds = torch.tensor([5])
+    noise, other = MissionNoise(), MissionNoise()
+    start = noise.normal("start", seeds)
+    assert (noise.normal("process", seeds) == other.normal("process", seeds)).all()
+    assert (start != noise.normal("process", seeds)).all()

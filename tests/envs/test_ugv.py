@@ -1,0 +1,302 @@
+"""The ground robot: dynamics, regimes, rewards, ends and resets."""
+
+import math
+import sys
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from afm_rl.dynamics import dubins_step
+from afm_rl.envs import Track, UGVTrack
+from afm_rl.errors import ConfigurationError, NonFiniteError
+from afm_rl.regimes import Schedule
+
+
+def quiet(**settings):
+    return UGVTrack(process_noise=0.0, start_noise=0.0, **settings)
+
+
+def act(env, data, action):
+    data["action"] = torch.as_tensor(action, dtype=env.dtype).expand(*data.batch_size, 2)
+    return env.step(data)["next"]
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+@pytest.mark.parametrize("schedule", [None, Schedule([]), Schedule([2, 5], by="step")])
+def test_specs_hold(batch, schedule):
+    env = UGVTrack(batch_size=batch, max_steps=3, schedule=schedule)
+    check_env_specs(env, break_when_any_done="both")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_specs_hold_in_either_precision(dtype):
+    env = UGVTrack(dtype=dtype)
+    check_env_specs(env)
+    data = env.rollout(3)
+    assert {data[key].dtype for key in ("pose", "goal", "regime")} == {dtype}
+    assert data["next", "reward"].dtype is dtype
+
+
+def test_specs_hold_under_transforms():
+    env = TransformedEnv(
+        UGVTrack(batch_size=(2,), max_steps=3), Compose(StepCounter(), RewardSum(), InitTracker())
+    )
+    check_env_specs(env, break_when_any_done="both")
+
+
+def test_the_action_is_bounded_per_axis():
+    space = UGVTrack(batch_size=(2,)).action_spec.space
+    torch.testing.assert_close(space.high, torch.tensor([1.0, math.pi / 2]).expand(2, 2))
+    torch.testing.assert_close(space.low, -space.high)
+
+
+def test_a_step_is_a_dubins_step_of_the_scaled_action():
+    env = quiet(missions={"regime": [{"v_gain": -2.5, "omega_gain": 0.5}] * 3})
+    start = env.reset()["pose"]
+    # v is clamped to 1 before the gain and reaches 2.5 m/s after it
+    after = act(env, env.reset(), [3.0, 1.0])
+    torch.testing.assert_close(after["pose"], dubins_step(start, torch.tensor([-2.5, 0.5]), 0.2))
+    torch.testing.assert_close(after["pose"], torch.tensor([7.2 - 0.5, 5.4, 0.1]))
+    torch.testing.assert_close(after["observation"], after["pose"])
+
+
+def test_the_heading_stays_wrapped():
+    env = UGVTrack(process_noise=0.5)
+    data = env.reset(TensorDict(batch_size=[50]))
+    for _ in range(20):
+        act(env, data, [0.0, 1.5])
+        data = env.step_mdp(data)
+    assert ((data["pose"][:, 2] >= -math.pi) & (data["pose"][:, 2] < math.pi)).all()
+    assert data["pose"][:, 2].std() > 0.5
+
+
+def test_noise_has_the_scale_that_was_asked_for():
+    env = UGVTrack(process_noise=0.01, start_noise=0.1)
+    data = env.reset(TensorDict(batch_size=[4000]))
+    spread = (data["pose"] - env.course.starts[0]).std(0)
+    torch.testing.assert_close(spread, torch.full((3,), 0.1), rtol=0.1, atol=0)
+    moved = act(env, data, [0.0, 0.0])["pose"] - data["pose"]
+    torch.testing.assert_close(moved.std(0), torch.full((3,), 0.01), rtol=0.1, atol=0)
+
+
+@pytest.mark.parametrize(("track", "first", "last"), [("ethz_1", 6, 28), ("ethz_2", 3, 16)])
+def test_the_regime_acts_strictly_between_its_thresholds(track, first, last):
+    env = quiet(tracks=(track,))
+    n = int(env.course.counts[0])
+    assert (first - 1) / n <= 0.15 < first / n
+    assert (last - 1) / n <= 0.80 < last / n
+    data = env.reset(env.mission(regime={"v_gain": -1.0}).expand(n), set_state=False)
+    data["reached"] = torch.arange(n)
+    data["pose"][:, :2] = 100.0  # far from every target: nothing more is reached
+    after = act(env, data, [1.0, 0.0])
+    active = torch.arange(n).ge(first) & torch.arange(n).lt(last)
+    assert (after["regime_active"] == active).all()
+    assert (after["regime"][:, 0] == torch.where(active, -1.0, 1.0)).all()
+    forward = (after["pose"] - data["pose"])[:, 0] / env.course.starts[0, 2].cos() > 0
+    assert (forward == ~active).all()
+
+
+def test_a_progress_equal_to_the_threshold_is_not_beyond_it():
+    corners = torch.tensor([[float(i), 0.0] for i in range(19)])
+    env = quiet(tracks=(Track("long", corners, torch.zeros(3), corners),))
+    data = env.reset(env.mission(regime={"v_gain": 2.0}).expand(2), set_state=False)
+    data["reached"] = torch.tensor([3, 4])  # 3 / 20 is 0.15
+    data["pose"][:, 1] = 50.0
+    assert act(env, data, [0.0, 0.0])["regime_active"].tolist() == [False, True]
+
+
+def test_missions_have_breakpoints_of_their_own():
+    env = quiet(schedule=Schedule([1], by="step"))
+    missions = env.mission(regime={"v_gain": 2.0}).expand(2).clone()
+    missions["mission", "at"] = torch.tensor([[0.0], [math.inf]])
+    data = env.reset(missions, set_state=False)
+    after = act(env, data, [0.0, 0.0])
+    assert after["regime_active"].tolist() == [True, False]
+
+
+def test_the_next_target_becomes_the_goal_one_per_step():
+    env = quiet(reach=10.0)
+    data = env.reset()
+    targets = env.course.targets[0]
+    torch.testing.assert_close(data["goal"], targets[0])
+    for reached in (1, 2, 3):
+        data = env.step_mdp(env.step(data.set("action", torch.zeros(2))))
+        assert data["reached"].item() == reached
+        torch.testing.assert_close(data["goal"], targets[reached])
+
+
+def test_the_reward_is_distance_gained_plus_targets_reached():
+    env = quiet()
+    data = env.reset(TensorDict(batch_size=[2]))
+    data["reached"] = torch.tensor([0, 1])
+    before = (data["pose"][1, :2] - env.course.targets[0, 1]).norm()
+    after = act(env, data, [1.0, 0.0])
+    gap = (after["pose"][1, :2] - env.course.targets[0, 1]).norm()
+    torch.testing.assert_close(
+        after["reward"][:, 0], torch.stack([torch.tensor(0.8), before - gap])
+    )
+
+
+def test_the_last_target_terminates_and_counts_no_further():
+    env = quiet()
+    data = env.reset()
+    data["reached"] = torch.tensor(18)
+    for _ in range(2):
+        after = act(env, data, [0.0, 0.0])
+        assert (after["reached"].item(), after["terminated"].item()) == (19, True)
+        assert (after["done"].item(), after["truncated"].item()) == (True, False)
+        data = env.step_mdp(data)
+    assert after["reward"].item() == 0.0
+
+
+def test_the_budget_truncates():
+    env = quiet(max_steps=3)
+    done = env.rollout(10)["next"]
+    assert done["truncated"][:, 0].tolist() == [False, False, True]
+    assert not done["terminated"].any()
+
+
+def test_seeds_decide_and_the_global_generator_is_left_alone():
+    before = torch.get_rng_state()
+    env = UGVTrack(batch_size=(3,))
+    runs = []
+    for seed in (1, 1, 2):
+        env.set_seed(seed)
+        data = env.reset()
+        runs.append(act(env, data, [1.0, 0.3])["pose"])
+    env.render()
+    assert (runs[0] == runs[1]).all()
+    assert (runs[0] != runs[2]).any(-1).all()
+    assert (torch.get_rng_state() == before).all()
+
+
+def test_a_reset_continues_the_noise_and_no_seed_restarts_it():
+    env = UGVTrack(seed=3)
+    first, second = env.reset()["pose"], env.reset()["pose"]
+    assert (first != second).any()
+    env.set_seed(None)
+    assert (env.reset()["pose"] == first).all()
+
+
+def test_default_missions_differ_in_their_noise():
+    data = UGVTrack(batch_size=(4,), seed=7).reset()
+    assert data["mission", "seed"].tolist() == [7, 8, 9, 10]
+    assert len(set(data["pose"][:, 0].tolist())) == 4
+
+
+def test_default_missions_broadcast_and_keep_what_reset_adds():
+    env = UGVTrack(["ethz_1", "ethz_2"], missions={"track": 1, "regime": {"v_gain": -1.0}})
+    given = TensorDict({"mission": {"seed": torch.tensor([5, 5])}}, [2])
+    data = env.reset(given, set_state=False)
+    assert data["mission", "track"].tolist() == [1, 1]
+    assert data["mission", "seed"].tolist() == [5, 5]
+    assert data["mission", "parameters"][:, 1, 0].tolist() == [-1, -1]
+    assert (data["pose"][0] == data["pose"][1]).all()
+
+
+def test_a_partial_reset_leaves_the_other_missions_alone():
+    env = UGVTrack(batch_size=(3,))
+    data = env.step_mdp(env.rand_step(env.reset()))
+    held = data.clone()
+    data["_reset"] = torch.tensor([[False], [True], [False]])
+    data = env.reset(data, set_state=False)
+    assert data["step"].tolist() == [1, 0, 1]
+    assert data["reached"].tolist() == [1, 0, 1]
+    rest = torch.tensor([0, 2])
+    assert (data["pose"][rest] == held["pose"][rest]).all()
+    assert (data["mission"] == held["mission"]).all()
+    fresh = UGVTrack(batch_size=(3,))
+    fresh.reset()
+    assert (data["pose"][1] == fresh.reset()["pose"][1]).all()  # the second start of its stream
+
+
+def test_an_automatic_reset_repeats_the_mission():
+    env = UGVTrack(["ethz_1", "ethz_2"], max_steps=4)
+    missions = [env.mission(seed % 2, seed, {"v_gain": -float(seed)}) for seed in range(1, 4)]
+    missions = torch.stack(missions)
+    for wrapped in (env, TransformedEnv(env, StepCounter())):
+        data = wrapped.rollout(
+            10,
+            tensordict=wrapped.reset(missions, set_state=False),
+            auto_reset=False,
+            break_when_any_done=False,
+        )
+        assert data["step"][0].tolist() == [0, 1, 2, 3] * 2 + [0, 1]
+        for step in (0, 5, 9):
+            for key in ("track", "seed"):
+                expected = missions["mission", key]
+                assert (data["mission", key][:, step] == expected).all()
+        assert (data["pose"][:, 4] != data["pose"][:, 0]).any(-1).all()
+        assert (data["next", "step"][:, 3] == 4).all()
+
+
+def test_an_automatic_reset_of_one_mission_does_not_touch_the_record_of_the_step():
+    env = UGVTrack(batch_size=(2,), max_steps=3)
+    data = env.reset()
+    data["step"] = torch.tensor([0, 2])
+    before, after = env.step_and_maybe_reset(env.rand_action(data))
+    assert before["next", "step"].tolist() == [1, 3]
+    assert before["next", "done"][:, 0].tolist() == [False, True]
+    assert after["step"].tolist() == [1, 0]
+
+
+def test_reset_without_a_step_before_falls_back_to_the_defaults():
+    env = UGVTrack(max_steps=3)
+    mask = TensorDict({"_reset": torch.ones(2, 1, dtype=torch.bool)}, [2])
+    assert env.reset(mask)["mission", "seed"].tolist() == [0, 1]
+    other = TensorDict({"_reset": torch.ones(3, 1, dtype=torch.bool)}, [3])
+    assert env.reset(other)["mission", "seed"].tolist() == [0, 1, 2]
+
+
+def test_a_state_can_be_set():
+    env = UGVTrack()
+    data = env.rollout(5)[-1]["next"].select("pose", "reached", "step", "mission")
+    again = env.reset(data.clone(), set_state=True)
+    assert (again["pose"] == data["pose"]).all()
+    assert again["step"].item() == 5
+    assert env.reset(data.clone(), set_state=False)["step"].item() == 0
+    assert env.reset(data.select("pose"), set_state=True)["reached"].item() == 0
+
+
+def test_a_run_resumes_bit_for_bit_in_another_environment():
+    env = UGVTrack(batch_size=(3,))
+    data = env.step_mdp(env.rand_step(env.reset()))
+    saved, streams = data.clone(), env.state_dict()
+    expected = [act(env, data, [1.0, 0.5])["pose"], env.reset()["pose"]]
+    other = UGVTrack(batch_size=(3,))
+    other.load_state_dict(streams)
+    resumed = [act(other, saved, [1.0, 0.5])["pose"], other.reset()["pose"]]
+    assert all((a == b).all() for a, b in zip(expected, resumed, strict=True))
+
+
+def test_missions_of_a_locked_batch_can_wait():
+    env = UGVTrack(batch_size=(3,))
+    data = env.reset()
+    data["_step"] = torch.tensor([[True], [False], [True]])
+    after = act(env, data, [1.0, 0.0])
+    assert after["step"].tolist() == [1, 0, 1]
+    assert (after["pose"][1] == data["pose"][1]).all()
+    assert after["reward"][1].item() == 0.0
+    env.rollout(3, break_when_any_done=False, break_when_all_done=True)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_broken_action_is_named(value):
+    env = UGVTrack()
+    data = env.reset(TensorDict(batch_size=[3]))
+    data["action"] = torch.zeros(3, 2)
+    data["action"][2, 1] = value
+    with pytest.raises(NonFiniteError, match=r"`action` .* missions \[2\]"):
+        env.step(data)
+
+
+def test_a_step_before_the_reset_says_so():
+    with pytest.raises(ConfigurationError, match="start with reset"):
+        UGVTrack().step(TensorDict({"action": torch.zeros(2)}, []))
+
+
+def test_the_package_has_one_name():
+    assert "envs" not in sys.modules

@@ -1,0 +1,109 @@
+"""Every setting of the environment is checked where it is given."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from afm_rl.envs import UGVTrack, load_track
+from afm_rl.errors import ConfigurationError
+from afm_rl.regimes import ActionGain, Regime, Schedule
+
+
+class Narrow(Regime):
+    """Returns one component less than it was given."""
+
+    names = ("gain",)
+    identity = (1.0,)
+
+    def apply(self, action, parameters, state):
+        return action[..., :1] * parameters
+
+    def sample(self, shape, generator=None):
+        return torch.ones(*shape, 1)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("tracks", "ethz_9"),
+        ("tracks", []),
+        ("tracks", ["ethz_1", "ethz_1"]),
+        ("tracks", 3),
+        ("tracks", [None]),
+        ("regime", "v_gain"),
+        ("regime", ActionGain(["a", "b", "c"])),
+        ("regime", Narrow()),
+        ("schedule", [0.1, 0.2]),
+        ("process_noise", -1e-5),
+        ("process_noise", math.nan),
+        ("start_noise", -0.1),
+        ("start_noise", "much"),
+        ("dt", 0.0),
+        ("dt", math.inf),
+        ("reach", -0.5),
+        ("max_steps", 0),
+        ("max_steps", 2.5),
+        ("action_low", (-1.0,)),
+        ("action_low", (2.0, -1.0)),
+        ("action_low", 1.0),
+        ("action_high", (1.0, math.inf)),
+        ("action_high", (1.0, 2.0, 3.0)),
+        ("batch_size", (0,)),
+        ("batch_size", (2.0,)),
+        ("seed", -1),
+        ("seed", "one"),
+        ("missions", TensorDict({}, [])),
+        ("missions", 3),
+        ("missions", {"trak": "ethz_2"}),
+        ("missions", {"track": "ethz_1"}),
+        ("dtype", torch.int64),
+    ],
+)
+def test_a_setting_out_of_range_is_named(setting, value):
+    with pytest.raises(ConfigurationError, match=setting):
+        UGVTrack(**{setting: value})
+
+
+def test_missions_have_to_broadcast():
+    missions = UGVTrack().mission().expand(3)
+    with pytest.raises(ConfigurationError, match="does not broadcast"):
+        UGVTrack(batch_size=(2,), missions=missions)
+    with pytest.raises(ConfigurationError, match="does not broadcast"):
+        UGVTrack(missions=missions)
+
+
+def test_missions_that_cannot_be_fail_at_once():
+    wrong = TensorDict({"mission": {"track": torch.tensor(7)}}, [])
+    with pytest.raises(ConfigurationError, match="missions: track"):
+        UGVTrack(missions=wrong)
+
+
+def test_one_track_needs_no_list():
+    assert [track.name for track in UGVTrack(tracks="ethz_1").tracks] == ["ethz_1"]
+    assert UGVTrack(tracks=load_track("ethz_1")).tracks[0].name == "ethz_1"
+
+
+def test_one_number_is_a_batch():
+    assert UGVTrack(batch_size=3).batch_size == (3,)
+
+
+def test_settings_reach_the_environment():
+    env = UGVTrack(
+        regime=ActionGain(["left", "right"]),
+        schedule=Schedule([3], by="step"),
+        action_low=[-2, -3],
+        action_high=[2, 3],
+        dt=0.1,
+        device="cpu",
+    )
+    assert env.mission_format.regime.names == ("left", "right")
+    assert env.action_spec.space.high.tolist() == [2, 3]
+    assert env.state_spec["mission", "parameters"].shape == (2, 2)
+    assert env.device == torch.device("cpu")
+
+
+def test_each_environment_has_a_lock_of_its_own():
+    free, locked = UGVTrack(), UGVTrack(batch_size=(2,))
+    assert (free.batch_locked, locked.batch_locked) == (False, True)
