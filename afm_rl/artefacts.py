@@ -72,11 +72,19 @@ def load_artefact(path: Path, module: nn.Module, description: Mapping[str, Any])
     if metadata.get("sha256") != _digest(tensors, text):
         raise ArtefactError(f"{path}: damaged: its checksum does not match; delete it")
     stored = json.loads(text)
-    for name, wanted in description.items():
+    for name, wanted in json.loads(json.dumps(description)).items():  # a tuple becomes a list
         if stored.get(name) != wanted:
             raise ArtefactError(
                 f"{path}: was made for {name}={stored.get(name)}, expected {name}={wanted}"
             )
+    found = {name: tuple(value.shape) for name, value in tensors.items()}
+    needed = {name: tuple(value.shape) for name, value in module.state_dict().items()}
+    if found != needed:
+        apart = sorted(name for name, _ in found.items() ^ needed.items())
+        raise ArtefactError(
+            f"{path}: does not fit {type(module).__name__}: {apart[0]} has shape "
+            f"{found.get(apart[0])}, expected {needed.get(apart[0])}"
+        )
     module.load_state_dict(tensors)
 
 

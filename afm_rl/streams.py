@@ -76,17 +76,20 @@ class Streams:
 
         if seeds is None:
             return draw((*batch, *shape), self.generator(None, device))
+        if seeds.numel() == 0:
+            return torch.empty((*seeds.shape, *shape), device=device, dtype=dtype)
         distinct, index = torch.unique(seeds, return_inverse=True)
         drawn = [draw(shape, self.generator(int(seed), device)) for seed in distinct.tolist()]
         return torch.stack(drawn)[index]
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return every generator's state, keyed ``seed@device``."""
-        return {f"{s}@{d}": g.get_state() for (s, d), g in self._generators.items()}
+        """Return every generator's state, keyed ``seed@device``, and the default ``seed``."""
+        states = {f"{s}@{d}": g.get_state() for (s, d), g in self._generators.items()}
+        return {"seed": torch.tensor(self.seed), **states}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore what :meth:`state_dict` returned."""
-        self._generators.clear()
-        for key, value in state.items():
+        self.manual_seed(int(state["seed"]))
+        for key in state.keys() - {"seed"}:
             seed, device = key.split("@")
-            self.generator(int(seed), device).set_state(value)
+            self.generator(int(seed), device).set_state(state[key])

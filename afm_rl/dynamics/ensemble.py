@@ -206,7 +206,7 @@ class Ensemble(DynamicsModel):
         """Return the first ``size`` outputs of every member ``(*L, *N, E, size)``."""
         rows, shape = self._rows(state, action)
         per_row = self.members * max(self.hidden, default=1)
-        width = min(rows.shape[1], max(1, CHUNK // per_row))
+        width = max(1, min(rows.shape[1], CHUNK // per_row))
         height = max(1, CHUNK // (per_row * width))
         pieces = []
         for top in range(0, rows.shape[0], height):

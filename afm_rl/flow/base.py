@@ -69,10 +69,11 @@ class Flow(nn.Module, ABC):
     def __init__(self, action_low: Tensor, action_high: Tensor, gate: float, window: int) -> None:
         super().__init__()
         low, high = torch.as_tensor(action_low), torch.as_tensor(action_high)
-        if low.shape != high.shape or low.dim() != 1 or not bool((low < high).all()):
+        fits = low.shape == high.shape and low.dim() == 1
+        if not fits or not bool(((low < high) & (high - low).isfinite()).all()):
             raise ConfigurationError(
                 f"flow: action bounds {low.tolist()}, {high.tolist()}: expected two lists of "
-                "one size, low < high"
+                "one size, finite, low < high"
             )
         self.gate = check_number("flow.gate", gate, low=0.0)
         self.window = window

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import check_count, check_number
+from afm_rl.errors import check_choice, check_count, check_number
 from afm_rl.flow.base import Context, Examples, Flow, Window
 from afm_rl.flow.effective import effective_action
 from afm_rl.flow.network import mlp
+from afm_rl.flow.saturation import MODES, intend, saturate
 from afm_rl.flow.solver import midpoint
 from afm_rl.regimes import Regime
 from afm_rl.sampling import uniform
 
+FORGETTING = (0.5, 0.9)  # of the least-squares guesses: one trusts the newest rows, one all
+PRIOR, LEAST = 1e-3, 0.02  # their pull towards gain 1, and the smallest gain they divide by
 LIMIT = 4.0  # effective actions beyond 4 half ranges are clamped: they carry no more news
 
 
@@ -44,6 +47,9 @@ class ContextFlow(Flow):
         steps: midpoint steps.
         hidden: units of the hidden layers of encoder and velocity network.
         latent: size of the encoded context.
+        saturation: what gives way when the planned action cannot be had in full:
+            ``"direction"`` does the same thing slower, ``"clip"`` cuts each component.
+        seed: seed of the initial weights.
 
     >>> flow = ContextFlow(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
     >>> flow.feature_size
@@ -63,14 +69,19 @@ class ContextFlow(Flow):
         steps: int = 3,
         hidden: Sequence[int] = (128, 128),
         latent: int = 64,
+        saturation: str = "direction",
+        seed: int = 0,
     ) -> None:
         super().__init__(action_low, action_high, gate, check_count("flow.window", window))
         self.samples = check_count("flow.samples", samples)
         self.source_std = check_number("flow.source_std", source_std, low=0.0)
         self.steps = check_count("flow.steps", steps)
+        self.saturation = check_choice("flow.saturation", saturation, MODES)
         size = self.action_size
-        self.encoder = mlp([self.feature_size, *hidden, latent])
-        self.velocity = mlp([latent + 2 * size + 1, *hidden, size])
+        generator = torch.Generator().manual_seed(seed)
+        self.encoder = mlp([self.feature_size, *hidden, latent], generator)
+        known = latent + (2 + len(FORGETTING)) * size
+        self.velocity = mlp([known + 1, *hidden, size], generator)
         half = torch.randn((samples + 1) // 2, size, generator=torch.Generator().manual_seed(0))
         points = torch.cat([half, -half])[:samples]
         self.register_buffer("source_points", points, persistent=False)
@@ -102,7 +113,25 @@ class ContextFlow(Flow):
 
     def forward(self, features: Tensor, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:
         """Return the velocity ``(*B, A)`` at ``point``, all actions in half ranges."""
-        return self.velocity(torch.cat([self.encoder(features), planned, point, tau], -1))
+        known = torch.cat([self.encoder(features), *self._guesses(features, planned)], -1)
+        return self.velocity(torch.cat([known, planned, point, tau], -1))
+
+    def _guesses(self, features: Tensor, planned: Tensor) -> list[Tensor]:
+        """Return what per-axis least squares with forgetting would execute, ``(*B, A)`` each.
+
+        Exact for gains; a hint for everything else.
+        """
+        pairs = features.unflatten(-1, (self.window, -1))
+        executed, effective, valid = pairs.split([self.action_size, self.action_size, 1], -1)
+        age = torch.arange(self.window - 1, -1, -1, device=features.device)
+        guesses = []
+        for forgetting in FORGETTING:
+            weight = valid * (forgetting**age).unsqueeze(-1)
+            cross = (weight * executed * effective).sum(-2) + PRIOR
+            gain = cross / ((weight * executed.square()).sum(-2) + PRIOR)
+            gain = torch.where(gain.abs() < LEAST, LEAST * (1 - 2 * (gain < 0).to(gain)), gain)
+            guesses.append(saturate(planned / gain, self.saturation))
+        return guesses
 
     def examples(
         self,
@@ -132,19 +161,20 @@ class ContextFlow(Flow):
         seen = effective_action(model, state, executed, realised, self.half_range)
         planned = self.denormalise(2 * torch.rand(count, self.action_size, generator=generator) - 1)
         low, high = self.centre - self.half_range, self.centre + self.half_range
-        intended = regime.inverse(planned, now, state[:, -1], low, high)
+        intended = intend(regime, planned, now, state[:, -1], low, high, self.saturation)
         return Examples(self.features(executed, seen.effective, valid), planned, intended)
 
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> tuple[Tensor, Tensor]:
         """Integrate the flow from every source point; return mean and spread."""
         unit = self.normalise(planned).unsqueeze(-2)
         start = self.source(unit, self.source_points)
-        latent = self.encoder(context.features).unsqueeze(-2).expand(*start.shape[:-1], -1)
-        unit = unit.expand_as(start)
+        guesses = self._guesses(context.features, unit.squeeze(-2))
+        known = torch.cat([self.encoder(context.features), *guesses], -1)
+        known = torch.cat([known.unsqueeze(-2), unit], -1).expand(*start.shape[:-1], -1)
 
         def velocity(tau: float, point: Tensor) -> Tensor:
             time = torch.full_like(point[..., :1], tau)
-            return self.velocity(torch.cat([latent, unit, point, time], -1))
+            return self.velocity(torch.cat([known, point, time], -1))
 
         end = midpoint(velocity, start, self.steps)
         spread = end.std(-2, correction=0) * self.half_range

@@ -37,6 +37,7 @@ class PaperFlow(Flow):
         wrap: take differences on the manifold; the published runs subtracted angles.
         latch: keep the transition that opened the gate until it closes (as published)
             instead of using the latest.
+        seed: seed of the initial weights.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class PaperFlow(Flow):
         error_action: str = "planned",
         wrap: bool = False,
         latch: bool = True,
+        seed: int = 0,
     ) -> None:
         super().__init__(action_low, action_high, gate, window=1)
         self.state_features = list(features)
@@ -61,9 +63,10 @@ class PaperFlow(Flow):
         )
         self.wrap, self.latch = wrap, latch
         size = self.action_size
-        self.regime_encoder = mlp([self.feature_size, width, width])
-        self.action_encoder = mlp([1 + size, width, width])
-        self.head = mlp([2 * width, width, width, size])
+        generator = torch.Generator().manual_seed(seed)
+        self.regime_encoder = mlp([self.feature_size, width, width], generator)
+        self.action_encoder = mlp([1 + size, width, width], generator)
+        self.head = mlp([2 * width, width, width, size], generator)
 
     @property
     def feature_size(self) -> int:

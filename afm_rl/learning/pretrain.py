@@ -48,6 +48,7 @@ def pretrain_ensemble(
     Returns:
         Root mean square of the held-out one-step error in standard deviations of the data.
     """
+    check_count("dynamics.pretrain.batch_size", batch_size)
     check_count("dynamics.pretrain.samples", samples, low=batch_size)
     check_count("dynamics.pretrain.epochs", epochs)
     check_number("dynamics.pretrain.lr", lr, low=0.0, open_low=True)
@@ -57,7 +58,8 @@ def pretrain_ensemble(
     state = uniform(*state_box, total, generator)
     action = uniform(*action_box, total, generator)
     factor = 1 + action_noise * (2 * torch.rand(action.shape, generator=generator) - 1)
-    change = teacher.manifold.difference(teacher(state, action * factor), state)
+    with torch.no_grad():
+        change = teacher.manifold.difference(teacher(state, action * factor), state)
     model.normalise_(model.inputs(state, action)[:samples], change[:samples])
     target = model.standardise(change)
     optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=True)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from afm_rl.dynamics import Oracle
@@ -53,8 +53,9 @@ class OnlineUpdater(Updater):
     """One gradient step on the latest transition, per mission.
 
     Losses are summed, so with parameters per mission (see ``DynamicsModel.expand_``) every
-    mission learns from its own transition only. Transitions that are not finite, or that
-    ``mask_key`` excludes, have no influence; how many were refused is in :attr:`refused`.
+    mission learns from its own transition only. Transitions whose entries or loss are not
+    finite (their loss is reported as NaN), or that ``mask_key`` excludes, have no influence;
+    how many were refused as not finite is in :attr:`refused`.
 
     Args:
         loss: the loss to descend.
@@ -79,20 +80,29 @@ class OnlineUpdater(Updater):
         """Measure the loss, then take one step."""
         batch = tensordict.batch_size
         kept = tensordict.select(*self.loss.in_keys).detach()
-        learn = torch.ones(batch, dtype=torch.bool, device=kept.device)
+        sound = torch.ones(batch, dtype=torch.bool, device=kept.device)
         for key in self.loss.in_keys:
-            learn &= kept.get(key).isfinite().all(-1)
-        self.refused += int((~learn).sum())
-        if self.mask_key is not None:
-            learn = learn & tensordict.get(self.mask_key).reshape(batch)
-        for key in self.loss.in_keys:  # NaN times zero is NaN: take it out before the loss
-            kept.set(key, torch.where(learn.unsqueeze(-1), kept.get(key), 0.0))
+            sound = sound & kept.get(key).isfinite().all(-1)
         with torch.enable_grad():
-            result = self.loss(kept)["loss_nll"]
+            result = self.loss(self._without(kept, sound))["loss_nll"]
+            if not bool(result.isfinite().all()):  # finite entries may still be absurd
+                sound = sound & result.isfinite()
+                result = self.loss(self._without(kept, sound))["loss_nll"]
+            learn = sound
+            if self.mask_key is not None:
+                learn = sound & tensordict.get(self.mask_key).reshape(batch)
             self.optimizer.zero_grad(set_to_none=True)
             torch.where(learn, result, 0.0).sum().backward()
         self.optimizer.step()
-        return TensorDict({"loss": result.detach()}, batch)
+        self.refused += int((~sound).sum())
+        return TensorDict({"loss": torch.where(sound, result.detach(), torch.nan)}, batch)
+
+    def _without(self, kept: TensorDictBase, sound: Tensor) -> TensorDictBase:
+        """Blank what is not sound before the loss: NaN times zero is NaN."""
+        blanked = kept.copy()
+        for key in self.loss.in_keys:
+            blanked.set(key, torch.where(sound.unsqueeze(-1), kept.get(key), 0.0))
+        return blanked
 
 
 class OracleUpdater(Updater):

@@ -9,7 +9,7 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
-from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.errors import ConfigurationError, check_choice, check_number
 from afm_rl.keys import as_keys
 
 
@@ -44,6 +44,9 @@ class GoalDistance(Cost):
         in_keys: the goal's key.
         goal_size: number of goal coordinates.
         weights: weight of each coordinate (1 each), in cost units per m or rad.
+        saturation: what should give way when an action cannot be had in full, for whoever
+            executes the plan: ``"direction"`` (be late, keep the path) suits a cost that can
+            wait, ``"clip"`` one that asks for a heading at every instant.
 
     >>> cost = GoalDistance([0, 1])
     >>> here = torch.zeros(3)
@@ -59,8 +62,10 @@ class GoalDistance(Cost):
         in_keys: Sequence[NestedKey] = ("goal",),
         goal_size: int = 2,
         weights: Sequence[float] | None = None,
+        saturation: str = "direction",
     ) -> None:
         super().__init__()
+        self.saturation = check_choice("cost.saturation", saturation, ("direction", "clip"))
         self.coordinates = list(coordinates)
         self.in_keys = as_keys(in_keys)
         self.in_sizes = [goal_size]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -23,24 +23,27 @@ from afm_rl.streams import Streams
 BOUND = 2.0  # exploration noise is truncated at two standard deviations
 
 
-def smooth(plan: Tensor, past: Tensor, beta: float) -> Tensor:
-    r"""Filter plans in time: :math:`u_h = \beta\,x_h + (1 - \beta)\,u_{h-1}`, u_{-1} = past.
+def smooth(plan: Tensor, past: Tensor, beta: float, low: Tensor, high: Tensor) -> Tensor:
+    r"""Filter plans in time, within the action box.
+
+    .. math:: u_h = \mathrm{clamp}(\beta\,x_h + (1 - \beta)\,u_{h-1}),\qquad u_{-1} = u_\text{past}
 
     Args:
         plan: raw actions x, ``(*B, H, A)``.
         past: the action before the plan, broadcastable to ``(*B, A)``.
         beta: weight of the new action in (0, 1]; 1 does not smooth.
+        low: lowest action, ``(A,)``.
+        high: highest action, ``(A,)``.
 
-    >>> smooth(torch.ones(2, 1), torch.zeros(1), 0.5).squeeze(-1)
-    tensor([0.5000, 0.7500])
+    >>> box = -torch.ones(1), torch.ones(1)
+    >>> smooth(torch.tensor([[1.0], [1.0], [9.0]]), torch.zeros(1), 0.5, *box).squeeze(-1)
+    tensor([0.5000, 0.7500, 1.0000])
     """
-    horizon = plan.shape[-2]
-    steps = torch.arange(horizon, device=plan.device, dtype=plan.dtype)
-    age = steps[:, None] - steps
-    keep = 1.0 - beta
-    kernel = torch.where(age >= 0, beta * keep ** age.clamp_min(0), 0.0)
-    fade = keep ** (steps + 1)
-    return kernel @ plan + fade[:, None] * past.unsqueeze(-2)
+    smoothed = []
+    for raw in (beta * plan).unbind(-2):
+        past = torch.minimum(torch.maximum(raw + (1.0 - beta) * past, low), high)
+        smoothed.append(past)
+    return torch.stack(smoothed, -2)
 
 
 def path_weights(returns: Tensor, temperature: float) -> Tensor:
@@ -64,7 +67,8 @@ class MPPI(MPCPlannerBase):
 
     Each step shifts the mean plan by one, draws N candidates around it,
 
-    .. math:: u^i_h = \beta\,(\bar u_h + \sigma\,\epsilon^i_h) + (1-\beta)\,u^i_{h-1},
+    .. math:: u^i_h = \mathrm{clamp}(\beta\,(\bar u_h + \sigma\,\epsilon^i_h)
+              + (1-\beta)\,u^i_{h-1}),
 
     rolls them out in the planning environment, and moves the mean to
     :math:`\sum_i w_i u^i`, :math:`w_i \propto \exp(R_i / \lambda)` (Nagabandi et al. 2020,
@@ -97,6 +101,7 @@ class MPPI(MPCPlannerBase):
     Returns that are not finite are ignored and counted in :attr:`discarded`; where all are,
     the shifted plan stands and a warning is given.
 
+    >>> from tensordict import TensorDict
     >>> from afm_rl.dynamics import Dubins
     >>> from afm_rl.planning import GoalDistance, PlanningEnv
     >>> world = PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5])
@@ -112,8 +117,8 @@ class MPPI(MPCPlannerBase):
         horizon: int = 5,
         population: int = 300,
         iterations: int = 1,
-        temperature: float = 0.01,
-        sigma: float = 0.5,
+        temperature: float = 0.001,
+        sigma: float = 1.0,
         beta: float = 0.6,
         noise: str = "scaled",
         past: str = "previous",
@@ -188,8 +193,7 @@ class MPPI(MPCPlannerBase):
         for _ in range(self.iterations):
             eps = self._noise(td, mean)
             raw = best.unsqueeze(-3) + self.scale * eps
-            plans = smooth(raw, past.unsqueeze(-2), self.beta)
-            plans = torch.minimum(torch.maximum(plans, space.low), space.high)
+            plans = smooth(raw, past.unsqueeze(-2), self.beta, space.low, space.high)
             best = self._blend(self._returns(td, plans), plans, best)
         return best
 

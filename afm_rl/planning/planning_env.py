@@ -51,11 +51,12 @@ class PlanningEnv(ModelBasedEnvBase):
         self.dynamics = dynamics
         self.cost = cost
         self.observation_key = as_key(observation_key)
-        low, high = torch.as_tensor(action_low), torch.as_tensor(action_high)
-        if low.shape != (dynamics.action_size,) or high.shape != low.shape or (low >= high).any():
+        low, high = (1.0 * torch.as_tensor(bound) for bound in (action_low, action_high))
+        fits = low.shape == high.shape == (dynamics.action_size,)
+        if not fits or not bool(((low < high) & (high - low).isfinite()).all()):
             raise ConfigurationError(
                 f"action bounds {low.tolist()}, {high.tolist()}: expected {dynamics.action_size} "
-                "numbers each, low < high"
+                "finite numbers each, low < high"
             )
         sizes = {self.observation_key: dynamics.state_size}
         sizes.update(zip(cost.in_keys, cost.in_sizes, strict=True))

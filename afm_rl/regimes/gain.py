@@ -38,6 +38,8 @@ class ActionGain(Regime):
         nominal: float = 0.25,
     ) -> None:
         self.names = tuple(names)
+        if not self.names or len(set(self.names)) < len(self.names):
+            raise ConfigurationError(f"names={self.names}: expected distinct names, one per axis")
         self.identity = (1.0,) * len(self.names)
         self.low = check_number("low", low, low=0.0, open_low=True)
         self.high = check_number("high", high, low=0.0, open_low=True)

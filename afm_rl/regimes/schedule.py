@@ -45,7 +45,7 @@ class Schedule:
         """
         measure = progress if self.by == "progress" else step
         if at is None:
-            at = torch.tensor(self.at, device=measure.device)
+            at = torch.tensor(self.at, device=measure.device, dtype=progress.dtype)
         return (measure.unsqueeze(-1) > at).sum(-1)
 
 

@@ -82,6 +82,10 @@ class ActionFlowTransform(Transform):
         """Return the key of an entry of the memory."""
         return unravel_key((self.prefix, *names))
 
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the tensordict as it is: a replay buffer or a policy has no step to watch."""
+        return tensordict
+
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.parent is None:  # inside a replay buffer: nothing to execute
             return tensordict

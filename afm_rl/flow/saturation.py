@@ -1,0 +1,58 @@
+"""What to do when an action cannot be had in full."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from afm_rl.regimes import Regime
+
+MODES = ("direction", "clip")
+ROUNDS, TOLERANCE = 8, 0.01  # bisection of the scale; miss in half ranges that still counts
+
+
+def saturate(unit: Tensor, mode: str) -> Tensor:
+    """Bring an action in half ranges, ``(*B, A)``, into the box [-1, 1]^A.
+
+    ``"clip"`` cuts each component for itself; ``"direction"`` shrinks all alike, so that the
+    robot does the same thing slower: the ratio of turning to driving is kept.
+
+    >>> saturate(torch.tensor([0.5, 2.0]), "direction")
+    tensor([0.2500, 1.0000])
+    """
+    if mode == "clip":
+        return unit.clamp(-1.0, 1.0)
+    return unit / unit.abs().amax(-1, keepdim=True).clamp_min(1.0)
+
+
+def intend(
+    regime: Regime,
+    planned: Tensor,
+    parameters: Tensor,
+    state: Tensor,
+    low: Tensor,
+    high: Tensor,
+    mode: str,
+) -> Tensor:
+    r"""Return the action whose effect under a regime T is the planned action, ``(*B, A)``.
+
+    .. math:: u = T^{-1}(s\,a),\qquad s = \max\{s \in [0, 1] : s\,a \in T(\text{box})\}
+
+    with ``mode="direction"``; with ``"clip"`` s = 1 and u has the nearest effect there is.
+    """
+    intended = regime.inverse(planned, parameters, state, low, high)
+    if mode == "clip":
+        return intended
+
+    def possible(action: Tensor, effect: Tensor) -> Tensor:
+        miss = (regime.apply(action, parameters, state) - effect).abs() / (0.5 * (high - low))
+        return (miss < TOLERANCE).all(-1, keepdim=True)
+
+    whole = possible(intended, planned)
+    scale = torch.zeros_like(planned[..., :1])
+    for k in range(1, ROUNDS + 1):
+        trial = scale + 0.5**k
+        action = regime.inverse(trial * planned, parameters, state, low, high)
+        scale = torch.where(possible(action, trial * planned), trial, scale)
+    slower = regime.inverse(scale * planned, parameters, state, low, high)
+    return torch.where(whole | (scale == 0), intended, slower)

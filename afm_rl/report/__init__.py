@@ -1,0 +1,20 @@
+"""What a run leaves behind: tables, figures, TensorBoard events."""
+
+from afm_rl.report.comparison import draw_comparison
+from afm_rl.report.console import print_summary
+from afm_rl.report.events import write_events
+from afm_rl.report.folder import write_run
+from afm_rl.report.learning import draw_learning
+from afm_rl.report.summary import summarise, summarise_cells
+from afm_rl.report.trajectory import draw_trajectories
+
+__all__ = [
+    "draw_comparison",
+    "draw_learning",
+    "draw_trajectories",
+    "print_summary",
+    "summarise",
+    "summarise_cells",
+    "write_events",
+    "write_run",
+]

@@ -1,0 +1,94 @@
+"""Summary tables for a terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import IO
+
+import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from afm_rl.report.summary import summarise, summarise_cells
+
+BETTER = {"success": max, "finished": max, "steps": min}
+HEADS = {"success": "success %", "finished": "finished %"}
+WIDE = 1000  # columns: numbers that are cut off are worse than lines that wrap
+
+
+def print_summary(missions: pd.DataFrame, file: IO[str] | None = None) -> None:
+    """Print the table of methods, then one for each cell if there is more than one.
+
+    In a terminal the best values are bold; a pipe or a file gets plain text.
+
+    Args:
+        missions: one row per mission.
+        file: where to; standard output if none is given.
+
+    >>> row = {"method": "physics", "track": "oval", "seed": 0, "seconds": 2.0}
+    >>> print_summary(pd.DataFrame([row | {"success_rate": 1.0, "finished": True, "steps": 300}]))
+    <BLANKLINE>
+     method   missions  success %  finished %  steps  seconds
+    ──────────────────────────────────────────────────────────
+     physics         1      100.0         100    300      2.0
+    <BLANKLINE>
+    """
+    console = Console(file=file, width=WIDE, highlight=False)
+    means, cells = summarise(missions), summarise_cells(missions)
+    console.print(_table(means))
+    if cells["cell"].nunique() > 1:
+        widths = _texts(cells).map(len).max()
+        for cell, group in cells.groupby("cell", sort=False):
+            console.print(_table(group, str(cell), widths))
+
+
+def _table(
+    means: pd.DataFrame, title: str | None = None, widths: Mapping[str, int] | None = None
+) -> Table:
+    """Return a table of what :func:`summarise` gave; the best of several methods are bold."""
+    texts = _texts(means)
+    some = bool(means[["success_low", "steps_low"]].notna().any(axis=None))
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        collapse_padding=True,
+        pad_edge=False,
+        caption="mean [95 % interval]" if some else None,
+    )
+    table.title, table.title_justify = Text(title) if title else None, "left"
+    for name in texts:
+        table.add_column(
+            HEADS.get(name, name),
+            justify="left" if name == "method" else "right",
+            min_width=int(widths[name]) if widths is not None else None,
+        )
+    best = {
+        name: choose(means[name]) for name, choose in BETTER.items() if means[name].nunique() > 1
+    }
+    for place, row in texts.iterrows():
+        bold = {name for name, value in best.items() if means.loc[place, name] == value}
+        table.add_row(*(Text(text, "bold" * (name in bold)) for name, text in row.items()))
+    return table
+
+
+def _texts(means: pd.DataFrame) -> pd.DataFrame:
+    """Return the cells of the table as text."""
+    rows = [
+        {
+            "method": row.method,
+            "missions": f"{row.missions}",
+            "success": _number(1, 100 * row.success, 100 * row.success_low, 100 * row.success_high),
+            "finished": f"{100 * row.finished:.0f}",
+            "steps": _number(0, row.steps, row.steps_low, row.steps_high),
+            "seconds": f"{row.seconds:.1f}",
+        }
+        for row in means.itertuples()
+    ]
+    return pd.DataFrame(rows, index=means.index)
+
+
+def _number(digits: int, mean: float, low: float, high: float) -> str:
+    interval = "" if math.isnan(low) else f" [{low:.{digits}f}, {high:.{digits}f}]"
+    return f"{mean:.{digits}f}{interval}"

@@ -1,0 +1,91 @@
+"""One method's curve against the step."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from afm_rl.report.style import BAND, Style
+
+WINDOW = 20  # steps in the moving average
+POINTS = 800  # more than the picture has room for
+RAW: dict[str, Any] = {"linewidth": 0.5, "alpha": 0.3, "zorder": 1.5}
+STARTS, ENDS = ">", "<"  # markers; together they bracket the stretch
+
+
+def draw_curve(axes: Axes, steps: pd.DataFrame, column: str, look: Style) -> None:
+    """Draw a column's moving average, and its raw values faint behind it.
+
+    Args:
+        axes: where to; the limits of the steps must be set.
+        steps: one mission's steps, in order.
+        column: what to draw.
+        look: how the mission's method is drawn.
+    """
+    shown = steps[steps["t"] <= axes.get_xlim()[1]]
+    values = shown[column].where(np.isfinite(shown[column]))
+    mean = values.rolling(WINDOW, min_periods=1).mean()
+    t, stride = shown["t"].to_numpy(), math.ceil(len(shown) / POINTS)
+    axes.plot(*extremes(t, values, stride), color=look.color, **RAW, gid="raw")
+    (line,) = axes.plot(t[::stride], mean[::stride], color=look.color, linewidth=1.7, gid="mean")
+    line.set_linestyle(look.linestyle)
+
+
+def extremes(t: np.ndarray, values: pd.Series, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest of every ``stride`` values: fewer points, same look.
+
+    >>> t, values = extremes(np.arange(4), pd.Series([3.0, 1.0, 2.0, 5.0]), 2)
+    >>> t.tolist(), values.tolist()
+    ([0, 0, 2, 2], [1.0, 3.0, 2.0, 5.0])
+    """
+    if stride == 1:
+        return t, values.to_numpy()
+    bins = values.groupby(np.arange(len(values)) // stride)
+    return t[::stride].repeat(2), bins.agg(["min", "max"]).to_numpy().ravel()
+
+
+def regime_changes(steps: pd.DataFrame) -> tuple[list[int], list[int]]:
+    """Return the steps at which the changed regime starts, and those at which it has ended.
+
+    A regime that lasts to the end of the mission has no end.
+
+    >>> steps = pd.DataFrame({"t": range(5), "regime_active": [0, 1, 1, 0, 1]})
+    >>> regime_changes(steps)
+    ([1, 4], [3])
+    """
+    active = steps["regime_active"].to_numpy().astype(int)
+    change, t = np.diff(active, prepend=0), steps["t"].to_numpy()
+    return t[change == 1].tolist(), t[change == -1].tolist()
+
+
+def mark_regime(axes: Axes, steps: pd.DataFrame, look: Style, alone: bool) -> None:
+    """Mark where the changed regime starts and ends.
+
+    Args:
+        axes: where to.
+        steps: one mission's steps.
+        look: how its method is drawn.
+        alone: no other method is in these axes, so there is room to shade the stretch.
+    """
+    starts, ends = regime_changes(steps)
+    for places, marker in ((starts, STARTS), (ends, ENDS)):
+        for place in places:
+            line = axes.axvline(place, color=look.color, linestyle=look.linestyle, gid="change")
+            line.set(linewidth=1.0, zorder=1)
+            if place <= axes.get_xlim()[1]:
+                _mark_top(axes, place, marker, look.color)
+    if alone:
+        last = int(steps["t"].iloc[-1])
+        for start, end in zip(starts, [*ends, last], strict=False):
+            axes.axvspan(start, end, color=BAND, alpha=0.2, linewidth=0, zorder=0.5, gid="band")
+
+
+def _mark_top(axes: Axes, place: int, marker: str, color: str) -> None:
+    """Put a marker on the upper edge of the axes."""
+    transform = axes.get_xaxis_transform()
+    (mark,) = axes.plot([place], [1.0], marker=marker, color=color, transform=transform)
+    mark.set(markersize=6, clip_on=False, gid="marker")

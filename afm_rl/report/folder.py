@@ -1,0 +1,89 @@
+"""A run's results as files."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from afm_rl.artefacts import write_whole
+from afm_rl.report.comparison import draw_comparison
+from afm_rl.report.events import write_events
+from afm_rl.report.frames import check_frames, order_columns
+from afm_rl.report.learning import draw_learning
+from afm_rl.report.road import DrawableTrack
+from afm_rl.report.style import png_bytes
+from afm_rl.report.trajectory import draw_trajectories
+
+
+def write_run(
+    folder: str | Path,
+    missions: pd.DataFrame,
+    steps: pd.DataFrame,
+    tracks: Sequence[DrawableTrack] = (),
+    *,
+    figures: bool = True,
+    tensorboard: bool = True,
+    echo: Callable[[str], object] = print,
+) -> list[Path]:
+    """Write tables, figures and TensorBoard events of one method or several.
+
+    Files: ``missions.csv``, ``steps.parquet``, ``figures/trajectory.png`` (if the steps have
+    ``x`` and ``y``), ``figures/learning.png``, ``figures/summary.png`` (if a method has more
+    than one mission), and event files under ``tensorboard/``. Each is written whole or not
+    at all; files of the same name are replaced, others left alone.
+
+    Args:
+        folder: where to; made if it is not there.
+        missions: one row per mission; mission numbers must differ over the whole frame.
+        steps: one row per mission and step.
+        tracks: tracks to draw, found by name.
+        figures: draw figures.
+        tensorboard: write events.
+        echo: receives one line per thing written.
+
+    Returns:
+        The files written.
+
+    Raises:
+        ConfigurationError: if the frames do not fit each other, or the folder cannot be
+            written.
+    """
+    check_frames(missions, steps)
+    folder = Path(folder)
+    written = []
+
+    def keep(name: str, data: bytes) -> None:
+        write_whole(folder / name, data)
+        written.append(folder / name)
+        echo(f"wrote {folder / name}")
+
+    # The numbers come first: whatever happens to a figure, they are safe.
+    table = order_columns(missions).to_csv(index=False, lineterminator="\n")
+    keep("missions.csv", table.encode())
+    buffer = io.BytesIO()
+    steps.to_parquet(buffer, index=False, compression="zstd")
+    keep("steps.parquet", buffer.getvalue())
+    if tensorboard:
+        written += write_events(folder / "tensorboard", missions, steps)
+        echo(f"wrote {folder / 'tensorboard'} (tensorboard --logdir {folder / 'tensorboard'})")
+    if figures:
+        for name, draw in _drawings(missions, steps, tracks).items():
+            keep(f"figures/{name}.png", png_bytes(draw()))
+    return written
+
+
+def _drawings(
+    missions: pd.DataFrame, steps: pd.DataFrame, tracks: Sequence[DrawableTrack]
+) -> dict[str, Callable[[], Figure]]:
+    """Return what there is to draw, by name."""
+    drawings: dict[str, Callable[[], Figure]] = {}
+    if {"x", "y"} <= set(steps.columns):
+        drawings["trajectory"] = lambda: draw_trajectories(missions, steps, tracks)
+    drawings["learning"] = lambda: draw_learning(missions, steps)
+    if missions["method"].duplicated().any():
+        drawings["summary"] = lambda: draw_comparison(missions)
+    return drawings

@@ -1,0 +1,83 @@
+"""The two data frames every report is made from: missions and steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import pandas as pd
+
+from afm_rl.errors import ConfigurationError
+
+FRONT = ["method", "track"]
+BACK = ["seed", "success_rate", "steps", "reached", "targets", "finished", "seconds", "mission"]
+STEPS = ["mission", "t", "error", "misaligned", "loss", "regime_active", "reached"]
+
+
+def check_frames(missions: pd.DataFrame, steps: pd.DataFrame) -> None:
+    """Check what reports rely on.
+
+    Raises:
+        ConfigurationError: if there is no mission, a column is missing, a mission's number
+            occurs twice, or a mission has no steps.
+    """
+    for name, frame, wanted in (("missions", missions, FRONT + BACK), ("steps", steps, STEPS)):
+        missing = [column for column in wanted if column not in frame]
+        if missing:
+            raise ConfigurationError(f"{name}: columns {', '.join(missing)} are missing")
+    number = missions["mission"]
+    if number.empty:
+        raise ConfigurationError("missions: no rows; expected at least one mission")
+    if not number.is_unique:
+        raise ConfigurationError(
+            f"missions: mission {number[number.duplicated()].iloc[0]} occurs twice; number the "
+            "missions of all methods through before joining their frames"
+        )
+    without = number[~number.isin(steps["mission"].unique())]
+    if len(without):
+        raise ConfigurationError(f"steps: no rows for mission {without.iloc[0]}")
+
+
+def regime_names(missions: pd.DataFrame) -> list[str]:
+    """Return the names of the regime's parameters: the columns between track and seed.
+
+    >>> regime_names(pd.DataFrame(columns=["method", "track", "v_gain", "seed", "steps"]))
+    ['v_gain']
+    """
+    names = list(missions.columns)
+    return names[names.index("track") + 1 : names.index("seed")]
+
+
+def order_columns(missions: pd.DataFrame) -> pd.DataFrame:
+    """Return the missions with their columns in the order of the files; others come last."""
+    known = [*FRONT, *regime_names(missions), *BACK]
+    return missions[[*known, *(name for name in missions if name not in known)]]
+
+
+def cell_names(missions: pd.DataFrame) -> pd.Series:
+    """Return each mission's cell: its track and regime, in words.
+
+    >>> row = {"method": "physics", "track": "oval", "v_gain": -1.0, "seed": 0}
+    >>> cell_names(pd.DataFrame([row])).tolist()
+    ['oval, v_gain = -1']
+    """
+    cells = missions["track"].astype(str)
+    for name in regime_names(missions):
+        cells = cells + missions[name].map(f", {name} = {{:g}}".format)
+    return cells.rename("cell")
+
+
+def first_missions(missions: pd.DataFrame) -> pd.DataFrame:
+    """Return one mission per method and cell, the first, with a column ``cell``."""
+    named = missions.assign(cell=cell_names(missions))
+    return named.drop_duplicates(["method", "cell"])
+
+
+def steps_of(steps: pd.DataFrame, missions: Iterable[int]) -> dict[int, pd.DataFrame]:
+    """Return the steps of some missions, by mission.
+
+    >>> steps = pd.DataFrame({"mission": [0, 0, 1, 2], "t": [0, 1, 0, 0]})
+    >>> {number: len(rows) for number, rows in steps_of(steps, [0, 2]).items()}
+    {0: 2, 2: 1}
+    """
+    chosen = steps[steps["mission"].isin(list(missions))]
+    return dict(iter(chosen.groupby("mission", sort=False)))

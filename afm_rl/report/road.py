@@ -1,0 +1,101 @@
+"""Tracks as figures show them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
+
+ROAD, WAYPOINT = "#e4e4e4", "#9a9a9a"
+MARGIN, STRAY = 0.04, 0.15  # of the road's extent: always shown around it; shown of who strays
+FINENESS = 16  # discs per road width
+
+
+class Box(NamedTuple):
+    """The area that a map shows (m)."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+
+
+class DrawableTrack(Protocol):
+    """What a figure must know of a track; lengths in metres."""
+
+    @property
+    def name(self) -> str:
+        """Name in the tables."""
+
+    @property
+    def waypoints(self) -> Any:
+        """Points to reach, ``(W, 2)``."""
+
+    @property
+    def centerline(self) -> Any:
+        """Dense closed line, ``(M, 2)``."""
+
+    @property
+    def width(self) -> float:
+        """Width of the road."""
+
+
+def resample(points: np.ndarray, spacing: float) -> np.ndarray:
+    """Return points ``(N, 2)`` along a closed line ``(M, 2)``, at most ``spacing`` apart.
+
+    >>> square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    >>> resample(square, 0.5).tolist()[:3]
+    [[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]]
+    """
+    closed = np.concatenate([points, points[:1]])
+    station = np.concatenate([[0.0], np.hypot(*np.diff(closed, axis=0).T).cumsum()])
+    count = max(2, int(np.ceil(station[-1] / spacing)))
+    wanted = np.arange(count) * (station[-1] / count)
+    return np.stack([np.interp(wanted, station, closed[:, k]) for k in range(2)], -1)
+
+
+def draw_road(axes: Axes, track: DrawableTrack) -> None:
+    """Draw the road as a ribbon, with its waypoints.
+
+    The ribbon is a row of discs: its width is in metres whatever the size of the axes, and
+    sharp corners come out right.
+    """
+    middle = resample(np.asarray(track.centerline, dtype=float), track.width / FINENESS)
+    size = np.full(len(middle), float(track.width))
+    discs = EllipseCollection(
+        size, size, np.zeros(len(middle)), units="xy", offsets=middle, facecolors=ROAD, linewidths=0
+    )
+    discs.set(offset_transform=axes.transData, gid="road", zorder=0.5)
+    axes.add_collection(discs)
+    x, y = np.asarray(track.waypoints, dtype=float).T
+    axes.plot(x, y, ".", color=WAYPOINT, markersize=3.5, zorder=1, gid="waypoints")
+
+
+def view(track: DrawableTrack | None, paths: Sequence[np.ndarray]) -> Box:
+    """Return the area to show of a track and paths ``(N, 2)``.
+
+    Paths that leave the road are followed a little way only: a robot that has gone astray
+    must not shrink the road to a dot.
+    """
+    points = np.concatenate([path[np.isfinite(path).all(-1)] for path in paths])
+    if track is None:
+        edge, stray = points, 0.0
+    else:
+        line, half = np.asarray(track.centerline, dtype=float), track.width / 2
+        edge, stray = np.concatenate([line - half, line + half]), STRAY
+    low, high = (edge.min(0), edge.max(0)) if len(edge) else (np.zeros(2), np.ones(2))
+    span = np.maximum(high - low, 1e-3)
+    if len(points):
+        low = np.minimum(low, np.maximum(points.min(0), low - stray * span))
+        high = np.maximum(high, np.minimum(points.max(0), high + stray * span))
+    margin = MARGIN * span.max()
+    (left, bottom), (right, top) = (low - margin).tolist(), (high + margin).tolist()
+    return Box(left, right, bottom, top)
+
+
+def distance_to(track: DrawableTrack, point: np.ndarray) -> float:
+    """Return how far a point ``(2,)`` is from the road's centre line (m)."""
+    return float(np.hypot(*(np.asarray(track.centerline, dtype=float) - point).T).min())

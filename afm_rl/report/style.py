@@ -1,0 +1,103 @@
+"""Colours, lines and sizes that all figures share.
+
+The colours are those of Okabe and Ito, which colour-blind readers can tell apart; line
+styles and markers say the same again in greyscale. Figures are built on matplotlib's
+objects, so no window opens and no global figure is left behind.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerTuple
+
+DPI = 150
+SMALL, NORMAL, LARGE = 8.0, 9.0, 10.0  # font sizes (pt)
+NOMINAL, REGIME, BAND = "#222222", "#d55e00", "#e69f00"  # before and after; under the regime
+FAINT = "#888888"
+
+COLOURS = ("#0072b2", "#009e73", "#cc79a7", "#000000", "#56b4e9", "#e69f00", "#d55e00")
+LINES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.2, 1)), (0, (6, 1.5, 1.2, 1.5)))
+MARKERS = "osD^vP*"
+
+
+class Style(NamedTuple):
+    """How one method is drawn in every figure."""
+
+    color: str
+    linestyle: Any
+    marker: str
+
+
+def method_styles(methods: Iterable[str]) -> dict[str, Style]:
+    """Return a style for each method, by order of first occurrence.
+
+    >>> styles = method_styles(["physics", "oracle", "physics"])
+    >>> list(styles), styles["physics"].color
+    (['physics', 'oracle'], '#0072b2')
+    """
+    return {
+        method: Style(COLOURS[k % len(COLOURS)], LINES[k % len(LINES)], MARKERS[k % len(MARKERS)])
+        for k, method in enumerate(dict.fromkeys(methods))
+    }
+
+
+def new_figure(width: float, height: float, layout: str = "constrained") -> Figure:
+    """Return an empty white figure of ``width`` by ``height`` inches."""
+    figure = Figure((width, height), dpi=DPI, layout=layout, facecolor="white")  # type: ignore[arg-type]
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def dress(axes: Axes) -> None:
+    """Give axes the common look: small ticks, a light frame."""
+    axes.tick_params(which="both", labelsize=SMALL, length=2.5, color=FAINT)
+    axes.tick_params(which="minor", length=1.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(FAINT)
+
+
+def legend_above(
+    figure: Figure, handles: Sequence[Any], labels: Sequence[str], title: str | None = None
+) -> None:
+    """Explain the lines above all axes."""
+    figure.legend(
+        handles,
+        [literal(label) for label in labels],
+        loc="outside upper center",
+        ncols=min(len(labels), 6),
+        title=title,
+        title_fontsize=LARGE,
+        fontsize=SMALL,
+        frameon=False,
+        columnspacing=1.5,
+        handler_map={tuple: HandlerTuple(ndivide=1)},
+    )
+
+
+def footnote(figure: Figure, notes: Iterable[str]) -> None:
+    """Write what a reader of the figure must know at its foot."""
+    text = "; ".join(note for note in notes if note)
+    if text:
+        figure.supxlabel(literal(text), fontsize=SMALL, color="#555555")
+
+
+def literal(text: str) -> str:
+    r"""Return ``text`` so that matplotlib takes no part of it for a formula.
+
+    >>> print(literal("a$b$"))
+    a\$b\$
+    """
+    return text.replace("$", r"\$")
+
+
+def png_bytes(figure: Figure) -> bytes:
+    """Return the figure as a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return buffer.getvalue()

@@ -1,0 +1,112 @@
+"""What all tests share: one thread, fixed seeds, and small trained models."""
+
+import copy
+
+import pytest
+import torch
+from hypothesis import settings
+
+from afm_rl.dynamics import Dubins, Ensemble
+from afm_rl.flow import ContextFlow, train_flow
+from afm_rl.learning import pretrain_ensemble
+from afm_rl.manifold import Manifold
+from afm_rl.regimes import ActionGain
+
+torch.set_num_threads(1)
+settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=50)
+settings.load_profile("repeatable")
+
+LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+STATES = torch.tensor([-5.0, -5.0, -3.14]), torch.tensor([5.0, 5.0, 3.14])
+
+
+@pytest.fixture(autouse=True)
+def _fixed_seed():
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def box():
+    """The action box of the ground robot."""
+    return LOW, HIGH
+
+
+@pytest.fixture
+def states():
+    """The box from which the small models were trained."""
+    return STATES
+
+
+@pytest.fixture
+def gains():
+    """Gains on both axes of the ground robot."""
+    return ActionGain(["v_gain", "omega_gain"])
+
+
+@pytest.fixture
+def transitions():
+    """Make ``(state, action)`` of a batch shape, inside the boxes."""
+
+    def make(*batch, seed=0, dtype=torch.float32):
+        generator = torch.Generator().manual_seed(seed)
+        drawn = [torch.rand(*batch, n, generator=generator, dtype=dtype) for n in (3, 2)]
+        boxes = (STATES, (LOW, HIGH))
+        return tuple(low + (high - low) * u for (low, high), u in zip(boxes, drawn, strict=True))
+
+    return make
+
+
+@pytest.fixture
+def make_ensemble():
+    """Make an untrained ensemble for the ground robot."""
+
+    def make(**settings):
+        settings = {"members": 3, "hidden": [16, 16], **settings}
+        model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], **settings)
+        model.input_mean.copy_(torch.tensor([0.1, -0.2, 0.3]))
+        model.input_std.copy_(torch.tensor([1.5, 0.5, 0.8]))
+        model.target_mean.copy_(torch.tensor([0.01, -0.02, 0.03]))
+        model.target_std.copy_(torch.tensor([0.1, 0.2, 0.3]))
+        return model
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def _trained_ensemble():
+    model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], members=3, hidden=[48, 48])
+    settings = {"samples": 16_000, "epochs": 10, "lr": 1e-2}
+    error = pretrain_ensemble(model, Dubins(), STATES, (LOW, HIGH), **settings)
+    return model, error
+
+
+@pytest.fixture
+def trained_ensemble(_trained_ensemble):
+    """A small ensemble that has learnt the nominal ground robot; a copy for each test."""
+    return copy.deepcopy(_trained_ensemble[0])
+
+
+@pytest.fixture
+def trained_error(_trained_ensemble):
+    """Its held-out error."""
+    return _trained_ensemble[1]
+
+
+@pytest.fixture(scope="session")
+def _trained_flow():
+    flow = ContextFlow(LOW, HIGH, window=4, hidden=[48, 48], latent=24)
+    prior = ActionGain(["v_gain", "omega_gain"], low=0.5, high=2.0)
+    error = train_flow(flow, Dubins(), prior, STATES, iterations=1200, batch_size=256, lr=5e-3)
+    return flow, error
+
+
+@pytest.fixture
+def trained_flow(_trained_flow):
+    """A small flow for the nominal ground robot under gains; a copy for each test."""
+    return copy.deepcopy(_trained_flow[0])
+
+
+@pytest.fixture
+def trained_flow_error(_trained_flow):
+    """Its held-out error."""
+    return _trained_flow[1]

@@ -1,0 +1,173 @@
+"""The probabilistic ensemble."""
+
+import copy
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from afm_rl.dynamics import Ensemble
+from afm_rl.dynamics import ensemble as module
+from afm_rl.errors import ConfigurationError
+from afm_rl.manifold import Manifold
+
+
+def member_by_member(model, state, action):
+    """Mean and raw log-variance of every member, with ordinary layers."""
+    inputs = (torch.cat([state[..., [2]], action], -1) - model.input_mean) / model.input_std
+    outputs = []
+    for e in range(model.members):
+        rows = inputs
+        for k, (weight, bias) in enumerate(zip(model.weights, model.biases, strict=True)):
+            rows = nn.functional.linear(rows, weight[e].T, bias[e, 0])
+            if k < len(model.weights) - 1:
+                rows = nn.functional.leaky_relu(rows, 0.01)
+        outputs.append(rows)
+    return torch.stack(outputs, -2).chunk(2, -1)
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 4), (0,)])
+@pytest.mark.parametrize("hidden", [[], [16], [8, 8, 8]])
+def test_predictions_equal_those_of_single_networks(make_ensemble, transitions, batch, hidden):
+    model = make_ensemble(hidden=hidden).double()
+    state, action = transitions(*batch, dtype=torch.float64)
+    mean, _ = member_by_member(model, state, action)
+    found, log_variance = model.moments(state, action)
+    assert found.shape == log_variance.shape == (*batch, 3, 3)
+    torch.testing.assert_close(found, mean)
+    change = mean.mean(-2) * model.target_std + model.target_mean
+    expected = model.manifold.add(state, change)
+    torch.testing.assert_close(model(state, action), expected)
+    assert model.jacobian(state, action).shape == (*batch, 3, 2)
+
+
+def test_log_variances_are_softly_bounded(make_ensemble, transitions):
+    model = make_ensemble(log_variance=(-3.0, 0.5))
+    state, action = transitions(500)
+    _, raw = member_by_member(model, 100 * state, 1000 * action)
+    assert raw.min() < -3 and raw.max() > 0.5  # or there would be nothing to bound
+    _, bounded = model.moments(100 * state, 1000 * action)
+    slack = math.log1p(math.exp(-3.5))  # what remains of the softness at the other end
+    assert bounded.min() >= -3.0 and bounded.max() <= 0.5 + slack
+    inside = (raw > -1.5) & (raw < -1.0)
+    torch.testing.assert_close(bounded[inside], raw[inside], rtol=0, atol=0.5)
+
+
+def test_the_noise_scale_is_that_of_the_mixture(make_ensemble, transitions):
+    model = make_ensemble().double()
+    state, action = transitions(6, dtype=torch.float64)
+    mean, log_variance = model.moments(state, action)
+    second = (log_variance.exp() + mean**2).mean(-2)
+    expected = (second - mean.mean(-2) ** 2).sqrt() * model.target_std
+    torch.testing.assert_close(model.noise_scale(state, action), expected)
+    ahead, noise = model.forecast(state, action)
+    torch.testing.assert_close(ahead, model(state, action))
+    torch.testing.assert_close(noise, expected)
+
+
+def test_chunks_change_nothing(make_ensemble, transitions, monkeypatch):
+    model = make_ensemble().double()
+    several = copy.deepcopy(model).expand_(4)
+    state, action = transitions(4, 9, dtype=torch.float64)
+    whole = model.moments(state, action), several.moments(state, action)
+    for size in (1, 100, 400, 1000):  # below one row, some rows, a mission, several missions
+        monkeypatch.setattr(module, "CHUNK", size)
+        torch.testing.assert_close(model.moments(state, action), whole[0])
+        torch.testing.assert_close(several.moments(state, action), whole[1])
+
+
+def test_sampled_predictions_scatter_around_the_mean(make_ensemble, transitions):
+    sampled = make_ensemble(propagation="sample", members=5).double()
+    plain = make_ensemble(members=5).double()
+    state, action = transitions(dtype=torch.float64)
+    many = sampled(state.expand(20_000, -1), action.expand(20_000, -1))
+    change = plain.manifold.difference(many, plain(state, action))
+    _, log_variance = plain.moments(state, action)
+    spread = (log_variance.exp().sum(-2).sqrt() / 5) * plain.target_std
+    torch.testing.assert_close(change.std(0), spread, rtol=0.03, atol=0)
+    assert (change.mean(0).abs() < 0.03 * spread).all()
+
+
+def test_sampling_follows_its_seed_and_no_other(make_ensemble, transitions):
+    state, action = transitions(4)
+    before = torch.get_rng_state()
+    drawn = [make_ensemble(propagation="sample", seed=s)(state, action) for s in (1, 1, 2)]
+    assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_training_members_see_samples_of_their_own(make_ensemble, transitions):
+    model = make_ensemble().double()
+    state, action = transitions(3, 8, dtype=torch.float64)
+    mean, log_variance = model.member_moments(state, action)
+    for e in range(3):
+        whole = model.moments(state[e], action[e])
+        torch.testing.assert_close(mean[e], whole[0][:, e])
+        torch.testing.assert_close(log_variance[e], whole[1][:, e])
+
+
+def test_statistics_are_those_of_the_data(make_ensemble):
+    model = make_ensemble()
+    inputs, targets = 3 + 2 * torch.randn(50, 3), torch.randn(50, 3)
+    targets[:, 1] = 7.0  # constant: must not divide by zero
+    model.normalise_(inputs, targets)
+    torch.testing.assert_close(model.input_mean, inputs.mean(0))
+    torch.testing.assert_close(model.input_std, inputs.std(0))
+    standard = model.standardise(targets)
+    assert standard.isfinite().all()
+    torch.testing.assert_close(standard[:, [0, 2]].std(0), torch.ones(2))
+
+
+def test_the_precision_is_that_of_the_model(make_ensemble, transitions):
+    model = make_ensemble()
+    state, action = transitions(5)
+    single = model(state, action)
+    assert single.dtype is torch.float32
+    double = model.double()(state.double(), action.double())
+    assert double.dtype is torch.float64
+    torch.testing.assert_close(double.float(), single, rtol=1e-5, atol=1e-5)
+
+
+def test_initial_weights_follow_the_seed_and_the_bounds_of_linear_layers(make_ensemble):
+    one, same, other = (make_ensemble(seed=seed) for seed in (1, 1, 2))
+    for left, right in zip(one.parameters(), same.parameters(), strict=True):
+        assert torch.equal(left, right)
+    assert not torch.equal(one.weights[0], other.weights[0])
+    assert one.weights[1].abs().max() <= 0.25  # 1 / sqrt(16)
+    assert one.weights[1].abs().max() > 0.24
+    assert not torch.equal(one.weights[0][0], one.weights[0][1])  # members differ
+
+
+def test_its_state_makes_a_twin(make_ensemble, transitions):
+    model, twin = make_ensemble(seed=1), make_ensemble(seed=2)
+    twin.normalise_(torch.randn(9, 3), torch.randn(9, 3))
+    state, action = transitions(5)
+    twin.load_state_dict(model.state_dict())
+    assert torch.equal(twin(state, action), model(state, action))
+
+
+def test_a_copy_is_independent(make_ensemble, transitions):
+    model = make_ensemble(propagation="sample")
+    twin = copy.deepcopy(model)
+    state, action = transitions(5)
+    assert torch.equal(twin(state, action), model(state, action))
+    twin.weights[0].data.zero_()
+    assert model.weights[0].abs().sum() > 0
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"features": [3]},
+        {"features": [-1]},
+        {"members": 0},
+        {"hidden": [16, 0]},
+        {"log_variance": (0.5, -10.0)},
+        {"propagation": "median"},
+    ],
+    ids=str,
+)
+def test_impossible_settings_are_refused(settings):
+    with pytest.raises(ConfigurationError, match=f"dynamics.{next(iter(settings))}"):
+        Ensemble(Manifold(3, angles=[2]), 2, **{"features": [2], **settings})

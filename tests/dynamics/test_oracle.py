@@ -1,0 +1,53 @@
+"""The model that is told the regime."""
+
+import torch
+
+from afm_rl.dynamics import Dubins, Oracle
+
+
+def test_it_predicts_what_the_regime_does(gains, transitions):
+    oracle, state_action = Oracle(Dubins(), gains), transitions(6)
+    state, action = state_action
+    assert torch.equal(oracle(state, action), Dubins()(state, action))  # nothing told yet
+    oracle.tell(gains.encode({"v_gain": -0.5, "omega_gain": 2.0}))
+    effective = action * torch.tensor([-0.5, 2.0])
+    torch.testing.assert_close(oracle(state, action), Dubins()(state, effective))
+
+
+def test_each_mission_may_be_told_another_regime(gains, transitions):
+    oracle = Oracle(Dubins(), gains)
+    rows = gains.sample((4,), torch.Generator().manual_seed(0))
+    oracle.tell(rows)
+    assert oracle.lead == (4,)
+    state, action = transitions(4, 7)
+    together = oracle(state, action)
+    for mission in range(4):
+        single = Oracle(Dubins(), gains)
+        single.tell(rows[mission])
+        expected = single(state[mission], action[mission])
+        torch.testing.assert_close(together[mission], expected)
+    oracle.select_(torch.tensor([2, 0]))
+    torch.testing.assert_close(oracle(state[[2, 0]], action[[2, 0]]), together[[2, 0]])
+
+
+def test_noise_and_units_are_those_of_the_model_behind(gains, transitions, make_ensemble):
+    behind = make_ensemble()
+    oracle = Oracle(behind, gains)
+    told = gains.encode({"v_gain": 2.0})
+    oracle.tell(told)
+    state, action = transitions(5)
+    expected = behind.moments(state, action * told)
+    for found, right in zip(oracle.moments(state, action), expected, strict=True):
+        torch.testing.assert_close(found, right)
+    noise = behind.noise_scale(state, action * told)
+    torch.testing.assert_close(oracle.noise_scale(state, action), noise)
+    torch.testing.assert_close(oracle.forecast(state, action)[1], noise)
+    torch.testing.assert_close(oracle.standardise(state), behind.standardise(state))
+
+
+def test_what_it_is_told_does_not_outlive_the_run(gains):
+    oracle = Oracle(Dubins(), gains)
+    oracle.tell(torch.full((2,), 2.0, requires_grad=True))
+    assert oracle.state_dict() == {}
+    assert not oracle.parameters_now.requires_grad
+    assert oracle.select_(torch.tensor([0])) is oracle and oracle.lead == ()

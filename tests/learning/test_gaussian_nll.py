@@ -1,0 +1,126 @@
+"""The loss of a dynamics model."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
+from afm_rl.learning import GaussianNLLLoss, gaussian_nll
+
+
+def transition(state, action, next_state):
+    td = TensorDict({"observation": state, "action": action}, state.shape[:-1])
+    return td.set(("next", "observation"), next_state)
+
+
+@pytest.fixture
+def data(make_ensemble, transitions):
+    """An ensemble in double precision and transitions that it does not explain."""
+    model = make_ensemble().double()
+    state, action = transitions(6, dtype=torch.float64)
+    seen = Dubins()(state, action) + 0.1 * torch.randn(6, 3, dtype=torch.float64)
+    return model, transition(state, action, seen)
+
+
+def test_it_is_twice_the_negative_log_likelihood_without_its_constant():
+    mean, target = torch.randn(2, 50, dtype=torch.float64)
+    log_variance = torch.linspace(-5, 2, 50, dtype=torch.float64)
+    normal = torch.distributions.Normal(mean, (0.5 * log_variance).exp())
+    expected = -2 * normal.log_prob(target) - math.log(2 * math.pi)
+    torch.testing.assert_close(gaussian_nll(mean, log_variance, target), expected)
+
+
+def test_it_is_averaged_over_members_and_coordinates(data):
+    model, td = data
+    change = model.manifold.difference(td["next", "observation"], td["observation"])
+    mean, log_variance = model.moments(td["observation"], td["action"])
+    normal = torch.distributions.Normal(
+        mean * model.target_std + model.target_mean, (0.5 * log_variance).exp() * model.target_std
+    )
+    expected = -2 * normal.log_prob(change.unsqueeze(-2)) - math.log(2 * math.pi)
+    expected = expected - 2 * model.target_std.log()  # the loss is in standardised units
+    loss = GaussianNLLLoss(model, reduction="none")(td)["loss_nll"]
+    torch.testing.assert_close(loss, expected.mean((-2, -1)))
+
+
+@pytest.mark.parametrize(("reduction", "reduce"), [("mean", torch.mean), ("sum", torch.sum)])
+def test_reductions(data, reduction, reduce):
+    model, td = data
+    each = GaussianNLLLoss(model, reduction="none")(td)["loss_nll"]
+    assert each.shape == (6,)
+    result = GaussianNLLLoss(model, reduction=reduction)(td)
+    assert result.batch_size == ()
+    torch.testing.assert_close(result["loss_nll"], reduce(each))
+
+
+def test_crossing_the_seam_costs_nothing():
+    model = Dubins()
+    state = torch.tensor([[0.0, 0.0, 3.1]])
+    action = torch.tensor([[0.3, 1.0]])
+    loss = GaussianNLLLoss(model)(transition(state, action, model(state, action)))
+    assert float(loss["loss_nll"]) == pytest.approx(0, abs=1e-6)
+
+
+def test_keys_can_be_chosen(data):
+    model, td = data
+    loss = GaussianNLLLoss(model)
+    assert loss.in_keys == ["observation", "action", ("next", "observation")]
+    expected = loss(td)["loss_nll"]
+    moved = TensorDict({}, [6])
+    moved["robot", "pose"], moved["did"] = td["observation"], td["action"]
+    moved["then"] = td["next", "observation"]
+    loss.set_keys(state=("robot", "pose"), action="did", next_state="then")
+    assert loss.in_keys == [("robot", "pose"), "did", "then"]
+    torch.testing.assert_close(loss(moved)["loss_nll"], expected)
+    loss.in_keys = ["did", "then"]
+    assert loss.in_keys == ["did", "then"]
+
+
+def test_the_executed_action_can_be_read_instead_of_the_planned(data):
+    model, td = data
+    loss = GaussianNLLLoss(model)
+    expected = loss(td)["loss_nll"]
+    td = td.clone()
+    td["next", "afm", "executed_action"] = td["action"]
+    td["action"] = -td["action"]
+    assert not torch.allclose(loss(td)["loss_nll"], expected)
+    loss.set_keys(action=("next", "afm", "executed_action"))
+    torch.testing.assert_close(loss(td)["loss_nll"], expected)
+
+
+def test_entries_may_come_by_name(data):
+    model, td = data
+    loss = GaussianNLLLoss(model)
+    by_name = loss(
+        observation=td["observation"],
+        action=td["action"],
+        next_observation=td["next", "observation"],
+    )
+    torch.testing.assert_close(by_name, loss(td)["loss_nll"])
+
+
+def test_masked_transitions_do_not_count(data):
+    model, td = data
+    td = td.clone()
+    td["next", "observation"][4:] = math.nan
+    td["mask"] = torch.arange(6) < 4
+    loss = GaussianNLLLoss(model)
+    loss.loss_mask_key = "mask"
+    torch.testing.assert_close(loss(td)["loss_nll"], loss(td[:4])["loss_nll"])
+
+
+def test_the_model_is_shared_not_copied(data):
+    model, td = data
+    loss = GaussianNLLLoss(model)
+    assert loss.model is model and not loss.functional
+    loss(td)["loss_nll"].backward()
+    assert all(parameter.grad.abs().sum() > 0 for parameter in model.parameters())
+    loss._forward_value_estimator_keys()  # torchrl calls this when keys change
+
+
+def test_unknown_reductions_are_refused():
+    with pytest.raises(ConfigurationError, match="loss.reduction='median'"):
+        GaussianNLLLoss(Dubins(), reduction="median")

@@ -1,0 +1,130 @@
+"""One gradient step per transition and mission."""
+
+import copy
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from afm_rl.dynamics import Dubins
+from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater
+
+
+def transition(state, action, factor=-1.0):
+    td = TensorDict({"observation": state, "action": action}, state.shape[:-1])
+    return td.set(("next", "observation"), Dubins()(state, factor * action))
+
+
+def updater_of(model, lr=1e-2, **settings):
+    return OnlineUpdater(GaussianNLLLoss(model), lambda p: FreshAdam(p, lr=lr), **settings)
+
+
+def weights(model, index=...):
+    return torch.cat([parameter.detach()[index].flatten() for parameter in model.parameters()])
+
+
+@pytest.fixture
+def missions(make_ensemble):
+    return make_ensemble().double().expand_(4)
+
+
+def test_it_is_gradient_descent_on_the_loss_before_the_step(make_ensemble, transitions):
+    model = make_ensemble().double()
+    reference = copy.deepcopy(model)
+    td = transition(*transitions(1, dtype=torch.float64))
+    optimizer = torch.optim.Adam(reference.parameters(), lr=1e-2)
+    loss = GaussianNLLLoss(reference)(td)["loss_nll"]
+    loss.backward()
+    optimizer.step()
+    measured = updater_of(model)(td)["loss"]
+    assert measured.shape == (1,) and not measured.requires_grad
+    torch.testing.assert_close(measured[0], loss.detach())
+    torch.testing.assert_close(weights(model), weights(reference))
+
+
+def test_missions_learn_as_if_they_were_alone(missions, make_ensemble, transitions):
+    updater = updater_of(missions)
+    alone = [make_ensemble().double() for _ in range(4)]
+    singles = [updater_of(model) for model in alone]
+    for step in range(5):
+        td = transition(*transitions(4, seed=step, dtype=torch.float64))
+        loss = updater(td)["loss"]
+        for index, single in enumerate(singles):
+            torch.testing.assert_close(single(td[index])["loss"], loss[index])
+    for index, model in enumerate(alone):
+        torch.testing.assert_close(weights(missions, index), weights(model), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 1)])
+def test_masked_missions_do_not_learn_but_are_measured(missions, transitions, shape):
+    updater = updater_of(missions, mask_key=["learn", "here"])
+    td = transition(*transitions(4, dtype=torch.float64))
+    td["learn", "here"] = torch.tensor([True, False, True, False]).reshape(shape)
+    before = [weights(missions, index) for index in range(4)]
+    expected = updater.loss(td)["loss_nll"].detach()
+    torch.testing.assert_close(updater(td)["loss"], expected)
+    changed = [not torch.equal(weights(missions, i), before[i]) for i in range(4)]
+    assert changed == [True, False, True, False] and updater.refused == 0
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e200])
+@pytest.mark.parametrize("key", ["observation", "action", ("next", "observation")])
+def test_faulty_transitions_are_refused_and_counted(missions, transitions, value, key):
+    updater, twin = updater_of(missions), copy.deepcopy(missions)
+    td = transition(*transitions(4, dtype=torch.float64))
+    good = td.clone()
+    td[key][1] = value
+    before = weights(missions, 1)
+    loss = updater(td)["loss"]
+    assert loss[1].isnan() and loss[[0, 2, 3]].isfinite().all()
+    assert updater.refused == 1
+    assert torch.equal(weights(missions, 1), before)
+    updater_of(twin)(good)  # the others learn as ever
+    for index in (0, 2, 3):
+        torch.testing.assert_close(weights(missions, index), weights(twin, index))
+    updater(td)
+    assert updater.refused == 2
+
+
+def test_a_fault_outside_the_mask_is_harmless_too(missions, transitions):
+    updater = updater_of(missions, mask_key="learn")
+    td = transition(*transitions(4, dtype=torch.float64))
+    td["next", "observation"][0] = math.nan
+    td["learn"] = torch.tensor([False, True, True, True])
+    updater(td)
+    assert weights(missions).isfinite().all() and updater.refused == 1
+
+
+def test_the_transition_given_is_not_changed(missions, transitions):
+    td = transition(*transitions(4, dtype=torch.float64))
+    td["observation"][2] = math.nan
+    before = td.clone()
+    updater_of(missions)(td)
+    assert set(td.keys(True, True)) == set(before.keys(True, True))
+    for key in td.keys(True, True):
+        torch.testing.assert_close(td[key], before[key], equal_nan=True, rtol=0, atol=0)
+
+
+def test_it_learns_where_gradients_are_switched_off(make_ensemble, transitions):
+    model = make_ensemble()
+    updater, before = updater_of(model), weights(model)
+    with torch.no_grad():
+        updater(transition(*transitions(2)))
+    assert updater.learns and not torch.equal(weights(model), before)
+
+
+def test_repetition_explains_the_transition(trained_ensemble, transitions):
+    updater = updater_of(trained_ensemble, lr=1e-3)
+    td = transition(*transitions(1))
+    losses = [float(updater(td)["loss"]) for _ in range(200)]
+    assert losses[-1] < 0.1 * losses[0]
+
+
+def test_any_optimiser_will_do_and_missions_may_leave(missions, transitions):
+    updater = OnlineUpdater(GaussianNLLLoss(missions), torch.optim.SGD)
+    updater(transition(*transitions(4, dtype=torch.float64)))
+    missions.select_(torch.tensor([3, 1]))
+    before = weights(missions, 0)
+    result = updater(transition(*transitions(2, dtype=torch.float64)))
+    assert result["loss"].shape == (2,) and not torch.equal(weights(missions, 0), before)

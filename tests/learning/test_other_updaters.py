@@ -1,0 +1,42 @@
+"""Updaters that do not learn."""
+
+import torch
+from tensordict import TensorDict
+
+from afm_rl.dynamics import Dubins, Oracle
+from afm_rl.learning import GaussianNLLLoss, OracleUpdater, Updater
+
+
+def transition(state, action, next_state):
+    td = TensorDict({"observation": state, "action": action}, state.shape[:-1])
+    return td.set(("next", "observation"), next_state)
+
+
+def test_a_frozen_model_is_measured_only(make_ensemble, transitions):
+    model = make_ensemble()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    state, action = transitions(5)
+    td = transition(state, action, Dubins()(state, action))
+    updater = Updater(GaussianNLLLoss(model))
+    updater.start(td)
+    loss = updater(td)["loss"]
+    expected = GaussianNLLLoss(model, reduction="none")(td)["loss_nll"]
+    torch.testing.assert_close(loss, expected)
+    assert not updater.learns and not loss.requires_grad
+    for name, value in model.state_dict().items():
+        assert torch.equal(value, before[name])
+
+
+def test_the_oracle_is_told_the_regime_of_the_next_action(gains, transitions):
+    oracle = Oracle(Dubins(), gains)
+    updater = OracleUpdater(GaussianNLLLoss(oracle), regime_key=["hidden", "regime"])
+    now, later = gains.sample((2, 3), torch.Generator().manual_seed(0))
+    state, action = transitions(3)
+    td = TensorDict({"observation": state, "action": action, "hidden": {"regime": now}}, [3])
+    updater.start(td)
+    assert updater.oracle is oracle and torch.equal(oracle.parameters_now, now)
+    td["next", "observation"] = Dubins()(state, action * now)
+    td["next", "hidden", "regime"] = later
+    loss = updater(td)["loss"]  # measured with what held during the transition
+    torch.testing.assert_close(loss, torch.zeros(3), rtol=0, atol=1e-6)
+    assert torch.equal(oracle.parameters_now, later)

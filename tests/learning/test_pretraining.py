@@ -1,0 +1,112 @@
+"""Pre-training of an ensemble."""
+
+import math
+
+import pytest
+import torch
+
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
+from afm_rl.learning import pretrain, pretrain_ensemble
+
+SHORT = {"samples": 512, "epochs": 2, "batch_size": 64}
+
+
+@pytest.fixture
+def fit(make_ensemble, states, box):
+    def run(teacher=None, seed=0, **settings):
+        model = make_ensemble()
+        error = pretrain_ensemble(
+            model, teacher or Dubins(), states, box, seed=seed, **{**SHORT, **settings}
+        )
+        return model, error
+
+    return run
+
+
+def same(left, right):
+    right = right.state_dict()
+    return all(torch.equal(value, right[name]) for name, value in left.state_dict().items())
+
+
+def test_a_small_budget_already_teaches(trained_ensemble, trained_error, transitions):
+    assert trained_error < 0.15
+    state, action = transitions(1000, seed=5)
+    right = Dubins()(state, action)
+    error = trained_ensemble.manifold.difference(trained_ensemble(state, action), right)
+    change = Dubins().manifold.difference(right, state)
+    ratio = error.square().mean(0).sqrt() / change.std(0)
+    assert (ratio < 0.2).all()
+
+
+def test_the_reported_error_is_that_of_the_model_kept(fit, states, box, monkeypatch):
+    errors = []
+    real = pretrain.held_out_error
+
+    def spy(*args):
+        errors.append(real(*args))
+        return errors[-1]
+
+    monkeypatch.setattr(pretrain, "held_out_error", spy)
+    # a step size that spoils what was learned: the best epoch is not the last
+    model, best = fit(epochs=6, lr=0.1)
+    assert best == min(errors) and len(errors) == 6
+
+
+def test_normalisation_comes_from_the_training_data(fit, states, box):
+    model, _ = fit(samples=4096)
+    low, high = states[0][2], states[1][2]
+    assert float(model.input_mean[0]) == pytest.approx(float(low + high) / 2, abs=0.1)
+    assert float(model.input_std[0]) == pytest.approx(float(high - low) / 12**0.5, rel=0.05)
+    torch.testing.assert_close(
+        model.input_std[1:], (box[1] - box[0]) / 12**0.5, rtol=0.05, atol=0
+    )
+
+
+def test_the_seed_decides_everything_and_the_global_generator_nothing(fit):
+    before = torch.get_rng_state()
+    first, _ = fit(seed=1)
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.rand(7)
+    again, _ = fit(seed=1)
+    other, _ = fit(seed=2)
+    assert same(first, again) and not same(first, other)
+
+
+def test_noise_perturbs_the_action_of_the_teacher_only(fit, box):
+    class Spy(Dubins):
+        def forward(self, state, action):
+            self.seen = action
+            return super().forward(state, action)
+
+    plain, noisy = Spy(), Spy()
+    models = [fit(plain)[0], fit(noisy, action_noise=0.1)[0]]
+    ratio = noisy.seen / plain.seen
+    assert ratio.min() >= 0.9 - 1e-6 and ratio.max() <= 1.1 + 1e-6 and ratio.std() > 0.05
+    torch.testing.assert_close(models[0].input_std, models[1].input_std)
+
+
+def test_an_ensemble_can_teach_another(fit, make_ensemble):
+    teacher = make_ensemble(seed=4)
+    before = {name: value.clone() for name, value in teacher.state_dict().items()}
+    _, error = fit(teacher=teacher)
+    assert math.isfinite(error)
+    assert all(torch.equal(teacher.state_dict()[name], before[name]) for name in before)
+    assert all(parameter.grad is None for parameter in teacher.parameters())
+
+
+def test_it_learns_where_gradients_are_switched_off(fit):
+    expected, _ = fit()
+    with torch.no_grad():
+        model, _ = fit()
+    assert same(model, expected)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"samples": 63}, {"epochs": 0}, {"batch_size": 0}, {"lr": 0.0}, {"action_noise": -0.1}],
+    ids=str,
+)
+def test_impossible_settings_are_refused(fit, settings):
+    with pytest.raises(ConfigurationError, match=f"dynamics.pretrain.{next(iter(settings))}"):
+        fit(**settings)

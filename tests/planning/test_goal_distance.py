@@ -1,0 +1,53 @@
+"""Distance to the goal as a cost."""
+
+import pytest
+import torch
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.planning import GoalDistance
+
+
+def cost_of(cost, state, goal):
+    state = torch.as_tensor(state)
+    return cost(torch.zeros_like(state), torch.zeros(2), state, torch.as_tensor(goal))
+
+
+def test_only_the_chosen_coordinates_count():
+    assert float(cost_of(GoalDistance([0, 1]), [1.0, 2.0, 3.0], [4.0, 6.0])) == 5.0
+    assert float(cost_of(GoalDistance([2], goal_size=1), [1.0, 2.0, 3.0], [5.0])) == 2.0
+
+
+def test_a_coordinate_without_a_goal_is_driven_to_zero():
+    pose = GoalDistance([0, 1, 2])
+    assert float(cost_of(pose, [0.0, 0.0, -2.0], [2.0, 1.0])) == 3.0
+
+
+def test_weights_scale_coordinates():
+    cost = GoalDistance([0, 1], weights=[2.0, 0.0])
+    assert float(cost_of(cost, [0.0, 9.0, 0.0], [1.5, -4.0])) == 3.0
+
+
+def test_states_and_goals_broadcast():
+    states, goals = torch.randn(4, 7, 3), torch.randn(4, 1, 2)
+    result = cost_of(GoalDistance(), states, goals)
+    torch.testing.assert_close(result, (states[..., :2] - goals).norm(dim=-1))
+
+
+def test_its_key_may_be_nested_and_come_from_yaml():
+    cost = GoalDistance(in_keys=[["task", "goal"]])
+    assert cost.in_keys == [("task", "goal")] and cost.in_sizes == [2]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"coordinates": [0], "goal_size": 2},
+        {"weights": [1.0]},
+        {"weights": [1.0, -1.0]},
+        {"weights": [1.0, float("nan")]},
+    ],
+    ids=str,
+)
+def test_impossible_settings_are_refused(settings):
+    with pytest.raises(ConfigurationError, match=f"cost.{next(iter(settings))}"):
+        GoalDistance(**settings)

@@ -1,0 +1,272 @@
+"""MPPI as a module: what it plans."""
+
+import math
+import warnings
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import step_mdp
+
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
+from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+
+SMALL = {"horizon": 4, "population": 32}
+
+
+@pytest.fixture
+def world(box):
+    return PlanningEnv(Dubins(), GoalDistance(), *box)
+
+
+def situation(*batch, horizon=4, seed=0):
+    """Where the robots are, where they shall go, and what they planned before."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.randn(*batch, *shape, generator=generator)
+
+    entries = {"observation": draw(3), "goal": 3 * draw(2)}
+    entries["mppi"] = TensorDict({"mean": 0.3 * draw(horizon, 2)}, batch)
+    return TensorDict(entries, batch)
+
+
+def plan(planner, td):
+    return planner(td.clone())["next", "mppi", "mean"]
+
+
+@pytest.mark.parametrize("settings", [{}, {"iterations": 3}, {"noise": "unit"}], ids=str)
+def test_both_backends_plan_the_same(world, settings):
+    fast, slow = (MPPI(world, backend=name, **SMALL, **settings) for name in ("fast", "env"))
+    assert MPPI(world, **SMALL).backend == "fast"
+    for batch in [(), (3,), (2, 2)]:
+        td = situation(*batch)
+        torch.testing.assert_close(plan(fast, td), plan(slow, td), rtol=0, atol=1e-5)
+
+
+def test_an_environment_without_returns_is_stepped(world):
+    wrapped = TransformedEnv(world)
+    wrapped.__class__ = type("Plain", (TransformedEnv,), {"__getattr__": _without_returns})
+    planner = MPPI(wrapped, **SMALL)
+    assert planner.backend == "env"
+    expected = plan(MPPI(world, **SMALL), situation(3))
+    torch.testing.assert_close(plan(planner, situation(3)), expected, rtol=0, atol=1e-5)
+    with pytest.raises(ConfigurationError, match="has no `returns`; use 'env'"):
+        MPPI(wrapped, backend="fast")
+
+
+def _without_returns(self, name):
+    if name == "returns":
+        raise AttributeError(name)
+    return TransformedEnv.__getattr__(self, name)
+
+
+def test_a_batch_of_missions_equals_single_ones(world):
+    together, td = MPPI(world, seed_key="seed", **SMALL), situation(5)
+    td["seed"] = torch.tensor([3, 1, 4, 1, 5])
+    planned = [plan(together, td) for _ in range(2)]
+    for mission in range(5):
+        alone = MPPI(world, seed_key="seed", **SMALL)
+        for step in range(2):
+            expected = plan(alone, td[mission])
+            torch.testing.assert_close(planned[step][mission], expected, rtol=0, atol=1e-6)
+
+
+def test_missions_of_one_seed_share_their_noise(world):
+    planner, td = MPPI(world, seed_key=["mission", "seed"], **SMALL), situation(1).expand(3)
+    td = td.clone()
+    td["mission", "seed"] = torch.tensor([8, 9, 8])
+    planned = plan(planner, td)
+    assert torch.equal(planned[0], planned[2]) and not torch.equal(planned[0], planned[1])
+    unseeded = plan(MPPI(world, **SMALL), td)
+    assert not torch.equal(unseeded[0], unseeded[2])
+
+
+def test_it_follows_its_seed_and_leaves_the_global_generator_alone(world):
+    td, before = situation(2), torch.get_rng_state()
+    plans = [plan(MPPI(world, seed=seed, **SMALL), td) for seed in (1, 1, 2)]
+    assert torch.equal(plans[0], plans[1]) and not torch.equal(plans[0], plans[2])
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize("noise", ["scaled", "unit"])
+@pytest.mark.parametrize("sigma", [0.1, 50.0])
+def test_actions_and_plans_stay_in_the_box(world, noise, sigma, box):
+    planner = MPPI(world, noise=noise, sigma=sigma, temperature=1e-6, **SMALL)
+    td = situation(20)
+    td["mppi", "mean"] *= 100  # a plan that someone else made
+    out = planner(td)
+    spec = world.action_spec
+    assert all(spec.is_in(action) for action in out["action"])
+    mean = out["next", "mppi", "mean"]
+    assert (mean >= box[0] - 1e-6).all() and (mean <= box[1] + 1e-6).all()
+
+
+def test_without_noise_the_plan_is_shifted_and_smoothed(world):
+    td = situation(3)
+    before = td["mppi", "mean"].clamp(-0.9, 0.9)
+    td["mppi", "mean"] = before
+    shifted = torch.cat([before[:, 1:], before[:, -1:]], 1)
+    assert torch.equal(td["mppi", "mean"], before)
+    torch.testing.assert_close(plan(MPPI(world, sigma=0.0, beta=1.0, **SMALL), td), shifted)
+    for past, first in (("previous", before[:, 0]), ("shifted", shifted[:, 0])):
+        smoothed = plan(MPPI(world, sigma=0.0, beta=0.6, past=past, **SMALL), td)
+        torch.testing.assert_close(smoothed[:, 0], 0.6 * shifted[:, 0] + 0.4 * first)
+
+
+def test_noise_scales_with_the_half_range_or_is_of_unit_size(world, box):
+    scaled, unit = MPPI(world, sigma=0.2), MPPI(world, sigma=0.2, noise="unit")
+    torch.testing.assert_close(scaled.scale, 0.2 * (box[1] - box[0]) / 2)
+    assert torch.equal(unit.scale, torch.ones(2))
+
+
+def test_a_hot_planner_keeps_the_mean_of_its_candidates(world):
+    planner = MPPI(world, horizon=1, population=4000, temperature=1e9, sigma=0.2, beta=1.0)
+    td = situation(1, horizon=1)
+    td["mppi", "mean"].fill_(0.1)
+    assert float(planner(td)["action"][0, 0]) == pytest.approx(0.1, abs=0.02)
+
+
+def test_a_cold_planner_takes_the_best_of_its_candidates(world):
+    planner = MPPI(world, temperature=1e-9, **SMALL)
+    candidates = {}
+    real = world.returns
+
+    def spy(state, plans, *task):
+        candidates["plans"], candidates["returns"] = plans, real(state, plans, *task)
+        return candidates["returns"]
+
+    world.returns = spy
+    found = plan(planner, situation())
+    best = candidates["plans"][candidates["returns"].argmax()]
+    torch.testing.assert_close(found, best)
+
+
+@pytest.mark.parametrize("lost", [0, 1, 16, 31, 32])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_returns_that_are_not_finite_are_ignored(world, lost, value):
+    planner, td = MPPI(world, **SMALL), situation(2)
+    real, seen = world.returns, {}
+
+    def faulty(state, plans, *task):
+        returns = real(state, plans, *task)
+        returns[1, :lost] = value
+        seen["plans"], seen["returns"] = plans, returns
+        return returns
+
+    world.returns = faulty
+    expected = plan(MPPI(PlanningEnv(world.dynamics, world.cost, *_bounds(world)), **SMALL), td)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = plan(planner, td)
+    assert planner.discarded == lost
+    assert found.isfinite().all()
+    torch.testing.assert_close(found[0], expected[0])  # the other mission notices nothing
+    told = [str(warning.message) for warning in caught if "no finite" in str(warning.message)]
+    if lost == 32:
+        assert told == ["planner: no finite return for 1 of 2 plans; the previous plan stands"]
+        mean = td["mppi", "mean"][1]
+        torch.testing.assert_close(found[1], torch.cat([mean[1:], mean[-1:]]))
+    else:
+        assert told == []
+        kept = seen["returns"][1, lost:]
+        weights = ((kept - kept.max()) / planner.temperature).exp()
+        blend = (weights / weights.sum()).view(-1, 1, 1) * seen["plans"][1, lost:]
+        torch.testing.assert_close(found[1], blend.sum(0))
+
+
+def _bounds(world):
+    return world.action_spec.space.low, world.action_spec.space.high
+
+
+@pytest.mark.parametrize("fault", [math.nan, math.inf, -math.inf, 1e30])
+def test_a_bad_observation_still_gives_a_sound_action(world, fault):
+    planner, td = MPPI(world, **SMALL), situation(3)
+    td["observation"][1] = fault
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        out = planner(td)
+    assert out["action"].isfinite().all()
+    assert all(world.action_spec.is_in(action) for action in out["action"])
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+def test_any_unit_of_the_cost_gives_a_sound_action(box, scale):
+    world = PlanningEnv(Dubins(), GoalDistance(weights=[scale, scale]), *box)
+    out = MPPI(world, **SMALL)(situation(4))
+    assert out["action"].isfinite().all()
+    assert all(world.action_spec.is_in(action) for action in out["action"])
+
+
+def test_a_missing_plan_is_told_once_and_taken_as_zero(world):
+    planner, td = MPPI(world, **SMALL), situation(2)
+    zero = td.clone()
+    zero["mppi", "mean"].zero_()
+    expected = plan(MPPI(world, **SMALL), zero)
+    del td["mppi"]
+    with pytest.warns(UserWarning, match="make_tensordict_primer"):
+        found = plan(planner, td)
+    torch.testing.assert_close(found, expected)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        planner(td.clone())
+
+
+def test_it_writes_what_it_says_where_it_is_told(world):
+    planner = MPPI(world, mean_key="plan", seed_key="seed", **SMALL)
+    assert planner.in_keys == ["observation", "goal", "plan", "seed"]
+    assert planner.out_keys == ["action", ("next", "plan")]
+    td = situation(2).rename_key_(("mppi", "mean"), "plan").set("seed", torch.zeros(2).long())
+    out = planner(td, tensordict_out=TensorDict({}, [2]))
+    assert set(out.keys(True, True)) == {"action", ("next", "plan")}
+    assert "action" not in td.keys()
+    other = MPPI(world, mean_key="plan", seed_key="seed", **SMALL)
+    torch.testing.assert_close(other.planning(td), out["action"])
+
+
+def test_no_gradient_is_kept(box, make_ensemble):
+    world = PlanningEnv(make_ensemble(), GoalDistance(), *box)
+    assert not MPPI(world, **SMALL)(situation(2))["action"].requires_grad
+
+
+@pytest.mark.parametrize("settings", [{}, {"beta": 1.0, "iterations": 2}, {"noise": "unit"}])
+def test_it_drives_to_the_goal(world, settings):
+    planner = MPPI(world, horizon=8, population=100, **settings)
+    start = TensorDict(
+        {
+            "observation": torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 3.0], [1.0, 1.0, -1.5]]),
+            "goal": torch.tensor([[2.0, 1.0], [2.0, 0.0], [-1.0, 0.0]]),
+        },
+        [3],
+    )
+    env = TransformedEnv(world, planner.make_tensordict_primer())
+    td = env.reset(start)
+    gaps = []
+    for _ in range(40):
+        td = env.step(planner(td))
+        gaps.append((td["next", "observation"][:, :2] - td["goal"]).norm(dim=-1))
+        td = step_mdp(td)
+    assert (torch.stack(gaps).amin(0) < 0.2).all()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"horizon": 0},
+        {"population": -3},
+        {"iterations": 1.5},
+        {"temperature": 0.0},
+        {"sigma": -0.1},
+        {"beta": 0.0},
+        {"beta": 1.1},
+        {"noise": "pink"},
+        {"past": "future"},
+        {"backend": "slow"},
+    ],
+    ids=str,
+)
+def test_impossible_settings_are_refused(world, settings):
+    with pytest.raises(ConfigurationError, match=f"planner.{next(iter(settings))}"):
+        MPPI(world, **settings)

@@ -1,0 +1,88 @@
+"""The world as the planner imagines it."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
+from afm_rl.planning import GoalDistance, PlanningEnv
+
+
+@pytest.fixture
+def world(box):
+    return PlanningEnv(Dubins(), GoalDistance(), *box)
+
+
+def test_specs_hold(world, make_ensemble, box):
+    check_env_specs(world)
+    check_env_specs(PlanningEnv(make_ensemble(), GoalDistance([0, 1, 2]), *box))
+
+
+def test_keys_may_be_nested(box):
+    cost = GoalDistance(in_keys=[["task", "goal"]])
+    env = PlanningEnv(Dubins(), cost, *box, ["robot", "pose"], ["robot", "action"])
+    check_env_specs(env)
+    assert env.rollout(3)["next", "robot", "pose"].shape == (3, 3)
+
+
+def test_a_step_is_a_model_step_and_the_reward_its_negative_cost(world):
+    state, goal = torch.randn(4, 6, 3), torch.randn(4, 6, 2)
+    td = TensorDict({"observation": state, "goal": goal}, [4, 6])
+    td = world.reset(td)
+    torch.testing.assert_close(td["observation"], state)
+    td["action"] = torch.rand(4, 6, 2)
+    after = world.step(td)["next"]
+    moved = Dubins()(state, td["action"])
+    torch.testing.assert_close(after["observation"], moved)
+    torch.testing.assert_close(after["reward"][..., 0], -(moved[..., :2] - goal).norm(dim=-1))
+    assert torch.equal(after["goal"], goal) and not after["done"].any()
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_returns_equal_a_rollout_step_by_step(world, transitions, batch):
+    state, goal = transitions(*batch)[0], torch.randn(*batch, 2)
+    plans = torch.rand(*batch, 5, 4, 2)
+    found = world.returns(state, plans, goal)
+    assert found.shape == (*batch, 5)
+    size = (*batch, 5)
+    start = {"observation": state.unsqueeze(-2), "goal": goal.unsqueeze(-2)}
+    start = {key: value.expand(*size, -1) for key, value in start.items()}
+    td, total = world.reset(TensorDict(start, size)), torch.zeros(size)
+    for step in range(4):
+        td["action"] = plans[..., step, :]
+        td = world.step(td)
+        total += td["next", "reward"].squeeze(-1)
+        td = world.step_mdp(td)
+    torch.testing.assert_close(found, total)
+
+
+def test_the_model_is_shared(box, make_ensemble):
+    model = make_ensemble()
+    assert PlanningEnv(model, GoalDistance(), *box).dynamics is model
+
+
+def test_whole_numbers_bound_real_actions():
+    env = PlanningEnv(Dubins(), GoalDistance(), [-1, -2], [1, 2])
+    drawn = env.action_spec.rand()
+    assert drawn.dtype is torch.float32 and env.action_spec.space.high.tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ([-1.0], [1.0]),
+        ([-1.0, -1.0], [1.0]),
+        ([1.0, -1.0], [-1.0, 1.0]),
+        ([-1.0, 1.0], [1.0, 1.0]),
+        ([math.nan, -1.0], [1.0, 1.0]),
+        ([-math.inf, -1.0], [1.0, 1.0]),
+    ],
+    ids=str,
+)
+def test_impossible_boxes_are_refused(low, high):
+    with pytest.raises(ConfigurationError, match="action bounds .* expected 2 finite numbers"):
+        PlanningEnv(Dubins(), GoalDistance(), low, high)

@@ -1,0 +1,125 @@
+"""Gains on the action axes."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.regimes import ActionGain
+from afm_rl.regimes.base import Regime
+
+STATE = torch.zeros(3)
+SMALL = st.floats(-3, 3)
+
+
+def test_a_gain_multiplies_its_axis(gains):
+    row = gains.encode({"omega_gain": -0.5})
+    effect = gains.apply(torch.tensor([[0.4, 1.0], [-1.0, 0.2]]), row, torch.zeros(2, 3))
+    torch.testing.assert_close(effect, torch.tensor([[0.4, -0.5], [-1.0, -0.1]]))
+
+
+def test_the_nominal_regime_is_recognised(gains):
+    rows = torch.stack([gains.encode({}), gains.encode({"v_gain": 1.1})])
+    assert gains.is_identity(rows).tolist() == [True, False]
+    assert gains.is_identity(rows.double()).tolist() == [True, False]
+    action = torch.tensor([0.3, -0.7])
+    assert torch.equal(gains.apply(action, rows[0], STATE), action)
+
+
+@given(SMALL, SMALL, SMALL, SMALL)
+def test_the_inverse_undoes_the_gain_or_saturates(v, omega, first, second):
+    gains = ActionGain(["v_gain", "omega_gain"])
+    low, high = torch.tensor([-1.0, -1.5]).double(), torch.tensor([0.5, 1.5]).double()
+    row = torch.tensor([first, second], dtype=torch.float64)
+    wanted = torch.tensor([v, omega], dtype=torch.float64)
+    found = gains.inverse(wanted, row, STATE, low, high)
+    assert found.isfinite().all() and (found >= low).all() and (found <= high).all()
+    for k in range(2):  # no other action of the box comes nearer
+        rival = torch.linspace(float(low[k]), float(high[k]), 101, dtype=torch.float64)
+        miss = abs(float(row[k] * found[k] - wanted[k]))
+        assert miss <= float((row[k] * rival - wanted[k]).abs().min()) + 1e-9
+
+
+def test_a_dead_axis_is_left_alone(gains):
+    row = gains.encode({"v_gain": 0.0})
+    low, high = torch.full((2,), -1.0), torch.ones(2)
+    found = gains.inverse(torch.tensor([0.5, 0.5]), row, STATE, low, high)
+    assert found.tolist() == [0.0, 0.5]
+
+
+def test_the_generic_search_agrees_with_the_closed_form(gains):
+    low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+    wanted = low + (high - low) * torch.rand(200, 2, generator=torch.Generator().manual_seed(0))
+    rows = gains.sample((200,), torch.Generator().manual_seed(1))
+    states = torch.zeros(200, 3)
+    exact = gains.inverse(wanted, rows, states, low, high)
+    before = torch.get_rng_state()
+    found = Regime.inverse(gains, wanted, rows, states, low, high)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert (found >= low).all() and (found <= high).all()
+    torch.testing.assert_close(rows * found, rows * exact, rtol=0, atol=1e-2)
+
+
+def test_the_prior_covers_what_it_says():
+    family = ActionGain(["a", "b"], low=0.1, high=2.0, nominal=0.25)
+    drawn = family.sample((4000, 5), torch.Generator().manual_seed(0))
+    assert drawn.shape == (4000, 5, 2)
+    nominal = drawn == 1.0
+    assert float(nominal.float().mean()) == pytest.approx(0.25, abs=0.01)
+    changed = drawn[~nominal]
+    assert changed.abs().min() >= 0.1 and changed.abs().max() <= 2.0 * (1 + 1e-6)
+    assert float((changed < 0).float().mean()) == pytest.approx(0.5, abs=0.01)
+    middle = math.sqrt(0.1 * 2.0)  # log-uniform: half of the gains are below
+    assert float((changed.abs() < middle).float().mean()) == pytest.approx(0.5, abs=0.01)
+
+
+def test_axes_are_drawn_independently(gains):
+    drawn = gains.sample((20_000,), torch.Generator().manual_seed(0))
+    assert abs(float(torch.corrcoef(drawn.T)[0, 1])) < 0.02
+
+
+def test_a_narrow_prior_is_a_point():
+    family = ActionGain(["a"], low=2.0, high=2.0, nominal=0.0)
+    drawn = family.sample((100,), torch.Generator().manual_seed(0))
+    torch.testing.assert_close(drawn.abs(), torch.full((100, 1), 2.0))
+
+
+def test_the_generator_decides_the_draw(gains):
+    drawn = [gains.sample((5,), torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
+    torch.manual_seed(3)
+    first = gains.sample((5,))
+    torch.manual_seed(3)
+    assert torch.equal(gains.sample((5,)), first)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, True, "2", None])
+def test_only_finite_numbers_are_encoded(gains, value):
+    with pytest.raises(ConfigurationError, match="v_gain=.*finite"):
+        gains.encode({"v_gain": value})
+
+
+def test_an_unknown_parameter_lists_the_known_ones(gains):
+    with pytest.raises(ConfigurationError, match="'v'; allowed: v_gain, omega_gain"):
+        gains.encode({"v": 1.0})
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"names": []},
+        {"names": ["a", "a"]},
+        {"low": 0.0},
+        {"low": 3.5},
+        {"high": math.inf},
+        {"nominal": 1.5},
+        {"nominal": -0.1},
+    ],
+    ids=str,
+)
+def test_impossible_priors_are_refused(settings):
+    with pytest.raises(ConfigurationError, match=next(iter(settings))):
+        ActionGain(**{"names": ["a"], **settings})

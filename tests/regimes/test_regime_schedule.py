@@ -1,0 +1,67 @@
+"""When regimes change."""
+
+import math
+
+import pytest
+import torch
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.regimes import Schedule, phase_parameters
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("at", [0.15, 0.3, 0.5, 0.7, 0.8])
+def test_a_phase_begins_beyond_its_breakpoint(at, dtype):
+    exact = torch.tensor(at, dtype=dtype)
+    progress = torch.stack([exact - 1e-6, exact, exact + 1e-6])
+    assert Schedule([at]).phase(progress, torch.zeros(3)).tolist() == [0, 0, 1]
+
+
+def test_the_default_is_the_published_schedule():
+    schedule = Schedule()
+    assert schedule.phases == 3 and schedule.at == (0.15, 0.80)
+    progress = torch.tensor([[0.0, 0.15, 0.2], [0.8, 0.81, 1.0]])
+    assert schedule.phase(progress, torch.zeros(2, 3)).tolist() == [[0, 0, 1], [1, 2, 2]]
+
+
+def test_a_schedule_by_steps_ignores_progress():
+    schedule = Schedule([2, 5], by="step")
+    steps = torch.arange(8)
+    assert schedule.phase(torch.rand(8), steps).tolist() == [0, 0, 0, 1, 1, 1, 2, 2]
+
+
+def test_without_breakpoints_there_is_one_phase():
+    schedule = Schedule([])
+    assert schedule.phases == 1
+    assert schedule.phase(torch.rand(4), torch.arange(4)).tolist() == [0] * 4
+
+
+def test_missions_may_have_breakpoints_of_their_own():
+    at = torch.tensor([[0.1, 0.2], [0.5, math.inf]])
+    progress = torch.tensor([0.4, 0.9])
+    assert Schedule().phase(progress, torch.zeros(2), at).tolist() == [2, 1]
+
+
+def test_each_mission_gets_the_row_of_its_phase():
+    rows = torch.arange(24.0).reshape(2, 3, 4)
+    picked = phase_parameters(rows, torch.tensor([2, 0]))
+    assert torch.equal(picked, torch.stack([rows[0, 2], rows[1, 0]]))
+    assert torch.equal(phase_parameters(rows[0], torch.tensor(1)), rows[0, 1])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"at": [0.8, 0.15]},
+        {"at": [1.5]},
+        {"at": [-0.1]},
+        {"at": [math.nan]},
+        {"at": [math.inf], "by": "step"},
+        {"at": ["0.5"]},
+        {"by": "steps"},
+    ],
+    ids=str,
+)
+def test_impossible_schedules_are_refused(settings):
+    with pytest.raises(ConfigurationError, match="schedule"):
+        Schedule(**settings)

@@ -1,0 +1,23 @@
+"""Points drawn uniformly in a box."""
+
+import torch
+
+from afm_rl.sampling import uniform
+
+
+def test_points_fill_their_box_evenly():
+    low, high = torch.tensor([-1.0, 5.0]), torch.tensor([3.0, 5.5])
+    points = uniform(low, high, 20_000, torch.Generator().manual_seed(0))
+    assert points.shape == (20_000, 2)
+    assert (points >= low).all() and (points <= high).all()
+    torch.testing.assert_close(points.mean(0), (low + high) / 2, rtol=0, atol=0.03)
+    torch.testing.assert_close(points.std(0), (high - low) / 12**0.5, rtol=0.02, atol=0)
+
+
+def test_the_generator_alone_decides():
+    low, high = torch.zeros(1), torch.ones(1)
+    drawn = []
+    for seed in (3, 3, 4):
+        torch.rand(seed)  # must not matter
+        drawn.append(uniform(low, high, 50, torch.Generator().manual_seed(seed)))
+    assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])

@@ -1,0 +1,95 @@
+"""Random numbers of a mission do not depend on its company."""
+
+import math
+
+import pytest
+import torch
+
+from afm_rl.streams import Streams
+
+
+def test_a_seed_gets_the_same_numbers_alone_as_in_any_batch():
+    alone, batched = Streams(salt=1), Streams(salt=1)
+    for seeds in ([7, 8, 9, 7], [9, 7], [5, 7]):  # missions come and go; 7 stays
+        expected = alone.normal((4, 2), seeds=torch.tensor([7]))[0]
+        together = batched.normal((4, 2), seeds=torch.tensor(seeds))
+        assert together.shape == (len(seeds), 4, 2)
+        for row in [i for i, seed in enumerate(seeds) if seed == 7]:
+            assert torch.equal(together[row], expected)
+
+
+def test_any_batch_shape_of_seeds_is_served():
+    shapes = [(), (3,), (2, 3), (0,)]
+    for shape in shapes:
+        seeds = torch.arange(math.prod(shape)).reshape(shape)
+        assert Streams().normal((5,), seeds=seeds).shape == (*shape, 5)
+
+
+def test_seeds_salts_and_calls_differ():
+    seeds = torch.tensor([1, 2])
+    one, other = Streams(salt=1), Streams(salt=2)
+    first, second, salted = one.normal((9,), seeds=seeds), one.normal((9,), seeds=seeds), None
+    salted = other.normal((9,), seeds=seeds)
+    rows = [*first, *second, *salted]
+    for i, left in enumerate(rows):
+        for right in rows[:i]:
+            assert not torch.equal(left, right)
+
+
+def test_without_seeds_the_batch_draws_from_the_default_stream():
+    streams = Streams(seed=4)
+    drawn = streams.normal((2,), batch=(3,))
+    assert drawn.shape == (3, 2) and len(drawn.unique()) == 6
+    streams.manual_seed(4)
+    assert torch.equal(streams.normal((2,), batch=(3,)), drawn)
+    streams.manual_seed(5)
+    assert not torch.equal(streams.normal((2,), batch=(3,)), drawn)
+
+
+def test_truncated_numbers_stay_in_bounds_and_have_the_right_moments():
+    drawn = Streams().normal((200_000,), bound=2.0)
+    assert drawn.abs().max() <= 2.0
+    density = math.exp(-2.0) / math.sqrt(2 * math.pi)
+    variance = 1 - 4 * density / math.erf(math.sqrt(2))
+    assert abs(float(drawn.mean())) < 0.01
+    assert float(drawn.var()) == pytest.approx(variance, rel=0.01)
+
+
+def test_a_wide_bound_changes_nothing_of_note():
+    drawn = Streams().normal((100_000,), bound=50.0)  # beyond what float32 can tell from 1
+    assert drawn.isfinite().all()
+    assert float(drawn.var()) == pytest.approx(1, rel=0.02)
+
+
+def test_untruncated_numbers_are_standard_normal():
+    drawn = Streams().normal((100_000,), dtype=torch.float64)
+    assert drawn.dtype is torch.float64
+    assert float(drawn.mean()) == pytest.approx(0, abs=0.01)
+    assert float((drawn**4).mean()) == pytest.approx(3, rel=0.05)
+
+
+def test_the_global_generator_is_not_touched():
+    before = torch.get_rng_state()
+    streams = Streams()
+    streams.normal((5,), seeds=torch.tensor([1, 2]), bound=2.0)
+    streams.normal((5,), batch=(2,))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_streams_continue_from_their_saved_state():
+    seeds = torch.tensor([3, 1])
+    streams = Streams(salt=2, seed=6)
+    streams.normal((4,), seeds=seeds), streams.normal((4,))
+    state = {key: value.clone() for key, value in streams.state_dict().items()}
+    expected = streams.normal((4,), seeds=seeds), streams.normal((4,))
+    other = Streams(salt=2)  # made with another seed; another stream has been begun
+    other.normal((4,), seeds=torch.tensor([99]))
+    other.load_state_dict(state)
+    resumed = other.normal((4,), seeds=seeds), other.normal((4,))
+    assert torch.equal(resumed[0], expected[0]) and torch.equal(resumed[1], expected[1])
+    assert other.seed == 6
+
+
+@pytest.mark.parametrize("seed", [0, 1, -1, 2**40, 2**62])
+def test_any_whole_number_is_a_seed(seed):
+    assert Streams(seed=seed).normal((3,)).isfinite().all()
