@@ -96,7 +96,7 @@ def trained_error(_trained_ensemble):
 def _trained_flow():
     flow = ContextFlow(LOW, HIGH, window=4, hidden=[48, 48], latent=24)
     prior = ActionGain(["v_gain", "omega_gain"], low=0.5, high=2.0)
-    error = train_flow(flow, Dubins(), prior, STATES, iterations=1200, batch_size=256, lr=5e-3)
+    error = train_flow(flow, Dubins(), prior, STATES, iterations=300, batch_size=256, lr=5e-3)
     return flow, error
 
 

@@ -76,7 +76,10 @@ def build(cfg: DictConfig) -> Agent:
     missions = build_missions(env, tracks, regimes, seeds)
 
     def make(group: str, *args: Any) -> Any:
-        return instantiate(cfg[group], _convert_="all")(*args)
+        try:
+            return instantiate(cfg[group], _convert_="all")(*args)
+        except TypeError as error:  # a setting that the part does not have
+            raise ConfigurationError(f"{group}: {error}") from error
 
     dynamics = make("dynamics", robot)
     base = dynamics.module

@@ -236,6 +236,7 @@ class MPPI(MPCPlannerBase):
             auto_reset=False,
             tensordict=start,
             break_when_any_done=False,
+            trust_policy=True,  # it takes the tensordict itself
         )
         rewards = _mask_post_done_reward(rollout, done_key=_planning_done_keys(self.env))
         return rewards.sum((-2, -1))

@@ -45,7 +45,7 @@ def draw_comparison(missions: pd.DataFrame) -> Figure:
     names = [style.literal(f"{row.method} (n = {row.missions})") for row in means.itertuples()]
     panels[0].set_yticks(range(len(means)), names, fontsize=style.NORMAL)
     panels[0].set_ylim(len(means) - 0.5, -0.5)
-    style.footnote(figure, ["mean with 95 % bootstrap interval; small dots are single missions"])
+    style.footnote(figure, "mean with 95 % bootstrap interval; small dots are single missions")
     return figure
 
 

@@ -71,21 +71,16 @@ def mark_regime(axes: Axes, steps: pd.DataFrame, look: Style, alone: bool) -> No
         look: how its method is drawn.
         alone: no other method is in these axes, so there is room to shade the stretch.
     """
-    starts, ends = regime_changes(steps)
-    for places, marker in ((starts, STARTS), (ends, ENDS)):
-        for place in places:
-            line = axes.axvline(place, color=look.color, linestyle=look.linestyle, gid="change")
-            line.set(linewidth=1.0, zorder=1)
-            if place <= axes.get_xlim()[1]:
-                _mark_top(axes, place, marker, look.color)
+    changes, limit = regime_changes(steps), axes.get_xlim()[1]
+    top = axes.get_xaxis_transform()  # steps across, 0 to 1 upwards
+    for places, marker in zip(changes, (STARTS, ENDS), strict=True):
+        seen = [place for place in places if place <= limit]
+        if seen:
+            lines = axes.vlines(seen, 0, 1, color=look.color, linewidth=1.0, transform=top)
+            lines.set(linestyle=look.linestyle, zorder=1, gid="change")
+            (marks,) = axes.plot(seen, [1.0] * len(seen), marker, color=look.color, transform=top)
+            marks.set(markersize=6, clip_on=False, gid="change")
     if alone:
         last = int(steps["t"].iloc[-1])
-        for start, end in zip(starts, [*ends, last], strict=False):
+        for start, end in zip(changes[0], [*changes[1], last], strict=False):
             axes.axvspan(start, end, color=BAND, alpha=0.2, linewidth=0, zorder=0.5, gid="band")
-
-
-def _mark_top(axes: Axes, place: int, marker: str, color: str) -> None:
-    """Put a marker on the upper edge of the axes."""
-    transform = axes.get_xaxis_transform()
-    (mark,) = axes.plot([place], [1.0], marker=marker, color=color, transform=transform)
-    mark.set(markersize=6, clip_on=False, gid="marker")

@@ -72,6 +72,12 @@ def first_missions(missions: pd.DataFrame) -> pd.DataFrame:
     return named.drop_duplicates(["method", "cell"])
 
 
+def left_out(missions: pd.DataFrame, shown: pd.DataFrame) -> str:
+    """Say how many missions a figure does not show; nothing if it shows all."""
+    missing = len(missions) - len(shown)
+    return f"{missing} of {len(missions)} missions not shown" if missing else ""
+
+
 def steps_of(steps: pd.DataFrame, missions: Iterable[int]) -> dict[int, pd.DataFrame]:
     """Return the steps of some missions, by mission.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from textwrap import wrap
 
 import numpy as np
 import pandas as pd
@@ -11,11 +12,12 @@ from matplotlib.lines import Line2D
 
 from afm_rl.report import style
 from afm_rl.report.curve import ENDS, STARTS, draw_curve, mark_regime
-from afm_rl.report.frames import first_missions, steps_of
+from afm_rl.report.frames import first_missions, left_out, steps_of
 
 CELLS = 4
 BEYOND = 1.15  # of the longest mission that finished: how far the axis of steps goes
 LINEAR = 10.0  # losses up to here, of either sign, are drawn to a linear scale
+LETTERS = 55  # that a line under one column has room for
 ROWS = {"error": "prediction error\nper step (m, rad)", "loss": "model loss\n(NLL)"}
 
 
@@ -47,8 +49,7 @@ def draw_learning(missions: pd.DataFrame, steps: pd.DataFrame) -> Figure:
                 mark_regime(panel, curves[row.mission], styles[row.method], len(rows) == 1)
     _dress(grid, pd.concat(curves.values()))
     _legend(figure, styles)
-    left_out = len(missions) - len(shown)
-    style.footnote(figure, [f"{left_out} of {len(missions)} missions not shown"] * (left_out > 0))
+    style.footnote(figure, left_out(missions, shown))
     return figure
 
 
@@ -78,7 +79,7 @@ def _step_label(missions: pd.DataFrame) -> str:
     beyond = missions[missions["steps"] > last_step(missions)]
     for step, rows in beyond.groupby("steps"):
         go = "goes" if len(rows) == 1 else "go"
-        lines.append(f"{', '.join(rows['method'])} {go} on to step {step}")
+        lines += wrap(f"{', '.join(rows['method'])} {go} on to step {step}", LETTERS)
     return style.literal("\n".join(lines))
 
 

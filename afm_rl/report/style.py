@@ -65,12 +65,15 @@ def dress(axes: Axes) -> None:
 def legend_above(
     figure: Figure, handles: Sequence[Any], labels: Sequence[str], title: str | None = None
 ) -> None:
-    """Explain the lines above all axes."""
+    """Explain the lines above all axes, in one row if they fit into it."""
+    room = [0.48 + 0.062 * len(label) for label in labels]  # inches, at the small font size
+    width = figure.get_figwidth()
+    columns = len(labels) if sum(room) <= width else max(1, int(width / max(room)))
     figure.legend(
         handles,
         [literal(label) for label in labels],
         loc="outside upper center",
-        ncols=min(len(labels), 6),
+        ncols=columns,
         title=title,
         title_fontsize=LARGE,
         fontsize=SMALL,
@@ -80,9 +83,8 @@ def legend_above(
     )
 
 
-def footnote(figure: Figure, notes: Iterable[str]) -> None:
-    """Write what a reader of the figure must know at its foot."""
-    text = "; ".join(note for note in notes if note)
+def footnote(figure: Figure, text: str) -> None:
+    """Write at the foot of the figure what a reader must know of it, if anything."""
     if text:
         figure.supxlabel(literal(text), fontsize=SMALL, color="#555555")
 

@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from afm_rl.report import style
-from afm_rl.report.frames import first_missions, steps_of
+from afm_rl.report.frames import first_missions, left_out, steps_of
 from afm_rl.report.path import draw_path, legend_handles, positions
 from afm_rl.report.road import Box, DrawableTrack, draw_road, view
 
 PANELS = 12
-WIDE, TALL = 9.9, 3.4  # inches: all maps side by side, one map
+WIDE, TALL, NARROW = 9.9, 3.4, 1.9  # inches: all maps side by side; one map: at most, at least
 TITLES, ENDS, SIDE = 0.45, 0.75, 0.5  # inches: titles of a row; legend and footnote; labels
 
 
@@ -51,8 +51,7 @@ def draw_trajectories(
         _title(axes, mission)
     title = style.literal(cells[0]) if len(cells) == 1 else None
     style.legend_above(figure, *legend_handles(), title)
-    left_out = len(missions) - len(shown)
-    style.footnote(figure, [f"{left_out} of {len(missions)} missions not shown"] * (left_out > 0))
+    style.footnote(figure, left_out(missions, shown))
     return figure
 
 
@@ -60,7 +59,7 @@ def _maps(
     methods: Sequence[str], cells: Sequence[str], views: Mapping[str, Box]
 ) -> tuple[Figure, dict[tuple[str, str], Axes]]:
     """Return a figure with axes by cell and method; those of a row show the same area."""
-    width = min(WIDE / len(methods), 1.5 * TALL)
+    width = max(NARROW, min(WIDE / len(methods), 1.5 * TALL))
     ratios = [
         (views[cell].top - views[cell].bottom) / (views[cell].right - views[cell].left)
         for cell in cells

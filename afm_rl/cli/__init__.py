@@ -1,0 +1,40 @@
+"""The command line."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import hydra
+from omegaconf import DictConfig
+
+from afm_rl.cli.mistakes import explain
+
+
+@hydra.main(version_base="1.3", config_path="pkg://afm_rl.conf", config_name="config")
+def _run(cfg: DictConfig) -> None:
+    from afm_rl.cli.launch import launch  # torch takes seconds: `--help` need not wait for it
+
+    with _explained():  # here, so that Hydra does not report the error once more
+        launch(cfg)
+
+
+@contextmanager
+def _explained() -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        message = explain(error)
+        if message is None:
+            raise
+        print(f"afm-rl: {message}", file=sys.stderr)
+        sys.exit(2)
+
+
+def main() -> None:
+    """Run ``afm-rl``; a mistake in the settings ends in one line and exit status 2."""
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # hand errors to us instead of printing them
+    with _explained():
+        _run()

@@ -1,0 +1,92 @@
+"""Planning step against its bare matrix products, and what the parts around it cost.
+
+    python benchmarks/bench_planner.py
+
+One mission, 1000 candidates, horizon 5, ensemble of 5 x (200, 200, 200), float32, one thread.
+Everything is timed in turns within one run, so the ratios hold when the machine's speed drifts.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from statistics import median
+
+import torch
+from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
+
+from afm_rl.dynamics import Ensemble
+from afm_rl.flow import ContextFlow
+from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater
+from afm_rl.manifold import Manifold
+from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+from afm_rl.transforms import ActionFlowTransform
+
+POPULATION, HORIZON, HIDDEN, ROUNDS = 1000, 5, (200, 200, 200), 40
+
+
+def timed(jobs: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
+    """Run every job once per round; return milliseconds."""
+    spent: dict[str, list[float]] = {name: [] for name in jobs}
+    for turn in range(rounds + 3):
+        for name, job in jobs.items():
+            start = time.perf_counter()
+            job()
+            if turn >= 3:  # the first rounds warm up
+                spent[name].append(1e3 * (time.perf_counter() - start))
+    return spent
+
+
+def main() -> None:
+    """Print a table."""
+    torch.set_num_threads(1)
+    low, high = torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57])
+    model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], hidden=HIDDEN)
+    world = PlanningEnv(model, GoalDistance(), low, high)
+    planner = MPPI(world, horizon=HORIZON, population=POPULATION)
+    env = TransformedEnv(world, planner.make_tensordict_primer())
+    td = env.reset().set("goal", torch.ones(2))
+    afm = TransformedEnv(
+        PlanningEnv(model, GoalDistance(), low, high),
+        ActionFlowTransform(model, ContextFlow(low, high)),
+    )
+    afm_td = afm.reset().set("action", torch.ones(2))
+    plain_td = world.reset().set("action", torch.ones(2))
+    learner = Ensemble(Manifold(3, angles=[2]), 2, features=[2], hidden=HIDDEN)
+    updater = OnlineUpdater(GaussianNLLLoss(learner), FreshAdam)
+    transition = TensorDict({"observation": torch.zeros(3), "action": torch.ones(2)})
+    transition["next", "observation"] = torch.ones(3)
+    weights = [weight.detach() for weight in model.weights]
+    weights[-1] = weights[-1][..., :3].contiguous()  # the planner needs the means only
+    rows = torch.randn(5, POPULATION, 3)
+
+    @torch.no_grad()
+    def products() -> None:
+        for _ in range(HORIZON):
+            hidden = rows
+            for weight in weights:
+                hidden = torch.bmm(hidden, weight)
+
+    spent = timed(
+        {
+            "matrix products": products,
+            "planning step": lambda: planner(td.clone()),
+            "environment step": lambda: world.step(plain_td.clone()),
+            "environment step with AFM": lambda: afm.step(afm_td.clone()),
+            "online update": lambda: updater(transition),
+        },
+        ROUNDS,
+    )
+    bare = median(spent["matrix products"])
+    print(f"{'':28}{'ms (median)':>14}{'/ products':>12}")
+    for name, values in spent.items():
+        print(f"{name:28}{median(values):14.2f}{median(values) / bare:12.3f}")
+    pairs = zip(spent["planning step"], spent["matrix products"], strict=True)
+    print(f"planning step / matrix products, round by round: {median(a / b for a, b in pairs):.3f}")
+    extra = median(spent["environment step with AFM"]) - median(spent["environment step"])
+    print(f"AFM adds {extra:.2f} ms, {extra / median(spent['planning step']):.1%} of a plan")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,182 @@
+"""Conditional flow matching: loss and training."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
+from afm_rl.flow import CFMLoss, ContextFlow, Examples, train_flow
+from afm_rl.flow.cfm import held_out_error
+
+TINY = {"window": 3, "hidden": [8], "latent": 4}
+
+
+class Exact(ContextFlow):
+    """Knows the right answer: it is in the context, in half ranges."""
+
+    def forward(self, features, planned, tau, point):
+        return (features - point) / (1 - tau)
+
+
+@pytest.fixture
+def examples(box):
+    low, high = box
+    planned, intended = (low + (high - low) * torch.rand(64, 2) for _ in range(2))
+    return {"planned": planned, "intended": intended}
+
+
+@pytest.fixture
+def train(states, gains, box):
+    def run(seed=0, **settings):
+        flow = ContextFlow(*box, **TINY)
+        settings = {"iterations": 6, "batch_size": 16, "seed": seed, **settings}
+        return flow, train_flow(flow, Dubins(), gains, states, **settings)
+
+    return run
+
+
+def same(left, right):
+    right = right.state_dict()
+    return all(torch.equal(value, right[name]) for name, value in left.state_dict().items())
+
+
+def test_the_exact_velocity_costs_nothing(box, examples):
+    flow = Exact(*box, **TINY)
+    td = TensorDict({**examples, "features": flow.normalise(examples["intended"])}, [64])
+    loss = CFMLoss(flow)(td)["loss_cfm"]
+    assert float(loss) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_still_flow_pays_for_the_way(box, examples):
+    class Still(ContextFlow):
+        def forward(self, features, planned, tau, point):
+            return torch.zeros_like(point)
+
+    flow = Still(*box, source_std=0.0, **TINY)
+    td = TensorDict({**examples, "features": torch.zeros(64, flow.feature_size)}, [64])
+    way = flow.normalise(examples["intended"]) - flow.normalise(examples["planned"])
+    each = CFMLoss(flow, reduction="none")(td)["loss_cfm"]
+    torch.testing.assert_close(each, way.square().mean(-1))
+    torch.testing.assert_close(CFMLoss(flow, reduction="sum")(td)["loss_cfm"], each.sum())
+    torch.testing.assert_close(CFMLoss(flow)(td)["loss_cfm"], each.mean())
+
+
+def test_times_and_sources_are_drawn_as_they_should(box, examples):
+    drawn = {}
+
+    class Spy(ContextFlow):
+        def forward(self, features, planned, tau, point):
+            drawn.update(tau=tau, point=point)
+            return torch.zeros_like(point)
+
+    flow, many = Spy(*box, source_std=0.3, **TINY), 4000
+    planned = examples["planned"][:1].expand(many, -1)
+    td = TensorDict({"planned": planned, "intended": planned}, [many])
+    td["features"] = torch.zeros(many, flow.feature_size)
+    CFMLoss(flow)(td)
+    assert drawn["tau"].min() >= 0 and drawn["tau"].max() <= 1
+    assert float(drawn["tau"].mean()) == pytest.approx(0.5, abs=0.02)
+    noise = (drawn["point"] - flow.normalise(planned)) / (1 - drawn["tau"])
+    assert float(noise.std()) == pytest.approx(0.3, rel=0.05)
+
+
+def test_keys_can_be_chosen_and_entries_come_by_name(box, examples):
+    flow = ContextFlow(*box, **TINY)
+    features = torch.randn(64, flow.feature_size)
+    expected = CFMLoss(flow)(TensorDict({**examples, "features": features}, [64]))["loss_cfm"]
+    torch.testing.assert_close(CFMLoss(flow)(features=features, **examples), expected)
+    loss = CFMLoss(flow)
+    loss.set_keys(planned=("plan", "action"), features="context")
+    assert loss.in_keys == ["context", ("plan", "action"), "intended"]
+    td = TensorDict({"context": features, "intended": examples["intended"]}, [64])
+    td["plan", "action"] = examples["planned"]
+    torch.testing.assert_close(loss(td)["loss_cfm"], expected)
+    loss.in_keys = ["context"]
+    assert loss.in_keys == ["context"]
+    loss._forward_value_estimator_keys()  # torchrl calls this when keys change
+
+
+def test_the_flow_is_shared_and_learns_through_the_loss(box, examples):
+    flow = ContextFlow(*box, **TINY)
+    loss = CFMLoss(flow)
+    assert loss.flow is flow and not loss.functional
+    td = TensorDict({**examples, "features": torch.randn(64, flow.feature_size)}, [64])
+    loss(td)["loss_cfm"].backward()
+    assert all(parameter.grad.abs().sum() > 0 for parameter in flow.parameters())
+    with pytest.raises(ConfigurationError, match="loss.reduction"):
+        CFMLoss(flow, reduction="median")
+
+
+def test_training_helps(trained_flow, trained_flow_error, states, gains):
+    untrained = ContextFlow(trained_flow.centre - 1, trained_flow.centre + 1, window=4)
+    fresh = trained_flow.examples(Dubins(), gains, states, 2000, torch.Generator().manual_seed(9))
+    assert held_out_error(trained_flow, fresh) < 0.5 * held_out_error(untrained, fresh)
+    assert trained_flow_error < 0.4
+
+
+def test_the_held_out_error_is_in_half_ranges(box, examples):
+    class Idle(ContextFlow):
+        def correct(self, context, state, planned):
+            return planned, torch.zeros_like(planned)
+
+    flow = Idle(*box, **TINY)
+    features = torch.zeros(64, flow.feature_size)
+    given = Examples(features, examples["planned"], examples["intended"])
+    gap = (examples["planned"] - examples["intended"]) / flow.half_range
+    assert held_out_error(flow, given) == pytest.approx(float(gap.square().mean().sqrt()))
+
+
+@pytest.mark.parametrize("reuse", [1, 3])
+def test_the_seed_decides_everything_and_the_global_generator_nothing(train, reuse):
+    before = torch.get_rng_state()
+    first, error = train(reuse=reuse)
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.rand(5)
+    again, same_error = train(reuse=reuse)
+    other, _ = train(seed=1, reuse=reuse)
+    assert same(first, again) and error == same_error and not same(first, other)
+
+
+def test_examples_are_used_again_when_the_model_is_slow(box, states, gains):
+    class Counting(ContextFlow):
+        made = 0
+
+        def examples(self, model, regime, state_box, count, generator):
+            self.made += count
+            return super().examples(model, regime, state_box, count, generator)
+
+    made = []
+    for reuse in (1, 4):
+        flow = Counting(*box, **TINY)
+        settings = {"iterations": 20, "batch_size": 32, "reuse": reuse}
+        train_flow(flow, Dubins(), gains, states, **settings)
+        made.append(flow.made - 4096)  # the held-out ones
+    assert made == [32 * 21, 4 * 32 + 20 * 8]
+
+
+def test_the_model_is_not_changed_and_gradients_may_be_off(trained_ensemble, box, states, gains):
+    before = {name: value.clone() for name, value in trained_ensemble.state_dict().items()}
+    flow = ContextFlow(*box, **TINY)
+    start = {name: value.clone() for name, value in flow.state_dict().items()}
+    with torch.no_grad():
+        train_flow(flow, trained_ensemble, gains, states, iterations=2, batch_size=8)
+    after = trained_ensemble.state_dict()
+    assert all(torch.equal(after[name], before[name]) for name in before)
+    assert not all(torch.equal(value, start[name]) for name, value in flow.state_dict().items())
+
+
+def test_progress_can_be_shown(train, capsys):
+    quiet, _ = train()
+    assert capsys.readouterr().err == ""
+    shown, _ = train(progress=True)
+    assert "training the flow" in capsys.readouterr().err
+    assert same(quiet, shown)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"iterations": 0}, {"batch_size": 1}, {"reuse": 0}, {"lr": 0.0}], ids=str
+)
+def test_impossible_settings_are_refused(train, settings):
+    with pytest.raises(ConfigurationError, match=f"flow.train.{next(iter(settings))}"):
+        train(**settings)

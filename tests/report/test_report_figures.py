@@ -1,0 +1,320 @@
+"""What the figures show."""
+
+import io
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib import _pylab_helpers
+from matplotlib.colors import to_hex
+from matplotlib.image import imread
+from matplotlib.text import Text
+
+from afm_rl.report import draw_comparison, draw_learning, draw_trajectories
+from afm_rl.report.road import distance_to, resample, view
+from afm_rl.report.style import DPI, MARKERS, REGIME, method_styles, png_bytes
+
+
+def texts(figure):
+    return [text.get_text() for text in figure.findobj(Text) if text.get_text()]
+
+
+def titles(figure):
+    return [axes.get_title().strip() for axes in figure.axes]
+
+
+def pixels(figure):
+    return imread(io.BytesIO(png_bytes(figure)))
+
+
+ALL = {
+    "trajectory": lambda missions, steps, ring: draw_trajectories(missions, steps, [ring]),
+    "learning": lambda missions, steps, ring: draw_learning(missions, steps),
+    "comparison": lambda missions, steps, ring: draw_comparison(missions),
+}
+
+
+@pytest.fixture(params=ALL)
+def draw(request, ring):
+    return lambda missions, steps: ALL[request.param](missions, steps, ring)
+
+
+def test_pictures_have_the_size_of_print(draw, make_results):
+    figure = draw(*make_results(seeds=2))
+    width, height = np.array(figure.get_size_inches()) * DPI
+    assert pixels(figure).shape[:2] == (int(height), int(width))
+    assert DPI == 150
+
+
+def test_letters_are_large_enough_to_read(draw, make_results):
+    figure = draw(*make_results(seeds=2, v_gains=[-1.0, 2.0]))
+    png_bytes(figure)  # labels of ticks come about here
+    assert min(text.get_fontsize() for text in figure.findobj(Text)) >= 8
+
+
+def test_nothing_is_cut_off_or_left_to_warnings(draw, make_results):
+    with matplotlib.rc_context(), pytest.warns(None) if False else _no_warnings():
+        image = pixels(draw(*make_results(seeds=2)))
+    edge = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+    assert (edge == 1).all()  # white all round
+
+
+def _no_warnings():
+    import warnings
+
+    context = warnings.catch_warnings(action="error")
+    return context
+
+
+def test_no_figure_stays_in_global_memory(draw, make_results):
+    png_bytes(draw(*make_results(seeds=2)))
+    assert not _pylab_helpers.Gcf.figs
+
+
+def test_names_are_no_formulas(draw, make_results):
+    missions, steps = make_results(["oracle"], seeds=2)
+    figure = draw(missions.assign(method="$x_{$ y", track="_$\\frac$"), steps)
+    png_bytes(figure)
+
+
+def test_a_picture_is_the_same_each_time(draw, make_results):
+    assert png_bytes(draw(*make_results(seeds=2))) == png_bytes(draw(*make_results(seeds=2)))
+
+
+def test_methods_differ_without_colour():
+    styles = method_styles(f"m{k}" for k in range(14)).values()
+    assert len({style[1:] for style in styles}) == len(styles)
+    assert len({style.color for style in styles}) == len(MARKERS)
+
+
+# Trajectories
+
+
+def test_one_map_per_method_and_cell(make_results, ring):
+    figure = draw_trajectories(*make_results(v_gains=[-1.0, 2.0], seeds=2), [ring])
+    assert titles(figure) == ["physics", "adaptive", "oracle"] * 2
+    assert "6 of 12 missions not shown" in texts(figure)
+    assert any("v_gain = 2\n" in text for text in texts(figure))
+
+
+def test_twelve_maps_at_most(make_results, ring):
+    figure = draw_trajectories(*make_results(v_gains=range(1, 8)), [ring])
+    assert len(figure.axes) == 12
+    assert "9 of 21 missions not shown" in texts(figure)
+
+
+def test_a_map_says_how_the_mission_fared(make_results, ring):
+    shown = texts(draw_trajectories(*make_results(), [ring]))
+    for text in ("2/8 targets, 399 steps", "8/8 targets, 119 steps", "8/8 targets, 99 steps"):
+        assert text in shown
+    assert "ring, v_gain = -1, omega_gain = 1" in shown
+    assert not any("not shown" in text for text in shown)
+
+
+def test_the_changed_stretch_is_coloured_and_shaded(make_results, ring, artists):
+    missions, steps = make_results(["oracle"])
+    (axes,) = draw_trajectories(missions, steps, [ring]).axes
+    (changed,), (band,) = artists(axes, "changed"), artists(axes, "band")
+    active = steps["regime_active"].to_numpy(dtype=bool)
+    expected = active | np.roll(active, 1)  # a move has two ends
+    for line in (changed, band):
+        assert (np.isfinite(line.get_xdata()) == expected).all()
+        np.testing.assert_array_equal(line.get_xdata()[expected], steps["x"][expected])
+    assert to_hex(changed.get_color()) == REGIME
+    assert band.get_linewidth() > 4 * changed.get_linewidth()
+    (whole,) = artists(axes, "nominal")
+    np.testing.assert_array_equal(whole.get_xydata(), steps[["x", "y"]])
+
+
+def test_the_road_is_as_wide_as_the_track_says(make_results, ring, artists):
+    (axes,) = draw_trajectories(*make_results(["oracle"]), [ring]).axes
+    (road,) = artists(axes, "road")
+    np.testing.assert_allclose(road.get_widths(), ring.width)
+    np.testing.assert_allclose(np.hypot(*road.get_offsets().T), 4.0, rtol=1e-3)
+    (dots,) = artists(axes, "waypoints")
+    assert len(dots.get_xdata()) == len(ring.waypoints)
+    assert axes.get_aspect() == 1
+
+
+def test_marks_say_how_it_began_and_ended(make_results, ring, artists):
+    missions, steps = make_results()
+    lost, _, done = draw_trajectories(missions, steps, [ring]).axes
+    for axes in (lost, done):
+        (start,) = artists(axes, "start")
+        np.testing.assert_allclose(start.get_xydata(), [[4.0, 0.0]], atol=1e-9)
+    assert len(artists(lost, "given up")) == len(artists(done, "finished")) == 1
+    assert not artists(lost, "finished") + artists(done, "given up")
+    (end,) = artists(done, "finished")
+    np.testing.assert_array_equal(end.get_xydata()[0], steps[["x", "y"]].iloc[-1])
+
+
+def test_who_goes_astray_does_not_shrink_the_map(make_results, ring, artists):
+    missions, steps = make_results()
+    axes = draw_trajectories(missions, steps, [ring]).axes[0]
+    last = steps[steps["mission"] == 0][["x", "y"]].iloc[-1].to_numpy()
+    left, right = axes.get_xlim()
+    assert last[0] < -90
+    assert right - left < 13
+    (end,) = artists(axes, "given up")
+    assert left < end.get_xdata()[0] < right
+    assert f"ends {distance_to(ring, last):.0f} m away" in texts(axes)
+
+
+def test_an_end_within_the_map_needs_no_words(make_results, ring):
+    missions, steps = make_results(["physics"])
+    figure = draw_trajectories(missions, steps[steps["t"] < 30], [ring])
+    assert not any("away" in text for text in texts(figure))
+
+
+def test_a_track_that_is_not_given_is_left_out(make_results, artists):
+    figure = draw_trajectories(*make_results())
+    assert not artists(figure, "road")
+    assert len(artists(figure, "nominal")) == 3
+    assert not any("away" in text for text in texts(figure))
+    png_bytes(figure)
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_places_that_are_not_finite_are_passed_over(make_results, ring, artists, given):
+    missions, steps = make_results(["oracle"])
+    some = steps.assign(x=steps["x"].where(steps["t"] < 50))
+    figure = draw_trajectories(missions, some, [ring] * given)
+    (end,) = artists(figure, "finished")
+    np.testing.assert_array_equal(end.get_xydata()[0], steps[["x", "y"]].iloc[49])
+    nowhere = draw_trajectories(missions, steps.assign(y=np.nan), [ring] * given)
+    assert not artists(nowhere, "start")
+    png_bytes(nowhere)
+
+
+def test_a_map_shows_road_and_paths():
+    path = np.array([[0.0, 0.0], [10.0, 5.0]])
+    box = view(None, [path])
+    np.testing.assert_allclose(box, [-0.4, 10.4, -0.4, 5.4])
+    lone = view(None, [np.zeros((1, 2))])
+    assert lone.left < 0 < lone.right
+    assert lone.bottom < 0 < lone.top
+
+
+def test_the_line_closes_when_resampled():
+    points = resample(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]), 0.5)
+    gaps = np.hypot(*np.diff(np.concatenate([points, points[:1]]), axis=0).T)
+    assert len(points) == 24
+    assert gaps.max() <= 0.5 + 1e-9
+
+
+# Learning
+
+
+def test_error_and_loss_of_every_cell(make_results, artists):
+    missions, steps = make_results(v_gains=[-1.0, 2.0])
+    figure = draw_learning(missions, steps)
+    assert len(figure.axes) == 4
+    for axes in figure.axes:
+        assert len(artists(axes, "mean")) == len(artists(axes, "raw")) == 3
+    error, loss = figure.axes[0], figure.axes[2]
+    assert (error.get_yscale(), loss.get_yscale()) == ("log", "symlog")
+    assert "(m, rad)" in error.get_ylabel()
+    assert "loss" in loss.get_ylabel()
+    assert {"physics", "adaptive", "oracle"} <= set(texts(figure))
+
+
+def test_four_cells_at_most(make_results):
+    figure = draw_learning(*make_results(v_gains=range(1, 7), seeds=2))
+    assert len(figure.axes) == 8
+    assert "24 of 36 missions not shown" in texts(figure)
+
+
+def test_a_curve_is_a_moving_average_over_what_was_measured(make_results, artists):
+    missions, steps = make_results(["oracle"])
+    axes = draw_learning(missions, steps).axes[0]
+    (mean,), (raw,) = artists(axes, "mean"), artists(axes, "raw")
+    error = steps["error"].to_numpy()
+    np.testing.assert_array_equal(raw.get_ydata(), error)
+    np.testing.assert_allclose(mean.get_ydata()[60], error[41:61].mean())
+    np.testing.assert_allclose(mean.get_ydata()[4], error[:5].mean())
+
+
+def test_long_curves_keep_their_extremes(make_results, artists):
+    missions, steps = make_results(["physics"])
+    many = pd.concat([steps.assign(t=steps["t"] + 400 * k) for k in range(10)])
+    many = many.assign(error=np.where(many["t"] == 1234, 77.0, many["error"]))
+    axes = draw_learning(missions.assign(steps=3999), many).axes[0]
+    (raw,), (mean,) = artists(axes, "raw"), artists(axes, "mean")
+    assert raw.get_ydata().max() == 77.0
+    assert len(raw.get_xdata()) <= 1600
+    assert len(mean.get_xdata()) <= 800
+
+
+def test_the_axis_ends_soon_after_the_last_who_finishes(make_results):
+    figure = draw_learning(*make_results())
+    assert figure.axes[0].get_xlim() == (0, round(1.15 * 119))
+    assert figure.axes[1].get_xlabel() == "step\nphysics goes on to step 399"
+
+
+def test_the_axis_is_whole_if_nobody_finishes(make_results):
+    figure = draw_learning(*make_results(["physics"]))
+    assert figure.axes[0].get_xlim() == (0, 399)
+    assert figure.axes[1].get_xlabel() == "step"
+
+
+def test_each_method_shows_where_its_regime_starts_and_ends(make_results, artists):
+    missions, steps = make_results(["adaptive", "oracle"])
+    axes = draw_learning(missions, steps).axes[0]
+    marks = [artist for artist in artists(axes, "change") if hasattr(artist, "get_marker")]
+    found = [(mark.get_marker(), *mark.get_xdata()) for mark in marks]
+    assert found == [(">", 25), ("<", 96), (">", 21), ("<", 80)]
+    colors = [style.color for style in method_styles(missions["method"]).values()]
+    assert [mark.get_color() for mark in marks] == list(np.repeat(colors, 2))
+    assert not artists(axes, "band")
+
+
+def test_changes_beyond_the_axis_are_not_marked(make_results, artists):
+    missions, steps = make_results(["physics", "oracle"])
+    late = (steps["mission"] == 0) & (steps["t"] > 300)
+    steps = steps.assign(regime_active=steps["regime_active"].where(~late, 0))
+    axes = draw_learning(missions, steps).axes[0]
+    marks = [artist for artist in artists(axes, "change") if hasattr(artist, "get_marker")]
+    assert max(mark.get_xdata()[0] for mark in marks) == 80
+
+
+@pytest.mark.parametrize(("method", "stretch"), [("oracle", (21, 80)), ("physics", (21, 399))])
+def test_a_lone_method_has_its_stretch_shaded(make_results, artists, method, stretch):
+    figure = draw_learning(*make_results([method]))
+    for axes in figure.axes:
+        (band,) = artists(axes, "band")
+        assert (band.get_x(), band.get_x() + band.get_width()) == stretch
+
+
+def test_small_losses_have_a_linear_scale(make_results):
+    missions, steps = make_results(["oracle"])
+    assert draw_learning(missions, steps).axes[1].get_yscale() == "linear"
+
+
+def test_numbers_that_cannot_be_drawn_do_no_harm(make_results):
+    missions, steps = make_results(["oracle"])
+    error, loss = steps["error"].copy(), steps["loss"].copy()
+    error[5:8], loss[9:11] = [0.0, np.nan, np.inf], [np.inf, -np.inf]
+    figure = draw_learning(missions, steps.assign(error=error, loss=loss))
+    png_bytes(figure)
+    assert figure.axes[0].get_ylim()[0] > 1e-7
+    png_bytes(draw_learning(missions, steps.assign(error=0.0, loss=np.nan)))
+
+
+# Comparison
+
+
+def test_means_and_intervals_of_each_method(make_results, artists):
+    missions, _ = make_results(["physics", "oracle"], seeds=4)
+    spread = missions.assign(success_rate=[0.2, 0.4, 0.2, 0.4, 1.0, 1.0, 1.0, 1.0])
+    success, steps = draw_comparison(spread).axes
+    means = [mark.get_xdata()[0] for mark in artists(success, "mean")]
+    np.testing.assert_allclose(means, [30.0, 100.0])
+    (interval,) = artists(success, "interval")  # none where all are alike
+    low, high = interval.get_xdata()
+    assert 20 <= low < 30 < high <= 40
+    assert interval.get_ydata() == [0, 0]
+    assert len(artists(steps, "interval")) == 2
+    assert [len(dots.get_xdata()) for dots in artists(steps, "single")] == [4, 4]
+    labels = [label.get_text() for label in success.get_yticklabels()]
+    assert labels == ["physics (n = 4)", "oracle (n = 4)"]

@@ -1,0 +1,129 @@
+"""The folder of a run."""
+
+import os
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.report import write_run
+from afm_rl.report.events import FILE
+
+
+def quiet(line):
+    pass
+
+
+def files(folder):
+    return sorted(
+        path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
+    )
+
+
+def test_all_files_of_a_run(tmp_path, make_results, ring):
+    lines = []
+    folder = tmp_path / "new" / "run"
+    written = write_run(folder, *make_results(), [ring], echo=lines.append)
+    assert files(folder) == [
+        "figures/learning.png",
+        "figures/trajectory.png",
+        "missions.csv",
+        "steps.parquet",
+        f"tensorboard/adaptive/{FILE}",
+        f"tensorboard/oracle/{FILE}",
+        f"tensorboard/physics/{FILE}",
+    ]
+    assert sorted(written) == sorted(folder / name for name in files(folder))
+    assert len(lines) == 5
+    assert all(str(folder) in line for line in lines)
+
+
+def test_missions_keep_their_columns_order_and_digits(tmp_path, make_results):
+    missions, steps = make_results(seeds=2)
+    write_run(str(tmp_path), missions, steps, figures=False, tensorboard=False, echo=quiet)
+    assert files(tmp_path) == ["missions.csv", "steps.parquet"]
+    head = (tmp_path / "missions.csv").read_text().splitlines()[0]
+    assert head == (
+        "method,track,v_gain,omega_gain,seed,success_rate,steps,reached,targets,finished,"
+        "seconds,mission"
+    )
+    stored = pd.read_csv(tmp_path / "missions.csv")
+    pd.testing.assert_frame_equal(
+        stored[missions.columns].astype(missions.dtypes), missions, check_exact=True
+    )
+
+
+def test_steps_come_back_as_they_were(tmp_path, make_results):
+    missions, steps = make_results()
+    write_run(tmp_path, missions, steps, figures=False, tensorboard=False, echo=quiet)
+    pd.testing.assert_frame_equal(pd.read_parquet(tmp_path / "steps.parquet"), steps)
+
+
+def test_several_missions_are_compared(tmp_path, make_results, ring):
+    write_run(tmp_path, *make_results(seeds=2), [ring], tensorboard=False, echo=quiet)
+    assert "figures/summary.png" in files(tmp_path)
+
+
+def test_robots_that_have_no_place_have_no_map(tmp_path, make_results):
+    missions, steps = make_results()
+    write_run(tmp_path, missions, steps.drop(columns="x"), tensorboard=False, echo=quiet)
+    assert files(tmp_path) == ["figures/learning.png", "missions.csv", "steps.parquet"]
+
+
+def test_echo_is_print_unless_told_otherwise(tmp_path, make_results, capsys):
+    write_run(tmp_path, *make_results(), figures=False, tensorboard=False)
+    assert f"wrote {tmp_path / 'missions.csv'}" in capsys.readouterr().out
+
+
+def test_writing_again_replaces_and_leaves_the_rest_alone(tmp_path, make_results, ring):
+    (tmp_path / "notes.txt").write_text("mine")
+    write_run(tmp_path, *make_results(), [ring], echo=quiet)
+    before = files(tmp_path)
+    write_run(tmp_path, *make_results(seeds=1, v_gains=[0.5]), [ring], echo=quiet)
+    assert files(tmp_path) == before
+    assert pd.read_csv(tmp_path / "missions.csv")["v_gain"].eq(0.5).all()
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path, make_results, ring, monkeypatch):
+    write_run(tmp_path, *make_results(), [ring], echo=quiet)
+    before = {name: (tmp_path / name).read_bytes() for name in files(tmp_path)}
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ConfigurationError, match="No space left"):
+        write_run(tmp_path, *make_results(v_gains=[0.5]), [ring], echo=quiet)
+    assert {name: (tmp_path / name).read_bytes() for name in files(tmp_path)} == before
+
+
+def test_a_figure_that_fails_costs_no_numbers(tmp_path, make_results, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("no figure")
+
+    monkeypatch.setattr("afm_rl.report.folder.draw_learning", broken)
+    with pytest.raises(RuntimeError, match="no figure"):
+        write_run(tmp_path, *make_results(), echo=quiet)
+    assert {"missions.csv", "steps.parquet"} <= set(files(tmp_path))
+
+
+def test_frames_that_do_not_fit_write_nothing(tmp_path, make_results):
+    missions, steps = make_results()
+    with pytest.raises(ConfigurationError, match="occurs twice"):
+        write_run(tmp_path / "run", missions.assign(mission=0), steps, echo=quiet)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_a_full_study_takes_seconds(tmp_path, make_results, ring):
+    missions, steps = make_results(["physics"], v_gains=range(11), seeds=10)
+    steps = pd.concat([steps.assign(t=steps["t"] + 400 * k) for k in range(13)])
+    steps = steps[steps["t"] < 5000].sort_values(["mission", "t"], ignore_index=True)
+    assert len(steps) == 550_000
+    missions = missions.assign(method=np.repeat(["a", "b", "c", "d", "e"], 22), steps=4999)
+    start = time.perf_counter()
+    write_run(tmp_path, missions, steps, [ring], echo=quiet)
+    assert time.perf_counter() - start < 20  # about 5 on one idle core

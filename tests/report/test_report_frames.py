@@ -1,0 +1,65 @@
+"""What reports read out of the data frames."""
+
+import pandas as pd
+import pytest
+
+from afm_rl.errors import AFMError, ConfigurationError
+from afm_rl.report.frames import (
+    cell_names,
+    check_frames,
+    first_missions,
+    left_out,
+    order_columns,
+    regime_names,
+)
+
+
+def test_parameters_of_any_regime_are_found():
+    missions = pd.DataFrame(columns=["mission", "method", "track", "mass", "wind_x", "seed"])
+    assert regime_names(missions) == ["mass", "wind_x"]
+    assert regime_names(pd.DataFrame(columns=["method", "track", "seed"])) == []
+
+
+def test_columns_nobody_knows_come_last(make_results):
+    missions, _ = make_results()
+    columns = list(order_columns(missions.assign(battery=1.0)))
+    assert columns[-2:] == ["mission", "battery"]
+    assert columns[:5] == ["method", "track", "v_gain", "omega_gain", "seed"]
+
+
+def test_a_cell_is_a_track_and_a_regime(make_results):
+    missions, _ = make_results(["oracle"], v_gains=[-1.0, 0.05], seeds=2, tracks=["ring", "oval"])
+    assert cell_names(missions).unique().tolist() == [
+        "ring, v_gain = -1, omega_gain = 1",
+        "ring, v_gain = 0.05, omega_gain = 1",
+        "oval, v_gain = -1, omega_gain = 1",
+        "oval, v_gain = 0.05, omega_gain = 1",
+    ]
+
+
+def test_the_first_mission_stands_for_its_method_and_cell(make_results):
+    missions, _ = make_results(v_gains=[-1.0, 2.0], seeds=3)
+    first = first_missions(missions)
+    assert first["mission"].tolist() == [0, 3, 6, 9, 12, 15]
+    assert left_out(missions, first) == "12 of 18 missions not shown"
+    assert left_out(missions, missions) == ""
+
+
+def test_frames_that_fit_pass(make_results):
+    check_frames(*make_results())
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda m, s: (m.drop(columns=["seed", "steps"]), s), "missions: columns seed, steps"),
+        (lambda m, s: (m, s.drop(columns="loss")), "steps: columns loss"),
+        (lambda m, s: (m[:0], s), "at least one mission"),
+        (lambda m, s: (m.assign(mission=0), s), "mission 0 occurs twice"),
+        (lambda m, s: (m, s[s["mission"] != 1]), "no rows for mission 1"),
+    ],
+)
+def test_frames_that_do_not_fit_are_refused(make_results, spoil, message):
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        check_frames(*spoil(*make_results()))
+    assert isinstance(caught.value, AFMError)
