@@ -20,7 +20,7 @@ help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
 
 demo: $(VENV)/.with-base ## Run a UGV mission, print its table, draw its figure (a few minutes)
-	@$(BIN)/afm-rl hydra.run.dir=outputs/demo
+	@$(BIN)/afm-rl hydra.run.dir=outputs/demo overwrite=true
 
 test: $(VENV)/.with-test ## Run all tests with coverage (at least 95 %)
 	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 \

@@ -21,8 +21,10 @@ STATES = torch.tensor([-5.0, -5.0, -3.14]), torch.tensor([5.0, 5.0, 3.14])
 
 
 @pytest.fixture(autouse=True)
-def _fixed_seed():
+def _same_for_all():
     torch.manual_seed(0)
+    yield
+    torch.set_num_threads(1)  # closing a parallel environment raises it
 
 
 @pytest.fixture

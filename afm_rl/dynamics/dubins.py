@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
-from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.errors import check_number
 from afm_rl.manifold import Manifold, wrap_angle
 
@@ -31,7 +33,7 @@ def dubins_step(state: Tensor, action: Tensor, dt: float) -> Tensor:
     return torch.stack(moved, -1)
 
 
-class Dubins(DynamicsModel):
+class Dubins(KnownDynamics):
     """A Dubins car with unit gains, as the ``physics`` baseline plans with it.
 
     Args:
@@ -45,26 +47,9 @@ class Dubins(DynamicsModel):
     """
 
     def __init__(self, dt: float = 0.2, noise_std: float = 1e-3) -> None:
-        super().__init__(Manifold(3, angles=[2]), action_size=2)
-        self.dt = check_number("dynamics.dt", dt, low=0.0, open_low=True)
-        self.noise_std = check_number("dynamics.noise_std", noise_std, low=0.0, open_low=True)
-
-    def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the next state ``(*B, 3)``."""
-        return dubins_step(state, action, self.dt)
-
-    def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a single member's mean and unit variance, in units of ``noise_std``."""
-        mean = self.standardise(self.manifold.difference(self(state, action), state))
-        return mean.unsqueeze(-2), torch.zeros_like(mean).unsqueeze(-2)
-
-    def standardise(self, change: Tensor) -> Tensor:
-        """Divide by ``noise_std``."""
-        return change / self.noise_std
-
-    def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return ``noise_std`` for every coordinate."""
-        return torch.full_like(state, self.noise_std)
+        dt = check_number("dynamics.dt", dt, low=0.0, open_low=True)
+        super().__init__(partial(dubins_step, dt=dt), Manifold(3, angles=[2]), 2, noise_std)
+        self.dt = dt
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the closed form ``(*B, 3, 2)``."""

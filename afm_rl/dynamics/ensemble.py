@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -14,6 +14,7 @@ from afm_rl.dynamics.stacked import stacked_mlp, stacked_mlp_tangent
 from afm_rl.errors import ConfigurationError, check_choice, check_count
 from afm_rl.manifold import Manifold
 
+Stack = Sequence[Tensor]
 CHUNK = 2**18  # activations per layer and chunk: 1 MiB in float32, so that they stay in cache
 
 
@@ -153,10 +154,12 @@ class Ensemble(DynamicsModel):
         axes = torch.eye(rows.shape[-1], device=rows.device, dtype=rows.dtype)
         axes = (axes / self.input_std)[len(self.features) :]
         size = self.manifold.tangent_size
-        weights, biases = self._stacked(slice(None), size)
-        moved = stacked_mlp_tangent(self._per_member(rows), axes, weights, biases)
-        mean = moved.unflatten(0, (-1, self.members)).mean(1)  # (l, n, A, D)
-        return (mean * self.target_std).mT.reshape(*shape, size, self.action_size)
+
+        def tangents(wide: Tensor, weights: Stack, biases: Stack) -> Tensor:
+            return stacked_mlp_tangent(wide, axes, weights, biases)
+
+        moved = self._chunked(tangents, rows, size).mean(2)  # (l, n, A, D)
+        return (moved * self.target_std).mT.reshape(*shape, size, self.action_size)
 
     def expand_(self, missions: int) -> Ensemble:
         """Give each of ``missions`` parameters of its own, in place."""
@@ -205,6 +208,12 @@ class Ensemble(DynamicsModel):
     def _run(self, state: Tensor, action: Tensor, size: int) -> Tensor:
         """Return the first ``size`` outputs of every member ``(*L, *N, E, size)``."""
         rows, shape = self._rows(state, action)
+        return self._chunked(stacked_mlp, rows, size).reshape(*shape, self.members, size)
+
+    def _chunked(
+        self, network: Callable[[Tensor, Stack, Stack], Tensor], rows: Tensor, size: int
+    ) -> Tensor:
+        """Apply stacked networks to ``(l, n, in)``; return ``(l, n, E, ...)``."""
         per_row = self.members * max(self.hidden, default=1)
         width = max(1, min(rows.shape[1], CHUNK // per_row))
         height = max(1, CHUNK // (per_row * width))
@@ -213,8 +222,7 @@ class Ensemble(DynamicsModel):
             missions = slice(top, top + height)
             weights, biases = self._stacked(missions, size)
             wide = self._per_member(rows[missions])
-            parts = [stacked_mlp(part, weights, biases) for part in wide.split(width, 1)]
+            parts = [network(part, weights, biases) for part in wide.split(width, 1)]
             pieces.append(torch.cat(parts, 1) if len(parts) > 1 else parts[0])
         out = torch.cat(pieces) if len(pieces) > 1 else pieces[0]
-        out = out.unflatten(0, (-1, self.members)).transpose(1, 2)  # (l, n, E, size)
-        return out.reshape(*shape, self.members, size)
+        return out.unflatten(0, (-1, self.members)).transpose(1, 2)

@@ -43,13 +43,12 @@ def stacked_mlp_tangent(
     Returns:
         Directional derivatives ``(M, N, A, out)``.
     """
-    size = (*inputs.shape[:2], len(tangents))
-    hidden, moved = inputs, tangents.expand(*size, -1)
+    moved = torch.cat([inputs.unsqueeze(2), tangents.expand(*inputs.shape[:2], *tangents.shape)], 2)
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-        hidden = torch.baddbmm(bias, hidden, weight)
-        moved = torch.bmm(moved.flatten(1, 2), weight).unflatten(1, size[1:])
+        rows = moved.shape[1:3]
+        moved = torch.bmm(moved.flatten(1, 2), weight).unflatten(1, rows)
         if layer < len(weights) - 1:
-            slope = torch.where(hidden > 0, 1.0, SLOPE).to(hidden.dtype)
-            hidden = hidden * slope
-            moved = moved * slope.unsqueeze(-2)
-    return moved
+            value = moved[:, :, :1] + bias.unsqueeze(2)
+            slope = torch.where(value > 0, 1.0, SLOPE).to(value.dtype)
+            moved = torch.cat([value, moved[:, :, 1:]], 2) * slope
+    return moved[:, :, 1:]

@@ -17,6 +17,8 @@ from afm_rl.flow.base import Context, Examples, Flow
 from afm_rl.learning.nll import REDUCTIONS
 from afm_rl.regimes import Regime
 
+POOL = 4  # batches kept of the examples that are used more than once
+
 
 class CFMLoss(LossModule):
     r"""Conditional flow matching with straight paths.
@@ -99,7 +101,7 @@ def train_flow(
     iterations: int = 10_000,
     batch_size: int = 512,
     lr: float = 2e-3,
-    reuse: int = 1,
+    reuse: int | None = None,
     seed: int = 0,
     progress: bool = False,
 ) -> float:
@@ -116,7 +118,8 @@ def train_flow(
         batch_size: examples per step.
         lr: largest step size.
         reuse: how often an example is used, on average: 1 makes every batch anew, more
-            saves time where the model is slow.
+            saves time where the model is slow. None: 1 for a model without parameters, 128
+            for a learned one.
         seed: seed of everything drawn.
         progress: show a progress bar.
 
@@ -125,6 +128,8 @@ def train_flow(
     """
     check_count("flow.train.iterations", iterations)
     check_count("flow.train.batch_size", batch_size, low=2)
+    if reuse is None:
+        reuse = 128 if any(True for _ in model.parameters()) else 1
     check_count("flow.train.reuse", reuse)
     check_number("flow.train.lr", lr, low=0.0, open_low=True)
     generator = torch.Generator().manual_seed(seed)
@@ -136,20 +141,19 @@ def train_flow(
         with torch.no_grad():
             return flow.examples(model, regime, state_box, count, generator)
 
-    fresh = math.ceil(batch_size / reuse)
-    pool = draw(batch_size * (1 if reuse == 1 else 4))
+    chunk = batch_size if reuse == 1 else math.ceil(batch_size / 8)
+    pause = max(1, reuse * chunk // batch_size)  # iterations between fresh chunks
+    pool = draw(POOL * batch_size if reuse > 1 else batch_size)
     size, cursor = len(pool.planned), 0
     bar = tqdm(range(iterations), desc="training the flow", disable=not progress)
     for step in bar:
-        if reuse == 1:
-            batch = draw(batch_size)
-        else:
-            rows = (cursor + torch.arange(fresh)) % size
-            for kept, new in zip(pool, draw(fresh), strict=True):
+        if step % pause == 0:
+            rows = (cursor + torch.arange(chunk)) % size
+            for kept, new in zip(pool, draw(chunk), strict=True):
                 kept[rows] = new
-            cursor = (cursor + fresh) % size
-            chosen = torch.randint(size, (batch_size,), generator=generator)
-            batch = Examples(*(part[chosen] for part in pool))
+            cursor = (cursor + chunk) % size
+        chosen = torch.randint(size, (batch_size,), generator=generator)
+        batch = pool if reuse == 1 else Examples(*(part[chosen] for part in pool))
         with torch.enable_grad():
             loss = loss_module(TensorDict(batch._asdict(), [batch_size]))["loss_cfm"]
             optimizer.zero_grad(set_to_none=True)
@@ -159,7 +163,7 @@ def train_flow(
         cycle.step()
         if progress and step % 200 == 0:
             bar.set_postfix(loss=f"{float(loss):.4f}")
-    return held_out_error(flow, draw(4096))
+    return held_out_error(flow, draw(2048))
 
 
 @torch.no_grad()

@@ -32,7 +32,7 @@ def print_summary(missions: pd.DataFrame, file: IO[str] | None = None) -> None:
     >>> print_summary(pd.DataFrame([row | {"success_rate": 1.0, "finished": True, "steps": 300}]))
     <BLANKLINE>
      method   missions  success %  finished %  steps  seconds
-    ──────────────────────────────────────────────────────────
+     ────────────────────────────────────────────────────────
      physics         1      100.0         100    300      2.0
     <BLANKLINE>
     """

@@ -86,15 +86,17 @@ def _step_label(missions: pd.DataFrame) -> str:
 def _dress(grid: np.ndarray, steps: pd.DataFrame) -> None:
     """Give the axes ``(2, C)`` scales that show these steps, and labels."""
     losses = steps["loss"].abs()
-    wide = bool((losses[np.isfinite(losses)] > LINEAR).any())
+    positive = bool((steps["error"] > 0).any())
+    large = bool((losses[np.isfinite(losses)] > LINEAR).any())
     for panels, label in zip(grid, ROWS.values(), strict=True):
         panels[0].set_ylabel(label, fontsize=style.NORMAL)
         for panel in panels:
             panel.grid(axis="y", color="#eeeeee", linewidth=0.6)
             style.dress(panel)
     for error, loss in grid.T:
-        error.set_yscale("log", nonpositive="mask")
-        if wide:
+        if positive:
+            error.set_yscale("log", nonpositive="mask")
+        if large:
             loss.set_yscale("symlog", linthresh=LINEAR)
 
 

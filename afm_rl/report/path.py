@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 
 from afm_rl.report import style
 from afm_rl.report.road import MARGIN, DrawableTrack, distance_to
@@ -97,14 +98,18 @@ def _last_inside(axes: Axes, path: np.ndarray) -> np.ndarray:
 
 
 def _say_where(axes: Axes, end: np.ndarray, distance: float) -> None:
-    right = end[0] > np.mean(axes.get_xlim())
+    """Write beside the mark of an end how far away the true one is, clear of the line."""
+    low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
+    right, up = place = 2 * (end - low) / (high - low) - 1  # -1 to 1, edge to edge
+    sideways = abs(right) > abs(up)  # how the line leaves
     axes.annotate(
         f"ends {distance:.0f} m away",
         tuple(end),
-        (-8 if right else 8, 0),
+        tuple(-np.sign(place) * ((0, 12) if sideways else (8, 0))),
         textcoords="offset points",
-        ha="right" if right else "left",
+        ha="right" if right > 0 else "left",
         va="center",
         fontsize=style.SMALL,
+        path_effects=[withStroke(linewidth=2, foreground="white")],
         zorder=6,
     )

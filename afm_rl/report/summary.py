@@ -26,8 +26,8 @@ def summarise(missions: pd.DataFrame) -> pd.DataFrame:
     >>> row = {"method": "physics", "seconds": 2.0}
     >>> good = row | {"success_rate": 1.0, "finished": True, "steps": 300}
     >>> poor = row | {"success_rate": 0.5, "finished": False, "steps": 500}
-    >>> summarise(pd.DataFrame([good, poor])).iloc[0][["success", "finished", "steps"]].tolist()
-    [0.75, 0.5, 400.0]
+    >>> summarise(pd.DataFrame([good, poor]))[["success", "finished", "steps"]].values.tolist()
+    [[0.75, 0.5, 400.0]]
     """
     return _means(missions, ["method"])
 
@@ -39,17 +39,14 @@ def summarise_cells(missions: pd.DataFrame) -> pd.DataFrame:
 
 def _means(missions: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
     groups = missions.groupby(list(by), sort=False)
-    rows = [
-        dict(zip(by, key, strict=True)) | _mean(group) for key, group in groups if len(group) > 0
-    ]
-    return pd.DataFrame(rows)
+    return pd.DataFrame([dict(zip(by, key, strict=True)) | _mean(group) for key, group in groups])
 
 
 def _mean(group: pd.DataFrame) -> dict[str, float]:
     success, steps = mean_interval(group["success_rate"]), mean_interval(group["steps"])
     return {
         "missions": len(group),
-        "success": float(group["success_rate"].mean()),
+        "success": float(group["success_rate"].astype(float).mean()),
         "success_low": success[0],
         "success_high": success[1],
         "finished": float(group["finished"].mean()),

@@ -126,4 +126,4 @@ def test_a_full_study_takes_seconds(tmp_path, make_results, ring):
     missions = missions.assign(method=np.repeat(["a", "b", "c", "d", "e"], 22), steps=4999)
     start = time.perf_counter()
     write_run(tmp_path, missions, steps, [ring], echo=quiet)
-    assert time.perf_counter() - start < 20  # about 5 on one idle core
+    assert time.perf_counter() - start < 30  # about 5 on one idle core

@@ -25,15 +25,16 @@ def table(missions, file):
 @pytest.fixture
 def four():
     """Two missions each of two methods, with means that are easily found by hand."""
-    base = {"track": "ring", "v_gain": -1.0, "seconds": 1.5}
     rows = [
         ("a", 0, 0.25, 300, False),
         ("b", 0, 1.0, 200, True),
         ("a", 1, 0.75, 300, False),
         ("b", 1, 0.5, 100, False),
     ]
-    names = ("method", "seed", "success_rate", "steps", "finished")
-    return pd.DataFrame([base | dict(zip(names, row, strict=True)) for row in rows])
+    frame = pd.DataFrame(rows, columns=["method", "seed", "success_rate", "steps", "finished"])
+    frame.insert(1, "track", "ring")
+    frame.insert(2, "v_gain", -1.0)
+    return frame.assign(seconds=1.5)
 
 
 def test_means_are_those_found_by_hand(four):

@@ -1,0 +1,51 @@
+"""Dynamics that are written down."""
+
+import pytest
+import torch
+
+from afm_rl.dynamics import KnownDynamics
+from afm_rl.errors import ConfigurationError
+from afm_rl.manifold import Manifold
+
+
+def push(state, action):
+    """A cart: position (m), speed (m/s); force (N)."""
+    return state + 0.1 * torch.cat([state[..., 1:], action.sin()], -1)
+
+
+def cart(**settings):
+    return KnownDynamics(push, Manifold(2), action_size=1, **settings)
+
+
+def test_any_step_function_is_a_model():
+    model, state, action = cart(), torch.randn(5, 4, 2), torch.randn(5, 4, 1)
+    assert torch.equal(model(state, action), push(state, action))
+    mean, log_variance = model.moments(state, action)
+    assert mean.shape == (5, 4, 1, 2) and torch.equal(log_variance, torch.zeros(5, 4, 1, 2))
+    change = push(state, action) - state
+    torch.testing.assert_close(mean.squeeze(-2), model.standardise(change))
+
+
+def test_its_jacobian_needs_no_closed_form():
+    state, action = torch.randn(7, 2), torch.randn(7, 1)
+    expected = torch.stack([torch.zeros(7), 0.1 * action[:, 0].cos()], -1).unsqueeze(-1)
+    torch.testing.assert_close(cart().jacobian(state, action), expected)
+
+
+@pytest.mark.parametrize(
+    ("given", "noise"), [(0.1, [0.1, 0.1]), ([0.1, 0.2], [0.1, 0.2]), ([0.3], [0.3, 0.3])]
+)
+def test_the_noise_is_one_number_or_one_per_coordinate(given, noise):
+    model = cart(noise_std=given)
+    for dtype in (torch.float32, torch.float64):
+        state = torch.zeros(3, 2, dtype=dtype)
+        expected, scale = model.forecast(state, torch.zeros(3, 1, dtype=dtype))
+        assert scale.dtype is expected.dtype is dtype
+        torch.testing.assert_close(scale, torch.tensor(noise, dtype=dtype).expand(3, 2))
+    torch.testing.assert_close(model.standardise(torch.ones(2)), 1 / torch.tensor(noise))
+
+
+@pytest.mark.parametrize("given", [[0.1, 0.2, 0.3], [0.1, 0.0], 0.0, -1.0, [float("nan"), 0.1]])
+def test_impossible_noise_is_refused(given):
+    with pytest.raises(ConfigurationError, match="dynamics.noise_std"):
+        cart(noise_std=given)

@@ -1,0 +1,213 @@
+"""The action flow transform does what TorchRL asks of every transform."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import (
+    Compose,
+    ObservationNorm,
+    ParallelEnv,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
+from torchrl.envs.utils import check_env_specs
+
+from afm_rl.dynamics import Dubins
+from afm_rl.envs import UGVTrack
+from afm_rl.errors import ConfigurationError
+from afm_rl.flow import ContextFlow, PaperFlow
+from afm_rl.planning import GoalDistance, PlanningEnv
+from afm_rl.transforms import ActionFlowTransform
+
+
+def transform(**settings):
+    low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+    flow = ContextFlow(low, high, window=3, hidden=[8], latent=4)
+    return ActionFlowTransform(Dubins(), flow, **settings)
+
+
+def track(**settings):
+    return UGVTrack(max_steps=3, **settings)
+
+
+def env(*more, **settings):
+    return TransformedEnv(track(**settings), Compose(transform(), *more))
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_single_environment(batch):
+    check_env_specs(env(batch_size=batch), break_when_any_done="both")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_either_precision(dtype):
+    whole = env(batch_size=(2,), dtype=dtype)
+    whole.transform.to(dtype)  # the flow computes in the precision of its weights
+    check_env_specs(whole)
+    data = whole.rollout(2)["next", "afm"]
+    assert data["state"].dtype is data["window", "planned"].dtype is dtype
+
+
+def test_planning_environment(box):
+    check_env_specs(TransformedEnv(PlanningEnv(Dubins(), GoalDistance(), *box), transform()))
+
+
+def test_published_flow(box):
+    flow = PaperFlow(*box, features=[2], state_size=3, width=8, gate=0.0)
+    chain = ActionFlowTransform(Dubins(), flow)
+    check_env_specs(TransformedEnv(track(batch_size=(2,)), chain), break_when_any_done="both")
+
+
+def test_inside_a_serial_environment():
+    check_env_specs(SerialEnv(2, env), break_when_any_done="both")
+
+
+def test_around_a_serial_environment():
+    check_env_specs(TransformedEnv(SerialEnv(2, track), transform()), break_when_any_done="both")
+
+
+def test_around_batches_in_series():
+    nested = TransformedEnv(SerialEnv(2, lambda: track(batch_size=(3,))), transform())
+    check_env_specs(nested)
+    assert nested.rollout(3)["next", "afm", "executed_action"].shape == (2, 3, 3, 2)
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_with_a_parallel_environment(inside):
+    parallel = ParallelEnv(2, env if inside else track, mp_start_method="fork")
+    try:
+        check_env_specs(parallel if inside else TransformedEnv(parallel, transform()))
+    finally:
+        parallel.close(raise_if_closed=False)
+
+
+def test_without_an_environment():
+    td = TensorDict({"observation": torch.randn(5, 3), "action": torch.randn(5, 2)}, [5])
+    assert (transform()(td.clone()) == td).all()
+    assert (transform().inv(td.clone()) == td).all()
+    assert (Compose(transform(), transform(prefix="b"))(td.clone()) == td).all()
+
+
+def test_in_a_model():
+    td = TensorDict({"observation": torch.randn(5, 3)}, [5])
+    assert (nn.Sequential(transform(), nn.Identity())(td.clone()) == td).all()
+
+
+def test_in_a_replay_buffer():
+    data = env(batch_size=(2,)).rollout(6, break_when_any_done=False).reshape(-1)
+    for chain in (None, transform()):
+        storage = LazyTensorStorage(20)
+        buffer = TensorDictReplayBuffer(storage=storage, batch_size=7, transform=chain)
+        buffer.extend(data)
+        sample = buffer.sample()
+        assert sample["next", "afm", "executed_action"].shape == (7, 2)
+        found = (sample["action"].unsqueeze(1) == data["action"]).all(-1)
+        assert found.any(-1).all()  # the planned actions, as they were
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_in_company(first):
+    others = [StepCounter(), RewardSum()]
+    chain = Compose(transform(), *others) if first else Compose(*others, transform())
+    together = TransformedEnv(track(batch_size=(2,)), chain)
+    check_env_specs(together, break_when_any_done="both")
+    data = together.rollout(3, break_when_any_done=False)
+    assert data["next", "step_count"][:, -1].flatten().tolist() == [3, 3]
+
+
+def test_a_later_normaliser_does_not_disturb_it():
+    norm = ObservationNorm(loc=3.0, scale=0.1, in_keys=["observation"])
+    data = env(norm, batch_size=(4,), process_noise=0.0).rollout(3)
+    assert not torch.allclose(data["next", "observation"], data["next", "pose"])
+    torch.testing.assert_close(data["next", "afm", "state"], data["next", "pose"])
+    assert float(data["next", "afm", "surprise"].max()) < 0.1
+
+
+def test_random_rollouts_stay_within_the_specs():
+    whole = env(batch_size=(4,))
+    data = whole.rollout(7, break_when_any_done=False)
+    spec = whole.observation_spec
+    for step in range(7):
+        found = data["next"][:, step].select(*spec.keys(True, True))
+        assert spec.is_in(found)
+    assert all(value.isfinite().all() for value in data.values(True, True))
+
+
+def test_two_prefixes_live_together():
+    chain = Compose(transform(prefix="first"), transform(prefix=["agent", "second"]))
+    both = TransformedEnv(track(batch_size=(2,)), chain)
+    check_env_specs(both, break_when_any_done="both")
+    data = both.rollout(3)
+    assert data["next", "agent", "second", "executed_action"].shape == (2, 3, 2)
+    assert data["next", "first", "window", "valid"].shape == (2, 3, 3)
+
+
+def test_keys_may_be_nested_and_come_from_yaml(box):
+    cost = GoalDistance(in_keys=[["task", "goal"]])
+    world = PlanningEnv(Dubins(), cost, *box, ["robot", "pose"], ["robot", "action"])
+    chain = transform(
+        observation_key=["robot", "pose"], action_key=["robot", "action"], prefix=["robot", "afm"]
+    )
+    nested = TransformedEnv(world, chain)
+    check_env_specs(nested)
+    assert nested.rollout(3)["next", "robot", "afm", "executed_action"].shape == (3, 2)
+    assert chain.key("window", "valid") == ("robot", "afm", "window", "valid")
+
+
+@pytest.mark.parametrize("double", [copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))])
+def test_copies_behave_alike(double):
+    original = transform()
+    twin = double(original)
+    results = []
+    for chain in (original, twin):
+        torch.manual_seed(0)
+        results.append(TransformedEnv(track(batch_size=(2,)), chain).rollout(3))
+    torch.testing.assert_close(results[0], results[1])
+    assert twin.flow is not original.flow and twin.model is not original.model
+
+
+def test_a_copied_environment_keeps_its_own_model():
+    whole = env(batch_size=(2,))
+    twin = copy.deepcopy(whole)
+    torch.testing.assert_close(twin.rollout(2).shape, whole.rollout(2).shape)
+    assert twin.transform[0].model is not whole.transform[0].model
+
+
+def test_an_appended_environment_copy_shares_the_specs():
+    whole = env(batch_size=(2,)).append_transform(StepCounter())
+    check_env_specs(whole)
+
+
+def test_the_flow_is_owned_and_the_model_is_shared(box, make_ensemble):
+    model = make_ensemble().train()
+    flow = ContextFlow(*box, window=3, hidden=[8], latent=4)
+    chain = ActionFlowTransform(model, flow)
+    whole = TransformedEnv(track(), Compose(chain))
+    assert chain.model is model and model.training  # composing switches what is owned to eval
+    stored = set(whole.state_dict())
+    assert len(stored) == len(flow.state_dict()) > 0
+    assert all("flow." in name for name in stored)
+    assert {id(p) for p in chain.parameters()} == {id(p) for p in flow.parameters()}
+
+
+def test_the_state_of_one_environment_loads_into_another():
+    one, other = env(), env()
+    for parameter in one.transform[0].flow.parameters():
+        parameter.data += 1.0
+    other.load_state_dict(one.state_dict())
+    pairs = zip(one.parameters(), other.parameters(), strict=True)
+    assert all(torch.equal(left, right) for left, right in pairs)
+
+
+def test_sizes_that_contradict_each_other_are_refused(box):
+    with pytest.raises(ConfigurationError, match="1 actions, but the dynamics model has 2"):
+        ActionFlowTransform(Dubins(), ContextFlow([-1.0], [1.0]))
+    with pytest.raises(ConfigurationError, match="'goal': holds 2 numbers, .* state has 3"):
+        TransformedEnv(track(), transform(observation_key="goal")).reset()

@@ -1,0 +1,162 @@
+"""The memory of the action flow transform lives in the tensordict."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs.utils import step_mdp
+
+from afm_rl.dynamics import Dubins
+from afm_rl.envs import UGVTrack
+from afm_rl.flow import ContextFlow
+from afm_rl.regimes import Schedule
+from afm_rl.transforms import ActionFlowTransform
+
+ROWS = 3
+
+
+@pytest.fixture
+def make(box):
+    """Make an environment with a reversed drive, which the flow does correct somehow."""
+
+    def build(batch=(4,), max_steps=100):
+        flow = ContextFlow(*box, window=ROWS, hidden=[8], latent=4)
+        base = UGVTrack(
+            batch_size=batch,
+            max_steps=max_steps,
+            process_noise=0.0,
+            schedule=Schedule([]),
+            missions={"regime": {"v_gain": -1.0}},
+        )
+        return TransformedEnv(base, ActionFlowTransform(Dubins(), flow))
+
+    return build
+
+
+def follow(env, td, actions):
+    """Step through given actions ``(T, *B, 2)``; return the last and all executed actions."""
+    executed = []
+    for action in actions:
+        td["action"] = action
+        td = env.step(td)
+        executed.append(td["next", "afm", "executed_action"])
+        td = step_mdp(td)
+    return td, torch.stack(executed)
+
+
+def same(left, right):
+    return all((left.get(key) == right.get(key)).all() for key in left.keys(True, True))
+
+
+def test_it_is_empty_at_the_start_but_for_the_state(make):
+    td = make().reset()
+    memory = td["afm"].clone()
+    torch.testing.assert_close(memory.pop("state"), td["observation"])
+    assert all((value == 0).all() for value in memory.values(True, True))
+
+
+def test_the_window_holds_the_latest_transitions_oldest_first(make):
+    data = make().rollout(6)
+    for step in range(6):
+        window = data["next", "afm", "window"][:, step]
+        first = max(0, step + 1 - ROWS)
+        held = step + 1 - first
+        assert (window["valid"].sum(-1) == held).all() and window["valid"][:, -held:].all()
+        past = data[:, first : step + 1]
+        torch.testing.assert_close(window["state"][:, -held:], past["observation"])
+        torch.testing.assert_close(window["next_state"][:, -held:], past["next", "observation"])
+        torch.testing.assert_close(window["planned"][:, -held:], past["action"])
+        executed = past["next", "afm", "executed_action"]
+        torch.testing.assert_close(window["executed"][:, -held:], executed)
+
+
+def test_the_gate_opens_after_the_first_surprise(make):
+    env, action = make(), torch.full((4, 2), 0.5)
+    td, executed = follow(env, env.reset(), action.expand(1, 4, 2))
+    assert not td["afm", "misaligned"].any() and torch.equal(executed[0], action)
+    td, executed = follow(env, td, action.expand(1, 4, 2))
+    assert td["afm", "misaligned"].all() and (executed[0] != action).any(-1).all()
+
+
+def test_an_automatic_reset_clears_it(make):
+    data = make(max_steps=4).rollout(9, break_when_any_done=False)
+    valid = data["afm", "window", "valid"].sum(-1)
+    assert valid.tolist() == [[0, 1, 2, 3, 0, 1, 2, 3, 0]] * 4
+    torch.testing.assert_close(data["afm", "state"], data["observation"])
+    assert not data["next", "afm", "misaligned"][:, [0, 4, 8]].any()
+
+
+def test_a_partial_reset_clears_its_own_rows_only(make):
+    env = make()
+    td, _ = follow(env, env.reset(), torch.full((4, 4, 2), 0.5))
+    before = td["afm"].clone()
+    rows = torch.tensor([True, False, False, True])
+    td["_reset"] = rows.unsqueeze(-1)
+    after = env.reset(td, set_state=False)
+    assert same(after["afm"][~rows], before[~rows])
+    fresh = after["afm"][rows]
+    torch.testing.assert_close(fresh["state"], after["observation"][rows])
+    assert (fresh["window", "valid"] == 0).all() and (fresh["surprise"] == 0).all()
+
+
+def test_missions_end_at_times_of_their_own(make):
+    env = make()
+    td = env.reset()
+    td["step"] = torch.tensor([99, 98, 97, 0])  # of 100
+    counts = []
+    for _ in range(4):
+        td["action"] = torch.full((4, 2), 0.1)
+        _, td = env.step_and_maybe_reset(td)
+        counts.append(td["afm", "window", "valid"].sum(-1).tolist())
+    assert counts == [[0, 1, 1, 1], [1, 0, 2, 2], [2, 1, 0, 3], [3, 2, 1, 3]]
+
+
+@pytest.mark.parametrize("cut", [1, 2, 5])
+def test_a_rollout_resumes_exactly_in_another_environment(make, cut):
+    actions = torch.rand(8, 4, 2)
+    env = make()
+    whole, executed = follow(env, env.reset(), actions)
+    first = make()
+    middle, _ = follow(first, first.reset(), actions[:cut])
+    kept = TensorDict({key: value.clone() for key, value in middle.items()}, [4])
+    end, resumed = follow(make(), kept, actions[cut:])
+    assert torch.equal(resumed, executed[cut:]) and same(end, whole)
+
+
+def test_branches_from_one_state_are_independent(make):
+    env, actions = make(), torch.rand(5, 4, 2)
+    fork, _ = follow(env, env.reset(), actions[:2])
+    saved = fork.clone()
+    first, _ = follow(env, fork.clone(), actions[2:])
+    follow(env, fork.clone(), -actions[2:])  # elsewhere in the meantime
+    again, _ = follow(env, fork.clone(), actions[2:])
+    assert same(first, again) and same(fork, saved)
+
+
+def test_environments_in_series_obey_the_tensordict_given(make):
+    series, actions = SerialEnv(2, lambda: make(batch=())), torch.rand(5, 2, 2)
+    fork, _ = follow(series, series.reset(), actions[:2])
+    fork = fork.clone()
+    first, expected = follow(series, fork.clone(), actions[2:])
+    again, executed = follow(series, fork.clone(), actions[2:])
+    assert torch.equal(executed, expected)
+
+
+def test_a_batch_equals_single_missions(make):
+    env, actions = make(), torch.rand(6, 4, 2)
+    start = env.reset()
+    _, together = follow(env, start.clone(), actions)
+    for mission in range(4):
+        single = make(batch=())
+        _, alone = follow(single, start[mission].clone(), actions[:, mission])
+        torch.testing.assert_close(alone, together[:, mission])
+
+
+@pytest.mark.parametrize("more", [[], [StepCounter()]], ids=["alone", "in company"])
+def test_a_tensordict_without_memory_is_refused_clearly(make, box, more):
+    flow = ContextFlow(*box, window=ROWS, hidden=[8], latent=4)
+    chain = Compose(ActionFlowTransform(Dubins(), flow, prefix=["my", "afm"]), *more)
+    env = TransformedEnv(UGVTrack(), chain)
+    td = env.reset().exclude("my")
+    with pytest.raises(KeyError, match=r"no \('my', 'afm'\) in the tensordict; start from env.r"):
+        env.step(td.set("action", torch.zeros(2)))
