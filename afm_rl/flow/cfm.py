@@ -141,11 +141,11 @@ def train_flow(
         with torch.no_grad():
             return flow.examples(model, regime, state_box, count, generator)
 
-    chunk = batch_size if reuse == 1 else math.ceil(batch_size / 8)
+    chunk = math.ceil(batch_size / min(reuse, 8))
     pause = max(1, reuse * chunk // batch_size)  # iterations between fresh chunks
     pool = draw(POOL * batch_size if reuse > 1 else batch_size)
     size, cursor = len(pool.planned), 0
-    bar = tqdm(range(iterations), desc="training the flow", disable=not progress)
+    bar = tqdm(range(iterations), desc="training the flow", disable=None if progress else True)
     for step in bar:
         if step % pause == 0:
             rows = (cursor + torch.arange(chunk)) % size
@@ -162,7 +162,7 @@ def train_flow(
         optimizer.step()
         cycle.step()
         if progress and step % 200 == 0:
-            bar.set_postfix(loss=f"{float(loss):.4f}")
+            bar.set_postfix(loss=f"{loss.item():.4f}")
     return held_out_error(flow, draw(2048))
 
 

@@ -58,9 +58,7 @@ class PaperFlow(Flow):
         self.state_features = list(features)
         self.state_size = check_count("flow.state_size", state_size)
         self.steps = check_count("flow.steps", steps)
-        self.error_action = check_choice(
-            "flow.error_action", error_action, ("planned", "executed")
-        )
+        self.error_action = check_choice("flow.error_action", error_action, ("planned", "executed"))
         self.wrap, self.latch = wrap, latch
         size = self.action_size
         generator = torch.Generator().manual_seed(seed)

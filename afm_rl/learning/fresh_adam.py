@@ -30,9 +30,7 @@ class FreshAdam(Optimizer):
     tensor([0.9000, 1.0000])
     """
 
-    def __init__(
-        self, params: Iterable[nn.Parameter], lr: float = 1e-3, eps: float = 1e-8
-    ) -> None:
+    def __init__(self, params: Iterable[nn.Parameter], lr: float = 1e-3, eps: float = 1e-8) -> None:
         check_number("updater.lr", lr, low=0.0, open_low=True)
         check_number("updater.eps", eps, low=0.0, open_low=True)
         super().__init__(params, {"lr": lr, "eps": eps})

@@ -13,6 +13,8 @@ from afm_rl.dynamics import Oracle
 from afm_rl.keys import as_key
 from afm_rl.learning.nll import GaussianNLLLoss
 
+ABSURD = 1e12  # in any unit: a reading beyond it is a fault, also where an angle would wrap it
+
 
 class Updater(nn.Module):
     """What happens to the dynamics model after each step: here, nothing (frozen).
@@ -54,8 +56,8 @@ class OnlineUpdater(Updater):
 
     Losses are summed, so with parameters per mission (see ``DynamicsModel.expand_``) every
     mission learns from its own transition only. Transitions whose entries or loss are not
-    finite (their loss is reported as NaN), or that ``mask_key`` excludes, have no influence;
-    how many were refused as not finite is in :attr:`refused`.
+    finite, or absurdly large, are refused: they have no influence, their loss is reported as
+    NaN, and :attr:`refused` counts them. Those that ``mask_key`` excludes are only measured.
 
     Args:
         loss: the loss to descend.
@@ -82,10 +84,10 @@ class OnlineUpdater(Updater):
         kept = tensordict.select(*self.loss.in_keys).detach()
         sound = torch.ones(batch, dtype=torch.bool, device=kept.device)
         for key in self.loss.in_keys:
-            sound = sound & kept.get(key).isfinite().all(-1)
+            sound = sound & (kept.get(key).abs() < ABSURD).all(-1)  # false for NaN
         with torch.enable_grad():
             result = self.loss(self._without(kept, sound))["loss_nll"]
-            if not bool(result.isfinite().all()):  # finite entries may still be absurd
+            if not bool(result.isfinite().all()):  # sound entries may still overflow
                 sound = sound & result.isfinite()
                 result = self.loss(self._without(kept, sound))["loss_nll"]
             learn = sound

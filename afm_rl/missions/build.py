@@ -116,4 +116,3 @@ def build(cfg: DictConfig) -> Agent:
         executed_key=executed_key,
         trainings=trainings,
     )
-

@@ -112,9 +112,7 @@ def _trained(
         return Part(flow)
 
     def train(progress: bool) -> float:
-        return train_flow(
-            flow, model, robot.regime, robot.state_box, progress=progress, **settings
-        )
+        return train_flow(flow, model, robot.regime, robot.state_box, progress=progress, **settings)
 
     return Part(flow, Training("flow", flow, train, unit))
 

@@ -43,9 +43,7 @@ class CEM(CEMPlanner):
         check_count("planner.horizon", horizon)
         check_count("planner.population", population)
         check_count("planner.iterations", iterations)
-        super().__init__(
-            env, horizon, iterations, population, _check_elites(elites, population)
-        )
+        super().__init__(env, horizon, iterations, population, _check_elites(elites, population))
 
     def planning(self, tensordict: TensorDictBase) -> Tensor:
         """Plan on the entries needed: the base class copies all of them per candidate."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import IO
 
 import pandas as pd
 from rich import box
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
@@ -20,7 +19,7 @@ WIDE = 1000  # columns: numbers that are cut off are worse than lines that wrap
 
 
 def print_summary(missions: pd.DataFrame, file: IO[str] | None = None) -> None:
-    """Print the table of methods, then one for each cell if there is more than one.
+    """Print the table of methods, then one of cells x methods if there are several cells.
 
     In a terminal the best values are bold; a pipe or a file gets plain text.
 
@@ -37,17 +36,33 @@ def print_summary(missions: pd.DataFrame, file: IO[str] | None = None) -> None:
     <BLANKLINE>
     """
     console = Console(file=file, width=WIDE, highlight=False)
-    means, cells = summarise(missions), summarise_cells(missions)
-    console.print(_table(means))
+    cells = summarise_cells(missions)
+    console.print(_table(summarise(missions)))
     if cells["cell"].nunique() > 1:
-        widths = _texts(cells).map(len).max()
-        for cell, group in cells.groupby("cell", sort=False):
-            console.print(_table(group, str(cell), widths))
+        console.print(_grid(cells))
 
 
-def _table(
-    means: pd.DataFrame, title: str | None = None, widths: Mapping[str, int] | None = None
-) -> Table:
+def _grid(cells: pd.DataFrame) -> Table:
+    """Return one row per cell: success and steps of every method, the best one bold."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption="success and steps, means")
+    methods = list(dict.fromkeys(cells["method"]))
+    table.add_column("cell")
+    for method in methods:
+        table.add_column(method, justify="right")
+    for cell, group in cells.groupby("cell", sort=False):
+        rank = {row.method: (row.success, -row.steps) for row in group.itertuples()}
+        texts = {
+            row.method: f"{100 * row.success:.0f} % {row.steps:6.0f}" for row in group.itertuples()
+        }
+        best = max(rank.values()) if len(set(rank.values())) > 1 else None
+        table.add_row(
+            str(cell),
+            *(Text(texts.get(m, "-"), "bold" * (rank.get(m) == best)) for m in methods),
+        )
+    return table
+
+
+def _table(means: pd.DataFrame) -> Table:
     """Return a table of what :func:`summarise` gave; the best of several methods are bold."""
     texts = _texts(means)
     some = bool(means[["success_low", "steps_low"]].notna().any(axis=None))
@@ -57,13 +72,9 @@ def _table(
         pad_edge=False,
         caption="mean [95 % interval]" if some else None,
     )
-    table.title, table.title_justify = Text(title) if title else None, "left"
     for name in texts:
-        table.add_column(
-            HEADS.get(name, name),
-            justify="left" if name == "method" else "right",
-            min_width=int(widths[name]) if widths is not None else None,
-        )
+        justify: JustifyMethod = "left" if name == "method" else "right"
+        table.add_column(HEADS.get(name, name), justify=justify)
     best = {
         name: choose(means[name]) for name, choose in BETTER.items() if means[name].nunique() > 1
     }

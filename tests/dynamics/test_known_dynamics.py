@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from afm_rl.dynamics import KnownDynamics
+from afm_rl.dynamics import DynamicsModel, KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.manifold import Manifold
 
@@ -49,3 +49,22 @@ def test_the_noise_is_one_number_or_one_per_coordinate(given, noise):
 def test_impossible_noise_is_refused(given):
     with pytest.raises(ConfigurationError, match="dynamics.noise_std"):
         cart(noise_std=given)
+
+
+def test_a_model_of_ones_own_needs_three_methods():
+    class Still(DynamicsModel):
+        def forward(self, state, action):
+            return state + 0.0 * action
+
+        def moments(self, state, action):
+            zero = torch.zeros_like(state).unsqueeze(-2)
+            return zero, zero
+
+        def noise_scale(self, state, action):
+            return torch.ones_like(state)
+
+    model, state = Still(Manifold(1), 1), torch.randn(4, 1)
+    assert torch.equal(model.standardise(state), state) and model.state_size == 1
+    assert torch.equal(model.forecast(state, state)[1], torch.ones(4, 1))
+    assert torch.equal(model.jacobian(state, state), torch.zeros(4, 1, 1))
+    assert model.expand_(3).select_(torch.tensor([0])).lead == ()

@@ -138,21 +138,24 @@ def test_the_seed_decides_everything_and_the_global_generator_nothing(train, reu
     assert same(first, again) and error == same_error and not same(first, other)
 
 
-def test_examples_are_used_again_when_the_model_is_slow(box, states, gains):
+def test_examples_are_used_again_when_the_model_is_slow(box, states, gains, make_ensemble):
     class Counting(ContextFlow):
-        made = 0
-
         def examples(self, model, regime, state_box, count, generator):
-            self.made += count
+            counts.append(count)
             return super().examples(model, regime, state_box, count, generator)
 
-    made = []
-    for reuse in (1, 4):
-        flow = Counting(*box, **TINY)
+    def made(reuse, model=None):
+        counts.clear()
         settings = {"iterations": 20, "batch_size": 32, "reuse": reuse}
-        train_flow(flow, Dubins(), gains, states, **settings)
-        made.append(flow.made - 4096)  # the held-out ones
-    assert made == [32 * 21, 4 * 32 + 20 * 8]
+        train_flow(Counting(*box, **TINY), model or Dubins(), gains, states, **settings)
+        return sum(counts[:-1])  # the last are held out
+
+    counts = []
+    assert made(1) == 32 + 20 * 32
+    assert made(4) == 4 * 32 + 20 * 8
+    assert made(64) == 4 * 32 + 3 * 4  # four of them every eight steps
+    assert made(None) == made(1)
+    assert made(None, make_ensemble()) < made(8)
 
 
 def test_the_model_is_not_changed_and_gradients_may_be_off(trained_ensemble, box, states, gains):

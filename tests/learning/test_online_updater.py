@@ -68,7 +68,7 @@ def test_masked_missions_do_not_learn_but_are_measured(missions, transitions, sh
     assert changed == [True, False, True, False] and updater.refused == 0
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e200])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e30])
 @pytest.mark.parametrize("key", ["observation", "action", ("next", "observation")])
 def test_faulty_transitions_are_refused_and_counted(missions, transitions, value, key):
     updater, twin = updater_of(missions), copy.deepcopy(missions)
@@ -85,6 +85,19 @@ def test_faulty_transitions_are_refused_and_counted(missions, transitions, value
         torch.testing.assert_close(weights(missions, index), weights(twin, index))
     updater(td)
     assert updater.refused == 2
+
+
+def test_sound_entries_whose_loss_overflows_are_refused(make_ensemble, transitions):
+    model = make_ensemble().expand_(2)  # in single precision
+    model.target_std.fill_(1e-8)
+    updater, before = updater_of(model), [weights(model, index) for index in range(2)]
+    td = transition(*transitions(2))
+    td["next", "observation"] = model(td["observation"], td["action"]).detach()
+    td["next", "observation"][0, 0] = 1e11
+    loss = updater(td)["loss"]
+    assert loss[0].isnan() and loss[1].isfinite() and updater.refused == 1
+    assert torch.equal(weights(model, 0), before[0])
+    assert weights(model, 1).isfinite().all() and not torch.equal(weights(model, 1), before[1])
 
 
 def test_a_fault_outside_the_mask_is_harmless_too(missions, transitions):

@@ -58,9 +58,7 @@ def test_normalisation_comes_from_the_training_data(fit, states, box):
     low, high = states[0][2], states[1][2]
     assert float(model.input_mean[0]) == pytest.approx(float(low + high) / 2, abs=0.1)
     assert float(model.input_std[0]) == pytest.approx(float(high - low) / 12**0.5, rel=0.05)
-    torch.testing.assert_close(
-        model.input_std[1:], (box[1] - box[0]) / 12**0.5, rtol=0.05, atol=0
-    )
+    torch.testing.assert_close(model.input_std[1:], (box[1] - box[0]) / 12**0.5, rtol=0.05, atol=0)
 
 
 def test_the_seed_decides_everything_and_the_global_generator_nothing(fit):
