@@ -25,6 +25,9 @@ def _run(cfg: DictConfig) -> None:
 def _explained() -> Iterator[None]:
     try:
         yield
+    except BrokenPipeError:  # nobody reads on, as in `afm-rl --help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except Exception as error:
         message = explain(error)
         if message is None:

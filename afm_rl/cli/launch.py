@@ -9,7 +9,7 @@ import pandas as pd
 import torch
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from afm_rl.artefacts import write_whole
 from afm_rl.errors import ConfigurationError, check_count
@@ -17,6 +17,7 @@ from afm_rl.missions import build, prepare, run
 from afm_rl.report import print_summary, write_run
 
 PARTS = ("dynamics", "updater", "transform", "flow")
+SWITCHES = ("overwrite", "progress", "figures", "tensorboard")
 
 
 def launch(cfg: DictConfig) -> None:
@@ -25,6 +26,11 @@ def launch(cfg: DictConfig) -> None:
     Everything is built and checked before anything is trained.
     """
     torch.set_num_threads(check_count("threads", cfg.threads))
+    for name in SWITCHES:
+        if not isinstance(cfg[name], bool):
+            raise ConfigurationError(f"{name}={cfg[name]!r}: expected true or false")
+    if not isinstance(cfg.cache, str):
+        raise ConfigurationError(f"cache={cfg.cache!r}: expected a folder")
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
     if (folder / "missions.csv").exists() and not cfg.overwrite:
@@ -48,13 +54,18 @@ def launch(cfg: DictConfig) -> None:
 
 
 def _methods(cfg: DictConfig, overrides: Sequence[str], method: str | None) -> list[DictConfig]:
-    """Return one configuration per method, each with its label."""
+    """Return one configuration per method, each with its label; none compares any more."""
+    compare = cfg.compare
+    if compare is not None:
+        names = list(compare) if isinstance(compare, ListConfig) else [None]
+        if not all(isinstance(n, str) for n in names) or len(set(names)) < len(names):
+            raise ConfigurationError(f"compare={compare}: expected a list of distinct methods")
     if method is not None or not cfg.compare:
         chosen = [(method, cfg)]
     else:
-        names = list(cfg.compare)
         chosen = [(name, compose("config", [*overrides, f"method={name}"])) for name in names]
     for name, each in chosen:
+        each.compare = []
         each.label = each.label if len(chosen) == 1 and each.label else _label(name, overrides)
     return [each for _, each in chosen]
 

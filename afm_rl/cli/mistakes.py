@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from hydra.errors import HydraException, InstantiationException
+from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from afm_rl.errors import AFMError
+
+NOISE = ("Config search path:", "Set the env", "See https://")  # of no help here
 
 
 def explain(error: BaseException) -> str | None:
@@ -21,16 +23,14 @@ def explain(error: BaseException) -> str | None:
     chain = list(_causes(error))
     for cause in chain:
         if isinstance(cause, AFMError):
-            return _one_line(str(cause))
+            return one_line(str(cause))
     for cause in chain:
-        if isinstance(cause, InstantiationException):
-            last = chain[-1]
-            where = getattr(cause, "full_key", None) or "settings"
-            return _one_line(str(cause) if last is cause else f"{where}: {last}")
         if isinstance(cause, HydraException | OmegaConfBaseException):
-            return _one_line(str(cause))
+            below = cause.__cause__
+            reason = f": {below}" if below is not None and str(below) not in str(cause) else ""
+            return one_line(f"{cause}{reason}")
         if isinstance(cause, OSError) and cause.strerror:
-            return _one_line(f"{cause.filename}: {cause.strerror}")
+            return one_line(f"{cause.filename or 'files'}: {cause.strerror}")
     return None
 
 
@@ -40,6 +40,16 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
-def _one_line(text: str) -> str:
-    lines = [" ".join(line.split()) for line in text.splitlines()]
-    return "; ".join(line for line in lines if line and not line.startswith("Set the env"))
+def one_line(text: str) -> str:
+    r"""Put a message of several lines into one; indented lines are the items of a list.
+
+    >>> one_line("Choose one of:\n\tcem\n\tmppi\nConfig search path:\n\tsomewhere")
+    'Choose one of: cem, mppi'
+    """
+    for noise in NOISE:
+        text = text.partition(noise)[0]
+    joined = ""
+    for line in filter(str.strip, text.splitlines()):
+        item = line[0].isspace() and bool(joined) and not joined.endswith(":")
+        joined += (", " if item else " ") + " ".join(line.split())
+    return joined.strip()

@@ -8,19 +8,18 @@ from dataclasses import dataclass
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from torchrl.objectives import LossModule
 from tqdm.auto import tqdm
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import check_choice, check_count, check_number
+from afm_rl.errors import check_count, check_number
 from afm_rl.flow.base import Context, Examples, Flow
-from afm_rl.learning.nll import REDUCTIONS
+from afm_rl.learning import InPlaceLoss
 from afm_rl.regimes import Regime
 
 POOL = 4  # batches kept of the examples that are used more than once
 
 
-class CFMLoss(LossModule):
+class CFMLoss(InPlaceLoss):
     r"""Conditional flow matching with straight paths.
 
     .. math:: \mathcal{L} = \| v_\phi(c, u_0, \tau, x_\tau) - (x_1 - x_0) \|^2,\qquad
@@ -54,29 +53,9 @@ class CFMLoss(LossModule):
     out_keys = ["loss_cfm"]
 
     def __init__(self, flow: Flow, reduction: str = "mean", seed: int = 0) -> None:
-        self._in_keys = None
-        super().__init__()
+        super().__init__(reduction)
         self.flow = flow
-        self.reduction = check_choice("loss.reduction", reduction, REDUCTIONS)
         self._generator = torch.Generator().manual_seed(seed)
-
-    @property
-    def functional(self) -> bool:
-        """The loss works on the flow itself."""
-        return False
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The three keys read."""
-        keys = self.tensor_keys
-        return self._in_keys or [keys.features, keys.planned, keys.intended]
-
-    @in_keys.setter
-    def in_keys(self, keys: list[NestedKey]) -> None:
-        self._in_keys = keys
-
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        """There is no value estimator."""
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -88,8 +67,7 @@ class CFMLoss(LossModule):
         start = self.flow.source(unit, noise)
         velocity = self.flow(features, unit, tau, torch.lerp(start, end, tau))
         loss = (velocity - (end - start)).square().mean(-1)
-        loss = self._reduce_loss(loss, tensordict=tensordict)
-        return TensorDict({"loss_cfm": loss}, loss.shape)
+        return self._reduced(loss, tensordict)
 
 
 def train_flow(

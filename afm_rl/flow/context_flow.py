@@ -155,12 +155,11 @@ class ContextFlow(Flow):
         valid = row >= _missing(self.window, newest, generator)
         state = uniform(*state_box, count * self.window, generator).view(*size, -1)
         executed = self.denormalise(_excite(*size, self.action_size, generator))
-        realised, noise = model.forecast(state, regime.apply(executed, parameters, state))
-        error = noise * torch.randn(noise.shape, generator=generator)
-        realised = model.manifold.add(realised, error)
+        low, high = self.centre - self.half_range, self.centre + self.half_range
+        effect = regime.apply(executed, parameters, state)
+        realised = _imagine(model, state, effect, low, high, generator)
         seen = effective_action(model, state, executed, realised, self.half_range)
         planned = self.denormalise(2 * torch.rand(count, self.action_size, generator=generator) - 1)
-        low, high = self.centre - self.half_range, self.centre + self.half_range
         intended = intend(regime, planned, now, state[:, -1], low, high, self.saturation)
         return Examples(self.features(executed, seen.effective, valid), planned, intended)
 
@@ -179,6 +178,26 @@ class ContextFlow(Flow):
         end = midpoint(velocity, start, self.steps)
         spread = end.std(-2, correction=0) * self.half_range
         return self.denormalise(end.mean(-2)), spread
+
+
+def _imagine(
+    model: DynamicsModel,
+    state: Tensor,
+    effect: Tensor,
+    low: Tensor,
+    high: Tensor,
+    generator: torch.Generator,
+) -> Tensor:
+    """Return noisy next states ``(*B, S)`` under effective actions, also beyond the box.
+
+    A learned model knows nothing outside the box, so it is continued linearly from its edge.
+    """
+    inside = torch.minimum(torch.maximum(effect, low), high)
+    state_at_edge, noise = model.forecast(state, inside)
+    slope = model.jacobian(state, inside)
+    beyond = (slope @ (effect - inside).unsqueeze(-1)).squeeze(-1)
+    error = noise * torch.randn(noise.shape, generator=generator)
+    return model.manifold.add(state_at_edge, beyond + error)
 
 
 def _newest(count: int, window: int, generator: torch.Generator) -> Tensor:

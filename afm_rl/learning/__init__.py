@@ -1,6 +1,7 @@
 """Learning: losses, updaters, optimisers, pre-training."""
 
 from afm_rl.learning.fresh_adam import FreshAdam
+from afm_rl.learning.loss import InPlaceLoss
 from afm_rl.learning.nll import GaussianNLLLoss, gaussian_nll
 from afm_rl.learning.pretrain import pretrain_ensemble
 from afm_rl.learning.updater import OnlineUpdater, OracleUpdater, Updater
@@ -8,6 +9,7 @@ from afm_rl.learning.updater import OnlineUpdater, OracleUpdater, Updater
 __all__ = [
     "FreshAdam",
     "GaussianNLLLoss",
+    "InPlaceLoss",
     "OnlineUpdater",
     "OracleUpdater",
     "Updater",

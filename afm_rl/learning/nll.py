@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
-from torchrl.objectives import LossModule
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import check_choice
-
-REDUCTIONS = ("mean", "sum", "none")
+from afm_rl.learning.loss import InPlaceLoss
 
 
 def gaussian_nll(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
@@ -28,7 +25,7 @@ def gaussian_nll(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
     return (mean - target) ** 2 * (-log_variance).exp() + log_variance
 
 
-class GaussianNLLLoss(LossModule):
+class GaussianNLLLoss(InPlaceLoss):
     """Gaussian negative log-likelihood of the state change under a dynamics model.
 
     The mean is taken over ensemble members and coordinates, the ``reduction`` over the
@@ -40,9 +37,10 @@ class GaussianNLLLoss(LossModule):
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (one value per transition).
 
     Keys (change them with ``set_keys``): ``state`` ("observation"), ``action`` ("action"),
-    ``next_state`` (("next", "observation")). ``loss_mask_key`` is honoured.
+    ``next_state`` (("next", "observation")).
 
     >>> import torch
+    >>> from tensordict import TensorDict
     >>> from afm_rl.dynamics import Dubins
     >>> loss = GaussianNLLLoss(Dubins())
     >>> s, a = torch.zeros(4, 3), torch.ones(4, 2)
@@ -67,28 +65,8 @@ class GaussianNLLLoss(LossModule):
     out_keys = ["loss_nll"]
 
     def __init__(self, model: DynamicsModel, reduction: str = "mean") -> None:
-        self._in_keys = None
-        super().__init__()
+        super().__init__(reduction)
         self.model = model
-        self.reduction = check_choice("loss.reduction", reduction, REDUCTIONS)
-
-    @property
-    def functional(self) -> bool:
-        """The loss works on the model itself."""
-        return False
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """The three keys read."""
-        keys = self.tensor_keys
-        return self._in_keys or [keys.state, keys.action, keys.next_state]
-
-    @in_keys.setter
-    def in_keys(self, keys: list[NestedKey]) -> None:
-        self._in_keys = keys
-
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        """There is no value estimator."""
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -98,5 +76,4 @@ class GaussianNLLLoss(LossModule):
         target = self.model.standardise(change).unsqueeze(-2)
         mean, log_variance = self.model.moments(state, action)
         loss = gaussian_nll(mean, log_variance, target).mean((-2, -1))
-        loss = self._reduce_loss(loss, tensordict=tensordict)
-        return TensorDict({"loss_nll": loss}, loss.shape)
+        return self._reduced(loss, tensordict)

@@ -66,7 +66,9 @@ def pretrain_ensemble(
     steps = samples // batch_size
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=steps * epochs)
     best, kept = float("inf"), None
-    bar = tqdm(total=steps * epochs, desc="pre-training the ensemble", disable=None if progress else True)
+    bar = tqdm(
+        total=steps * epochs, desc="pre-training the ensemble", disable=None if progress else True
+    )
     with bar, torch.enable_grad():
         for _ in range(epochs):
             order = torch.rand(model.members, samples, generator=generator).argsort(-1)

@@ -15,6 +15,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 from afm_rl.dynamics import DynamicsModel, Oracle
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.learning import GaussianNLLLoss, OracleUpdater, Updater
+from afm_rl.missions.checks import blaming, check_cost, check_keys
 from afm_rl.missions.parts import Training
 from afm_rl.missions.robot import Robot
 from afm_rl.missions.selection import (
@@ -60,26 +61,33 @@ def build(cfg: DictConfig) -> Agent:
     Raises:
         ConfigurationError: for settings that cannot be used, naming the key.
     """
-    settings = OmegaConf.to_container(cfg, resolve=True)
-    robot: Robot = instantiate(cfg.robot, _convert_="all")
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    label = cfg.label
+    if label is not None and not isinstance(label, str):
+        raise ConfigurationError(f"label={label!r}: expected a text")
+    with blaming("robot"):
+        robot: Robot = instantiate(cfg.robot, _convert_="all")
     tracks = select_tracks(settings["tracks"], robot)
     regimes = select_regimes(settings["regimes"], robot)
     seeds = select_seeds(settings["seeds"])
-    env = robot.env(
-        tracks=tracks,
-        regime=robot.regime,
-        schedule=robot.schedule,
-        max_steps=check_count("budget", settings["budget"]),
-        action_low=robot.action_low,
-        action_high=robot.action_high,
-    )
+    budget = check_count("budget", settings["budget"])
+    with blaming("robot.env"):
+        env = robot.env(
+            tracks=tracks,
+            regime=robot.regime,
+            schedule=robot.schedule,
+            max_steps=budget,
+            action_low=robot.action_low,
+            action_high=robot.action_high,
+        )
+    goal, names = env.observation_spec["goal"].shape[-1], list(robot.goal_names)
+    if len(names) != goal:
+        raise ConfigurationError(f"robot.goal_names={names}: expected {goal} names")
     missions = build_missions(env, tracks, regimes, seeds)
 
     def make(group: str, *args: Any) -> Any:
-        try:
+        with blaming(group):
             return instantiate(cfg[group], _convert_="all")(*args)
-        except TypeError as error:  # a setting that the part does not have
-            raise ConfigurationError(f"{group}: {error}") from error
 
     dynamics = make("dynamics", robot)
     base = dynamics.module
@@ -90,7 +98,8 @@ def build(cfg: DictConfig) -> Agent:
         if part.training is not None
     ]
     model = base
-    cost = instantiate(cfg.cost, _convert_="all")
+    with blaming("cost"):
+        cost = instantiate(cfg.cost, _convert_="all")
     planner = make("planner", PlanningEnv(model, cost, *robot.action_box))
     transform = make("transform", model, flow.module)
     executed_key = "action" if transform is None else ("next", transform.key("executed_action"))
@@ -104,10 +113,14 @@ def build(cfg: DictConfig) -> Agent:
     chain = [] if transform is None else [transform]
     if hasattr(planner, "make_tensordict_primer"):
         chain.append(planner.make_tensordict_primer())
+    whole = TransformedEnv(env, Compose(*chain))
+    check_cost(cost, model, whole)
+    check_keys("planner", planner, whole)
+    check_keys("updater", updater, whole)
     return Agent(
-        label=settings["label"] or "unnamed",
+        label=label or "unnamed",
         robot=robot,
-        env=TransformedEnv(env, Compose(*chain)),
+        env=whole,
         missions=missions,
         model=model,
         planner=planner,

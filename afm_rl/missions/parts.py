@@ -17,6 +17,7 @@ from afm_rl.dynamics import DynamicsModel, Ensemble, Oracle
 from afm_rl.errors import AFMError, ConfigurationError
 from afm_rl.flow import ContextFlow, Flow, PaperFlow, train_flow
 from afm_rl.learning import pretrain_ensemble
+from afm_rl.missions.checks import check_training
 from afm_rl.missions.robot import Robot
 from afm_rl.transforms import ActionFlowTransform
 
@@ -56,6 +57,8 @@ def oracle(robot: Robot) -> Part:
 def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part:
     """Return an ensemble to be pre-trained on the nominal physics."""
     nominal = robot.model
+    least = {"samples": pretrain.get("batch_size", 1)}
+    check_training("dynamics.pretrain", pretrain_ensemble, pretrain, **least)
     model = Ensemble(nominal.manifold, nominal.action_size, list(robot.features), **settings)
 
     def train(progress: bool) -> float:
@@ -104,7 +107,10 @@ def _trained(
     checkpoint: str | None,
     unit: str,
 ) -> Part:
+    check_training("flow.train", train_flow, settings, batch_size=2)
     if checkpoint is not None:
+        if not isinstance(checkpoint, str):
+            raise ConfigurationError(f"flow.checkpoint={checkpoint!r}: expected the path of a file")
         try:
             load_artefact(Path(checkpoint), flow, flow.signature)
         except AFMError as error:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from afm_rl._version import __version__
 from afm_rl.artefacts import cached
+from afm_rl.errors import ConfigurationError
 from afm_rl.missions.build import Agent
+from afm_rl.missions.parts import Training
 
 
 def prepare(
@@ -21,13 +24,30 @@ def prepare(
         cache: folder of trained parts.
         progress: show progress bars.
         echo: receives one line per part.
+
+    Raises:
+        ConfigurationError: if the cache cannot be written; before anything is trained.
+        ArtefactError: if a part in the cache is damaged.
     """
+    folder = Path(cache).expanduser()
+
+    def train(part: Training) -> float:
+        _check_writable(folder)
+        return part.train(progress)
+
     for part in agent.trainings:
         description = {"name": part.title, "version": __version__, "settings": part.settings}
         description.update(getattr(part.module, "signature", {}))
         start = time.perf_counter()
-        error, found = cached(
-            Path(cache).expanduser(), part.module, description, lambda p=part: p.train(progress)
-        )
+        error, found = cached(folder, part.module, description, lambda p=part: train(p))
         spent = "from the cache" if found else f"trained in {time.perf_counter() - start:.0f} s"
         echo(f"{part.title}: held-out error {error:.4f} {part.unit} ({spent})")
+
+
+def _check_writable(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ConfigurationError(f"cache={folder}: cannot be written: {error.strerror}") from error

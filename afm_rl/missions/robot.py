@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.regimes import Regime, Schedule
 
 
@@ -54,19 +54,31 @@ class Robot:
     paper_regimes: Sequence[Mapping[str, float]]
 
     def __post_init__(self) -> None:
-        """Check that the boxes fit the model.
+        """Check that boxes, names and features fit the model.
 
         Raises:
-            ConfigurationError: if a box has the wrong size or is turned inside out.
+            ConfigurationError: if a box has the wrong size or is turned inside out, a
+                coordinate lacks its name, or a feature is no coordinate.
         """
         for kind, size in (("action", self.model.action_size), ("state", self.model.state_size)):
-            low, high = getattr(self, f"{kind}_low"), getattr(self, f"{kind}_high")
+            low, high = (
+                [check_number(f"robot.{kind}_{end}", x) for x in getattr(self, f"{kind}_{end}")]
+                for end in ("low", "high")
+            )
             fits = len(low) == len(high) == size
             if not fits or any(a > b for a, b in zip(low, high, strict=True)):
                 raise ConfigurationError(
                     f"robot.{kind}_low={list(low)}, robot.{kind}_high={list(high)}: expected "
                     f"{size} numbers each, low <= high"
                 )
+            names = list(getattr(self, f"{kind}_names"))
+            if len(names) != size:
+                raise ConfigurationError(f"robot.{kind}_names={names}: expected {size} names")
+        size, features = self.model.state_size, list(self.features)
+        if not all(type(index) is int and 0 <= index < size for index in features):
+            raise ConfigurationError(
+                f"robot.features={features}: expected indices in 0..{size - 1}"
+            )
 
     @property
     def action_box(self) -> tuple[Tensor, Tensor]:

@@ -49,7 +49,9 @@ def run(agent: Agent, progress: bool = False) -> Results:
     ends = {name: torch.zeros(total) for name in ("steps", "reached", "seconds")}
     log = StepLog(_columns(agent), whole=["misaligned", "regime_active", "reached"])
     clock, step = time.perf_counter(), 0
-    with tqdm(total=total, desc=agent.label, unit="mission", disable=None if progress else True) as bar:
+    with tqdm(
+        total=total, desc=agent.label, unit="mission", disable=None if progress else True
+    ) as bar:
         while len(ids):
             td = env.step(planner(td))
             error, surprise = _error(agent, td)

@@ -34,10 +34,10 @@ def select_regimes(regimes: Any, robot: Robot) -> list[RegimeValues]:
     Raises:
         ConfigurationError: naming the parameter that is unknown or not finite.
     """
-    if regimes == "paper":
-        return list(robot.paper_regimes)
     if regimes == "none":
         return [{}]
+    if regimes == "paper":
+        regimes = list(robot.paper_regimes)
     if isinstance(regimes, Mapping):
         regimes = [regimes]
     if not isinstance(regimes, list) or not regimes:
@@ -59,7 +59,7 @@ def select_seeds(seeds: Any) -> list[int]:
     """Return seeds: a count, or a list."""
     if isinstance(seeds, int) and not isinstance(seeds, bool) and seeds >= 1:
         return list(range(seeds))
-    whole = isinstance(seeds, list) and all(type(s) is int and s >= 0 for s in seeds)
+    whole = isinstance(seeds, list) and all(type(s) is int and 0 <= s < 2**63 for s in seeds)
     if not whole or not seeds or len(set(seeds)) < len(seeds):
         raise ConfigurationError(
             f"seeds={seeds!r}: expected a count of at least 1, or a list of distinct whole numbers"

@@ -1,5 +1,8 @@
 """Conditional flow matching: loss and training."""
 
+import io
+import sys
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -169,12 +172,19 @@ def test_the_model_is_not_changed_and_gradients_may_be_off(trained_ensemble, box
     assert not all(torch.equal(value, start[name]) for name, value in flow.state_dict().items())
 
 
-def test_progress_can_be_shown(train, capsys):
-    quiet, _ = train()
-    assert capsys.readouterr().err == ""
-    shown, _ = train(progress=True)
-    assert "training the flow" in capsys.readouterr().err
-    assert same(quiet, shown)
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_can_be_shown_on_a_terminal(train, monkeypatch):
+    written = {}
+    for progress in (False, True):
+        monkeypatch.setattr("sys.stderr", Terminal())
+        flow, _ = train(progress=progress)
+        written[progress] = sys.stderr.getvalue()
+    assert written[False] == "" and "training the flow" in written[True]
+    assert same(flow, train()[0])
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def test_a_reversed_motor_is_corrected_by_reversing_the_action(trained_flow, win
     corrected, _ = trained_flow.correct(context_of(trained_flow, window), None, planned)
     right = planned * torch.tensor([-1.0, 1.0])
     miss = (corrected - right) / trained_flow.half_range
-    assert float(miss.square().mean().sqrt()) < 0.2
+    assert miss.square().mean().sqrt() < 0.2
     reached = Dubins()(torch.zeros(len(planned), 3), corrected * torch.tensor([-1.0, 1.0]))
     wanted = Dubins()(torch.zeros(len(planned), 3), planned)
     uncorrected = Dubins()(torch.zeros(len(planned), 3), right)
@@ -61,7 +61,7 @@ def test_a_nominal_window_changes_little(trained_flow, window_of, box):
     assert not context.misaligned.any()
     corrected, _ = trained_flow.correct(context, None, planned)
     miss = (corrected - planned) / trained_flow.half_range
-    assert float(miss.square().mean().sqrt()) < 0.2
+    assert miss.square().mean().sqrt() < 0.2
 
 
 def test_the_context_holds_pairs_in_half_ranges(flow, window_of):

@@ -1,0 +1,110 @@
+"""Checks of settings that no part can make alone, before anything is trained."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from inspect import signature
+from typing import Any
+
+import torch
+from hydra.errors import InstantiationException
+from tensordict import unravel_key
+from torchrl.envs import EnvBase
+
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_count, check_number
+from afm_rl.planning import Cost
+
+MISTAKES = (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError)
+KEYS = ("seed_key", "mask_key", "regime_key")  # settings that name an entry of the environment
+
+
+@contextmanager
+def blaming(group: str) -> Iterator[None]:
+    """Turn what a maker of parts raises into an error that names the settings at fault.
+
+    Raises:
+        ConfigurationError: naming ``group``, or the key inside it that Hydra blames.
+
+    >>> with blaming("planner"):
+    ...     dict(horizon=5, horizn=3)["population"]
+    Traceback (most recent call last):
+        ...
+    afm_rl.errors.ConfigurationError: planner: 'population'
+    """
+    try:
+        yield
+    except AFMError:
+        raise
+    except InstantiationException as error:
+        last: BaseException = error
+        while last.__cause__ is not None:
+            last = last.__cause__
+        if isinstance(last, AFMError):
+            raise last from error
+        found = re.search(r"full_key: (\S+)", str(error))
+        text = str(last).partition("\nfull_key:")[0]
+        raise ConfigurationError(f"{found[1] if found else group}: {text}") from error
+    except MISTAKES as error:
+        raise ConfigurationError(f"{group}: {error}") from error
+
+
+def check_training(
+    group: str, train: Callable[..., Any], settings: Mapping[str, Any], **least: int
+) -> None:
+    """Check the ``settings`` of a training function by its defaults.
+
+    Counts must be at least 1, or what ``least`` says; other numbers must not be negative.
+
+    Raises:
+        ConfigurationError: for an unknown setting, or one out of range.
+    """
+    known = {
+        name: parameter.default
+        for name, parameter in signature(train).parameters.items()
+        if parameter.kind is parameter.KEYWORD_ONLY and name != "progress"
+    }
+    for name, value in settings.items():
+        check_choice(f"{group}: setting", name, known)
+        if value is None and known[name] is None:
+            continue
+        if known[name] is None or isinstance(known[name], int):
+            check_count(f"{group}.{name}", value, low=0 if name == "seed" else least.get(name, 1))
+        else:
+            check_number(f"{group}.{name}", value, low=0.0, open_low=name == "lr")
+
+
+def check_cost(cost: Cost, model: DynamicsModel, env: EnvBase) -> None:
+    """Check that the environment gives what the cost reads, by trying it once.
+
+    Raises:
+        ConfigurationError: otherwise.
+    """
+    spec = env.observation_spec
+    for key, size in zip(cost.in_keys, cost.in_sizes, strict=True):
+        found = spec[key].shape[-1] if key in spec.keys(True, True) else "nothing"
+        if found != size:
+            raise ConfigurationError(
+                f"cost: reads {size} numbers from {key!r}, but the environment gives {found} there"
+            )
+    state, action = torch.zeros(model.state_size), torch.zeros(model.action_size)
+    with blaming("cost"):
+        cost(state, action, state, *(torch.zeros(size) for size in cost.in_sizes))
+
+
+def check_keys(group: str, part: Any, env: EnvBase) -> None:
+    """Check that the entries that a part was told to read are there.
+
+    Raises:
+        ConfigurationError: otherwise.
+    """
+    given = list(env.observation_spec.keys(True, True))
+    for name in KEYS:
+        key = getattr(part, name, None)
+        bare = key[1:] if isinstance(key, tuple) and key[0] == "next" else key
+        if key is not None and unravel_key(bare) not in given:
+            raise ConfigurationError(
+                f"{group}.{name}={key!r}: expected one of {', '.join(map(repr, given))}"
+            )
