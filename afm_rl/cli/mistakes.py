@@ -26,9 +26,8 @@ def explain(error: BaseException) -> str | None:
             return one_line(str(cause))
     for cause in chain:
         if isinstance(cause, HydraException | OmegaConfBaseException):
-            below = cause.__cause__
-            reason = f": {below}" if below is not None and str(below) not in str(cause) else ""
-            return one_line(f"{cause}{reason}")
+            merging = str(cause).startswith("Error merging")  # Hydra keeps the reason to itself
+            return one_line(f"{cause}: {cause.__cause__}" if merging else str(cause))
         if isinstance(cause, OSError) and cause.strerror:
             return one_line(f"{cause.filename or 'files'}: {cause.strerror}")
     return None

@@ -108,7 +108,7 @@ class PaperFlow(Flow):
 
     def context(self, window: Window, model: DynamicsModel, last: Context) -> Context:
         """Compare the last transition with the model's prediction."""
-        row = Window(*(part[..., -1:, :] for part in window[:4]), window.valid[..., -1:])
+        row = Window(*(part.narrow(window.valid.dim() - 1, -1, 1) for part in window))
         action = row.planned if self.error_action == "planned" else row.executed
         expected = model(row.state, action)
         raw = row.next_state - expected

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -122,7 +123,7 @@ class OracleUpdater(Updater):
     @property
     def oracle(self) -> Oracle:
         """The model to tell."""
-        return self.loss.model
+        return cast(Oracle, self.loss.model)
 
     def start(self, tensordict: TensorDictBase) -> None:
         """Tell the first regime."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from afm_rl._version import __version__
@@ -39,7 +40,7 @@ def prepare(
         description = {"name": part.title, "version": __version__, "settings": part.settings}
         description.update(getattr(part.module, "signature", {}))
         start = time.perf_counter()
-        error, found = cached(folder, part.module, description, lambda p=part: train(p))
+        error, found = cached(folder, part.module, description, partial(train, part))
         spent = "from the cache" if found else f"trained in {time.perf_counter() - start:.0f} s"
         echo(f"{part.title}: held-out error {error:.4f} {part.unit} ({spent})")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import pandas as pd
 import torch
@@ -113,7 +114,7 @@ def _missions(agent: Agent, ends: dict[str, Tensor]) -> pd.DataFrame:
     reached = ends["reached"].int()
     targets = base.course.counts[mission["track"]].int()
     changed = _changed(agent, mission["parameters"])
-    frame = {
+    frame: dict[str, Any] = {
         "mission": range(len(reached)),
         "method": agent.label,
         "track": [base.tracks[int(index)].name for index in mission["track"]],

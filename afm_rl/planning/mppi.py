@@ -149,7 +149,7 @@ class MPPI(MPCPlannerBase):
         self.action_key = as_key(action_key)
         mean_key = self.mean_key if isinstance(self.mean_key, tuple) else (self.mean_key,)
         self.next_mean_key = ("next", *mean_key)
-        self.in_keys = [*self.in_keys, self.mean_key]
+        self.in_keys = [*env.observation_spec.keys(True, True), self.mean_key]
         if self.seed_key is not None:
             self.in_keys.append(self.seed_key)
         self.out_keys = [self.action_key, self.next_mean_key]

@@ -42,8 +42,8 @@ class PlanningEnv(ModelBasedEnvBase):
         self,
         dynamics: DynamicsModel,
         cost: Cost,
-        action_low: Sequence[float],
-        action_high: Sequence[float],
+        action_low: Sequence[float] | Tensor,
+        action_high: Sequence[float] | Tensor,
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
     ) -> None:

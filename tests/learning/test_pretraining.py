@@ -1,5 +1,6 @@
 """Pre-training of an ensemble."""
 
+import copy
 import math
 
 import pytest
@@ -39,18 +40,21 @@ def test_a_small_budget_already_teaches(trained_ensemble, trained_error, transit
     assert (ratio < 0.2).all()
 
 
-def test_the_reported_error_is_that_of_the_model_kept(fit, states, box, monkeypatch):
-    errors = []
-    real = pretrain.held_out_error
+def test_the_best_epoch_is_kept_and_its_error_returned(fit, monkeypatch):
+    errors, seen = iter([0.5, 0.2, 0.9, 0.3]), []
 
-    def spy(*args):
-        errors.append(real(*args))
-        return errors[-1]
+    def judge(model, *held_out):
+        seen.append(copy.deepcopy(model))
+        return next(errors)
 
-    monkeypatch.setattr(pretrain, "held_out_error", spy)
-    # a step size that spoils what was learned: the best epoch is not the last
-    model, best = fit(epochs=6, lr=0.1)
-    assert best == min(errors) and len(errors) == 6
+    monkeypatch.setattr(pretrain, "held_out_error", judge)
+    model, best = fit(epochs=4)
+    assert best == 0.2 and [same(model, other) for other in seen] == [False, True, False, False]
+
+
+def test_training_that_breaks_down_is_reported_as_such(fit, monkeypatch):
+    monkeypatch.setattr(pretrain, "held_out_error", lambda *_: math.nan)
+    assert fit()[1] == math.inf
 
 
 def test_normalisation_comes_from_the_training_data(fit, states, box):
