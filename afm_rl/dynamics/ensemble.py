@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.dynamics.sparse import sparse_layer, uniform_layer
 from afm_rl.dynamics.stacked import stacked_mlp, stacked_mlp_tangent
 from afm_rl.errors import ConfigurationError, check_choice, check_count
 from afm_rl.manifold import Manifold
+from afm_rl.running_stats import RunningStats
 
 Stack = Sequence[Tensor]
+INITS = {"uniform": uniform_layer, "sparse": sparse_layer}
 CHUNK = 2**18  # activations per layer and chunk: 1 MiB in float32, so that they stay in cache
 
 
@@ -37,6 +41,11 @@ class Ensemble(DynamicsModel):
         hidden: units of the hidden layers.
         log_variance: soft lower and upper bound of the log-variance.
         propagation: ``"mean"`` or ``"sample"``.
+        init: ``"uniform"``, or ``"sparse"``: a tenth of the weights is not zero.
+        layer_norm: standardise the units of a layer before each LeakyReLU.
+        running_count: None: the statistics that standardise inputs stay as pre-training set
+            them. A count: :meth:`observe_` goes on with them, as if they came from at most
+            so many samples.
         seed: seed of the initial weights.
 
     >>> model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], hidden=[16])
@@ -58,6 +67,9 @@ class Ensemble(DynamicsModel):
         hidden: Sequence[int] = (200, 200, 200),
         log_variance: Sequence[float] = (-10.0, 0.5),
         propagation: str = "mean",
+        init: str = "uniform",
+        layer_norm: bool = False,
+        running_count: int | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__(manifold, action_size)
@@ -73,19 +85,23 @@ class Ensemble(DynamicsModel):
             raise ConfigurationError(f"dynamics.log_variance=[{low}, {high}]: expected low < high")
         self.log_variance = (float(low), float(high))
         self.propagation = check_choice("dynamics.propagation", propagation, ("mean", "sample"))
+        self.layer_norm = layer_norm
         self._generator = torch.Generator().manual_seed(seed)
         inputs, targets = len(self.features) + action_size, manifold.tangent_size
         sizes = [inputs, *self.hidden, 2 * targets]
+        draw = INITS[check_choice("dynamics.init", init, INITS)]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
-            bound = 1 / math.sqrt(fan_in)  # nn.Linear's own
-            uniform = torch.rand(members, fan_in + 1, fan_out, generator=self._generator)
-            drawn = (2 * uniform - 1) * bound
-            self.weights.append(nn.Parameter(drawn[:, :fan_in].clone()))
-            self.biases.append(nn.Parameter(drawn[:, fan_in:].clone()))
+            weight, bias = draw(members, fan_in, fan_out, self._generator)
+            self.weights.append(nn.Parameter(weight))
+            self.biases.append(nn.Parameter(bias))
         for name, size in (("input", inputs), ("target", targets)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
+        self.running_count, self.running = running_count, None
+        if running_count is not None:
+            check_count("dynamics.running_count", running_count, low=2)
+            self.running = RunningStats(inputs)
 
     @property
     def lead(self) -> torch.Size:
@@ -97,6 +113,20 @@ class Ensemble(DynamicsModel):
         for name, data in (("input", inputs), ("target", targets)):
             getattr(self, f"{name}_mean").copy_(data.mean(0))
             getattr(self, f"{name}_std").copy_(data.std(0).clamp_min(1e-8))
+        if self.running is not None:
+            count = min(len(inputs), self.running_count or 0)
+            self.running.start_(self.input_mean, self.input_std, count)
+
+    def observe_(self, state: Tensor, action: Tensor, where: Tensor | None = None) -> None:
+        """Let the running statistics, if there are any, see inputs ``(*L, *N)`` met in use.
+
+        Args:
+            state: ``(*L, *N, S)``.
+            action: ``(*L, *N, A)``.
+            where: ``(*L, *N)`` boolean, which of them count; None for all.
+        """
+        if self.running is not None:
+            self.running.update_(self.inputs(state, action), where)
 
     def inputs(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the raw network inputs ``(*B, in)``."""
@@ -127,8 +157,9 @@ class Ensemble(DynamicsModel):
 
         For training the members of a shared ensemble on different samples.
         """
-        rows = (self.inputs(state, action) - self.input_mean) / self.input_std
-        return self._moments(stacked_mlp(rows, list(self.weights), list(self.biases)))
+        rows = self._standard(self.inputs(state, action))
+        weights, biases = list(self.weights), list(self.biases)
+        return self._moments(stacked_mlp(rows, weights, biases, self.layer_norm))
 
     def _moments(self, out: Tensor) -> tuple[Tensor, Tensor]:
         """Split raw outputs into mean and softly bounded log-variance."""
@@ -152,13 +183,15 @@ class Ensemble(DynamicsModel):
         """Return the mean Jacobian of the members ``(*L, *N, D, A)``, in closed form."""
         rows, shape = self._rows(state, action)
         axes = torch.eye(rows.shape[-1], device=rows.device, dtype=rows.dtype)
-        axes = (axes / self.input_std)[len(self.features) :]
+        axes = axes[len(self.features) :]
         size = self.manifold.tangent_size
 
         def tangents(wide: Tensor, weights: Stack, biases: Stack) -> Tensor:
-            return stacked_mlp_tangent(wide, axes, weights, biases)
+            return stacked_mlp_tangent(wide, axes, weights, biases, self.layer_norm)
 
-        moved = self._chunked(tangents, rows, size).mean(2)  # (l, n, A, D)
+        std = self.input_std if self.running is None else self.running.std
+        std = std[..., len(self.features) :].reshape(-1, 1, self.action_size, 1)
+        moved = self._chunked(tangents, rows, size).mean(2) / std  # (l, n, A, D)
         return (moved * self.target_std).mT.reshape(*shape, size, self.action_size)
 
     def expand_(self, missions: int) -> Ensemble:
@@ -168,6 +201,8 @@ class Ensemble(DynamicsModel):
         for parameter in self.parameters():
             parameter.data = parameter.data.expand(missions, *parameter.shape).clone()
             parameter.grad = None
+        if self.running is not None:
+            self.running.expand_(missions)
         return self
 
     def select_(self, index: Tensor) -> Ensemble:
@@ -176,6 +211,8 @@ class Ensemble(DynamicsModel):
             for parameter in self.parameters():
                 parameter.data = parameter.data[index]
                 parameter.grad = None
+            if self.running is not None:
+                self.running.select_(index)
         return self
 
     def _rows(self, state: Tensor, action: Tensor) -> tuple[Tensor, torch.Size]:
@@ -188,8 +225,14 @@ class Ensemble(DynamicsModel):
                 f"{self.state_size})"
             )
         raw = self.inputs(state, action)
-        rows = (raw - self.input_mean) / self.input_std
+        rows = self._standard(raw)
         return rows.reshape(max(1, math.prod(lead)), -1, rows.shape[-1]), raw.shape[:-1]
+
+    def _standard(self, raw: Tensor) -> Tensor:
+        """Standardise raw inputs ``(*L, *N, in)``."""
+        if self.running is None:
+            return (raw - self.input_mean) / self.input_std
+        return self.running(raw)
 
     def _per_member(self, rows: Tensor) -> Tensor:
         """Repeat ``(l, n, in)`` for every member: ``(l * E, n, in)``."""
@@ -208,7 +251,8 @@ class Ensemble(DynamicsModel):
     def _run(self, state: Tensor, action: Tensor, size: int) -> Tensor:
         """Return the first ``size`` outputs of every member ``(*L, *N, E, size)``."""
         rows, shape = self._rows(state, action)
-        return self._chunked(stacked_mlp, rows, size).reshape(*shape, self.members, size)
+        network = partial(stacked_mlp, layer_norm=self.layer_norm)
+        return self._chunked(network, rows, size).reshape(*shape, self.members, size)
 
     def _chunked(
         self, network: Callable[[Tensor, Stack, Stack], Tensor], rows: Tensor, size: int

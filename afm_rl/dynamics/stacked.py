@@ -9,28 +9,41 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
 SLOPE = 0.01  # of the LeakyReLU
+EPS = 1e-5  # of the layer norm: torch's own
 
 
-def stacked_mlp(inputs: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> Tensor:
+def stacked_mlp(
+    inputs: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    layer_norm: bool = False,
+) -> Tensor:
     """Run M perceptrons with LeakyReLU on M batches: ``(M, N, in) -> (M, N, out)``.
 
     Args:
         inputs: ``(M, N, in)``.
         weights: one ``(M, in, out)`` per layer.
         biases: one ``(M, 1, out)`` per layer.
+        layer_norm: standardise the units of a layer before each LeakyReLU.
 
     >>> stacked_mlp(torch.ones(2, 7, 3), [torch.ones(2, 3, 1)], [torch.zeros(2, 1, 1)])[0, 0]
     tensor([3.])
     """
     hidden = torch.baddbmm(biases[0], inputs, weights[0])
     for weight, bias in zip(weights[1:], biases[1:], strict=True):
+        if layer_norm:
+            hidden = F.layer_norm(hidden, hidden.shape[-1:], eps=EPS)
         hidden = F.leaky_relu(hidden, SLOPE, inplace=True)
         hidden = torch.baddbmm(bias, hidden, weight)
     return hidden
 
 
 def stacked_mlp_tangent(
-    inputs: Tensor, tangents: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]
+    inputs: Tensor,
+    tangents: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    layer_norm: bool = False,
 ) -> Tensor:
     """Push A tangent vectors through the networks of :func:`stacked_mlp`.
 
@@ -39,6 +52,7 @@ def stacked_mlp_tangent(
         tangents: ``(A, in)``, the same for every row.
         weights: one ``(M, in, out)`` per layer.
         biases: one ``(M, 1, out)`` per layer.
+        layer_norm: standardise the units of a layer before each LeakyReLU.
 
     Returns:
         Directional derivatives ``(M, N, A, out)``.
@@ -48,7 +62,22 @@ def stacked_mlp_tangent(
         rows = moved.shape[1:3]
         moved = torch.bmm(moved.flatten(1, 2), weight).unflatten(1, rows)
         if layer < len(weights) - 1:
-            value = moved[:, :, :1] + bias.unsqueeze(2)
+            value, change = moved[:, :, :1] + bias.unsqueeze(2), moved[:, :, 1:]
+            if layer_norm:
+                value, change = _layer_norm_tangent(value, change)
             slope = torch.where(value > 0, 1.0, SLOPE).to(value.dtype)
-            moved = torch.cat([value, moved[:, :, 1:]], 2) * slope
+            moved = torch.cat([value, change], 2) * slope
     return moved[:, :, 1:]
+
+
+def _layer_norm_tangent(value: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a layer norm's value ``(..., 1, D)`` and its tangents ``(..., A, D)``.
+
+    With ``n = (v - mean v) / s``, ``s`` the root of the variance plus a small constant:
+    ``dn = (dv - mean dv - n mean(n dv)) / s``.
+    """
+    centred = value - value.mean(-1, keepdim=True)
+    scale = (centred.square().mean(-1, keepdim=True) + EPS).rsqrt()
+    normed = centred * scale
+    along = (normed * change).mean(-1, keepdim=True)
+    return normed, (change - change.mean(-1, keepdim=True) - normed * along) * scale

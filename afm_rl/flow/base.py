@@ -1,4 +1,4 @@
-"""The contract between the transform and a flow."""
+"""The contract between the transform and what corrects its actions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Window(NamedTuple):
 
 
 class Context(NamedTuple):
-    """What a flow reads in a window."""
+    """What a corrector reads in a window."""
 
     features: Tensor
     """Description of the regime, ``(*B, C)``."""
@@ -39,18 +39,7 @@ class Context(NamedTuple):
     """Is the model misaligned? ``(*B)``."""
 
 
-class Examples(NamedTuple):
-    """Training examples of a flow."""
-
-    features: Tensor
-    """Context, ``(N, C)``."""
-    planned: Tensor
-    """Planned action, ``(N, A)``."""
-    intended: Tensor
-    """Action to execute instead, ``(N, A)``."""
-
-
-class Flow(nn.Module, ABC):
+class Corrector(nn.Module, ABC):
     """Turns planned actions into executed ones, given what the window shows.
 
     Actions are handled in units of half ranges around the centre of their box, u in
@@ -92,7 +81,7 @@ class Flow(nn.Module, ABC):
 
     @property
     def signature(self) -> dict[str, object]:
-        """What a stored flow must agree in to be loaded."""
+        """What a stored corrector must agree in to be loaded."""
         return {
             "kind": type(self).__name__,
             "action_size": self.action_size,
@@ -106,6 +95,29 @@ class Flow(nn.Module, ABC):
     def denormalise(self, unit: Tensor) -> Tensor:
         """Return the action for u."""
         return self.centre + self.half_range * unit
+
+    @abstractmethod
+    def context(self, window: Window, model: DynamicsModel, last: Context) -> Context:
+        """Describe the regime under the *present* model; ``last`` is the previous answer."""
+
+    @abstractmethod
+    def correct(self, context: Context, state: Tensor, planned: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the action to execute and its spread over samples, ``(*B, A)`` each."""
+
+
+class Examples(NamedTuple):
+    """Training examples of a flow."""
+
+    features: Tensor
+    """Context, ``(N, C)``."""
+    planned: Tensor
+    """Planned action, ``(N, A)``."""
+    intended: Tensor
+    """Action to execute instead, ``(N, A)``."""
+
+
+class Flow(Corrector):
+    """A corrector that learns a velocity field from the planned action to the corrected one."""
 
     @abstractmethod
     def forward(self, features: Tensor, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:
@@ -125,11 +137,3 @@ class Flow(nn.Module, ABC):
         generator: torch.Generator,
     ) -> Examples:
         """Make counterfactual training examples: what the model would have been seen to do."""
-
-    @abstractmethod
-    def context(self, window: Window, model: DynamicsModel, last: Context) -> Context:
-        """Describe the regime under the *present* model; ``last`` is the previous answer."""
-
-    @abstractmethod
-    def correct(self, context: Context, state: Tensor, planned: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the action to execute and its spread over samples, ``(*B, A)`` each."""

@@ -9,20 +9,20 @@ from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_choice, check_count, check_number
-from afm_rl.flow.base import Context, Examples, Flow, Window
+from afm_rl.flow.base import Context, Examples, Flow
 from afm_rl.flow.effective import effective_action
+from afm_rl.flow.least_squares import fit_gain
 from afm_rl.flow.network import mlp
+from afm_rl.flow.pairs import PairCorrector
 from afm_rl.flow.saturation import MODES, intend, saturate
 from afm_rl.flow.solver import midpoint
 from afm_rl.regimes import Regime
 from afm_rl.sampling import uniform
 
 FORGETTING = (0.5, 0.9)  # of the least-squares guesses: one trusts the newest rows, one all
-PRIOR, LEAST = 1e-3, 0.02  # their pull towards gain 1, and the smallest gain they divide by
-LIMIT = 4.0  # effective actions beyond 4 half ranges are clamped: they carry no more news
 
 
-class ContextFlow(Flow):
+class ContextFlow(PairCorrector, Flow):
     r"""A flow from noise around the planned action to the action that has its effect.
 
     The regime is described by K pairs (executed, effective action), which mean the same for
@@ -72,7 +72,7 @@ class ContextFlow(Flow):
         saturation: str = "direction",
         seed: int = 0,
     ) -> None:
-        super().__init__(action_low, action_high, gate, check_count("flow.window", window))
+        super().__init__(action_low, action_high, window, gate)
         self.samples = check_count("flow.samples", samples)
         self.source_std = check_number("flow.source_std", source_std, low=0.0)
         self.steps = check_count("flow.steps", steps)
@@ -87,25 +87,9 @@ class ContextFlow(Flow):
         self.register_buffer("source_points", points, persistent=False)
 
     @property
-    def feature_size(self) -> int:
-        """K (executed, effective, valid)."""
-        return self.window * (2 * self.action_size + 1)
-
-    def features(self, executed: Tensor, effective: Tensor, valid: Tensor) -> Tensor:
-        """Return the context features ``(*B, C)`` of pairs ``(*B, K, A)``, ``(*B, K)``."""
-        pairs = torch.cat([self.normalise(executed), self.normalise(effective)], -1)
-        kept = torch.where(valid.unsqueeze(-1), pairs.clamp(-LIMIT, LIMIT), 0.0)
-        return torch.cat([kept, valid.unsqueeze(-1).to(kept)], -1).flatten(-2)
-
-    def context(self, window: Window, model: DynamicsModel, last: Context) -> Context:
-        """Describe the window under the present model."""
-        seen = effective_action(
-            model, window.state, window.executed, window.next_state, self.half_range
-        )
-        valid = window.valid & seen.effective.isfinite().all(-1) & seen.surprise.isfinite()
-        surprise = torch.where(valid, seen.surprise, 0.0).amax(-1)
-        features = self.features(window.executed, seen.effective, valid)
-        return Context(features, surprise, surprise > self.gate)
+    def signature(self) -> dict[str, object]:
+        """Include what the hints depend on."""
+        return {**super().signature, "saturation": self.saturation}
 
     def source(self, planned: Tensor, noise: Tensor) -> Tensor:
         """Return a point near the planned action."""
@@ -121,17 +105,9 @@ class ContextFlow(Flow):
 
         Exact for gains; a hint for everything else.
         """
-        pairs = features.unflatten(-1, (self.window, -1))
-        executed, effective, valid = pairs.split([self.action_size, self.action_size, 1], -1)
-        age = torch.arange(self.window - 1, -1, -1, device=features.device)
-        guesses = []
-        for forgetting in FORGETTING:
-            weight = valid * (forgetting**age).unsqueeze(-1)
-            cross = (weight * executed * effective).sum(-2) + PRIOR
-            gain = cross / ((weight * executed.square()).sum(-2) + PRIOR)
-            gain = torch.where(gain.abs() < LEAST, LEAST * (1 - 2 * (gain < 0).to(gain)), gain)
-            guesses.append(saturate(planned / gain, self.saturation))
-        return guesses
+        pairs = self.pairs(features)
+        fits = [fit_gain(*pairs, forgetting) for forgetting in FORGETTING]
+        return [saturate(planned / gain, self.saturation) for gain in fits]
 
     def examples(
         self,

@@ -15,7 +15,7 @@ from torch import nn
 from afm_rl.artefacts import load_artefact
 from afm_rl.dynamics import DynamicsModel, Ensemble, Oracle
 from afm_rl.errors import AFMError, ConfigurationError
-from afm_rl.flow import ContextFlow, Flow, PaperFlow, train_flow
+from afm_rl.flow import ContextFlow, Corrector, Flow, LeastSquares, PaperFlow, train_flow
 from afm_rl.learning import pretrain_ensemble
 from afm_rl.missions.checks import check_training
 from afm_rl.missions.robot import Robot
@@ -99,6 +99,11 @@ def paper_flow(
     return _trained(flow, robot, model, train, checkpoint, "action units")
 
 
+def least_squares(robot: Robot, model: DynamicsModel, **settings: Any) -> Part:
+    """Return least squares with forgetting, which needs no training."""
+    return Part(LeastSquares(*robot.action_box, **settings))
+
+
 def _trained(
     flow: Flow,
     robot: Robot,
@@ -123,13 +128,13 @@ def _trained(
     return Part(flow, Training("flow", flow, train, unit))
 
 
-def no_transform(model: DynamicsModel, flow: Flow | None) -> None:
+def no_transform(model: DynamicsModel, flow: Corrector | None) -> None:
     """Return nothing: the planned action is executed as it is."""
     if flow is not None:
         raise ConfigurationError("flow: nothing uses it; choose transform=afm, or flow=none")
 
 
-def afm(model: DynamicsModel, flow: Flow | None, **settings: Any) -> ActionFlowTransform:
+def afm(model: DynamicsModel, flow: Corrector | None, **settings: Any) -> ActionFlowTransform:
     """Return the action flow transform."""
     if flow is None:
         raise ConfigurationError("transform=afm: needs a flow; choose flow=context or flow=paper")

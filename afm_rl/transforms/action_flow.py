@@ -9,7 +9,7 @@ from torchrl.envs import Transform
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import Context, Flow, Window
+from afm_rl.flow import Context, Corrector, Window
 from afm_rl.keys import as_key
 
 
@@ -53,12 +53,12 @@ class ActionFlowTransform(Transform):
     torch.Size([5, 2])
     """
 
-    flow: Flow
+    flow: Corrector
 
     def __init__(
         self,
         model: DynamicsModel,
-        flow: Flow,
+        flow: Corrector,
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
         prefix: NestedKey = "afm",

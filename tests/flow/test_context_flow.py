@@ -8,7 +8,7 @@ import torch
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
 from afm_rl.flow import Context, ContextFlow, Window, midpoint
-from afm_rl.flow.context_flow import LIMIT
+from afm_rl.flow.pairs import LIMIT
 from afm_rl.regimes import ActionGain
 
 SILENT = Context(torch.zeros(1), torch.zeros(1), torch.zeros(1, dtype=torch.bool))
