@@ -94,7 +94,9 @@ class RunningStats(nn.Module):
         if where is None:
             where = torch.ones(batch, dtype=torch.bool, device=values.device)
         elif where.shape != batch:
-            raise ConfigurationError(f"where of shape {tuple(where.shape)}: expected {tuple(batch)}")
+            raise ConfigurationError(
+                f"where of shape {tuple(where.shape)}: expected {tuple(batch)}"
+            )
         counts = where.reshape(*self.lead, -1, 1)
         values = values.reshape(*self.lead, -1, self.size).to(self.mean)
         values = torch.where(counts, values, 0.0)  # NaN times zero would be NaN

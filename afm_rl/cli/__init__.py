@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from afm_rl.cli.mistakes import explain
@@ -17,12 +19,13 @@ from afm_rl.cli.mistakes import explain
 def _run(cfg: DictConfig) -> None:
     from afm_rl.cli.launch import launch  # torch takes seconds: `--help` need not wait for it
 
-    with _explained():  # here, so that Hydra does not report the error once more
+    sweep = HydraConfig.get().mode == RunMode.MULTIRUN
+    with _explained(sweep):  # here, so that Hydra does not report the error once more
         launch(cfg)
 
 
 @contextmanager
-def _explained() -> Iterator[None]:
+def _explained(sweep: bool = False) -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:  # nobody reads on, as in `afm-rl --help | head`
@@ -33,6 +36,8 @@ def _explained() -> Iterator[None]:
         if message is None:
             raise
         print(f"afm-rl: {message}", file=sys.stderr)
+        if sweep:
+            raise  # the other jobs go on; Hydra raises the first error again at the end
         sys.exit(2)
 
 

@@ -41,12 +41,12 @@ class Ensemble(DynamicsModel):
         hidden: units of the hidden layers.
         log_variance: soft lower and upper bound of the log-variance.
         propagation: ``"mean"`` or ``"sample"``.
+        seed: seed of the initial weights.
         init: ``"uniform"``, or ``"sparse"``: a tenth of the weights is not zero.
         layer_norm: standardise the units of a layer before each LeakyReLU.
         running_count: None: the statistics that standardise inputs stay as pre-training set
             them. A count: :meth:`observe_` goes on with them, as if they came from at most
             so many samples.
-        seed: seed of the initial weights.
 
     >>> model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], hidden=[16])
     >>> model(torch.zeros(7, 3), torch.zeros(7, 2)).shape
@@ -67,10 +67,10 @@ class Ensemble(DynamicsModel):
         hidden: Sequence[int] = (200, 200, 200),
         log_variance: Sequence[float] = (-10.0, 0.5),
         propagation: str = "mean",
+        seed: int = 0,
         init: str = "uniform",
         layer_norm: bool = False,
         running_count: int | None = None,
-        seed: int = 0,
     ) -> None:
         super().__init__(manifold, action_size)
         self.features = list(features)
@@ -157,7 +157,7 @@ class Ensemble(DynamicsModel):
 
         For training the members of a shared ensemble on different samples.
         """
-        rows = self._standard(self.inputs(state, action))
+        rows = self._standardised(self.inputs(state, action))
         weights, biases = list(self.weights), list(self.biases)
         return self._moments(stacked_mlp(rows, weights, biases, self.layer_norm))
 
@@ -225,10 +225,10 @@ class Ensemble(DynamicsModel):
                 f"{self.state_size})"
             )
         raw = self.inputs(state, action)
-        rows = self._standard(raw)
+        rows = self._standardised(raw)
         return rows.reshape(max(1, math.prod(lead)), -1, rows.shape[-1]), raw.shape[:-1]
 
-    def _standard(self, raw: Tensor) -> Tensor:
+    def _standardised(self, raw: Tensor) -> Tensor:
         """Standardise raw inputs ``(*L, *N, in)``."""
         if self.running is None:
             return (raw - self.input_mean) / self.input_std

@@ -3,15 +3,19 @@
 from afm_rl.learning.fresh_adam import FreshAdam
 from afm_rl.learning.loss import InPlaceLoss
 from afm_rl.learning.nll import GaussianNLLLoss, gaussian_nll
+from afm_rl.learning.obgd import ObGD
 from afm_rl.learning.pretrain import pretrain_ensemble
+from afm_rl.learning.stream_x import StreamXUpdater
 from afm_rl.learning.updater import OnlineUpdater, OracleUpdater, Updater
 
 __all__ = [
     "FreshAdam",
     "GaussianNLLLoss",
     "InPlaceLoss",
+    "ObGD",
     "OnlineUpdater",
     "OracleUpdater",
+    "StreamXUpdater",
     "Updater",
     "gaussian_nll",
     "pretrain_ensemble",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -95,10 +94,10 @@ class ObGD(Optimizer):
     def step(  # type: ignore[override]
         self, delta: Tensor | float = 1.0, closure: Callable[[], float] | None = None
     ) -> float | None:
-        """Take one step.
+        r"""Take one step.
 
         Args:
-            delta: error :math:`\\delta`, a number or one per learner: broadcasts to L.
+            delta: error :math:`\delta`, a number or one per learner: broadcasts to L.
                 Learners with an error of 0 stay where they are.
             closure: computes the gradients first; returns the loss.
 
@@ -118,7 +117,8 @@ class ObGD(Optimizer):
                 continue
             dims = group["lead_dims"]
             lead = _lead([z for _, z in pairs], dims)
-            size = sum(torch.linalg.vector_norm(z.reshape(*lead, -1), 1, -1) for _, z in pairs)
+            norms = [torch.linalg.vector_norm(z.reshape(*lead, -1), 1, -1) for _, z in pairs]
+            size = torch.stack(norms).sum(0)
             error = _errors(delta, size)
             scale = error * bounded_step_size(size, error, group["lr"], group["kappa"])
             for parameter, trace in pairs:

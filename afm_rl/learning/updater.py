@@ -87,18 +87,26 @@ class OnlineUpdater(Updater):
         for key in self.loss.in_keys:
             sound = sound & (kept.get(key).abs() < ABSURD).all(-1)  # false for NaN
         with torch.enable_grad():
-            result = self.loss(self._without(kept, sound))["loss_nll"]
-            if not bool(result.isfinite().all()):  # sound entries may still overflow
-                sound = sound & result.isfinite()
-                result = self.loss(self._without(kept, sound))["loss_nll"]
+            found = self._measure(self._without(kept, sound))
+            if not bool(found["loss"].isfinite().all()):  # sound entries may still overflow
+                sound = sound & found["loss"].isfinite()
+                found = self._measure(self._without(kept, sound))
             learn = sound
             if self.mask_key is not None:
                 learn = sound & tensordict.get(self.mask_key).reshape(batch)
-            self.optimizer.zero_grad(set_to_none=True)
-            torch.where(learn, result, 0.0).sum().backward()
-        self.optimizer.step()
+            self._learn(found, learn)
         self.refused += int((~sound).sum())
-        return TensorDict({"loss": torch.where(sound, result.detach(), torch.nan)}, batch)
+        return TensorDict({"loss": torch.where(sound, found["loss"].detach(), torch.nan)}, batch)
+
+    def _measure(self, transitions: TensorDictBase) -> dict[str, Tensor]:
+        """Return the ``loss`` ``(*B)``, and whatever else :meth:`_learn` wants to see."""
+        return {"loss": self.loss(transitions)["loss_nll"]}
+
+    def _learn(self, found: dict[str, Tensor], learn: Tensor) -> None:
+        """Take one step where ``learn`` ``(*B)`` says so."""
+        self.optimizer.zero_grad(set_to_none=True)
+        torch.where(learn, found["loss"], 0.0).sum().backward()
+        self.optimizer.step()
 
     def _without(self, kept: TensorDictBase, sound: Tensor) -> TensorDictBase:
         """Blank what is not sound before the loss: NaN times zero is NaN."""

@@ -67,8 +67,8 @@ def build(cfg: DictConfig) -> Agent:
         raise ConfigurationError(f"label={label!r}: expected a text")
     with blaming("robot"):
         robot: Robot = instantiate(cfg.robot, _convert_="all")
-    tracks = select_tracks(settings["tracks"], robot)
-    regimes = select_regimes(settings["regimes"], robot)
+        tracks = select_tracks(settings["tracks"], robot)
+        regimes = select_regimes(settings["regimes"], robot)
     seeds = select_seeds(settings["seeds"])
     budget = check_count("budget", settings["budget"])
     with blaming("robot.env"):

@@ -17,7 +17,7 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_count, check_number
 from afm_rl.planning import Cost
 
-MISTAKES = (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError)
+MISTAKES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 KEYS = ("seed_key", "mask_key", "regime_key")  # settings that name an entry of the environment
 
 
@@ -43,7 +43,7 @@ def blaming(group: str) -> Iterator[None]:
         while last.__cause__ is not None:
             last = last.__cause__
         if isinstance(last, AFMError):
-            raise last from error
+            raise ConfigurationError(str(last)) from error
         found = re.search(r"full_key: (\S+)", str(error))
         text = str(last).partition("\nfull_key:")[0]
         raise ConfigurationError(f"{found[1] if found else group}: {text}") from error

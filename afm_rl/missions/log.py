@@ -8,9 +8,11 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+FIRST_ROWS = 4096
+
 
 class StepLog:
-    """One row per mission and step, kept as tensors until a table is asked for.
+    """One row per mission and step, kept in memory until a table is asked for.
 
     Args:
         columns: names of the values.
@@ -25,24 +27,28 @@ class StepLog:
     def __init__(self, columns: Sequence[str], whole: Sequence[str] = ()) -> None:
         self.columns = list(columns)
         self.whole = list(whole)
-        self._missions: list[Tensor] = []
-        self._values: list[Tensor] = []
-        self._steps: list[int] = []
+        self._count = 0
+        self._values = torch.empty(FIRST_ROWS, len(self.columns))
+        self._keys = torch.empty(FIRST_ROWS, 2, dtype=torch.int64)  # mission, step
 
     def add(self, missions: Tensor, step: int, values: Tensor) -> None:
         """Add one step of the missions ``(B,)``: ``(B, C)``."""
-        self._missions.append(missions.cpu())
-        self._values.append(values.detach().float().cpu())
-        self._steps.append(step)
+        rows = slice(self._count, self._count + len(missions))
+        while rows.stop > len(self._keys):
+            # One block that doubles: thousands of small tensors would pin the heap in pieces
+            # between the large temporaries of a learning model, and memory would grow.
+            self._values = torch.cat([self._values, torch.empty_like(self._values)])
+            self._keys = torch.cat([self._keys, torch.empty_like(self._keys)])
+        self._values[rows] = values.detach().to(self._values)
+        self._keys[rows, 0] = missions.to(self._keys)
+        self._keys[rows, 1] = step
+        self._count = rows.stop
 
     def table(self) -> pd.DataFrame:
         """Return everything, ordered by mission and step."""
-        counts = torch.tensor([len(part) for part in self._missions])
-        missions = torch.cat(self._missions)
-        steps = torch.tensor(self._steps).repeat_interleave(counts)
-        order = torch.argsort(missions * (steps.max() + 1) + steps)
-        values = torch.cat(self._values)[order].numpy()
-        frame = pd.DataFrame(values, columns=self.columns)
+        missions, steps = self._keys[: self._count].unbind(-1)
+        order = torch.argsort(missions * (self._keys[: self._count, 1].max() + 1) + steps)
+        frame = pd.DataFrame(self._values[: self._count][order].numpy(), columns=self.columns)
         frame.insert(0, "t", steps[order].int().numpy())
         frame.insert(0, "mission", missions[order].int().numpy())
         return frame.astype({name: "int32" for name in self.whole})

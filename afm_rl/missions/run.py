@@ -34,12 +34,19 @@ def run(agent: Agent, progress: bool = False) -> Results:
     """Run every mission of an agent to its end; missions that finish leave the batch.
 
     Each step: plan, transform and act, look at the model's error, update the model. The
-    order is the same for one mission and for hundreds, and so are the results.
+    order is the same for one mission and for hundreds, and so are the results: to the bit, but
+    for networks, whose batched products may round the last bit another way.
 
     Args:
         agent: from :func:`~afm_rl.missions.build.build`, prepared. Its model learns in place.
         progress: show a progress bar.
     """
+    with torch.random.fork_rng(devices=[]):  # TorchRL's own planners draw from the global one
+        torch.manual_seed(0)
+        return _run(agent, progress)
+
+
+def _run(agent: Agent, progress: bool) -> Results:
     env, planner, updater, model = agent.env, agent.planner, agent.updater, agent.model
     total = len(agent.missions)
     if updater.learns:

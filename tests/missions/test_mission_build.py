@@ -1,0 +1,192 @@
+"""A configuration becomes an agent, or an error that names the setting."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from hydra.errors import InstantiationException
+from tensordict import unravel_key
+from torch import nn
+
+import afm_rl.conf
+from afm_rl.artefacts import save_artefact
+from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.flow import ContextFlow, PaperFlow
+from afm_rl.missions import build, prepare
+from afm_rl.missions.checks import blaming, check_training
+
+METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
+LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+SHAPE = {"window": 4, "hidden": [8], "latent": 4}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_planner_transform_and_updater_share_one_model(configure, no_training, method):
+    cfg = configure(f"method={method}")
+    agent = build(cfg)
+    assert agent.label == method
+    assert agent.planner.env.dynamics is agent.model
+    assert agent.updater.loss.model is agent.model
+    assert (agent.transform is None) == cfg.transform._target_.endswith("no_transform")
+    if agent.transform is not None:
+        assert agent.transform.model is agent.model
+        assert unravel_key(agent.executed_key) == ("next", "afm", "executed_action")
+    assert [part.module for part in agent.trainings if part.title == "ensemble"] == [
+        agent.model for _ in agent.trainings if "pretrain" in cfg.dynamics
+    ][:1]
+
+
+def test_an_agent_without_a_name(configure):
+    assert build(configure()).label == "unnamed"
+
+
+def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
+    agent = build(configure("planner=cem"))
+    assert ("mppi", "mean") not in agent.env.observation_spec.keys(True, True)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "complaint"),
+    [
+        (["transform=afm"], "transform=afm: needs a flow; choose flow=context or flow=paper"),
+        (["flow=context"], "flow: nothing uses it; choose transform=afm, or flow=none"),
+        (["dynamics=oracle"], "dynamics=oracle and updater=oracle belong together"),
+        (["updater=oracle"], "dynamics=oracle and updater=oracle belong together"),
+        (["updater=online"], "updater: optimizer got an empty parameter list"),
+        (["+planner.horizn=3"], "planner: .* unexpected keyword argument 'horizn'"),
+        (["+robot.env.horizn=3"], "robot.env: .* unexpected keyword argument 'horizn'"),
+        (["cost.coordinates=[0, 7]"], "cost: index 7 is out of bounds"),
+        (["cost.coordinates=[0]"], r"cost.coordinates=\[0\]: expected at least one per goal"),
+        (["+cost.in_keys=[gaol]"], "cost: reads 2 numbers from 'gaol', .* gives nothing there"),
+        (["+cost.goal_size=1"], "cost: reads 1 numbers from 'goal', .* gives 2 there"),
+        (["planner.seed_key=[mission, sed]"], r"planner.seed_key=\('mission', 'sed'\): expected"),
+        (["method=online_pe", "+updater.mask_key=mask"], "updater.mask_key='mask': expected one"),
+        (["method=oracle", "updater.regime_key=gain"], "updater.regime_key='gain': expected one"),
+        (["robot.state_names=[x, y]"], r"robot.state_names=\['x', 'y'\]: expected 3 names"),
+        (["robot.action_names=[v]"], r"robot.action_names=\['v'\]: expected 2 names"),
+        (["robot.goal_names=[x]"], r"robot.goal_names=\['x'\]: expected 2 names"),
+        (["robot.schedule.at=0.5"], "robot.schedule: 'float' object is not iterable"),
+        (["robot.schedule.at=[0.8, 0.15]"], "schedule.at=.*expected increasing breakpoints"),
+        (["planner._target_=afm_rl.planning.Nope"], "planner: .*afm_rl.planning.Nope"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(configure, no_training, overrides, complaint):
+    with pytest.raises(ConfigurationError, match=complaint):
+        build(configure(*overrides))
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"label": 3}, "label=3: expected a text"),
+        ({"budget": 0}, "budget=0: expected a whole number of at least 1"),
+        ({"planner.population": 0}, "planner.population=0: expected a whole number"),
+    ],
+)
+def test_settings_out_of_range_are_refused(configure, no_training, settings, complaint):
+    with pytest.raises(ConfigurationError, match=f"^{complaint}"):
+        build(configure(**settings))
+
+
+@pytest.mark.parametrize("key", ["next", "plain"])
+def test_an_updater_may_read_what_the_transform_or_the_step_writes(configure, key):
+    written = "[next,afm,misaligned]" if key == "next" else "[afm,misaligned]"
+    build(configure("method=afm_paper", f"+updater.mask_key={written}"))
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"action_low": [-1.0]}, r"robot.action_low=\[-1.0\], .* expected 2 numbers each"),
+        ({"action_low": [2.0, -1.5]}, "robot.action_low=.* expected 2 numbers each, low <= high"),
+        ({"state_high": [0.0, 0.0]}, "robot.state_high=.* expected 3 numbers each"),
+        ({"state_low": [0.0, 0.0, float("nan")]}, "robot.state_low=nan: expected a finite number"),
+        ({"action_high": ["a", 1.0]}, "robot.action_high='a': expected a finite number"),
+        ({"features": [3]}, r"robot.features=\[3\]: expected indices in 0..2"),
+        ({"features": [-1]}, r"robot.features=\[-1\]: expected indices"),
+        ({"features": [2.0]}, r"robot.features=\[2.0\]: expected indices"),
+    ],
+)
+def test_a_robot_that_contradicts_its_model_is_refused(robot, change, complaint):
+    with pytest.raises(ConfigurationError, match=complaint):
+        dataclasses.replace(robot, **change)
+
+
+def test_whole_numbers_are_numbers_too(drive):
+    run = drive("method=afm_physics", **{"robot.action_low": [-1, -1], "robot.action_high": [1, 1]})
+    assert run.steps[["executed_v", "executed_omega"]].abs().max().max() <= 1
+
+
+def _checkpoint(path, flow):
+    for parameter in flow.parameters():
+        nn.init.constant_(parameter, 0.01)
+    save_artefact(path, flow, flow.signature)
+    return flow
+
+
+def test_a_good_checkpoint_is_used(configure, no_training, tmp_path, cache):
+    stored = _checkpoint(tmp_path / "flow", ContextFlow(LOW, HIGH, **SHAPE))
+    changes = {f"flow.{name}": value for name, value in SHAPE.items()}
+    cfg = configure("method=afm_physics", **changes, **{"flow.checkpoint": str(tmp_path / "flow")})
+    agent = build(cfg)
+    assert agent.trainings == []
+    prepare(agent, cache)
+    for name, value in stored.state_dict().items():
+        assert torch.equal(agent.transform.flow.state_dict()[name], value)
+
+
+@pytest.mark.parametrize(
+    ("flow", "complaint"),
+    [
+        (ContextFlow(LOW[:1], HIGH[:1], **SHAPE), "action_size=1, expected action_size=2"),
+        (ContextFlow(LOW, HIGH, **{**SHAPE, "window": 5}), "feature_size=25, expected feature"),
+        (ContextFlow(LOW, HIGH, **{**SHAPE, "hidden": [9]}), r"has shape \(9,\), expected \(8,\)"),
+        (PaperFlow(LOW, HIGH, [2], 3), "kind=PaperFlow, expected kind=ContextFlow"),
+    ],
+)
+def test_a_checkpoint_of_another_flow_is_refused(configure, no_training, tmp_path, flow, complaint):
+    _checkpoint(tmp_path / "flow", flow)
+    changes = {f"flow.{name}": value for name, value in SHAPE.items()}
+    cfg = configure("method=afm_physics", **changes, **{"flow.checkpoint": str(tmp_path / "flow")})
+    with pytest.raises(ConfigurationError, match=f"^flow.checkpoint: {tmp_path}.*{complaint}"):
+        build(cfg)
+
+
+def test_a_checkpoint_that_is_not_there_is_refused(configure, tmp_path):
+    for given in (str(tmp_path / "nowhere"), str(tmp_path), 3):
+        cfg = configure("method=afm_physics", **{"flow.checkpoint": given})
+        with pytest.raises(ConfigurationError, match="^flow.checkpoint.*(no such file|the path)"):
+            build(cfg)
+
+
+def _train(*, samples: int = 100, lr: float = 1e-3, seed: int = 0, progress: bool = False):
+    """Stand for a training function."""
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"samples": 9}, "part.train.samples=9: expected a whole number of at least 10"),
+        ({"lr": 0.0}, "part.train.lr=0.0: expected a finite number"),
+        ({"seed": -1}, "part.train.seed=-1: expected a whole number of at least 0"),
+        ({"sample": 10}, "part.train: setting='sample': expected one of samples, lr, seed"),
+        ({"progress": True}, "setting='progress'"),
+    ],
+)
+def test_settings_of_a_training_are_checked_before_it_begins(settings, complaint):
+    with pytest.raises(ConfigurationError, match=complaint):
+        check_training("part.train", _train, settings, samples=10)
+    check_training("part.train", _train, {"samples": 10, "lr": 1e-3, "seed": 0}, samples=10)
+
+
+def test_our_own_errors_keep_their_words():
+    with pytest.raises(ArtefactError, match="^damaged$"), blaming("flow"):
+        raise ArtefactError("damaged")
+    with pytest.raises(ConfigurationError, match="^robot.regime: bad$"), blaming("robot"):
+        raise InstantiationException("Error in call\nfull_key: robot.regime") from TypeError("bad")
+    with pytest.raises(ConfigurationError, match="^low=0$") as caught, blaming("robot"):
+        raise InstantiationException("Error in call") from ConfigurationError("low=0")
+    assert isinstance(caught.value.__cause__, InstantiationException)
+    with pytest.raises(OSError, match="disk"), blaming("robot"):
+        raise OSError("disk")

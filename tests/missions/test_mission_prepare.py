@@ -1,0 +1,86 @@
+"""What needs training is trained once, and taken from the cache ever after."""
+
+import pytest
+import torch
+
+from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.missions import build, prepare
+
+METHOD = "method=afm_frozen_pe"  # trains an ensemble, then a flow over it
+
+
+@pytest.fixture
+def prepared(configure):
+    """Build and prepare; return the agent and what was said."""
+
+    def make(cache, *overrides, **settings):
+        agent, lines = build(configure(METHOD, *overrides, **settings)), []
+        prepare(agent, cache, echo=lines.append)
+        return agent, lines
+
+    return make
+
+
+def parameters(agent):
+    return [*agent.model.state_dict().values(), *agent.transform.flow.state_dict().values()]
+
+
+def test_trained_once_then_from_the_cache(prepared, tmp_path):
+    first, lines = prepared(tmp_path / "new")
+    assert [line.split(":")[0] for line in lines] == ["ensemble", "flow"]
+    assert all("held-out error" in line and "trained in" in line for line in lines)
+    again, repeated = prepared(str(tmp_path / "new"))
+    assert [line.partition(" (")[0] for line in repeated] == [
+        line.partition(" (")[0] for line in lines
+    ]
+    assert all("(from the cache)" in line for line in repeated)
+    for one, other in zip(parameters(first), parameters(again), strict=True):
+        assert torch.equal(one, other)
+    assert len(list((tmp_path / "new").iterdir())) == 2
+
+
+def test_only_what_the_result_depends_on_is_part_of_the_key(prepared, cache):
+    prepared(cache)
+    _, lines = prepared(cache, "planner=mppi_paper", "seeds=3", budget=3)
+    assert all("from the cache" in line for line in lines)
+    _, lines = prepared(cache, **{"flow.train.iterations": 21})
+    assert ["from the cache" in line for line in lines] == [True, False]
+    _, lines = prepared(cache, **{"dynamics.seed": 1})
+    assert not any("from the cache" in line for line in lines)
+
+
+def test_a_damaged_file_is_named_not_used(prepared, tmp_path):
+    prepared(tmp_path)
+    (path,) = tmp_path.glob("flow-*")
+    whole = bytearray(path.read_bytes())
+    whole[-9] ^= 4
+    path.write_bytes(whole)
+    with pytest.raises(ArtefactError, match=f"{path}: damaged.*delete it"):
+        prepared(tmp_path)
+
+
+def test_a_cache_that_cannot_be_written_is_refused_first(prepared, tmp_path, no_training):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigurationError, match="^cache=.*file/below: cannot be written: Not a"):
+        prepared(tmp_path / "file" / "below")
+
+
+def test_a_home_folder_may_be_meant(prepared, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    prepared("~/parts")
+    assert len(list((tmp_path / "parts").iterdir())) == 2
+
+
+def test_nothing_to_train_needs_no_cache(configure, no_training):
+    prepare(build(configure("method=physics")), "/dev/null/nowhere")
+
+
+def test_progress_is_shown_if_asked_for(configure, tmp_path):
+    seen = []
+    agent = build(configure("method=afm_physics"))
+    agent.trainings = [
+        part._replace(train=lambda progress: seen.append(progress) or 0.5)
+        for part in agent.trainings
+    ]
+    prepare(agent, tmp_path, progress=True, echo=seen.append)
+    assert seen == [True, "flow: held-out error 0.5000 half ranges (trained in 0 s)"]
