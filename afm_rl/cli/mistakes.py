@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from afm_rl.errors import AFMError
 
@@ -25,7 +26,7 @@ def explain(error: BaseException) -> str | None:
         if isinstance(cause, AFMError):
             return one_line(str(cause))
     for cause in chain:
-        if isinstance(cause, HydraException | OmegaConfBaseException):
+        if isinstance(cause, HydraException | OmegaConfBaseException | YAMLError):
             merging = str(cause).startswith("Error merging")  # Hydra keeps the reason to itself
             return one_line(f"{cause}: {cause.__cause__}" if merging else str(cause))
         if isinstance(cause, OSError) and cause.strerror:

@@ -135,5 +135,9 @@ class Flow(Corrector):
         state_box: tuple[Tensor, Tensor],
         count: int,
         generator: torch.Generator,
+        plans: int = 1,
     ) -> Examples:
-        """Make counterfactual training examples: what the model would have been seen to do."""
+        """Make ``count`` counterfactual examples: what the model would have been seen to do.
+
+        Where contexts are dear, several ``plans`` can be drawn for each.
+        """

@@ -16,7 +16,8 @@ from afm_rl.flow.base import Context, Examples, Flow
 from afm_rl.learning import InPlaceLoss
 from afm_rl.regimes import Regime
 
-POOL = 4  # batches kept of the examples that are used more than once
+POOL = 16  # batches kept of the examples that are used more than once
+PLANS = 4  # plans per context among them
 
 
 class CFMLoss(InPlaceLoss):
@@ -96,7 +97,7 @@ def train_flow(
         batch_size: examples per step.
         lr: largest step size.
         reuse: how often an example is used, on average: 1 makes every batch anew, more
-            saves time where the model is slow. None: 1 for a model without parameters, 128
+            saves time where the model is slow. None: 1 for a model without parameters, 32
             for a learned one.
         seed: seed of everything drawn.
         progress: show a progress bar.
@@ -107,9 +108,10 @@ def train_flow(
     check_count("flow.train.iterations", iterations)
     check_count("flow.train.batch_size", batch_size, low=2)
     if reuse is None:
-        reuse = 128 if any(True for _ in model.parameters()) else 1
+        reuse = 32 if any(True for _ in model.parameters()) else 1
     check_count("flow.train.reuse", reuse)
     check_number("flow.train.lr", lr, low=0.0, open_low=True)
+    plans = 1 if reuse == 1 else PLANS
     generator = torch.Generator().manual_seed(seed)
     loss_module = CFMLoss(flow, seed=seed + 1)
     optimizer = torch.optim.Adam(flow.parameters(), lr=lr, fused=True)
@@ -117,7 +119,7 @@ def train_flow(
 
     def draw(count: int) -> Examples:
         with torch.no_grad():
-            return flow.examples(model, regime, state_box, count, generator)
+            return flow.examples(model, regime, state_box, count, generator, plans)
 
     chunk = math.ceil(batch_size / min(reuse, 8))
     pause = max(1, reuse * chunk // batch_size)  # iterations between fresh chunks

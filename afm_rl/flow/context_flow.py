@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -116,28 +117,33 @@ class ContextFlow(PairCorrector, Flow):
         state_box: tuple[Tensor, Tensor],
         count: int,
         generator: torch.Generator,
+        plans: int = 1,
     ) -> Examples:
         """Draw regimes from the prior and show the model's world to the flow through them.
 
         The newest rows of each window come from the regime to correct, the older ones from
         the regime before; some windows are not full yet.
         """
-        size = (count, self.window)
-        now, before = regime.sample((2, count), generator)
+        contexts = math.ceil(count / plans)
+        size = (contexts, self.window)
+        now, before = regime.sample((2, contexts), generator)
         row = torch.arange(self.window).expand(size)
-        newest = _newest(count, self.window, generator)
+        newest = _newest(contexts, self.window, generator)
         fresh = row >= self.window - newest
         parameters = torch.where(fresh.unsqueeze(-1), now.unsqueeze(1), before.unsqueeze(1))
         valid = row >= _missing(self.window, newest, generator)
-        state = uniform(*state_box, count * self.window, generator).view(*size, -1)
+        state = uniform(*state_box, contexts * self.window, generator).view(*size, -1)
         executed = self.denormalise(_excite(*size, self.action_size, generator))
         low, high = self.centre - self.half_range, self.centre + self.half_range
         effect = regime.apply(executed, parameters, state)
         realised = _imagine(model, state, effect, low, high, generator)
         seen = effective_action(model, state, executed, realised, self.half_range)
         planned = self.denormalise(2 * torch.rand(count, self.action_size, generator=generator) - 1)
-        intended = intend(regime, planned, now, state[:, -1], low, high, self.saturation)
-        return Examples(self.features(executed, seen.effective, valid), planned, intended)
+        rows = torch.arange(count) // plans
+        present = planned, now[rows], state[rows, -1]
+        intended = intend(regime, *present, low, high, self.saturation)
+        features = self.features(executed, seen.effective, valid)[rows]
+        return Examples(features, planned, intended)
 
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> tuple[Tensor, Tensor]:
         """Integrate the flow from every source point; return mean and spread."""

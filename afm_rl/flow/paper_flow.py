@@ -98,8 +98,12 @@ class PaperFlow(Flow):
         state_box: tuple[Tensor, Tensor],
         count: int,
         generator: torch.Generator,
+        plans: int = 1,
     ) -> Examples:
-        """Register transitions of one action as if they came from another."""
+        """Register transitions of one action as if they came from another.
+
+        The plan is part of the context, so each has its own.
+        """
         state = uniform(*state_box, count, generator)
         box = (self.centre - self.half_range, self.centre + self.half_range)
         planned, intended = (uniform(*box, count, generator) for _ in range(2))

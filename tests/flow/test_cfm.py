@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
 from afm_rl.flow import CFMLoss, ContextFlow, Examples, train_flow
-from afm_rl.flow.cfm import held_out_error
+from afm_rl.flow.cfm import POOL, held_out_error
 
 TINY = {"window": 3, "hidden": [8], "latent": 4}
 
@@ -143,9 +143,9 @@ def test_the_seed_decides_everything_and_the_global_generator_nothing(train, reu
 
 def test_examples_are_used_again_when_the_model_is_slow(box, states, gains, make_ensemble):
     class Counting(ContextFlow):
-        def examples(self, model, regime, state_box, count, generator):
+        def examples(self, model, regime, state_box, count, generator, plans=1):
             counts.append(count)
-            return super().examples(model, regime, state_box, count, generator)
+            return super().examples(model, regime, state_box, count, generator, plans)
 
     def made(reuse, model=None):
         counts.clear()
@@ -155,8 +155,8 @@ def test_examples_are_used_again_when_the_model_is_slow(box, states, gains, make
 
     counts = []
     assert made(1) == 32 + 20 * 32
-    assert made(4) == 4 * 32 + 20 * 8
-    assert made(64) == 4 * 32 + 3 * 4  # four of them every eight steps
+    assert made(4) == POOL * 32 + 20 * 8
+    assert made(64) == POOL * 32 + 3 * 4  # four of them every eight steps
     assert made(None) == made(1)
     assert made(None, make_ensemble()) < made(8)
 
@@ -193,3 +193,12 @@ def test_progress_can_be_shown_on_a_terminal(train, monkeypatch):
 def test_impossible_settings_are_refused(train, settings):
     with pytest.raises(ConfigurationError, match=f"flow.train.{next(iter(settings))}"):
         train(**settings)
+
+
+def test_plans_share_a_context(box, states, gains):
+    flow, generator = ContextFlow(*box, **TINY), torch.Generator().manual_seed(0)
+    found = flow.examples(Dubins(), gains, states, 10, generator, plans=4)
+    assert len(found.features) == len(found.planned) == len(found.intended) == 10
+    assert torch.equal(found.features[0], found.features[3])
+    assert not torch.equal(found.features[3], found.features[4])
+    assert not torch.equal(found.planned[0], found.planned[1])

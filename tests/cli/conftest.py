@@ -1,0 +1,104 @@
+"""The command line, in this process and in one of its own."""
+
+import functools
+import logging
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.singleton import Singleton
+
+from afm_rl import cli
+from afm_rl.missions import parts
+
+QUICK = ["progress=false", "figures=false", "tensorboard=false"]
+SMALL_FLOW = ["flow.train.iterations=20", "flow.hidden=[16,16]", "flow.latent=8"]
+
+
+@pytest.fixture
+def quick():
+    """Settings of a run that only writes its tables."""
+    return [*QUICK, "planner.population=16"]
+
+
+@pytest.fixture
+def small_flow():
+    """Settings of a flow that is trained in no time."""
+    return SMALL_FLOW
+
+
+@pytest.fixture
+def small_training(monkeypatch):
+    """Make trainings short, whatever their settings say."""
+    for name, small in (
+        ("pretrain_ensemble", {"samples": 512, "epochs": 1}),
+        ("train_flow", {"iterations": 10}),
+    ):
+        whole = getattr(parts, name)
+
+        def short(*args, _whole=whole, _small=small, **settings):
+            return _whole(*args, **{**settings, **_small})
+
+        monkeypatch.setattr(parts, name, functools.wraps(whole)(short))
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    """Folder of trained parts that all these tests share."""
+    return tmp_path_factory.getbasetemp() / "trained_parts"
+
+
+@pytest.fixture
+def afm_rl(monkeypatch, capsys, cache):
+    """Call the command line in this process; return status, output and errors."""
+    monkeypatch.setenv("AFM_RL_CACHE", str(cache))
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    monkeypatch.setenv("COLUMNS", "80")
+    root, states = logging.getLogger(), Singleton.get_state()
+    handlers, level, threads = root.handlers[:], root.level, torch.get_num_threads()
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["afm-rl", *map(str, arguments)])
+        GlobalHydra.instance().clear()
+        capsys.readouterr()
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as ended:
+            status = ended.code
+        said = capsys.readouterr()
+        return SimpleNamespace(status=status, out=said.out, err=said.err)
+
+    yield call
+    GlobalHydra.instance().clear()
+    Singleton.set_state(states)
+    root.handlers[:], root.level = handlers, level
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture
+def process(cache, tmp_path):
+    """Run a command in a process of its own, from a folder outside the repository."""
+
+    def run(*command, **settings):
+        return subprocess.run(
+            [str(part) for part in command],
+            cwd=tmp_path,
+            env=os.environ | {"AFM_RL_CACHE": str(cache), "OMP_NUM_THREADS": "1"},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            **settings,
+        )
+
+    return run
+
+
+@pytest.fixture
+def program():
+    """The installed command."""
+    return os.path.join(os.path.dirname(sys.executable), "afm-rl")

@@ -1,0 +1,249 @@
+"""Settings that cannot be used: one line that names them, before anything is trained."""
+
+import re
+
+import pytest
+import torch
+
+from afm_rl.artefacts import save_artefact
+from afm_rl.cli.mistakes import explain, one_line
+from afm_rl.errors import ConfigurationError
+from afm_rl.flow import ContextFlow
+
+# method, overrides, what the line must name
+CASES = """
+-               method=nope                              method/nope afm_physics
+-               planner=nope                             planner/nope mppi_paper
+-               plannr=mppi                              plannr
+physics         planner.horizn=3                         planner.horizn
+physics         +planner.horizn=3                        planner: horizn
+physics         +robot.env.horizn=3                      robot.env: horizn
+physics         seeds                                    seeds
+physics         seeds=[1                                 [1
+physics         seeds=0                                  seeds=0
+physics         seeds=-3                                 seeds=-3
+physics         seeds=[1,1]                              seeds=[1,
+physics         seeds=1.5                                seeds=1.5
+physics         seeds=many                               seeds='many'
+physics         seeds=[99999999999999999999]             seeds=
+physics         budget=0                                 budget=0
+physics         budget=1.5                               budget=1.5
+physics         budget=${nope}                           nope
+physics         threads=0                                threads=0
+physics         threads=two                              threads='two'
+physics         overwrite=perhaps                        overwrite='perhaps'
+physics         figures=3                                figures=3
+physics         ~tensorboard                             tensorboard
+physics         label=3                                  label=3
+physics         cache=null                               cache=None
+-               compare=[nope]                           method/nope afm_physics
+-               compare=physics                          compare=physics
+-               compare=[physics,physics]                compare=
+-               compare=3                                compare=3
+physics         regimes=[]                               regimes=[] paper none v_gain
+physics         regimes=papper                           regimes='papper' paper
+physics         regimes=[{v_gain:nan}]                   regimes v_gain=nan
+physics         regimes=[{gain:1.0}]                     regimes 'gain' omega_gain
+physics         regimes=[{v_gain:fast}]                  regimes v_gain='fast'
+physics         regimes={v_gain:-1.0}                    regimes
+physics         regimes=[[{},{}]]                        regimes 3
+physics         tracks=nope                              tracks='nope' ethz_1 ethz_2
+physics         tracks=[]                                tracks=[]
+physics         tracks=missing.csv                       tracks missing.csv
+physics         tracks=[ethz_1,ethz_1]                   tracks
+physics         robot.tracks=3,tracks=all                robot
+physics         planner.horizon=-1                       planner.horizon=-1
+physics         planner.horizon=0                        planner.horizon=0
+physics         planner.horizon=1.5                      planner.horizon=1.5
+physics         planner.horizon=abc                      planner.horizon='abc'
+physics         planner.population=0                     planner.population=0
+physics         planner.iterations=0                     planner.iterations=0
+physics         planner.beta=0                           planner.beta=0
+physics         planner.beta=2                           planner.beta=2
+physics         planner.temperature=0                    planner.temperature=0
+physics         planner.temperature=nan                  planner.temperature=nan
+physics         planner.sigma=-1                         planner.sigma=-1
+physics         planner.noise=loud                       planner.noise='loud' scaled unit
+physics         planner.seed_key=sed                     planner.seed_key='sed'
+physics         planner=cem,planner.elites=500           planner.elites=500
+physics         planner=torchrl_mppi,planner.elites=0    planner.elites=0
+physics         planner._target_=nowhere.Planner         planner nowhere
+physics         cost.coordinates=[0]                     cost.coordinates=[0]
+physics         cost.coordinates=[0,7]                   cost 7
+physics         +cost.weights=[1,-1]                     cost.weights=-1
+physics         cost.saturation=foo                      cost.saturation='foo' direction
+physics         robot.schedule.at=[0.8,0.15]             schedule.at=[0.8,
+physics         robot.schedule.at=[0.15,1.8]             schedule.at=1.8
+physics         robot.schedule.by=foo                    schedule.by='foo' progress step
+physics         robot.action_low=[1.0,9.0]               robot.action_low=[1.0, low
+physics         robot.action_low=[1.0]                   robot.action_low=[1.0] 2
+physics         robot.action_high=[inf,inf]              robot.action_high=inf
+physics         robot.state_low=[0,0]                    robot.state_low=[0.0, 3
+physics         robot.features=[7]                       robot.features=[7]
+physics         robot.env.dt=0                           dt=0
+physics         robot.env.reach=nan                      reach=nan
+physics         robot.model.noise_std=0                  noise_std=0
+physics         robot.regime.low=0                       low=0
+physics         robot.paper_regimes=[],regimes=paper     regimes=[]
+physics         transform=afm                            transform=afm flow=context
+physics         flow=context                             flow transform=afm
+physics         dynamics=oracle                          dynamics=oracle updater=oracle
+physics         updater=online                           updater
+online_pe       dynamics.members=0                       dynamics.members=0
+online_pe       dynamics.hidden=[0]                      dynamics.hidden=0
+online_pe       dynamics.hidden=16                       dynamics
+online_pe       dynamics.log_variance=[1,-1]             dynamics.log_variance=[1,
+online_pe       dynamics.log_variance=[1]                dynamics
+online_pe       dynamics.propagation=foo                 dynamics.propagation='foo' mean
+online_pe       dynamics.pretrain.samples=10             dynamics.pretrain.samples=10 256
+online_pe       dynamics.pretrain.epochs=0               dynamics.pretrain.epochs=0
+online_pe       dynamics.pretrain.lr=0                   dynamics.pretrain.lr=0
+online_pe       dynamics.pretrain.action_noise=-1        dynamics.pretrain.action_noise=-1
+online_pe       +dynamics.pretrain.step=1                dynamics.pretrain 'step' samples
+online_pe       dynamics.pretrain=3                      dynamics
+online_pe       updater.optimizer.lr=0                   updater lr=0
+online_pe       updater.optimizer._target_=torch.Nope    updater.optimizer torch.Nope
+afm_physics     flow.gate=-1                             flow.gate=-1
+afm_physics     flow.gate=nan                            flow.gate=nan
+afm_physics     flow.window=0                            flow.window=0
+afm_physics     flow.samples=0                           flow.samples=0
+afm_physics     flow.steps=0                             flow.steps=0
+afm_physics     flow.hidden=[0]                          flow
+afm_physics     flow.saturation=foo                      flow.saturation='foo' direction clip
+afm_physics     flow.train.iterations=0                  flow.train.iterations=0
+afm_physics     flow.train.batch_size=1                  flow.train.batch_size=1
+afm_physics     flow.train.lr=-1                         flow.train.lr=-1
+afm_physics     +flow.train.step=1                       flow.train 'step' iterations
+afm_physics     flow.checkpoint=missing                  flow.checkpoint missing
+afm_physics     flow=none                                transform=afm flow=paper
+afm_physics     +transform.prefx=a                       transform prefx
+afm_paper       flow.error_action=foo                    flow.error_action='foo' planned
+"""
+
+
+def cases():
+    """Read the table: a comma before a group's key separates two overrides."""
+    found = []
+    for line in CASES.strip().splitlines():
+        method, overrides, named = line.split(None, 2)
+        method = [] if method == "-" else [f"method={method}"]
+        parts = re.split(r",(?=[a-z.]+=)", overrides)
+        found.append(pytest.param([*method, *parts], named.split(), id=overrides))
+    return found
+
+
+@pytest.fixture
+def refuse(afm_rl, tmp_path, quick, monkeypatch):
+    """Call the command line with settings that it must refuse; return its one line."""
+
+    def never(*args, **kwargs):
+        raise AssertionError("went on, though the settings cannot be used")
+
+    monkeypatch.setattr("afm_rl.missions.parts.Training.train", never)
+    monkeypatch.setattr("afm_rl.cli.launch.run", never)
+
+    def call(*overrides):
+        given = {override.partition("=")[0].lstrip("+~") for override in overrides}
+        extra = [text for text in quick if text.partition("=")[0] not in given]
+        folder = [] if "hydra.run.dir" in given else [f"hydra.run.dir={tmp_path}/run"]
+        done = afm_rl(*extra, *folder, *overrides)
+        assert done.status == 2
+        assert done.out == ""
+        assert done.err.startswith("afm-rl: ") and done.err.count("\n") == 1, done.err
+        assert not any((tmp_path / "run").glob("*"))
+        return done.err
+
+    return call
+
+
+@pytest.mark.parametrize(("overrides", "named"), cases())
+def test_a_setting_that_cannot_be_used(refuse, overrides, named):
+    line = refuse(*overrides)
+    assert all(word in line for word in named), line
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        ("x,y\n0,0\n", "waypoint count 1: expected at least 2"),
+        ("x,y\n0,0\n1,one\n", "line 3: 'one' is not a finite number"),
+        ("x,y\n0,0\n1,nan\n", "line 3: 'nan' is not a finite number"),
+        ("x,y\n0,0\n1\n", "line 3: 1 values, expected 2"),
+        ("a,b\n0,0\n1,1\n", "the first line is a,b, expected x,y or x,y,radius"),
+        ("", "the first line is nothing"),
+        ("x,y\n0,0\n0,0\n", "waypoint 1 and waypoint 2 coincide"),
+    ],
+)
+def test_a_track_that_cannot_be_used(refuse, tmp_path, content, complaint):
+    (tmp_path / "my_track.csv").write_text(content)
+    line = refuse("method=physics", f"tracks={tmp_path}/my_track.csv")
+    assert "tracks" in line and "my_track" in line and complaint in line
+
+
+def test_a_folder_that_cannot_be_written(refuse, tmp_path):
+    (tmp_path / "file").write_text("")
+    line = refuse("method=physics", f"hydra.run.dir={tmp_path}/file/run")
+    assert line == f"afm-rl: {tmp_path}/file/run: Not a directory\n"
+
+
+def test_a_cache_that_cannot_be_written(afm_rl, tmp_path, quick, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("afm_rl.missions.parts.train_flow", lambda *args, **settings: 1 / 0)
+    monkeypatch.setattr("afm_rl.missions.parts.check_training", lambda *args, **settings: None)
+    folder = f"hydra.run.dir={tmp_path}/run"
+    done = afm_rl("method=afm_physics", f"cache={tmp_path}/file/parts", folder, *quick)
+    assert done.status == 2
+    assert done.err.startswith(f"afm-rl: cache={tmp_path}/file/parts: cannot be written: Not a ")
+
+
+def test_a_checkpoint_for_another_robot(refuse, tmp_path):
+    flow = ContextFlow(torch.tensor([-1.0]), torch.tensor([1.0]))
+    save_artefact(tmp_path / "flow", flow, flow.signature)
+    line = refuse("method=afm_physics", f"flow.checkpoint={tmp_path}/flow")
+    assert "flow.checkpoint: " in line and "action_size=1, expected action_size=2" in line
+
+
+def test_a_checkpoint_that_is_no_checkpoint(refuse, tmp_path):
+    (tmp_path / "flow").write_bytes(b"\x80\x04cposix\nsystem\n.")
+    line = refuse("method=afm_physics", f"flow.checkpoint={tmp_path}/flow")
+    assert "flow.checkpoint: " in line and "damaged" in line
+
+
+@pytest.mark.parametrize("target", ["os.system", "subprocess.run", "builtins.eval"])
+@pytest.mark.parametrize("place", ["planner", "robot.env", "updater.optimizer"])
+def test_a_loaded_configuration_runs_no_command(refuse, tmp_path, target, place):
+    canary = tmp_path / "canary"
+    line = refuse(
+        "method=online_pe",
+        f"{place}._target_={target}",
+        f"+{place}._args_=['touch {canary}']",
+        f"{place}._partial_=false",
+    )
+    assert f"{place}: Target '{target}' is blocklisted" in line
+    assert not canary.exists()
+
+
+def test_yaml_tags_are_not_followed(refuse, tmp_path):
+    canary = tmp_path / "canary"
+    config = tmp_path / "config"
+    config.mkdir()
+    (config / "evil.yaml").write_text(
+        f"label: !!python/object/apply:os.system ['touch {canary}']\n"
+    )
+    line = refuse(f"--config-path={config}", "--config-name=evil")
+    assert "could not determine a constructor" in line and "evil.yaml" in line
+    assert not canary.exists()
+
+
+def test_what_is_no_mistake_is_not_explained():
+    assert explain(RuntimeError("a bug")) is None
+    assert explain(OSError("no number")) is None
+    assert explain(OSError(28, "No space left on device")) == "files: No space left on device"
+    wrapped = RuntimeError("outer")
+    wrapped.__context__ = ConfigurationError("budget=0:\n  expected more")
+    assert explain(wrapped) == "budget=0: expected more"
+
+
+def test_lines_are_joined_so_that_they_read_well():
+    assert one_line("It failed.\nTry again:\n\tone\n\ttwo\n\n") == "It failed. Try again: one, two"
+    assert one_line("Wrong\nSee https://example.org/a/b for details") == "Wrong"

@@ -1,0 +1,67 @@
+"""The command line as people start it: in a process of its own."""
+
+import subprocess
+import sys
+
+import pandas as pd
+
+STUDY = "method=afm_physics tracks=all regimes=paper seeds=5 planner=mppi_paper cost=goal_pose"
+
+
+def test_the_paper_s_study_is_one_line(process, program, afm_rl, tmp_path, quick, small_flow):
+    small = [*quick, *small_flow, "budget=20"]
+    done = process(program, *STUDY.split(), f"hydra.run.dir={tmp_path}/one", *small)
+    assert (done.returncode, done.stderr) == (0, "")
+    missions = pd.read_csv(tmp_path / "one" / "missions.csv")
+    assert len(missions) == 110
+    assert (
+        list(missions)
+        == (
+            "method track v_gain omega_gain seed success_rate steps reached targets finished seconds "
+            "mission"
+        ).split()
+    )
+    assert not missions.duplicated(["track", "v_gain", "omega_gain", "seed"]).any()
+    assert missions.groupby("track").size().to_dict() == {"ethz_1": 55, "ethz_2": 55}
+    # The same line in another process gives the same numbers, bit for bit.
+    assert afm_rl(*STUDY.split(), f"hydra.run.dir={tmp_path}/other", *small).status == 0
+    steps = [pd.read_parquet(tmp_path / name / "steps.parquet") for name in ("one", "other")]
+    pd.testing.assert_frame_equal(*steps, check_exact=True)
+
+
+def test_help_lists_groups_and_choices_and_needs_no_torch(process):
+    code = "import sys, afm_rl.cli; sys.argv[1:] = ['--help']; afm_rl.cli.main()"
+    done = process(sys.executable, "-c", f"{code}; assert 'torch' not in sys.modules")
+    assert (done.returncode, done.stderr) == (0, "")
+    for line in (
+        "planner: cem, mppi, mppi_paper, torchrl_mppi",
+        "cost: goal_pose, goal_position",
+        "robot: ugv",
+        "transform: afm, none",
+    ):
+        assert line in done.stdout
+    assert "afm_physics" in done.stdout and "seeds: 1" in done.stdout
+
+
+def test_a_mistake_is_one_line_and_status_2(process, program):
+    done = process(program, "planner.horizon=-1", "method=physics")
+    assert done.returncode == 2
+    assert done.stderr == "afm-rl: planner.horizon=-1: expected a whole number of at least 1\n"
+    assert done.stdout == ""
+
+
+def test_a_choice_that_is_not_there_is_one_line_too(process):
+    done = process(sys.executable, "-m", "afm_rl.cli", "planner=mpppi")
+    assert done.returncode == 2
+    assert done.stderr.startswith("afm-rl: ") and done.stderr.count("\n") == 1
+    assert "mppi, mppi_paper, torchrl_mppi" in done.stderr
+
+
+def test_a_reader_that_has_seen_enough_is_no_error(program):
+    with subprocess.Popen(
+        [program, "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
+        running.stdout.close()
+        said = running.stderr.read()
+    assert running.returncode == 1
+    assert said == ""

@@ -1,0 +1,167 @@
+"""What a run of the command line leaves behind."""
+
+import pandas as pd
+import pytest
+from omegaconf import OmegaConf
+
+from afm_rl.missions import build, prepare, run
+
+COLUMNS = (
+    "method track v_gain omega_gain seed success_rate steps reached targets finished seconds "
+    "mission"
+).split()
+
+
+def files(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
+
+
+def test_one_method(afm_rl, tmp_path, quick):
+    done = afm_rl(
+        "method=physics", "seeds=2", "budget=4", f"hydra.run.dir={tmp_path}/new/run", *quick
+    )
+    assert (done.status, done.err) == (0, "")
+    folder = tmp_path / "new" / "run"
+    assert files(folder) == ["config.yaml", "missions.csv", "steps.parquet"]
+    missions = pd.read_csv(folder / "missions.csv")
+    assert list(missions) == COLUMNS
+    assert missions["method"].tolist() == ["physics"] * 2
+    assert missions["v_gain"].eq(-1).all() and missions["steps"].eq(3).all()
+    assert len(pd.read_parquet(folder / "steps.parquet")) == 8
+    assert "physics" in done.out and done.out.rstrip().endswith(f"Results: {folder}")
+
+
+def test_bare_compares_four_methods(afm_rl, tmp_path, small_training):
+    done = afm_rl(
+        f"hydra.run.dir={tmp_path}", f"cache={tmp_path}/parts", "budget=6", "planner.population=8"
+    )
+    assert done.status == 0
+    methods = ["physics", "online_pe", "afm_physics", "oracle"]
+    missions = pd.read_csv(tmp_path / "missions.csv")
+    assert missions["method"].tolist() == methods
+    assert missions["mission"].tolist() == [0, 1, 2, 3]
+    assert missions["track"].eq("ethz_2").all()
+    steps = pd.read_parquet(tmp_path / "steps.parquet")
+    assert steps["mission"].tolist() == [k for k in range(4) for _ in range(6)]
+    assert sorted(path.stem for path in (tmp_path / "config").iterdir()) == sorted(methods)
+    assert (tmp_path / "figures" / "trajectory.png").stat().st_size > 1000
+    assert sorted(path.name for path in (tmp_path / "tensorboard").iterdir()) == sorted(methods)
+    assert "ensemble: held-out error" in done.out and "flow: held-out error" in done.out
+    assert all(method in done.out for method in methods)
+
+
+@pytest.mark.parametrize(
+    ("choices", "labels"),
+    [
+        (["method=physics"], ["physics"]),
+        (["method=physics", "label=mine"], ["mine"]),
+        (["method=physics", "planner=mppi_paper"], ["physics"]),
+        (["method=oracle", "dynamics=oracle"], ["oracle+dynamics=oracle"]),
+        (["compare=[]"], ["physics"]),
+        (["compare=[]", "dynamics=oracle", "updater=oracle"], ["dynamics=oracle+updater=oracle"]),
+        (["compare=[]", "label=mine"], ["mine"]),
+        (["compare=null"], ["physics"]),
+        (["compare=[oracle, physics]", "label=mine"], ["oracle", "physics"]),
+    ],
+)
+def test_labels_tell_what_was_chosen(afm_rl, tmp_path, quick, choices, labels):
+    assert afm_rl(*choices, "budget=1", f"hydra.run.dir={tmp_path}", *quick).status == 0
+    assert pd.read_csv(tmp_path / "missions.csv")["method"].tolist() == labels
+
+
+def test_results_are_not_overwritten_unless_told(afm_rl, tmp_path, quick):
+    command = ["method=physics", "budget=2", f"hydra.run.dir={tmp_path}", *quick]
+    assert afm_rl(*command).status == 0
+    before = {name: (tmp_path / name).read_bytes() for name in files(tmp_path)}
+    refused = afm_rl(*command, "seeds=2")
+    assert refused.status == 2
+    assert refused.err == (
+        f"afm-rl: hydra.run.dir={tmp_path}: holds results; choose another folder, or "
+        "overwrite=true\n"
+    )
+    assert {name: (tmp_path / name).read_bytes() for name in files(tmp_path)} == before
+    assert afm_rl(*command, "seeds=2", "overwrite=true").status == 0
+    assert len(pd.read_csv(tmp_path / "missions.csv")) == 2
+
+
+def test_a_sweep_makes_a_folder_for_each_job(afm_rl, tmp_path, quick):
+    done = afm_rl(
+        "-m", "method=physics", "budget=2", "seeds=1,2", f"hydra.sweep.dir={tmp_path}", *quick
+    )
+    assert done.status == 0
+    folders = {path.parent.name: len(pd.read_csv(path)) for path in tmp_path.glob("*/missions.csv")}
+    assert sorted(folders.values()) == [1, 2]
+    assert all(f"seeds={count}" in name for name, count in folders.items())
+
+
+def test_a_sweep_goes_on_after_a_mistake_and_reports_it(afm_rl, tmp_path, quick):
+    done = afm_rl(
+        "-m", "method=physics", "budget=2", "seeds=0,1", f"hydra.sweep.dir={tmp_path}", *quick
+    )
+    assert done.status == 2
+    assert "afm-rl: seeds=0: expected a count" in done.err and "Traceback" not in done.err
+    assert len(list(tmp_path.glob("*/missions.csv"))) == 1
+
+
+def stored(folder):
+    missions = pd.read_csv(folder / "missions.csv").drop(columns="seconds")
+    return missions, pd.read_parquet(folder / "steps.parquet")
+
+
+def assert_same_results(left, right):
+    for one, other in zip(stored(left), stored(right), strict=True):
+        pd.testing.assert_frame_equal(one, other, check_exact=True)
+
+
+def test_the_stored_configuration_makes_the_same_run(afm_rl, tmp_path, quick, small_flow, cache):
+    first, again = tmp_path / "first", tmp_path / "again"
+    chosen = ["method=afm_physics", "flow.window=3", "budget=20", "seeds=[4]", "label=mine"]
+    assert afm_rl(*chosen, *small_flow, *quick, f"hydra.run.dir={first}").status == 0
+    replay = [f"--config-path={first}", "--config-name=config", f"hydra.run.dir={again}"]
+    done = afm_rl(*replay)
+    assert done.status == 0
+    assert "from the cache" in done.out
+    assert_same_results(first, again)
+    agent = build(OmegaConf.load(first / "config.yaml"))  # and so it does in Python
+    prepare(agent, cache)
+    pd.testing.assert_frame_equal(run(agent).steps, stored(first)[1], check_exact=True)
+
+
+def test_each_stored_method_of_a_comparison_makes_its_own_run(afm_rl, tmp_path, quick):
+    first, again = tmp_path / "first", tmp_path / "again"
+    chosen = ["compare=[physics, oracle]", "budget=8", *quick]
+    assert afm_rl(*chosen, f"hydra.run.dir={first}").status == 0
+    replay = [f"--config-path={first}/config", "--config-name=oracle", f"hydra.run.dir={again}"]
+    assert afm_rl(*replay).status == 0
+    missions, steps = stored(first)
+    assert missions["method"].tolist() == ["physics", "oracle"]
+    replayed, replayed_steps = stored(again)
+    assert replayed["method"].tolist() == ["oracle"]
+    steps = steps[steps["mission"] == 1].drop(columns="mission").reset_index(drop=True)
+    pd.testing.assert_frame_equal(replayed_steps.drop(columns="mission"), steps, check_exact=True)
+
+
+def test_tracks_of_ones_own(afm_rl, tmp_path, quick):
+    track = tmp_path / "my_track.csv"
+    track.write_text("x,y\n0,0\n0.02,0\n")
+    done = afm_rl(
+        "method=physics",
+        f"tracks=[{track},ethz_1]",
+        "regimes=none",
+        "budget=5",
+        *quick,
+        f"hydra.run.dir={tmp_path}/run",
+    )
+    assert done.status == 0
+    missions = pd.read_csv(tmp_path / "run" / "missions.csv")
+    assert missions["track"].tolist() == ["my_track", "ethz_1"]
+    assert missions["finished"].tolist() == [True, False]
+
+
+def test_a_bug_is_not_dressed_up_as_a_mistake(afm_rl, tmp_path, quick, monkeypatch):
+    def bug(*args, **kwargs):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr("afm_rl.cli.launch.run", bug)
+    with pytest.raises(RuntimeError, match="a bug"):
+        afm_rl("method=physics", f"hydra.run.dir={tmp_path}", *quick)
