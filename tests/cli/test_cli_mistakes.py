@@ -21,103 +21,57 @@ physics         +robot.env.horizn=3                      robot.env: horizn
 physics         seeds                                    seeds
 physics         seeds=[1                                 [1
 physics         seeds=0                                  seeds=0
-physics         seeds=-3                                 seeds=-3
 physics         seeds=[1,1]                              seeds=[1,
-physics         seeds=1.5                                seeds=1.5
 physics         seeds=many                               seeds='many'
 physics         seeds=[99999999999999999999]             seeds=
 physics         budget=0                                 budget=0
-physics         budget=1.5                               budget=1.5
 physics         budget=${nope}                           nope
 physics         threads=0                                threads=0
-physics         threads=two                              threads='two'
 physics         overwrite=perhaps                        overwrite='perhaps'
 physics         figures=3                                figures=3
 physics         ~tensorboard                             tensorboard
-physics         label=3                                  label=3
 physics         cache=null                               cache=None
 -               compare=[nope]                           method/nope afm_physics
 -               compare=physics                          compare=physics
 -               compare=[physics,physics]                compare=
--               compare=3                                compare=3
 physics         regimes=[]                               regimes=[] paper none v_gain
 physics         regimes=papper                           regimes='papper' paper
 physics         regimes=[{v_gain:nan}]                   regimes v_gain=nan
 physics         regimes=[{gain:1.0}]                     regimes 'gain' omega_gain
-physics         regimes=[{v_gain:fast}]                  regimes v_gain='fast'
 physics         regimes={v_gain:-1.0}                    regimes
-physics         regimes=[[{},{}]]                        regimes 3
 physics         tracks=nope                              tracks='nope' ethz_1 ethz_2
-physics         tracks=[]                                tracks=[]
 physics         tracks=missing.csv                       tracks missing.csv
-physics         tracks=[ethz_1,ethz_1]                   tracks
-physics         robot.tracks=3,tracks=all                robot
 physics         planner.horizon=-1                       planner.horizon=-1
 physics         planner.horizon=0                        planner.horizon=0
-physics         planner.horizon=1.5                      planner.horizon=1.5
 physics         planner.horizon=abc                      planner.horizon='abc'
 physics         planner.population=0                     planner.population=0
-physics         planner.iterations=0                     planner.iterations=0
-physics         planner.beta=0                           planner.beta=0
 physics         planner.beta=2                           planner.beta=2
 physics         planner.temperature=0                    planner.temperature=0
-physics         planner.temperature=nan                  planner.temperature=nan
-physics         planner.sigma=-1                         planner.sigma=-1
-physics         planner.noise=loud                       planner.noise='loud' scaled unit
-physics         planner.seed_key=sed                     planner.seed_key='sed'
 physics         planner=cem,planner.elites=500           planner.elites=500
 physics         planner=torchrl_mppi,planner.elites=0    planner.elites=0
-physics         planner._target_=nowhere.Planner         planner nowhere
-physics         cost.coordinates=[0]                     cost.coordinates=[0]
-physics         cost.coordinates=[0,7]                   cost 7
 physics         +cost.weights=[1,-1]                     cost.weights=-1
-physics         cost.saturation=foo                      cost.saturation='foo' direction
 physics         robot.schedule.at=[0.8,0.15]             schedule.at=[0.8,
-physics         robot.schedule.at=[0.15,1.8]             schedule.at=1.8
 physics         robot.schedule.by=foo                    schedule.by='foo' progress step
 physics         robot.action_low=[1.0,9.0]               robot.action_low=[1.0, low
-physics         robot.action_low=[1.0]                   robot.action_low=[1.0] 2
 physics         robot.action_high=[inf,inf]              robot.action_high=inf
-physics         robot.state_low=[0,0]                    robot.state_low=[0.0, 3
-physics         robot.features=[7]                       robot.features=[7]
-physics         robot.env.dt=0                           dt=0
 physics         robot.env.reach=nan                      reach=nan
-physics         robot.model.noise_std=0                  noise_std=0
-physics         robot.regime.low=0                       low=0
 physics         robot.paper_regimes=[],regimes=paper     regimes=[]
 physics         transform=afm                            transform=afm flow=context
 physics         flow=context                             flow transform=afm
 physics         dynamics=oracle                          dynamics=oracle updater=oracle
-physics         updater=online                           updater
 online_pe       dynamics.members=0                       dynamics.members=0
 online_pe       dynamics.hidden=[0]                      dynamics.hidden=0
-online_pe       dynamics.hidden=16                       dynamics
 online_pe       dynamics.log_variance=[1,-1]             dynamics.log_variance=[1,
-online_pe       dynamics.log_variance=[1]                dynamics
-online_pe       dynamics.propagation=foo                 dynamics.propagation='foo' mean
 online_pe       dynamics.pretrain.samples=10             dynamics.pretrain.samples=10 256
-online_pe       dynamics.pretrain.epochs=0               dynamics.pretrain.epochs=0
-online_pe       dynamics.pretrain.lr=0                   dynamics.pretrain.lr=0
-online_pe       dynamics.pretrain.action_noise=-1        dynamics.pretrain.action_noise=-1
 online_pe       +dynamics.pretrain.step=1                dynamics.pretrain 'step' samples
-online_pe       dynamics.pretrain=3                      dynamics
 online_pe       updater.optimizer.lr=0                   updater lr=0
-online_pe       updater.optimizer._target_=torch.Nope    updater.optimizer torch.Nope
 afm_physics     flow.gate=-1                             flow.gate=-1
-afm_physics     flow.gate=nan                            flow.gate=nan
 afm_physics     flow.window=0                            flow.window=0
-afm_physics     flow.samples=0                           flow.samples=0
-afm_physics     flow.steps=0                             flow.steps=0
 afm_physics     flow.hidden=[0]                          flow
-afm_physics     flow.saturation=foo                      flow.saturation='foo' direction clip
 afm_physics     flow.train.iterations=0                  flow.train.iterations=0
-afm_physics     flow.train.batch_size=1                  flow.train.batch_size=1
-afm_physics     flow.train.lr=-1                         flow.train.lr=-1
 afm_physics     +flow.train.step=1                       flow.train 'step' iterations
 afm_physics     flow.checkpoint=missing                  flow.checkpoint missing
 afm_physics     flow=none                                transform=afm flow=paper
-afm_physics     +transform.prefx=a                       transform prefx
-afm_paper       flow.error_action=foo                    flow.error_action='foo' planned
 """
 
 

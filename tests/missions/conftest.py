@@ -1,5 +1,7 @@
 """Small agents, composed as the command line composes them, and a small track."""
 
+import copy
+import functools
 import math
 from types import SimpleNamespace
 
@@ -26,13 +28,24 @@ SMALL = {  # settings that are there are made small
 TARGETS = 20  # of the ring
 
 
+@pytest.fixture(scope="session")
+def composed():
+    """Compose a configuration from overrides, each once: it takes a tenth of a second."""
+
+    @functools.cache
+    def make(*overrides):
+        with initialize_config_module("afm_rl.conf", version_base="1.3"):
+            return compose("config", list(overrides))
+
+    return make
+
+
 @pytest.fixture
-def configure():
-    """Compose a small configuration from overrides."""
+def configure(composed):
+    """Make a small configuration from overrides."""
 
     def make(*overrides, **settings):
-        with initialize_config_module("afm_rl.conf", version_base="1.3"):
-            cfg = compose("config", list(overrides))
+        cfg = copy.deepcopy(composed(*overrides))
         cfg.label = next((o.removeprefix("method=") for o in overrides if "method=" in o), None)
         for key, value in SMALL.items():
             if OmegaConf.select(cfg, key) is not None:

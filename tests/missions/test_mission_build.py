@@ -76,17 +76,72 @@ def test_parts_that_do_not_fit_are_refused(configure, no_training, overrides, co
         build(configure(*overrides))
 
 
+NAN = float("nan")
+
+
 @pytest.mark.parametrize(
-    ("settings", "complaint"),
+    ("method", "key", "value", "complaint"),
     [
-        ({"label": 3}, "label=3: expected a text"),
-        ({"budget": 0}, "budget=0: expected a whole number of at least 1"),
-        ({"planner.population": 0}, "planner.population=0: expected a whole number"),
+        ("physics", "label", 3, "label=3: expected a text"),
+        ("physics", "label", ["a"], r"label=\['a'\]: expected a text"),
+        ("physics", "budget", 0, "budget=0: expected a whole number of at least 1"),
+        ("physics", "budget", 1.5, "budget=1.5: expected a whole number"),
+        ("physics", "tracks", "nope", "tracks='nope': expected one of ethz_1, ethz_2"),
+        ("physics", "tracks", ["ethz_1", "ethz_1"], "tracks=.*distinct names"),
+        ("physics", "regimes", [[{}, {}]], "regimes: .*or one for each of 3 phases"),
+        ("physics", "planner.horizon", 0, "planner.horizon=0: expected a whole number"),
+        ("physics", "planner.population", 0, "planner.population=0: expected a whole number"),
+        ("physics", "planner.iterations", 0, "planner.iterations=0: expected a whole number"),
+        ("physics", "planner.beta", 0, r"planner.beta=0: expected .* \(0, 1\]"),
+        ("physics", "planner.beta", 2, r"planner.beta=2: expected .* \(0, 1\]"),
+        ("physics", "planner.temperature", 0.0, "planner.temperature=0.0: expected a finite"),
+        ("physics", "planner.temperature", NAN, "planner.temperature=nan: expected a finite"),
+        ("physics", "planner.sigma", -1, "planner.sigma=-1: expected a finite"),
+        ("physics", "planner.noise", "loud", "planner.noise='loud': expected one of scaled, unit"),
+        ("physics", "planner.past", "long", "planner.past='long': expected one of"),
+        ("physics", "cost.saturation", "foo", "cost.saturation='foo': expected one of"),
+        ("physics", "cost.coordinates", 3, "cost: 'int' object is not iterable"),
+        ("physics", "robot.schedule.at", [0.15, 1.8], r"schedule.at=1.8: .* \[0, 1\]"),
+        ("physics", "robot.schedule.by", "foo", "schedule.by='foo': expected one of progress"),
+        ("physics", "robot.action_low", [1.0, 0.5], "action_low=.*expected less than action_high"),
+        ("physics", "robot.action_low", 3, "robot: 'int' object is not iterable"),
+        ("physics", "robot.env.dt", 0, "dynamics.dt=0: expected a finite number"),
+        ("physics", "robot.env.process_noise", -1, "process_noise=-1: expected a finite number"),
+        ("physics", "robot.env.reach", NAN, "reach=nan: expected a finite number"),
+        ("physics", "robot.model.noise_std", 0, "dynamics.noise_std=0: expected"),
+        ("physics", "robot.regime.low", 0, "low=0: expected a finite number"),
+        ("physics", "robot.regime.names", ["a", "a"], "names=.*expected distinct names"),
+        ("physics", "robot.tracks", 3, "robot: 'int' object is not iterable"),
+        ("online_pe", "dynamics.members", 1.5, "dynamics.members=1.5: expected a whole number"),
+        ("online_pe", "dynamics.hidden", [0], "dynamics.hidden=0: expected a whole number"),
+        ("online_pe", "dynamics.log_variance", [1], "dynamics: not enough values"),
+        ("online_pe", "dynamics.log_variance", [NAN, 1], "dynamics.log_variance=.*low < high"),
+        ("online_pe", "dynamics.propagation", "foo", "dynamics.propagation='foo': expected one"),
+        ("online_pe", "dynamics.seed", "abc", "dynamics: "),
+        ("online_pe", "dynamics.pretrain", 3, "dynamics: 'int' object"),
+        ("online_pe", "dynamics.pretrain.epochs", 0, "dynamics.pretrain.epochs=0: expected"),
+        ("online_pe", "dynamics.pretrain.batch_size", 0, "dynamics.pretrain.batch_size=0: exp"),
+        ("online_pe", "dynamics.pretrain.lr", NAN, "dynamics.pretrain.lr=nan: expected"),
+        ("online_pe", "dynamics.pretrain.action_noise", -1, "dynamics.pretrain.action_noise=-1"),
+        ("online_pe", "updater.optimizer.lr", "abc", "updater.lr='abc': expected a finite"),
+        ("online_pe", "updater.optimizer._target_", "torch.Nope", "updater.optimizer: .*torch.N"),
+        ("afm_physics", "flow.gate", NAN, "flow.gate=nan: expected a finite number"),
+        ("afm_physics", "flow.samples", 0, "flow.samples=0: expected a whole number"),
+        ("afm_physics", "flow.steps", 0, "flow.steps=0: expected a whole number"),
+        ("afm_physics", "flow.source_std", -1, "flow.source_std=-1: expected a finite number"),
+        ("afm_physics", "flow.latent", -1, "flow: "),
+        ("afm_physics", "flow.hidden", 3, "flow: Value after . must be an iterable"),
+        ("afm_physics", "flow.train", 3, "flow: 'int' object"),
+        ("afm_physics", "flow.train.batch_size", 1, "flow.train.batch_size=1: expected"),
+        ("afm_physics", "flow.train.reuse", 0, "flow.train.reuse=0: expected"),
+        ("afm_physics", "flow.train.seed", "abc", "flow.train.seed='abc': expected"),
+        ("afm_paper", "flow.width", 0, "flow: "),
+        ("afm_paper", "flow.error_action", "foo", "flow.error_action='foo': expected one of"),
     ],
 )
-def test_settings_out_of_range_are_refused(configure, no_training, settings, complaint):
+def test_settings_out_of_range_are_refused(configure, no_training, method, key, value, complaint):
     with pytest.raises(ConfigurationError, match=f"^{complaint}"):
-        build(configure(**settings))
+        build(configure(f"method={method}", **{key: value}))
 
 
 @pytest.mark.parametrize("key", ["next", "plain"])
