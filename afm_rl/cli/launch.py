@@ -60,7 +60,9 @@ def _methods(cfg: DictConfig, overrides: Sequence[str], method: str | None) -> l
         names = list(compare) if isinstance(compare, ListConfig) else [None]
         if not all(isinstance(n, str) for n in names) or len(set(names)) < len(names):
             raise ConfigurationError(f"compare={compare}: expected a list of distinct methods")
-    if method is not None or not cfg.compare:
+    given = {text.split("=")[0] for text in overrides}
+    by_hand = "compare" not in given and not given.isdisjoint(PARTS)
+    if method is not None or by_hand or not cfg.compare:
         chosen = [(method, cfg)]
     else:
         chosen = [(name, compose("config", [*overrides, f"method={name}"])) for name in names]

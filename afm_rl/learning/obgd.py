@@ -122,7 +122,7 @@ class ObGD(Optimizer):
             error = _errors(delta, size)
             scale = error * bounded_step_size(size, error, group["lr"], group["kappa"])
             for parameter, trace in pairs:
-                share = scale.to(trace).reshape(*lead, *[1] * (trace.dim() - dims))
+                share = scale.to(trace)[(..., *[None] * (trace.dim() - dims))]
                 parameter.addcmul_(trace, share, value=-1)
         return loss
 

@@ -111,7 +111,6 @@ NAN = float("nan")
         ("physics", "robot.model.noise_std", 0, "dynamics.noise_std=0: expected"),
         ("physics", "robot.regime.low", 0, "low=0: expected a finite number"),
         ("physics", "robot.regime.names", ["a", "a"], "names=.*expected distinct names"),
-        ("physics", "robot.tracks", 3, "robot: 'int' object is not iterable"),
         ("online_pe", "dynamics.members", 1.5, "dynamics.members=1.5: expected a whole number"),
         ("online_pe", "dynamics.hidden", [0], "dynamics.hidden=0: expected a whole number"),
         ("online_pe", "dynamics.log_variance", [1], "dynamics: not enough values"),
@@ -142,6 +141,11 @@ NAN = float("nan")
 def test_settings_out_of_range_are_refused(configure, no_training, method, key, value, complaint):
     with pytest.raises(ConfigurationError, match=f"^{complaint}"):
         build(configure(f"method={method}", **{key: value}))
+
+
+def test_a_robot_without_tracks_is_refused(configure):
+    with pytest.raises(ConfigurationError, match="robot: 'int' object is not iterable"):
+        build(configure(tracks="all", **{"robot.tracks": 3}))
 
 
 @pytest.mark.parametrize("key", ["next", "plain"])

@@ -1,0 +1,205 @@
+"""Bounded steps on the latest transition, per mission and member."""
+
+import copy
+import math
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from hydra.utils import instantiate
+from tensordict import TensorDict
+
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
+from afm_rl.learning import GaussianNLLLoss, StreamXUpdater, gaussian_nll, pretrain_ensemble
+
+FORMS = ["error", "loss"]
+SETTINGS = {"init": "sparse", "layer_norm": True, "running_count": 1000}
+
+
+def transition(state, action, factor=-1.0):
+    td = TensorDict({"observation": state, "action": action}, state.shape[:-1])
+    return td.set(("next", "observation"), Dubins()(state, factor * action))
+
+
+def updater_of(model, **settings):
+    return StreamXUpdater(GaussianNLLLoss(model), **settings)
+
+
+def state_of(model, index=...):
+    parts = [*model.parameters(), model.running.mean, model.running.scatter]
+    return torch.cat([part.detach()[index].flatten() for part in parts])
+
+
+@pytest.fixture
+def make(make_ensemble):
+    """Make an ensemble of the stream-x kind that has seen a little."""
+
+    def build(**settings):
+        model = make_ensemble(**{**SETTINGS, **settings}).double()
+        generator = torch.Generator().manual_seed(0)
+        inputs = torch.randn(50, 3, generator=generator, dtype=torch.float64)
+        model.normalise_(inputs, 0.1 * inputs + 0.01)
+        return model
+
+    return build
+
+
+@pytest.fixture
+def missions(make):
+    return make().expand_(4)
+
+
+def by_hand(model, td, form, kappa=2.0):
+    """One step of every member of an unexpanded ensemble, in the plainest way."""
+    found = []
+    target = model.standardise(
+        model.manifold.difference(td["next", "observation"], td["observation"])
+    )
+    size = target.shape[-1]
+    for e in range(model.members):
+        mean, log_variance = (x[0, e] for x in model.moments(td["observation"], td["action"]))
+        nll = gaussian_nll(mean, log_variance, target[0]).mean()
+        error = (target[0] - mean).norm()
+        parameters = list(model.parameters())
+        if form == "loss":
+            steps = [(1.0, torch.autograd.grad(nll, parameters))]
+        else:
+            slow = torch.autograd.grad(nll, parameters, retain_graph=True)
+            head = [torch.zeros_like(g) for g in slow]
+            for k in (len(model.weights) - 1, len(parameters) - 1):  # last weight, last bias
+                head[k][..., size:] = slow[k][..., size:]
+            steps = [(error.item(), torch.autograd.grad(error, parameters)), (1.0, head)]
+        values = [parameter.detach()[e].clone() for parameter in parameters]
+        for delta, gradients in steps:
+            norm = sum(float(g[e].abs().sum()) for g in gradients)
+            scale = delta / max(1.0, kappa * max(delta, 1.0) * norm)
+            values = [v - scale * g[e] for v, g in zip(values, gradients, strict=True)]
+        found.append(values)
+    return [torch.stack(parts) for parts in zip(*found, strict=True)]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_step_is_that_of_each_member_alone(make, transitions, form):
+    model = make()
+    td = transition(*transitions(1, dtype=torch.float64))
+    expected = by_hand(copy.deepcopy(model), td, form)
+    loss = GaussianNLLLoss(model)(td)["loss_nll"]
+    measured = updater_of(model, form=form)(td)["loss"]
+    assert measured.shape == (1,) and not measured.requires_grad
+    torch.testing.assert_close(measured[0], loss.detach())
+    torch.testing.assert_close([p.data for p in model.parameters()], expected)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_missions_learn_as_if_they_were_alone(missions, make, transitions, form):
+    updater = updater_of(missions, form=form)
+    alone = [make() for _ in range(4)]
+    singles = [updater_of(model, form=form) for model in alone]
+    for step in range(5):
+        td = transition(*transitions(4, seed=step, dtype=torch.float64))
+        loss = updater(td)["loss"]
+        for index, single in enumerate(singles):
+            torch.testing.assert_close(single(td[[index]])["loss"][0], loss[index])
+    for index, model in enumerate(alone):
+        torch.testing.assert_close(state_of(missions, index), state_of(model))
+
+
+def test_repetition_explains_the_transition_and_never_flips_the_error(missions, transitions):
+    updater = updater_of(missions)
+    td = transition(*transitions(4, dtype=torch.float64))
+    change = missions.manifold.difference(td["next", "observation"], td["observation"])
+    target, sizes = missions.standardise(change).unsqueeze(-2), []
+    missions.running = None  # with inputs as they are, each step must bring the target nearer
+    for _ in range(150):
+        mean, _ = missions.moments(td["observation"], td["action"])
+        sizes.append((target - mean.detach()).norm(dim=-1))
+        updater(td)
+    sizes = torch.stack(sizes)
+    assert (sizes[1:] <= sizes[:-1] + 0.02).all() and (sizes[-1] < 0.1 * sizes[0]).all()
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_stream_of_reversed_actions_is_learnt(make, states, box, transitions, form):
+    model = make(hidden=[32, 32]).float()
+    pretrain_ensemble(model, Dubins(), states, box, samples=4000, epochs=4, lr=5e-3)
+    updater = updater_of(model.expand_(1), form=form)
+    state, action = transitions(1, 500, seed=1)
+    truth = Dubins()(state, -action)
+
+    @torch.no_grad()
+    def miss():
+        error = model.manifold.difference(model(state, action), truth)
+        return float(error.square().mean().sqrt())
+
+    before = miss()
+    stream_state, stream_action = transitions(1200, 1, seed=2)
+    for s, a in zip(stream_state, stream_action, strict=True):
+        updater(transition(s, a))
+    assert updater.refused == 0 and miss() < 0.4 * before
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("shape", [(4,), (4, 1)])
+def test_masked_missions_do_not_learn_but_are_measured(missions, transitions, shape, form):
+    updater = updater_of(missions, mask_key=["learn", "here"], form=form)
+    td = transition(*transitions(4, dtype=torch.float64))
+    td["learn", "here"] = torch.tensor([True, False, True, False]).reshape(shape)
+    before = [state_of(missions, index) for index in range(4)]
+    expected = updater.loss(td)["loss_nll"].detach()
+    torch.testing.assert_close(updater(td)["loss"], expected)
+    changed = [not torch.equal(state_of(missions, i), before[i]) for i in range(4)]
+    assert changed == [True, False, True, False] and updater.refused == 0
+    assert missions.running.count.flatten().tolist() == [51, 50, 51, 50]
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
+@pytest.mark.parametrize("key", ["observation", "action", ("next", "observation")])
+def test_faulty_transitions_are_refused_and_counted(missions, transitions, value, key, form):
+    updater, twin = updater_of(missions, form=form), copy.deepcopy(missions)
+    td = transition(*transitions(4, dtype=torch.float64))
+    good = td.clone()
+    td[key][1] = value
+    before = state_of(missions, 1)
+    loss = updater(td)["loss"]
+    assert loss[1].isnan() and loss[[0, 2, 3]].isfinite().all() and updater.refused == 1
+    assert torch.equal(state_of(missions, 1), before)
+    updater_of(twin, form=form)(good)  # the others learn as ever
+    for index in (0, 2, 3):
+        torch.testing.assert_close(state_of(missions, index), state_of(twin, index))
+
+
+def test_missions_may_leave_and_a_shared_model_learns_from_all(missions, make, transitions):
+    updater = updater_of(missions)
+    updater(transition(*transitions(4, dtype=torch.float64)))
+    missions.select_(torch.tensor([3, 1]))
+    before = state_of(missions, 0)
+    result = updater(transition(*transitions(2, dtype=torch.float64)))
+    assert result["loss"].shape == (2,) and not torch.equal(state_of(missions, 0), before)
+    shared = make()
+    losses = [updater_of(shared)(transition(*transitions(6, dtype=torch.float64)))["loss"]]
+    losses += [updater_of(shared)(transition(*transitions(6, dtype=torch.float64)))["loss"]]
+    assert losses[1].mean() < losses[0].mean() and shared.running.count == 62
+
+
+def test_impossible_settings_are_refused(make):
+    for settings in ({"form": "both"}, {"lr": 0.0}, {"kappa": math.inf}):
+        with pytest.raises(ConfigurationError, match=f"updater.{next(iter(settings))}"):
+            updater_of(make(), **settings)
+    with pytest.raises(ConfigurationError, match="teaches an Ensemble, got Dubins"):
+        updater_of(Dubins())
+
+
+@pytest.mark.parametrize("method", ["stream_x_pe", "afm_stream_x_pe", "afm_online_pe"])
+def test_presets_choose_what_their_name_says(method):
+    with initialize_config_module("afm_rl.conf", version_base=None):
+        cfg = compose("config", overrides=[f"method={method}"])
+        literal = compose("config", overrides=["updater=stream_x_literal"]).updater
+    assert (cfg.flow.get("window") is not None) == method.startswith("afm")
+    loss = GaussianNLLLoss(instantiate(cfg.dynamics)(instantiate(cfg.robot)).module)
+    updater = instantiate(cfg.updater)(loss)
+    assert isinstance(updater, StreamXUpdater) == ("stream_x" in method)
+    assert loss.model.layer_norm == ("stream_x" in method)
+    if method == "stream_x_pe":
+        assert (updater.form, instantiate(literal)(loss).form) == ("error", "loss")

@@ -1,0 +1,130 @@
+"""Every choice of every configuration group says what it is, composes, and runs."""
+
+import copy
+import functools
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+import afm_rl.conf
+from afm_rl.missions import build, prepare, run
+
+CONF = Path(afm_rl.conf.__file__).parent
+FILES = sorted(CONF.glob("*/*.yaml"))
+GROUPS = {
+    folder: [path.stem for path in paths]
+    for folder, paths in itertools.groupby(FILES, lambda path: path.parent.name)
+}
+SMALL = {  # settings that are there are made small
+    "planner.population": 8,
+    "planner.elites": 2,
+    "dynamics.members": 2,
+    "dynamics.hidden": [8, 8],
+    "dynamics.pretrain.samples": 256,
+    "dynamics.pretrain.epochs": 1,
+    "flow.hidden": [8, 8],
+    "flow.latent": 8,
+    "flow.width": 8,
+    "flow.train.iterations": 5,
+    "budget": 5,
+}
+PARTNERS = {  # what else must be chosen for a choice to make sense
+    "dynamics=oracle": ["updater=oracle"],
+    "updater=oracle": ["dynamics=oracle"],
+    "updater=online": ["dynamics=pe"],
+    "updater=stream_x": ["dynamics=pe_stream_x"],
+    "updater=stream_x_literal": ["dynamics=pe_stream_x"],
+    "transform=afm": ["flow=context"],
+    "transform=none": [],
+    "flow=none": [],
+}
+
+
+def choices(*groups):
+    """Name every combination of choices, with the partners that they need."""
+    for names in itertools.product(*(GROUPS[group] for group in groups)):
+        chosen = [f"{group}={name}" for group, name in zip(groups, names, strict=True)]
+        yield chosen + [partner for choice in chosen for partner in PARTNERS.get(choice, [])]
+
+
+PAIRS = [
+    *choices("dynamics", "planner"),
+    *(["method=online_pe", "seeds=2", planner] for (planner,) in choices("planner")),
+]
+SINGLES = [
+    *choices("method"),
+    *choices("updater"),
+    *choices("transform"),
+    *([choice, "transform=afm"] for (choice, *_) in choices("flow") if choice != "flow=none"),
+    *([cost, "method=afm_physics"] for (cost,) in choices("cost")),
+    *choices("robot"),
+]
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    """Folder of trained parts that all these tests share."""
+    return tmp_path_factory.getbasetemp() / "trained_parts"
+
+
+@functools.cache
+def composed(*overrides):
+    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+@pytest.mark.parametrize("overrides", [*PAIRS, *SINGLES], ids=" ".join)
+def test_every_choice_runs(overrides, cache):
+    cfg = copy.deepcopy(composed(*overrides))
+    for key, value in SMALL.items():
+        if OmegaConf.select(cfg, key) is not None:
+            OmegaConf.update(cfg, key, value)
+    agent = build(cfg)
+    prepare(agent, cache, echo=lambda line: None)
+    results = run(agent)
+    assert results.steps["t"].tolist() == [0, 1, 2, 3, 4] * len(results.missions)
+    assert np.isfinite(results.steps.to_numpy(dtype=float)).all()
+    assert results.missions["steps"].eq(4).all()
+
+
+def comments(path):
+    """Return the lines of a file, without the one that tells Hydra where it belongs."""
+    lines = path.read_text().splitlines()
+    return [line for line in lines if not line.startswith("# @package")]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_every_file_begins_with_what_it_is(path):
+    first, second = comments(path)[:2]
+    assert first.startswith("# ") and first[2].isupper() and first.endswith(".")
+    assert not second.startswith("#")
+
+
+def test_every_setting_has_a_comment():
+    lines = (CONF / "config.yaml").read_text().splitlines()
+    settings = [line for line in lines if line[:1].isalpha()]
+    names = {line.partition(":")[0] for line in settings}
+    assert names == {"defaults", *composed()} - set(GROUPS) | {"hydra"}
+    bare = {line.partition(":")[0] for line in settings if " # " not in line}
+    assert bare == {"defaults", "hydra"}
+
+
+@pytest.mark.parametrize("method", GROUPS["method"])
+def test_a_method_chooses_four_parts_and_nothing_else(method):
+    text = (CONF / "method" / f"{method}.yaml").read_text()
+    assert text.startswith("# @package _global_\n")
+    loaded = OmegaConf.create(text)
+    assert list(loaded) == ["defaults"]
+    parts = [next(iter(entry)).removeprefix("override /") for entry in loaded.defaults]
+    assert parts == ["dynamics", "updater", "transform", "flow"]
+
+
+def test_without_a_choice_four_methods_are_compared():
+    cfg = composed()
+    assert list(cfg.compare) == ["physics", "online_pe", "afm_physics", "oracle"]
+    assert set(cfg.compare) <= set(GROUPS["method"])
+    assert cfg.regimes == [{"v_gain": -1.0, "omega_gain": 1.0}]

@@ -1,0 +1,118 @@
+"""What the README and the examples show works."""
+
+import functools
+import re
+import runpy
+import shlex
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+import afm_rl.conf
+import afm_rl.flow
+import afm_rl.learning
+from afm_rl.missions import build
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text()
+CONF = Path(afm_rl.conf.__file__).parent
+GROUPS = {path.name: {p.stem for p in path.glob("*.yaml")} for path in CONF.iterdir()}
+GROUPS = {group: choices for group, choices in GROUPS.items() if choices}
+BLOCKS = re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+
+def rows():
+    """Read the README's tables: the backticked words of each group's rows."""
+    found, group = {}, None
+    for line in README.splitlines():
+        cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
+        if not line.startswith("|"):
+            group = None
+        elif cells[0]:
+            group = cells[0].strip("`")
+        if group in GROUPS:
+            found.setdefault(group, []).extend(re.findall(r"`([^`]+)`", " ".join(cells[1:])))
+    return found
+
+
+def commands():
+    """Find the README's command lines, each as a list of overrides."""
+    texts = re.findall(r"^(?:\S*/)?afm-rl (.+)$", README, re.MULTILINE)
+    texts += re.findall(r"`afm-rl ([^`]+)`", README)
+    split = (shlex.split(text, comments=True) for text in texts)
+    return [[part for part in parts if not part.startswith("-")] for parts in split]
+
+
+@pytest.fixture
+def short_trainings(monkeypatch):
+    """Cut every training short."""
+    for module, name, small in (
+        (afm_rl.flow, "train_flow", {"iterations": 5}),
+        (afm_rl.learning, "pretrain_ensemble", {"samples": 512, "epochs": 1}),
+    ):
+        whole = getattr(module, name)
+
+        def short(*args, _whole=whole, _small=small, **settings):
+            return _whole(*args, **{**settings, **_small, "progress": False})
+
+        monkeypatch.setattr(module, name, functools.wraps(whole)(short))
+
+
+def test_there_is_something_to_check():
+    assert BLOCKS and EXAMPLES and len(commands()) > 5
+    assert rows().keys() == GROUPS.keys()
+
+
+@pytest.mark.parametrize("code", BLOCKS)
+def test_python_blocks_run_by_themselves(code, short_trainings, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, "README.md", "exec"), {"__name__": "readme"})
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_run(path, short_trainings, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", [str(path)])
+    runpy.run_path(str(path), run_name="__main__")
+    assert capsys.readouterr().out
+
+
+@pytest.mark.parametrize("group", sorted(GROUPS))
+def test_every_choice_is_in_the_table_of_choices(group):
+    words = rows()[group]
+    assert GROUPS[group] - set(words) == set()
+    named = {word for word in words if re.fullmatch(r"[a-z]\w*", word)}
+    assert named - GROUPS[group] == set()
+
+
+@pytest.mark.parametrize("group", sorted(GROUPS))
+def test_settings_in_the_table_of_choices_exist(group):
+    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+        cfg = compose("config", [])
+    for word in rows()[group]:
+        if re.fullmatch(rf"{group}\.\w+", word):
+            assert word.partition(".")[2] in cfg[group]
+
+
+@pytest.mark.parametrize("overrides", commands(), ids=" ".join)
+def test_command_lines_can_be_run(overrides, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    Path("my_track.csv").write_text("x,y\n0,0\n4,0\n4,4\n")
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    first = [
+        f"{each.get_key_element()}={next(iter(each.sweep_string_iterator()))}"
+        if each.is_sweep_override()
+        else each.input_line
+        for each in parsed
+    ]
+    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+        build(compose("config", first))
+
+
+def test_files_that_are_linked_exist():
+    links = re.findall(r"\]\(([^)#:]+)\)", README)
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
