@@ -60,6 +60,20 @@ def check_count(name: str, value: int, *, low: int = 1) -> int:
     return value
 
 
+def check_counts(name: str, values: Iterable[int], *, low: int = 1) -> list[int]:
+    """Return ``values`` as a list if each is a whole number of at least ``low``.
+
+    Raises:
+        ConfigurationError: otherwise.
+
+    >>> check_counts("hidden", (200, 200))
+    [200, 200]
+    """
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise ConfigurationError(f"{name}={values!r}: expected a list of whole numbers")
+    return [check_count(name, value, low=low) for value in values]
+
+
 def check_choice(name: str, value: str, allowed: Iterable[str]) -> str:
     """Return ``value`` if it is one of ``allowed``.
 
@@ -72,4 +86,18 @@ def check_choice(name: str, value: str, allowed: Iterable[str]) -> str:
     allowed = tuple(allowed)
     if value not in allowed:
         raise ConfigurationError(f"{name}={value!r}: expected one of {', '.join(allowed)}")
+    return value
+
+
+def check_flag(name: str, value: bool) -> bool:
+    """Return ``value`` if it is true or false.
+
+    Raises:
+        ConfigurationError: otherwise.
+
+    >>> check_flag("enabled", True)
+    True
+    """
+    if not isinstance(value, bool):
+        raise ConfigurationError(f"{name}={value!r}: expected true or false")
     return value

@@ -13,7 +13,13 @@ from torch import Tensor, nn
 from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.dynamics.sparse import sparse_layer, uniform_layer
 from afm_rl.dynamics.stacked import stacked_mlp, stacked_mlp_tangent
-from afm_rl.errors import ConfigurationError, check_choice, check_count
+from afm_rl.errors import (
+    ConfigurationError,
+    check_choice,
+    check_count,
+    check_counts,
+    check_flag,
+)
 from afm_rl.manifold import Manifold
 from afm_rl.running_stats import RunningStats
 
@@ -79,13 +85,13 @@ class Ensemble(DynamicsModel):
                 f"dynamics.features={self.features}: expected indices in 0..{manifold.size - 1}"
             )
         self.members = check_count("dynamics.members", members)
-        self.hidden = [check_count("dynamics.hidden", units) for units in hidden]
+        self.hidden = check_counts("dynamics.hidden", hidden)
         low, high = log_variance
         if not low < high:
             raise ConfigurationError(f"dynamics.log_variance=[{low}, {high}]: expected low < high")
         self.log_variance = (float(low), float(high))
         self.propagation = check_choice("dynamics.propagation", propagation, ("mean", "sample"))
-        self.layer_norm = layer_norm
+        self.layer_norm = check_flag("dynamics.layer_norm", layer_norm)
         self._generator = torch.Generator().manual_seed(seed)
         inputs, targets = len(self.features) + action_size, manifold.tangent_size
         sizes = [inputs, *self.hidden, 2 * targets]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import check_choice, check_count, check_number
+from afm_rl.errors import check_choice, check_count, check_counts, check_number
 from afm_rl.flow.base import Context, Examples, Flow
 from afm_rl.flow.effective import effective_action
 from afm_rl.flow.least_squares import fit_gain
@@ -78,6 +78,8 @@ class ContextFlow(PairCorrector, Flow):
         self.source_std = check_number("flow.source_std", source_std, low=0.0)
         self.steps = check_count("flow.steps", steps)
         self.saturation = check_choice("flow.saturation", saturation, MODES)
+        hidden = check_counts("flow.hidden", hidden)
+        check_count("flow.latent", latent)
         size = self.action_size
         generator = torch.Generator().manual_seed(seed)
         self.encoder = mlp([self.feature_size, *hidden, latent], generator)

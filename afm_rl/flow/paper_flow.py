@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import check_choice, check_count
+from afm_rl.errors import check_choice, check_count, check_flag
 from afm_rl.flow.base import Context, Examples, Flow, Window
 from afm_rl.flow.network import mlp
 from afm_rl.flow.solver import midpoint
@@ -59,7 +59,9 @@ class PaperFlow(Flow):
         self.state_size = check_count("flow.state_size", state_size)
         self.steps = check_count("flow.steps", steps)
         self.error_action = check_choice("flow.error_action", error_action, ("planned", "executed"))
-        self.wrap, self.latch = wrap, latch
+        self.wrap = check_flag("flow.wrap", wrap)
+        self.latch = check_flag("flow.latch", latch)
+        check_count("flow.width", width)
         size = self.action_size
         generator = torch.Generator().manual_seed(seed)
         self.regime_encoder = mlp([self.feature_size, width, width], generator)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from afm_rl.dynamics import Oracle
+from afm_rl.errors import ConfigurationError
 from afm_rl.keys import as_key
 from afm_rl.learning.nll import GaussianNLLLoss
 
@@ -75,6 +76,11 @@ class OnlineUpdater(Updater):
         mask_key: NestedKey | None = None,
     ) -> None:
         super().__init__(loss)
+        if not any(True for _ in loss.model.parameters()):
+            raise ConfigurationError(
+                "updater: the dynamics model has nothing to learn; choose dynamics=pe, or "
+                "updater=frozen"
+            )
         self.optimizer = optimizer(loss.model.parameters())
         self.mask_key = None if mask_key is None else as_key(mask_key)
         self.refused = 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +26,15 @@ from afm_rl.missions.selection import (
 )
 from afm_rl.planning import PlanningEnv
 from afm_rl.transforms import ActionFlowTransform
+
+ROBOT_SHAPES = (
+    *("action_low", "action_high", "state_low", "state_high"),
+    *("features", "model", "regime"),
+)
+AFTER_TRAINING = (
+    *("gate", "samples", "steps", "error_action", "wrap", "latch", "checkpoint"),
+    "propagation",
+)
 
 
 @dataclass
@@ -92,9 +101,10 @@ def build(cfg: DictConfig) -> Agent:
     dynamics = make("dynamics", robot)
     base = dynamics.module
     flow = make("flow", robot, base)
+    shapes = [_shaping(settings, group) for group in ("robot", "dynamics", "flow")]
     trainings = [
-        part.training._replace(settings={key: settings[key] for key in ("robot", *groups)})
-        for part, groups in ((dynamics, ["dynamics"]), (flow, ["dynamics", "flow"]))
+        part.training._replace(settings=shaping)
+        for part, shaping in ((dynamics, shapes[:2]), (flow, shapes))
         if part.training is not None
     ]
     model = base
@@ -129,3 +139,10 @@ def build(cfg: DictConfig) -> Agent:
         executed_key=executed_key,
         trainings=trainings,
     )
+
+
+def _shaping(settings: Mapping[str, Any], group: str) -> dict[str, Any]:
+    """Return those settings of a group that shape a trained part, for its place in the cache."""
+    if group == "robot":
+        return {name: settings[group][name] for name in ROBOT_SHAPES}
+    return {name: value for name, value in settings[group].items() if name not in AFTER_TRAINING}

@@ -6,7 +6,7 @@ it as a :class:`Training`, so that everything is built and checked before anythi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,7 +33,7 @@ class Training(NamedTuple):
     """Trains with or without a progress bar; returns the held-out error."""
     unit: str
     """Unit of the held-out error."""
-    settings: Mapping[str, Any] = {}
+    settings: Sequence[Mapping[str, Any]] = ()
     """Everything that the result depends on."""
 
 

@@ -8,7 +8,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Transform
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, check_flag
 from afm_rl.flow import Context, Corrector, Window
 from afm_rl.keys import as_key
 
@@ -76,7 +76,7 @@ class ActionFlowTransform(Transform):
         self.observation_key = observation_key
         self.action_key = action_key
         self.prefix = as_key(prefix)
-        self.enabled = enabled
+        self.enabled = check_flag("transform.enabled", enabled)
 
     def key(self, *names: str) -> NestedKey:
         """Return the key of an entry of the memory."""

@@ -43,6 +43,9 @@ def test_only_what_the_result_depends_on_is_part_of_the_key(prepared, cache):
     prepared(cache)
     _, lines = prepared(cache, "planner=mppi_paper", "seeds=3", budget=3)
     assert all("from the cache" in line for line in lines)
+    after = {"flow.gate": 9.0, "flow.samples": 2, "flow.steps": 1, "dynamics.propagation": "sample"}
+    _, lines = prepared(cache, **after)
+    assert all("from the cache" in line for line in lines)
     _, lines = prepared(cache, **{"flow.train.iterations": 21})
     assert ["from the cache" in line for line in lines] == [True, False]
     _, lines = prepared(cache, **{"dynamics.seed": 1})
