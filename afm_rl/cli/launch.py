@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from afm_rl.artefacts import write_whole
-from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.errors import ConfigurationError, check_count, check_flag
 from afm_rl.missions import build, prepare, run
 from afm_rl.report import print_summary, write_run
 
@@ -27,8 +27,7 @@ def launch(cfg: DictConfig) -> None:
     """
     torch.set_num_threads(check_count("threads", cfg.threads))
     for name in SWITCHES:
-        if not isinstance(cfg[name], bool):
-            raise ConfigurationError(f"{name}={cfg[name]!r}: expected true or false")
+        check_flag(name, cfg[name])
     if not isinstance(cfg.cache, str):
         raise ConfigurationError(f"cache={cfg.cache!r}: expected a folder")
     job = HydraConfig.get()
