@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from afm_rl.envs.track import Track
 from afm_rl.envs.ugv import UGVTrack
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes import Schedule
+from afm_rl.regimes import Regime, Schedule
 
 
 def build_native(
@@ -23,6 +23,8 @@ def build_native(
     regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None,
     gains: Mapping[str, float | None],
     schedule: Schedule | Sequence[float] | None,
+    ramp: int,
+    family: Regime | None,
     batch_size: tuple[int, ...],
     settings: Mapping[str, Any],
 ) -> UGVTrack:
@@ -33,6 +35,8 @@ def build_native(
         regime: parameters of the changed phase, or one mapping per phase.
         gains: more parameters of the changed phase; None where not given.
         schedule: a schedule, or breakpoints of the progress.
+        ramp: steps that each change takes.
+        family: regime family; gains on v and omega if None.
         batch_size: number of missions.
         settings: further arguments of :class:`~afm_rl.envs.UGVTrack`.
 
@@ -48,9 +52,10 @@ def build_native(
         regime = {**(regime or {}), **given}
     return UGVTrack(
         tracks=(track,),
+        regime=family,
         schedule=schedule,
         batch_size=batch_size,
-        missions={"regime": regime},
+        missions={"regime": regime, "ramp": ramp},
         **settings,
     )
 

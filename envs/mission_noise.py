@@ -7,15 +7,16 @@ from torch import Tensor
 
 from afm_rl.streams import Streams
 
-_SALTS = {"start": 0x55475653, "process": 0x55475650}
+_SALTS = {"start": 0x55475653, "process": 0x55475650, "actuator": 0x55475641}
+_SIZES = {"start": 3, "process": 3, "actuator": 2}
 
 
 class MissionNoise:
-    """Start and process noise that depend on a mission's seed alone.
+    """Start, process and actuator noise that depend on a mission's seed alone.
 
-    Starts and steps draw from streams of their own, so a reset does not shift the noise of the
-    steps, and rows that are left out of a call draw nothing. Rows with equal seeds share their
-    numbers call by call: step them together, and they are paired.
+    Each kind draws from streams of its own, so a reset does not shift the noise of the steps, and
+    rows that are left out of a call draw nothing. Rows with equal seeds share their numbers call
+    by call: step them together, and they are paired.
 
     >>> noise = MissionNoise()
     >>> seeds = torch.tensor([3, 4, 3])
@@ -34,19 +35,20 @@ class MissionNoise:
         rows: Tensor | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> Tensor:
-        """Draw N(0, 1) numbers ``(*B, 3)``.
+        """Draw N(0, 1) numbers ``(*B, N)``: N is 3, for poses, or 2, for actions.
 
         Args:
-            event: ``"start"`` or ``"process"``.
+            event: ``"start"``, ``"process"`` or ``"actuator"``.
             seeds: seed of each mission, ``(*B)``.
             rows: missions that draw, booleans ``(*B)``; the others get zeros. All if None.
             dtype: floating-point type.
         """
-        noise = torch.zeros(*seeds.shape, 3, device=seeds.device, dtype=dtype)
+        size = _SIZES[event]
+        noise = torch.zeros(*seeds.shape, size, device=seeds.device, dtype=dtype)
         rows = torch.ones_like(seeds, dtype=torch.bool) if rows is None else rows
         if rows.any():
             noise[rows] = self.streams[event].normal(
-                (3,), seeds=seeds[rows], device=seeds.device, dtype=dtype
+                (size,), seeds=seeds[rows], device=seeds.device, dtype=dtype
             )
         return noise
 

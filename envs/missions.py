@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -21,6 +22,7 @@ class MissionFormat:
     ``seed``       int64   seed of the mission's noise, ``(*B)``
     ``parameters`` float   regime parameters per phase, ``(*B, P, F)``
     ``at``         float   breakpoints of the schedule, ``(*B, K)``, padded with ``inf``
+    ``ramp``       int64   steps that a change takes, ``(*B)``; 0 for sudden changes
     ============== ======= ===========================================================
 
     Because they travel with the state, one tensordict holds any mix of missions.
@@ -53,6 +55,7 @@ class MissionFormat:
             "seed": (),
             "parameters": (schedule.phases, len(regime.names)),
             "at": (len(schedule.at),),
+            "ramp": (),
         }
 
     def spec(self, batch: torch.Size, device: torch.device | None) -> Composite:
@@ -61,6 +64,7 @@ class MissionFormat:
         leaves = {
             "track": Bounded(0, last, shape=batch, dtype=torch.int64, device=device),
             "seed": Unbounded(shape=batch, dtype=torch.int64, device=device),
+            "ramp": Bounded(0, 2**31 - 1, shape=batch, dtype=torch.int64, device=device),
         }
         for name in ("parameters", "at"):
             shape = (*batch, *self._shapes[name])
@@ -72,6 +76,8 @@ class MissionFormat:
         track: int | str = 0,
         seed: int | None = None,
         regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+        at: Sequence[float] | None = None,
+        ramp: int = 0,
     ) -> TensorDict:
         """Describe one mission: ``env.reset(torch.stack([...]), set_state=False)`` runs many.
 
@@ -79,13 +85,21 @@ class MissionFormat:
             track: index or name.
             seed: seed of its noise; if None, the environment numbers its missions.
             regime: parameters that are not nominal: one mapping for the second phase (the
-                only one, if the schedule has no breakpoint), or one mapping per phase.
+                only one, if there is no breakpoint), or one mapping per phase.
+            at: breakpoints of its own, at most as many as the schedule has; the schedule's if
+                None. The last phase goes on to the end.
+            ramp: steps over which the parameters move linearly from those of the last phase to
+                those of the present one; 0 for sudden changes.
+
+        Raises:
+            ConfigurationError: for a value that cannot be used.
         """
         if isinstance(track, str):
             track = self.tracks.index(check_choice("missions: track", track, self.tracks))
         elif check_count("missions: track", track, low=0) >= len(self.tracks):
             raise ConfigurationError(f"missions: track={track}: there are {len(self.tracks)}")
-        phases = self.schedule.phases
+        breakpoints = self._breakpoints(at)
+        phases = len(breakpoints) + 1
         if regime is None or isinstance(regime, Mapping):
             changed = min(1, phases - 1)
             regime = [(regime or {}) if phase == changed else {} for phase in range(phases)]
@@ -94,19 +108,37 @@ class MissionFormat:
             raise ConfigurationError(
                 f"regimes: {regime!r}: expected one mapping, or one for each of {phases} phases"
             )
+        more = self.schedule.phases - phases
         rows = torch.stack([self.regime.encode(values) for values in regime])
-        entries = {"track": torch.tensor(track), "parameters": rows}
+        entries = {
+            "track": torch.tensor(track),
+            "parameters": torch.cat([rows, rows[-1:].expand(more, -1)]),
+            "at": torch.tensor([*breakpoints, *[math.inf] * more]),
+            "ramp": torch.tensor(check_count("missions: ramp", ramp, low=0)),
+        }
         if seed is not None:
             entries["seed"] = torch.tensor(check_count("missions: seed", seed, low=0))
         return TensorDict({"mission": entries})
+
+    def _breakpoints(self, at: Sequence[float] | None) -> list[float]:
+        """Return a mission's own breakpoints, or the schedule's without its padding."""
+        room = len(self.schedule.at)
+        if at is None:
+            return [value for value in self.schedule.at if math.isfinite(value)]
+        if isinstance(at, str) or not isinstance(at, Sequence) or len(at) > room:
+            raise ConfigurationError(
+                f"missions: at={at!r}: expected a list of at most {room} breakpoints; give the "
+                "environment a schedule with more phases, such as Schedule(...).padded(9)"
+            )
+        return list(Schedule(at, self.schedule.by).at)
 
     def complete(
         self, given: TensorDictBase | None, batch: torch.Size, seed: int, device
     ) -> TensorDict:
         """Check what is ``given`` of a batch of missions and add what is missing.
 
-        Missing are: the first track, nominal dynamics, the schedule's breakpoints, and the
-        seeds ``seed, seed + 1, ...`` so that no two missions share their noise.
+        Missing are: the first track, nominal dynamics, the schedule's breakpoints, no ramp, and
+        the seeds ``seed, seed + 1, ...`` so that no two missions share their noise.
 
         Raises:
             ConfigurationError: for an unknown entry, a wrong shape or an impossible value.
@@ -126,10 +158,11 @@ class MissionFormat:
             "seed": seed + index,
             "parameters": nominal.expand(*batch, *nominal.shape),
             "at": torch.tensor(self.schedule.at).expand(*batch, -1),
+            "ramp": torch.zeros_like(index),
         }
         mission = {}
         for name, value in default.items():
-            whole = name in ("track", "seed")
+            whole = name in ("track", "seed", "ramp")
             value = entries.get(name, value)
             mission[name] = value.to(device, torch.int64 if whole else self.dtype, copy=True)
         self._check_values(mission)
@@ -141,5 +174,7 @@ class MissionFormat:
             raise ConfigurationError(f"missions: track: expected indices 0..{last}")
         if not mission["parameters"].isfinite().all():
             raise ConfigurationError("missions: parameters: expected finite numbers")
+        if (mission["ramp"] < 0).any():
+            raise ConfigurationError("missions: ramp: expected whole numbers of at least 0")
         if mission["at"].isnan().any():
             raise ConfigurationError("missions: at: expected numbers; pad with inf")

@@ -45,25 +45,28 @@ class UGVTrack(EnvBase):
     distance gained on the current target in metres, plus 1 for a target reached. An episode
     terminates with the last target and is truncated after ``max_steps``.
 
-    ================== ============ =====================================================
-    ``observation``    ``(*B, 3)``  the pose, for policies: x, y (m), theta (rad)
-    ``goal``           ``(*B, 2)``  current target (m)
-    ``reached``        ``(*B)``     number of targets reached
-    ``step``           ``(*B)``     number of steps taken
-    ``pose``           ``(*B, 3)``  the state itself; transforms should leave it alone
-    ``mission``        nested       see :class:`~afm_rl.envs.missions.MissionFormat`
-    ``regime``         ``(*B, F)``  parameters that act on the next action: hidden truth,
-                                    for oracles and logs only
-    ``regime_active``  ``(*B)``     whether they differ from nominal; hidden truth as well
-    ================== ============ =====================================================
+    ================= ============== ====================================================
+    ``observation``   ``(*B, 3)``    the pose, for policies: x, y (m), theta (rad)
+    ``goal``          ``(*B, 2)``    current target (m)
+    ``reached``       ``(*B)``       number of targets reached
+    ``step``          ``(*B)``       number of steps taken
+    ``since``         ``(*B)``       step at which the present phase began
+    ``past``          ``(*B, D, 2)`` the last D clamped actions, newest first; only there
+                                     if the regime depends on them
+    ``pose``          ``(*B, 3)``    the state itself; transforms should leave it alone
+    ``mission``       nested         see :class:`~afm_rl.envs.missions.MissionFormat`
+    ``regime``        ``(*B, F)``    parameters that act on the next action: hidden truth,
+                                     for oracles and logs only
+    ``regime_active`` ``(*B)``       whether they differ from nominal; hidden truth as well
+    ================= ============== ====================================================
 
     The state travels in the tensordict. With ``batch_size=()`` the environment accepts
     tensordicts of any batch shape, also one that loses rows from step to step. ``reset`` keeps
     the ``mission`` entries it is given (say ``set_state=False`` for a fresh start and
-    ``set_state=True`` to go on from ``pose``, ``reached`` and ``step``); an automatic reset
-    repeats the mission. Noise comes from one stream per mission seed, so a mission meets the
-    same noise alone as in a batch. The streams live in the environment: ``set_seed`` restarts
-    them, a reset continues them, ``state_dict`` holds them.
+    ``set_state=True`` to go on from ``pose``, ``reached``, ``step``, ``since`` and ``past``); an
+    automatic reset repeats the mission. Noise comes from one stream per mission seed, so a mission
+    meets the same noise alone as in a batch. The streams live in the environment: ``set_seed``
+    restarts them, a reset continues them, ``state_dict`` holds them.
 
     Args:
         tracks: names, CSV paths (see :func:`~afm_rl.envs.tracks.load_track`) or tracks.
@@ -143,13 +146,14 @@ class UGVTrack(EnvBase):
         self.mission_format = MissionFormat(names, self.regime, self.schedule, self.dtype)
         if isinstance(missions, Mapping) and not isinstance(missions, TensorDictBase):
             for key in missions:
-                check_choice("missions", key, ("track", "seed", "regime"))
+                check_choice("missions", key, ("track", "seed", "regime", "at", "ramp"))
             missions = self.mission(**missions)
         self._default = settings.check_missions(missions, batch)
         self._last: TensorDictBase | None = None
         self._missions_of(None, batch)  # a wrong default fails here, not at the first reset
 
-        state = specs.state_spec(self.mission_format.spec(batch, self.device), self.dtype)
+        mission = self.mission_format.spec(batch, self.device)
+        state = specs.state_spec(mission, self.dtype, self.regime.history)
         self.state_spec = state
         self.observation_spec = specs.observation_spec(state, len(self.regime.names))
         self.full_action_spec = specs.action_spec(
@@ -168,9 +172,11 @@ class UGVTrack(EnvBase):
         track: int | str = 0,
         seed: int | None = None,
         regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+        at: Sequence[float] | None = None,
+        ramp: int = 0,
     ) -> TensorDict:
         """Describe one mission; see :meth:`~afm_rl.envs.missions.MissionFormat.build`."""
-        return self.mission_format.build(track, seed, regime).to(self.device)
+        return self.mission_format.build(track, seed, regime, at, ramp).to(self.device)
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs
@@ -178,18 +184,21 @@ class UGVTrack(EnvBase):
         batch = self.batch_size if tensordict is None else tensordict.batch_size
         given = TensorDict({}, batch) if tensordict is None else tensordict
         mission = self._missions_of(given, batch)
-        reached = step = torch.zeros_like(mission["track"])
+        nothing = torch.zeros_like(mission["track"])
+        state = {"reached": nothing, "step": nothing, "since": nothing}
+        if self.regime.history:
+            size = (*batch, self.regime.history, 2)
+            state["past"] = torch.zeros(size, dtype=self.dtype, device=self.device)
         if set_state and "pose" in given.keys():
             pose = given["pose"].to(self.dtype, copy=True)
-            reached, step = given.get("reached", reached), given.get("step", step)
+            state = {name: given.get(name, value) for name, value in state.items()}
         else:
             rows = given.get("_reset", None)
             rows = None if rows is None else rows.reshape(batch)
             noise = self.noise.normal("start", mission["seed"], rows, self.dtype)
             pose = self.simulation.start(mission, self.start_noise * noise)
-        return self._remembered(
-            self.simulation.describe(mission, pose, reached.clone(), step.clone())
-        )
+        state = {name: value.clone() for name, value in state.items()}
+        return self._remembered(self.simulation.describe(mission, pose, **state))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if "mission" not in tensordict.keys() or "pose" not in tensordict.keys():
@@ -208,7 +217,10 @@ class UGVTrack(EnvBase):
         _check_finite(tensordict["action"])
         seeds = tensordict["mission", "seed"]
         noise = self.noise.normal("process", seeds, dtype=self.dtype)
-        return self.simulation.advance(tensordict, self.process_noise * noise)
+        actuator = None
+        if self.regime.noisy:
+            actuator = self.noise.normal("actuator", seeds, dtype=self.dtype)
+        return self.simulation.advance(tensordict, self.process_noise * noise, actuator)
 
     def _remembered(self, out: TensorDictBase) -> TensorDictBase:
         self._last = out.select("pose", "goal", "mission")

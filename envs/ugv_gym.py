@@ -16,7 +16,7 @@ from afm_rl.envs.rendering import canvas_of
 from afm_rl.envs.track import Track
 from afm_rl.envs.ugv_vector import UGVTrackVectorEnv
 from afm_rl.errors import check_choice
-from afm_rl.regimes import Schedule
+from afm_rl.regimes import Regime, Schedule
 
 __all__ = ["UGVTrackGym", "UGVTrackVectorEnv"]
 
@@ -34,6 +34,8 @@ class UGVTrackGym(gymnasium.Env):
         render_mode: None or ``"rgb_array"``.
         v_gain: short for ``regime={"v_gain": ...}``.
         omega_gain: short for ``regime={"omega_gain": ...}``.
+        ramp: steps over which the regime changes; 0 for sudden changes.
+        family: regime family, which names the parameters; gains on v and omega if None.
         settings: further arguments of :class:`~afm_rl.envs.UGVTrack`.
 
     Raises:
@@ -57,6 +59,8 @@ class UGVTrackGym(gymnasium.Env):
         render_mode: str | None = None,
         v_gain: float | None = None,
         omega_gain: float | None = None,
+        ramp: int = 0,
+        family: Regime | None = None,
         **settings: Any,
     ) -> None:
         if render_mode is not None:
@@ -64,7 +68,7 @@ class UGVTrackGym(gymnasium.Env):
         self.render_mode = render_mode
         gains = {"v_gain": v_gain, "omega_gain": omega_gain}
         settings.setdefault("max_steps", 2**62)  # gymnasium limits time by a wrapper
-        self.native = build_native(track, regime, gains, schedule, (), settings)
+        self.native = build_native(track, regime, gains, schedule, ramp, family, (), settings)
         self.observation_space, self.action_space = spaces(self.native)
         self._data: TensorDictBase | None = None
         self._trail: list[torch.Tensor] = []

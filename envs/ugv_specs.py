@@ -7,17 +7,24 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 
-def state_spec(mission: Composite, dtype: torch.dtype) -> Composite:
-    """Return the entries that make up the state: what a step starts from."""
+def state_spec(mission: Composite, dtype: torch.dtype, history: int) -> Composite:
+    """Return the entries that make up the state: what a step starts from.
+
+    Previous actions ``(*B, history, 2)`` are among them if the regime depends on some.
+    """
     batch, device = mission.shape, mission.device
-    return Composite(
+    spec = Composite(
         pose=Unbounded(shape=(*batch, 3), dtype=dtype, device=device),
         reached=Unbounded(shape=batch, dtype=torch.int64, device=device),
         step=Unbounded(shape=batch, dtype=torch.int64, device=device),
+        since=Unbounded(shape=batch, dtype=torch.int64, device=device),
         mission=mission.clone(),
         shape=batch,
         device=device,
     )
+    if history:
+        spec["past"] = Unbounded(shape=(*batch, history, 2), dtype=dtype, device=device)
+    return spec
 
 
 def observation_spec(state: Composite, parameters: int) -> Composite:

@@ -16,7 +16,7 @@ from afm_rl.envs.gym_adapter import build_native, observe, require_reset, spaces
 from afm_rl.envs.rendering import canvas_of
 from afm_rl.envs.track import Track
 from afm_rl.errors import ConfigurationError, check_choice, check_count
-from afm_rl.regimes import Schedule
+from afm_rl.regimes import Regime, Schedule
 
 
 class UGVTrackVectorEnv(VectorEnv):
@@ -37,6 +37,8 @@ class UGVTrackVectorEnv(VectorEnv):
         render_mode: None or ``"rgb_array"``.
         v_gain: short for ``regime={"v_gain": ...}``.
         omega_gain: short for ``regime={"omega_gain": ...}``.
+        ramp: steps over which the regime changes; 0 for sudden changes.
+        family: regime family, which names the parameters; gains on v and omega if None.
         settings: further arguments of :class:`~afm_rl.envs.UGVTrack`.
 
     Raises:
@@ -65,6 +67,8 @@ class UGVTrackVectorEnv(VectorEnv):
         render_mode: str | None = None,
         v_gain: float | None = None,
         omega_gain: float | None = None,
+        ramp: int = 0,
+        family: Regime | None = None,
         **settings: Any,
     ) -> None:
         if render_mode is not None:
@@ -79,7 +83,9 @@ class UGVTrackVectorEnv(VectorEnv):
         self.num_envs = check_count("num_envs", num_envs)
         settings.setdefault("max_steps", max_episode_steps)
         gains = {"v_gain": v_gain, "omega_gain": omega_gain}
-        self.native = build_native(track, regime, gains, schedule, (num_envs,), settings)
+        self.native = build_native(
+            track, regime, gains, schedule, ramp, family, (num_envs,), settings
+        )
         self.single_observation_space, self.single_action_space = spaces(self.native)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)

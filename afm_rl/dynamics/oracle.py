@@ -12,6 +12,9 @@ from afm_rl.regimes import Regime
 class Oracle(DynamicsModel):
     """Nominal dynamics seen through the true regime. For comparison only.
 
+    It knows every parameter, but neither the noise nor the actions before: it does not plan ahead
+    for a delay.
+
     Args:
         model: the nominal dynamics.
         regime: the regime family of the environment.

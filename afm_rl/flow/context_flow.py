@@ -11,7 +11,6 @@ from torch import Tensor
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_choice, check_count, check_counts, check_number
 from afm_rl.flow.base import Context, Examples, Flow
-from afm_rl.flow.effective import effective_action
 from afm_rl.flow.least_squares import fit_gain
 from afm_rl.flow.network import mlp
 from afm_rl.flow.pairs import PairCorrector
@@ -100,10 +99,10 @@ class ContextFlow(PairCorrector, Flow):
 
     def forward(self, features: Tensor, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:
         """Return the velocity ``(*B, A)`` at ``point``, all actions in half ranges."""
-        known = torch.cat([self.encoder(features), *self._guesses(features, planned)], -1)
+        known = torch.cat([self.encoder(features), *self.hints(features, planned)], -1)
         return self.velocity(torch.cat([known, planned, point, tau], -1))
 
-    def _guesses(self, features: Tensor, planned: Tensor) -> list[Tensor]:
+    def hints(self, features: Tensor, planned: Tensor) -> list[Tensor]:
         """Return what per-axis least squares with forgetting would execute, ``(*B, A)`` each.
 
         Exact for gains; a hint for everything else.
@@ -139,19 +138,22 @@ class ContextFlow(PairCorrector, Flow):
         low, high = self.centre - self.half_range, self.centre + self.half_range
         effect = regime.apply(executed, parameters, state)
         realised = _imagine(model, state, effect, low, high, generator)
-        seen = effective_action(model, state, executed, realised, self.half_range)
+        features, _ = self.describe(model, state, executed, realised, valid)
         planned = self.denormalise(2 * torch.rand(count, self.action_size, generator=generator) - 1)
         rows = torch.arange(count) // plans
-        present = planned, now[rows], state[rows, -1]
-        intended = intend(regime, *present, low, high, self.saturation)
-        features = self.features(executed, seen.effective, valid)[rows]
-        return Examples(features, planned, intended)
+        intended = self.target(regime, planned, now[rows], state[rows, -1])
+        return Examples(features[rows], planned, intended)
+
+    def target(self, regime: Regime, planned: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
+        """Return the action to execute under a regime: the one that has the planned effect."""
+        low, high = self.centre - self.half_range, self.centre + self.half_range
+        return intend(regime, planned, parameters, state, low, high, self.saturation)
 
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> tuple[Tensor, Tensor]:
         """Integrate the flow from every source point; return mean and spread."""
         unit = self.normalise(planned).unsqueeze(-2)
         start = self.source(unit, self.source_points)
-        guesses = self._guesses(context.features, unit.squeeze(-2))
+        guesses = self.hints(context.features, unit.squeeze(-2))
         known = torch.cat([self.encoder(context.features), *guesses], -1)
         known = torch.cat([known.unsqueeze(-2), unit], -1).expand(*start.shape[:-1], -1)
 

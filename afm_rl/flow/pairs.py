@@ -46,12 +46,22 @@ class PairCorrector(Corrector):
         executed, effective, valid = rows.split([self.action_size, self.action_size, 1], -1)
         return executed, effective, valid
 
+    def describe(
+        self,
+        model: DynamicsModel,
+        state: Tensor,
+        executed: Tensor,
+        next_state: Tensor,
+        valid: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Return features ``(*B, C)`` and surprise ``(*B)`` of K transitions ``(*B, K, ...)``."""
+        seen = effective_action(model, state, executed, next_state, self.half_range)
+        valid = valid & seen.effective.isfinite().all(-1) & seen.surprise.isfinite()
+        surprise = torch.where(valid, seen.surprise, 0.0).amax(-1)
+        return self.features(executed, seen.effective, valid), surprise
+
     def context(self, window: Window, model: DynamicsModel, last: Context) -> Context:
         """Describe the window under the present model."""
-        seen = effective_action(
-            model, window.state, window.executed, window.next_state, self.half_range
-        )
-        valid = window.valid & seen.effective.isfinite().all(-1) & seen.surprise.isfinite()
-        surprise = torch.where(valid, seen.surprise, 0.0).amax(-1)
-        features = self.features(window.executed, seen.effective, valid)
+        rows = window.state, window.executed, window.next_state, window.valid
+        features, surprise = self.describe(model, *rows)
         return Context(features, surprise, surprise > self.gate)

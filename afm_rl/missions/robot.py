@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,6 +36,8 @@ class Robot:
         schedule: when regimes start and end.
         tracks: all tracks.
         paper_regimes: the regimes of the published study.
+        families: regimes of which every seed gets a draw of its own, by name; see
+            :class:`~afm_rl.missions.families.Family`.
     """
 
     name: str
@@ -52,6 +55,7 @@ class Robot:
     schedule: Schedule
     tracks: Sequence[str]
     paper_regimes: Sequence[Mapping[str, float]]
+    families: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check that boxes, names and features fit the model.

@@ -1,7 +1,47 @@
 """Regimes: what changes under the robot, and when."""
 
-from afm_rl.regimes.base import Compose, Regime
+from afm_rl.regimes.base import Regime
+from afm_rl.regimes.bias import Bias
+from afm_rl.regimes.compose import Compose
+from afm_rl.regimes.dead_zone import DeadZone
+from afm_rl.regimes.delay import Delay
+from afm_rl.regimes.flight import (
+    InertiaFactor,
+    MassFactor,
+    MotorEfficiency,
+    Payload,
+    Wind,
+    flight_regimes,
+    wind_of,
+)
 from afm_rl.regimes.gain import ActionGain
-from afm_rl.regimes.schedule import Schedule, phase_parameters
+from afm_rl.regimes.gain_noise import GainNoise
+from afm_rl.regimes.patches import Patches
+from afm_rl.regimes.rotation import Rotation
+from afm_rl.regimes.saturation import Saturation
+from afm_rl.regimes.schedule import Schedule, blend_phases, phase_parameters
+from afm_rl.regimes.slip import WheelSlip
 
-__all__ = ["ActionGain", "Compose", "Regime", "Schedule", "phase_parameters"]
+__all__ = [
+    "ActionGain",
+    "Bias",
+    "Compose",
+    "DeadZone",
+    "Delay",
+    "GainNoise",
+    "InertiaFactor",
+    "MassFactor",
+    "MotorEfficiency",
+    "Patches",
+    "Payload",
+    "Regime",
+    "Rotation",
+    "Saturation",
+    "Schedule",
+    "WheelSlip",
+    "Wind",
+    "blend_phases",
+    "flight_regimes",
+    "phase_parameters",
+    "wind_of",
+]

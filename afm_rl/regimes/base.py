@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -23,15 +24,38 @@ class Regime(ABC):
 
     Attributes:
         names: names of the F parameters, in order.
-        identity: their values under nominal dynamics.
+        identity: their values under nominal dynamics; an action then stays what it is, to the
+            bit.
+        limits: lowest and highest value of those parameters that cannot be any number.
+        history: how many previous actions the effect depends on, D.
+        noisy: whether the effect is random.
     """
 
     names: tuple[str, ...]
     identity: tuple[float, ...]
+    limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    history: int = 0
+    noisy: bool = False
 
     @abstractmethod
-    def apply(self, action: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
-        """Return what ``action`` ``(*B, A)`` is worth in ``state`` ``(*B, S)``."""
+    def apply(
+        self,
+        action: Tensor,
+        parameters: Tensor,
+        state: Tensor,
+        past: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """Return what an action is worth, ``(*B, A)``.
+
+        Args:
+            action: commanded action, ``(*B, A)``.
+            parameters: of the regime, ``(*B, F)``.
+            state: in which it acts, ``(*B, S)``.
+            past: the previous D commanded actions, newest first, ``(*B, D, A)``; None if they
+                are not known: nothing is then delayed.
+            noise: standard normal numbers, ``(*B, A)``; None for the mean effect.
+        """
 
     @abstractmethod
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
@@ -58,56 +82,50 @@ class Regime(ABC):
             centre = points.gather(-2, best.expand(*best.shape[:-1], len(low))).squeeze(-2)
         return centre
 
+    @property
+    def closed_form(self) -> bool:
+        """Whether :meth:`inverse` is a formula, which also serves an infinite box."""
+        return type(self).inverse is not Regime.inverse
+
     def encode(self, values: Mapping[str, float]) -> Tensor:
         """Return the parameter row ``(F,)`` with ``values`` and the rest nominal.
 
         Raises:
-            ConfigurationError: for an unknown name or a value that is not finite.
+            ConfigurationError: for an unknown name, or a value that is not finite or beyond
+                its limits.
         """
+        self.check_names(values)
         row = list(self.identity)
         for name, value in values.items():
+            low, high = self.limits.get(name, (-math.inf, math.inf))
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not number or not math.isfinite(value) or not low <= value <= high:
+                where = f" in [{low:g}, {high:g}]" if name in self.limits else ""
+                raise ConfigurationError(
+                    f"regimes: {name}={value!r}: expected a finite number{where}"
+                )
+            row[self.names.index(name)] = float(value)
+        return torch.tensor(row)
+
+    def check_names(self, names: Iterable[str]) -> None:
+        """Check that all ``names`` are parameters.
+
+        Raises:
+            ConfigurationError: naming the first that is not.
+        """
+        for name in names:
             if name not in self.names:
                 raise ConfigurationError(
                     f"regimes: unknown parameter {name!r}; allowed: {', '.join(self.names)}"
                 )
-            number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not number or not math.isfinite(value):
-                raise ConfigurationError(f"regimes: {name}={value!r}: expected a finite number")
-            row[self.names.index(name)] = float(value)
-        return torch.tensor(row)
+
+    def describe(self, row: Tensor) -> str:
+        """Return the values of a parameter row ``(F,)`` that are not nominal, in words."""
+        nominal = torch.tensor(self.identity, dtype=row.dtype).tolist()
+        pairs = zip(self.names, row.tolist(), nominal, strict=True)
+        return ", ".join(f"{name} = {x:g}" for name, x, usual in pairs if x != usual) or "nominal"
 
     def is_identity(self, parameters: Tensor) -> Tensor:
         """Return ``(*B)`` booleans: is this the nominal regime?"""
         nominal = torch.tensor(self.identity, device=parameters.device, dtype=parameters.dtype)
         return (parameters == nominal).all(-1)
-
-
-class Compose(Regime):
-    """Several families one after the other: the first acts on the action first.
-
-    >>> from afm_rl.regimes import ActionGain
-    >>> both = Compose([ActionGain(["a_gain"]), ActionGain(["b_gain"])])
-    >>> both.apply(torch.ones(1), both.encode({"a_gain": 2.0, "b_gain": -3.0}), torch.zeros(1))
-    tensor([-6.])
-    """
-
-    def __init__(self, regimes: Sequence[Regime]) -> None:
-        self.regimes = list(regimes)
-        self.names = tuple(name for regime in self.regimes for name in regime.names)
-        self.identity = tuple(value for regime in self.regimes for value in regime.identity)
-        twice = {name for name in self.names if self.names.count(name) > 1}
-        if not self.regimes or twice:
-            raise ConfigurationError(
-                f"regimes: expected families with distinct parameter names, got {self.names}"
-            )
-        self._sizes = [len(regime.names) for regime in self.regimes]
-
-    def apply(self, action: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
-        """Apply every family in turn."""
-        for regime, part in zip(self.regimes, parameters.split(self._sizes, -1), strict=True):
-            action = regime.apply(action, part, state)
-        return action
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw every family independently."""
-        return torch.cat([regime.sample(shape, generator) for regime in self.regimes], -1)

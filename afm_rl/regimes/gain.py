@@ -47,7 +47,14 @@ class ActionGain(Regime):
             raise ConfigurationError(f"low={low!r}: expected at most high={high!r}")
         self.nominal = check_number("nominal", nominal, low=0.0, high=1.0)
 
-    def apply(self, action: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
+    def apply(
+        self,
+        action: Tensor,
+        parameters: Tensor,
+        state: Tensor,
+        past: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
         """Multiply; the state plays no part."""
         return action * parameters
 
@@ -55,8 +62,7 @@ class ActionGain(Regime):
         self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
     ) -> Tensor:
         """Divide and clamp; a gain of zero leaves nothing to choose and gives zero."""
-        divided = torch.where(parameters == 0, 0.0, action / parameters)
-        return torch.minimum(torch.maximum(divided, low), high)
+        return torch.minimum(torch.maximum(divide(action, parameters), low), high)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw gains ``(*shape, A)``."""
@@ -65,3 +71,12 @@ class ActionGain(Regime):
         span = math.log(self.high / self.low)
         gains = self.low * torch.exp(span * uniform[0]) * torch.where(uniform[1] < 0.5, -1.0, 1.0)
         return torch.where(uniform[2] < self.nominal, 1.0, gains)
+
+
+def divide(action: Tensor, gains: Tensor) -> Tensor:
+    """Undo gains; one of zero leaves nothing to choose and gives zero.
+
+    >>> divide(torch.tensor([1.0, 1.0]), torch.tensor([-2.0, 0.0]))
+    tensor([-0.5000,  0.0000])
+    """
+    return torch.where(gains == 0, 0.0, action / gains)

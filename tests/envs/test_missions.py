@@ -26,6 +26,7 @@ def test_missing_entries_are_nominal_and_numbered(form):
     assert mission["track"].tolist() == [0, 0, 0]
     assert mission["seed"].tolist() == [10, 11, 12]
     assert (mission["parameters"] == torch.ones(3, 3, 2)).all()
+    assert mission["ramp"].tolist() == [0, 0, 0]
     torch.testing.assert_close(mission["at"], torch.tensor([[0.15, 0.8]]).expand(3, 2))
 
 
@@ -51,6 +52,7 @@ def test_what_is_completed_fits_the_spec(form):
         ({"parameters": torch.ones(3, 2, 2)}, r"expected \(3, 3, 2\)"),
         ({"parameters": torch.full((3, 3, 2), torch.nan)}, "parameters: expected finite"),
         ({"at": torch.full((3, 2), torch.nan)}, "at: expected numbers"),
+        ({"ramp": torch.tensor([0, -1, 0])}, "ramp: expected whole numbers of at least 0"),
         ({"track": torch.tensor([0, 2, 0])}, r"track: expected indices 0\.\.1"),
         ({"track": torch.tensor([0, -1, 0])}, r"track: expected indices 0\.\.1"),
     ],
@@ -70,6 +72,23 @@ def test_a_mapping_describes_the_phase_between_the_breakpoints(form):
 def test_several_mappings_describe_every_phase(form):
     phases = [{"v_gain": 2.0}, {}, {"omega_gain": 3.0}]
     assert form.build(regime=phases)["mission", "parameters"].tolist() == [[2, 1], [1, 1], [1, 3]]
+
+
+def test_a_mission_has_breakpoints_and_a_ramp_of_its_own(form):
+    mission = form.build(regime=[{}, {"v_gain": 2.0}], at=[0.5], ramp=7)["mission"]
+    assert mission["parameters"].tolist() == [[1, 1], [2, 1], [2, 1]]
+    assert mission["at"].tolist() == [0.5, torch.inf]
+    assert mission["ramp"].item() == 7
+    changed = form.build(regime={"v_gain": 2.0}, at=[0.5])["mission", "parameters"]
+    assert changed.tolist() == mission["parameters"].tolist()
+
+
+def test_room_for_more_phases_changes_no_mission():
+    form = MissionFormat(("a",), GAINS, Schedule().padded(5))
+    for regime in ({"v_gain": 2.0}, [{}, {"v_gain": 2.0}, {}]):
+        mission = form.build(regime=regime)["mission"]
+        assert mission["parameters"][:, 0].tolist() == [1, 2, 1, 1, 1]
+        assert mission["at"].tolist() == pytest.approx([0.15, 0.8, torch.inf, torch.inf])
 
 
 def test_a_schedule_without_breakpoints_has_one_phase():

@@ -17,7 +17,7 @@ class Narrow(Regime):
     names = ("gain",)
     identity = (1.0,)
 
-    def apply(self, action, parameters, state):
+    def apply(self, action, parameters, state, past=None, noise=None):
         return action[..., :1] * parameters
 
     def sample(self, shape, generator=None):

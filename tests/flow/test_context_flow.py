@@ -164,11 +164,11 @@ def test_hints_are_exact_for_gains(box, window_of, saturation):
     gain = torch.tensor([-1.6, 1.3])
     context = context_of(flow, window_of(gain.tolist(), 25))
     unit = grid(box) / flow.half_range
-    for hint in flow._guesses(context.features, unit):
+    for hint in flow.hints(context.features, unit):
         torch.testing.assert_close(hint, unit / gain, rtol=0, atol=0.02)
         assert hint.abs().max() <= 1
     blank = torch.zeros(25, flow.feature_size)
-    for hint in flow._guesses(blank, unit):  # knowing nothing, the model is believed
+    for hint in flow.hints(blank, unit):  # knowing nothing, the model is believed
         torch.testing.assert_close(hint, unit)
 
 

@@ -3,7 +3,15 @@
 import pytest
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.missions.selection import build_missions, select_regimes, select_seeds, select_tracks
+from afm_rl.missions.families import Family
+from afm_rl.missions.selection import (
+    build_missions,
+    fit_schedule,
+    name_regimes,
+    select_regimes,
+    select_seeds,
+    select_tracks,
+)
 
 
 @pytest.mark.parametrize(
@@ -42,22 +50,43 @@ def test_the_regimes_of_the_paper(robot):
         ([{"v_gain": 2}, {"omega_gain": 0.5}], [{"v_gain": 2}, {"omega_gain": 0.5}]),
         ([[{}, {"v_gain": 2.0}, {}]], [[{}, {"v_gain": 2.0}, {}]]),
         ([{}], [{}]),
+        (
+            [{"phases": [{}, {"delay": 1}], "at": [0.5]}],
+            [{"phases": [{}, {"delay": 1}], "at": [0.5]}],
+        ),
+        ({"phases": [{}, {}, {}], "ramp": 5}, [{"phases": [{}, {}, {}], "ramp": 5}]),
     ],
 )
 def test_regimes(robot, written, chosen):
     assert select_regimes(written, robot) == chosen
 
 
+def test_families_are_chosen_by_name(robot):
+    everything = select_regimes("families", robot)
+    assert [family.name for family in everything] == list(robot.families)
+    (slip,) = select_regimes("slip", robot)
+    assert isinstance(slip, Family) and slip.name == "slip"
+    mixed = select_regimes(["drift", {"v_gain": -1.0}, "slip"], robot)
+    assert [mixed[0].name, mixed[1], mixed[2]] == ["drift", {"v_gain": -1.0}, slip]
+
+
 @pytest.mark.parametrize(
     ("written", "complaint"),
     [
-        ([], r"^regimes=\[\]: expected paper, none, or a list .* v_gain, omega_gain"),
+        ([], r"^regimes=\[\]: expected paper, none, families, one of gains, .* v_gain, omega_gain"),
+        (["nope"], "^regimes='nope': expected one of gains, coupling"),
+        ([{"phases": {}}], r"^regimes: phases=\{\}: expected a list"),
+        ([{"phases": [3]}], "^regimes: 3: expected a mapping of delay"),
+        ([{"phases": [{"delay": 9}]}], "^regimes: delay=9: expected a finite number"),
+        ([{"phases": [{}], "at": 0.5}], "^regimes: at=0.5: expected a list"),
+        ([{"phases": [{}], "ramp": -1}], "^regimes: ramp=-1: expected a whole number"),
+        ([{"phases": [{}], "rmap": 1}], "^regimes: setting='rmap': expected one of phases, at, ra"),
         (None, "^regimes=None: expected paper"),
         ("papper", "^regimes='papper': expected paper"),
         (3, "^regimes=3: expected paper"),
-        ([3], "^regimes: 3: expected a mapping of v_gain, omega_gain"),
+        ([3], "^regimes: 3: expected a mapping of delay, .*v_gain, omega_gain"),
         ([[{"v_gain": 1.0}, "none"]], "^regimes: 'none': expected a mapping"),
-        ([{"gain": 1.0}], "^regimes: unknown parameter 'gain'; allowed: v_gain, omega_gain"),
+        ([{"gain": 1.0}], "^regimes: unknown parameter 'gain'; allowed: .*v_gain, omega_gain"),
         ([{"v_gain": float("nan")}], "^regimes: v_gain=nan: expected a finite number"),
         ([[{}, {"omega_gain": float("inf")}]], "^regimes: omega_gain=inf: expected a finite"),
         ([{"v_gain": "fast"}], "^regimes: v_gain='fast': expected a finite number"),
@@ -89,5 +118,42 @@ def test_every_combination_is_a_mission(robot):
     assert missions.batch_size == (12,)
     assert missions["track"].tolist() == [0] * 6 + [1] * 6
     assert missions["seed"].tolist() == [4, 9] * 6
-    assert missions["parameters"][2].tolist() == [[1, 1], [-1, 1], [1, 1]]
-    assert missions["parameters"][4].tolist() == [[2, 1], [1, 1], [1, 0.5]]
+    gains = [robot.regime.names.index(name) for name in ("v_gain", "omega_gain")]
+    assert missions["parameters"][2][:, gains].tolist() == [[1, 1], [-1, 1], [1, 1]]
+    assert missions["parameters"][4][:, gains].tolist() == [[2, 1], [1, 1], [1, 0.5]]
+
+
+def test_each_seed_of_a_family_meets_a_draw_of_its_own_on_every_track(robot):
+    tracks = ["ethz_1", "ethz_2"]
+    written = ["changes", {"v_gain": -1.0}, {"phases": [{}, {"delay": 1}], "at": [0.4], "ramp": 3}]
+    regimes = select_regimes(written, robot)
+    schedule = fit_schedule(robot.schedule, regimes)
+    assert schedule.phases == 5 and fit_schedule(robot.schedule, regimes[1:]).phases == 3
+    env = robot.env(tracks=tracks, regime=robot.regime, schedule=schedule)
+    missions = build_missions(env, tracks, regimes, [0, 1])["mission"]
+    assert (missions["parameters"][0] != missions["parameters"][1]).any()
+    assert (missions["parameters"][:2] == missions["parameters"][6:8]).all()
+    assert missions["at"].isfinite().sum(-1).tolist() == [4, 4, 2, 2, 1, 1] * 2
+    assert missions["ramp"].tolist() == [0, 0, 0, 0, 3, 3] * 2
+    usual = build_missions(env, tracks, select_regimes([{"v_gain": -1.0}], robot), [0, 1])[
+        "mission"
+    ]
+    assert (usual[0] == missions[2]).all()
+
+
+def test_regimes_have_names(robot):
+    written = [
+        *("slip", {}, {"v_gain": -1, "omega_gain": 1}, [{}, {"delay": 1, "v_bias": 0.1}]),
+        {"phases": [{}, {"v_gain": 2.0}], "at": [0.25], "ramp": 9},
+        {"phases": [{"v_gain": 2.0}], "at": []},
+    ]
+    names = name_regimes(["a", "b"], select_regimes(written, robot), [0, 1], robot)
+    assert names[::2] == names[1::2] and names[:12] == names[12:]
+    assert names[:12:2] == [
+        "slip",
+        "nominal",
+        "v_gain = -1",
+        "nominal; delay = 1, v_bias = 0.1",
+        "nominal; v_gain = 2; at 0.25; ramp 9",
+        "v_gain = 2",
+    ]

@@ -4,18 +4,18 @@ import pytest
 import torch
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes import ActionGain, Compose
+from afm_rl.regimes import ActionGain, Bias, Compose, DeadZone, Delay, GainNoise, Rotation
 from afm_rl.regimes.base import Regime
 
 LOW, HIGH = torch.full((2,), -1.0), torch.ones(2)
 
 
-class Bias(Regime):
+class Shift(Regime):
     """Adds a number to both axes: not a gain, and no closed inverse."""
 
     names, identity = ("bias",), (0.0,)
 
-    def apply(self, action, parameters, state):
+    def apply(self, action, parameters, state, past=None, noise=None):
         return action + parameters
 
     def sample(self, shape, generator=None):
@@ -24,14 +24,14 @@ class Bias(Regime):
 
 @pytest.fixture
 def both(gains):
-    return Compose([gains, Bias()])
+    return Compose([gains, Shift()])
 
 
 def test_the_first_family_acts_first(both, gains):
     row = both.encode({"v_gain": 2.0, "bias": 0.5})
     assert row.tolist() == [2.0, 1.0, 0.5]
     assert both.apply(torch.ones(2), row, torch.zeros(3)).tolist() == [2.5, 1.5]
-    reverse = Compose([Bias(), gains])
+    reverse = Compose([Shift(), gains])
     row = reverse.encode({"v_gain": 2.0, "bias": 0.5})
     assert reverse.apply(torch.ones(2), row, torch.zeros(3)).tolist() == [3.0, 1.5]
 
@@ -68,3 +68,115 @@ def test_the_search_serves_a_single_action_and_stays_in_the_box(both):
 def test_families_need_distinct_names(families):
     with pytest.raises(ConfigurationError, match="distinct parameter names"):
         Compose(families)
+
+
+HALF = [1.0, 1.0]
+
+
+@pytest.fixture
+def robot(gains):
+    """All kinds of families: with history, noise and closed forms."""
+    return Compose(
+        {
+            "delay": Delay(),
+            "dead_zone": DeadZone(HALF),
+            "rotation": Rotation(HALF),
+            "gain": gains,
+            "noise": GainNoise(),
+            "bias": Bias(["v_bias", "omega_bias"], HALF),
+        },
+        prior=[["gain"], ["gain", "rotation"], ["bias", "dead_zone"]],
+    )
+
+
+def test_history_and_noise_are_those_of_the_families(robot, both):
+    assert (robot.history, robot.noisy) == (2, True)
+    assert (both.history, both.noisy) == (0, False)
+    row = robot.encode({"delay": 1.0, "gain_noise": 0.5})
+    past = torch.tensor([[0.4, -0.2], [0.0, 0.0]])
+    effect = robot.apply(torch.ones(2), row, torch.zeros(3), past, torch.tensor([1.0, -1.0]))
+    torch.testing.assert_close(effect, torch.tensor([0.6, -0.1]))
+
+
+def test_the_prior_draws_the_families_of_one_of_its_lists(robot):
+    rows = robot.sample((6000,), torch.Generator().manual_seed(0))
+    assert rows.shape == (6000, 8)
+    changed = rows != torch.tensor(robot.identity)
+    kinds = {
+        "dead_zone": changed[:, 1],
+        "rotation": changed[:, 2],
+        "gain": changed[:, 3:5].any(-1),
+        "bias": changed[:, 6:].any(-1),
+    }
+    assert not changed[:, 0].any() and not changed[:, 5].any()  # delay and noise are in no list
+    assert torch.equal(kinds["dead_zone"], kinds["bias"])
+    assert not (kinds["bias"] & (kinds["gain"] | kinds["rotation"])).any()
+    for name in ("dead_zone", "rotation"):
+        assert float(kinds[name].float().mean()) == pytest.approx(1 / 3, abs=0.02)
+    again = robot.sample((6000,), torch.Generator().manual_seed(0))
+    assert torch.equal(rows, again)
+
+
+def test_named_families_are_drawn_and_the_others_stay_nominal(robot):
+    rows = robot.draw(["bias", "delay"], (5, 2), torch.Generator().manual_seed(0))
+    changed = (rows != torch.tensor(robot.identity)).flatten(0, 1).all(0)
+    assert changed.tolist() == [True] + [False] * 5 + [True] * 2
+
+
+def test_the_inverse_chains_closed_forms(robot):
+    rows = robot.sample((300,), torch.Generator().manual_seed(0))
+    commanded = 2 * torch.rand(300, 2, generator=torch.Generator().manual_seed(1)) - 1
+    wanted = robot.apply(commanded, rows, torch.zeros(300, 3))
+    found = robot.inverse(wanted, rows, torch.zeros(300, 3), LOW, HIGH)
+    assert robot.closed_form
+    effect = robot.apply(found, rows, torch.zeros(300, 3))
+    torch.testing.assert_close(effect, wanted, rtol=0, atol=1e-5)
+    far = robot.inverse(10 * wanted, rows, torch.zeros(300, 3), LOW, HIGH)
+    assert (far.abs() <= 1).all()
+
+
+def test_a_family_without_a_closed_form_makes_the_inverse_a_search(both, robot):
+    assert not both.closed_form
+    assert not Compose({"robot": robot, "shift": Shift()}).closed_form
+
+
+def test_nominal_families_cost_no_bit_and_change_no_shape(robot, gains):
+    rows = gains.sample((50,), torch.Generator().manual_seed(0))
+    action = torch.rand(50, 2, generator=torch.Generator().manual_seed(1))
+    whole = robot.encode({}).repeat(50, 1)
+    assert torch.equal(robot.apply(action, whole, torch.zeros(50, 3)), action)
+    assert robot.apply(action[0], whole, torch.zeros(3)).shape == (50, 2)
+    assert robot.inverse(action[0], whole, torch.zeros(3), LOW, HIGH).shape == (50, 2)
+    whole[:, 3:5] = rows
+    effect = robot.apply(action, whole, torch.zeros(50, 3))
+    assert torch.equal(effect, gains.apply(action, rows, torch.zeros(50, 3)))
+
+
+def test_families_check_their_own_values(robot):
+    assert robot.encode({"delay": 2, "v_gain": -1.0}).tolist() == [2, 0, 0, -1, 1, 0, 0, 0]
+    assert robot.describe(robot.encode({"v_bias": 0.1, "delay": 1})) == "delay = 1, v_bias = 0.1"
+    with pytest.raises(ConfigurationError, match="delay=1.5: expected 0, 1 or 2"):
+        robot.encode({"delay": 1.5})
+    with pytest.raises(ConfigurationError, match="unknown parameter 'dealy'; allowed: delay"):
+        robot.encode({"dealy": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"regimes": {"gain": "ActionGain"}}, "gain='ActionGain': expected a Regime"),
+        ({"regimes": {"b": Shift(), "late": Delay()}}, "late depend on previous actions"),
+        ({"prior": []}, r"prior=\[\]: expected at least one list"),
+        ({"prior": [["nope"]]}, "family='nope': expected one of delay, shift"),
+        ({"prior": ["delay"]}, "'delay': expected a list of families"),
+        ({"prior": [3]}, "3: expected a list of families"),
+    ],
+)
+def test_families_that_do_not_go_together_are_refused(settings, complaint):
+    with pytest.raises(ConfigurationError, match=complaint):
+        Compose(**{"regimes": {"delay": Delay(), "shift": Shift()}, **settings})
+
+
+def test_unknown_families_are_not_drawn(robot):
+    with pytest.raises(ConfigurationError, match="family='nope'"):
+        robot.draw(["nope"], ())

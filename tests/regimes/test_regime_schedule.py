@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes import Schedule, phase_parameters
+from afm_rl.regimes import Schedule, blend_phases, phase_parameters
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -47,6 +47,28 @@ def test_each_mission_gets_the_row_of_its_phase():
     picked = phase_parameters(rows, torch.tensor([2, 0]))
     assert torch.equal(picked, torch.stack([rows[0, 2], rows[1, 0]]))
     assert torch.equal(phase_parameters(rows[0], torch.tensor(1)), rows[0, 1])
+
+
+def test_a_padded_schedule_has_phases_that_never_begin():
+    schedule = Schedule([2], by="step")
+    roomy = schedule.padded(4)
+    assert (roomy.phases, roomy.by, schedule.phases) == (4, "step", 2)
+    assert roomy.phase(torch.rand(2), torch.tensor([2, 10**9])).tolist() == [0, 1]
+    assert roomy.padded(2).at == roomy.at  # room enough
+
+
+def test_a_ramp_moves_from_the_last_row_to_the_present_one():
+    rows = torch.tensor([[1.0, 0.3], [-1.0, 0.7], [0.1, 0.9]]).expand(6, 3, 2)
+    age, phase = torch.tensor([0, 1, 3, 4, 99, 5]), torch.tensor([1, 1, 1, 1, 1, 0])
+    found = blend_phases(rows, phase, age, torch.full((6,), 4))
+    assert found[:, 0].tolist() == pytest.approx([1.0, 0.5, -0.5, -1.0, -1.0, 1.0])
+    assert torch.equal(found[3:5], rows[3:5, 1])  # to the bit
+
+
+def test_without_a_ramp_a_change_is_sudden_to_the_bit():
+    rows = torch.randn(50, 3, 2, generator=torch.Generator().manual_seed(0))
+    phase, none = torch.arange(50) % 3, torch.zeros(50, dtype=torch.int64)
+    assert torch.equal(blend_phases(rows, phase, none, none), phase_parameters(rows, phase))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,109 @@
+"""Families of regimes: every seed gets a draw of its own."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from afm_rl.errors import ConfigurationError, check_choice, check_count
+from afm_rl.missions.robot import Robot
+from afm_rl.regimes import Compose
+
+KEYS = ("draw", "set", "ramp", "changes")
+CHANGES = 0.1, 0.9  # progress between which breakpoints are drawn
+
+
+@dataclass(frozen=True)
+class Family:
+    """A family of regimes.
+
+    What a mission meets is drawn from the family's name and the mission's seed alone: it is the
+    same on every track, and for every method.
+
+    Args:
+        name: what it is called in configurations and tables.
+        regime: the robot's regime, whose families are drawn.
+        draw: lists of their names; each draw picks one list and draws all in it.
+        fixed: parameters that are set after the draw.
+        ramp: steps over which each change comes about; 0 for sudden changes.
+        changes: number of changes, each to a new draw, at random progress. 0: one change, on the
+            robot's schedule.
+
+    >>> from afm_rl.regimes import ActionGain
+    >>> regime = Compose({"gain": ActionGain(["v_gain", "omega_gain"])})
+    >>> turned = Family("turned", regime, [["gain"]], {"v_gain": -1.0})
+    >>> turned.mission(seed=3)["regime"]["v_gain"]
+    -1.0
+    """
+
+    name: str
+    regime: Compose
+    draw: Sequence[Sequence[str]]
+    fixed: Mapping[str, float]
+    ramp: int = 0
+    changes: int = 0
+
+    def mission(self, seed: int) -> dict[str, Any]:
+        """Return what ``env.mission`` is to be told: ``regime``, ``at`` and ``ramp``."""
+        generator = torch.Generator().manual_seed(_stable(self.name, seed))
+        if not self.changes:
+            return {"regime": self._values(generator), "ramp": self.ramp}
+        low, high = CHANGES
+        at = low + (high - low) * torch.rand(self.changes, generator=generator)
+        phases = [{}, *(self._values(generator) for _ in range(self.changes))]
+        return {"regime": phases, "at": at.sort().values.tolist(), "ramp": self.ramp}
+
+    def _values(self, generator: torch.Generator) -> dict[str, float]:
+        """Return a draw of all parameters, by name."""
+        names = self.draw[int(torch.randint(len(self.draw), (), generator=generator))]
+        row = self.regime.draw(names, (), generator)
+        return {**dict(zip(self.regime.names, row.tolist(), strict=True)), **self.fixed}
+
+
+def find_family(name: str, robot: Robot) -> Family:
+    """Return a family of the robot's configuration.
+
+    Raises:
+        ConfigurationError: if there is none of this name, or its settings cannot be used.
+    """
+    given = robot.families[check_choice("regimes", name, robot.families)]
+    where, regime = f"robot.families.{name}", robot.regime
+    if not isinstance(regime, Compose):
+        raise ConfigurationError(f"{where}: expected robot.regime to be a Compose, to draw from")
+    if not isinstance(given, Mapping):
+        raise ConfigurationError(f"{where}={given!r}: expected a mapping of {', '.join(KEYS)}")
+    for key in given:
+        check_choice(f"{where}: setting", key, KEYS)
+    rows, fixed = given.get("draw", []), given.get("set", {})
+    if isinstance(rows, list) and all(isinstance(entry, str) for entry in rows):
+        rows = [rows]
+    if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
+        raise ConfigurationError(
+            f"{where}.draw={rows!r}: expected names among {', '.join(regime.regimes)}, or lists "
+            "of these to pick from"
+        )
+    for family in (family for row in rows for family in row):
+        check_choice(f"{where}.draw", family, regime.regimes)
+    if not isinstance(fixed, Mapping):
+        raise ConfigurationError(
+            f"{where}.set={fixed!r}: expected a mapping of {', '.join(regime.names)}"
+        )
+    regime.encode(fixed)
+    changes = check_count(f"{where}.changes", given.get("changes", 0), low=0)
+    if changes and robot.schedule.by != "progress":
+        raise ConfigurationError(
+            f"{where}.changes={changes}: breakpoints are drawn in the progress; choose "
+            "robot.schedule.by=progress"
+        )
+    ramp = check_count(f"{where}.ramp", given.get("ramp", 0), low=0)
+    return Family(name, regime, rows, fixed, ramp, changes)
+
+
+def _stable(name: str, seed: int) -> int:
+    """Return a seed for (name, seed) that is the same in every process."""
+    digest = hashlib.sha256(f"{name} {seed}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1  # a generator takes 63 bits

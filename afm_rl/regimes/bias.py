@@ -1,0 +1,66 @@
+"""Actuator offsets: a steering that pulls to one side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.regimes.base import Regime
+from afm_rl.regimes.settings import HalfRange, check_span, draw_between
+
+
+class Bias(Regime):
+    r"""Per-axis offsets: :math:`a_\mathrm{eff} = a + b \odot h`.
+
+    Args:
+        names: one parameter name per action axis.
+        half_range: half ranges h of the action axes, the unit of the offsets b.
+        span: lowest and highest offset in the prior, uniform.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+
+    >>> bias = Bias(["v_bias", "omega_bias"], half_range=[1.0, 2.0])
+    >>> bias.apply(torch.zeros(2), bias.encode({"omega_bias": 0.25}), torch.zeros(3))
+    tensor([0.0000, 0.5000])
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        half_range: Sequence[float],
+        span: Sequence[float] = (-0.4, 0.4),
+    ) -> None:
+        self.names = tuple(names)
+        self.half_range = HalfRange(half_range)
+        axes = len(self.half_range.values)
+        if not len(set(self.names)) == len(self.names) == axes:
+            raise ConfigurationError(
+                f"names={self.names}: expected {axes} distinct names, one per axis"
+            )
+        self.identity = (0.0,) * len(self.names)
+        self.span = check_span("span", span)
+
+    def apply(
+        self,
+        action: Tensor,
+        parameters: Tensor,
+        state: Tensor,
+        past: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """Add; the state plays no part."""
+        return action + parameters * self.half_range.like(action)
+
+    def inverse(
+        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
+    ) -> Tensor:
+        """Subtract and clamp."""
+        return (action - parameters * self.half_range.like(action)).clamp(low, high)
+
+    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
+        """Draw offsets ``(*shape, A)``, uniform."""
+        return draw_between(self.span, (*shape, len(self.names)), generator)

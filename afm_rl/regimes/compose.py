@@ -1,0 +1,164 @@
+"""Several families of regimes one after the other."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from afm_rl.errors import ConfigurationError, check_choice
+from afm_rl.regimes.base import Regime
+from afm_rl.regimes.settings import Constant
+
+
+class Compose(Regime):
+    """Several families one after the other: the first acts on the action first.
+
+    Families that are nominal for the whole batch are left out of the arithmetic. The noise, if
+    any, is the same for all noisy families.
+
+    Args:
+        regimes: the families, by name; or a list, whose names are the indices. Only the first may
+            depend on previous actions, because these are commands.
+        prior: lists of family names: each draw picks one list at random and draws the families in
+            it, the others stay nominal. None: all families are drawn.
+
+    Raises:
+        ConfigurationError: for families that do not go together, or an unknown name.
+
+    >>> from afm_rl.regimes import ActionGain
+    >>> both = Compose({"worn": ActionGain(["a_gain"]), "turned": ActionGain(["b_gain"])})
+    >>> both.apply(torch.ones(1), both.encode({"a_gain": 2.0, "b_gain": -3.0}), torch.zeros(1))
+    tensor([-6.])
+    """
+
+    def __init__(
+        self,
+        regimes: Mapping[str, Regime] | Sequence[Regime],
+        prior: Sequence[Sequence[str]] | None = None,
+    ) -> None:
+        if not isinstance(regimes, Mapping):
+            regimes = {str(index): regime for index, regime in enumerate(regimes)}
+        for name, regime in regimes.items():
+            if not isinstance(regime, Regime):
+                raise ConfigurationError(f"regimes: {name}={regime!r}: expected a Regime")
+        self.regimes = dict(regimes)
+        families = list(self.regimes.values())
+        self.names = tuple(name for regime in families for name in regime.names)
+        self.identity = tuple(value for regime in families for value in regime.identity)
+        twice = {name for name in self.names if self.names.count(name) > 1}
+        if not families or twice:
+            raise ConfigurationError(
+                f"regimes: expected families with distinct parameter names, got {self.names}"
+            )
+        late = [name for name, regime in self.regimes.items() if regime.history]
+        if set(late) - {next(iter(self.regimes))}:
+            raise ConfigurationError(
+                f"regimes: {', '.join(late)} depend on previous actions: expected one such "
+                "family, at the beginning"
+            )
+        self.history = families[0].history
+        self.noisy = any(regime.noisy for regime in families)
+        ends = itertools.accumulate(len(regime.names) for regime in families)
+        self._nominal = Constant(self.identity)
+        self._parts = [slice(e - len(f.names), e) for f, e in zip(families, ends, strict=True)]
+        self.prior = None if prior is None else [self._known(row) for row in prior]
+        if self.prior == []:
+            raise ConfigurationError("prior=[]: expected at least one list of families, or none")
+
+    @property
+    def closed_form(self) -> bool:
+        """Whether all families have one."""
+        return all(regime.closed_form for regime in self.regimes.values())
+
+    def apply(
+        self,
+        action: Tensor,
+        parameters: Tensor,
+        state: Tensor,
+        past: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """Apply every family in turn."""
+        action = _spread(action, parameters)
+        for regime, part in self._active(parameters):
+            action = regime.apply(action, part, state, past, noise)
+        return action
+
+    def inverse(
+        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
+    ) -> Tensor:
+        """Undo the last family first and clamp at the end, if every family has a closed form.
+
+        Where the box is left on the way, the result is in it, but need not be the nearest.
+        """
+        if not self.closed_form:
+            return super().inverse(action, parameters, state, low, high)
+        free = torch.full_like(high, torch.inf)
+        action = _spread(action, parameters)
+        for regime, part in reversed(self._active(parameters)):
+            action = regime.inverse(action, part, state, -free, free)
+        return action.clamp(low, high)
+
+    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
+        """Draw parameters ``(*shape, F)``: one list of the prior each, or every family."""
+        if self.prior is None:
+            return self.draw(list(self.regimes), shape, generator)
+        table = torch.zeros(len(self.prior), len(self.names), dtype=torch.bool)
+        for row, names in zip(table, self.prior, strict=True):
+            for name, part in zip(self.regimes, self._parts, strict=True):
+                row[part] = name in names
+        chosen = torch.randint(len(self.prior), shape, generator=generator)
+        drawn = self.draw(sorted({name for row in self.prior for name in row}), shape, generator)
+        return torch.where(table[chosen], drawn, torch.tensor(self.identity))
+
+    def draw(
+        self,
+        names: Sequence[str],
+        shape: tuple[int, ...],
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Draw the named families from their priors; the others stay nominal, ``(*shape, F)``.
+
+        Raises:
+            ConfigurationError: for an unknown name.
+        """
+        self._known(names)
+        return torch.cat(
+            [
+                regime.sample(shape, generator)
+                if name in names
+                else torch.tensor(regime.identity).expand(*shape, -1)
+                for name, regime in self.regimes.items()
+            ],
+            -1,
+        )
+
+    def encode(self, values: Mapping[str, float]) -> Tensor:
+        """Return the parameter row ``(F,)``; every family checks its own values."""
+        self.check_names(values)
+        families = self.regimes.values()
+        own = [{name: values[name] for name in f.names if name in values} for f in families]
+        return torch.cat([f.encode(mine) for f, mine in zip(families, own, strict=True)])
+
+    def _known(self, names: Sequence[str]) -> list[str]:
+        if isinstance(names, str) or not isinstance(names, Sequence):
+            raise ConfigurationError(f"regimes: {names!r}: expected a list of families")
+        return [check_choice("regimes: family", name, self.regimes) for name in names]
+
+    def _active(self, parameters: Tensor) -> list[tuple[Regime, Tensor]]:
+        """Return the families that are not nominal everywhere, with their parameters."""
+        rows = (parameters != self._nominal.like(parameters)).reshape(-1, len(self.names))
+        changed = rows.sum(0).tolist()  # faster than any
+        pairs = zip(self.regimes.values(), self._parts, strict=True)
+        return [(regime, parameters[..., at]) for regime, at in pairs if any(changed[at])]
+
+
+def _spread(action: Tensor, parameters: Tensor) -> Tensor:
+    """Give the action the batch shape of the result, also if no family is active."""
+    if action.shape[:-1] == parameters.shape[:-1]:
+        return action
+    batch = torch.broadcast_shapes(action.shape[:-1], parameters.shape[:-1])
+    return action.expand(*batch, action.shape[-1])

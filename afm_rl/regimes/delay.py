@@ -1,0 +1,71 @@
+"""Delay: commands arrive late."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.regimes.base import Regime
+
+STEPS = 2  # longest delay
+
+
+class Delay(Regime):
+    r"""The command of 0, 1 or 2 steps ago: :math:`a_\mathrm{eff} = a_{t - d}`.
+
+    Between whole steps, as in a ramp, the neighbouring commands are mixed linearly. Whoever does
+    not know the previous commands sees no delay, and so the inverse is the action itself. The
+    prior draws 1 or 2.
+
+    >>> late = Delay()
+    >>> past = torch.tensor([[0.2, 0.0], [0.1, 0.0]])  # newest first
+    >>> late.apply(torch.ones(2), late.encode({"delay": 2}), torch.zeros(3), past)
+    tensor([0.1000, 0.0000])
+    """
+
+    names = ("delay",)
+    identity = (0.0,)
+    limits = {"delay": (0.0, STEPS)}
+    history = STEPS
+
+    def apply(
+        self,
+        action: Tensor,
+        parameters: Tensor,
+        state: Tensor,
+        past: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """Pick the command out of the past; the state plays no part."""
+        if past is None:
+            return action
+        kept = past[..., :STEPS, :].unbind(-2)
+        effect = action * (1 - parameters).clamp(min=0.0)
+        for steps, command in enumerate(kept, 1):
+            effect = effect + command * (1 - (parameters - steps).abs()).clamp(min=0.0)
+        return effect
+
+    def inverse(
+        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
+    ) -> Tensor:
+        """Clamp: what was commanded before cannot be changed."""
+        return action.clamp(low, high)
+
+    def encode(self, values: Mapping[str, float]) -> Tensor:
+        """Return the parameter row; only whole steps are taken.
+
+        Raises:
+            ConfigurationError: also for a fraction of a step.
+        """
+        row = super().encode(values)
+        if float(row) % 1:
+            given = values["delay"]
+            raise ConfigurationError(f"regimes: delay={given!r}: expected 0, 1 or 2 steps")
+        return row
+
+    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
+        """Draw steps ``(*shape, 1)``."""
+        return torch.randint(1, STEPS + 1, (*shape, 1), generator=generator).float()

@@ -1,0 +1,254 @@
+"""What all families of regimes have in common, and what each does to an action."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.regimes import (
+    ActionGain,
+    Bias,
+    DeadZone,
+    Delay,
+    GainNoise,
+    Patches,
+    Rotation,
+    Saturation,
+    WheelSlip,
+)
+
+HALF = [1.0, 1.5]
+LOW, HIGH = -torch.tensor(HALF), torch.tensor(HALF)
+FREE = torch.full((2,), torch.inf)
+STATE = torch.zeros(3)
+NAMES = ["v_bias", "omega_bias"]
+FAMILIES = {
+    "gain": ActionGain(["v_gain", "omega_gain"]),
+    "bias": Bias(NAMES, HALF),
+    "rotation": Rotation(HALF),
+    "saturation": Saturation(HALF),
+    "dead_zone": DeadZone(HALF),
+    "slip": WheelSlip(HALF),
+    "delay": Delay(),
+    "patches": Patches(),
+    "gain_noise": GainNoise(),
+}
+every_family = pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
+
+
+def drawn(family, count=400, dtype=torch.float64):
+    """Return actions in the box, parameters from the prior and places."""
+    generator = torch.Generator().manual_seed(0)
+    action = LOW + (HIGH - LOW) * torch.rand(count, 2, generator=generator, dtype=dtype)
+    state = 10 * torch.rand(count, 3, generator=generator, dtype=dtype) - 5
+    return action, family.sample((count,), generator).to(dtype), state
+
+
+@every_family
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_nominal_regime_keeps_every_action_to_the_bit(family, dtype):
+    action, _, state = drawn(family, dtype=dtype)
+    nominal = family.encode({}).to(dtype).expand(400, -1)
+    past, noise = torch.rand(400, family.history, 2, dtype=dtype), torch.randn(400, 2, dtype=dtype)
+    assert family.is_identity(nominal).all()
+    assert torch.equal(family.apply(action, nominal, state), action)
+    assert torch.equal(family.apply(action, nominal, state, past, noise), action)
+    assert torch.equal(family.inverse(action, nominal, state, -FREE, FREE), action)
+
+
+@every_family
+def test_what_an_action_can_be_worth_is_had_by_the_inverse(family):
+    commanded, rows, state = drawn(family)
+    wanted = family.apply(commanded, rows, state)
+    found = family.inverse(wanted, rows, state, -FREE, FREE)
+    torch.testing.assert_close(family.apply(found, rows, state), wanted, rtol=0, atol=2e-6)
+
+
+@every_family
+def test_the_inverse_stays_in_the_box(family):
+    wanted, rows, state = drawn(family)
+    found = family.inverse(3 * wanted, rows, state, LOW, HIGH)
+    assert ((found >= LOW) & (found <= HIGH)).all()
+
+
+@every_family
+def test_a_batch_is_what_its_rows_are_alone(family):
+    action, rows, state = drawn(family, 20)
+    past, noise = torch.rand(20, 2, 2).double(), torch.randn(20, 2).double()
+    whole = family.apply(action, rows, state, past, noise)
+    back = family.inverse(action, rows, state, LOW, HIGH)
+    for k in (0, 7, 19):
+        one = family.apply(action[k], rows[k], state[k], past[k], noise[k])
+        torch.testing.assert_close(whole[k], one)
+        torch.testing.assert_close(back[k], family.inverse(action[k], rows[k], state[k], LOW, HIGH))
+    wide = family.apply(action.unsqueeze(1), rows.unsqueeze(1), state.unsqueeze(1))
+    torch.testing.assert_close(wide.squeeze(1), family.apply(action, rows, state))
+
+
+@every_family
+@pytest.mark.parametrize("shape", [(), (3,), (2, 4)])
+def test_the_generator_decides_the_draw(family, shape):
+    rows = [family.sample(shape, torch.Generator().manual_seed(seed)) for seed in (1, 1)]
+    assert rows[0].shape == (*shape, len(family.names))
+    assert torch.equal(*rows)
+    values = dict(zip(family.names, family.sample((), None).tolist(), strict=True))
+    assert family.encode(values).tolist() == pytest.approx(list(values.values()))
+
+
+@pytest.mark.parametrize(
+    ("family", "least", "most"),
+    [
+        ("bias", [-0.4, -0.4], [0.4, 0.4]),
+        ("rotation", [-math.pi], [math.pi]),
+        ("saturation", [0.2], [0.6]),
+        ("dead_zone", [0.1], [0.6]),
+        ("slip", [0.2, 0.3], [0.8, 0.9]),
+        ("delay", [1.0], [2.0]),
+        ("patches", [-1.5, 1.0], [-0.5, 1.0]),
+        ("gain_noise", [0.1], [0.5]),
+    ],
+)
+def test_the_prior_covers_its_range(family, least, most):
+    rows = FAMILIES[family].sample((4000,), torch.Generator().manual_seed(0))
+    torch.testing.assert_close(rows.amin(0), torch.tensor(least), rtol=0, atol=0.01)
+    torch.testing.assert_close(rows.amax(0), torch.tensor(most), rtol=0, atol=0.01)
+
+
+@given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-4, 4))
+def test_a_rotation_keeps_the_length_in_half_ranges(v, omega, angle):
+    action = torch.tensor([v, omega * 1.5], dtype=torch.float64)
+    row = torch.tensor([angle], dtype=torch.float64)
+    effect = FAMILIES["rotation"].apply(action, row, torch.zeros(3)) / HIGH
+    assert float(effect.norm()) == pytest.approx(math.hypot(v, omega), abs=1e-9)
+
+
+def test_large_commands_are_cut_alike_on_every_axis():
+    family = FAMILIES["saturation"]
+    row, action = family.encode({"saturation": 0.4}), torch.tensor([[-0.9, 1.5], [0.3, -0.2]])
+    effect = family.apply(action, row, torch.zeros(3))
+    torch.testing.assert_close(effect, torch.tensor([[-0.4, 0.6], [0.3, -0.2]]))
+
+
+def test_small_commands_do_nothing_in_a_dead_zone():
+    family = FAMILIES["dead_zone"]
+    row, action = family.encode({"dead_zone": 0.4}), torch.tensor([[-0.9, 1.5], [0.3, -0.5]])
+    effect = family.apply(action, row, torch.zeros(3))
+    torch.testing.assert_close(effect, torch.tensor([[-0.5, 0.9], [0.0, 0.0]]))
+    assert family.inverse(torch.zeros(2), row, torch.zeros(3), LOW, HIGH).tolist() == [0, 0]
+
+
+def test_traction_peaks_and_falls():
+    family = FAMILIES["slip"]
+    row = family.encode({"slip_at": 0.5, "slip_peak": 0.8})
+    effects = [float(family.apply(torch.tensor([u, 0.0]), row, STATE)[0]) for u in (0.4, 0.5, 0.6)]
+    assert effects[1] == pytest.approx(0.8) and effects[0] < effects[1] > effects[2] > 0
+
+
+def test_more_traction_than_there_is_takes_the_command_of_the_peak():
+    family = FAMILIES["slip"]
+    row = family.encode({"slip_at": 0.5, "slip_peak": 0.8})
+    found = family.inverse(torch.tensor([-0.9, 1.4]), row, STATE, LOW, HIGH)
+    torch.testing.assert_close(found, torch.tensor([-0.5, 0.75]))
+    nothing = family.encode({"slip_at": 0.5, "slip_peak": 0.0})
+    assert family.inverse(torch.zeros(2), nothing, STATE, LOW, HIGH).tolist() == [0, 0]
+
+
+PAST = torch.tensor([[0.2, 0.3], [-0.6, 0.5]])
+
+
+@pytest.mark.parametrize(
+    ("steps", "effect"),
+    [(0.0, [1.0, 1.0]), (1.0, [0.2, 0.3]), (2.0, [-0.6, 0.5]), (0.5, [0.6, 0.65])],
+)
+def test_a_delay_picks_the_command_of_that_many_steps_ago(steps, effect):
+    found = FAMILIES["delay"].apply(torch.ones(2), torch.tensor([steps]), STATE, PAST)
+    torch.testing.assert_close(found, torch.tensor(effect))
+
+
+def test_without_a_past_nothing_is_delayed():
+    family = FAMILIES["delay"]
+    row = family.encode({"delay": 2})
+    assert family.apply(torch.ones(2), row, STATE).tolist() == [1, 1]
+
+
+def test_patches_depend_on_the_place():
+    family = Patches(size=2.0, where=[0, 1], names=["gain"])
+    row = family.encode({"gain": -1.0})
+    places = torch.tensor([[1.0, 1.0], [3.0, 1.0], [3.0, 3.0], [-1.0, 1.0], [-1.0, -1.0]])
+    found = family.apply(torch.ones(5, 1), row, places).squeeze(-1)
+    assert found.tolist() == [1, -1, 1, -1, 1]
+
+
+def test_gain_noise_has_the_action_as_its_mean():
+    family = FAMILIES["gain_noise"]
+    row, action = family.encode({"gain_noise": 0.3}), torch.tensor([0.5, -1.0])
+    noise = torch.randn(20_000, 2, generator=torch.Generator().manual_seed(0))
+    effect = family.apply(action, row, STATE, noise=noise)
+    torch.testing.assert_close(effect.mean(0), action, rtol=0, atol=0.01)
+    torch.testing.assert_close(effect.std(0), 0.3 * action.abs(), rtol=0.03, atol=0)
+    assert torch.equal(family.apply(action, row, STATE), action)
+
+
+def test_a_row_is_described_by_what_is_not_nominal(gains):
+    assert gains.describe(gains.encode({})) == "nominal"
+    assert gains.describe(gains.encode({"omega_gain": 0.05})) == "omega_gain = 0.05"
+    whole = gains.encode({"v_gain": -1.0, "omega_gain": 2.0})
+    assert gains.describe(whole.double()) == "v_gain = -1, omega_gain = 2"
+
+
+@pytest.mark.parametrize(
+    ("family", "values", "complaint"),
+    [
+        (
+            "saturation",
+            {"saturation": 1.5},
+            r"saturation=1.5: expected a finite number in \[0, 1\]",
+        ),
+        ("dead_zone", {"dead_zone": -0.1}, r"dead_zone=-0.1: .* in \[0, inf\]"),
+        ("slip", {"slip_at": -1}, r"slip_at=-1: .* in \[0, inf\]"),
+        ("slip", {"slip_peak": "much"}, "slip_peak='much': expected a finite number"),
+        ("delay", {"delay": 3}, r"delay=3: expected a finite number in \[0, 2\]"),
+        ("delay", {"delay": 0.5}, "delay=0.5: expected 0, 1 or 2 steps"),
+        ("gain_noise", {"gain_noise": -0.1}, r"gain_noise=-0.1: .* in \[0, inf\]"),
+        ("bias", {"v_bias": math.nan}, "v_bias=nan: expected a finite number$"),
+    ],
+)
+def test_values_beyond_their_limits_are_refused(family, values, complaint):
+    with pytest.raises(ConfigurationError, match=f"^regimes: {complaint}"):
+        FAMILIES[family].encode(values)
+
+
+@pytest.mark.parametrize(
+    ("make", "complaint"),
+    [
+        (lambda: Bias(["a"], HALF), r"names=\('a',\): expected 2 distinct names"),
+        (lambda: Bias(["a", "a"], HALF), "expected 2 distinct names"),
+        (lambda: Bias(NAMES, HALF, span=[0.4, -0.4]), r"span=\[0.4, -0.4\]: .*lower number first"),
+        (lambda: Bias(NAMES, HALF, span=[0.4]), r"span=\[0.4\]: expected two numbers"),
+        (lambda: Bias(NAMES, HALF, span=0.4), "span=0.4: expected two numbers"),
+        (lambda: Bias(NAMES, HALF, span=[0, math.inf]), "span=inf: expected a finite number"),
+        (lambda: Rotation([1.0]), r"half_range=\[1.0\]: expected two action axes"),
+        (
+            lambda: Rotation([1.0, 0.0]),
+            r"half_range=\[1.0, 0.0\]: expected a finite number above 0",
+        ),
+        (lambda: Rotation(1.0), "half_range=1.0: expected a finite number"),
+        (lambda: Saturation([]), r"half_range=\[\]: expected"),
+        (lambda: Saturation(HALF, span=[0.2, 2.0]), r"span=2.0: .* in \[0, 1\]"),
+        (lambda: DeadZone([1.0, math.inf]), r"half_range=\[1.0, inf\]: .*action_high"),
+        (lambda: DeadZone(HALF, span=[-1, 1]), "span=-1: expected"),
+        (lambda: WheelSlip(HALF, at=[-1, 1]), "at=-1: expected"),
+        (lambda: WheelSlip(HALF, peak=["a", 1]), "peak='a': expected"),
+        (lambda: Patches(size=0.0), "size=0.0: expected"),
+        (lambda: Patches(where=[-1]), "where=-1: expected"),
+        (lambda: Patches(names=[]), r"names=\(\): expected distinct names"),
+        (lambda: Patches(span=[0.0, 1.0]), "span=0.0: expected"),
+        (lambda: GainNoise(span=[-0.1, 1.0]), "span=-0.1: expected"),
+    ],
+)
+def test_impossible_settings_are_refused(make, complaint):
+    with pytest.raises(ConfigurationError, match=complaint):
+        make()
