@@ -8,12 +8,11 @@ Everything is timed in turns within one run, so the ratios hold when the machine
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from statistics import median
 
 import torch
 from tensordict import TensorDict
+from timing import timed
 from torchrl.envs import TransformedEnv
 
 from afm_rl.dynamics import Ensemble
@@ -24,18 +23,6 @@ from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 from afm_rl.transforms import ActionFlowTransform
 
 POPULATION, HORIZON, HIDDEN, ROUNDS = 1000, 5, (200, 200, 200), 40
-
-
-def timed(jobs: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
-    """Run every job once per round; return milliseconds."""
-    spent: dict[str, list[float]] = {name: [] for name in jobs}
-    for turn in range(rounds + 3):
-        for name, job in jobs.items():
-            start = time.perf_counter()
-            job()
-            if turn >= 3:  # the first rounds warm up
-                spent[name].append(1e3 * (time.perf_counter() - start))
-    return spent
 
 
 def main() -> None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.dynamics.copies import Copies
 from afm_rl.dynamics.sparse import sparse_layer, uniform_layer
 from afm_rl.dynamics.stacked import stacked_mlp, stacked_mlp_tangent
 from afm_rl.errors import (
@@ -24,6 +24,8 @@ from afm_rl.manifold import Manifold
 from afm_rl.running_stats import RunningStats
 
 Stack = Sequence[Tensor]
+Parameters = tuple[Iterable[Tensor], Iterable[Tensor]]  # weights and biases, layer by layer
+PROPAGATIONS = ("mean", "sample", "member")
 INITS = {"uniform": uniform_layer, "sparse": sparse_layer}
 CHUNK = 2**18  # activations per layer and chunk: 1 MiB in float32, so that they stay in cache
 
@@ -34,7 +36,13 @@ class Ensemble(DynamicsModel):
     Each member maps the standardised features of state and action to mean and
     log-variance of the standardised state change,
     :math:`(s_{t+1} \ominus s_t - m) / c`. The prediction is the mean over members of their
-    means (``propagation="mean"``), or of one sample each (``"sample"``, as published).
+    means (``propagation="mean"``), or of one sample each (``"sample"``, as published). With
+    ``"member"`` candidate i, counted along the last batch dimension, goes through member i
+    modulo E alone, at every step of its plan (Chua et al.'s TS-infinity), for 1/E of the
+    work; where that dimension is shorter than E, or is that of the missions, it is the mean.
+
+    Only :meth:`forward` knows ``propagation`` and ``precision``: losses, errors and Jacobians
+    are always those of the whole ensemble in the parameters' own precision.
 
     Parameters are stacked, ``(*L, E, in, out)``: no loop over members. :meth:`expand_`
     gives every mission a copy of its own to learn with.
@@ -46,13 +54,16 @@ class Ensemble(DynamicsModel):
         members: number of networks, E.
         hidden: units of the hidden layers.
         log_variance: soft lower and upper bound of the log-variance.
-        propagation: ``"mean"`` or ``"sample"``.
+        propagation: ``"mean"``, ``"sample"`` or ``"member"``.
         seed: seed of the initial weights.
         init: ``"uniform"``, or ``"sparse"``: a tenth of the weights is not zero.
         layer_norm: standardise the units of a layer before each LeakyReLU.
         running_count: None: the statistics that standardise inputs stay as pre-training set
             them. A count: :meth:`observe_` goes on with them, as if they came from at most
             so many samples.
+        precision: of the hidden layers in :meth:`forward`: ``"float32"``, or ``"bfloat16"``
+            wherever no gradients are recorded, as in planning. First and last layer and the
+            state stay as they are.
 
     >>> model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], hidden=[16])
     >>> model(torch.zeros(7, 3), torch.zeros(7, 2)).shape
@@ -77,6 +88,7 @@ class Ensemble(DynamicsModel):
         init: str = "uniform",
         layer_norm: bool = False,
         running_count: int | None = None,
+        precision: str = "float32",
     ) -> None:
         super().__init__(manifold, action_size)
         self.features = list(features)
@@ -90,7 +102,9 @@ class Ensemble(DynamicsModel):
         if not low < high:
             raise ConfigurationError(f"dynamics.log_variance=[{low}, {high}]: expected low < high")
         self.log_variance = (float(low), float(high))
-        self.propagation = check_choice("dynamics.propagation", propagation, ("mean", "sample"))
+        self.propagation = check_choice("dynamics.propagation", propagation, PROPAGATIONS)
+        check_choice("dynamics.precision", precision, ("float32", "bfloat16"))
+        self.precision, self._copies = precision, Copies(torch.bfloat16)
         self.layer_norm = check_flag("dynamics.layer_norm", layer_norm)
         self._generator = torch.Generator().manual_seed(seed)
         inputs, targets = len(self.features) + action_size, manifold.tangent_size
@@ -144,19 +158,23 @@ class Ensemble(DynamicsModel):
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the expected next state ``(*L, *N, S)``."""
+        size, parameters = self.manifold.tangent_size, self._planning_parameters()
         if self.propagation == "sample":
-            mean, log_variance = self.moments(state, action)
+            mean, log_variance = self._moments(self._run(state, action, 2 * size, parameters))
             noise = torch.randn(
                 mean.shape, generator=self._generator, dtype=mean.dtype, device="cpu"
             ).to(mean.device)
             change = (mean + noise * (0.5 * log_variance).exp()).mean(-2)
+        elif self.propagation == "member" and self._enough(state):
+            change = self._run_shared_out(state, action, size, parameters)
         else:
-            change = self._run(state, action, self.manifold.tangent_size).mean(-2)
+            change = self._run(state, action, size, parameters).mean(-2)
         return self.manifold.add(state, change * self.target_std + self.target_mean)
 
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return standardised mean and log-variance ``(*L, *N, E, D)``."""
-        return self._moments(self._run(state, action, 2 * self.manifold.tangent_size))
+        parameters = self.weights, self.biases
+        return self._moments(self._run(state, action, 2 * self.manifold.tangent_size, parameters))
 
     def member_moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return each member's moments on inputs of its own: ``(E, N, S)`` in, ``(E, N, D)`` out.
@@ -197,7 +215,8 @@ class Ensemble(DynamicsModel):
 
         std = self.input_std if self.running is None else self.running.std
         std = std[..., len(self.features) :].reshape(-1, 1, self.action_size, 1)
-        moved = self._chunked(tangents, rows, size).mean(2) / std  # (l, n, A, D)
+        rows, parameters = self._per_member(rows), (self.weights, self.biases)
+        moved = self._chunked(tangents, rows, size, parameters).mean(2) / std  # (l, n, A, D)
         return (moved * self.target_std).mT.reshape(*shape, size, self.action_size)
 
     def expand_(self, missions: int) -> Ensemble:
@@ -241,37 +260,77 @@ class Ensemble(DynamicsModel):
         return self.running(raw)
 
     def _per_member(self, rows: Tensor) -> Tensor:
-        """Repeat ``(l, n, in)`` for every member: ``(l * E, n, in)``."""
-        return rows.unsqueeze(1).expand(-1, self.members, -1, -1).flatten(0, 1)
+        """Show ``(l, n, in)`` to every member: ``(l, E, n, in)``."""
+        return rows.unsqueeze(1).expand(-1, self.members, -1, -1)
 
-    def _stacked(self, missions: slice, size: int) -> tuple[list[Tensor], list[Tensor]]:
+    def _planning_parameters(self) -> Parameters:
+        """Return weights and biases for :meth:`forward`, the hidden layers' in its precision."""
+        if self.precision == "float32" or torch.is_grad_enabled():
+            return self.weights, self.biases
+        weights, biases = list(self.weights), list(self.biases)
+        cast = self._copies.of([*weights[1:-1], *biases[1:-1]])
+        half = len(cast) // 2
+        weights[1:-1], biases[1:-1] = cast[:half], cast[half:]
+        return weights, biases
+
+    def _stacked(
+        self, missions: slice, size: int, parameters: Parameters
+    ) -> tuple[list[Tensor], list[Tensor]]:
         """Return flattened parameters of some missions, the last layer cut to ``size``."""
         stacks = []
-        for parameters in (self.weights, self.biases):
-            parts = [p if self.lead else p.unsqueeze(0) for p in parameters]
-            stack = [p[missions].flatten(0, 1) for p in parts]
+        for group in parameters:
+            stack = list(group)
+            if self.lead:  # a slice of all would cost a copy of all in the backward pass
+                cut = missions.stop < self.lead[0] or missions.start > 0
+                stack = [(p[missions] if cut else p).flatten(0, 1) for p in stack]
             stack[-1] = stack[-1][..., :size]
             stacks.append(stack)
         return stacks[0], stacks[1]
 
-    def _run(self, state: Tensor, action: Tensor, size: int) -> Tensor:
+    def _run(self, state: Tensor, action: Tensor, size: int, parameters: Parameters) -> Tensor:
         """Return the first ``size`` outputs of every member ``(*L, *N, E, size)``."""
         rows, shape = self._rows(state, action)
-        network = partial(stacked_mlp, layer_norm=self.layer_norm)
-        return self._chunked(network, rows, size).reshape(*shape, self.members, size)
+        out = self._chunked(self._network, self._per_member(rows), size, parameters)
+        return out.reshape(*shape, self.members, size)
+
+    def _enough(self, state: Tensor) -> bool:
+        """Are there candidates, and no fewer than members?"""
+        return state.dim() - 1 > len(self.lead) and state.shape[-2] >= self.members
+
+    def _run_shared_out(
+        self, state: Tensor, action: Tensor, size: int, parameters: Parameters
+    ) -> Tensor:
+        """Return one member's first outputs ``(*L, *N, size)``: candidate i, member i modulo E."""
+        rows, shape = self._rows(state, action)
+        candidates, members = shape[-1], self.members
+        turns = -(-candidates // members)
+        rows = rows.unflatten(1, (-1, candidates))
+        rows = F.pad(rows, (0, 0, 0, turns * members - candidates))
+        rows = rows.unflatten(2, (turns, members)).permute(0, 3, 1, 2, 4).flatten(2, 3)
+        out = self._chunked(self._network, rows, size, parameters)  # (l, k * turns, E, size)
+        out = out.unflatten(1, (-1, turns)).flatten(2, 3)[:, :, :candidates]
+        return out.reshape(*shape, size)
+
+    def _network(self, rows: Tensor, weights: Stack, biases: Stack) -> Tensor:
+        """Run the stacked members."""
+        return stacked_mlp(rows, weights, biases, self.layer_norm)
 
     def _chunked(
-        self, network: Callable[[Tensor, Stack, Stack], Tensor], rows: Tensor, size: int
+        self,
+        network: Callable[[Tensor, Stack, Stack], Tensor],
+        rows: Tensor,
+        size: int,
+        parameters: Parameters,
     ) -> Tensor:
-        """Apply stacked networks to ``(l, n, in)``; return ``(l, n, E, ...)``."""
+        """Apply stacked networks to ``(l, E, n, in)``; return ``(l, n, E, ...)``."""
         per_row = self.members * max(self.hidden, default=1)
-        width = max(1, min(rows.shape[1], CHUNK // per_row))
+        width = max(1, min(rows.shape[2], CHUNK // per_row))
         height = max(1, CHUNK // (per_row * width))
         pieces = []
         for top in range(0, rows.shape[0], height):
             missions = slice(top, top + height)
-            weights, biases = self._stacked(missions, size)
-            wide = self._per_member(rows[missions])
+            weights, biases = self._stacked(missions, size, parameters)
+            wide = rows[missions].flatten(0, 1)
             parts = [network(part, weights, biases) for part in wide.split(width, 1)]
             pieces.append(torch.cat(parts, 1) if len(parts) > 1 else parts[0])
         out = torch.cat(pieces) if len(pieces) > 1 else pieces[0]

@@ -20,6 +20,8 @@ def stacked_mlp(
 ) -> Tensor:
     """Run M perceptrons with LeakyReLU on M batches: ``(M, N, in) -> (M, N, out)``.
 
+    Each layer runs in the precision of its parameters.
+
     Args:
         inputs: ``(M, N, in)``.
         weights: one ``(M, in, out)`` per layer.
@@ -29,14 +31,20 @@ def stacked_mlp(
     >>> stacked_mlp(torch.ones(2, 7, 3), [torch.ones(2, 3, 1)], [torch.zeros(2, 1, 1)])[0, 0]
     tensor([3.])
     """
-    # baddbmm would copy the bias first: slower than adding it to a product that is in cache.
-    hidden = torch.bmm(inputs, weights[0]).add_(biases[0])
+    hidden = _affine(inputs, weights[0], biases[0])
     for weight, bias in zip(weights[1:], biases[1:], strict=True):
         if layer_norm:
             hidden = F.layer_norm(hidden, hidden.shape[-1:], eps=EPS)
         hidden = F.leaky_relu(hidden, SLOPE, inplace=True)
-        hidden = torch.bmm(hidden, weight).add_(bias)
+        hidden = _affine(hidden.to(weight.dtype), weight, bias)
     return hidden
+
+
+def _affine(inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """Return ``inputs @ weight + bias``, whichever way is faster."""
+    if weight.dtype is torch.bfloat16:  # adding in it is slow: the product does it on the way
+        return torch.baddbmm(bias, inputs, weight)
+    return torch.bmm(inputs, weight).add_(bias)  # baddbmm would copy the bias first
 
 
 def stacked_mlp_tangent(

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from afm_rl.errors import check_number
+
+PIECE = 2**16  # numbers: three times 256 KiB in float32 fit into a second-level cache
 
 
 class FreshAdam(Optimizer):
@@ -47,6 +49,14 @@ class FreshAdam(Optimizer):
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:
-                    size = parameter.grad.abs().add_(group["eps"])
-                    parameter.addcdiv_(parameter.grad, size, value=-group["lr"])
+                    _sign_step(parameter, parameter.grad, group["lr"], group["eps"])
         return loss
+
+
+def _sign_step(parameter: Tensor, gradient: Tensor, lr: float, eps: float) -> None:
+    """Step in pieces that stay in cache: one pass over memory instead of three."""
+    pair: list[tuple[Tensor, ...]] = [(parameter,), (gradient,)]
+    if parameter.is_contiguous() and gradient.is_contiguous():
+        pair = [whole.view(-1).split(PIECE) for whole in (parameter, gradient)]
+    for values, slopes in zip(*pair, strict=True):
+        values.addcdiv_(slopes, slopes.abs().add_(eps), value=-lr)

@@ -6,6 +6,7 @@ from torch import nn
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import FreshAdam
+from afm_rl.learning import fresh_adam as module
 
 
 def parameters(seed=0):
@@ -24,6 +25,18 @@ def test_each_step_is_the_first_step_of_a_new_adam():
         optimizer.step(), fresh.step()
         for left, right in zip(ours, theirs, strict=True):
             torch.testing.assert_close(left, right)
+
+
+@pytest.mark.parametrize("size", [1, 5, 7, 12, 100])
+@pytest.mark.parametrize("turned", [False, True])
+def test_pieces_change_nothing(size, turned, monkeypatch):
+    monkeypatch.setattr(module, "PIECE", size)
+    start, gradient = (torch.randn(4, 3, dtype=torch.float64) for _ in range(2))
+    weight = nn.Parameter(start.clone().T if turned else start.clone())
+    weight.grad = gradient.T if turned else gradient
+    FreshAdam([weight], lr=0.1).step()
+    expected = start - 0.1 * gradient / (gradient.abs() + 1e-8)
+    torch.testing.assert_close(weight.data.T if turned else weight.data, expected)
 
 
 def test_what_has_no_gradient_stays():
