@@ -1,20 +1,24 @@
-"""What a run leaves behind: tables, figures, TensorBoard events."""
+"""What runs leave behind, tables, figures, TensorBoard events, and reports on many of them."""
 
 from afm_rl.report.comparison import draw_comparison
 from afm_rl.report.console import print_summary
 from afm_rl.report.events import write_events
+from afm_rl.report.feasible import draw_feasible
 from afm_rl.report.folder import write_run
 from afm_rl.report.learning import draw_learning
 from afm_rl.report.summary import summarise, summarise_cells
 from afm_rl.report.trajectory import draw_trajectories
+from afm_rl.report.write import write_report
 
 __all__ = [
     "draw_comparison",
+    "draw_feasible",
     "draw_learning",
     "draw_trajectories",
     "print_summary",
     "summarise",
     "summarise_cells",
     "write_events",
+    "write_report",
     "write_run",
 ]

@@ -17,7 +17,9 @@ RAW: dict[str, Any] = {"linewidth": 0.5, "alpha": 0.3, "zorder": 1.5}
 STARTS, ENDS = ">", "<"  # markers; together they bracket the stretch
 
 
-def draw_curve(axes: Axes, steps: pd.DataFrame, column: str, look: Style) -> None:
+def draw_curve(
+    axes: Axes, steps: pd.DataFrame, column: str, look: Style, many: bool = False
+) -> None:
     """Draw a column's moving average, and its raw values faint behind it.
 
     Args:
@@ -25,14 +27,20 @@ def draw_curve(axes: Axes, steps: pd.DataFrame, column: str, look: Style) -> Non
         steps: one mission's steps, in order.
         column: what to draw.
         look: how the mission's method is drawn.
+        many: there are many methods in these axes: leave out the raw values, and put markers on
+            the lines.
     """
     shown = steps[steps["t"] <= axes.get_xlim()[1]]
     values = shown[column].where(np.isfinite(shown[column]))
     mean = values.rolling(WINDOW, min_periods=1).mean()
     t, stride = shown["t"].to_numpy(), math.ceil(len(shown) / POINTS)
-    axes.plot(*extremes(t, values, stride), color=look.color, **RAW, gid="raw")
+    if not many:
+        axes.plot(*extremes(t, values, stride), color=look.color, **RAW, gid="raw")
     (line,) = axes.plot(t[::stride], mean[::stride], color=look.color, linewidth=1.7, gid="mean")
     line.set_linestyle(look.linestyle)
+    if many:
+        line.set(linewidth=1.3, marker=look.marker, markersize=4.5, markevery=(0.05, 0.3))
+        line.set(markeredgecolor="white", markeredgewidth=0.5)
 
 
 def extremes(t: np.ndarray, values: pd.Series, stride: int) -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +70,9 @@ def regime_changes(steps: pd.DataFrame) -> tuple[list[int], list[int]]:
     return t[change == 1].tolist(), t[change == -1].tolist()
 
 
-def mark_regime(axes: Axes, steps: pd.DataFrame, look: Style, alone: bool) -> None:
+def mark_regime(
+    axes: Axes, steps: pd.DataFrame, look: Style, alone: bool, lines: bool = True
+) -> None:
     """Mark where the changed regime starts and ends.
 
     Args:
@@ -70,14 +80,16 @@ def mark_regime(axes: Axes, steps: pd.DataFrame, look: Style, alone: bool) -> No
         steps: one mission's steps.
         look: how its method is drawn.
         alone: no other method is in these axes, so there is room to shade the stretch.
+        lines: draw a line across the axes at each change, not the triangle alone.
     """
     changes, limit = regime_changes(steps), axes.get_xlim()[1]
     top = axes.get_xaxis_transform()  # steps across, 0 to 1 upwards
     for places, marker in zip(changes, (STARTS, ENDS), strict=True):
         seen = [place for place in places if place <= limit]
+        if seen and lines:
+            across = axes.vlines(seen, 0, 1, color=look.color, linewidth=1.0, transform=top)
+            across.set(linestyle=look.linestyle, zorder=1, gid="change")
         if seen:
-            lines = axes.vlines(seen, 0, 1, color=look.color, linewidth=1.0, transform=top)
-            lines.set(linestyle=look.linestyle, zorder=1, gid="change")
             (marks,) = axes.plot(seen, [1.0] * len(seen), marker, color=look.color, transform=top)
             marks.set(markersize=6, clip_on=False, gid="change")
     if alone:

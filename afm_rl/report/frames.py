@@ -56,14 +56,37 @@ def order_columns(missions: pd.DataFrame) -> pd.DataFrame:
 def cell_names(missions: pd.DataFrame) -> pd.Series:
     """Return each mission's cell: its track and regime, in words.
 
+    The regime is what the column ``regime`` calls it; without one, its parameters.
+
     >>> row = {"method": "physics", "track": "oval", "v_gain": -1.0, "seed": 0}
     >>> cell_names(pd.DataFrame([row])).tolist()
     ['oval, v_gain = -1']
+    >>> cell_names(pd.DataFrame([row | {"regime": "slip"}])).tolist()
+    ['oval, slip']
     """
     cells = missions["track"].astype(str)
+    if "regime" in missions:
+        # A family draws its parameters anew for each seed: only its name is the same.
+        return (cells + ", " + missions["regime"].astype(str)).rename("cell")
     for name in regime_names(missions):
         cells = cells + missions[name].map(f", {name} = {{:g}}".format)
     return cells.rename("cell")
+
+
+def short_cell_names(missions: pd.DataFrame) -> pd.Series:
+    """Return each mission's cell, gains of 1 not named, as the column ``regime`` has it.
+
+    So results with that column and results without it can be joined.
+
+    >>> row = {"method": "physics", "track": "oval", "v_gain": 1.0, "seed": 0}
+    >>> short_cell_names(pd.DataFrame([row, row | {"v_gain": -1.0}])).tolist()
+    ['oval, nominal', 'oval, v_gain = -1']
+    """
+    names = cell_names(missions)
+    if "regime" in missions:
+        return names
+    short = names.str.replace(r", \w*gain = 1(?=,|$)", "", regex=True)
+    return short.where(short != missions["track"].astype(str), short + ", nominal")
 
 
 def first_missions(missions: pd.DataFrame) -> pd.DataFrame:

@@ -7,6 +7,7 @@ from textwrap import wrap
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -85,19 +86,23 @@ def _step_label(missions: pd.DataFrame) -> str:
 
 def _dress(grid: np.ndarray, steps: pd.DataFrame) -> None:
     """Give the axes ``(2, C)`` scales that show these steps, and labels."""
-    losses = steps["loss"].abs()
-    positive = bool((steps["error"] > 0).any())
-    large = bool((losses[np.isfinite(losses)] > LINEAR).any())
     for panels, label in zip(grid, ROWS.values(), strict=True):
         panels[0].set_ylabel(label, fontsize=style.NORMAL)
         for panel in panels:
             panel.grid(axis="y", color="#eeeeee", linewidth=0.6)
             style.dress(panel)
-    for error, loss in grid.T:
-        if positive:
-            error.set_yscale("log", nonpositive="mask")
-        if large:
-            loss.set_yscale("symlog", linthresh=LINEAR)
+    for panels, column in zip(grid, ROWS, strict=True):
+        for panel in panels:
+            scale_panel(panel, column, steps[column])
+
+
+def scale_panel(axes: Axes, column: str, values: pd.Series) -> None:
+    """Give axes a scale that shows these errors (positive), or losses (of either sign)."""
+    if column == "error":
+        if (values > 0).any():
+            axes.set_yscale("log", nonpositive="mask")
+    elif (values[np.isfinite(values)].abs() > LINEAR).any():
+        axes.set_yscale("symlog", linthresh=LINEAR)
 
 
 def _legend(figure: Figure, styles: Mapping[str, style.Style]) -> None:

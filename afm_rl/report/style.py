@@ -22,8 +22,10 @@ NOMINAL, REGIME, BAND = "#222222", "#d55e00", "#e69f00"  # before and after; und
 FAINT = "#888888"
 
 COLOURS = ("#0072b2", "#009e73", "#cc79a7", "#000000", "#56b4e9", "#e69f00", "#d55e00")
+# As many lines and markers as have no divisor in common with the colours, or are many: methods
+# that must share a colour have another line and another marker.
 LINES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.2, 1)), (0, (6, 1.5, 1.2, 1.5)))
-MARKERS = "osD^vP*"
+MARKERS = "osD^vP*X<>pdhH"
 
 
 class Style(NamedTuple):

@@ -13,7 +13,7 @@ from matplotlib.text import Text
 
 from afm_rl.report import draw_comparison, draw_learning, draw_trajectories
 from afm_rl.report.road import distance_to, resample, view
-from afm_rl.report.style import DPI, MARKERS, REGIME, method_styles, png_bytes
+from afm_rl.report.style import COLOURS, DPI, REGIME, method_styles, png_bytes
 
 
 def texts(figure):
@@ -78,7 +78,17 @@ def test_a_picture_is_the_same_each_time(draw, make_results):
 def test_methods_differ_without_colour():
     styles = method_styles(f"m{k}" for k in range(14)).values()
     assert len({style[1:] for style in styles}) == len(styles)
-    assert len({style.color for style in styles}) == len(MARKERS)
+    assert len({style.color for style in styles}) == len(COLOURS)
+    assert len({style.marker for style in styles}) == len(styles)
+
+
+def test_methods_of_one_colour_differ_in_line_and_marker():
+    styles = list(method_styles(f"m{k}" for k in range(13)).values())
+    for k, first in enumerate(styles):
+        for second in styles[k + 1 :]:
+            if first.color == second.color:
+                assert first.linestyle != second.linestyle
+                assert first.marker != second.marker
 
 
 # Trajectories

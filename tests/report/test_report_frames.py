@@ -11,6 +11,7 @@ from afm_rl.report.frames import (
     left_out,
     order_columns,
     regime_names,
+    short_cell_names,
 )
 
 
@@ -34,6 +35,24 @@ def test_a_cell_is_a_track_and_a_regime(make_results):
         "ring, v_gain = 0.05, omega_gain = 1",
         "oval, v_gain = -1, omega_gain = 1",
         "oval, v_gain = 0.05, omega_gain = 1",
+    ]
+
+
+def test_a_regime_goes_by_the_name_it_was_given(make_results):
+    missions, _ = make_results(["oracle"], v_gains=[-1.0, 0.05])
+    named = missions.assign(regime="slip")
+    assert cell_names(named).unique().tolist() == ["ring, slip"]
+    assert list(order_columns(named))[-1] == "regime"
+    pd.testing.assert_series_equal(short_cell_names(named), cell_names(named))
+
+
+def test_short_names_leave_out_gains_of_one(make_results):
+    missions, _ = make_results(["oracle"], v_gains=[-1.0, 1.0, 1.5, 0.1])
+    assert short_cell_names(missions).tolist() == [
+        "ring, v_gain = -1",
+        "ring, nominal",
+        "ring, v_gain = 1.5",
+        "ring, v_gain = 0.1",
     ]
 
 

@@ -1,0 +1,72 @@
+"""The command ``afm-rl-report``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import NoReturn
+
+from afm_rl.cli.mistakes import explain, one_line
+
+NAME = "afm-rl-report"
+ABOUT = """\
+Join the results of runs and studies; write tables (CSV, LaTeX), figures and one HTML page.
+
+  afm-rl-report outputs/demo                       one run: report in outputs/demo/report
+  afm-rl-report study_a study_b --out report       several folders, joined
+  afm-rl-report study --baselines physics          compare every method with physics
+  afm-rl-report study --no-figures                 tables only, in seconds
+
+A folder is what `afm-rl` or a study has written: missions.csv, and steps.parquet for curves, maps
+and recovery times. A study may still be running: the report takes what is finished, and says
+which methods, cells and seeds are missing (missing.csv). Of a mission that stands in several
+folders, the last one counts.
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong in one line."""
+        print(f"{NAME}: {message} (see {NAME} --help)", file=sys.stderr)
+        sys.exit(2)
+
+
+def main() -> None:
+    """Run ``afm-rl-report``; a mistake ends in one line and exit status 2."""
+    parser = _Parser(
+        prog=NAME, description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("folders", metavar="FOLDER", nargs="+", type=Path, help="results of a run or a study")
+    add("--out", metavar="DIR", type=Path, help="where to (FOLDER/report, of the first one)")
+    add(
+        "--baselines",
+        metavar="METHOD",
+        nargs="+",
+        default=["online_pe", "adaptive_affine"],
+        help="methods that the others are compared with (online_pe adaptive_affine)",
+    )
+    add("--oracle", metavar="METHOD", default="oracle", help="who knows the regime (oracle)")
+    add("--no-figures", dest="figures", action="store_false", help="write tables only")
+    options = parser.parse_args()
+
+    from afm_rl.report.write import write_report  # torch takes seconds: `--help` need not wait
+
+    # By name, as configurations do: no module imports the environments.
+    load_track = import_module("afm_rl.envs").load_track
+    out = options.out or options.folders[0] / "report"
+    chosen = {"baselines": options.baselines, "oracle": options.oracle, "figures": options.figures}
+    try:
+        write_report(options.folders, out, **chosen, load_track=load_track)
+    except BrokenPipeError:  # nobody reads on, as in `afm-rl-report study | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except Exception as error:
+        message = explain(error)
+        if message is None:
+            raise
+        print(f"{NAME}: {one_line(message)}", file=sys.stderr)
+        sys.exit(2)

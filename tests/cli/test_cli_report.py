@@ -1,0 +1,127 @@
+"""The command ``afm-rl-report``."""
+
+import os
+import sys
+from itertools import product
+from types import SimpleNamespace
+
+import pandas as pd
+import pytest
+
+from afm_rl.cli import report
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    """A run of two methods that stood still, on a track of the catalogue."""
+    table = []
+    for number, (method, seed) in enumerate(product(["physics", "oracle"], range(2))):
+        success = float(method == "oracle")
+        table.append(
+            {
+                "method": method,
+                "track": "ethz_2",
+                "v_gain": -1.0,
+                "omega_gain": 1.0,
+                "seed": seed,
+                "success_rate": success,
+                "steps": 9 + seed,
+                "reached": int(19 * success),
+                "targets": 19,
+                "finished": success == 1,
+                "seconds": 1.0,
+                "mission": number,
+            }
+        )
+    steps = [
+        {
+            "mission": number,
+            "t": t,
+            "x": 7.2,
+            "y": 5.4,
+            "error": 0.1,
+            "loss": 1.0,
+            "regime_active": int(t > 4),
+            "reached": 0,
+        }
+        for number in range(4)
+        for t in range(10)
+    ]
+    pd.DataFrame(table).to_csv(tmp_path / "missions.csv", index=False)
+    pd.DataFrame(steps).to_parquet(tmp_path / "steps.parquet")
+    return tmp_path
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Call the command; return status, output and errors."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["afm-rl-report", *map(str, arguments)])
+        try:
+            report.main()
+            status = 0
+        except SystemExit as ended:
+            status = ended.code
+        said = capsys.readouterr()
+        return SimpleNamespace(status=status, out=said.out, err=said.err)
+
+    return run
+
+
+def test_a_report_of_a_run(call, run_folder):
+    done = call(run_folder, "--baselines", "physics")
+    assert (done.status, done.err) == (0, "")
+    assert done.out.splitlines()[0].startswith("4 missions of 2 methods in 1 cells")
+    assert done.out.splitlines()[-1] == f"Report: {run_folder}/report/index.html"
+    assert (run_folder / "report" / "figures" / "heat_ethz_2.png").exists()
+    assert (run_folder / "report" / "tables" / "paper_ethz_2_steps.tex").exists()
+
+
+def test_tables_only_in_a_folder_of_one_s_choice(call, run_folder, tmp_path):
+    done = call(run_folder, "--out", tmp_path / "elsewhere", "--no-figures", "--oracle", "physics")
+    assert done.status == 0
+    assert not (tmp_path / "elsewhere" / "figures").exists()
+    table = pd.read_csv(tmp_path / "elsewhere" / "tables" / "aggregate.csv")
+    assert table["ratio_all_pairs"].tolist() == [2, 2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "the following arguments are required: FOLDER"),
+        (["a", "--fast"], "unrecognized arguments: --fast"),
+        (["nowhere"], "nowhere: no such folder"),
+        (["nowhere", "--out"], "argument --out: expected one argument"),
+    ],
+)
+def test_mistakes_end_in_one_line(call, arguments, message):
+    done = call(*arguments)
+    assert (done.status, done.out) == (2, "")
+    assert done.err.startswith(f"afm-rl-report: {message}") and done.err.count("\n") == 1
+
+
+def test_what_is_no_mistake_is_not_hidden(call, run_folder, monkeypatch):
+    def broken(*_, **settings):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr("afm_rl.report.write.write_report", broken)
+    with pytest.raises(RuntimeError, match="a bug"):
+        call(run_folder)
+
+
+def test_the_help_teaches(call):
+    done = call("--help")
+    assert done.status == 0
+    for word in ("missing.csv", "--baselines", "--oracle", "several folders", "outputs/demo"):
+        assert word in done.out
+
+
+def test_a_reader_that_leaves_is_no_mistake(call, run_folder, monkeypatch):
+    def left(*_, **settings):
+        raise BrokenPipeError
+
+    monkeypatch.setattr("afm_rl.report.write.write_report", left)
+    with os.fdopen(os.dup(1), "w") as pipe:  # as if standard output were one
+        monkeypatch.setattr(sys, "stdout", pipe)
+        assert call(run_folder).status == 1

@@ -1,0 +1,70 @@
+"""Recovery times against those that were put into the errors."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from afm_rl.report.recovery import FLOOR, STAY, recovery_table, recovery_times
+
+LOW, HIGH = 1e-3, 0.5
+
+
+def mission(*stretches):
+    """Steps made of (regime active, error, number of steps)."""
+    active = np.concatenate([np.full(n, on) for on, _, n in stretches])
+    error = np.concatenate([np.full(n, size) for _, size, n in stretches])
+    return pd.DataFrame({"regime_active": active, "error": error})
+
+
+def times(steps):
+    return recovery_times(steps).set_index("change")["time"].to_dict()
+
+
+def test_the_first_step_of_the_first_quiet_stretch_counts():
+    steps = mission(
+        (0, LOW, 50), (1, HIGH, 13), (1, LOW, STAY), (1, HIGH, 5), (0, HIGH, 4), (0, LOW, 40)
+    )
+    assert times(steps) == {1: 13, 2: 4}
+
+
+def test_a_short_quiet_stretch_is_no_recovery():
+    steps = mission((0, LOW, 50), (1, HIGH, 9), (1, LOW, STAY - 1), (1, HIGH, 2), (1, LOW, STAY))
+    assert times(steps) == {1: 9 + STAY - 1 + 2}
+
+
+def test_an_error_that_never_rises_takes_no_time():
+    assert times(mission((0, LOW, 50), (1, LOW, 50))) == {1: 0}
+
+
+def test_an_error_that_stays_high_is_never_recovered_from():
+    assert times(mission((0, LOW, 50), (1, HIGH, 50), (0, LOW, 50))) == {1: np.inf, 2: 0}
+
+
+def test_stretches_too_short_to_tell_are_left_out():
+    assert times(mission((0, LOW, 50), (1, LOW, STAY - 1), (0, LOW, STAY))) == {2: 0}
+
+
+def test_missions_without_a_change_have_no_times():
+    for active in (0, 1):
+        assert recovery_times(mission((active, LOW, 50))).empty
+
+
+@pytest.mark.parametrize(("factor", "time"), [(1.4, 0), (1.6, np.inf)])
+def test_the_level_is_a_high_quantile_of_the_errors_before(factor, time):
+    steps = mission((0, LOW, 96), (0, HIGH, 4), (1, factor * LOW, 50))
+    assert times(steps) == {1: time}  # 4 of 100 outliers do not matter
+
+
+def test_errors_below_the_floor_are_all_the_same():
+    assert times(mission((0, FLOOR / 100, 50), (1, 0.9 * FLOOR, 50))) == {1: 0}
+
+
+def test_missions_never_recovered_count_in_the_median():
+    frame = pd.DataFrame({"method": "a", "change": 1, "time": [3.0, np.inf, 5.0, np.inf, np.inf]})
+    other = pd.DataFrame({"method": "b", "change": 1, "time": [3.0, 5.0, 9.0]})
+    table = recovery_table(pd.concat([frame, other]))
+    assert table.numbers["never"].tolist() == [0.6, 0.0]
+    assert table.numbers["median"].tolist() == [np.inf, 5.0]
+    assert table.shown["never recovered %"].tolist() == ["60", "0"]
+    assert table.shown["median steps"].tolist() == ["∞", "5"]
+    assert table.shown["quartiles"].tolist() == ["5 to ∞", "3 to 5"]

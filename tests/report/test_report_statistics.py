@@ -1,0 +1,250 @@
+"""Numbers of the joined tables against those found by hand and by scipy."""
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.stats
+
+from afm_rl.report.absent import absent_lines, absent_table, find_absent
+from afm_rl.report.aggregate import aggregate, aggregate_table
+from afm_rl.report.bootstrap import bounds, interquartile_mean, resample, stratified_interval
+from afm_rl.report.cells import cell_table
+from afm_rl.report.improvement import probability_of_improvement
+from afm_rl.report.outcomes import add_outcomes, budget_notes, pair
+from afm_rl.report.pairs import compare, comparison_tables
+
+NOTHING = pd.DataFrame(columns=["seconds", "missions"])
+
+
+def rows(method, cell, outcomes):
+    """Missions of a method in a cell: (success, steps) by seed."""
+    return [
+        {
+            "method": method,
+            "cell": cell,
+            "track": cell,
+            "seed": seed,
+            "success_rate": success,
+            "steps": steps,
+            "finished": success == 1.0,
+            "seconds": 10.0,
+        }
+        for seed, (success, steps) in enumerate(outcomes)
+    ]
+
+
+@pytest.fixture
+def missions():
+    table = [
+        *rows("ours", "a", [(1.0, 99), (1.0, 199)]),
+        *rows("ours", "b", [(0.5, 499), (1.0, 399)]),
+        *rows("base", "a", [(1.0, 199), (0.5, 499)]),
+        *rows("base", "b", [(0.5, 499)]),
+        *rows("oracle", "a", [(1.0, 99), (1.0, 99)]),
+        *rows("oracle", "b", [(1.0, 199), (0.5, 499)]),
+    ]
+    return add_outcomes(pd.DataFrame(table))
+
+
+def test_given_up_missions_cost_the_budget_of_their_cell():
+    table = [*rows("a", "x", [(0.5, 50), (0.5, 80), (1.0, 30)]), *rows("a", "y", [(0.5, 60)])]
+    missions = add_outcomes(pd.DataFrame(table))
+    assert missions["cost"].tolist() == [80, 80, 30, 60]
+    (note,) = budget_notes(missions)
+    assert note.startswith("x: missions were given up after 50 to 80 steps")
+
+
+def test_success_comes_first_and_fewer_steps_break_ties():
+    table = rows("a", "x", [(0.5, 90), (1.0, 80), (1.0, 30), (0.25, 90), (1.0, 80)])
+    assert add_outcomes(pd.DataFrame(table))["score"].tolist() == [1, 2, 3, 0, 2]
+
+
+def test_pairs_share_cell_and_seed(missions):
+    pairs = pair(missions, "ours", "base")
+    assert pairs[["cell", "seed"]].to_numpy().tolist() == [["a", 0], ["a", 1], ["b", 0]]
+    assert (pairs["cost"] - pairs["cost_other"]).tolist() == [-100, -300, 0]
+
+
+def test_draws_stay_within_their_stratum():
+    strata = np.array(["b", "a", "b", "c", "a", "b"])
+    drawn = resample(strata)
+    assert (strata[drawn] == strata).all()
+    for place in range(len(strata)):
+        alike = np.flatnonzero(strata == strata[place])
+        often = np.bincount(drawn[:, place], minlength=6)[alike] / len(drawn)
+        np.testing.assert_allclose(often, 1 / len(alike), atol=0.05)
+
+
+def test_one_stratum_is_the_plain_bootstrap():
+    sample = np.random.default_rng(3).gamma(2.0, size=40)
+    for statistic in (np.mean, interquartile_mean):
+        expected = scipy.stats.bootstrap(
+            (sample,), statistic, method="percentile", n_resamples=20_000
+        ).confidence_interval
+        found = stratified_interval(sample, np.zeros(40), statistic)
+        np.testing.assert_allclose(found, expected, rtol=0.04)
+
+
+def test_intervals_hold_the_mean_as_often_as_they_say():
+    rng, held, means = np.random.default_rng(0), 0, np.array([0.0, 5.0, 20.0, 3.0])
+    strata = np.repeat(np.arange(4), 12)
+    for _ in range(200):
+        sample = means[strata] + rng.normal(size=len(strata))
+        low, high = stratified_interval(sample, strata)
+        held += low <= means.mean() <= high
+        assert high - low < 1.0  # what differs between cells is no spread
+    assert 0.88 <= held / 200 <= 0.99
+
+
+def test_no_draw_that_differs_no_interval():
+    for values, strata in (([1.0, 2.0], ["a", "b"]), ([3.0, 3.0], ["a", "a"]), ([], [])):
+        assert all(map(math.isnan, stratified_interval(values, strata)))
+    assert bounds(np.arange(101.0)) == pytest.approx((2.5, 97.5))
+
+
+def test_the_interquartile_mean_cuts_a_quarter_on_each_side():
+    values = np.array([9.0, 1.0, 2.0, 3.0, 4.0, 100.0, -50.0, 0.0])
+    assert interquartile_mean(values) == np.sort(values)[2:6].mean()
+    assert interquartile_mean(np.stack([values, values + 1])).tolist() == [2.5, 3.5]
+
+
+def test_improvement_is_mann_whitney_s_u_in_each_cell():
+    rng = np.random.default_rng(1)
+    frames = [
+        pd.DataFrame({"cell": rng.choice(["a", "b"], 30), "score": rng.integers(0, 6, 30)})
+        for _ in range(2)
+    ]
+    expected = []
+    for cell in "ab":
+        x, y = (frame.loc[frame["cell"] == cell, "score"] for frame in frames)
+        expected.append(scipy.stats.mannwhitneyu(x, y).statistic / (len(x) * len(y)))
+    found, (low, high) = probability_of_improvement(*frames)
+    assert found == pytest.approx(np.mean(expected))
+    assert 0 < low < found < high < 1
+    back, _ = probability_of_improvement(*frames[::-1])
+    assert back == pytest.approx(1 - found)
+
+
+def test_improvement_s_interval_is_that_of_draws_one_by_one():
+    rng = np.random.default_rng(2)
+    x, y = rng.normal(0.5, 1, 10).round(1), rng.normal(0, 1, 8).round(1)
+    mine, other = (pd.DataFrame({"cell": "a", "score": values}) for values in (x, y))
+    drawn = []
+    for _ in range(4000):
+        pairs = rng.choice(x, len(x))[:, None] - rng.choice(y, len(y))
+        drawn.append((0.5 * (np.sign(pairs) + 1)).mean())
+    _, found = probability_of_improvement(mine, other)
+    np.testing.assert_allclose(found, np.quantile(drawn, [0.025, 0.975]), atol=0.03)
+
+
+def test_nothing_shared_no_probability():
+    frames = [pd.DataFrame({"cell": [cell], "score": [0]}) for cell in "ab"]
+    found, interval = probability_of_improvement(*frames)
+    assert all(map(math.isnan, (found, *interval)))
+
+
+def test_aggregates_are_those_found_by_hand(missions):
+    means = aggregate(missions, NOTHING, "oracle").set_index("method")
+    ours = means.loc["ours"]
+    assert (ours["missions"], ours["cells"], ours["finished"]) == (4, 2, 0.75)
+    assert ours["success"] == 0.875
+    assert ours["steps"] == (99 + 199 + 499 + 399) / 4
+    assert ours["success_iqm"] == 1.0
+    assert ours["steps_iqm"] == (199 + 399) / 2
+    assert ours["per_hour"] == 360
+    assert ours["ratio_pairs"] == 3 and ours["ratio_all_pairs"] == 4
+    assert ours["ratio"] == pytest.approx((1 * 2 * 2.5) ** (1 / 3))
+    assert ours["ratio_all"] == pytest.approx((1 * 2 * 2.5 * 0.8) ** (1 / 4))
+    assert means.loc["base", "ratio_all_pairs"] == 3
+    assert means.loc["oracle", "ratio"] == 1.0
+    # Two seeds in each cell: the four means of success are 0.75, 0.875 and 1.
+    assert (ours["success_low"], ours["success_high"]) == (0.75, 1.0)
+
+
+def test_the_table_of_aggregates_is_bold_for_the_best_but_the_oracle(missions):
+    last = pd.DataFrame(rows("base", "b", [(0.5, 499)])).assign(seed=1)
+    spared = pd.DataFrame(rows("spared", "a", [(1.0, 9)]))
+    whole = add_outcomes(pd.concat([missions, last, spared], ignore_index=True))
+    means = aggregate(whole, NOTHING, "oracle")
+    table = aggregate_table(means, "oracle")
+    assert table.shown["method"].tolist() == ["ours", "base", "oracle", "spared"]
+    assert table.shown.loc[0, "success %"] == "87.5 [75.0, 100.0]"
+    assert "(n = 3)" in table.shown.loc[0, "steps / oracle, where it finished"]
+    assert {row for row, _ in table.bold} == {0}
+    assert {column for _, column in table.bold} == {2, 3, 4, 5, 6, 7, 8}
+
+
+def test_no_oracle_no_ratio(missions):
+    table = aggregate_table(aggregate(missions, NOTHING, "nobody"), "nobody")
+    assert table.shown["steps / nobody, all"].tolist() == ["-"] * 3
+
+
+def test_speed_comes_from_the_study_or_from_the_missions(missions):
+    study = pd.DataFrame({"seconds": [36.0], "missions": [4]}, index=["ours"])
+    means = aggregate(missions, study, "oracle").set_index("method")
+    assert means["per_hour"].to_dict() == {"ours": 400.0, "base": 360.0, "oracle": 360.0}
+    timeless = aggregate(missions.drop(columns="seconds"), NOTHING, "oracle")
+    assert timeless["per_hour"].isna().all()
+
+
+def test_differences_are_paired(missions):
+    numbers = compare(missions, ["base", "nobody"])
+    assert numbers["method"].tolist() == ["ours", "oracle"]
+    ours = numbers.iloc[0]
+    assert ours["pairs"] == 3
+    assert ours["success"] == pytest.approx(0.5 / 3)
+    assert ours["steps"] == pytest.approx(-400 / 3)
+    # Cell a: 99 beats both, 199 ties once and wins once. Cell b: 0.5 ties, 1.0 wins.
+    assert ours["better"] == pytest.approx((3.5 / 4 + 1.5 / 2) / 2)
+    (table,) = comparison_tables(numbers)
+    assert table.name == "against_base"
+    assert table.shown.loc[0, "n pairs"] == "3"
+    assert table.shown.loc[0, "steps"].startswith("-133 [-")
+    assert (0, 3) in table.bold  # the interval of steps lies below 0
+
+
+def test_methods_that_share_no_cell_are_not_compared(missions):
+    apart = missions[(missions["method"] == "ours") ^ (missions["cell"] == "b")]
+    apart = apart[(apart["method"] != "ours") | (apart["cell"] == "a")]
+    assert compare(apart, ["base"])["method"].tolist() == ["oracle"]
+    assert comparison_tables(compare(missions, [])) == []
+
+
+def test_a_cell_shared_without_a_seed_has_no_pairs(missions):
+    apart = missions[missions["method"] != "oracle"]
+    apart = apart.assign(seed=apart["seed"].where(apart["method"] == "ours", 7))
+    (table,) = comparison_tables(compare(apart.drop_duplicates(["method", "cell"]), ["base"]))
+    assert table.shown.iloc[0, 1:4].tolist() == ["0", "-", "-"]
+    assert table.shown.loc[0, "P(better)"] == "0.75"
+
+
+def test_cells_times_methods(missions):
+    table = cell_table(missions)
+    assert table.shown.to_numpy().tolist() == [
+        ["a", "100 / 149", "75 / 349", "100 / 99"],
+        ["b", "75 / 449", "50 / 499", "75 / 349"],
+    ]
+    assert table.bold == {(0, 3), (1, 3)}
+    alone = cell_table(missions[(missions["method"] != "base") | (missions["cell"] == "a")])
+    assert alone.shown.loc[1, "base"] == "-"
+
+
+def test_what_is_missing_is_counted(missions):
+    asked = pd.DataFrame({"method": ["online"], "cell": ["a"], "seed": [5]})
+    absent = find_absent(missions, asked)
+    assert len(absent) == 1 + 4 + 4  # base: b, seed 1; seed 5 of all four; all of online's
+    lines = absent_lines(absent, ["ours", "base", "oracle"], cells=2)
+    assert "missing: base: 2 missions in all 2 cells" in lines
+    assert "missing: ours: 1 mission in a" in lines
+    assert "missing: online (it has none): 5 missions in all 2 cells" in lines
+    table = absent_table(absent, cells=2)
+    assert table.numbers is absent
+    assert table.shown["missions"].astype(int).sum() == 9
+
+
+def test_many_missing_cells_are_not_all_named():
+    absent = pd.DataFrame({"method": "a", "cell": list("abcde"), "seed": 0})
+    (line,) = absent_lines(absent, ["a"], cells=9)
+    assert line == "missing: a: 5 missions in a; b; c and 2 more"
