@@ -17,3 +17,6 @@ if "afm_rl/UGVTrack-v0" not in gymnasium.registry:  # strings only: nothing heav
         vector_entry_point="afm_rl.envs.ugv_gym:UGVTrackVectorEnv",
         max_episode_steps=5000,
     )
+    gymnasium.register(
+        id="afm_rl/CrazyflieTrack-v0", entry_point="afm_rl.envs.quadrotor_gym:CrazyflieTrackGym"
+    )

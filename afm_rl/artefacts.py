@@ -41,10 +41,37 @@ def write_whole(path: Path, data: bytes) -> None:
 
 def save_artefact(path: Path, module: nn.Module, description: Mapping[str, Any]) -> None:
     """Save a module's state with a JSON description and a checksum of both."""
-    tensors = {name: value.contiguous() for name, value in module.state_dict().items()}
+    save_tensors(path, module.state_dict(), description)
+
+
+def save_tensors(path: Path, tensors: Mapping[str, Tensor], description: Mapping[str, Any]) -> None:
+    """Save tensors with a JSON description and a checksum of both."""
+    tensors = {name: value.contiguous() for name, value in tensors.items()}
     text = json.dumps(description, sort_keys=True)
-    metadata = {"description": text, "sha256": _digest(tensors, text)}
+    metadata = {"description": text, "sha256": digest_of(tensors, text)}
     write_whole(Path(path), save(tensors, metadata))
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read the tensors and the description that :func:`save_tensors` wrote.
+
+    Raises:
+        ConfigurationError: if there is no such file.
+        ArtefactError: if it is damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ConfigurationError(f"{path}: no such file")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise ArtefactError(f"{path}: damaged, or no safetensors file ({error})") from error
+    text = metadata.get("description", "")
+    if metadata.get("sha256") != digest_of(tensors, text):
+        raise ArtefactError(f"{path}: damaged: its checksum does not match; delete it")
+    return tensors, json.loads(text)
 
 
 def load_artefact(path: Path, module: nn.Module, description: Mapping[str, Any]) -> None:
@@ -59,19 +86,7 @@ def load_artefact(path: Path, module: nn.Module, description: Mapping[str, Any])
         ConfigurationError: if there is no such file.
         ArtefactError: if it is damaged, or belongs to something else.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise ConfigurationError(f"{path}: no such file")
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise ArtefactError(f"{path}: damaged, or no safetensors file ({error})") from error
-    text = metadata.get("description", "")
-    if metadata.get("sha256") != _digest(tensors, text):
-        raise ArtefactError(f"{path}: damaged: its checksum does not match; delete it")
-    stored = json.loads(text)
+    tensors, stored = read_tensors(path)
     for name, wanted in json.loads(json.dumps(description)).items():  # a tuple becomes a list
         if stored.get(name) != wanted:
             raise ArtefactError(
@@ -118,7 +133,12 @@ def cached(
     return error, False
 
 
-def _digest(tensors: Mapping[str, Tensor], text: str) -> str:
+def digest_of(tensors: Mapping[str, Tensor], text: str = "") -> str:
+    """Return the SHA-256 of named tensors and a text.
+
+    >>> digest_of({}) == digest_of({}, "a")
+    False
+    """
     digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         digest.update(f"{name}{tensors[name].dtype}{tuple(tensors[name].shape)}".encode())

@@ -3,6 +3,18 @@
 from afm_rl.envs.course import Course
 from afm_rl.envs.mission_noise import MissionNoise
 from afm_rl.envs.missions import MissionFormat
+from afm_rl.envs.quadrotor import CrazyflieTrack
+from afm_rl.envs.quadrotor_gym import CrazyflieTrackGym
+from afm_rl.envs.quadrotor_settings import schedule_in_seconds
+from afm_rl.envs.references import (
+    Circle,
+    FigureEight,
+    Hover,
+    Reference,
+    Table,
+    Waypoints,
+    load_reference,
+)
 from afm_rl.envs.rendering import TrackCanvas
 from afm_rl.envs.track import Track
 from afm_rl.envs.tracks import load_track
@@ -11,13 +23,23 @@ from afm_rl.envs.ugv_gym import UGVTrackGym
 from afm_rl.envs.ugv_vector import UGVTrackVectorEnv
 
 __all__ = [
+    "Circle",
     "Course",
+    "CrazyflieTrack",
+    "CrazyflieTrackGym",
+    "FigureEight",
+    "Hover",
     "MissionFormat",
     "MissionNoise",
+    "Reference",
+    "Table",
     "Track",
     "TrackCanvas",
     "UGVTrack",
     "UGVTrackGym",
     "UGVTrackVectorEnv",
+    "Waypoints",
+    "load_reference",
     "load_track",
+    "schedule_in_seconds",
 ]

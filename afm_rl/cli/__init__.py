@@ -13,6 +13,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from afm_rl.cli.mistakes import explain
+from afm_rl.cli.overrides import relaxed
 
 
 @hydra.main(version_base="1.3", config_path="pkg://afm_rl.conf", config_name="config")
@@ -44,5 +45,6 @@ def _explained(sweep: bool = False) -> Iterator[None]:
 def main() -> None:
     """Run ``afm-rl``; a mistake in the settings ends in one line and exit status 2."""
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # hand errors to us instead of printing them
+    sys.argv[1:] = relaxed(sys.argv[1:])
     with _explained():
         _run()

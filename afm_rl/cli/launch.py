@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import torch
@@ -12,16 +13,16 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from afm_rl.artefacts import write_whole
+from afm_rl.cli.overrides import PARTS, has, optional
 from afm_rl.errors import ConfigurationError, check_count, check_flag
 from afm_rl.missions import build, prepare, run
 from afm_rl.report import print_summary, write_run
 
-PARTS = ("dynamics", "updater", "transform", "flow")
 SWITCHES = ("overwrite", "progress", "figures", "tensorboard")
 
 
 def launch(cfg: DictConfig) -> None:
-    """Run the missions of one method, or of several to compare, and write the results.
+    """Run the missions of one method, of several to compare, or a study; write the results.
 
     Everything is built and checked before anything is trained.
     """
@@ -32,11 +33,17 @@ def launch(cfg: DictConfig) -> None:
         raise ConfigurationError(f"cache={cfg.cache!r}: expected a folder")
     job = HydraConfig.get()
     folder = Path(job.runtime.output_dir)
-    if (folder / "missions.csv").exists() and not cfg.overwrite:
+    study = cfg.get("study")
+    if (folder / "missions.csv").exists() and not cfg.overwrite and study is None:
         raise ConfigurationError(
             f"hydra.run.dir={folder}: holds results; choose another folder, or overwrite=true"
         )
     methods = _methods(cfg, list(job.overrides.task), job.runtime.choices.get("method"))
+    if study is not None:
+        from afm_rl.cli.study import launch_study  # file locks: not on every system
+
+        launch_study(study, methods, folder, cfg.progress)
+        return
     agents = [build(method) for method in methods]
     for method in methods:
         name = "config.yaml" if len(methods) == 1 else f"config/{method.label}.yaml"
@@ -60,15 +67,48 @@ def _methods(cfg: DictConfig, overrides: Sequence[str], method: str | None) -> l
         if not all(isinstance(n, str) for n in names) or len(set(names)) < len(names):
             raise ConfigurationError(f"compare={compare}: expected a list of distinct methods")
     given = {text.split("=")[0] for text in overrides}
-    by_hand = "compare" not in given and not given.isdisjoint(PARTS)
+    by_hand = given.isdisjoint({"compare", "study"}) and not given.isdisjoint(PARTS)
     if method is not None or by_hand or not cfg.compare:
         chosen = [(method, cfg)]
     else:
-        chosen = [(name, compose("config", [*overrides, f"method={name}"])) for name in names]
+        chosen = [*_compared(list(compare), overrides)]
     for name, each in chosen:
         each.compare = []
+        OmegaConf.set_struct(each, False)
+        each.pop("study", None)
         each.label = each.label if len(chosen) == 1 and each.label else _label(name, overrides)
     return [each for _, each in chosen]
+
+
+def _compared(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[str, DictConfig]]:
+    """Compose each method with those settings of its parts that it has.
+
+    Raises:
+        ConfigurationError: for a setting that none of them has.
+    """
+    some = optional(overrides)
+    common = [text for text in overrides if text not in some.values()]
+    bare = {name: compose("config", [*common, f"method={name}"]) for name in names}
+    if not some:
+        return list(bare.items())
+    plain: dict[str, Any] = {
+        name: OmegaConf.to_container(cfg, resolve=False) for name, cfg in bare.items()
+    }
+    for key, text in some.items():
+        without = [name for name in names if not has(plain[name], key)]
+        if len(without) == len(names):
+            raise ConfigurationError(f"{text.lstrip('+')}: none of {', '.join(names)} has {key}")
+        for name in without:
+            print(f"{name}: has no {key}, so it stays as it is")
+    return [
+        (name, compose("config", [*common, *_fitting(some, plain[name]), f"method={name}"]))
+        for name in names
+    ]
+
+
+def _fitting(some: Mapping[str, str], settings: Mapping[str, Any]) -> list[str]:
+    """Return the overrides of settings that there are."""
+    return [text for key, text in some.items() if has(settings, key)]
 
 
 def _label(method: str | None, overrides: Sequence[str]) -> str:

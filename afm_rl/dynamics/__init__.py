@@ -5,5 +5,14 @@ from afm_rl.dynamics.dubins import Dubins, dubins_step
 from afm_rl.dynamics.ensemble import Ensemble
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.oracle import Oracle
+from afm_rl.dynamics.quadrotor import Quadrotor
 
-__all__ = ["DynamicsModel", "Dubins", "Ensemble", "KnownDynamics", "Oracle", "dubins_step"]
+__all__ = [
+    "DynamicsModel",
+    "Dubins",
+    "Ensemble",
+    "KnownDynamics",
+    "Oracle",
+    "Quadrotor",
+    "dubins_step",
+]

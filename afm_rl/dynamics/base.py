@@ -79,6 +79,28 @@ class DynamicsModel(nn.Module, ABC):
         ]
         return torch.stack(columns, -1)
 
+    def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        r"""Return the next state and its derivatives by state and action.
+
+        .. math:: f(s + ds, a + da) \approx f(s, a) + A\,ds + B\,da
+
+        In raw coordinates, also where the manifold has angles or rotations. Forward
+        differentiation of all S + A columns in one batch; models with a closed form override it.
+
+        Returns:
+            f ``(*L, *N, S)``, A ``(*L, *N, S, S)`` and B ``(*L, *N, S, A)``.
+        """
+        sizes = (state.shape[-1], action.shape[-1])
+        axes = torch.eye(sum(sizes), device=state.device, dtype=state.dtype)
+        inputs, tangents = [], []
+        for given, axis in zip((state, action), axes.split(sizes, -1), strict=True):
+            wide = given.unsqueeze(-2).expand(*given.shape[:-1], *axis.shape)
+            inputs.append(wide.contiguous())
+            tangents.append(axis.to(wide).expand_as(wide).contiguous())
+        result = torch.func.jvp(self, tuple(inputs), tuple(tangents))
+        by_state, by_action = result[1].mT.split(sizes, -1)
+        return result[0][..., 0, :], by_state, by_action
+
     def expand_(self, missions: int) -> DynamicsModel:
         """Give each of ``missions`` parameters of its own, in place.
 

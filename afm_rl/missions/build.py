@@ -20,6 +20,8 @@ from afm_rl.missions.parts import Training
 from afm_rl.missions.robot import Robot
 from afm_rl.missions.selection import (
     build_missions,
+    fit_schedule,
+    name_regimes,
     select_regimes,
     select_seeds,
     select_tracks,
@@ -33,7 +35,7 @@ ROBOT_SHAPES = (
 )
 AFTER_TRAINING = (
     *("gate", "samples", "steps", "error_action", "wrap", "latch", "checkpoint"),
-    "propagation",
+    *("propagation", "precision"),
 )
 
 
@@ -48,12 +50,16 @@ class Agent:
     robot: Robot
     env: TransformedEnv
     missions: TensorDictBase
+    regime_names: list[str]
+    """The regime of each mission, in words."""
     model: DynamicsModel
     planner: TensorDictModuleBase
     updater: Updater
     transform: ActionFlowTransform | None
     executed_key: NestedKey
     trainings: Sequence[Training]
+    settings: Mapping[str, Any]
+    """The resolved configuration."""
 
     @property
     def base_env(self) -> EnvBase:
@@ -84,7 +90,7 @@ def build(cfg: DictConfig) -> Agent:
         env = robot.env(
             tracks=tracks,
             regime=robot.regime,
-            schedule=robot.schedule,
+            schedule=fit_schedule(robot.schedule, regimes),
             max_steps=budget,
             action_low=robot.action_low,
             action_high=robot.action_high,
@@ -132,12 +138,14 @@ def build(cfg: DictConfig) -> Agent:
         robot=robot,
         env=whole,
         missions=missions,
+        regime_names=name_regimes(tracks, regimes, seeds, robot),
         model=model,
         planner=planner,
         updater=updater,
         transform=transform,
         executed_key=executed_key,
         trainings=trainings,
+        settings=settings,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import pandas as pd
 import torch
@@ -31,6 +31,9 @@ class StepLog:
         self._values = torch.empty(FIRST_ROWS, len(self.columns))
         self._keys = torch.empty(FIRST_ROWS, 2, dtype=torch.int64)  # mission, step
 
+    def __len__(self) -> int:
+        return self._count
+
     def add(self, missions: Tensor, step: int, values: Tensor) -> None:
         """Add one step of the missions ``(B,)``: ``(B, C)``."""
         rows = slice(self._count, self._count + len(missions))
@@ -52,3 +55,16 @@ class StepLog:
         frame.insert(0, "t", steps[order].int().numpy())
         frame.insert(0, "mission", missions[order].int().numpy())
         return frame.astype({name: "int32" for name in self.whole})
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return all rows so far."""
+        return {"values": self._values[: self._count], "keys": self._keys[: self._count]}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Go on from what :meth:`state_dict` returned."""
+        self._count = len(state["keys"])
+        spare = max(self._count, FIRST_ROWS)
+        self._values, self._keys = (
+            torch.cat([rows, rows.new_empty(spare, rows.shape[-1])])
+            for rows in (state["values"], state["keys"])
+        )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -14,7 +16,9 @@ from torchrl.envs.utils import step_mdp
 from tqdm.auto import tqdm
 
 from afm_rl.missions.build import Agent
+from afm_rl.missions.checkpoint import Checkpoint, Stopped
 from afm_rl.missions.log import StepLog
+from afm_rl.missions.state import Loop
 
 SILENT = 5.0  # surprise, in standard deviations, up to which a model counts as aligned
 
@@ -30,57 +34,99 @@ class Results:
 
 
 @torch.no_grad()
-def run(agent: Agent, progress: bool = False) -> Results:
+def run(
+    agent: Agent,
+    progress: bool = False,
+    checkpoint: Path | None = None,
+    every: float = 60.0,
+    watch: Callable[[Loop], bool] | None = None,
+) -> Results:
     """Run every mission of an agent to its end; missions that finish leave the batch.
 
     Each step: plan, transform and act, look at the model's error, update the model. The
     order is the same for one mission and for hundreds, and so are the results: to the bit, but
     for networks, whose batched products may round the last bit another way.
 
+    With a ``checkpoint`` a run that was killed goes on where it was, and its results are the
+    same to the bit. The file stays: delete it once the results are safe.
+
     Args:
         agent: from :func:`~afm_rl.missions.build.build`, prepared. Its model learns in place.
         progress: show a progress bar.
+        checkpoint: a file that keeps the state; if it is there, the run goes on from it.
+        every: time between two writes of it (s); 0 writes after each step.
+        watch: is shown the state after each step; true stops the run.
+
+    Raises:
+        ArtefactError: if the checkpoint is damaged, or was made by other missions.
+        ConfigurationError: for a time that cannot be used, or a file that cannot be written.
+        Stopped: if ``watch`` said so; a checkpoint was written.
     """
     with torch.random.fork_rng(devices=[]):  # TorchRL's own planners draw from the global one
         torch.manual_seed(0)
-        return _run(agent, progress)
+        kept = None if checkpoint is None else Checkpoint(checkpoint, agent, every)
+        return _run(agent, progress, kept, watch)
 
 
-def _run(agent: Agent, progress: bool) -> Results:
-    env, planner, updater, model = agent.env, agent.planner, agent.updater, agent.model
-    total = len(agent.missions)
-    if updater.learns:
-        model.expand_(total)
-    td = env.reset(agent.missions, set_state=False)
-    updater.start(td)
-    ids = torch.arange(total)
-    ends = {name: torch.zeros(total) for name in ("steps", "reached", "seconds")}
-    log = StepLog(_columns(agent), whole=["misaligned", "regime_active", "reached"])
-    clock, step = time.perf_counter(), 0
+def _run(
+    agent: Agent,
+    progress: bool,
+    checkpoint: Checkpoint | None,
+    watch: Callable[[Loop], bool] | None,
+) -> Results:
+    loop = _start(agent)
+    if checkpoint is not None:
+        checkpoint.resume(loop)
+    total, clock = len(agent.missions), time.perf_counter()
     with tqdm(
         total=total, desc=agent.label, unit="mission", disable=None if progress else True
     ) as bar:
-        while len(ids):
-            td = env.step(planner(td))
-            error, surprise = _error(agent, td)
-            loss = updater(td)["loss"]
-            log.add(ids, step, _row(agent, td, error, surprise, loss))
+        while len(loop.ids):
+            bar.update(total - len(loop.ids) - bar.n)
+            if progress and loop.step % 50 == 0:
+                bar.set_postfix(step=loop.step, running=len(loop.ids))
+            ids = loop.ids
+            _advance(agent, loop)
             now = time.perf_counter()
-            ends["seconds"][ids] += (now - clock) / len(ids)
+            loop.ends["seconds"][ids] += (now - clock) / len(ids)
             clock = now
-            done = td["next", "done"].squeeze(-1)
-            ends["steps"][ids] = step
-            ends["reached"][ids] = td["next", "reached"].float()
-            td = step_mdp(td)
-            if bool(done.any()):
-                keep = (~done).nonzero().squeeze(-1)
-                bar.update(int(done.sum()))
-                ids, td = ids[keep], td[keep]
-                model.select_(keep)
-            step += 1
-            if progress and step % 50 == 0:
-                bar.set_postfix(step=step, running=len(ids))
-    return Results(_missions(agent, ends), log.table())
+            stop = watch is not None and watch(loop)
+            if checkpoint is not None:
+                checkpoint.write(loop) if stop else checkpoint.keep(loop)
+            if stop:
+                raise Stopped(f"stopped before step {loop.step}")
+        bar.update(total - bar.n)
+    return Results(_missions(agent, loop.ends), loop.log.table())
+
+
+def _start(agent: Agent) -> Loop:
+    """Return the state before the first step."""
+    total = len(agent.missions)
+    if agent.updater.learns:
+        agent.model.expand_(total)
+    td = agent.env.reset(agent.missions, set_state=False)
+    agent.updater.start(td)
+    ends = {name: torch.zeros(total) for name in ("steps", "reached", "seconds")}
+    log = StepLog(_columns(agent), whole=["misaligned", "regime_active", "reached"])
+    return Loop(td, torch.arange(total), ends, log)
+
+
+def _advance(agent: Agent, loop: Loop) -> None:
+    """Take one step with every mission that runs, in place."""
+    td, ids = agent.env.step(agent.planner(loop.td)), loop.ids
+    error, surprise = _error(agent, td)
+    miss = error if agent.transform is None else _miss(agent, td)
+    loss = agent.updater(td)["loss"]
+    loop.log.add(ids, loop.step, _row(agent, td, error, miss, surprise, loss))
+    done = td["next", "done"].squeeze(-1)
+    loop.ends["steps"][ids] = loop.step
+    loop.ends["reached"][ids] = td["next", "reached"].float()
+    loop.td = step_mdp(td)
+    if bool(done.any()):
+        keep = (~done).nonzero().squeeze(-1)
+        loop.ids, loop.td = ids[keep], loop.td[keep]
+        agent.model.select_(keep)
+    loop.step += 1
 
 
 def _error(agent: Agent, td: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -91,6 +137,12 @@ def _error(agent: Agent, td: TensorDictBase) -> tuple[Tensor, Tensor]:
     return error.norm(dim=-1), (error.abs() / noise).amax(-1)
 
 
+def _miss(agent: Agent, td: TensorDictBase) -> Tensor:
+    """Return how far the robot is from where the plan wanted it, ``(B,)``: judges the transform."""
+    intended, _ = agent.model.forecast(td["observation"], td["action"])
+    return agent.model.manifold.difference(td["next", "observation"], intended).norm(dim=-1)
+
+
 def _columns(agent: Agent) -> list[str]:
     actions = agent.robot.action_names
     return [
@@ -99,6 +151,7 @@ def _columns(agent: Agent) -> list[str]:
         *(f"planned_{name}" for name in actions),
         *(f"executed_{name}" for name in actions),
         "error",
+        "miss",
         "misaligned",
         "loss",
         "regime_active",
@@ -106,11 +159,11 @@ def _columns(agent: Agent) -> list[str]:
     ]
 
 
-def _row(agent: Agent, td: TensorDictBase, error, surprise, loss) -> Tensor:
+def _row(agent: Agent, td: TensorDictBase, error, miss, surprise, loss) -> Tensor:
     """Return one step's values ``(B, C)``, in the order of :func:`_columns`."""
     transform = agent.transform
     flag = surprise > SILENT if transform is None else td["next", transform.key("misaligned")]
-    scalars = [error, flag, loss, td["regime_active"], td["reached"]]
+    scalars = [error, miss, flag, loss, td["regime_active"], td["reached"]]
     parts = [td["observation"], td["goal"], td["action"], td.get(agent.executed_key)]
     return torch.cat([*parts, torch.stack([value.float() for value in scalars], -1)], -1)
 
@@ -135,6 +188,7 @@ def _missions(agent: Agent, ends: dict[str, Tensor]) -> pd.DataFrame:
         targets=targets,
         finished=reached == targets,
         seconds=ends["seconds"],
+        regime=agent.regime_names,
     )
     return pd.DataFrame({name: _plain(value) for name, value in frame.items()})
 

@@ -11,57 +11,68 @@ from afm_rl.report.table import Table, number
 STAY = 20  # steps that the error must stay low
 QUANTILE, FACTOR = 0.95, 1.5  # of the errors before the first change: the nominal level
 FLOOR = 1e-4  # m, rad: below this every robot counts as well predicted
+MEASURES = {"miss": "motion", "error": "model"}  # columns of the steps, and what they judge
 NOTE = (
-    f"Steps from a change of the regime until the one-step prediction error has come under the "
+    f"Steps from a change of the regime until the one-step error has come under the "
     f"nominal level and stays there for {STAY} steps. The nominal level of a mission is {FACTOR} "
     f"times the {100 * QUANTILE:.0f}th percentile of its errors before the first change, at least "
     f"{FLOOR:g}. The median is over all changes, those never recovered from included as ∞; "
     f"changes with fewer than {STAY} steps to the next one or to the end cannot tell and are left "
-    "out. This measures the model: a method that corrects actions over a frozen model may drive "
-    "well and never recover."
+    "out. Two errors are judged: that of the motion, against what the plan intended, and that of "
+    "the model, against what it predicts of the action that was executed. A method that corrects "
+    "actions over a frozen model recovers its motion, and its model never."
 )
 
 
 def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per change of the regime: ``change`` (from 1) and ``time`` (steps).
+    """Return one row per change and measure: ``of``, ``change`` (from 1) and ``time`` (steps).
 
     ``time`` is 0 where the error never left the nominal level, inf where it stays above it
     until the next change or the end. Changes that are too near to those are left out, and so
     is a mission that changes at once: it shows no nominal level.
 
     Args:
-        steps: one mission's steps, in order.
+        steps: one mission's steps, in order; without a column ``miss`` only models are judged.
 
     >>> active, error = [0] * 30 + [1] * 50, [1e-3] * 30 + [1] * 7 + [1e-3] * 43
     >>> steps = pd.DataFrame({"regime_active": active, "error": error})
     >>> recovery_times(steps).to_dict("records")
-    [{'change': 1, 'time': 7.0}]
+    [{'of': 'model', 'change': 1, 'time': 7.0}]
     """
-    active, error = steps["regime_active"].to_numpy(), steps["error"].to_numpy(dtype=float)
+    active = steps["regime_active"].to_numpy()
     changes = np.flatnonzero(np.diff(active)) + 1
     rows = []
-    if len(changes):
-        level = max(FLOOR, FACTOR * float(np.quantile(error[: changes[0]], QUANTILE)))
-        for count, (start, end) in enumerate(zip(changes, [*changes[1:], len(error)], strict=True)):
-            if end - start >= STAY:
-                low = sliding_window_view(error[start:end] <= level, STAY).all(-1)
-                time = float(low.argmax()) if low.any() else np.inf
-                rows.append({"change": count + 1, "time": time})
-    return pd.DataFrame(rows, columns=["change", "time"])
+    for column, of in MEASURES.items():
+        if len(changes) and column in steps and steps[column].notna().all():
+            times = _times(steps[column].to_numpy(dtype=float), changes)
+            rows += [{"of": of, "change": change, "time": time} for change, time in times]
+    return pd.DataFrame(rows, columns=["of", "change", "time"])
+
+
+def _times(error: np.ndarray, changes: np.ndarray) -> list[tuple[int, float]]:
+    """Return changes, from 1, and their recovery times; ``changes`` are places in ``error``."""
+    level = max(FLOOR, FACTOR * float(np.quantile(error[: changes[0]], QUANTILE)))
+    times = []
+    for count, (start, end) in enumerate(zip(changes, [*changes[1:], len(error)], strict=True)):
+        if end - start >= STAY:
+            low = sliding_window_view(error[start:end] <= level, STAY).all(-1)
+            times.append((count + 1, float(low.argmax()) if low.any() else np.inf))
+    return times
 
 
 def recovery_table(times: pd.DataFrame) -> Table:
-    """Return medians per method and change.
+    """Return medians per method, measure and change.
 
     Args:
         times: rows of :func:`recovery_times` with a column ``method``; at least one.
     """
     rows = []
-    for (method, change), group in times.groupby(["method", "change"], sort=False):
+    for (method, of, change), group in times.groupby(["method", "of", "change"], sort=False):
         quartiles = group["time"].quantile([0.25, 0.5, 0.75], interpolation="lower")
         rows.append(
             {
                 "method": method,
+                "of": of,
                 "change": change,
                 "changes": len(group),
                 "never": float(np.isinf(group["time"]).mean()),
@@ -74,6 +85,7 @@ def recovery_table(times: pd.DataFrame) -> Table:
     shown = pd.DataFrame(
         {
             "method": numbers["method"],
+            "of the": numbers["of"],
             "change": numbers["change"].astype(str),
             "changes seen": numbers["changes"].astype(str),
             "never recovered %": [number(100 * share) for share in numbers["never"]],

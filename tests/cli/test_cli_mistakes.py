@@ -53,7 +53,7 @@ physics         +cost.weights=[1,-1]                     cost.weights=-1
 physics         robot.schedule.at=[0.8,0.15]             schedule.at=[0.8,
 physics         robot.schedule.by=foo                    schedule.by='foo' progress step
 physics         robot.action_low=[1.0,9.0]               robot.action_low=[1.0, low
-physics         robot.action_high=[inf,inf]              robot.action_high=inf
+physics         robot.action_high=[inf,inf]              half_range=[inf, action_high
 physics         robot.env.reach=nan                      reach=nan
 physics         robot.paper_regimes=[],regimes=paper     regimes=[]
 physics         transform=afm                            transform=afm flow=context

@@ -35,8 +35,8 @@ def test_the_columns(drive, ring, tables):
         "steps": ["mission", "t", *states, "goal_x", "goal_y"]
         + [f"{kind}_{name}" for kind in ("planned", "executed") for name in actions]
         + ["error", "misaligned", "loss", "regime_active", "reached"],
-        "missions": ["mission", "method", "track", "v_gain", "omega_gain", "seed"]
-        + ["success_rate", "steps", "reached", "targets", "finished", "seconds"],
+        "missions": ["mission", "method", "track", *run.agent.robot.regime.names, "seed"]
+        + ["success_rate", "steps", "reached", "targets", "finished", "seconds", "regime"],
     }
     assert list(getattr(run, tables)) == columns[tables]
 
@@ -53,6 +53,21 @@ def test_missions_stand_in_order_tracks_then_regimes_then_seeds(drive, ring):
     assert missions["seed"].tolist() == [4, 2] * 6
     assert missions["method"].eq("unnamed").all()
     assert run.steps["mission"].tolist() == [mission for mission in range(12) for _ in range(2)]
+
+
+def test_the_regime_of_a_mission_in_words(drive, ring):
+    regimes = ["mixed", BACKWARDS, [{"v_gain": 2.0}, {}, {"delay": 1}]]
+    run = drive(tracks=["ethz_1", ring], regimes=regimes, seeds=2, budget=2)
+    words = ["mixed", "v_gain = -1", "v_gain = 2; nominal; delay = 1"]
+    assert run.missions["regime"].tolist() == [name for name in words for _ in range(2)] * 2
+    assert run.agent.regime_names == run.missions["regime"].tolist()
+
+
+def test_the_oracle_is_told_what_acts_during_a_ramp(drive, ring):
+    regime = {"phases": [{}, {"v_gain": 0.5, "rotation": 0.3}], "at": [0.0], "ramp": 30}
+    steps = drive("method=oracle", tracks=ring, regimes=[regime], budget=60).steps
+    assert steps["regime_active"].sum() > 40
+    assert steps["error"].max() < 1e-4  # process noise is 1e-5
 
 
 def test_a_finished_mission(drive, ring):

@@ -1,0 +1,135 @@
+"""A quadrotor's parameters, its mixer, and what its motors can do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from afm_rl.errors import ConfigurationError, check_number
+
+
+@dataclass(frozen=True)
+class QuadrotorBody:
+    r"""A quadrotor in plus configuration; by default a Crazyflie 2.
+
+    Actions are a wrench :math:`u = (T, M_x, M_y, M_z)` in N and N m, in the body frame. Motors 1
+    to 4 stand on the axes +x, +y, -x, -y at the distance ``arm`` and push with
+    :math:`F_i = k_t \Omega_i^2`; the drag :math:`k_d \Omega_i^2` of neighbours turns opposite ways.
+
+    Args:
+        mass: mass (kg).
+        inertia: moments of inertia about x, y and z (kg m^2).
+        arm: distance of the motors from the centre (m).
+        k_t: thrust coefficient (N s^2/rad^2).
+        k_d: drag coefficient (N m s^2/rad^2).
+        rotor_speed: highest speed of a rotor (rad/s).
+        gravity: acceleration of free fall (m/s^2).
+
+    Raises:
+        ConfigurationError: for a value that cannot be used.
+
+    >>> round(QuadrotorBody().max_thrust, 3)
+    0.575
+    """
+
+    mass: float = 0.03
+    inertia: tuple[float, float, float] = (1.43e-5, 1.43e-5, 2.89e-5)
+    arm: float = 0.046
+    k_t: float = 2.3e-8
+    k_d: float = 7.8e-11
+    rotor_speed: float = 2500.0
+    gravity: float = 9.81
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name == "inertia":
+                self._check_inertia()
+            else:
+                above = field.name != "gravity"
+                check_number(f"body.{field.name}", value, low=0.0, open_low=above)
+
+    def _check_inertia(self) -> None:
+        given = list(self.inertia) if isinstance(self.inertia, (tuple, list)) else []
+        if len(given) != 3:
+            raise ConfigurationError(
+                f"body.inertia={self.inertia!r}: expected three moments of inertia (kg m^2)"
+            )
+        for value in given:
+            check_number("body.inertia", value, low=0.0, open_low=True)
+        # A tuple, whatever sequence was given: bodies are keys of caches.
+        object.__setattr__(self, "inertia", tuple(float(value) for value in given))
+
+    @property
+    def max_force(self) -> float:
+        """Largest thrust of one motor (N)."""
+        return self.k_t * self.rotor_speed**2
+
+    @property
+    def max_thrust(self) -> float:
+        """Largest thrust of all motors (N)."""
+        return 4 * self.max_force
+
+    @property
+    def hover_thrust(self) -> float:
+        """Thrust that carries the weight (N)."""
+        return self.mass * self.gravity
+
+    @property
+    def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Lowest and highest value of each action component; not all of them go together."""
+        roll, yaw = self.arm * self.max_force, 2 * self.k_d / self.k_t * self.max_force
+        return (0.0, -roll, -roll, -yaw), (self.max_thrust, roll, roll, yaw)
+
+
+def mix(forces: Tensor, body: QuadrotorBody) -> Tensor:
+    r"""Return the wrench ``(*B, 4)`` of motor forces ``(*B, 4)`` in N.
+
+    .. math:: T = \sum_i F_i,\quad M_x = L (F_2 - F_4),\quad M_y = L (F_3 - F_1),\quad
+              M_z = \tfrac{k_d}{k_t} (F_1 - F_2 + F_3 - F_4)
+
+    >>> mix(torch.tensor([0.1, 0.2, 0.1, 0.0]), QuadrotorBody()).round(decimals=4)
+    tensor([0.4000, 0.0092, 0.0000, 0.0000])
+    """
+    return _through(_mixers(body, forces.dtype, forces.device)[0], forces)
+
+
+def unmix(action: Tensor, body: QuadrotorBody) -> Tensor:
+    """Return the motor forces ``(*B, 4)`` in N that make up wrenches ``(*B, 4)``.
+
+    >>> unmix(torch.tensor([0.4, 0.0, 0.0, 0.0]), QuadrotorBody())
+    tensor([0.1000, 0.1000, 0.1000, 0.1000])
+    """
+    return _through(_mixers(body, action.dtype, action.device)[1], action)
+
+
+def saturate(action: Tensor, body: QuadrotorBody) -> Tensor:
+    r"""Return the wrench ``(*B, 4)`` that the motors give when they are asked for ``action``.
+
+    .. math:: \mathrm{mix}(\mathrm{clamp}(\mathrm{mix}^{-1} u, 0, F_\mathrm{max}))
+
+    A wrench within their means is kept to the bit.
+
+    >>> saturate(torch.tensor([0.8, 0.0, 0.0, 0.0]), QuadrotorBody())[0]
+    tensor(0.5750)
+    """
+    forces = unmix(action, body)
+    return action + mix(forces.clamp(0.0, body.max_force) - forces, body)
+
+
+def _through(matrix: Tensor, vector: Tensor) -> Tensor:
+    # No matmul: a row's result must not depend on the size of the batch.
+    return (matrix * vector.unsqueeze(-2)).sum(-1)
+
+
+@lru_cache(maxsize=64)
+def _mixers(body: QuadrotorBody, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the mixer and its inverse, ``(4, 4)`` each."""
+    arm, drag = body.arm, body.k_d / body.k_t
+    rows = [[1.0] * 4, [0.0, arm, 0.0, -arm], [-arm, 0.0, arm, 0.0], [drag, -drag, drag, -drag]]
+    with torch.inference_mode(False):  # what is cached must also serve training
+        mixer = torch.tensor(rows, dtype=torch.float64, device="cpu")
+        return mixer.to(device, dtype), mixer.inverse().to(device, dtype)

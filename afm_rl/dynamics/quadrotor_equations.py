@@ -1,0 +1,223 @@
+"""A quadrotor's equations of motion, their derivatives, and their integration."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from afm_rl.airframe import QuadrotorBody
+from afm_rl.rotations import body_z_axis, quaternion_normalise
+
+
+class _Tables(NamedTuple):
+    """The products of two attitude and rate components that make up a rate of change."""
+
+    first: Tensor  # (30,) index of one factor
+    second: Tensor  # (30,) index of the other
+    factor: Tensor  # (3, 10) up to three products for each of b_3, q' and the gyroscopic w'
+    slope: Tensor  # (7, 70) derivative of these sums by (q, w), linear in (q, w)
+    inverse: Tensor  # (3,) one over the moments of inertia
+    weight: Tensor  # (3,) acceleration of gravity
+
+
+class _Held(NamedTuple):
+    """What stays constant while an action is held: rates are ``gain * products + offset``."""
+
+    gain: Tensor  # (*B, 10)
+    offset: Tensor  # (*B, 10)
+    tables: _Tables
+
+
+def _hold(action: Tensor, body: QuadrotorBody, wind: Tensor | None = None) -> _Held:
+    """Prepare the equations for a constant action ``(*B, 4)``; see :func:`quadrotor_rate`."""
+    tables = _tables(body, action.dtype, action.device)
+    lift = action[..., :1] / body.mass
+    zero = torch.zeros_like(lift)
+    push = torch.cat([zero, zero, lift], -1) + tables.weight
+    push = push if wind is None else push + wind
+    still = zero.expand(*zero.shape[:-1], 4)
+    one = torch.ones_like(lift).expand(*zero.shape[:-1], 7)
+    gain = torch.cat([lift.expand(*lift.shape[:-1], 3), one], -1)
+    return _Held(gain, torch.cat([push, still, action[..., 1:] * tables.inverse], -1), tables)
+
+
+def _rate(state: Tensor, held: _Held) -> Tensor:
+    """Return the rate of change ``(*B, 13)`` while an action is held."""
+    sums = _sums(state, held.tables)
+    return torch.cat([state[..., 3:6], torch.addcmul(held.offset, held.gain, sums)], -1)
+
+
+def _sums(state: Tensor, tables: _Tables) -> Tensor:
+    turning = state[..., 6:]
+    pairs = turning.index_select(-1, tables.first) * turning.index_select(-1, tables.second)
+    return (pairs.unflatten(-1, (3, 10)) * tables.factor).sum(-2)
+
+
+def quadrotor_rate(
+    state: Tensor, action: Tensor, body: QuadrotorBody, wind: Tensor | None = None
+) -> Tensor:
+    r"""Return the rate of change of states, ``(*B, 13)``.
+
+    .. math:: r' = v,\quad v' = g + w + \tfrac{T}{m} b_3(q),\quad
+              q' = \tfrac12 q \otimes (\omega, 0),\quad
+              \omega' = J^{-1} (M - \omega \times J \omega)
+
+    Args:
+        state: position r (m), velocity v (m/s), quaternion q (scalar-last), body rate
+            :math:`\omega` (rad/s), ``(*B, 13)``.
+        action: thrust T (N) and moments M (N m), ``(*B, 4)``.
+        body: the quadrotor.
+        wind: a further acceleration w (m/s^2), ``(*B, 3)``.
+
+    >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
+    >>> body = QuadrotorBody()
+    >>> quadrotor_rate(level, torch.tensor([2 * body.hover_thrust, 0, 0, 0]), body)[3:6]
+    tensor([0.0000, 0.0000, 9.8100])
+    """
+    state, action = _aligned(state, action)
+    return _rate(state, _hold(action, body, wind))
+
+
+def quadrotor_step(
+    state: Tensor, action: Tensor, dt: float, substeps: int, body: QuadrotorBody
+) -> Tensor:
+    """Return the last state ``(*B, 13)`` of :func:`quadrotor_path`."""
+    return quadrotor_path(state, action, dt, substeps, body)[-1]
+
+
+def quadrotor_path(
+    state: Tensor,
+    action: Tensor,
+    dt: float,
+    substeps: int,
+    body: QuadrotorBody,
+    wind: Tensor | None = None,
+) -> Tensor:
+    """Fly for ``dt`` seconds by fourth-order Runge-Kutta steps, the action held.
+
+    The quaternion is scaled back to length 1 at the end; before that it is off by the error of the
+    integration.
+
+    Args:
+        state: where to start, ``(*B, 13)``.
+        action: thrust (N) and moments (N m), ``(*B, 4)``.
+        dt: time (s).
+        substeps: number of Runge-Kutta steps, N.
+        body: the quadrotor.
+        wind: a further acceleration (m/s^2), ``(*B, 3)``.
+
+    Returns:
+        The state after every step, ``(N, *B, 13)``.
+
+    >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
+    >>> fallen = quadrotor_path(level, torch.zeros(4), 1.0, 2, QuadrotorBody())
+    >>> fallen[:, 2]
+    tensor([-1.2263, -4.9050])
+    """
+    state, action = _aligned(state, action)
+    held, step, path = _hold(action, body, wind), dt / substeps, []
+    for _ in range(substeps):
+        first = _rate(state, held)
+        second = _rate(torch.add(state, first, alpha=step / 2), held)
+        third = _rate(torch.add(state, second, alpha=step / 2), held)
+        fourth = _rate(torch.add(state, third, alpha=step), held)
+        slope = torch.add(first + fourth, second + third, alpha=2.0)
+        state = torch.add(state, slope, alpha=step / 6)
+        path.append(state)
+    path[-1] = unit(state)
+    return torch.stack(path)
+
+
+def unit(state: Tensor) -> Tensor:
+    """Scale the quaternions in states ``(*B, 13)`` to length 1."""
+    turned = quaternion_normalise(state[..., 6:10])
+    return torch.cat([state[..., :6], turned, state[..., 10:]], -1)
+
+
+def linearised_path(
+    state: Tensor, action: Tensor, dt: float, substeps: int, body: QuadrotorBody
+) -> tuple[Tensor, Tensor]:
+    r"""Return where a flight leads to, and how that depends on its start and action.
+
+    The chain rule through the stages of the Runge-Kutta steps:
+    :math:`dk_i = \tfrac{\partial f}{\partial s}(s_i)\,ds_i + \tfrac{\partial f}{\partial u}(s_i)`,
+    with :math:`ds_i` the derivative of stage i by start and action.
+
+    Args:
+        state: where to start, ``(*B, 13)``.
+        action: thrust (N) and moments (N m), ``(*B, 4)``.
+        dt: time (s).
+        substeps: number of Runge-Kutta steps.
+        body: the quadrotor.
+
+    Returns:
+        The state ``(*B, 13)``, and its derivative ``(*B, 13, 17)`` by start and action.
+    """
+    state, action = _aligned(state, action)
+    held, step = _hold(action, body), dt / substeps
+    eye = torch.eye(13, 17, dtype=state.dtype, device=state.device)
+    through = eye.expand(*state.shape[:-1], 13, 17)
+    for _ in range(substeps):
+        total, slope = torch.zeros_like(state), torch.zeros_like(through)
+        here, there = state, through
+        for weight, reach in ((1, 0.5), (2, 0.5), (2, 1.0), (1, 0.0)):
+            change, turn = _rate(here, held), _slope(here, there, held, body)
+            total, slope = total + weight * change, slope + weight * turn
+            here, there = state + reach * step * change, through + reach * step * turn
+        state, through = state + step / 6 * total, through + step / 6 * slope
+    size = state[..., 6:10].square().sum(-1, keepdim=True).sqrt().unsqueeze(-1)
+    state = unit(state)
+    turned, rows = state[..., 6:10].unsqueeze(-1), through[..., 6:10, :]
+    rows = (rows - turned * (turned * rows).sum(-2, keepdim=True)) / size
+    return state, torch.cat([through[..., :6, :], rows, through[..., 10:, :]], -2)
+
+
+def _slope(state: Tensor, through: Tensor, held: _Held, body: QuadrotorBody) -> Tensor:
+    """Return the derivative of the rate of change by start and action, ``(*B, 13, 17)``."""
+    turning, tables = state[..., 6:], held.tables
+    slope = (turning @ tables.slope).unflatten(-1, (10, 7)) * held.gain.unsqueeze(-1)
+    rest = slope @ through[..., 6:, :]
+    rest[..., :3, 13] += body_z_axis(state[..., 6:10]) / body.mass
+    rest[..., 7:, 14:] += tables.inverse.diag()
+    return torch.cat([through[..., 3:6, :], rest], -2)
+
+
+def _aligned(state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    """Give both the same batch shape and type."""
+    batch = torch.broadcast_shapes(state.shape[:-1], action.shape[:-1])
+    dtype = torch.promote_types(state.dtype, action.dtype)
+    return state.expand(*batch, 13).to(dtype), action.expand(*batch, 4).to(dtype)
+
+
+@lru_cache(maxsize=64)
+def _tables(body: QuadrotorBody, dtype: torch.dtype, device: torch.device) -> _Tables:
+    x, y, z, w, p, q, r = range(7)  # quaternion (x, y, z, w), body rate (p, q, r)
+    along_x, along_y, along_z = body.inertia
+    sums: list[list[tuple[int, int, float]]] = [
+        [(x, z, 2.0), (y, w, 2.0)],  # b_3
+        [(y, z, 2.0), (x, w, -2.0)],
+        [(x, x, -2.0), (y, y, -2.0)],  # less the 1, which the offset holds
+        [(w, p, 0.5), (z, q, -0.5), (y, r, 0.5)],  # q'
+        [(z, p, 0.5), (w, q, 0.5), (x, r, -0.5)],
+        [(y, p, -0.5), (x, q, 0.5), (w, r, 0.5)],
+        [(x, p, -0.5), (y, q, -0.5), (z, r, -0.5)],
+        [(q, r, (along_y - along_z) / along_x)],  # w', less what the moments add
+        [(r, p, (along_z - along_x) / along_y)],
+        [(p, q, (along_x - along_y) / along_z)],
+    ]
+    with torch.inference_mode(False):  # what is cached must also serve training
+        first, second = torch.zeros(2, 3, 10, dtype=torch.int64)
+        factor, slope = (torch.zeros(size, dtype=torch.float64) for size in ((3, 10), (7, 10, 7)))
+        for row, products in enumerate(sums):
+            for place, (i, j, value) in enumerate(products):
+                first[place, row], second[place, row], factor[place, row] = i, j, value
+                slope[j, row, i] += value
+                slope[i, row, j] += value
+        inertia = torch.tensor(body.inertia, dtype=torch.float64)
+        weight = torch.tensor([0.0, 0.0, -body.gravity], dtype=torch.float64)
+        floats = (factor, slope.flatten(1), 1 / inertia, weight)
+        indices = (first.flatten().to(device), second.flatten().to(device))
+        return _Tables(*indices, *(table.to(device, dtype) for table in floats))

@@ -1,0 +1,285 @@
+"""Model predictive control by Gauss-Newton steps on a linearised model."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import cast
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.modules.planners.common import MPCPlannerBase
+
+from afm_rl.errors import ConfigurationError, check_choice, check_count
+from afm_rl.keys import as_key
+from afm_rl.manifold import Manifold, wrap_angle
+from afm_rl.planning.conic import load_casadi, solve_conic
+from afm_rl.planning.planning_env import PlanningEnv
+from afm_rl.planning.primer import ZeroPrimer
+from afm_rl.planning.riccati import LQProblem, LQSolution, solve_lq
+from afm_rl.planning.tracking import QuadraticCost
+
+SOLVERS: dict[str, Callable[[LQProblem], LQSolution]] = {"riccati": solve_lq, "hpipm": solve_conic}
+
+
+def linear_quadratic(
+    world: PlanningEnv,
+    states: Tensor,
+    actions: Tensor,
+    task: Sequence[Tensor],
+    low: Tensor,
+    high: Tensor,
+) -> LQProblem:
+    r"""Return the problem of the best small change of a trajectory (multiple shooting).
+
+    Around states x and actions u the dynamics are
+    :math:`dx_{k+1} = A_k dx_k + B_k du_k + f(x_k, u_k) - x_{k+1}`, as the trajectory need not
+    follow them; the cost is expanded to second order. :math:`dx_0 = 0`.
+
+    Args:
+        world: dynamics and quadratic cost.
+        states: x, ``(*B, N + 1, S)``.
+        actions: u, ``(*B, N, A)``.
+        task: the cost's task entries, see :meth:`QuadraticCost.quadratic`.
+        low: lowest action, ``(A,)``.
+        high: highest action, ``(A,)``.
+    """
+    ahead, by_state, by_action = world.dynamics.linearise(states[..., :-1, :], actions)
+    gap = _raw_difference(world.dynamics.manifold, ahead, states[..., 1:, :])
+    cost = cast(QuadraticCost, world.cost)
+    in_states, state_slope, in_actions, action_slope = cost.quadratic(states, actions, *task)
+    return LQProblem(
+        *(by_state, by_action, gap, in_states, state_slope, in_actions, action_slope),
+        start=torch.zeros_like(states[..., 0, :]),
+        low=low - actions,
+        high=high - actions,
+    )
+
+
+def _raw_difference(manifold: Manifold, state: Tensor, origin: Tensor) -> Tensor:
+    """Subtract coordinates ``(*B, S)``, angles by the shorter way, rotations as numbers."""
+    gap = state - origin
+    return torch.where(manifold.is_angle, wrap_angle(gap), gap)
+
+
+class MPC(MPCPlannerBase):
+    r"""Nonlinear model predictive control, one linear-quadratic problem per tick.
+
+    Minimises the cost of the N + 1 states and N actions from the measured state on, subject
+    to the dynamics and to bounds on the actions: the real-time iteration (Diehl et al. 2005).
+    Each tick shifts the previous solution by one stage, puts the measured state in front,
+    linearises the dynamics along it (:meth:`DynamicsModel.linearise`), solves
+    :func:`linear_quadratic` with the bounds, takes the full step and applies the first
+    action. Further ``iterations`` repeat this and converge to a stationary point of the
+    nonlinear problem, usually linearly, as curvature of the dynamics is left out.
+
+    States and actions of the solution live in the tensordict, so every flight of a batch has
+    its own and resets start afresh: append :meth:`make_tensordict_primer` to the
+    environment. A flight whose memory is zero is new: it starts from the measured state held
+    and the middle of the action box, with ``first_iterations``.
+
+    Args:
+        env: a :class:`PlanningEnv` whose cost is a :class:`QuadraticCost`.
+        horizon: stages, N.
+        iterations: linearisations per tick.
+        first_iterations: linearisations at the first tick of a flight.
+        bounded: indices of the action components whose box the plan respects; None for
+            all. Others are only projected when the action is applied.
+        qp: ``"riccati"``, :func:`solve_lq`, or ``"hpipm"``, :func:`solve_conic`, a reference
+            that needs casadi.
+        memory_key: where ``states`` ``(*B, N + 1, S)`` and ``actions`` ``(*B, N, A)`` are kept.
+        action_key: where the action goes.
+
+    The cost's task entries may be ``(*B, size)``, held over the horizon, or ``(*B, N + 1,
+    size)``, one per stage. Solutions that are not finite are counted in :attr:`discarded`;
+    the previous plan, shifted, stands and a warning is given. :attr:`inexact` counts those
+    within the bounds that are not the minimum, see :func:`solve_lq`.
+
+    Raises:
+        ConfigurationError: for settings that cannot be used, or task entries of other shapes.
+
+    >>> from tensordict import TensorDict
+    >>> from afm_rl.dynamics import Dubins
+    >>> from afm_rl.planning import PlanningEnv, TrackingCost
+    >>> cost = TrackingCost([1.0, 1.0, 0.0], [0.01, 0.01], coordinates=[0, 1])
+    >>> planner = MPC(PlanningEnv(Dubins(), cost, [-1.0, -1.5], [1.0, 1.5]), horizon=5)
+    >>> td = TensorDict({"observation": torch.zeros(4, 3), "reference": torch.ones(4, 2)}, [4])
+    >>> memory = {"states": torch.zeros(4, 6, 3), "actions": torch.zeros(4, 5, 2)}
+    >>> planner(td.set("mpc", TensorDict(memory, [4])))["action"].shape
+    torch.Size([4, 2])
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self,
+        env: PlanningEnv,
+        horizon: int = 20,
+        iterations: int = 1,
+        first_iterations: int = 5,
+        bounded: Sequence[int] | None = None,
+        qp: str = "riccati",
+        memory_key: NestedKey = "mpc",
+        action_key: NestedKey = "action",
+    ) -> None:
+        if not isinstance(env, PlanningEnv) or not isinstance(env.cost, QuadraticCost):
+            cost = f" with {type(env.cost).__name__}" if isinstance(env, PlanningEnv) else ""
+            raise ConfigurationError(
+                f"planner: got {type(env).__name__}{cost}; MPC needs a PlanningEnv with a "
+                "quadratic cost, such as TrackingCost"
+            )
+        super().__init__(env, action_key=as_key(action_key))
+        self.horizon = check_count("planner.horizon", horizon)
+        self.iterations = check_count("planner.iterations", iterations)
+        self.first_iterations = check_count("planner.first_iterations", first_iterations)
+        self.qp = check_choice("planner.qp", qp, SOLVERS)
+        if qp == "hpipm":
+            load_casadi()
+        space, size = self.action_spec.space, env.dynamics.action_size
+        within = list(range(size)) if bounded is None else list(bounded)
+        if not all(isinstance(i, int) and 0 <= i < size for i in within):
+            raise ConfigurationError(
+                f"planner.bounded={within}: expected indices in 0..{size - 1}, or none"
+            )
+        free = torch.ones(size, dtype=torch.bool)
+        free[within] = False
+        self.register_buffer("low", space.low.masked_fill(free, -torch.inf), persistent=False)
+        self.register_buffer("high", space.high.masked_fill(free, torch.inf), persistent=False)
+        self.register_buffer("middle", (space.low + space.high) / 2, persistent=False)
+        self.action_key = as_key(action_key)
+        memory_key = as_key(memory_key)
+        root = memory_key if isinstance(memory_key, tuple) else (memory_key,)
+        self.memory_keys = [(*root, "states"), (*root, "actions")]
+        self.next_memory_keys = [("next", *key) for key in self.memory_keys]
+        self.in_keys = [env.observation_key, *env.cost.in_keys, *self.memory_keys]
+        self.out_keys = [self.action_key, *self.next_memory_keys]
+        self.discarded = self.inexact = 0
+        self._told = False
+        states, actions = (torch.zeros(shape) for shape in self._shapes)
+        task = [torch.zeros(1, size) for size in env.cost.in_sizes]
+        env.cost.quadratic(states, actions, *task)  # it says what does not fit
+
+    @property
+    def _shapes(self) -> list[tuple[int, int]]:
+        dynamics = self.env.dynamics
+        return [
+            (self.horizon + 1, dynamics.state_size),
+            (self.horizon, dynamics.action_size),
+        ]
+
+    def make_tensordict_primer(self) -> ZeroPrimer:
+        """Return the transform that puts an empty memory into every reset."""
+        dtype = self.action_spec.dtype
+        pairs = zip(self.memory_keys, self._shapes, strict=True)
+        return ZeroPrimer(Composite({key: Unbounded(shape, dtype=dtype) for key, shape in pairs}))
+
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        tensordict_out: TensorDictBase | None = None,
+        **kwargs,
+    ) -> TensorDictBase:
+        """Write the action and the next memory."""
+        solution = self._plan(tensordict)
+        out = tensordict if tensordict_out is None else tensordict_out
+        for key, value in zip(self.next_memory_keys, solution, strict=True):
+            out.set(key, value)
+        return out.set(self.action_key, self.action_spec.project(solution[1][..., 0, :]))
+
+    def planning(self, td: TensorDictBase) -> Tensor:
+        """Return the action ``(*B, A)`` without writing anything."""
+        return self._plan(td)[1][..., 0, :]
+
+    @torch.no_grad()
+    def _plan(self, td: TensorDictBase) -> list[Tensor]:
+        """Return states ``(*B, N + 1, S)`` and actions ``(*B, N, A)`` of the solution."""
+        measured, task = td.get(self.env.observation_key), self._task(td)
+        shifted = [torch.cat([old[..., 1:, :], old[..., -1:, :]], -2) for old in self._memory(td)]
+        states, actions = (old.to(measured) for old in shifted)
+        new = (states == 0).flatten(-2).all(-1) & (actions == 0).flatten(-2).all(-1)
+        alike = new[..., None, None]
+        here = measured.unsqueeze(-2)
+        # The last state may stay as it is: the solution does not depend on it.
+        guess = [
+            torch.cat([here, torch.where(alike, here, states[..., 1:, :])], -2),
+            torch.where(alike, self.middle.to(actions), actions),
+        ]
+        solved, rounds = torch.zeros_like(new), self.iterations
+        if bool(new.any()):
+            rounds = max(rounds, self.first_iterations)
+        for count in range(rounds):
+            better, exact = self._improve(guess, task)
+            sound = better[0].flatten(-2).isfinite().all(-1)
+            sound = sound & better[1].flatten(-2).isfinite().all(-1)
+            wanted = torch.where(new, count < self.first_iterations, count < self.iterations)
+            use = sound & wanted
+            guess = _choose(use, better, guess)
+            solved = solved | use
+            self.inexact += int((use & ~exact).sum())
+        if not bool(solved.all()):
+            lost = int((~solved).sum())
+            self.discarded += lost
+            warnings.warn(
+                f"planner: no finite solution for {lost} of {solved.numel()} flights; the "
+                "previous plan stands",
+                stacklevel=4,
+            )
+        dtype = self.action_spec.dtype
+        return _choose(solved, [found.to(dtype) for found in guess], shifted)
+
+    def _improve(
+        self, guess: Sequence[Tensor], task: Sequence[Tensor]
+    ) -> tuple[list[Tensor], Tensor]:
+        """Return states and actions after one Gauss-Newton step, and whether it is exact."""
+        states, actions = guess
+        low, high = self.low.to(actions), self.high.to(actions)
+        found = SOLVERS[self.qp](linear_quadratic(self.env, states, actions, task, low, high))
+        actions = torch.minimum(torch.maximum(actions + found.controls, low), high)  # rounding
+        return [states + found.states, actions], found.exact
+
+    def _task(self, td: TensorDictBase) -> list[Tensor]:
+        """Return the cost's entries, each ``(*B, N + 1, size)`` or ``(*B, 1, size)``.
+
+        Raises:
+            ConfigurationError: for an entry of another shape.
+        """
+        cost, batch = self.env.cost, td.batch_size
+        task = []
+        for key, size in zip(cost.in_keys, cost.in_sizes, strict=True):
+            entry = td.get(key, None)
+            held, staged = (*batch, size), (*batch, self.horizon + 1, size)
+            if entry is None or entry.shape not in (held, staged):
+                given = "is missing" if entry is None else f"has shape {tuple(entry.shape)}"
+                raise ConfigurationError(
+                    f"planner: {key!r} {given}; expected {held}, held over the horizon, or "
+                    f"{staged}, one per stage"
+                )
+            task.append(entry.unsqueeze(-2) if entry.shape == held else entry)
+        return task
+
+    def _memory(self, td: TensorDictBase) -> list[Tensor]:
+        """Return the previous states and actions, zeros where there are none."""
+        memory = [td.get(key, None) for key in self.memory_keys]
+        if all(entry is not None for entry in memory):
+            return memory
+        if not self._told:
+            warnings.warn(
+                f"planner: no {self.memory_keys[0][:-1]} in the tensordict, so every plan starts "
+                "cold; append planner.make_tensordict_primer() to the environment",
+                stacklevel=5,
+            )
+            self._told = True
+        shapes = [(*td.batch_size, *shape) for shape in self._shapes]
+        dtype = self.action_spec.dtype
+        return [torch.zeros(shape, device=td.device, dtype=dtype) for shape in shapes]
+
+
+def _choose(where: Tensor, first: Sequence[Tensor], second: Sequence[Tensor]) -> list[Tensor]:
+    """Take each flight's tensors from ``first`` or ``second``; ``where`` is ``(*B)``."""
+    if bool(where.all()):
+        return list(first)
+    mask = where[..., None, None]
+    return [torch.where(mask, a, b) for a, b in zip(first, second, strict=True)]

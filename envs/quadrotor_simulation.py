@@ -1,0 +1,150 @@
+"""What happens in one control tick of the quadrotor: pure functions of the tensordict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from afm_rl.airframe import QuadrotorBody, saturate
+from afm_rl.dynamics.quadrotor_equations import quadrotor_path
+from afm_rl.envs.references import Reference, references_at
+from afm_rl.regimes import Regime, Schedule, blend_phases, wind_of
+from afm_rl.rotations import RigidBodySpace
+
+
+@dataclass(frozen=True)
+class QuadrotorSimulation:
+    r"""Quadrotors under regimes, without any state or random numbers of its own.
+
+    The plant takes ``substeps`` Runge-Kutta steps per tick, while the effective action
+
+    .. math:: u_\mathrm{eff} = g(\mathrm{saturate}(u); \rho_t)
+
+    is held. The regime acts on what the motors give. Arguments are those of
+    :class:`~afm_rl.envs.CrazyflieTrack`, with ``sensor_noise`` as a tensor ``(12,)`` and the
+    duration as a number of ``steps``.
+    """
+
+    references: Sequence[Reference]
+    regime: Regime
+    schedule: Schedule
+    body: QuadrotorBody
+    dt: float
+    substeps: int
+    steps: int
+    horizon: int
+    preview: bool
+    start: str
+    limit: float
+    sensor_noise: Tensor
+
+    def begin(self, mission: TensorDictBase, dtype: torch.dtype) -> dict[str, Tensor]:
+        """Return the state at the beginning of flights: at the reference, level, not turning."""
+        none = torch.zeros_like(mission["seed"])
+        wanted = self._wanted(mission, none.to(dtype).unsqueeze(-1)).squeeze(-2)
+        turning = torch.zeros(*none.shape, 7, dtype=dtype, device=none.device)
+        turning[..., 3] = 1.0
+        if self.start == "rest":
+            wanted = torch.cat([wanted[..., :3], torch.zeros_like(wanted[..., 3:])], -1)
+        state = {
+            "pose": torch.cat([wanted, turning], -1),
+            "step": none,
+            "since": none.clone(),
+            "lost": none.bool(),
+        }
+        if self.regime.history:
+            size = (*none.shape, self.regime.history, 4)
+            state["past"] = torch.zeros(size, dtype=dtype, device=none.device)
+        return state
+
+    def advance(
+        self, data: TensorDictBase, sensor: Tensor | None, actuator: Tensor | None
+    ) -> TensorDict:
+        """Return what one control tick leads to.
+
+        Args:
+            data: ``mission``, ``pose``, ``step``, ``since``, ``lost``, ``action`` and, for a
+                regime with a history, ``past``.
+            sensor: standard normal numbers for the observation, ``(*B, 12)``; None for none.
+            actuator: standard normal numbers for a noisy regime, ``(*B, 4)``.
+        """
+        mission, pose, step = data["mission"], data["pose"], data["step"]
+        past = data["past"] if self.regime.history else None
+        action = saturate(data["action"].to(pose.dtype), self.body)
+        parameters = self.regime_now(mission, step, data["since"])
+        effective = self.regime.apply(action, parameters, pose, past, actuator)
+        wind = wind_of(self.regime, parameters)
+        path = quadrotor_path(pose, effective, self.dt, self.substeps, self.body, wind)
+
+        # The published metric compares with the reference one plant step ahead of the state.
+        ahead = torch.arange(2, self.substeps + 2, device=pose.device) * (self.dt / self.substeps)
+        wanted = self._wanted(mission, step.unsqueeze(-1) * self.dt + ahead.to(pose))[..., :3]
+        miss = wanted - path[..., :3].movedim(0, -2)
+        flies = path.isfinite().all(-1).all(0) & (miss.norm(dim=-1) <= self.limit).all(-1)
+        lost = data["lost"] | ~flies
+        frozen = lost.unsqueeze(-1)
+        miss = torch.where(frozen.unsqueeze(-1), wanted - pose[..., None, :3], miss)
+
+        state = {
+            "pose": torch.where(frozen, pose, path[-1]),
+            "step": step + 1,
+            "since": torch.where(
+                self._phase(mission, step) == self._phase(mission, step + 1),
+                data["since"],
+                step + 1,
+            ),
+            "lost": lost,
+        }
+        if past is not None:
+            state["past"] = torch.cat([action.unsqueeze(-2), past[..., :-1, :]], -2)
+        out = self.describe(mission, state, sensor)
+        out["square_error"] = miss.square().mean(-2)
+        out["reward"] = -out["square_error"].sum(-1, keepdim=True)
+        out["terminated"] = frozen.clone()
+        out["truncated"] = (state["step"] >= self.steps).unsqueeze(-1)
+        out["done"] = out["terminated"] | out["truncated"]
+        return out
+
+    def describe(
+        self, mission: TensorDictBase, state: dict[str, Tensor], sensor: Tensor | None
+    ) -> TensorDict:
+        """Return the state and what is seen of it; no error is known yet."""
+        pose, step = state["pose"], state["step"]
+        parameters = self.regime_now(mission, step, state["since"])
+        seen = pose.clone()
+        if sensor is not None:
+            seen = RigidBodySpace().add(pose, sensor * self.sensor_noise.to(pose))
+        ticks = torch.arange(self.horizon + 1, device=pose.device) * self.preview
+        times = ((step.unsqueeze(-1) + ticks) * self.dt).to(pose.dtype)
+        entries = {
+            **state,
+            "mission": mission.clone(),
+            "observation": seen,
+            "reference": self._wanted(mission, times),
+            "square_error": torch.zeros_like(pose[..., :3]),
+            "regime": parameters,
+            "regime_active": ~self.regime.is_identity(parameters),
+        }
+        return TensorDict(entries, mission.batch_size, device=mission.device)
+
+    def regime_now(self, mission: TensorDictBase, step: Tensor, since: Tensor) -> Tensor:
+        """Return the parameters ``(*B, F)`` that act on the next action.
+
+        Args:
+            mission: parameters, breakpoints and ramp.
+            step: number of ticks flown, ``(*B)``.
+            since: tick at which the present phase began, ``(*B)``.
+        """
+        phase = self._phase(mission, step)
+        return blend_phases(mission["parameters"], phase, step - since, mission["ramp"])
+
+    def _phase(self, mission: TensorDictBase, step: Tensor) -> Tensor:
+        progress = step.to(mission["at"].dtype) / self.steps
+        return self.schedule.phase(progress, step, mission["at"])
+
+    def _wanted(self, mission: TensorDictBase, time: Tensor) -> Tensor:
+        return references_at(self.references, mission["track"], time)

@@ -1,0 +1,317 @@
+"""The quadrotor's equations against closed forms, and its derivatives."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+from afm_rl.airframe import QuadrotorBody, mix, saturate, unmix
+from afm_rl.dynamics import Dubins, DynamicsModel, Oracle, Quadrotor
+from afm_rl.dynamics import quadrotor_equations as equations
+from afm_rl.dynamics.quadrotor_equations import quadrotor_path, quadrotor_rate, quadrotor_step
+from afm_rl.errors import ConfigurationError
+from afm_rl.regimes import flight_regimes
+from afm_rl.rotations import body_z_axis, quaternion_normalise, rotate
+
+BODY = QuadrotorBody()
+INERTIA = torch.tensor(BODY.inertia, dtype=torch.float64)
+SCALE = torch.tensor([0.1, 2e-5, 2e-5, 5e-6], dtype=torch.float64)
+
+
+def level(*batch, dtype=torch.float64):
+    state = torch.zeros(*batch, 13, dtype=dtype)
+    state[..., 9] = 1.0
+    return state
+
+
+def flights(*batch, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    state = torch.randn(*batch, 13, generator=generator, dtype=torch.float64)
+    state[..., 6:10] = quaternion_normalise(state[..., 6:10])
+    action = torch.randn(*batch, 4, generator=generator, dtype=torch.float64) * SCALE
+    action[..., 0] += BODY.hover_thrust
+    return state, action
+
+
+def test_the_body_is_the_published_one():
+    assert BODY.max_force == pytest.approx(0.14375)
+    assert BODY.max_thrust == pytest.approx(0.575)
+    assert BODY.hover_thrust == pytest.approx(0.2943)
+    low, high = BODY.bounds
+    assert low == (0.0, *(-x for x in high[1:]))
+    assert high == pytest.approx((0.575, 6.6125e-3, 6.6125e-3, 9.75e-4))
+
+
+def test_any_sequence_of_moments_of_inertia_will_do():
+    assert hash(QuadrotorBody(inertia=list(BODY.inertia))) == hash(BODY)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"mass": 0.0}, r"body.mass=0.0: expected a finite number in \(0, inf\]"),
+        ({"mass": -1.0}, "body.mass=-1.0"),
+        ({"arm": float("nan")}, "body.arm=nan"),
+        ({"k_t": 0}, "body.k_t=0"),
+        ({"gravity": -9.81}, r"body.gravity=-9.81: expected a finite number in \[0, inf\]"),
+        ({"inertia": 1e-5}, "body.inertia=1e-05: expected three moments"),
+        ({"inertia": (1e-5, 1e-5)}, "expected three moments"),
+        ({"inertia": (1e-5, 1e-5, 0.0)}, "body.inertia=0.0"),
+    ],
+)
+def test_impossible_bodies_are_refused(settings, message):
+    with pytest.raises(ConfigurationError, match=message):
+        QuadrotorBody(**settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"dt": 0.0}, "dynamics.dt=0.0"),
+        ({"substeps": 0}, "dynamics.substeps=0"),
+        ({"body": "crazyflie"}, "body='crazyflie': expected a QuadrotorBody"),
+        ({"noise_std": [1.0] * 13}, "expected one number, or 12 numbers"),
+    ],
+)
+def test_impossible_models_are_refused(settings, message):
+    with pytest.raises(ConfigurationError, match=message):
+        Quadrotor(**settings)
+
+
+def test_the_mixer_is_the_published_one():
+    arm, drag = BODY.arm, BODY.k_d / BODY.k_t
+    columns = mix(torch.eye(4, dtype=torch.float64), BODY).T
+    expected = [[1, 1, 1, 1], [0, arm, 0, -arm], [-arm, 0, arm, 0], [drag, -drag, drag, -drag]]
+    torch.testing.assert_close(columns, torch.tensor(expected, dtype=torch.float64))
+    forces = torch.rand(5, 2, 4, dtype=torch.float64)
+    torch.testing.assert_close(unmix(mix(forces, BODY), BODY), forces)
+
+
+def test_motors_saturate_one_by_one():
+    forces = torch.tensor([0.2, 0.05, -0.01, 0.1], dtype=torch.float64)
+    given = unmix(saturate(mix(forces, BODY), BODY), BODY)
+    torch.testing.assert_close(given, forces.clamp(0.0, BODY.max_force), rtol=1e-12, atol=1e-15)
+
+
+def test_actions_within_the_means_of_the_motors_are_kept_to_the_bit():
+    forces = 0.01 + 0.12 * torch.rand(1000, 4)
+    action = mix(forces, BODY)
+    assert (saturate(action, BODY) == action).all()
+
+
+def test_free_fall():
+    after = quadrotor_step(level(), torch.zeros(4), 0.5, 3, BODY)
+    expected = level()
+    expected[2], expected[5] = -9.81 / 8, -9.81 / 2
+    torch.testing.assert_close(after, expected)
+
+
+def test_hover():
+    action = torch.tensor([BODY.hover_thrust, 0, 0, 0], dtype=torch.float64)
+    torch.testing.assert_close(quadrotor_step(level(), action, 2.0, 10, BODY), level())
+
+
+def test_the_wind_pushes():
+    wind = torch.tensor([0.5, 0.0, 1.0], dtype=torch.float64)
+    action = torch.tensor([BODY.hover_thrust, 0, 0, 0], dtype=torch.float64)
+    after = quadrotor_path(level(), action, 2.0, 10, BODY, wind)[-1]
+    torch.testing.assert_close(after[:3], 2 * wind)
+    torch.testing.assert_close(after[3:6], 2 * wind)
+
+
+def test_the_rate_is_that_of_a_rigid_body():
+    state, action = flights(50)
+    found = quadrotor_rate(state, action, BODY)
+    turn, spin = state[:, 6:10], state[:, 10:]
+    push = body_z_axis(turn) * action[:, :1] / BODY.mass
+    push[:, 2] -= BODY.gravity
+    torch.testing.assert_close(found[:, :3], state[:, 3:6])
+    torch.testing.assert_close(found[:, 3:6], push)
+    # in the body frame the quaternion changes by half the rate
+    flow = torch.func.jvp(lambda q: rotate(q, spin), (turn,), (found[:, 6:10],))[1]
+    torch.testing.assert_close(flow, torch.zeros_like(flow), rtol=0, atol=1e-12)
+    lever = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64).expand_as(spin)
+    flow = torch.func.jvp(lambda q: rotate(q, lever), (turn,), (found[:, 6:10],))[1]
+    torch.testing.assert_close(flow, rotate(turn, torch.linalg.cross(spin, lever)))
+    turning = INERTIA * found[:, 10:] + torch.linalg.cross(spin, INERTIA * spin)
+    torch.testing.assert_close(turning, action[:, 1:], rtol=1e-12, atol=1e-18)
+
+
+def test_angular_momentum_and_energy_are_conserved_without_moments():
+    body = QuadrotorBody(inertia=(1e-5, 2e-5, 3.5e-5))
+    inertia = torch.tensor(body.inertia, dtype=torch.float64)
+    state = level()
+    state[10:] = torch.tensor([3.0, 0.1, -2.0])
+    path = quadrotor_path(state, torch.zeros(4), 2.0, 1000, body)
+    spin = path[:, 10:]
+    momentum = rotate(path[:, 6:10], inertia * spin)
+    torch.testing.assert_close(momentum, momentum[:1].expand_as(momentum), rtol=1e-8, atol=1e-14)
+    energy = (inertia * spin.square()).sum(-1)
+    torch.testing.assert_close(energy, energy[:1].expand_as(energy), rtol=1e-8, atol=0)
+    assert (spin[-1] - spin[0]).norm() > 1.0  # it tumbled
+
+
+def test_the_error_falls_with_the_fourth_power_of_the_step():
+    state, action = flights(20)
+    exact = quadrotor_step(state, action, 0.4, 800, BODY)
+    errors = [
+        (quadrotor_step(state, action, 0.4, steps, BODY) - exact).norm().item()
+        for steps in (8, 16, 32)
+    ]
+    for coarse, fine in zip(errors, errors[1:], strict=False):
+        assert 13 < coarse / fine < 19
+
+
+def test_one_step_is_accurate_in_ordinary_flight():
+    state, action = flights(200)
+    state[:, 6:9] *= 0.2
+    state[:, 10:] *= 0.5
+    state = equations.unit(state)
+    error = Quadrotor()(state, action) - Quadrotor(substeps=100)(state, action)
+    assert error.abs().max() < 2e-6
+
+
+def test_predictions_have_unit_quaternions():
+    state, action = flights(30)
+    length = Quadrotor(dt=0.5)(state, action)[:, 6:10].norm(dim=-1)
+    torch.testing.assert_close(length, torch.ones_like(length), rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("batch", [(), (1,), (25,), (2, 3)])
+def test_a_flight_is_the_same_to_the_bit_in_any_batch(batch, dtype):
+    state, action = (x.to(dtype) for x in flights(400))
+    whole = quadrotor_path(state, action, 0.05, 25, BODY)
+    count = torch.Size(batch).numel()
+    part = quadrotor_path(
+        state[:count].reshape(*batch, 13), action[:count].reshape(*batch, 4), 0.05, 25, BODY
+    )
+    assert part.dtype is dtype
+    assert (part.reshape(25, count, 13) == whole[:, :count]).all()
+
+
+def test_states_and_actions_broadcast():
+    state, action = flights(3)
+    assert Quadrotor()(state[:, None], action).shape == (3, 3, 13)
+    assert Quadrotor()(state[0], action).shape == (3, 13)
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+@pytest.mark.parametrize("batch", [(), (6,), (2, 3)])
+def test_linearisation_matches_finite_differences(batch, substeps):
+    model, (state, action) = Quadrotor(substeps=substeps), flights(*batch)
+    state = state + 0.01  # no unit quaternion: raw coordinates are free
+    ahead, by_state, by_action = model.linearise(state, action)
+    assert by_state.shape == (*batch, 13, 13)
+    assert by_action.shape == (*batch, 13, 4)
+    torch.testing.assert_close(ahead, model(state, action))
+    for column in range(13):
+        step = torch.zeros(13, dtype=torch.float64).index_fill(0, torch.tensor(column), 1e-6)
+        slope = (model(state + step, action) - model(state - step, action)) / 2e-6
+        torch.testing.assert_close(by_state[..., column], slope, rtol=1e-6, atol=1e-7)
+    for column in range(4):
+        step = 1e-3 * SCALE * torch.eye(4, dtype=torch.float64)[column]
+        slope = (model(state, action + step) - model(state, action - step)) / (2 * step.sum())
+        torch.testing.assert_close(by_action[..., column], slope, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("batch", [(), (6,), (2, 3)])
+def test_closed_form_and_forward_differentiation_agree(batch):
+    model, (state, action) = Quadrotor(substeps=2), flights(*batch)
+    for closed, automatic in zip(
+        model.linearise(state, action),
+        DynamicsModel.linearise(model, state, action),
+        strict=True,
+    ):
+        torch.testing.assert_close(closed, automatic)
+
+
+def test_any_model_can_be_linearised(transitions, make_ensemble):
+    state, action = transitions(4, dtype=torch.float64)
+    for model in (Dubins(), make_ensemble().double()):
+        ahead, by_state, by_action = model.linearise(state, action)
+        torch.testing.assert_close(ahead, model(state, action))
+        slopes = torch.func.jacrev(model, argnums=(0, 1))
+        expected = [slopes(*pair) for pair in zip(state, action, strict=True)]
+        torch.testing.assert_close(by_state, torch.stack([one[0] for one in expected]))
+        torch.testing.assert_close(by_action, torch.stack([one[1] for one in expected]))
+
+
+def test_missions_are_linearised_with_parameters_of_their_own():
+    regimes, (state, action) = flight_regimes(), flights(2, 5)
+    oracle = Oracle(Quadrotor(), regimes)
+    rows = [regimes.encode({"mass": factor}) for factor in (0.5, 2.0)]
+    oracle.tell(torch.stack(rows).double())
+    by_action = oracle.linearise(state, action)[2]
+    for row, factor in enumerate((0.5, 2.0)):
+        effective = action[row] / torch.tensor([factor, 1, 1, 1])
+        nominal = Quadrotor().linearise(state[row], effective)[2]
+        torch.testing.assert_close(by_action[row, ..., 0], nominal[..., 0] / factor)
+
+
+def test_the_jacobian_lives_on_the_tangent_space():
+    model, (state, action) = Quadrotor(), flights(5)
+    found = model.jacobian(state, action)
+    assert found.shape == (5, 12, 4)
+    for column in range(4):
+        step = 1e-3 * SCALE * torch.eye(4, dtype=torch.float64)[column]
+        ends = [model.manifold.difference(model(state, action + s * step), state) for s in (1, -1)]
+        slope = (ends[0] - ends[1]) / (2 * step.sum())
+        torch.testing.assert_close(found[..., column], slope, rtol=1e-6, atol=1e-6)
+    assert model.jacobian(level(), torch.zeros(4, dtype=torch.float64)).isfinite().all()
+
+
+def test_noise_is_one_number_per_direction():
+    model, (state, action) = Quadrotor(noise_std=[0.1] * 12), flights(3)
+    torch.testing.assert_close(model.noise_scale(state, action), torch.full((3, 12), 0.1).double())
+    mean, spread = model.moments(state, action)
+    assert mean.shape == spread.shape == (3, 1, 12)
+
+
+def test_copies_fly_alike():
+    model, (state, action) = Quadrotor(dt=0.1, substeps=2), flights(3)
+    assert (copy.deepcopy(model)(state, action) == model(state, action)).all()
+
+
+@pytest.mark.parametrize("first", ["inference", "forward", "vmap"])
+def test_constants_serve_training_wherever_they_were_made(first):
+    equations._tables.cache_clear()
+    state, action = flights(2)
+    if first == "inference":
+        with torch.inference_mode():
+            Quadrotor().linearise(state.clone(), action.clone())
+    elif first == "forward":
+        DynamicsModel.linearise(Quadrotor(), state, action)
+    else:
+        torch.func.vmap(torch.func.jacrev(Quadrotor()))(state, action)
+    action.requires_grad_()
+    Quadrotor()(state, action).sum().backward()
+    by_action = Quadrotor().linearise(state, action.detach())[2]
+    torch.testing.assert_close(action.grad, by_action.sum(-2))
+
+
+def test_agrees_with_rotorpy():
+    """The same rigid body, integrated by another library: equal to 1e-9 after 50 ms."""
+    multirotor = pytest.importorskip("rotorpy.vehicles.multirotor")
+    arm, (x, y, z) = BODY.arm, BODY.inertia
+    places = [[arm, 0, 0], [0, arm, 0], [-arm, 0, 0], [0, -arm, 0]]
+    parameters = {
+        **{"mass": BODY.mass, "Ixx": x, "Iyy": y, "Izz": z, "Ixy": 0.0, "Ixz": 0.0, "Iyz": 0.0},
+        **{"num_rotors": 4, "rotor_directions": np.array([1, -1, 1, -1]), "tau_m": 0.1},
+        "rotor_pos": {f"r{i}": np.array(place) for i, place in enumerate(places)},
+        **{"rotor_speed_min": 0, "rotor_speed_max": BODY.rotor_speed},
+        **{"k_eta": BODY.k_t, "k_m": BODY.k_d},
+    }
+    exact = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-12}
+    other = multirotor.Multirotor(parameters, aero=False, integrator_kwargs=exact)
+    states, actions = flights(10)
+    actions = saturate(actions, BODY)
+    speeds = (unmix(actions, BODY).clamp(min=0) / BODY.k_t).sqrt().numpy()
+    ours = quadrotor_step(states, actions, 0.05, 100, BODY)
+    for state, speed, expected in zip(states.numpy(), speeds, ours, strict=True):
+        before = {"x": state[:3], "v": state[3:6], "q": state[6:10], "w": state[10:]}
+        before |= {"wind": np.zeros(3), "rotor_speeds": speed}
+        after = other.step(before, {"cmd_motor_speeds": speed}, 0.05)
+        found = np.concatenate([after[key] for key in "xvqw"])
+        np.testing.assert_allclose(expected.numpy(), found, rtol=0, atol=1e-9)

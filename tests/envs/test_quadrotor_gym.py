@@ -1,0 +1,73 @@
+"""The quadrotor's gymnasium adapter equals the native environment."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+import afm_rl  # noqa: F401  registers the environments
+from afm_rl.envs import Circle, CrazyflieTrack, CrazyflieTrackGym
+from afm_rl.errors import ConfigurationError, NonFiniteError
+
+NAME = "afm_rl/CrazyflieTrack-v0"
+HOVER = np.array([0.2943, 0, 0, 0], dtype=np.float32)
+
+
+def test_gymnasium_accepts_the_environment():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # advice on bounds, which positions do not have
+        check_env(gymnasium.make(NAME, sensor_noise=0.01).unwrapped)
+
+
+def test_it_is_the_native_environment():
+    changes = {"regime": [{}, {"mass": 0.5}, {"mass": 4 / 3}], "ramp": 1}
+    settings = {"sensor_noise": 0.01, "start_noise": 0.1, "duration": 0.5}
+    env = gymnasium.make(NAME, reference=Circle(1.0), times=[0.1, 0.3], **changes, **settings)
+    native = CrazyflieTrack(Circle(1.0), schedule=[0.1, 0.3], missions=changes, **settings)
+    native.set_seed(3, static_seed=True)
+    observation, info = env.reset(seed=3)
+    data, active = native.reset(), []
+    for step in range(10):
+        seen = torch.cat([data["observation"], data["reference"][0]])
+        np.testing.assert_array_equal(observation, seen.numpy())
+        observation, reward, terminated, truncated, info = env.step(HOVER)
+        data["action"] = torch.tensor(HOVER)
+        after = native.step(data)["next"]
+        assert reward == after["reward"].item()
+        np.testing.assert_array_equal(info["square_error"], after["square_error"].numpy())
+        assert info["time"] == pytest.approx(0.05 * (step + 1))
+        active.append(info["regime_active"])
+        data = native.step_mdp(data)
+    assert active == [False, False] + [True] * 8  # a ramp begins with nothing
+    assert (terminated, truncated) == (False, True)
+
+
+def test_a_seed_repeats_a_flight_and_no_seed_does_not():
+    env = CrazyflieTrackGym(start_noise=0.1)
+    first, again, other = env.reset(seed=1)[0], env.reset(seed=1)[0], env.reset()[0]
+    assert (first == again).all()
+    assert (first != other).any()
+
+
+def test_the_spaces_have_units():
+    env = CrazyflieTrackGym()
+    np.testing.assert_allclose(env.action_space.high, [0.575, 6.6125e-3, 6.6125e-3, 9.75e-4])
+    np.testing.assert_allclose(env.action_space.low[:2], [0, -6.6125e-3])
+    assert env.observation_space.shape == (19,)
+
+
+def test_mistakes_are_explained():
+    with pytest.raises(ConfigurationError, match="render_mode='human': expected none"):
+        CrazyflieTrackGym(render_mode="human")
+    with pytest.raises(ConfigurationError, match="mass=0.0"):
+        CrazyflieTrackGym(regime={"mass": 0.0})
+    env = CrazyflieTrackGym()
+    with pytest.raises(ResetNeeded):
+        env.step(HOVER)
+    env.reset()
+    with pytest.raises(NonFiniteError):
+        env.step(HOVER * np.nan)

@@ -1,0 +1,197 @@
+"""Runs that are interrupted and go on give what they would have given, to the bit."""
+
+import random
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from afm_rl.artefacts import read_tensors
+from afm_rl.errors import AFMError, ArtefactError, ConfigurationError
+from afm_rl.missions import run
+from afm_rl.missions.checkpoint import Checkpoint, Stopped
+from afm_rl.missions.log import StepLog
+from afm_rl.missions.state import fingerprint
+from afm_rl.missions.tree import flatten, unflatten
+
+METHODS = [
+    *("physics", "online_pe", "oracle", "afm_physics", "afm_paper", "stream_x_pe"),
+    *("adaptive_gain", "physics planner=cem", "online_pe dynamics.propagation=sample"),
+    "online_pe updater.optimizer._target_=torch.optim.Adam",
+]
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL."""
+
+
+@pytest.fixture
+def agent(make_agent, ring, spot):
+    """Make an agent for three missions on two tracks, of which one ends early."""
+
+    def make(method, **settings):
+        tracks = [ring] if "Adam" in method else [ring, spot]  # Adam's moments cannot be selected
+        settings = {"tracks": tracks, "seeds": [3, 8], "budget": 14, **settings}
+        return make_agent(*f"method={method}".split(), **settings)
+
+    return make
+
+
+def same(left, right):
+    """Compare results bit for bit, but for the time that was spent."""
+    pairs = ((left.missions, right.missions), (left.steps, right.steps))
+    for one, other in pairs:
+        one, other = (t.drop(columns="seconds", errors="ignore") for t in (one, other))
+        pd.testing.assert_frame_equal(one, other, check_exact=True)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_interrupted_runs_are_bit_identical(agent, tmp_path, method):
+    whole = run(agent(method))
+    for seed in range(2):
+        path = tmp_path / f"{seed}.safetensors"
+        for stop in sorted(random.Random(seed).sample(range(1, 14), 3)):
+            with pytest.raises(Stopped, match=f"step {stop}"):
+                run(agent(method), checkpoint=path, watch=lambda loop, at=stop: loop.step == at)
+            torch.rand(5)  # the global generator goes its own way
+        same(whole, run(agent(method), checkpoint=path))
+
+
+@pytest.mark.parametrize("method", ["online_pe", "afm_physics"])
+def test_a_run_killed_at_each_write_in_turn(agent, tmp_path, method, monkeypatch):
+    whole, path = run(agent(method)), tmp_path / "run.safetensors"
+    left = 0
+
+    def replace(source, target):
+        nonlocal left
+        left -= 1
+        if left == 0:
+            raise Killed
+        real(source, target)
+
+    import os
+
+    real = os.replace
+    for left in (1, 3, 1, 4):  # noqa: B007
+        with monkeypatch.context() as patched, pytest.raises(Killed):
+            patched.setattr("afm_rl.artefacts.os.replace", replace)
+            run(agent(method), checkpoint=path, every=0)
+    assert list(tmp_path.glob(".run*")) == []
+    same(whole, run(agent(method), checkpoint=path, every=0))
+
+
+def test_a_checkpoint_is_written_when_it_is_time_and_stays(agent, tmp_path):
+    path = tmp_path / "deep" / "run.safetensors"
+    whole = run(agent("physics"), checkpoint=path)
+    assert not path.exists()
+    same(whole, run(agent("physics"), checkpoint=path, every=0))
+    assert path.exists()
+    same(whole, run(agent("physics"), checkpoint=path))  # nothing is left to do
+    assert path.read_bytes()
+
+
+def test_seconds_add_up_over_interruptions(agent, tmp_path):
+    path = tmp_path / "run.safetensors"
+    with pytest.raises(Stopped):
+        run(agent("physics"), checkpoint=path, watch=lambda loop: loop.step == 7)
+    first = run(agent("physics"), checkpoint=path)
+    assert first.missions["seconds"].gt(0).all()
+
+
+def test_a_run_without_a_checkpoint_can_be_stopped_too(agent):
+    with pytest.raises(Stopped):
+        run(agent("physics"), watch=lambda loop: True)
+
+
+@pytest.fixture
+def kept(agent, tmp_path):
+    """The checkpoint of a run that was stopped."""
+    path = tmp_path / "run.safetensors"
+    with pytest.raises(Stopped):
+        run(agent("physics"), checkpoint=path, watch=lambda loop: loop.step == 3)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "named"),
+    [
+        ("physics", {"budget": 15}, "settings.budget: 14 -> 15"),
+        ("physics", {"seeds": [3]}, "settings.seeds: [3, 8] -> [3]"),
+        ("physics", {"robot.env.dt": 0.1}, "settings.robot.env.dt: 0.2 -> 0.1"),
+        ("oracle", {}, "settings.dynamics._target_: afm_rl.missions.parts.physics -> "),
+    ],
+)
+def test_checkpoints_of_other_missions_are_refused(agent, kept, method, settings, named):
+    before = kept.read_bytes()
+    with pytest.raises(ArtefactError, match="made by other missions") as found:
+        run(agent(method, **settings), checkpoint=kept)
+    assert named in str(found.value) and str(kept) in str(found.value)
+    assert kept.read_bytes() == before
+
+
+def test_a_checkpoint_of_other_weights_is_refused(agent, tmp_path):
+    path = tmp_path / "run.safetensors"
+    with pytest.raises(Stopped):
+        run(agent("frozen_pe"), checkpoint=path, watch=lambda loop: loop.step == 3)
+    other = agent("frozen_pe")
+    other.model.biases[0].data += 1e-6
+    with pytest.raises(ArtefactError, match="parts: "):
+        run(other, checkpoint=path)
+
+
+def test_settings_without_influence_may_change(agent, kept):
+    run(agent("physics", progress=False, threads=2, cache="elsewhere"), checkpoint=kept)
+
+
+def test_a_damaged_checkpoint_is_refused(agent, kept):
+    data = bytearray(kept.read_bytes())
+    data[-9] ^= 1
+    kept.write_bytes(data)
+    with pytest.raises(ArtefactError, match="damaged"):
+        run(agent("physics"), checkpoint=kept)
+
+
+@pytest.mark.parametrize("every", [-1, float("nan"), "often"])
+def test_times_that_cannot_be_used(agent, tmp_path, every):
+    with pytest.raises(ConfigurationError, match=f"every={every!r}"):
+        Checkpoint(tmp_path / "run", agent("physics"), every)
+
+
+def test_a_checkpoint_holds_everything_that_moves(agent, tmp_path):
+    path = tmp_path / "run.safetensors"
+    with pytest.raises(Stopped):
+        run(agent("stream_x_pe"), checkpoint=path, watch=lambda loop: loop.step == 5)
+    tensors, _ = read_tensors(path)
+    names = " ".join(tensors)
+    for part in ("running.mean", "weights.0", '"planner.streams"', "_generator", "pose", "global"):
+        assert part in names
+    assert len(tensors['["tensors", "model.weights.0"]']) == 2  # missions that still run
+
+
+def test_equal_agents_have_equal_fingerprints(agent):
+    assert fingerprint(agent("online_pe")) == fingerprint(agent("online_pe"))
+    assert fingerprint(agent("online_pe")) != fingerprint(agent("physics"))
+
+
+def test_trees_come_back(transitions):
+    state, _ = transitions(4)
+    tree = {"a": {0: {"x/y": state}, "1": {}}, "b": [1, None], "c": 0.1}
+    again = unflatten(*flatten(tree))
+    assert torch.equal(again["a"][0].pop("x/y"), state)
+    assert again == {"a": {0: {}, "1": {}}, "b": [1, None], "c": 0.1}
+
+
+def test_a_log_grows_on_after_it_was_taken_up():
+    log, again = StepLog(["x"]), StepLog(["x"])
+    log.add(torch.arange(3), 0, torch.ones(3, 1))
+    again.load_state_dict(log.state_dict())
+    for both in (log, again):
+        for step in range(1, 3000):
+            both.add(torch.arange(2), step, torch.full((2, 1), float(step)))
+    assert len(again) == 3 + 2 * 2999
+    assert np.array_equal(log.table(), again.table())
+
+
+def test_stopped_is_an_error_of_the_library():
+    assert issubclass(Stopped, AFMError)

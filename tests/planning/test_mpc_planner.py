@@ -1,0 +1,323 @@
+"""Model predictive control as a module: what it plans."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from afm_rl.dynamics import Dubins, KnownDynamics
+from afm_rl.errors import ConfigurationError
+from afm_rl.manifold import Manifold
+from afm_rl.planning import MPC, GoalDistance, PlanningEnv, TrackingCost
+
+DT, HORIZON = 0.1, 12
+
+
+def pendulum_step(state, action):
+    """Swing a damped pendulum: angle (rad), rate (rad/s); torque."""
+    angle, rate = state.unbind(-1)
+    rate = rate + DT * (4.0 * angle.sin() - 0.2 * rate + action[..., 0])
+    return torch.stack([angle + DT * rate, rate], -1)
+
+
+@pytest.fixture
+def pendulum():
+    """A pendulum that is to stand up (angle 0), in double precision, with a weak motor."""
+    model = KnownDynamics(pendulum_step, Manifold(2), 1)
+    cost = TrackingCost([4.0, 0.1], [0.01], [0])
+    bound = torch.tensor([5.0]).double()
+    return PlanningEnv(model, cost, -bound, bound)
+
+
+def car(box, dynamics=None, **settings):
+    cost = TrackingCost([1.0, 1.0, 0.0], [0.02, 0.02], [0, 1])
+    planner = MPC(PlanningEnv(dynamics or Dubins(), cost, *box), **{"horizon": 6, **settings})
+    return planner
+
+
+def situation(planner, *batch, seed=0, memory=0.1, dtype=None):
+    """Where the robots are, where they shall be, and what they planned before."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.randn(*batch, *shape, generator=generator)
+
+    size, inputs = planner.env.dynamics.state_size, planner.env.dynamics.action_size
+    td = TensorDict({"observation": 0.5 * draw(size)}, batch)
+    td["reference"] = draw(planner.env.cost.in_sizes[0])
+    td["mpc", "states"] = memory * draw(planner.horizon + 1, size)
+    td["mpc", "actions"] = memory * draw(planner.horizon, inputs)
+    return td if dtype is None else td.to(dtype)
+
+
+def plan(planner, td):
+    out = planner(td.clone())["next", "mpc"]
+    return out["states"], out["actions"]
+
+
+def balance(env, planner, ticks, warm=True):
+    """Control the pendulum; return the actions ``(ticks)`` and the last tensordict."""
+    td = situation(planner, memory=0.0, dtype=torch.float64)
+    td["observation"], td["reference"] = torch.tensor([0.9, 0.3]).double(), torch.zeros(1)
+    actions = []
+    for _ in range(ticks):
+        out = planner(td.clone())
+        actions.append(float(out["action"]))
+        td["observation"] = env.dynamics(td["observation"], out["action"])
+        if warm:
+            td["mpc"] = out["next", "mpc"]
+    return actions, td
+
+
+def ipopt(casadi, start, guess):
+    """Solve the pendulum's problem exactly, by multiple shooting; return states, actions."""
+    opti = casadi.Opti()
+    x, u = opti.variable(2, HORIZON + 1), opti.variable(1, HORIZON)
+    cost = 0.01 * casadi.sumsqr(u) + 4.0 * casadi.sumsqr(x[0, :]) + 0.1 * casadi.sumsqr(x[1, :])
+    opti.minimize(cost)
+    opti.subject_to(x[:, 0] == start)
+    for k in range(HORIZON):
+        rate = x[1, k] + DT * (4.0 * casadi.sin(x[0, k]) - 0.2 * x[1, k] + u[k])
+        opti.subject_to(x[1, k + 1] == rate)
+        opti.subject_to(x[0, k + 1] == x[0, k] + DT * rate)
+    opti.subject_to(opti.bounded(-5.0, u, 5.0))
+    for variable, value in zip((x, u), guess, strict=True):
+        opti.set_initial(variable, value.numpy().T)
+    quiet = {"print_level": 0, "tol": 1e-10, "sb": "yes"}
+    opti.solver("ipopt", {"print_time": False}, quiet)
+    solution = opti.solve()
+    return np.asarray(solution.value(x)).T, np.asarray(solution.value(u))
+
+
+@pytest.mark.parametrize(("iterations", "tolerance"), [(20, 1e-6), (1, 0.05)])
+def test_a_flight_equals_an_exact_solver(pendulum, iterations, tolerance):
+    casadi = pytest.importorskip("casadi")
+    planner = MPC(pendulum, HORIZON, iterations, first_iterations=30)
+    td = situation(planner, memory=0.0, dtype=torch.float64)
+    td["observation"], td["reference"] = torch.tensor([0.9, 0.3]).double(), torch.zeros(1)
+    saturated = 0
+    for _ in range(10):
+        states, actions = plan(planner, td)
+        exact_states, exact_actions = ipopt(casadi, td["observation"].numpy(), (states, actions))
+        np.testing.assert_allclose(actions[:, 0], exact_actions, atol=tolerance)
+        np.testing.assert_allclose(states, exact_states, atol=tolerance)
+        saturated += int((actions.abs() == 5.0).sum())
+        td["observation"] = pendulum.dynamics(td["observation"], actions[0])
+        td["mpc"] = TensorDict({"states": states, "actions": actions})
+    assert 0 < saturated < 60 and planner.inexact == planner.discarded == 0
+
+
+@pytest.mark.parametrize("task", ["pendulum", "car"])
+def test_both_solvers_plan_the_same(pendulum, box, task):
+    pytest.importorskip("casadi")
+    planners = []
+    for qp in ("riccati", "hpipm"):
+        if task == "car":
+            planners.append(car([bound.double() for bound in box], qp=qp, iterations=3))
+        else:
+            planners.append(MPC(pendulum, HORIZON, iterations=3, qp=qp))
+    td = situation(planners[0], 3, dtype=torch.float64)
+    for fast, reference in zip(*(plan(planner, td) for planner in planners), strict=True):
+        torch.testing.assert_close(fast, reference, rtol=0, atol=1e-5)
+
+
+def test_the_plan_follows_the_dynamics_once_converged(pendulum):
+    planner = MPC(pendulum, HORIZON, iterations=20)
+    td = situation(planner, 5, dtype=torch.float64)
+    states, actions = plan(planner, td)
+    torch.testing.assert_close(states[:, 0], td["observation"])
+    ahead = pendulum.dynamics(states[:, :-1], actions)
+    torch.testing.assert_close(states[:, 1:], ahead, rtol=0, atol=1e-8)
+
+
+def test_it_gets_the_pendulum_up_and_holds_it(pendulum):
+    actions, td = balance(pendulum, MPC(pendulum, HORIZON), 60)
+    assert max(map(abs, actions)) == pytest.approx(5.0)
+    torch.testing.assert_close(td["observation"], torch.zeros(2).double(), rtol=0, atol=1e-2)
+
+
+def test_a_warm_start_beats_a_cold_one(pendulum):
+    best, _ = balance(pendulum, MPC(pendulum, HORIZON, iterations=10), 15)
+    warm, _ = balance(pendulum, MPC(pendulum, HORIZON), 15)
+    cold, _ = balance(pendulum, MPC(pendulum, HORIZON, first_iterations=1), 15, warm=False)
+    worse, better = (
+        max(abs(a - b) for a, b in zip(found, best, strict=True)) for found in (cold, warm)
+    )
+    assert better < 0.2 * worse
+
+
+@pytest.mark.parametrize("batch", [(4,), (2, 3)], ids=str)
+def test_a_batch_of_flights_equals_single_ones(box, batch):
+    planner = car(box, iterations=2)
+    td = situation(planner, *batch)
+    td["mpc", "states"][0] = td["mpc", "actions"][0] = 0.0  # these have just begun
+    states, actions = plan(planner, td)
+    assert states.shape == (*batch, 7, 3) and actions.shape == (*batch, 6, 2)
+    for index in np.ndindex(*batch):
+        alone = plan(planner, td[index])
+        torch.testing.assert_close(alone[0], states[index], rtol=0, atol=1e-5)
+        torch.testing.assert_close(alone[1], actions[index], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("angle", [0.0, 2 * math.pi, -2 * math.pi])
+def test_headings_may_be_written_in_any_way(box, angle):
+    planner, td = car(box), None
+    td = situation(planner, 5)
+    expected = planner(td.clone())["action"]
+    td["mpc", "states"][..., 2] += angle
+    torch.testing.assert_close(planner(td)["action"], expected, rtol=0, atol=1e-5)
+
+
+def test_a_held_reference_equals_one_repeated_for_each_stage(box):
+    planner = car(box)
+    td = situation(planner, 3)
+    held = plan(planner, td)
+    td["reference"] = td["reference"].unsqueeze(-2).repeat(1, 7, 1)
+    for one, other in zip(held, plan(planner, td), strict=True):
+        torch.testing.assert_close(one, other)
+    td["reference"][:, 5:] += 1.0
+    assert not torch.allclose(plan(planner, td)[1], held[1], atol=1e-3)
+
+
+@pytest.mark.parametrize("bounded", [None, [0], []], ids=str)
+def test_bounds_hold_for_the_components_chosen(box, bounded):
+    planner = car(box, bounded=bounded, iterations=3)
+    td = situation(planner, 20)
+    td["reference"] *= 20
+    out = planner(td)
+    assert all(planner.action_spec.is_in(action) for action in out["action"])
+    outside = (out["next", "mpc", "actions"].abs() > box[1] + 1e-6).flatten(0, 1).any(0)
+    free = [] if bounded is None else [i for i in range(2) if i not in bounded]
+    assert outside.nonzero().flatten().tolist() == free
+
+
+@pytest.mark.parametrize("learnt", [False, True])
+def test_it_drives_to_the_goal(box, trained_ensemble, learnt):
+    truth = Dubins()
+    planner = car(box, trained_ensemble if learnt else truth, horizon=10)
+    td = situation(planner, 3, memory=0.0)
+    td["observation"] = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 2.0], [1.0, 1.0, -1.5]])
+    td["reference"] = torch.tensor([[2.0, 1.0], [2.0, 0.0], [-1.0, 0.0]])
+    for _ in range(30):
+        td = planner(td)
+        assert not td["action"].requires_grad
+        td["observation"] = truth(td["observation"], td["action"])
+        td["mpc"] = td["next", "mpc"]
+    assert ((td["observation"][:, :2] - td["reference"]).norm(dim=-1) < 0.3).all()
+    assert planner.discarded == 0
+
+
+def test_missions_with_models_of_their_own_plan_with_them(box, make_ensemble):
+    shared = make_ensemble()
+    planner, td = car(box, shared), situation(car(box), 3)
+    expected = planner(td.clone())["action"]
+    shared.expand_(3)
+    torch.testing.assert_close(planner(td.clone())["action"], expected, rtol=0, atol=1e-5)
+    shared.biases[-1].data[1] += 1.0
+    changed = (planner(td)["action"] - expected).abs().amax(-1) > 1e-4
+    assert changed.tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("fault", [math.nan, math.inf])
+@pytest.mark.parametrize("cold", [False, True])
+def test_without_a_finite_solution_the_previous_plan_stands(box, fault, cold):
+    planner = car(box)
+    td = situation(planner, 3)
+    if cold:
+        td["mpc"].zero_()
+    expected = plan(planner, td)
+    td["observation"][1] = fault
+    with pytest.warns(UserWarning, match="no finite solution for 1 of 3 flights"):
+        states, actions = plan(planner, td)
+    assert planner.discarded == 1
+    for found, name, good in zip((states, actions), ("states", "actions"), expected, strict=True):
+        old = td["mpc", name][1]
+        assert torch.equal(found[1], torch.cat([old[1:], old[-1:]]))
+        torch.testing.assert_close(found[::2], good[::2])
+    with pytest.warns(UserWarning, match="no finite"):
+        assert planner.planning(td).isfinite().all()
+
+
+def test_new_flights_iterate_as_long_as_they_are_told(pendulum):
+    td = situation(MPC(pendulum, HORIZON), 2, dtype=torch.float64)
+    td["mpc", "states"][0] = td["mpc", "actions"][0] = 0.0
+    short, long = MPC(pendulum, HORIZON, first_iterations=1), MPC(pendulum, HORIZON)
+    few, many = plan(short, td)[1], plan(long, td)[1]
+    torch.testing.assert_close(few[1], many[1])
+    assert (few[0] - many[0]).abs().max() > 1e-3
+
+
+def test_a_missing_memory_is_told_once_and_taken_as_zero(box):
+    planner = car(box)
+    td = situation(planner, 2, memory=0.0)
+    expected = planner(td.clone())["action"]
+    del td["mpc"]
+    with pytest.warns(UserWarning, match=r"no \('mpc',\).*make_tensordict_primer"):
+        torch.testing.assert_close(planner(td.clone())["action"], expected)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        planner(td.clone())
+
+
+def test_it_writes_what_it_says_where_it_is_told(box):
+    planner = car(box, memory_key=["agent", "plan"])
+    memory = [("agent", "plan", "states"), ("agent", "plan", "actions")]
+    assert planner.in_keys == ["observation", "reference", *memory]
+    assert planner.out_keys == ["action", *(("next", *key) for key in memory)]
+    td = situation(car(box), 2)
+    td["agent"] = TensorDict({"plan": td.pop("mpc")}, [2])
+    out = planner(td, tensordict_out=TensorDict({}, [2]))
+    assert set(out.keys(True, True)) == set(planner.out_keys)
+    assert "action" not in td.keys()
+    torch.testing.assert_close(planner.planning(td), out["action"])
+
+
+def test_plans_that_are_not_minima_are_counted(box, monkeypatch):
+    from afm_rl.planning import mpc
+
+    planner = car(box)
+    td = situation(planner, 3)
+    td["reference"] *= 50
+    monkeypatch.setitem(mpc.SOLVERS, "riccati", lambda task: mpc.solve_lq(task, sweeps=1))
+    actions = plan(planner, td)[1]
+    assert planner.inexact == 3
+    assert (actions.abs() <= box[1]).all()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"horizon": 0},
+        {"iterations": 0},
+        {"first_iterations": 1.5},
+        {"bounded": [2]},
+        {"bounded": ["v"]},
+        {"qp": "osqp"},
+    ],
+    ids=str,
+)
+def test_impossible_settings_are_refused(box, settings):
+    with pytest.raises(ConfigurationError, match=f"planner.{next(iter(settings))}"):
+        car(box, **settings)
+
+
+def test_costs_and_environments_that_do_not_fit_are_refused(box):
+    with pytest.raises(ConfigurationError, match="PlanningEnv with GoalDistance; MPC needs"):
+        MPC(PlanningEnv(Dubins(), GoalDistance(), *box))
+    with pytest.raises(ConfigurationError, match="got Dubins; MPC needs"):
+        MPC(Dubins())
+    with pytest.raises(ConfigurationError, match="there are 3 and 2"):
+        MPC(PlanningEnv(Dubins(), TrackingCost([1.0], [1.0], [0]), *box))
+
+
+@pytest.mark.parametrize("shape", [(3, 6, 2), (3, 8, 2), (3, 3)], ids=str)
+def test_references_of_another_shape_are_refused(box, shape):
+    planner = car(box)
+    td = situation(planner, 3).set("reference", torch.zeros(shape))
+    with pytest.raises(ConfigurationError, match=r"expected \(3, 2\), held .* \(3, 7, 2\)"):
+        planner(td)
+    with pytest.raises(ConfigurationError, match="'reference' is missing; expected"):
+        planner(td.exclude("reference"))

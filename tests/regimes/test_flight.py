@@ -1,0 +1,149 @@
+"""Regimes of the quadrotor: each is exactly what happens to the body."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from afm_rl.airframe import QuadrotorBody, mix, unmix
+from afm_rl.dynamics.quadrotor_equations import quadrotor_rate
+from afm_rl.errors import ConfigurationError
+from afm_rl.regimes import (
+    Compose,
+    InertiaFactor,
+    MassFactor,
+    MotorEfficiency,
+    Payload,
+    Wind,
+    flight_regimes,
+    wind_of,
+)
+
+BODY = QuadrotorBody()
+LOW, HIGH = (torch.tensor(bound, dtype=torch.float64) for bound in BODY.bounds)
+FAMILIES = [MassFactor(), InertiaFactor(), MotorEfficiency(), Payload(), Wind(), flight_regimes()]
+
+
+def actions(*batch):
+    return LOW + (HIGH - LOW) * torch.rand(*batch, 4, dtype=torch.float64)
+
+
+def states(*batch):
+    state = torch.randn(*batch, 13, dtype=torch.float64)
+    state[..., 6:10] /= state[..., 6:10].norm(dim=-1, keepdim=True)
+    return state
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_nominal_parameters_keep_an_action_to_the_bit(family):
+    action, row = actions(1000), family.encode({}).double()
+    assert (family.apply(action, row, states(1000)) == action).all()
+    assert family.is_identity(row)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_draws_are_legal_and_undone_by_the_inverse(family):
+    rows = family.sample((200,), torch.Generator().manual_seed(0)).double()
+    assert rows.shape == (200, len(family.names))
+    for row in rows[:20]:
+        family.encode(dict(zip(family.names, row.tolist(), strict=True)))
+    action, state = actions(200), states(200)
+    wide = torch.full((4,), torch.inf, dtype=torch.float64)
+    command = family.inverse(action, rows, state, -wide, wide)
+    torch.testing.assert_close(family.apply(command, rows, state), action)
+    assert family.closed_form
+    boxed = family.inverse(action, rows, state, LOW, HIGH)
+    assert ((boxed >= LOW) & (boxed <= HIGH)).all()
+
+
+@pytest.mark.parametrize("factor", [0.5, 4 / 3])
+def test_a_mass_factor_is_exactly_a_thrust_gain(factor):
+    family, state, action = MassFactor(), states(50), actions(50)
+    row = torch.tensor([factor], dtype=torch.float64)
+    changed = quadrotor_rate(state, action, replace(BODY, mass=factor * BODY.mass))
+    effective = family.apply(action, row, state)
+    torch.testing.assert_close(quadrotor_rate(state, effective, BODY), changed)
+    torch.testing.assert_close(effective[:, 0], action[:, 0] / factor, rtol=1e-15, atol=0)
+    assert (effective[:, 1:] == action[:, 1:]).all()
+
+
+def test_an_inertia_factor_is_exactly_a_moment_gain():
+    family, state, action = InertiaFactor(), states(50), actions(50)
+    heavy = replace(BODY, inertia=tuple(2 * x for x in BODY.inertia))
+    effective = family.apply(action, family.encode({"inertia": 2.0}).double(), state)
+    changed = quadrotor_rate(state, action, heavy)
+    torch.testing.assert_close(quadrotor_rate(state, effective, BODY), changed)
+
+
+def test_motors_lose_force_one_by_one():
+    family, action = MotorEfficiency(), actions(50)
+    row = torch.tensor([1.0, 0.5, 0.0, 0.8], dtype=torch.float64)
+    effective = family.apply(action, row, states(50))
+    torch.testing.assert_close(effective, mix(unmix(action, BODY) * row, BODY))
+    # nothing can be had of a motor that stands still
+    command = family.inverse(effective, row, states(50), LOW - 1, HIGH + 1)
+    torch.testing.assert_close(family.apply(command, row, states(50)), effective)
+    torch.testing.assert_close(unmix(command, BODY)[:, 2], torch.zeros(50).double())
+
+
+def test_a_payload_in_hover_pulls_with_its_weight():
+    family = Payload()
+    row = family.encode({"payload": 1 / 3, "payload_x": 0.004, "payload_y": -0.002}).double()
+    action = torch.tensor([BODY.hover_thrust * 4 / 3, 0, 0, 0], dtype=torch.float64)
+    effective = family.apply(action, row, states())
+    weight = torch.tensor([0, 0, -BODY.hover_thrust / 3], dtype=torch.float64)
+    place = torch.tensor([0.004, -0.002, 0], dtype=torch.float64)
+    moment = torch.linalg.cross(place, weight)
+    torch.testing.assert_close(effective[1:], moment, rtol=1e-6, atol=1e-12)
+    torch.testing.assert_close(effective[0].item(), BODY.hover_thrust, rtol=1e-6, atol=0)
+
+
+def test_the_wind_is_found_among_other_parameters():
+    family = flight_regimes()
+    row = family.encode({"wind_y": 1.5, "mass": 0.5})
+    assert wind_of(family, row.expand(2, -1)).tolist() == [[0.0, 1.5, 0.0]] * 2
+    assert wind_of(Compose([MassFactor(), Payload()]), torch.ones(4)) is None
+
+
+def test_a_draw_changes_one_thing():
+    family = flight_regimes()
+    rows = family.sample((300,), torch.Generator().manual_seed(1))
+    for name, part in (("mass", {"mass"}), ("wind", set(Wind.names))):
+        columns = [i for i, known in enumerate(family.names) if known in part]
+        others = [i for i, known in enumerate(family.names) if known not in part]
+        nominal = torch.tensor(family.identity)
+        changed = (rows[:, columns] != nominal[columns]).any(-1)
+        assert 20 < changed.sum() < 120, name
+        assert (rows[changed][:, others] == nominal[others]).all()
+
+
+@pytest.mark.parametrize(
+    ("family", "values", "message"),
+    [
+        (MassFactor(), {"mass": 0.0}, r"mass=0.0: expected a finite number in \[0.01, 100\]"),
+        (MassFactor(), {"mass": -1.0}, "mass=-1.0"),
+        (InertiaFactor(), {"inertia": 0.0}, "inertia=0.0"),
+        (MotorEfficiency(), {"motor_2": 1.5}, r"motor_2=1.5: expected a finite number in \[0, 1\]"),
+        (Payload(), {"payload": -0.1}, "payload=-0.1"),
+        (Wind(), {"wind_x": float("inf")}, "wind_x=inf"),
+    ],
+)
+def test_impossible_parameters_are_refused(family, values, message):
+    with pytest.raises(ConfigurationError, match=message):
+        family.encode(values)
+
+
+@pytest.mark.parametrize(
+    ("make", "settings"),
+    [
+        (MassFactor, {"span": (0.0, 1.0)}),
+        (InertiaFactor, {"span": 2.0}),
+        (MotorEfficiency, {"span": (0.5, 1.5)}),
+        (Payload, {"share": (-0.5, 0.5)}),
+        (Payload, {"offset": (0.01, -0.01)}),
+        (Wind, {"span": (1.0,)}),
+    ],
+)
+def test_impossible_priors_are_refused(make, settings):
+    with pytest.raises(ConfigurationError, match=next(iter(settings))):
+        make(**settings)
