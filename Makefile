@@ -52,8 +52,9 @@ bench: $(VENV)/.with-base ## Run every benchmarks/bench_*.py, one after the othe
 docs: $(VENV)/.with-docs build/package ## Build the documentation into site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict && echo "docs: site/index.html"
 
-notebooks: $(VENV)/.with-test $(VENV)/.with-notebooks ## Run every notebook from top to bottom
-	@MPLBACKEND=Agg $(BIN)/pytest -q --nbmake --nbmake-timeout=600 --timeout=0 notebooks
+notebooks: $(VENV)/.with-test ## Run every notebook from top to bottom, at a small size
+	@CI=true OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --nbmake --nbmake-timeout=600 \
+		--timeout=0 notebooks
 
 clean: ## Remove build products and caches; .venv and outputs/ stay
 	@rm -rf build dist site *.egg-info .coverage .coverage.* htmlcov .hypothesis \

@@ -42,7 +42,7 @@ def launch(cfg: DictConfig) -> None:
     if study is not None:
         from afm_rl.cli.study import launch_study  # file locks: not on every system
 
-        launch_study(study, methods, folder, cfg.progress)
+        launch_study(study, methods, folder, cfg.progress, cfg.figures)
         return
     agents = [build(method) for method in methods]
     for method in methods:

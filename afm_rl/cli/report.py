@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
 
@@ -53,10 +52,9 @@ def main() -> None:
     add("--no-figures", dest="figures", action="store_false", help="write tables only")
     options = parser.parse_args()
 
-    from afm_rl.report.write import write_report  # torch takes seconds: `--help` need not wait
+    from afm_rl.envs import load_track  # torch takes seconds: `--help` need not wait
+    from afm_rl.report.write import write_report
 
-    # By name, as configurations do: no module imports the environments.
-    load_track = import_module("afm_rl.envs").load_track
     out = options.out or options.folders[0] / "report"
     chosen = {"baselines": options.baselines, "oracle": options.oracle, "figures": options.figures}
     try:

@@ -10,14 +10,19 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from afm_rl.envs import load_track
 from afm_rl.missions.study import run_study
-from afm_rl.report import print_summary
+from afm_rl.report import print_summary, write_report
 
 
 def launch_study(
-    settings: DictConfig, methods: Sequence[DictConfig], folder: Path, progress: bool
+    settings: DictConfig,
+    methods: Sequence[DictConfig],
+    folder: Path,
+    progress: bool,
+    figures: bool,
 ) -> None:
-    """Run a study, or what is left of it, and print its table.
+    """Run a study, or what is left of it, print its table and write its report.
 
     Exits with status 1 if shards failed, and with 130 if it was interrupted.
 
@@ -26,6 +31,7 @@ def launch_study(
         methods: one configuration per method, with its label.
         folder: the study's own.
         progress: show progress in a terminal.
+        figures: draw the figures of the report.
     """
     try:
         with _interrupted_by(signal.SIGTERM):
@@ -38,7 +44,7 @@ def launch_study(
         sys.exit(130)
     if len(outcome.missions):
         print_summary(outcome.missions)
-        # A report of the folder belongs here: its tables are complete, also if shards failed.
+        write_report([folder], folder / "report", figures=figures, load_track=load_track)
     print(f"Results: {folder}")
     for shard, reason in outcome.failures.items():
         print(f"afm-rl: {shard}: failed: {reason}", file=sys.stderr)

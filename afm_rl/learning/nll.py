@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
@@ -35,6 +36,8 @@ class GaussianNLLLoss(InPlaceLoss):
     Args:
         model: any :class:`~afm_rl.dynamics.DynamicsModel`.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (one value per transition).
+        wrap: take state changes on the manifold; False subtracts angles as they are, so that
+            each crossing of pi is an outlier of 2 pi, as in the published runs.
 
     Keys (change them with ``set_keys``): ``state`` ("observation"), ``action`` ("action"),
     ``next_state`` (("next", "observation")).
@@ -64,16 +67,21 @@ class GaussianNLLLoss(InPlaceLoss):
     target_model_params: None
     out_keys = ["loss_nll"]
 
-    def __init__(self, model: DynamicsModel, reduction: str = "mean") -> None:
+    def __init__(self, model: DynamicsModel, reduction: str = "mean", wrap: bool = True) -> None:
         super().__init__(reduction)
         self.model = model
+        self.wrap = wrap
+
+    def target(self, state: Tensor, next_state: Tensor) -> Tensor:
+        """Return the standardised state change ``(*B, D)``."""
+        change = self.model.manifold.difference if self.wrap else torch.sub
+        return self.model.standardise(change(next_state, state))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_nll`` for transitions ``(*L, *N)``."""
         state, action, next_state = (tensordict.get(key) for key in self.in_keys)
-        change = self.model.manifold.difference(next_state, state)
-        target = self.model.standardise(change).unsqueeze(-2)
+        target = self.target(state, next_state).unsqueeze(-2)
         mean, log_variance = self.model.moments(state, action)
         loss = gaussian_nll(mean, log_variance, target).mean((-2, -1))
         return self._reduced(loss, tensordict)

@@ -40,6 +40,7 @@ class StreamXUpdater(OnlineUpdater):
         lr: step size, > 0; 1 leaves it to the bound.
         kappa: strictness of the bound, > 0.
         mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
+        wrap: see :class:`~afm_rl.learning.GaussianNLLLoss`.
 
     Raises:
         ConfigurationError: for settings out of range, or a model that is no ensemble.
@@ -63,21 +64,21 @@ class StreamXUpdater(OnlineUpdater):
         lr: float = 1.0,
         kappa: float = 2.0,
         mask_key: NestedKey | None = None,
+        wrap: bool = True,
     ) -> None:
         if not isinstance(loss.model, Ensemble):
             raise ConfigurationError(
                 f"updater: {type(self).__name__} teaches an Ensemble, got "
                 f"{type(loss.model).__name__}; choose an ensemble, such as dynamics=pe_stream_x"
             )
-        super().__init__(loss, partial(ObGD, lr=lr, kappa=kappa, lead_dims=1), mask_key)
+        super().__init__(loss, partial(ObGD, lr=lr, kappa=kappa, lead_dims=1), mask_key, wrap)
         self.form = check_choice("updater.form", form, FORMS)
 
     def _measure(self, transitions: TensorDictBase) -> dict[str, Tensor]:
         """Return the loss ``(*B)`` and what it is made of, ``(*B, E, D)`` each."""
         model = cast(Ensemble, self.loss.model)
         state, action, next_state = (transitions.get(key) for key in self.loss.in_keys)
-        change = model.manifold.difference(next_state, state)
-        target = model.standardise(change).unsqueeze(-2)
+        target = self.loss.target(state, next_state).unsqueeze(-2)
         mean, log_variance = model.moments(state, action)
         loss = gaussian_nll(mean, log_variance, target).mean((-2, -1))
         found = {"loss": loss, "error": target - mean, "log_variance": log_variance}

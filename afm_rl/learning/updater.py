@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from afm_rl.dynamics import Oracle
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, check_flag
 from afm_rl.keys import as_key
 from afm_rl.learning.nll import GaussianNLLLoss
 
@@ -65,6 +65,7 @@ class OnlineUpdater(Updater):
         loss: the loss to descend.
         optimizer: makes the optimiser of the model's parameters.
         mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
+        wrap: see :class:`~afm_rl.learning.GaussianNLLLoss`.
     """
 
     learns = True
@@ -74,8 +75,10 @@ class OnlineUpdater(Updater):
         loss: GaussianNLLLoss,
         optimizer: Callable[..., Optimizer],
         mask_key: NestedKey | None = None,
+        wrap: bool = True,
     ) -> None:
         super().__init__(loss)
+        loss.wrap = check_flag("updater.wrap", wrap)
         if not any(True for _ in loss.model.parameters()):
             raise ConfigurationError(
                 "updater: the dynamics model has nothing to learn; choose dynamics=pe, or "

@@ -139,20 +139,28 @@ def test_mistakes_are_one_line(afm_rl, tmp_path, settings, named):
 
 
 def ended(monkeypatch, outcome):
+    """Let a study end at once; return the folders that a report was asked for."""
+    reported = []
+
     def run_study(*args):
         if isinstance(outcome, BaseException):
             raise outcome
         return outcome
 
     monkeypatch.setattr("afm_rl.cli.study.run_study", run_study)
+    monkeypatch.setattr(
+        "afm_rl.cli.study.write_report", lambda folders, *_, **__: reported.extend(folders)
+    )
+    return reported
 
 
 def test_shards_that_failed_are_listed(afm_rl, tmp_path, monkeypatch):
     row = {"method": "physics", "track": "oval", "seed": 0, "seconds": 2.0, "steps": 3}
     missions = pd.DataFrame([row | {"success_rate": 1.0, "finished": True}])
-    ended(monkeypatch, Outcome(missions, {Shard("oracle", 3): "out of luck"}))
+    reported = ended(monkeypatch, Outcome(missions, {Shard("oracle", 3): "out of luck"}))
     done = afm_rl(*TINY, f"hydra.run.dir={tmp_path}")
     assert done.status == 1
+    assert reported == [tmp_path]
     assert "physics" in done.out and f"Results: {tmp_path}" in done.out
     assert "afm-rl: oracle, seed 3: failed: out of luck\n" in done.err
     assert "1 shards failed" in done.err

@@ -124,3 +124,11 @@ def test_the_model_is_shared_not_copied(data):
 def test_unknown_reductions_are_refused():
     with pytest.raises(ConfigurationError, match="loss.reduction='median'"):
         GaussianNLLLoss(Dubins(), reduction="median")
+
+
+@pytest.mark.parametrize(("wrap", "turn"), [(True, 0.2), (False, 0.2 - 2 * math.pi)])
+def test_a_turn_across_pi_is_small_unless_angles_are_subtracted(wrap, turn):
+    state = torch.tensor([0.0, 0.0, math.pi - 0.1])
+    after = torch.tensor([0.0, 0.0, 0.1 - math.pi])
+    target = GaussianNLLLoss(Dubins(noise_std=1.0), wrap=wrap).target(state, after)
+    assert target[2].item() == pytest.approx(turn, abs=1e-5)
