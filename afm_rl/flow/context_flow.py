@@ -11,15 +11,13 @@ from torch import Tensor
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_choice, check_count, check_counts, check_number
 from afm_rl.flow.base import Context, Examples, Flow
-from afm_rl.flow.least_squares import fit_gain
+from afm_rl.flow.hints import FITS, least_squares_hints
 from afm_rl.flow.network import mlp
 from afm_rl.flow.pairs import PairCorrector
-from afm_rl.flow.saturation import MODES, intend, saturate
+from afm_rl.flow.saturation import MODES, intend
 from afm_rl.flow.solver import midpoint
 from afm_rl.regimes import Regime
 from afm_rl.sampling import uniform
-
-FORGETTING = (0.5, 0.9)  # of the least-squares guesses: one trusts the newest rows, one all
 
 
 class ContextFlow(PairCorrector, Flow):
@@ -82,7 +80,8 @@ class ContextFlow(PairCorrector, Flow):
         size = self.action_size
         generator = torch.Generator().manual_seed(seed)
         self.encoder = mlp([self.feature_size, *hidden, latent], generator)
-        known = latent + (2 + len(FORGETTING)) * size
+        self.hint_size = 2 * FITS * size
+        known = latent + self.hint_size + 2 * size  # with the plan and the point on the path
         self.velocity = mlp([known + 1, *hidden, size], generator)
         half = torch.randn((samples + 1) // 2, size, generator=torch.Generator().manual_seed(0))
         points = torch.cat([half, -half])[:samples]
@@ -99,17 +98,12 @@ class ContextFlow(PairCorrector, Flow):
 
     def forward(self, features: Tensor, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:
         """Return the velocity ``(*B, A)`` at ``point``, all actions in half ranges."""
-        known = torch.cat([self.encoder(features), *self.hints(features, planned)], -1)
+        known = torch.cat([self.encoder(features), self.hints(features, planned)], -1)
         return self.velocity(torch.cat([known, planned, point, tau], -1))
 
-    def hints(self, features: Tensor, planned: Tensor) -> list[Tensor]:
-        """Return what per-axis least squares with forgetting would execute, ``(*B, A)`` each.
-
-        Exact for gains; a hint for everything else.
-        """
-        pairs = self.pairs(features)
-        fits = [fit_gain(*pairs, forgetting) for forgetting in FORGETTING]
-        return [saturate(planned / gain, self.saturation) for gain in fits]
+    def hints(self, features: Tensor, planned: Tensor) -> Tensor:
+        """Return what least squares would execute, and how well it fits, ``(*B, hint_size)``."""
+        return least_squares_hints(*self.pairs(features), planned, self.saturation)
 
     def examples(
         self,
@@ -153,8 +147,8 @@ class ContextFlow(PairCorrector, Flow):
         """Integrate the flow from every source point; return mean and spread."""
         unit = self.normalise(planned).unsqueeze(-2)
         start = self.source(unit, self.source_points)
-        guesses = self.hints(context.features, unit.squeeze(-2))
-        known = torch.cat([self.encoder(context.features), *guesses], -1)
+        hints = self.hints(context.features, unit.squeeze(-2))
+        known = torch.cat([self.encoder(context.features), hints], -1)
         known = torch.cat([known.unsqueeze(-2), unit], -1).expand(*start.shape[:-1], -1)
 
         def velocity(tau: float, point: Tensor) -> Tensor:

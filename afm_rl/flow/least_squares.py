@@ -13,7 +13,12 @@ from afm_rl.flow.saturation import MODES, saturate
 PRIOR, LEAST = 1e-3, 0.02  # pull towards the nominal fit, and the smallest gain divided by
 
 
-def _weights(valid: Tensor, forgetting: float) -> Tensor:
+def weigh(valid: Tensor, forgetting: float) -> Tensor:
+    r"""Return the weight of each pair ``(*B, K, 1)``: :math:`\lambda^k` at age k, if it counts.
+
+    >>> weigh(torch.ones(3, 1), 0.5).squeeze(-1)
+    tensor([0.2500, 0.5000, 1.0000])
+    """
     window = valid.shape[-2]
     age = torch.arange(window - 1, -1, -1, device=valid.device, dtype=valid.dtype)
     return valid * (forgetting**age).unsqueeze(-1)
@@ -40,9 +45,40 @@ def fit_gain(executed: Tensor, effective: Tensor, valid: Tensor, forgetting: flo
     >>> fit_gain(u, -2 * u, torch.ones(2, 1), 0.8).round(decimals=2)
     tensor([-2.])
     """
-    weight = _weights(valid, forgetting)
+    weight = weigh(valid, forgetting)
     cross = (weight * executed * effective).sum(-2) + PRIOR
     gain = cross / ((weight * executed.square()).sum(-2) + PRIOR)
+    return _not_zero(gain)
+
+
+def fit_friction(
+    executed: Tensor, effective: Tensor, valid: Tensor, forgetting: float
+) -> tuple[Tensor, Tensor]:
+    r"""Fit :math:`u_\mathrm{eff} = g \odot u + h \odot \mathrm{sign}(u)`, each axis for itself.
+
+    Dry friction, or a dead zone outside of it. Args and shapes as for :func:`fit_gain`, with a
+    ridge towards g = 1, h = 0.
+
+    Returns:
+        Gains, none smaller than 0.02 in size, and offsets, ``(*B, A)`` each.
+    """
+    weight, sign = weigh(valid, forgetting), executed.sign()
+    uu = (weight * executed.square()).sum(-2) + PRIOR
+    us = (weight * executed.abs()).sum(-2)
+    ss = (weight * sign.square()).sum(-2) + 10 * PRIOR  # the offset is the rarer of the two
+    ue = (weight * executed * effective).sum(-2) + PRIOR
+    se = (weight * sign * effective).sum(-2)
+    determinant = (uu * ss - us.square()).clamp_min(PRIOR**2)
+    gain, offset = (ss * ue - us * se) / determinant, (uu * se - us * ue) / determinant
+    return _not_zero(gain), offset
+
+
+def invert_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
+    """Return the action ``(*B, A)`` that has the effect ``unit`` under :func:`fit_friction`."""
+    return (unit - offset * (unit / gain).sign()) / gain
+
+
+def _not_zero(gain: Tensor) -> Tensor:
     return torch.where(gain.abs() < LEAST, torch.where(gain < 0, -LEAST, LEAST), gain)
 
 
@@ -56,7 +92,7 @@ def fit_affine(
     Returns:
         D ``(*B, A, A)`` and b ``(*B, A)``.
     """
-    weight = _weights(valid, forgetting)
+    weight = weigh(valid, forgetting)
     inputs = torch.cat([executed, torch.ones_like(executed[..., :1])], -1)
     size = inputs.shape[-1]
     nominal = torch.eye(size, device=inputs.device, dtype=inputs.dtype)
@@ -64,6 +100,16 @@ def fit_affine(
     cross = (weight * inputs).mT @ effective + PRIOR * nominal[:, :-1]
     solution = torch.linalg.solve(gram, cross).mT  # (*B, A, A + 1)
     return solution[..., :-1], solution[..., -1]
+
+
+def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:
+    """Return the action ``(*B, A)`` whose effect under :func:`fit_affine` is nearest to ``unit``.
+
+    A small ridge keeps it finite where the matrix is all but singular.
+    """
+    ridge = LEAST**2 * torch.eye(unit.shape[-1], device=unit.device, dtype=unit.dtype)
+    target = matrix.mT @ (unit - bias).unsqueeze(-1)
+    return torch.linalg.solve(matrix.mT @ matrix + ridge, target).squeeze(-1)
 
 
 class LeastSquares(PairCorrector):
@@ -109,9 +155,6 @@ class LeastSquares(PairCorrector):
         if self.form == "gain":
             wanted = unit / fit_gain(*pairs, self.forgetting)
         else:
-            matrix, bias = fit_affine(*pairs, self.forgetting)
-            ridge = LEAST**2 * torch.eye(self.action_size).to(unit)
-            target = matrix.mT @ (unit - bias).unsqueeze(-1)
-            wanted = torch.linalg.solve(matrix.mT @ matrix + ridge, target).squeeze(-1)
+            wanted = invert_affine(*fit_affine(*pairs, self.forgetting), unit)
         executed = self.denormalise(saturate(wanted, self.saturation))
         return executed, torch.zeros_like(executed)

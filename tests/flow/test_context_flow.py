@@ -158,20 +158,6 @@ def test_source_points_cancel_and_a_point_source_has_no_spread(box, window_of):
     torch.testing.assert_close(spread, torch.zeros(25, 2), rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("saturation", ["direction", "clip"])
-def test_hints_are_exact_for_gains(box, window_of, saturation):
-    flow = ContextFlow(*box, window=4, saturation=saturation)
-    gain = torch.tensor([-1.6, 1.3])
-    context = context_of(flow, window_of(gain.tolist(), 25))
-    unit = grid(box) / flow.half_range
-    for hint in flow.hints(context.features, unit):
-        torch.testing.assert_close(hint, unit / gain, rtol=0, atol=0.02)
-        assert hint.abs().max() <= 1
-    blank = torch.zeros(25, flow.feature_size)
-    for hint in flow.hints(blank, unit):  # knowing nothing, the model is believed
-        torch.testing.assert_close(hint, unit)
-
-
 def test_examples_show_the_regime_and_its_inverse(flow, states, box):
     twice = ActionGain(["v_gain", "omega_gain"], low=2.0, high=2.0, nominal=0.0)
     generator = torch.Generator().manual_seed(0)
