@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -18,6 +20,7 @@ from afm_rl.regimes import Regime
 
 POOL = 16  # batches kept of the examples that are used more than once
 PLANS = 4  # plans per context among them
+BLOCK = 8  # batches made at once where each example is used once: many small calls are slow
 
 
 class CFMLoss(InPlaceLoss):
@@ -121,19 +124,13 @@ def train_flow(
         with torch.no_grad():
             return flow.examples(model, regime, state_box, count, generator, plans)
 
-    chunk = math.ceil(batch_size / min(reuse, 8))
-    pause = max(1, reuse * chunk // batch_size)  # iterations between fresh chunks
-    pool = draw(POOL * batch_size if reuse > 1 else batch_size)
-    size, cursor = len(pool.planned), 0
+    if reuse == 1:
+        batches = _fresh(draw, batch_size)
+    else:
+        batches = _reused(draw, batch_size, reuse, generator)
     bar = tqdm(range(iterations), desc="training the flow", disable=None if progress else True)
     for step in bar:
-        if step % pause == 0:
-            rows = (cursor + torch.arange(chunk)) % size
-            for kept, new in zip(pool, draw(chunk), strict=True):
-                kept[rows] = new
-            cursor = (cursor + chunk) % size
-        chosen = torch.randint(size, (batch_size,), generator=generator)
-        batch = pool if reuse == 1 else Examples(*(part[chosen] for part in pool))
+        batch = next(batches)
         with torch.enable_grad():
             loss = loss_module(TensorDict(batch._asdict(), [batch_size]))["loss_cfm"]
             optimizer.zero_grad(set_to_none=True)
@@ -144,6 +141,32 @@ def train_flow(
         if progress and step % 200 == 0:
             bar.set_postfix(loss=f"{loss.item():.4f}")
     return held_out_error(flow, draw(2048))
+
+
+def _fresh(draw: Callable[[int], Examples], size: int) -> Iterator[Examples]:
+    """Yield batches of new examples, made several batches at once."""
+    while True:
+        yield from map(
+            Examples._make, zip(*(part.split(size) for part in draw(BLOCK * size)), strict=True)
+        )
+
+
+def _reused(
+    draw: Callable[[int], Examples], size: int, reuse: int, generator: torch.Generator
+) -> Iterator[Examples]:
+    """Yield batches from a pool in which new examples take the place of the oldest."""
+    chunk = math.ceil(size / min(reuse, 8))
+    pause = max(1, reuse * chunk // size)  # batches between fresh chunks
+    pool = draw(POOL * size)
+    cursor, count = 0, POOL * size
+    for step in itertools.count():
+        if step % pause == 0:
+            rows = (cursor + torch.arange(chunk)) % count
+            for kept, new in zip(pool, draw(chunk), strict=True):
+                kept[rows] = new
+            cursor = (cursor + chunk) % count
+        chosen = torch.randint(count, (size,), generator=generator)
+        yield Examples(*(part[chosen] for part in pool))
 
 
 @torch.no_grad()

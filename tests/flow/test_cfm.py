@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
 from afm_rl.flow import CFMLoss, ContextFlow, Examples, train_flow
-from afm_rl.flow.cfm import POOL, held_out_error
+from afm_rl.flow.cfm import BLOCK, POOL, held_out_error
 
 TINY = {"window": 3, "hidden": [8], "latent": 4}
 
@@ -154,7 +154,7 @@ def test_examples_are_used_again_when_the_model_is_slow(box, states, gains, make
         return sum(counts[:-1])  # the last are held out
 
     counts = []
-    assert made(1) == 32 + 20 * 32
+    assert made(1) == 3 * BLOCK * 32  # the last block is not used up
     assert made(4) == POOL * 32 + 20 * 8
     assert made(64) == POOL * 32 + 3 * 4  # four of them every eight steps
     assert made(None) == made(1)
