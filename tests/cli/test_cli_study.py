@@ -54,15 +54,22 @@ def test_a_study_in_processes_of_its_own(process, program, tmp_path):
     assert list(folder.glob("shards/*/*/checkpoint.safetensors")) == []
 
 
-@pytest.mark.parametrize(("study", "budget"), [("ugv", 5000), ("ugv_families", 3000)])
-def test_the_studies(afm_rl, asked, study, budget, monkeypatch, tmp_path):
+@pytest.mark.parametrize(
+    ("study", "budget", "count", "last"),
+    [
+        ("ugv", 5000, 13, "oracle"),
+        ("ugv_paper", 5000, 5, "afm_paper"),
+        ("ugv_families", 3000, 13, "oracle"),
+    ],
+)
+def test_the_studies(afm_rl, asked, study, budget, count, last, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     done = afm_rl(f"study={study}", "planner.population=77")
     assert done.status == 0, done.err
     ((folder, methods, workers, every, progress),) = asked
     assert folder == tmp_path / "outputs" / "study" / study
     assert (workers, every, progress) == (None, 60, True)
-    assert len(methods) == 13 and list(methods)[0] == "physics" and list(methods)[-1] == "oracle"
+    assert len(methods) == count and [*methods][0] == "physics" and [*methods][-1] == last
     for cfg in methods.values():
         assert (cfg.seeds, cfg.budget, cfg.tracks) == (5, budget, "all")
         assert cfg.planner.population == 77
