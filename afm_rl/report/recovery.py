@@ -46,7 +46,8 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
         if len(changes) and column in steps and steps[column].notna().all():
             times = _times(steps[column].to_numpy(dtype=float), changes)
             rows += [{"of": of, "change": change, "time": time} for change, time in times]
-    return pd.DataFrame(rows, columns=["of", "change", "time"])
+    table = pd.DataFrame(rows, columns=["of", "change", "time"])
+    return table.astype({"change": int, "time": float})  # also without rows: tables are joined
 
 
 def _times(error: np.ndarray, changes: np.ndarray) -> list[tuple[int, float]]:

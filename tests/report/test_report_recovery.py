@@ -49,6 +49,19 @@ def test_missions_without_a_change_have_no_times():
         assert recovery_times(mission((active, LOW, 50))).empty
 
 
+def test_missions_without_times_may_come_first():
+    parts = [mission((0, LOW, 50)), mission((0, LOW, 50), (1, HIGH, 5), (1, LOW, STAY))]
+    joined = pd.concat([recovery_times(part).assign(method="a") for part in parts])
+    assert recovery_table(joined).numbers["median"].tolist() == [5]
+
+
+def test_motion_is_judged_where_it_was_logged():
+    steps = mission((0, LOW, 50), (1, HIGH, 50)).assign(miss=LOW)
+    found = recovery_times(steps).set_index("of")["time"].to_dict()
+    assert found == {"motion": 0, "model": np.inf}
+    assert recovery_times(steps.assign(miss=np.nan))["of"].tolist() == ["model"]
+
+
 @pytest.mark.parametrize(("factor", "time"), [(1.4, 0), (1.6, np.inf)])
 def test_the_level_is_a_high_quantile_of_the_errors_before(factor, time):
     steps = mission((0, LOW, 96), (0, HIGH, 4), (1, factor * LOW, 50))
