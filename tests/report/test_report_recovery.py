@@ -73,8 +73,10 @@ def test_errors_below_the_floor_are_all_the_same():
 
 
 def test_missions_never_recovered_count_in_the_median():
-    frame = pd.DataFrame({"method": "a", "change": 1, "time": [3.0, np.inf, 5.0, np.inf, np.inf]})
-    other = pd.DataFrame({"method": "b", "change": 1, "time": [3.0, 5.0, 9.0]})
+    frame = pd.DataFrame(
+        {"method": "a", "of": "model", "change": 1, "time": [3.0, np.inf, 5.0, np.inf, np.inf]}
+    )
+    other = pd.DataFrame({"method": "b", "of": "model", "change": 1, "time": [3.0, 5.0, 9.0]})
     table = recovery_table(pd.concat([frame, other]))
     assert table.numbers["never"].tolist() == [0.6, 0.0]
     assert table.numbers["median"].tolist() == [np.inf, 5.0]
