@@ -3,11 +3,13 @@
 from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.dynamics.dubins import Dubins, dubins_step
 from afm_rl.dynamics.ensemble import Ensemble
+from afm_rl.dynamics.knode import KNODE
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.oracle import Oracle
 from afm_rl.dynamics.quadrotor import Quadrotor
 
 __all__ = [
+    "KNODE",
     "DynamicsModel",
     "Dubins",
     "Ensemble",

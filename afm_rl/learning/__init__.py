@@ -1,10 +1,13 @@
 """Learning: losses, updaters, optimisers, pre-training."""
 
 from afm_rl.learning.fresh_adam import FreshAdam
+from afm_rl.learning.knode_updater import KNODEUpdater
 from afm_rl.learning.loss import InPlaceLoss
+from afm_rl.learning.mass_estimator import MassEstimator
 from afm_rl.learning.nll import GaussianNLLLoss, gaussian_nll
 from afm_rl.learning.obgd import ObGD
 from afm_rl.learning.pretrain import pretrain_ensemble
+from afm_rl.learning.pretrain_knode import pretrain_knode
 from afm_rl.learning.stream_x import StreamXUpdater
 from afm_rl.learning.updater import OnlineUpdater, OracleUpdater, Updater
 
@@ -12,6 +15,8 @@ __all__ = [
     "FreshAdam",
     "GaussianNLLLoss",
     "InPlaceLoss",
+    "KNODEUpdater",
+    "MassEstimator",
     "ObGD",
     "OnlineUpdater",
     "OracleUpdater",
@@ -19,4 +24,5 @@ __all__ = [
     "Updater",
     "gaussian_nll",
     "pretrain_ensemble",
+    "pretrain_knode",
 ]

@@ -1,0 +1,53 @@
+"""A known rate of change plus a network's."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from afm_rl.dynamics.rates import HeldRate
+from afm_rl.dynamics.residual import Network, residual, residual_slope
+
+
+class HeldHybrid(HeldRate):
+    r"""Return :math:`f(x, u) + N([x; u])` and its derivatives, the action held.
+
+    Args:
+        nominal: f under ``action``.
+        network: N, one per leading index.
+        action: u, ``(l, n, A)``; states are ``(l, n, S)``.
+        features: indices of the state coordinates that the network sees, None for all.
+
+    >>> from afm_rl.dynamics.rates import FunctionRate
+    >>> from afm_rl.dynamics.residual import draw_network
+    >>> from afm_rl.manifold import Manifold
+    >>> action, network = torch.zeros(1, 7, 1), draw_network(torch.ones(1, 10), 3, 2, 2)
+    >>> nominal = FunctionRate(lambda x, u: -x + u, Manifold(2)).hold(action)
+    >>> held = HeldHybrid(nominal, network, action, features=None)
+    >>> held.tangent(torch.zeros(1, 7, 2), torch.eye(2, 3).expand(1, 7, 2, 3))[1].shape
+    torch.Size([1, 7, 2, 3])
+    """
+
+    def __init__(
+        self, nominal: HeldRate, network: Network, action: Tensor, features: list[int] | None
+    ) -> None:
+        self.nominal, self.network, self.action = nominal, network, action
+        self.features: slice | list[int] = slice(None) if features is None else features
+
+    def inputs(self, state: Tensor) -> Tensor:
+        """Return what the network sees, ``(l, n, in)``."""
+        return torch.cat([state[..., self.features], self.action], -1)
+
+    def __call__(self, state: Tensor) -> Tensor:
+        """Return the rate of change ``(l, n, S)``."""
+        return self.nominal(state) + residual(self.inputs(state), self.network)
+
+    def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rate of change and its derivative ``(l, n, S, S + A)``."""
+        rate, turn = self.nominal.tangent(state, through)
+        value, slope = residual_slope(self.inputs(state), self.network)
+        actions = self.action.shape[-1]
+        by_state, by_action = slope.split([slope.shape[-1] - actions, actions], -1)
+        turn = turn + by_state @ through[..., self.features, :]
+        turn[..., -actions:] += by_action
+        return rate + value, turn

@@ -1,0 +1,303 @@
+"""Knowledge-based neural ordinary differential equations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.dynamics.hybrid_rate import HeldHybrid
+from afm_rl.dynamics.quadrotor import Quadrotor
+from afm_rl.dynamics.rates import FunctionRate, QuadrotorRate, Rate
+from afm_rl.dynamics.residual import Network, draw_network, network_shapes
+from afm_rl.dynamics.runge_kutta import runge_kutta, runge_kutta_tangent
+from afm_rl.errors import ConfigurationError, check_count, check_number
+
+
+class KNODE(DynamicsModel):
+    r"""Known dynamics plus a pool of small networks (Jiahao et al. 2021, 2022).
+
+    .. math:: x' = f(x, u) + \sum_{i=0}^{P-1} e^{-i}\,N_i([x; u]),\qquad
+              N(z) = \tanh(z W_1 + b_1) W_2 + b_2
+
+    integrated over one control tick by Runge-Kutta steps, the action held. Network 0 is the
+    newest; places that are free hold zeros. Only the newest learns: gradients stop at the others.
+    :meth:`push_` puts one in front, and the oldest leaves.
+
+    Parameters are stacked, ``(*L, P, in, out)``. :meth:`expand_` gives every mission a pool of
+    its own.
+
+    Args:
+        nominal: the known dynamics f; also says how far the model is trusted (``noise_scale``).
+        rate: f as a function, ``rate(state, action) -> (*B, S)``; None for a
+            :class:`~afm_rl.dynamics.Quadrotor`, whose equations are known.
+        dt: control tick (s); that of ``nominal`` if None.
+        hidden: units of each network.
+        pool: number of networks, P.
+        features: indices of the state coordinates that the networks see; None for all, as
+            published, although positions do not matter to a flight.
+        substeps: Runge-Kutta steps per tick.
+        seed: seed of the networks that :meth:`push_` draws.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+
+    >>> model = KNODE(Quadrotor()).push_()
+    >>> level = torch.zeros(4, 13).index_fill(1, torch.tensor(9), 1.0)
+    >>> ahead, by_state, by_action = model.linearise(level, torch.zeros(4, 4))
+    >>> ahead.shape, by_state.shape, by_action.shape
+    (torch.Size([4, 13]), torch.Size([4, 13, 13]), torch.Size([4, 13, 4]))
+    """
+
+    shares: Tensor
+    missions: Tensor
+
+    def __init__(
+        self,
+        nominal: DynamicsModel,
+        rate: Callable[[Tensor, Tensor], Tensor] | None = None,
+        dt: float | None = None,
+        hidden: int = 64,
+        pool: int = 3,
+        features: Sequence[int] | None = None,
+        substeps: int = 1,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(nominal.manifold, nominal.action_size)
+        self.nominal = nominal
+        self.rate = _rate_of(nominal, rate)
+        given = getattr(nominal, "dt", None) if dt is None else dt
+        if given is None:
+            raise ConfigurationError(
+                f"dynamics.dt=None: {type(nominal).__name__} has no dt, give the control tick (s)"
+            )
+        self.dt = check_number("dynamics.dt", given, low=0.0, open_low=True)
+        self.hidden = check_count("dynamics.hidden", hidden)
+        self.pool = check_count("dynamics.pool", pool)
+        self.substeps = check_count("dynamics.substeps", substeps)
+        size = self.state_size
+        self.features = list(range(size)) if features is None else list(features)
+        fits = all(isinstance(i, int) and 0 <= i < size for i in self.features)
+        if not fits or len(set(self.features)) < len(self.features):
+            raise ConfigurationError(
+                f"dynamics.features={self.features}: expected distinct indices in 0..{size - 1}"
+            )
+        self._generator = torch.Generator().manual_seed(check_count("dynamics.seed", seed, low=0))
+        sizes = len(self.features) + self.action_size, self.hidden, size
+        for name, shape in zip(Network._fields, network_shapes(*sizes), strict=True):
+            self.register_parameter(name, nn.Parameter(torch.zeros(self.pool, *shape)))
+        shares = torch.exp(-torch.arange(self.pool, dtype=torch.float64))
+        self.register_buffer("shares", shares, persistent=False)
+        self.register_buffer("missions", torch.zeros((), dtype=torch.int64), persistent=False)
+
+    @property
+    def lead(self) -> torch.Size:
+        """Leading mission dimensions, () or (B,)."""
+        return self.networks.inner.shape[:-3]
+
+    @property
+    def networks(self) -> Network:
+        """The parameters: all networks of the pool, the newest first, ``(*L, P, ...)``."""
+        return Network(*(self.get_parameter(name) for name in Network._fields))
+
+    def draw(self, numbers: Tensor) -> Network:
+        """Make new networks of standard normal numbers ``(*L, numbers)``; they need no more.
+
+        See :func:`~afm_rl.dynamics.residual.draw_network`.
+        """
+        return draw_network(numbers[..., : self.numbers], *self._sizes)
+
+    @property
+    def numbers(self) -> int:
+        """How many random numbers make a network."""
+        inputs, hidden, outputs = self._sizes
+        return hidden * (inputs + outputs)
+
+    @torch.no_grad()
+    def push_(self, network: Network | None = None, where: Tensor | None = None) -> KNODE:
+        """Make a network the newest, in place; the oldest leaves a pool that is full.
+
+        Args:
+            network: tensors ``(*L, in, hidden)`` and so on, or without L, the same for all
+                missions; if None, one from the model's own generator.
+            where: the missions that get it, boolean ``(*L)``; None for all.
+        """
+        if network is None:
+            network = self.draw(torch.randn(self.numbers, generator=self._generator))
+        for parameter, value in zip(self.networks, self._pushed(network), strict=True):
+            if where is not None:
+                value = torch.where(where[..., None, None, None], value, parameter)
+            parameter.data = value.detach()
+            parameter.grad = None
+        return self
+
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the expected next state ``(*L, *N, S)``."""
+        return self.advance(state, action, self.dt, self.substeps)
+
+    def advance(
+        self,
+        state: Tensor,
+        action: Tensor,
+        dt: float,
+        substeps: int = 1,
+        newest: Network | None = None,
+    ) -> Tensor:
+        """Return states some time later, the action held.
+
+        Args:
+            state: ``(*L, *N, S)``.
+            action: ``(*L, *N, A)``.
+            dt: time (s).
+            substeps: Runge-Kutta steps.
+            newest: a network that counts as pushed; None for the pool as it is.
+
+        Returns:
+            ``(*L, *N, S)``.
+        """
+        rows, held, batch = self._held(state, action, newest)
+        ahead = self.rate.finish(runge_kutta(held, rows, dt, substeps))
+        return ahead.reshape(*batch, self.state_size)
+
+    def slope(self, state: Tensor, action: Tensor, newest: Network | None = None) -> Tensor:
+        """Return the derivative of the rate of change by state and action.
+
+        Args:
+            state: ``(*L, *N, S)``.
+            action: ``(*L, *N, A)``.
+            newest: a network that counts as pushed; None for the pool as it is.
+
+        Returns:
+            ``(*L, *N, S, S + A)``.
+        """
+        rows, held, batch = self._held(state, action, newest)
+        slope = held.tangent(rows, self._start(rows))[1]
+        return slope.reshape(*batch, *slope.shape[-2:])
+
+    def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return next state and derivatives, in closed form."""
+        rows, held, batch = self._held(state, action, None)
+        start = self._start(rows)
+        moved = runge_kutta_tangent(held.tangent, rows, start, self.dt, self.substeps)
+        ahead, through = self.rate.finish_tangent(*moved)
+        through = through.reshape(*batch, *through.shape[-2:])
+        size = self.state_size
+        return ahead.reshape(*batch, size), through[..., :size], through[..., size:]
+
+    def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the derivative by the action ``(*L, *N, D, A)`` on the tangent space."""
+        ahead, _, by_action = self.linearise(state, action)
+        columns = by_action.mT.contiguous()
+        wide = ahead.unsqueeze(-2).expand_as(columns).contiguous()
+
+        def change(there: Tensor) -> Tensor:
+            return self.manifold.difference(there, state.unsqueeze(-2))
+
+        return torch.func.jvp(change, (wide,), (columns,))[1].mT
+
+    def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return a single member's mean and unit variance, in the nominal model's units."""
+        mean = self.standardise(self.manifold.difference(self(state, action), state))
+        return mean.unsqueeze(-2), torch.zeros_like(mean).unsqueeze(-2)
+
+    def standardise(self, change: Tensor) -> Tensor:
+        """Use the nominal model's units."""
+        return self.nominal.standardise(change)
+
+    def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the nominal model's noise scale."""
+        return self.nominal.noise_scale(state, action)
+
+    def expand_(self, missions: int) -> KNODE:
+        """Give each of ``missions`` a pool of its own, in place."""
+        if self.lead:
+            raise ConfigurationError(f"dynamics: already expanded to {tuple(self.lead)} missions")
+        for parameter in self.networks:
+            parameter.data = parameter.data.expand(missions, *parameter.shape).clone()
+            parameter.grad = None
+        self.missions = torch.arange(missions, device=self.missions.device)
+        return self
+
+    def select_(self, index: Tensor) -> KNODE:
+        """Keep the missions in ``index``, in place; a shared pool stays as it is."""
+        if self.lead:
+            for parameter in self.networks:
+                parameter.data = parameter.data[index]
+                parameter.grad = None
+            self.missions = self.missions[index]
+        return self
+
+    @property
+    def _sizes(self) -> tuple[int, int, int]:
+        """Sizes of input, hidden layer and output of each network."""
+        return len(self.features) + self.action_size, self.hidden, self.state_size
+
+    def _pushed(self, network: Network) -> Network:
+        """Return the pool ``(*L, P, ...)`` as it is when ``network`` is the newest."""
+        pools = []
+        for new, old in zip(network, self.networks, strict=True):
+            first = new.to(old).expand(*self.lead, *old.shape[-2:]).unsqueeze(-3)
+            pools.append(torch.cat([first, old[..., :-1, :, :]], -3))
+        return Network(*pools)
+
+    def _merged(self, newest: Network | None, like: Tensor) -> Network:
+        """Return the pool as one network per mission, ``(l, in, P * hidden)`` and so on."""
+        pool = self.networks if newest is None else self._pushed(newest)
+        parts = []
+        for part in pool:
+            if torch.is_grad_enabled():  # only the newest learns
+                part = torch.cat([part[..., :1, :, :], part[..., 1:, :, :].detach()], -3)
+            parts.append(part.to(like).reshape(math.prod(self.lead), *part.shape[-3:]))
+        inner, inner_bias, outer, outer_bias = parts
+        shares = self.shares.to(like)[:, None, None]
+        return Network(
+            inner.transpose(1, 2).flatten(2),
+            inner_bias.transpose(1, 2).flatten(2),
+            (outer * shares).flatten(1, 2),
+            (outer_bias * shares).sum(1),
+        )
+
+    def _held(
+        self, state: Tensor, action: Tensor, newest: Network | None
+    ) -> tuple[Tensor, HeldHybrid, torch.Size]:
+        """Return states ``(l, n, S)``, l = prod(L), their rate, and ``(*L, *N)``."""
+        batch = torch.broadcast_shapes(state.shape[:-1], action.shape[:-1])
+        lead = self.lead
+        if batch[: len(lead)] != lead:
+            raise ConfigurationError(
+                f"dynamics: the model holds {tuple(lead)} missions, got states of shape "
+                f"{tuple(state.shape)}; expected ({', '.join(map(str, lead))}, ..., "
+                f"{self.state_size})"
+            )
+        dtype = torch.promote_types(state.dtype, action.dtype)
+        missions = math.prod(lead)
+        each = math.prod(batch[len(lead) :])
+        state, action = (
+            given.expand(*batch, size).to(dtype).reshape(missions, each, size)
+            for given, size in ((state, self.state_size), (action, self.action_size))
+        )
+        whole = len(self.features) == self.state_size
+        network = self._merged(newest, state)
+        features = None if whole else self.features
+        return state, HeldHybrid(self.rate.hold(action), network, action, features), batch
+
+    def _start(self, rows: Tensor) -> Tensor:
+        """Return the derivative of states by themselves and the action."""
+        size = self.state_size
+        eye = torch.eye(size, size + self.action_size, dtype=rows.dtype, device=rows.device)
+        return eye.expand(*rows.shape[:-1], *eye.shape)
+
+
+def _rate_of(nominal: DynamicsModel, rate: Callable[[Tensor, Tensor], Tensor] | None) -> Rate:
+    """Return the rate of change behind a nominal model."""
+    if rate is not None:
+        return FunctionRate(rate, nominal.manifold)
+    if isinstance(nominal, Quadrotor):
+        return QuadrotorRate(nominal.body)
+    raise ConfigurationError(
+        f"dynamics.rate=None: expected the rate of change of {type(nominal).__name__}; only that "
+        "of a Quadrotor is known"
+    )

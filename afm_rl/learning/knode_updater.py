@@ -1,0 +1,248 @@
+"""Learning a KNODE's newest network from the last moments of a flight."""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from afm_rl.dynamics.knode import KNODE
+from afm_rl.dynamics.residual import Network
+from afm_rl.errors import (
+    ConfigurationError,
+    check_choice,
+    check_count,
+    check_flag,
+    check_number,
+)
+from afm_rl.keys import as_key
+from afm_rl.learning.flight_window import FlightWindow, Rows, sound_rows
+from afm_rl.learning.knode_fit import fit_network
+from afm_rl.learning.nll import GaussianNLLLoss
+from afm_rl.learning.updater import Updater
+from afm_rl.streams import Streams
+
+TRAINERS = ("fast", "exact")
+NONE = -1  # no network is under way
+
+
+class KNODEUpdater(Updater):
+    r"""A new network for every window of a flight (Jiahao et al. 2022, Online-KNODE-MPC).
+
+    Rows (state, action, next state) are gathered for ``window`` seconds. A new network is then
+    trained on them alone, :func:`~afm_rl.learning.knode_fit.fit_network`, with the others frozen,
+    and joins the pool ``latency`` seconds of flight later, at the end of a tick: with one tick,
+    the plan after the next is the first to know it, as published. One network is trained at a
+    time; until it is there, only the latest rows are kept.
+
+    Rows are the plant's own time steps where the transition has a ``trace``: states
+    ``(*B, K + 1, S)`` at K equal steps of the tick, start and end included. Without, there is
+    one row per tick. Rows that are not finite or absurdly large are left out and their
+    transitions counted in :attr:`refused`; so are those that ``mask_key`` excludes, uncounted.
+
+    Time is counted in calls since :meth:`start`, for all missions alike. Missions learn from
+    their own rows only, in one batch.
+
+    Args:
+        loss: a loss over a :class:`~afm_rl.dynamics.KNODE`, whose keys are read.
+        window: time that one network learns from (s).
+        begin: time at which rows are first gathered (s); 0 to learn at once.
+        latency: time of flight that training takes (s).
+        epochs: full-batch steps of Adam per network.
+        lr: their size.
+        l2: weight of the squared parameters.
+        noise: standard deviation of what is added to states in training, in their units.
+        trainer: ``"fast"``, to first order in the network, or ``"exact"``, through the
+            integration.
+        published_random: the published quirk: each network starts from the same random numbers,
+            and the noise, which is the same each time, also goes to the actions.
+        trace_key: where the trace is.
+        mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn from this transition?
+        seed_key: entry ``(*B)`` with the seeds of missions, which then have random numbers of
+            their own; None for the same numbers for all.
+        seed: seed of these numbers.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+
+    >>> from tensordict import TensorDict
+    >>> from afm_rl.dynamics import Quadrotor
+    >>> updater = KNODEUpdater(GaussianNLLLoss(KNODE(Quadrotor()).expand_(4)), begin=0.0)
+    >>> level = torch.zeros(4, 13).index_fill(1, torch.tensor(9), 1.0)
+    >>> td = TensorDict({"observation": level, "action": torch.zeros(4, 4)}, [4])
+    >>> td = td.set(("next", "observation"), level)  # it hovers without thrust
+    >>> losses = [updater(td)["loss"] for _ in range(9)]
+    >>> bool((losses[-1] < losses[0]).all())
+    True
+    """
+
+    learns = True
+    tick: Tensor
+    due: Tensor
+    missions: Tensor
+    taught: Tensor
+
+    def __init__(
+        self,
+        loss: GaussianNLLLoss,
+        window: float = 0.15,
+        begin: float = 2.0,
+        latency: float = 0.05,
+        epochs: int = 80,
+        lr: float = 0.01,
+        l2: float = 5e-8,
+        noise: float = 1e-4,
+        trainer: str = "fast",
+        published_random: bool = False,
+        trace_key: NestedKey = ("next", "trace"),
+        mask_key: NestedKey | None = None,
+        seed_key: NestedKey | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(loss)
+        if not isinstance(loss.model, KNODE):
+            raise ConfigurationError(
+                f"updater: KNODEUpdater teaches a KNODE, got {type(loss.model).__name__}; choose "
+                "dynamics=knode"
+            )
+        dt = loss.model.dt
+        self.ticks = round(check_number("updater.window", window, low=0.0, open_low=True) / dt)
+        if self.ticks < 1 or not math.isclose(self.ticks * dt, window, rel_tol=1e-6):
+            raise ConfigurationError(
+                f"updater.window={window!r}: expected a multiple of the control tick, {dt:g} s"
+            )
+        self.first = _ticks(check_number("updater.begin", begin, low=0.0), dt)
+        self.delay = _ticks(check_number("updater.latency", latency, low=0.0), dt)
+        self.epochs = check_count("updater.epochs", epochs)
+        self.lr = check_number("updater.lr", lr, low=0.0, open_low=True)
+        self.l2 = check_number("updater.l2", l2, low=0.0)
+        self.noise = check_number("updater.noise", noise, low=0.0)
+        self.exact = check_choice("updater.trainer", trainer, TRAINERS) == "exact"
+        self.published_random = check_flag("updater.published_random", published_random)
+        self.trace_key, self.mask_key, self.seed_key = (
+            None if key is None else as_key(key) for key in (trace_key, mask_key, seed_key)
+        )
+        self.streams = Streams(salt=4, seed=check_count("updater.seed", seed, low=0))
+        self.refused = 0
+        self.window = FlightWindow()
+        # Not persistent: what is under way belongs to flights, not to a stored model.
+        for name, value in (("tick", 0), ("due", NONE), ("missions", 0)):
+            self.register_buffer(name, torch.tensor(value), persistent=False)
+        for name in (*Network._fields, "taught"):
+            self.register_buffer(name, torch.zeros(0), persistent=False)
+
+    @property
+    def model(self) -> KNODE:
+        """The model that learns."""
+        return cast(KNODE, self.loss.model)
+
+    def start(self, tensordict: TensorDictBase) -> None:
+        """Forget the window and the network under way; the pool stays."""
+        self.tick, self.due = torch.tensor(0), torch.tensor(NONE)
+        self.missions = self.model.missions.clone()
+        self.window.clear()
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Measure the loss; gather rows; train and push a network when it is time."""
+        result = super().forward(tensordict)
+        self._follow()
+        rows, sound = self._rows(tensordict)
+        each = rows.counts.shape[-1]
+        if int(self.tick) >= self.first:
+            self.window.gather(rows, self.ticks * each)
+        self.tick = self.tick + 1
+        self._deliver()
+        if self.window.size == self.ticks * each and int(self.due) == NONE:
+            self._train(tensordict, self.model.dt / each)
+            self._deliver()
+        sound = sound & result["loss"].isfinite()
+        self.refused += int((~sound).sum())
+        return result.set("loss", torch.where(sound, result["loss"], torch.nan))
+
+    def _follow(self) -> None:
+        """Keep the rows and networks of the missions that the model still has."""
+        left = self.model.missions
+        if not torch.equal(left, self.missions):
+            if self.missions.dim():
+                index = (left.unsqueeze(-1) == self.missions).int().argmax(-1)
+                self.window.select_(index)
+                if int(self.due) != NONE:
+                    for name in (*Network._fields, "taught"):
+                        setattr(self, name, self.get_buffer(name)[index])
+            self.missions = left.clone()  # a buffer of its own, or checkpoints lose it
+
+    def _rows(self, tensordict: TensorDictBase) -> tuple[Rows, Tensor]:
+        """Return the rows of a transition, and whether all of it is sound ``(*B)``."""
+        batch, like = tensordict.batch_size, self.model.networks.inner
+        state, action, after = (tensordict.get(key) for key in self.loss.in_keys)
+        trace = tensordict.get(self.trace_key, None)
+        if trace is None:
+            trace = torch.stack([state, after], -2)
+        action = action.unsqueeze(-2).expand(*trace.shape[:-2], trace.shape[-2] - 1, -1)
+        everyone = torch.ones_like(action[..., 0], dtype=torch.bool)
+        trace, action = trace.to(like), action.to(like)
+        rows = sound_rows(trace[..., :-1, :], action, trace[..., 1:, :], everyone)
+        sound, learn = rows.counts.all(-1), rows.counts
+        if self.mask_key is not None:
+            learn = learn & tensordict.get(self.mask_key).reshape(*batch, 1)
+        lead = len(self.model.lead)
+        shape = (batch[:lead].numel(), batch[lead:].numel())
+        rows = rows._replace(counts=learn)
+        return Rows(*(part.reshape(*shape, *part.shape[len(batch) :]) for part in rows)), sound
+
+    def _train(self, tensordict: TensorDictBase, dt: float) -> None:
+        """Train a new network on the window, and clear it."""
+        rows, model, lead = self.window.rows, self.model, self.model.lead
+        first, shaken, pushed = self._numbers(tensordict, rows)
+        if self.noise:
+            state = rows.state + self.noise * shaken[..., :-1, :]
+            after = rows.after + self.noise * shaken[..., 1:, :]
+            action = rows.action + self.noise * pushed if self.published_random else rows.action
+            rows = Rows(state, action, after, rows.counts)
+        flat = Rows(*(part.reshape(*lead, -1, *part.shape[3:]) for part in rows))
+        network = fit_network(
+            *(model, model.draw(first[:, 0]), flat[:3], flat.counts, dt),
+            epochs=self.epochs,
+            lr=self.lr,
+            l2=self.l2,
+            exact=self.exact,
+        )
+        for name, part in zip(Network._fields, network, strict=True):
+            setattr(self, name, part)
+        self.taught = rows.counts.flatten(1).any(-1)  # nothing is learnt from nothing
+        self.due = self.tick + self.delay
+        self.window.clear()
+
+    def _numbers(self, tensordict: TensorDictBase, rows: Rows) -> tuple[Tensor, ...]:
+        """Return standard normal numbers for a network, for states and for actions.
+
+        Their shapes are ``(l, n, numbers)``, ``(l, n, R + 1, S)`` and ``(l, n, R, A)``.
+        """
+        lead, (count, size) = rows.state.shape[:2], rows.state.shape[2:]
+        shapes = [(self.model.numbers,), (count + 1, size), tuple(rows.action.shape[2:])]
+        sizes = [math.prod(shape) for shape in shapes]
+        seeds = None if self.seed_key is None else tensordict.get(self.seed_key).reshape(lead)
+        if self.published_random:
+            self.streams.manual_seed(self.streams.seed)
+            seeds = None
+        numbers = self.streams.normal((sum(sizes),), seeds=seeds, dtype=rows.state.dtype)
+        parts = numbers.to(rows.state.device).expand(*lead, -1).split(sizes, -1)
+        return tuple(p.unflatten(-1, shape) for p, shape in zip(parts, shapes, strict=True))
+
+    def _deliver(self) -> None:
+        """Push the network under way if its time has come."""
+        if int(self.due) != NONE and int(self.tick) >= int(self.due):
+            lead = self.model.lead
+            network = Network(*(self.get_buffer(name) for name in Network._fields))
+            network = Network(*(part.reshape(*lead, *part.shape[1:]) for part in network))
+            self.model.push_(network, self.taught.reshape(lead))
+            self.due = torch.tensor(NONE)
+
+
+def _ticks(time: float, dt: float) -> int:
+    """Return the first tick at or after a time."""
+    return math.ceil(time / dt - 1e-6)

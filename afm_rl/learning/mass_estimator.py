@@ -1,0 +1,134 @@
+"""A scalar estimate of a quadrotor's mass: the classical yardstick."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from afm_rl.airframe import saturate
+from afm_rl.dynamics import Oracle, Quadrotor
+from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.learning.nll import GaussianNLLLoss
+from afm_rl.learning.updater import Updater
+from afm_rl.rotations import body_z_axis
+
+
+def inverse_mass(
+    velocity: Tensor, faster: Tensor, axis: Tensor, thrust: Tensor, dt: float, gravity: float
+) -> Tensor:
+    r"""Return one over the mass that explains a change of velocity, ``(*B)`` in 1/kg.
+
+    .. math:: k = \frac{(\Delta v + g\,\Delta t\,e_z) \cdot b}{T\,\Delta t\,|b|^2}
+
+    Args:
+        velocity: at the start (m/s), ``(*B, 3)``.
+        faster: at the end (m/s), ``(*B, 3)``.
+        axis: the thrust's mean direction b, ``(*B, 3)``.
+        thrust: T (N), ``(*B)``, not 0.
+        dt: time in between (s).
+        gravity: acceleration of free fall (m/s^2).
+
+    >>> up, still = torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3)
+    >>> inverse_mass(still, still, up, torch.tensor(0.2943), 0.05, 9.81)  # it hovers: 30 g
+    tensor(33.3333)
+    """
+    push = faster - velocity
+    lift = (push * axis).sum(-1) + gravity * dt * axis[..., 2]
+    return lift / (thrust * dt * axis.square().sum(-1))
+
+
+class MassEstimator(Updater):
+    r"""Tells a model the mass that the last changes of velocity speak for.
+
+    :func:`inverse_mass` per tick, low-passed:
+    :math:`1/m \leftarrow s\,k + (1 - s) / m`. Nothing else about the flight is estimated.
+
+    Args:
+        loss: a loss over an :class:`~afm_rl.dynamics.Oracle` of a
+            :class:`~afm_rl.dynamics.Quadrotor` whose regime has a ``mass``, such as
+            :class:`~afm_rl.regimes.MassFactor`. It is told the estimate, not the truth.
+        share: s, weight of the latest measurement, in (0, 1].
+        least_thrust: thrust, as a share of the weight, below which nothing is measured.
+        least: lowest factor of the nominal mass that is believed.
+        most: highest one.
+
+    Ticks without a finite measurement leave the estimate as it is and are counted in
+    :attr:`refused` if their loss is not finite.
+
+    Raises:
+        ConfigurationError: for a setting or model that cannot be used.
+
+    >>> from afm_rl.regimes import MassFactor
+    >>> updater = MassEstimator(GaussianNLLLoss(Oracle(Quadrotor(), MassFactor())), share=1.0)
+    >>> level = torch.zeros(2, 13).index_fill(1, torch.tensor(9), 1.0)
+    >>> action = torch.tensor([[0.2943, 0, 0, 0], [0.44145, 0, 0, 0]])
+    >>> td = TensorDict({"observation": level, "action": action}, [2])
+    >>> _ = updater(td.set(("next", "observation"), level))  # both hover
+    >>> updater.model.parameters_now
+    tensor([[1.0000],
+            [1.5000]])
+    """
+
+    def __init__(
+        self,
+        loss: GaussianNLLLoss,
+        share: float = 0.7,
+        least_thrust: float = 0.1,
+        least: float = 0.1,
+        most: float = 10.0,
+    ) -> None:
+        super().__init__(loss)
+        model = loss.model
+        if not isinstance(model, Oracle) or not isinstance(model.model, Quadrotor):
+            raise ConfigurationError(
+                f"updater: MassEstimator needs an Oracle of a Quadrotor, got {type(model).__name__}"
+            )
+        if "mass" not in model.regime.names:
+            raise ConfigurationError(
+                f"updater: the regime has {', '.join(model.regime.names)}: expected a mass"
+            )
+        self.column = model.regime.names.index("mass")
+        self.share = check_number("updater.share", share, low=0.0, high=1.0, open_low=True)
+        self.least_thrust = check_number(
+            "updater.least_thrust", least_thrust, low=0.0, open_low=True
+        )
+        self.least = check_number("updater.least", least, low=0.0, open_low=True)
+        self.most = check_number("updater.most", most, low=self.least, open_low=True)
+        self.refused = 0
+
+    @property
+    def model(self) -> Oracle:
+        """The model that is told."""
+        return cast(Oracle, self.loss.model)
+
+    def start(self, tensordict: TensorDictBase) -> None:
+        """Tell the nominal mass."""
+        regime = torch.tensor(self.model.regime.identity)
+        self.model.tell(regime.expand(*tensordict.batch_size, -1).clone())
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Measure the loss, then tell the new estimate."""
+        batch = tensordict.batch_size
+        if self.model.parameters_now.shape[:-1] != batch:
+            self.start(tensordict)
+        loss = super().forward(tensordict)["loss"]
+        self.refused += int((~loss.isfinite()).sum())
+        physics = cast(Quadrotor, self.model.model)
+        body = physics.body
+        state, action, after = (tensordict.get(key) for key in self.loss.in_keys)
+        thrust = saturate(action, body)[..., 0]
+        axis = (body_z_axis(state[..., 6:10]) + body_z_axis(after[..., 6:10])) / 2
+        enough = thrust >= self.least_thrust * body.hover_thrust
+        speeds = state[..., 3:6], after[..., 3:6]
+        seen = inverse_mass(*speeds, axis, thrust.where(enough, 1.0), physics.dt, body.gravity)
+        told = self.model.parameters_now.clone()
+        factor = told[..., self.column]
+        inverse = torch.lerp(1 / factor, seen * body.mass, self.share)
+        fresh = 1 / inverse.clamp(1 / self.most, 1 / self.least)
+        told[..., self.column] = torch.where(enough & seen.isfinite(), fresh, factor)
+        self.model.tell(told)
+        return TensorDict({"loss": loss}, batch)

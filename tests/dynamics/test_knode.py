@@ -1,0 +1,253 @@
+"""Known dynamics plus a pool of networks: derivatives, pool, missions."""
+
+import copy
+import math
+
+import pytest
+import torch
+
+from afm_rl.airframe import QuadrotorBody
+from afm_rl.dynamics import KNODE, Dubins, DynamicsModel, KnownDynamics, Quadrotor
+from afm_rl.dynamics.rates import QuadrotorRate
+from afm_rl.dynamics.residual import Network
+from afm_rl.dynamics.runge_kutta import runge_kutta_tangent
+from afm_rl.errors import ConfigurationError
+from afm_rl.manifold import Manifold
+from afm_rl.rotations import quaternion_normalise
+
+SCALE = torch.tensor([0.1, 2e-5, 2e-5, 5e-6], dtype=torch.float64)
+
+
+def flights(*batch, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    state = torch.randn(*batch, 13, generator=generator, dtype=torch.float64)
+    state[..., 6:10] = quaternion_normalise(state[..., 6:10])
+    action = torch.randn(*batch, 4, generator=generator, dtype=torch.float64) * SCALE
+    action[..., 0] += QuadrotorBody().hover_thrust
+    return state, action
+
+
+def car_rate(state, action):
+    heading, speed = state[..., 2:], action[..., :1]
+    return torch.cat([speed * heading.cos(), speed * heading.sin(), action[..., 1:]], -1)
+
+
+def cart_step(state, action):
+    return state + 0.1 * torch.cat([state[..., 1:], action], -1)
+
+
+def full(networks=3, **settings):
+    """Return a quadrotor with several networks, also with biases."""
+    model = KNODE(Quadrotor(**settings.pop("nominal", {})), **settings)
+    generator = torch.Generator().manual_seed(9)
+    for _ in range(networks):
+        network = model.draw(torch.randn(model.numbers, generator=generator))
+        model.push_(
+            Network(*(p + 0.1 * torch.randn(p.shape, generator=generator) for p in network))
+        )
+    return model
+
+
+def constant(model, *values):
+    """Return a network that gives the same whatever it is shown."""
+    network = model.draw(torch.zeros(model.numbers))
+    return network._replace(outer_bias=torch.tensor([values]))
+
+
+def test_the_networks_are_the_published_ones():
+    model = KNODE(Quadrotor()).push_()
+    assert sum(part[0].numel() for part in model.networks) == 1997
+    first = model.networks
+    assert not first.inner_bias.any() and not first.outer_bias.any()
+    bound = math.sqrt(6 / (17 + 64))
+    assert 0.95 * bound < first.inner[0].abs().max() <= bound
+    assert float(first.inner[0].std()) == pytest.approx(bound / math.sqrt(3), rel=0.05)  # uniform
+
+
+def test_without_networks_it_is_the_nominal_model():
+    state, action = flights(7)
+    model, nominal = KNODE(Quadrotor(), substeps=2), Quadrotor(substeps=2)
+    for one, other in zip(
+        model.linearise(state, action), nominal.linearise(state, action), strict=True
+    ):
+        torch.testing.assert_close(one, other)
+    torch.testing.assert_close(model(state, action), nominal(state, action))
+    for one, other in zip(
+        model.moments(state, action), nominal.moments(state, action), strict=True
+    ):
+        torch.testing.assert_close(one, other)
+    assert torch.equal(model.noise_scale(state, action), nominal.noise_scale(state, action))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"features": range(3, 13)}, {"substeps": 3, "hidden": 8}, {"nominal": {"dt": 0.1}}],
+    ids=str,
+)
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)], ids=str)
+def test_closed_forms_equal_forward_mode(settings, batch):
+    model, (state, action) = full(**settings), flights(*batch)
+    for one, other in zip(
+        model.linearise(state, action), DynamicsModel.linearise(model, state, action), strict=True
+    ):
+        torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-11)
+    by_action = DynamicsModel.jacobian(model, state, action)
+    torch.testing.assert_close(model.jacobian(state, action), by_action, rtol=1e-11, atol=1e-11)
+
+
+def test_closed_forms_equal_finite_differences():
+    model, (state, action) = full(), flights(4)
+    _, by_state, by_action = model.linearise(state, action)
+    for given, found, step in ((0, by_state, 1e-6), (1, by_action, 1e-9)):
+        for column in range(found.shape[-1]):
+            ends = []
+            for sign in (1, -1):
+                point = [state.clone(), action.clone()]
+                point[given][:, column] += sign * step
+                ends.append(model(*point))
+            slope = (ends[0] - ends[1]) / (2 * step)
+            torch.testing.assert_close(slope, found[..., column], rtol=1e-4, atol=2e-5)
+
+
+def test_any_rate_of_change_will_do():
+    model = KNODE(Dubins(), rate=car_rate, substeps=2, hidden=8).push_().double()
+    generator = torch.Generator().manual_seed(0)
+    state, action = (torch.randn(6, n, generator=generator).double() for n in (3, 2))
+    state[:, 2] = 3.14  # some of them cross pi
+    ahead, by_state, by_action = model.linearise(state, action)
+    assert ahead[:, 2].abs().max() <= math.pi
+    for one, other in zip(
+        (ahead, by_state, by_action), DynamicsModel.linearise(model, state, action), strict=True
+    ):
+        torch.testing.assert_close(one, other)
+    torch.testing.assert_close(
+        model.jacobian(state, action), DynamicsModel.jacobian(model, state, action)
+    )
+
+
+def test_the_chain_rule_is_that_of_the_quadrotor():
+    state, action = flights(5)
+    held = QuadrotorRate(QuadrotorBody()).hold(action)
+    start = torch.eye(13, 17, dtype=torch.float64).expand(5, 13, 17)
+    rate = QuadrotorRate(QuadrotorBody())
+    ahead, slope = rate.finish_tangent(*runge_kutta_tangent(held.tangent, state, start, 0.1, 2))
+    expected = Quadrotor(dt=0.1, substeps=2).linearise(state, action)
+    torch.testing.assert_close(ahead, expected[0])
+    torch.testing.assert_close(slope, torch.cat(expected[1:], -1))
+
+
+def test_the_newest_network_counts_most_and_the_oldest_leaves():
+    model = KNODE(KnownDynamics(cart_step, Manifold(2), 1), lambda x, u: 0 * x, dt=1.0, pool=3)
+    state, action = torch.zeros(2), torch.zeros(1)
+    for count in range(1, 6):
+        model.push_(constant(model, float(10**count), 0.0))
+        found = model(state, action)[0]
+        newest = [10.0**k for k in range(count, max(0, count - 3), -1)]
+        expected = sum(x * math.exp(-i) for i, x in enumerate(newest))
+        torch.testing.assert_close(found, torch.tensor(expected))
+
+
+def test_a_network_can_be_tried_before_it_is_pushed():
+    model, (state, action) = full(2), flights(3)
+    network = model.draw(torch.randn(model.numbers))
+    tried = model.advance(state, action, 0.05, newest=network)
+    slope = model.slope(state, action, network)
+    model.push_(network)
+    torch.testing.assert_close(tried, model(state, action))
+    torch.testing.assert_close(slope, model.slope(state, action))
+
+
+def test_only_the_newest_learns():
+    model, (state, action) = full(), flights(3)
+    model(state, action).square().sum().backward()
+    for part in model.networks:
+        assert part.grad[0].any() and not part.grad[1:].any()
+    model.push_()
+    assert all(part.grad is None for part in model.networks)
+
+
+def test_new_networks_follow_the_seed_and_no_other():
+    before = torch.get_rng_state()
+    drawn = [KNODE(Quadrotor(), seed=seed).push_().push_() for seed in (1, 1, 2)]
+    one, same, other = (model.networks.inner for model in drawn)
+    assert torch.equal(one, same) and not torch.equal(one, other)
+    assert not torch.equal(one[0], one[1])
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_missions_have_pools_of_their_own():
+    model = full(2)
+    several, (state, action) = copy.deepcopy(model).expand_(3), flights(3, 4)
+    torch.testing.assert_close(several(state, action), model(state, action))
+    several.push_(where=torch.tensor([True, False, True]))
+    assert torch.equal(several.networks.inner[1], model.networks.inner)
+    assert torch.equal(several.networks.inner[0], several.networks.inner[2])
+    assert torch.equal(several.networks.inner[0, 1:], model.networks.inner[:-1])
+    numbers = torch.randn(3, model.numbers)
+    several.push_(several.draw(numbers))
+    whole = several.linearise(state, action)
+    for k in range(3):  # each alone
+        alone = copy.deepcopy(several).select_(torch.tensor([k]))
+        rows = slice(k, k + 1)
+        for one, other in zip(alone.linearise(state[rows], action[rows]), whole, strict=True):
+            torch.testing.assert_close(one, other[rows], rtol=1e-9, atol=1e-9)
+    several.select_(torch.tensor([2, 0]))
+    assert several.lead == (2,) and several.missions.tolist() == [2, 0]
+    torch.testing.assert_close(several(state[[2, 0]], action[[2, 0]]), whole[0][[2, 0]])
+    none = several.select_(torch.tensor([], dtype=torch.int64))
+    assert none(state[:0], action[:0]).shape == (0, 4, 13)
+
+
+def test_a_shared_pool_stays_as_it_is():
+    model, (state, action) = full(), flights(3)
+    before = model(state, action)
+    assert model.select_(torch.tensor([1])).lead == ()
+    assert torch.equal(model(state, action), before)
+
+
+def test_its_state_makes_a_twin():
+    model, (state, action) = full(), flights(3)
+    twin = KNODE(Quadrotor())
+    twin.load_state_dict(model.state_dict())
+    assert torch.equal(twin(state, action), model(state, action))
+    assert set(model.state_dict()) == set(Network._fields)
+
+
+def test_single_precision_stays():
+    model, (state, action) = full(), flights(3)
+    single = model(state.float(), action.float())
+    assert single.dtype is torch.float32
+    torch.testing.assert_close(single.double(), model(state, action), rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"hidden": 0}, "dynamics.hidden=0"),
+        ({"pool": 0}, "dynamics.pool=0"),
+        ({"substeps": 0}, "dynamics.substeps=0"),
+        ({"dt": 0.0}, "dynamics.dt=0.0"),
+        ({"seed": -1}, "dynamics.seed=-1"),
+        ({"features": [13]}, r"dynamics.features=\[13\]: expected distinct indices in 0..12"),
+        ({"features": [1, 1]}, "expected distinct indices"),
+    ],
+    ids=str,
+)
+def test_impossible_settings_are_refused(settings, message):
+    with pytest.raises(ConfigurationError, match=message):
+        KNODE(Quadrotor(), **settings)
+
+
+def test_models_whose_equations_are_not_known_are_refused():
+    with pytest.raises(ConfigurationError, match="dynamics.rate=None: .* of Dubins"):
+        KNODE(Dubins())
+    with pytest.raises(ConfigurationError, match="dynamics.dt=None: KnownDynamics has no dt"):
+        KNODE(KnownDynamics(cart_step, Manifold(2), 1), rate=lambda x, u: x)
+
+
+def test_missions_that_do_not_fit_are_refused():
+    model = full().expand_(3)
+    with pytest.raises(ConfigurationError, match=r"holds \(3,\) missions, got .* \(2, 13\)"):
+        model(*flights(2))
+    with pytest.raises(ConfigurationError, match=r"already expanded to \(3,\) missions"):
+        model.expand_(3)

@@ -1,0 +1,305 @@
+"""Learning networks from windows of a flight."""
+
+import copy
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from afm_rl.airframe import QuadrotorBody
+from afm_rl.dynamics import KNODE, Dubins, Quadrotor
+from afm_rl.dynamics.quadrotor_equations import quadrotor_path
+from afm_rl.errors import ConfigurationError
+from afm_rl.learning import GaussianNLLLoss, KNODEUpdater
+from afm_rl.learning import knode_fit as module
+from afm_rl.learning.knode_fit import fit_network
+from afm_rl.missions.log import StepLog
+from afm_rl.missions.state import Loop, restore, snapshot
+from afm_rl.missions.tree import flatten, unflatten
+
+BODY = QuadrotorBody()
+FACTORS = torch.tensor([1.5, 0.75, 2.0])  # gains of the thrust
+
+
+def stream(ticks, factors=FACTORS, trace=True):
+    """Return ticks of flights whose thrust does more, or less, than it should."""
+    generator = torch.Generator().manual_seed(3)
+    state = torch.zeros(len(factors), 13).index_fill(1, torch.tensor(9), 1.0)
+    result = []
+    for _ in range(ticks):
+        action = torch.tensor([BODY.hover_thrust, 0.0, 0.0, 0.0]).expand(len(factors), 4).clone()
+        action[:, 1:] += 1e-6 * torch.randn(3, generator=generator)
+        given = action.clone()
+        given[:, 0] *= factors
+        path = quadrotor_path(state, given, 0.05, 25, BODY)
+        td = TensorDict({"observation": state, "action": action}, [len(factors)])
+        td["next", "observation"] = path[-1].clone()
+        td["mission"] = TensorDict({"seed": torch.arange(len(factors))}, [len(factors)])
+        if trace:
+            td["next", "trace"] = torch.cat([state[None], path]).movedim(0, -2)
+        result.append(td)
+        state = path[-1]
+    return result
+
+
+def teach(ticks=(), missions=3, model=None, **settings):
+    model = KNODE(Quadrotor()) if model is None else model
+    if missions:
+        model.expand_(missions)
+    updater = KNODEUpdater(GaussianNLLLoss(model), **{"begin": 0.0, **settings})
+    for k, td in enumerate(ticks):
+        if k == 0:
+            updater.start(td)
+        updater(td)
+    return model, updater
+
+
+def missed(model, td):
+    """Return the largest error of the acceleration (m/s^2) in a tick, per flight."""
+    ahead = model(td["observation"], td["action"])
+    return ((ahead - td["next", "observation"])[..., 3:6] / 0.05).abs().amax(-1).detach()
+
+
+@pytest.mark.parametrize("settings", [{}, {"trainer": "exact"}, {"noise": 0.0}], ids=str)
+def test_a_gain_of_the_thrust_is_learnt_in_a_few_updates(settings):
+    ticks = stream(11)
+    model, updater = teach(ticks[:10], **settings)
+    last = ticks[10]
+    before = (FACTORS - 1).abs() * BODY.gravity
+    torch.testing.assert_close(missed(KNODE(Quadrotor()), last), before, rtol=0.01, atol=0.01)
+    assert (missed(model, last) < 0.15 * before).all()
+    assert updater.refused == 0
+
+
+def test_transitions_without_a_trace_will_do():
+    ticks = stream(11, trace=False)
+    model, _ = teach(ticks[:10])
+    assert (missed(model, ticks[10]) < 0.2 * missed(KNODE(Quadrotor()), ticks[10])).all()
+
+
+def test_missions_learn_as_if_they_were_alone():
+    ticks = stream(8)
+    model, _ = teach(ticks)
+    for k in range(3):
+        alone, _ = teach([td[k : k + 1] for td in ticks], missions=1)
+        for one, other in zip(alone.networks, model.networks, strict=True):
+            torch.testing.assert_close(one[0], other[k], rtol=1e-3, atol=1e-4)
+
+
+def test_a_shared_pool_learns_from_all_flights():
+    ticks = stream(5, torch.tensor([1.5, 1.5]))
+    model, _ = teach(ticks[:4], missions=0)
+    assert model.networks.inner.shape == (3, 17, 64)
+    assert (missed(model, ticks[4]) < 1.0).all()
+    single, _ = teach([td[0] for td in ticks[:4]], missions=0)
+    assert (missed(single, ticks[4]) < 1.0).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "arrives"),
+    [
+        ({}, [4, 7]),
+        ({"latency": 0.0}, [3, 6, 9]),
+        ({"latency": 0.12}, [6, 9]),  # the first tick after 0.12 s
+        ({"latency": 0.25}, [8]),  # meanwhile no other is trained
+        ({"begin": 0.1}, [6, 9]),
+        ({"window": 0.05, "latency": 0.0}, [*range(1, 10)]),
+    ],
+    ids=str,
+)
+def test_networks_join_in_simulated_time(settings, arrives):
+    ticks = stream(9)
+    model, updater = teach(epochs=1, **settings)
+    updater.start(ticks[0])
+    changes, last = [], model.networks.inner.clone()
+    for k, td in enumerate(ticks):
+        updater(td)
+        if not torch.equal(model.networks.inner, last):
+            changes.append(k + 1)  # ticks flown
+        last = model.networks.inner.clone()
+    assert changes == arrives
+
+
+def test_a_busy_trainer_leaves_the_latest_rows():
+    ticks = stream(9)
+    _, updater = teach(ticks[:7], epochs=1, latency=0.25)
+    latest = torch.cat([td["next", "trace"][:, :-1] for td in ticks[4:7]], 1)
+    assert torch.equal(updater.window.rows.state[:, 0], latest)
+
+
+def test_random_numbers_are_of_the_seed_and_paired_by_missions():
+    ticks = stream(4, torch.tensor([1.5, 1.5]))
+    (one, _), (same, _), (other, _) = (teach(ticks, missions=2, seed=s) for s in (1, 1, 2))
+    assert torch.equal(one.networks.inner, same.networks.inner)
+    assert not torch.equal(one.networks.inner, other.networks.inner)
+    torch.testing.assert_close(*one.networks.inner, rtol=1e-3, atol=1e-3)
+    own, _ = teach(ticks, missions=2, seed_key=["mission", "seed"])
+    assert not torch.equal(own.networks.inner[0], own.networks.inner[1])
+
+
+def test_the_published_numbers_repeat_themselves():
+    ticks = stream(3) * 3  # the same window again and again
+    settings = {"pool": 1, "hidden": 8}  # no older networks
+    quirk, updater = teach(model=KNODE(Quadrotor(), **settings), published_random=True)
+    free, other = teach(model=KNODE(Quadrotor(), **settings))
+    found = {quirk: [], free: []}
+    for td in ticks:
+        for model, learner in ((quirk, updater), (free, other)):
+            learner(td)
+            found[model].append(model.networks.inner.clone())
+    assert torch.equal(found[quirk][3], found[quirk][6])
+    assert not torch.equal(found[free][3], found[free][6])
+
+
+def test_noise_on_the_moments_is_learnt_as_a_turn():
+    ticks = stream(5, torch.ones(1))
+    turns = []
+    for published in (False, True):
+        model, _ = teach(ticks[:4], missions=1, published_random=published)
+        ahead = model(ticks[4]["observation"], ticks[4]["action"])
+        turns.append((ahead - ticks[4]["next", "observation"])[..., 10:].abs().max())
+    assert turns[1] > 3 * turns[0]
+
+
+def test_faulty_rows_are_left_out():
+    ticks = stream(5)
+    ticks[1]["next", "trace"][0, 7] = torch.nan
+    ticks[2]["next", "observation"][1] = torch.inf
+    model, updater = teach()
+    losses = [updater(td)["loss"] for td in ticks[:4]]
+    assert updater.refused == 2
+    assert losses[1].isnan().tolist() == [True, False, False]
+    assert losses[2].isnan().tolist() == [False, True, False]
+    assert all(part.isfinite().all() for part in model.networks)
+    assert (missed(model, ticks[4]) < missed(KNODE(Quadrotor()), ticks[4])).all()
+
+
+def test_the_mask_says_who_learns():
+    ticks = stream(4)
+    for td in ticks:
+        td["mask"] = torch.tensor([[True], [False], [True]])
+    model, updater = teach(ticks, mask_key="mask")
+    assert not model.networks.inner[1].any()
+    assert model.networks.inner[0].any() and updater.refused == 0
+
+
+def test_missions_that_end_take_their_rows_along():
+    ticks = stream(9)
+    whole, _ = teach(ticks)
+    model, updater = teach(ticks[:4])
+    model.select_(torch.tensor([2, 0]))
+    for k, td in enumerate(ticks[4:]):
+        updater(td[torch.tensor([2, 0]) if k < 2 else torch.tensor([0])])
+        if k == 1:  # a network is under way
+            assert int(updater.due) > 0
+            model.select_(torch.tensor([1]))
+    for one, other in zip(model.networks, whole.networks, strict=True):
+        torch.testing.assert_close(one[0], other[0], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("stop", [2, 3, 5])
+def test_a_snapshot_goes_on_to_the_bit(stop):
+    def agent(model, updater):
+        parts = {"env": nn.Module(), "planner": nn.Module()}
+        return SimpleNamespace(model=model, updater=updater, **parts)
+
+    ticks, left = stream(8), torch.tensor([2, 0])
+    settings = {"seed_key": ("mission", "seed"), "latency": 0.1}
+    whole = agent(*teach(ticks[:2], **settings))
+    whole.model.select_(left)  # one flight is over
+    ticks = [*ticks[:2], *(td[left] for td in ticks[2:])]
+    for td in ticks[2:stop]:
+        whole.updater(td)
+    loop = Loop(ticks[stop], left, {}, StepLog(["x"]))
+    tensors, rest = flatten(copy.deepcopy(snapshot(whole, loop)))
+    state = unflatten(tensors, rest)
+    for td in ticks[stop:]:
+        whole.updater(td)
+    second = agent(*teach(**settings))
+    second.updater.start(ticks[0])
+    restore(second, loop, state)
+    for td in ticks[stop:]:
+        second.updater(td)
+    for one, other in zip(second.model.networks, whole.model.networks, strict=True):
+        assert torch.equal(one, other)
+    storages = [
+        tensor.untyped_storage().data_ptr() for tensor in tensors.values() if tensor.numel()
+    ]
+    assert len(set(storages)) == len(storages)  # files cannot hold views of one another
+
+
+def test_start_forgets_the_flight_but_not_the_pool():
+    ticks = stream(5)
+    model, updater = teach(ticks)
+    pool = model.networks.inner.clone()
+    updater.start(ticks[0])
+    assert updater.window.size == 0 and int(updater.tick) == 0 and int(updater.due) == -1
+    assert torch.equal(model.networks.inner, pool)
+    assert not any("window" in name or name == "tick" for name in updater.state_dict())
+
+
+def test_the_fast_gradient_is_the_exact_one_to_first_order():
+    (td,) = stream(1)
+    trace = td["next", "trace"].double()
+    state, after = trace[:, :-1].flatten(0, 1), trace[:, 1:].flatten(0, 1)
+    action = td["action"].double().unsqueeze(1).expand(-1, 25, -1).flatten(0, 1)
+    model = KNODE(Quadrotor()).push_().push_()
+    network = model.draw(torch.randn(1, model.numbers, dtype=torch.float64))
+    share = torch.full((1, len(state), 1), 1 / (13 * len(state)), dtype=torch.float64)
+    model.double()
+    found = []
+    for trainer in (module._fast, module._exact):
+        gradient = trainer(model, (state, action, after), share, 0.002)(network)
+        found.append(torch.cat([part.flatten() for part in gradient]))
+    assert (found[0] - found[1]).norm() < 0.05 * found[1].norm()
+
+
+def test_the_weights_decay():
+    (td,) = stream(1)
+    rows = td["observation"], td["action"], td["next", "observation"]
+    model = KNODE(Quadrotor())
+    start = model.draw(torch.randn(1, model.numbers))
+    none = torch.zeros(3, dtype=torch.bool)  # no row counts
+    settings = {"epochs": 5, "lr": 0.01}
+    still, less = (fit_network(model, start, rows, none, 0.05, l2=l2, **settings) for l2 in (0, 1))
+    assert torch.equal(still.inner, start.inner)
+    assert less.inner.abs().sum() < start.inner.abs().sum()
+
+
+def test_the_loss_is_measured_before_learning():
+    ticks = stream(3)
+    model, updater = teach(latency=0.0)
+    for td in ticks:
+        expected = GaussianNLLLoss(KNODE(Quadrotor()), reduction="none")(td)["loss_nll"]
+        torch.testing.assert_close(updater(td)["loss"], expected.detach())
+    assert model.networks.inner.any() and updater.learns
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"window": 0.0}, "updater.window=0.0"),
+        ({"window": 0.12}, "updater.window=0.12: expected a multiple of the control tick, 0.05 s"),
+        ({"window": 0.01}, "updater.window=0.01: expected a multiple"),
+        ({"begin": -1.0}, "updater.begin=-1.0"),
+        ({"latency": -0.1}, "updater.latency=-0.1"),
+        ({"epochs": 0}, "updater.epochs=0"),
+        ({"lr": 0.0}, "updater.lr=0.0"),
+        ({"l2": -1.0}, "updater.l2=-1.0"),
+        ({"noise": -1.0}, "updater.noise=-1.0"),
+        ({"trainer": "slow"}, "updater.trainer='slow': expected one of fast, exact"),
+        ({"published_random": 1}, "updater.published_random=1"),
+        ({"seed": -1}, "updater.seed=-1"),
+    ],
+    ids=str,
+)
+def test_impossible_settings_are_refused(settings, message):
+    with pytest.raises(ConfigurationError, match=message):
+        KNODEUpdater(GaussianNLLLoss(KNODE(Quadrotor())), **settings)
+
+
+def test_other_models_are_refused():
+    with pytest.raises(ConfigurationError, match="teaches a KNODE, got Dubins"):
+        KNODEUpdater(GaussianNLLLoss(Dubins()))

@@ -1,0 +1,44 @@
+"""A KNODE's first network, before any flight."""
+
+import pytest
+import torch
+
+from afm_rl.dynamics import KNODE, Oracle, Quadrotor
+from afm_rl.errors import ConfigurationError
+from afm_rl.learning.pretrain_knode import pretrain_knode
+from afm_rl.regimes import MassFactor
+
+LEVEL = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
+SPREAD = torch.tensor([0.5] * 6 + [0.05] * 3 + [0.3] * 3)
+BOX = torch.tensor([0.2, 0.0, 0.0, 0.0]), torch.tensor([0.4, 0.0, 0.0, 0.0])
+
+
+def train(model, **settings):
+    teacher = Oracle(Quadrotor(), MassFactor())
+    teacher.tell(torch.tensor([1.2]))
+    settings = {"flights": 20, "ticks": 4, "epochs": 60, **settings}
+    return pretrain_knode(model, teacher, LEVEL, SPREAD, BOX, **settings)
+
+
+def test_another_mass_is_learnt_and_the_same_each_time():
+    model, twin, other = (KNODE(Quadrotor()) for _ in range(3))
+    error = train(model)
+    assert error == train(twin) != train(other, seed=1)
+    assert torch.equal(model.networks.inner, twin.networks.inner)
+    assert error < 0.5 * train(KNODE(Quadrotor()), epochs=1)
+    assert not model.networks.inner[1:].any()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"flights": 0}, {"ticks": 0}, {"epochs": 0}, {"lr": 0.0}, {"noise": -1.0}, {"seed": -1}],
+    ids=str,
+)
+def test_impossible_settings_are_refused(settings):
+    with pytest.raises(ConfigurationError, match=f"dynamics.pretrain.{next(iter(settings))}"):
+        train(KNODE(Quadrotor()), **settings)
+
+
+def test_it_comes_before_the_missions():
+    with pytest.raises(ConfigurationError, match="before it is given to 4 missions"):
+        train(KNODE(Quadrotor()).expand_(4))
