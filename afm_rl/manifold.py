@@ -50,6 +50,10 @@ class Manifold(nn.Module):
         mask[list(angles)] = True
         self.register_buffer("is_angle", mask, persistent=False)
 
+    def project(self, raw: Tensor) -> Tensor:
+        """Return the states ``(*B, S)`` that numbers drawn from a box stand for: themselves."""
+        return raw
+
     def difference(self, state: Tensor, origin: Tensor) -> Tensor:
         """Return the tangent vector ``(*B, D)`` that leads from ``origin`` to ``state``."""
         raw = state - origin

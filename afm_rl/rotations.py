@@ -132,6 +132,11 @@ class RigidBodySpace(Manifold):
         super().__init__(13)
         self.tangent_size = 12
 
+    def project(self, raw: Tensor) -> Tensor:
+        """Scale the quaternions in ``(*B, 13)`` to length 1."""
+        turned = quaternion_normalise(raw[..., 6:10])
+        return torch.cat([raw[..., :6], turned, raw[..., 10:]], -1)
+
     def difference(self, state: Tensor, origin: Tensor) -> Tensor:
         """Return the tangent vector ``(*B, 12)`` that leads from ``origin`` to ``state``."""
         raw = state - origin

@@ -1,6 +1,7 @@
 """Environments: robots whose dynamics change under way."""
 
 from afm_rl.envs.course import Course
+from afm_rl.envs.flights import find_reference, make_flights
 from afm_rl.envs.mission_noise import MissionNoise
 from afm_rl.envs.missions import MissionFormat
 from afm_rl.envs.quadrotor import CrazyflieTrack
@@ -39,7 +40,9 @@ __all__ = [
     "UGVTrackGym",
     "UGVTrackVectorEnv",
     "Waypoints",
+    "find_reference",
     "load_reference",
     "load_track",
+    "make_flights",
     "schedule_in_seconds",
 ]

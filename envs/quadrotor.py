@@ -52,6 +52,7 @@ class CrazyflieTrack(MissionEnv):
     ``pose``          ``(*B, 13)``     the state itself; transforms should leave it alone
     ``mission``       nested           see :class:`~afm_rl.envs.missions.MissionFormat`;
                                        ``track`` is the index of the reference
+    ``phase``         ``(*B)``         index of the present phase; hidden truth
     ``regime``        ``(*B, F)``      parameters that act on the next action: hidden
                                        truth, for oracles and logs only
     ``regime_active`` ``(*B)``         whether they differ from nominal; hidden as well
@@ -69,7 +70,8 @@ class CrazyflieTrack(MissionEnv):
         body: the quadrotor, a Crazyflie if None.
         duration: length of a flight (s).
         horizon: ticks N by which ``reference`` looks ahead.
-        preview: whether it holds the future; otherwise it repeats the present set-point.
+        preview: whether it holds the future; otherwise it repeats the present set-point, which
+            like the metric is one plant step ahead.
         start: ``"moving"``, with the velocity of the reference, or ``"rest"``. Either starts at
             the reference, level.
         limit: distance from the reference at which a flight is lost (m).
@@ -83,6 +85,8 @@ class CrazyflieTrack(MissionEnv):
         device: where the tensors live.
         missions: what missions are unless ``reset`` is told otherwise: a tensordict that
             broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
+        action_low: lowest action, ``(4,)``; what the motors can do if None.
+        action_high: highest action.
         dtype: floating-point type, torch's default if None.
 
     Raises:
@@ -118,6 +122,8 @@ class CrazyflieTrack(MissionEnv):
         device: torch.device | str | None = None,
         missions: TensorDictBase | Mapping[str, Any] | None = None,
         *,
+        action_low: Sequence[float] | None = None,
+        action_high: Sequence[float] | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
         batch = check_batch(batch_size)
@@ -163,7 +169,8 @@ class CrazyflieTrack(MissionEnv):
         self.observation_spec = specs.observation_spec(
             state, self.simulation.horizon, len(self.regime.names)
         )
-        self.full_action_spec = specs.action_spec(self.body, state)
+        bounds = settings.check_action_box(action_low, action_high, self.body)
+        self.full_action_spec = specs.action_spec(bounds, state)
         self.full_reward_spec = reward_spec(state)
         self.full_done_spec = done_spec(state)
 

@@ -60,7 +60,8 @@ class CrazyflieTrackGym(gymnasium.Env):
             raise ConfigurationError(f"render_mode={render_mode!r}: expected none")
         missions = {"regime": regime, "ramp": ramp}
         self.native = CrazyflieTrack(reference, schedule=times, missions=missions, **settings)
-        low, high = (np.array(bound, dtype=np.float32) for bound in self.native.body.bounds)
+        box = self.native.action_spec.space
+        low, high = (bound.cpu().numpy().astype(np.float32) for bound in (box.low, box.high))
         self.action_space = Box(low, high, dtype=np.float32)
         self.observation_space = Box(-np.inf, np.inf, (19,), dtype=np.float32)
         self._data: TensorDictBase | None = None

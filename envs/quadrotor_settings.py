@@ -14,6 +14,7 @@ from afm_rl.envs.references import Circle, Reference, load_reference
 from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.regimes import Compose, Regime, Schedule, flight_regimes
 
+NAMES = ("action_low", "action_high")
 UNIT = 1e-3  # how far a quaternion's length may be from 1
 
 
@@ -95,6 +96,32 @@ def check_flight_schedule(schedule: Schedule | Sequence[float] | None, dt: float
     if isinstance(schedule, Schedule):
         return schedule
     return schedule_in_seconds((2.0, 5.0) if schedule is None else schedule, dt)
+
+
+def check_action_box(
+    low: Sequence[float] | None, high: Sequence[float] | None, body: QuadrotorBody
+) -> tuple[list[float], list[float]]:
+    """Return lowest and highest action; None means what the motors can do.
+
+    Raises:
+        ConfigurationError: unless there are four numbers each, low < high.
+
+    >>> check_action_box(None, [0.4, 1e-3, 1e-3, 1e-4], QuadrotorBody())[1]
+    [0.4, 0.001, 0.001, 0.0001]
+    """
+    bounds = []
+    for name, given, most in zip(NAMES, (low, high), body.bounds, strict=True):
+        values = most if given is None else given
+        if isinstance(values, str) or not isinstance(values, Sequence) or len(values) != 4:
+            raise ConfigurationError(
+                f"{name}={values!r}: expected four numbers, thrust (N) and moments (N m)"
+            )
+        bounds.append([check_number(name, value) for value in values])
+    if any(below >= above for below, above in zip(*bounds, strict=True)):
+        raise ConfigurationError(
+            f"action_low={bounds[0]}: expected less than action_high={bounds[1]} on each axis"
+        )
+    return bounds[0], bounds[1]
 
 
 def check_flight_regime(regime: Regime | None, body: QuadrotorBody) -> Regime:

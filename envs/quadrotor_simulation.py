@@ -120,12 +120,15 @@ class QuadrotorSimulation:
             seen = RigidBodySpace().add(pose, sensor * self.sensor_noise.to(pose))
         ticks = torch.arange(self.horizon + 1, device=pose.device) * self.preview
         times = ((step.unsqueeze(-1) + ticks) * self.dt).to(pose.dtype)
+        if not self.preview:  # the published set-point is as far ahead as the metric's
+            times = times + self.dt / self.substeps
         entries = {
             **state,
             "mission": mission.clone(),
             "observation": seen,
             "reference": self._wanted(mission, times),
             "square_error": torch.zeros_like(pose[..., :3]),
+            "phase": self._phase(mission, step),
             "regime": parameters,
             "regime_active": ~self.regime.is_identity(parameters),
         }

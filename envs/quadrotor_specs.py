@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-
-from afm_rl.airframe import QuadrotorBody
 
 
 def state_spec(mission: Composite, dtype: torch.dtype, history: int) -> Composite:
@@ -40,16 +40,15 @@ def observation_spec(state: Composite, horizon: int, parameters: int) -> Composi
     }
     for name, size in sizes.items():
         spec[name] = Unbounded(shape=(*batch, *size), dtype=dtype, device=device)
+    spec["phase"] = Unbounded(shape=batch, dtype=torch.int64, device=device)
     spec["regime_active"] = Categorical(2, shape=batch, dtype=torch.bool, device=device)
     return spec
 
 
-def action_spec(body: QuadrotorBody, state: Composite) -> Composite:
-    """Return the box of the actions: thrust (N) and moments (N m)."""
+def action_spec(bounds: Sequence[Sequence[float]], state: Composite) -> Composite:
+    """Return the box of the actions: thrust (N) and moments (N m), lowest and highest."""
     shape = torch.Size((*state.shape, 4))
     dtype, device = state["pose"].dtype, state.device
-    low, high = (
-        torch.tensor(bound, dtype=dtype, device=device).expand(shape) for bound in body.bounds
-    )
+    low, high = (torch.tensor(bound, dtype=dtype, device=device).expand(shape) for bound in bounds)
     box = Bounded(low=low, high=high, shape=shape, dtype=dtype, device=device)
     return Composite(action=box, shape=state.shape, device=device)

@@ -38,6 +38,8 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "updater=online": ["dynamics=pe"],
     "updater=stream_x": ["dynamics=pe_stream_x"],
     "updater=stream_x_literal": ["dynamics=pe_stream_x"],
+    "planner=mpc": ["robot=quadrotor"],
+    "cost=tracking": ["robot=quadrotor"],
     "transform=afm": ["flow=context"],
     "transform=none": [],
     "flow=none": [],
@@ -53,14 +55,14 @@ def choices(*groups):
 
 PAIRS = [
     *choices("dynamics", "planner"),
-    *(["method=online_pe", "seeds=2", planner] for (planner,) in choices("planner")),
+    *(["method=online_pe", "seeds=2", *planner] for planner in choices("planner")),
 ]
 SINGLES = [
     *choices("method"),
     *choices("updater"),
     *choices("transform"),
     *([choice, "transform=afm"] for (choice, *_) in choices("flow") if choice != "flow=none"),
-    *([cost, "method=afm_physics"] for (cost,) in choices("cost")),
+    *([*cost, "method=afm_physics"] for cost in choices("cost")),
     *choices("robot"),
 ]
 
@@ -121,6 +123,26 @@ def test_a_method_chooses_four_parts_and_nothing_else(method):
     assert list(loaded) == ["defaults"]
     parts = [next(iter(entry)).removeprefix("override /") for entry in loaded.defaults]
     assert parts == ["dynamics", "updater", "transform", "flow"]
+
+
+def test_a_robot_may_choose_a_cost_and_a_planner_but_the_user_has_the_last_word():
+    cfg = composed("robot=quadrotor")
+    assert (cfg.planner._target_, cfg.cost._target_, cfg.tracks, cfg.regimes) == (
+        "afm_rl.planning.MPC",
+        "afm_rl.planning.TrackingCost",
+        "circle_2m_0.8mps",
+        "paper",
+    )
+    assert set(cfg.compare) <= set(GROUPS["method"])
+    given = ["planner=cem", "cost=goal_pose", "tracks=hover", "regimes=none", "compare=[oracle]"]
+    cfg = composed("robot=quadrotor", *given)
+    assert (cfg.planner._target_, cfg.cost._target_) == (
+        "afm_rl.planning.CEM",
+        "afm_rl.planning.GoalDistance",
+    )
+    assert (cfg.tracks, cfg.regimes, cfg.compare) == ("hover", "none", ["oracle"])
+    cfg = composed()
+    assert (cfg.planner._target_, cfg.cost.coordinates) == ("afm_rl.planning.MPPI", [0, 1])
 
 
 def test_without_a_choice_four_methods_are_compared():

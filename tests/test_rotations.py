@@ -120,3 +120,12 @@ def test_tangents_turn_in_the_body_frame():
 def test_the_space_has_thirteen_coordinates_and_twelve_directions():
     space = RigidBodySpace()
     assert (space.size, space.tangent_size) == (13, 12)
+
+
+def test_numbers_from_a_box_become_states():
+    raw = torch.rand(50, 13, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = RigidBodySpace().project(raw)
+    torch.testing.assert_close(found[:, 6:10].norm(dim=-1), torch.ones(50).double())
+    kept = [*range(6), *range(10, 13)]
+    assert torch.equal(found[:, kept], raw[:, kept])
+    torch.testing.assert_close(RigidBodySpace().project(found), found)

@@ -52,7 +52,8 @@ def launch(cfg: DictConfig) -> None:
         prepare(agent, cfg.cache, progress=cfg.progress)
     results = [run(agent, progress=cfg.progress) for agent in agents]
     missions, steps = _joined(results)
-    tracks = {track.name: track for agent in agents for track in agent.base_env.tracks}
+    roads = [getattr(agent.base_env, "tracks", ()) for agent in agents]  # flights have none
+    tracks = {track.name: track for some in roads for track in some}
     shown = {"figures": cfg.figures, "tensorboard": cfg.tensorboard}
     write_run(folder, missions, steps, list(tracks.values()), **shown)
     print_summary(missions)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -90,16 +91,7 @@ class DynamicsModel(nn.Module, ABC):
         Returns:
             f ``(*L, *N, S)``, A ``(*L, *N, S, S)`` and B ``(*L, *N, S, A)``.
         """
-        sizes = (state.shape[-1], action.shape[-1])
-        axes = torch.eye(sum(sizes), device=state.device, dtype=state.dtype)
-        inputs, tangents = [], []
-        for given, axis in zip((state, action), axes.split(sizes, -1), strict=True):
-            wide = given.unsqueeze(-2).expand(*given.shape[:-1], *axis.shape)
-            inputs.append(wide.contiguous())
-            tangents.append(axis.to(wide).expand_as(wide).contiguous())
-        result = torch.func.jvp(self, tuple(inputs), tuple(tangents))
-        by_state, by_action = result[1].mT.split(sizes, -1)
-        return result[0][..., 0, :], by_state, by_action
+        return linearised(self, state, action)
 
     def expand_(self, missions: int) -> DynamicsModel:
         """Give each of ``missions`` parameters of its own, in place.
@@ -111,3 +103,34 @@ class DynamicsModel(nn.Module, ABC):
     def select_(self, index: Tensor) -> DynamicsModel:
         """Keep the missions in ``index`` only, in place (see :meth:`expand_`)."""
         return self
+
+
+def linearised(
+    function: Callable[[Tensor, Tensor], Tensor], state: Tensor, action: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a function of state and action, and its derivatives by both.
+
+    Forward differentiation of all S + A columns in one batch.
+
+    Args:
+        function: takes states ``(*B, S)`` and actions ``(*B, A)``, returns ``(*B, R)``.
+        state: ``(*B, S)``.
+        action: ``(*B, A)``.
+
+    Returns:
+        The value ``(*B, R)`` and derivatives ``(*B, R, S)`` and ``(*B, R, A)``.
+
+    >>> value, by_state, by_action = linearised(torch.mul, torch.ones(2), torch.tensor([3.0, 4.0]))
+    >>> by_state.tolist(), by_action.tolist()
+    ([[3.0, 0.0], [0.0, 4.0]], [[1.0, 0.0], [0.0, 1.0]])
+    """
+    sizes = (state.shape[-1], action.shape[-1])
+    axes = torch.eye(sum(sizes), device=state.device, dtype=state.dtype)
+    inputs, tangents = [], []
+    for given, axis in zip((state, action), axes.split(sizes, -1), strict=True):
+        wide = given.unsqueeze(-2).expand(*given.shape[:-1], *axis.shape)
+        inputs.append(wide.contiguous())
+        tangents.append(axis.to(wide).expand_as(wide).contiguous())
+    result = torch.func.jvp(function, tuple(inputs), tuple(tangents))
+    by_state, by_action = result[1].mT.split(sizes, -1)
+    return result[0][..., 0, :], by_state, by_action

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.dynamics.base import DynamicsModel, linearised
 from afm_rl.regimes import Regime
 
 
@@ -57,6 +57,12 @@ class Oracle(DynamicsModel):
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the true expected next state."""
         return self.model(state, self.effective(state, action))
+
+    def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return next state and derivatives: those of the nominal model, by the chain rule."""
+        effective, in_state, in_action = linearised(self.effective, state, action)
+        ahead, by_state, by_effective = self.model.linearise(state, effective)
+        return ahead, by_state + by_effective @ in_state, by_effective @ in_action
 
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return the nominal model's moments at the effective action."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 
+import torch
 from torch import Tensor
 
 from afm_rl.airframe import QuadrotorBody
@@ -57,6 +58,14 @@ class Quadrotor(KnownDynamics):
         """Return next state and derivatives, in closed form."""
         ahead, slope = linearised_path(state, action, self.dt, self.substeps, self.body)
         return ahead, slope[..., :13], slope[..., 13:]
+
+    def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the derivative by the action on the tangent space, ``(*B, 12, 4)``."""
+        ahead, _, by_action = self.linearise(state, action)
+        origin, columns = state.unsqueeze(-2), by_action.mT.contiguous()
+        wide = ahead.unsqueeze(-2).expand_as(columns).contiguous()
+        differ = partial(self.manifold.difference, origin=origin)
+        return torch.func.jvp(differ, (wide,), (columns,))[1].mT
 
 
 def check_body(body: QuadrotorBody | None) -> QuadrotorBody:

@@ -127,7 +127,8 @@ class ContextFlow(PairCorrector, Flow):
         fresh = row >= self.window - newest
         parameters = torch.where(fresh.unsqueeze(-1), now.unsqueeze(1), before.unsqueeze(1))
         valid = row >= _missing(self.window, newest, generator)
-        state = uniform(*state_box, contexts * self.window, generator).view(*size, -1)
+        drawn = uniform(*state_box, contexts * self.window, generator).view(*size, -1)
+        state = model.manifold.project(drawn)
         executed = self.denormalise(_excite(*size, self.action_size, generator))
         low, high = self.centre - self.half_range, self.centre + self.half_range
         effect = regime.apply(executed, parameters, state)

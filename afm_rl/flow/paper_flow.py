@@ -106,7 +106,7 @@ class PaperFlow(Flow):
 
         The plan is part of the context, so each has its own.
         """
-        state = uniform(*state_box, count, generator)
+        state = model.manifold.project(uniform(*state_box, count, generator))
         box = (self.centre - self.half_range, self.centre + self.half_range)
         planned, intended = (uniform(*box, count, generator) for _ in range(2))
         error = model.manifold.difference(model(state, intended), model(state, planned))

@@ -55,7 +55,7 @@ def pretrain_ensemble(
     check_number("dynamics.pretrain.action_noise", action_noise, low=0.0)
     generator = torch.Generator().manual_seed(seed)
     total = samples + samples // 10
-    state = uniform(*state_box, total, generator)
+    state = teacher.manifold.project(uniform(*state_box, total, generator))
     action = uniform(*action_box, total, generator)
     factor = 1 + action_noise * (2 * torch.rand(action.shape, generator=generator) - 1)
     with torch.no_grad():

@@ -26,12 +26,12 @@ from afm_rl.missions.selection import (
     select_seeds,
     select_tracks,
 )
-from afm_rl.planning import PlanningEnv
+from afm_rl.planning import MPC, PlanningEnv
 from afm_rl.transforms import ActionFlowTransform
 
 ROBOT_SHAPES = (
     *("action_low", "action_high", "state_low", "state_high"),
-    *("features", "model", "regime"),
+    *("features", "model", "regime", "flow_low", "flow_high"),
 )
 AFTER_TRAINING = (
     *("gate", "samples", "steps", "error_action", "wrap", "latch", "checkpoint"),
@@ -95,9 +95,7 @@ def build(cfg: DictConfig) -> Agent:
             action_low=robot.action_low,
             action_high=robot.action_high,
         )
-    goal, names = env.observation_spec["goal"].shape[-1], list(robot.goal_names)
-    if len(names) != goal:
-        raise ConfigurationError(f"robot.goal_names={names}: expected {goal} names")
+    robot.judge.check(env, robot.goal_names)
     missions = build_missions(env, tracks, regimes, seeds)
 
     def make(group: str, *args: Any) -> Any:
@@ -130,7 +128,8 @@ def build(cfg: DictConfig) -> Agent:
     if hasattr(planner, "make_tensordict_primer"):
         chain.append(planner.make_tensordict_primer())
     whole = TransformedEnv(env, Compose(*chain))
-    check_cost(cost, model, whole)
+    stages = planner.horizon + 1 if isinstance(planner, MPC) else None
+    check_cost(cost, model, whole, stages)
     check_keys("planner", planner, whole)
     check_keys("updater", updater, whole)
     return Agent(
@@ -152,5 +151,5 @@ def build(cfg: DictConfig) -> Agent:
 def _shaping(settings: Mapping[str, Any], group: str) -> dict[str, Any]:
     """Return those settings of a group that shape a trained part, for its place in the cache."""
     if group == "robot":
-        return {name: settings[group][name] for name in ROBOT_SHAPES}
+        return {name: settings[group][name] for name in ROBOT_SHAPES if name in settings[group]}
     return {name: value for name, value in settings[group].items() if name not in AFTER_TRAINING}

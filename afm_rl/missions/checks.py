@@ -76,8 +76,15 @@ def check_training(
             check_number(f"{group}.{name}", value, low=0.0, open_low=name == "lr")
 
 
-def check_cost(cost: Cost, model: DynamicsModel, env: EnvBase) -> None:
+def check_cost(cost: Cost, model: DynamicsModel, env: EnvBase, stages: int | None = None) -> None:
     """Check that the environment gives what the cost reads, by trying it once.
+
+    Args:
+        cost: the cost.
+        model: of whose states and actions.
+        env: the environment.
+        stages: how many numbers in a row, one per planned state, the planner takes; None for
+            planners that take the present ones only.
 
     Raises:
         ConfigurationError: otherwise.
@@ -88,6 +95,14 @@ def check_cost(cost: Cost, model: DynamicsModel, env: EnvBase) -> None:
         if found != size:
             raise ConfigurationError(
                 f"cost: reads {size} numbers from {key!r}, but the environment gives {found} there"
+            )
+        batch = env.observation_spec.shape
+        rows = spec[key].shape[len(batch) : -1]
+        if rows and rows != (stages,):
+            wanted = "one" if stages is None else f"one or {stages}"
+            raise ConfigurationError(
+                f"planner: the environment gives {rows.numel()} targets in a row in {key!r}, but "
+                f"the planner takes {wanted}; choose planner=mpc with the environment's horizon"
             )
     state, action = torch.zeros(model.state_size), torch.zeros(model.action_size)
     with blaming("cost"):

@@ -81,7 +81,7 @@ def context_flow(
     **settings: Any,
 ) -> Part:
     """Return the context flow, to be trained over ``model``."""
-    flow = ContextFlow(*robot.action_box, **settings)
+    flow = ContextFlow(*robot.flow_box, **settings)
     return _trained(flow, robot, model, train, checkpoint, "half ranges")
 
 
@@ -92,16 +92,24 @@ def paper_flow(
     checkpoint: str | None = None,
     **settings: Any,
 ) -> Part:
-    """Return the published flow, to be trained over ``model``."""
+    """Return the published flow, to be trained over ``model``.
+
+    Raises:
+        ConfigurationError: if states turn: the flow reads errors as differences of numbers.
+    """
+    if model.manifold.tangent_size != model.state_size:
+        raise ConfigurationError(
+            f"flow=paper: robot={robot.name} has states with rotations; choose flow=context"
+        )
     flow = PaperFlow(
-        *robot.action_box, features=list(robot.features), state_size=model.state_size, **settings
+        *robot.flow_box, features=list(robot.features), state_size=model.state_size, **settings
     )
     return _trained(flow, robot, model, train, checkpoint, "action units")
 
 
 def least_squares(robot: Robot, model: DynamicsModel, **settings: Any) -> Part:
     """Return least squares with forgetting, which needs no training."""
-    return Part(LeastSquares(*robot.action_box, **settings))
+    return Part(LeastSquares(*robot.flow_box, **settings))
 
 
 def _trained(

@@ -12,6 +12,8 @@ from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.missions.laps import LapScore
+from afm_rl.missions.score import Score
 from afm_rl.regimes import Regime, Schedule
 
 
@@ -38,6 +40,10 @@ class Robot:
         paper_regimes: the regimes of the published study.
         families: regimes of which every seed gets a draw of its own, by name; see
             :class:`~afm_rl.missions.families.Family`.
+        score: what missions are judged by; targets reached if None.
+        flow_low: lowest corner of the box in which flows correct actions; the actions' if None.
+            Where planned actions keep to a small part of their box, a smaller one helps.
+        flow_high: its highest corner.
     """
 
     name: str
@@ -56,6 +62,9 @@ class Robot:
     tracks: Sequence[str]
     paper_regimes: Sequence[Mapping[str, float]]
     families: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    score: Score | None = None
+    flow_low: Sequence[float] | None = None
+    flow_high: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         """Check that boxes, names and features fit the model.
@@ -65,16 +74,7 @@ class Robot:
                 coordinate lacks its name, or a feature is no coordinate.
         """
         for kind, size in (("action", self.model.action_size), ("state", self.model.state_size)):
-            low, high = (
-                [check_number(f"robot.{kind}_{end}", x) for x in getattr(self, f"{kind}_{end}")]
-                for end in ("low", "high")
-            )
-            fits = len(low) == len(high) == size
-            if not fits or any(a > b for a, b in zip(low, high, strict=True)):
-                raise ConfigurationError(
-                    f"robot.{kind}_low={list(low)}, robot.{kind}_high={list(high)}: expected "
-                    f"{size} numbers each, low <= high"
-                )
+            self._check_box(kind, size)
             names = list(getattr(self, f"{kind}_names"))
             if len(names) != size:
                 raise ConfigurationError(f"robot.{kind}_names={names}: expected {size} names")
@@ -83,6 +83,35 @@ class Robot:
             raise ConfigurationError(
                 f"robot.features={features}: expected indices in 0..{size - 1}"
             )
+
+        if self.flow_low is not None or self.flow_high is not None:
+            self._check_box("flow", self.model.action_size)
+        if self.score is not None and not isinstance(self.score, Score):
+            raise ConfigurationError(f"robot.score={self.score!r}: expected a Score, or null")
+
+    def _check_box(self, kind: str, size: int) -> None:
+        low, high = (
+            [check_number(f"robot.{kind}_{end}", x) for x in getattr(self, f"{kind}_{end}") or ()]
+            for end in ("low", "high")
+        )
+        fits = len(low) == len(high) == size
+        if not fits or any(a > b for a, b in zip(low, high, strict=True)):
+            raise ConfigurationError(
+                f"robot.{kind}_low={list(low)}, robot.{kind}_high={list(high)}: expected "
+                f"{size} numbers each, low <= high"
+            )
+
+    @property
+    def judge(self) -> Score:
+        """The score."""
+        return LapScore() if self.score is None else self.score
+
+    @property
+    def flow_box(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest action in which flows correct, ``(A,)`` each."""
+        if self.flow_low is None:
+            return self.action_box
+        return torch.tensor(self.flow_low), torch.tensor(self.flow_high)
 
     @property
     def action_box(self) -> tuple[Tensor, Tensor]:

@@ -106,8 +106,10 @@ def _start(agent: Agent) -> Loop:
         agent.model.expand_(total)
     td = agent.env.reset(agent.missions, set_state=False)
     agent.updater.start(td)
-    ends = {name: torch.zeros(total) for name in ("steps", "reached", "seconds")}
-    log = StepLog(_columns(agent), whole=["misaligned", "regime_active", "reached"])
+    ends = {name: torch.zeros(total) for name in ("steps", "seconds")}
+    ends |= agent.robot.judge.start(agent.missions)
+    whole = ["misaligned", "regime_active", *agent.robot.judge.whole]
+    log = StepLog(_columns(agent), whole)
     return Loop(td, torch.arange(total), ends, log)
 
 
@@ -120,7 +122,7 @@ def _advance(agent: Agent, loop: Loop) -> None:
     loop.log.add(ids, loop.step, _row(agent, td, error, miss, surprise, loss))
     done = td["next", "done"].squeeze(-1)
     loop.ends["steps"][ids] = loop.step
-    loop.ends["reached"][ids] = td["next", "reached"].float()
+    agent.robot.judge.add(loop.ends, ids, td)
     loop.td = step_mdp(td)
     if bool(done.any()):
         keep = (~done).nonzero().squeeze(-1)
@@ -155,7 +157,7 @@ def _columns(agent: Agent) -> list[str]:
         "misaligned",
         "loss",
         "regime_active",
-        "reached",
+        *agent.robot.judge.columns,
     ]
 
 
@@ -163,33 +165,26 @@ def _row(agent: Agent, td: TensorDictBase, error, miss, surprise, loss) -> Tenso
     """Return one step's values ``(B, C)``, in the order of :func:`_columns`."""
     transform = agent.transform
     flag = surprise > SILENT if transform is None else td["next", transform.key("misaligned")]
-    scalars = [error, miss, flag, loss, td["regime_active"], td["reached"]]
-    parts = [td["observation"], td["goal"], td["action"], td.get(agent.executed_key)]
-    return torch.cat([*parts, torch.stack([value.float() for value in scalars], -1)], -1)
+    scalars = torch.stack([x.float() for x in (error, miss, flag, loss, td["regime_active"])], -1)
+    score, executed = agent.robot.judge, td.get(agent.executed_key)
+    parts = [td["observation"], score.goal(td), td["action"], executed, scalars, score.row(td)]
+    return torch.cat(parts, -1)
 
 
 def _missions(agent: Agent, ends: dict[str, Tensor]) -> pd.DataFrame:
     """Return the table of missions."""
     mission, base = agent.missions["mission"], agent.base_env
-    reached = ends["reached"].int()
-    targets = base.course.counts[mission["track"]].int()
+    tracks = base.mission_format.tracks
     changed = _changed(agent, mission["parameters"])
     frame: dict[str, Any] = {
-        "mission": range(len(reached)),
+        "mission": range(len(agent.missions)),
         "method": agent.label,
-        "track": [base.tracks[int(index)].name for index in mission["track"]],
+        "track": [tracks[int(index)] for index in mission["track"]],
     }
     frame.update({name: changed[:, k] for k, name in enumerate(agent.robot.regime.names)})
-    frame.update(
-        seed=mission["seed"],
-        success_rate=reached / targets,
-        steps=ends["steps"].int(),
-        reached=reached,
-        targets=targets,
-        finished=reached == targets,
-        seconds=ends["seconds"],
-        regime=agent.regime_names,
-    )
+    frame.update(seed=mission["seed"])
+    frame.update(agent.robot.judge.table(base, agent.missions, ends))
+    frame.update(seconds=ends["seconds"], regime=agent.regime_names)
     return pd.DataFrame({name: _plain(value) for name, value in frame.items()})
 
 

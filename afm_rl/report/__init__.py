@@ -4,6 +4,7 @@ from afm_rl.report.comparison import draw_comparison
 from afm_rl.report.console import print_summary
 from afm_rl.report.events import write_events
 from afm_rl.report.feasible import draw_feasible
+from afm_rl.report.flight import draw_flight
 from afm_rl.report.folder import write_run
 from afm_rl.report.learning import draw_learning
 from afm_rl.report.summary import summarise, summarise_cells
@@ -13,6 +14,7 @@ from afm_rl.report.write import write_report
 __all__ = [
     "draw_comparison",
     "draw_feasible",
+    "draw_flight",
     "draw_learning",
     "draw_trajectories",
     "print_summary",

@@ -68,6 +68,9 @@ def collect(folders: Sequence[str | Path]) -> Collection:
     if missions.empty:
         names = ", ".join(str(folder) for folder in folders)
         raise ConfigurationError(f"{names}: no mission is finished yet; expected at least one")
+    if "mse" in missions and missions["mse"].isna().any():
+        names = ", ".join(str(folder) for folder in folders)
+        raise ConfigurationError(f"{names}: hold flights and other missions; report on each alone")
     notes = _replaced(missions, folders)
     missions = missions.drop_duplicates(KEY, keep="last").drop(columns="folder")
     missions = missions.assign(mission=range(len(missions))).reset_index(drop=True)

@@ -1,4 +1,4 @@
-"""Methods side by side: success and steps."""
+"""Methods side by side, by what counts."""
 
 from __future__ import annotations
 
@@ -8,19 +8,17 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from afm_rl.report import style
+from afm_rl.report.kinds import Measure, kind_of
 from afm_rl.report.summary import summarise
 
 SPREAD = 0.26  # of a row: how far single missions lie off its middle
-PANELS = {
-    "success": ("success_rate", 100.0, "targets reached (%)"),
-    "steps": ("steps", 1.0, "steps"),
-}
 
 
 def draw_comparison(missions: pd.DataFrame) -> Figure:
-    """Return a figure of mean success and mean number of steps of each method.
+    """Return a figure of mean success and mean number of steps of each method, or of mean errors.
 
     Large markers are means, with 95 % bootstrap intervals where there are any; small dots
     are single missions.
@@ -32,16 +30,16 @@ def draw_comparison(missions: pd.DataFrame) -> Figure:
     styles = style.method_styles(means["method"])
     figure = style.new_figure(7.0, 1.1 + 0.42 * len(means))
     panels = figure.subplots(1, 2, sharey=True)
-    for axes, (name, (column, scale, label)) in zip(panels, PANELS.items(), strict=True):
+    for axes, measure in zip(panels, kind_of(missions).measures, strict=True):
         for place, row in means.iterrows():
-            single = missions.loc[missions["method"] == row["method"], column]
-            _draw_row(axes, int(place), row, name, scale, single, styles[row["method"]])
-        axes.set_xlabel(label, fontsize=style.NORMAL)
+            single = missions.loc[missions["method"] == row["method"], measure.column]
+            _draw_row(axes, int(place), row, measure, single, styles[row["method"]])
+        axes.set_xlim(measure.limits or (0, 1.04 * measure.scale * missions[measure.column].max()))
+        axes.xaxis.set_major_locator(MaxNLocator(6))
+        axes.set_xlabel(measure.label, fontsize=style.NORMAL)
         style.dress(axes)
         axes.grid(axis="x", color="#eeeeee", linewidth=0.6)
         axes.set_axisbelow(True)
-    panels[0].set_xlim(-4, 104)
-    panels[1].set_xlim(0, 1.04 * missions["steps"].max())
     names = [style.literal(f"{row.method} (n = {row.missions})") for row in means.itertuples()]
     panels[0].set_yticks(range(len(means)), names, fontsize=style.NORMAL)
     panels[0].set_ylim(len(means) - 0.5, -0.5)
@@ -53,11 +51,11 @@ def _draw_row(
     axes: Axes,
     place: int,
     means: pd.Series,
-    name: str,
-    scale: float,
+    measure: Measure,
     single: pd.Series,
     look: style.Style,
 ) -> None:
+    name, scale = measure.name, measure.scale
     offset = SPREAD * np.linspace(-1, 1, len(single)) if len(single) > 1 else 0.0
     axes.plot(
         scale * single, place + offset, ".", color=look.color, alpha=0.3, markersize=4, gid="single"

@@ -11,10 +11,9 @@ from rich.console import Console, JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
+from afm_rl.report.kinds import Kind, kind_of
 from afm_rl.report.summary import summarise, summarise_cells
 
-BETTER = {"success": max, "finished": max, "steps": min}
-HEADS = {"success": "success %", "finished": "finished %"}
 WIDE = 1000  # columns: numbers that are cut off are worse than lines that wrap
 
 
@@ -36,24 +35,25 @@ def print_summary(missions: pd.DataFrame, file: IO[str] | None = None) -> None:
     <BLANKLINE>
     """
     console = Console(file=file, width=WIDE, highlight=False)
-    cells = summarise_cells(missions)
-    console.print(_table(summarise(missions)))
+    cells, kind = summarise_cells(missions), kind_of(missions)
+    console.print(_table(summarise(missions), kind))
     if cells["cell"].nunique() > 1:
-        console.print(_grid(cells))
+        console.print(_grid(cells, kind))
 
 
-def _grid(cells: pd.DataFrame) -> Table:
-    """Return one row per cell: success and steps of every method, the best one bold."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption="success and steps, means")
+def _grid(cells: pd.DataFrame, kind: Kind) -> Table:
+    """Return one row per cell: what counts, of every method, the best one bold."""
+    heads = [measure.head.removesuffix(" %") for measure in kind.measures[: len(kind.short)]]
+    caption = f"{' and '.join(heads)}, means"
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=caption)
     methods = list(dict.fromkeys(cells["method"]))
     table.add_column("cell")
     for method in methods:
         table.add_column(method, justify="right")
     for cell, group in cells.groupby("cell", sort=False):
-        rank = {row.method: (row.success, -row.steps) for row in group.itertuples()}
-        texts = {
-            row.method: f"{100 * row.success:.0f} % {row.steps:6.0f}" for row in group.itertuples()
-        }
+        rows = group.to_dict("records")
+        rank = {row["method"]: kind.rank(row) for row in rows}
+        texts = {row["method"]: kind.cell(row) for row in rows}
         best = max(rank.values()) if len(set(rank.values())) > 1 else None
         table.add_row(
             str(cell),
@@ -62,10 +62,12 @@ def _grid(cells: pd.DataFrame) -> Table:
     return table
 
 
-def _table(means: pd.DataFrame) -> Table:
+def _table(means: pd.DataFrame, kind: Kind) -> Table:
     """Return a table of what :func:`summarise` gave; the best of several methods are bold."""
-    texts = _texts(means)
-    some = bool(means[["success_low", "steps_low"]].notna().any(axis=None))
+    texts = _texts(means, kind)
+    some = bool(means[[f"{each.name}_low" for each in kind.measures]].notna().any(axis=None))
+    heads = {"finished": "finished %"} | {each.name: each.head for each in kind.measures}
+    better = {"finished": max} | {each.name: each.best for each in kind.measures}
     table = Table(
         box=box.SIMPLE_HEAD,
         collapse_padding=True,
@@ -74,9 +76,9 @@ def _table(means: pd.DataFrame) -> Table:
     )
     for name in texts:
         justify: JustifyMethod = "left" if name == "method" else "right"
-        table.add_column(HEADS.get(name, name), justify=justify)
+        table.add_column(heads.get(name, name), justify=justify)
     best = {
-        name: choose(means[name]) for name, choose in BETTER.items() if means[name].nunique() > 1
+        name: choose(means[name]) for name, choose in better.items() if means[name].nunique() > 1
     }
     for place, row in texts.iterrows():
         bold = {name for name, value in best.items() if means.loc[place, name] == value}
@@ -84,19 +86,17 @@ def _table(means: pd.DataFrame) -> Table:
     return table
 
 
-def _texts(means: pd.DataFrame) -> pd.DataFrame:
+def _texts(means: pd.DataFrame, kind: Kind) -> pd.DataFrame:
     """Return the cells of the table as text."""
-    rows = [
-        {
-            "method": row.method,
-            "missions": f"{row.missions}",
-            "success": _number(1, 100 * row.success, 100 * row.success_low, 100 * row.success_high),
-            "finished": f"{100 * row.finished:.0f}",
-            "steps": _number(0, row.steps, row.steps_low, row.steps_high),
-            "seconds": f"{row.seconds:.1f}",
-        }
-        for row in means.itertuples()
-    ]
+    rows = []
+    for row in means.to_dict("records"):
+        texts = {"method": row["method"], "missions": f"{row['missions']}"}
+        for place, each in enumerate(kind.measures):
+            values = (each.scale * row[each.name + end] for end in ("", "_low", "_high"))
+            texts[each.name] = _number(each.digits, *values)
+            if place == 0:
+                texts["finished"] = f"{100 * row['finished']:.0f}"
+        rows.append(texts | {"seconds": f"{row['seconds']:.1f}"})
     return pd.DataFrame(rows, index=means.index)
 
 

@@ -14,11 +14,11 @@ from torch.utils.tensorboard import FileWriter
 
 from afm_rl.artefacts import write_whole
 from afm_rl.report.frames import cell_names, steps_of
+from afm_rl.report.kinds import kind_of
 
 POINTS = 1000  # per curve
 SINGLE = 8  # missions of each method with curves of their own
-CURVES = ["error", "loss", "misaligned", "regime_active", "reached"]
-FINAL = ["success_rate", "steps"]
+CURVES = ["error", "loss", "misaligned", "regime_active"]
 FILE = "events.out.tfevents.0.afm_rl"  # TensorBoard looks for "tfevents" in the name
 
 
@@ -27,8 +27,9 @@ def write_events(folder: Path, missions: pd.DataFrame, steps: pd.DataFrame) -> l
 
     A method's curves (``step/error``, ``step/loss``, ``step/misaligned``,
     ``step/regime_active``, ``step/reached``) are means over the missions that are still
-    running; ``final/success_rate`` and ``final/steps`` are means over all of them. The only
-    mission of a method has no folder of its own: its curves are the means.
+    running; ``final/success_rate`` and ``final/steps`` are means over all of them. Flights have
+    squared errors instead. The only mission of a method has no folder of its own: its curves
+    are the means.
 
     Args:
         folder: where to.
@@ -40,28 +41,31 @@ def write_events(folder: Path, missions: pd.DataFrame, steps: pd.DataFrame) -> l
     """
     stride = math.ceil((int(steps["t"].max()) + 1) / POINTS)
     titles = cell_names(missions) + ", seed " + missions["seed"].astype(str)
-    named = missions.assign(title=titles)
+    named, kind = missions.assign(title=titles), kind_of(missions)
+    shown, final = [*CURVES, *kind.steps], list(kind.final)
     groups = named.groupby("method", sort=False)
     written = []
     for name, (_, group) in zip(folder_names(groups.groups), groups, strict=True):
         own, place = steps[steps["mission"].isin(group["mission"])], Path(folder) / name
-        written.append(_write(place / FILE, curves(own, stride), group[FINAL].mean()))
+        written.append(
+            _write(place / FILE, curves(own[["t", *shown]], stride), group[final].mean())
+        )
         single = group[: SINGLE if len(group) > 1 else 0]
         rows = steps_of(own, single["mission"])
         for title, (_, row) in zip(folder_names(single["title"]), single.iterrows(), strict=True):
-            curve = curves(rows[row["mission"]], stride)
-            written.append(_write(place / title / FILE, curve, row[FINAL]))
+            curve = curves(rows[row["mission"]][["t", *shown]], stride)
+            written.append(_write(place / title / FILE, curve, row[final]))
     return written
 
 
 def curves(steps: pd.DataFrame, stride: int) -> pd.DataFrame:
     """Return the means over missions, and over ``stride`` steps at a time.
 
-    >>> steps = pd.DataFrame({"t": [0, 1, 2], **{name: [1.0, 2.0, 4.0] for name in CURVES}})
+    >>> steps = pd.DataFrame({"t": [0, 1, 2], "loss": [1.0, 2.0, 4.0]})
     >>> curves(steps, 2)["loss"].to_dict()
     {0: 1.5, 2: 4.0}
     """
-    return steps.groupby(steps["t"] // stride * stride)[CURVES].mean()
+    return steps.drop(columns="t").groupby(steps["t"] // stride * stride).mean()
 
 
 def folder_names(names: Iterable[str]) -> list[str]:
@@ -84,7 +88,7 @@ def folder_names(names: Iterable[str]) -> list[str]:
 def _write(path: Path, curve: pd.DataFrame, final: pd.Series) -> Path:
     with TemporaryDirectory() as scratch:
         writer = FileWriter(scratch)
-        writer.add_summary(_summary([f"final/{name}" for name in FINAL], final), 0)
+        writer.add_summary(_summary([f"final/{name}" for name in final.index], final), 0)
         tags = [f"step/{name}" for name in curve.columns]
         for step, values in zip(curve.index, curve.to_numpy(), strict=True):
             writer.add_summary(_summary(tags, values), int(step))

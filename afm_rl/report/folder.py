@@ -12,7 +12,9 @@ from matplotlib.figure import Figure
 from afm_rl.artefacts import write_whole
 from afm_rl.report.comparison import draw_comparison
 from afm_rl.report.events import write_events
+from afm_rl.report.flight import draw_flight
 from afm_rl.report.frames import check_frames, order_columns
+from afm_rl.report.kinds import FLIGHTS, kind_of
 from afm_rl.report.learning import draw_learning
 from afm_rl.report.road import DrawableTrack
 from afm_rl.report.style import png_bytes
@@ -32,9 +34,10 @@ def write_run(
     """Write tables, figures and TensorBoard events of one method or several.
 
     Files: ``missions.csv``, ``steps.parquet``, ``figures/trajectory.png`` (if the steps have
-    ``x`` and ``y``), ``figures/learning.png``, ``figures/summary.png`` (if a method has more
-    than one mission), and event files under ``tensorboard/``. Each is written whole or not
-    at all; files of the same name are replaced, others left alone.
+    ``x`` and ``y``) or, of flights, ``figures/flight.png``, ``figures/learning.png``,
+    ``figures/summary.png`` (if a method has more than one mission), and event files under
+    ``tensorboard/``. Each is written whole or not at all; files of the same name are replaced,
+    others left alone.
 
     Args:
         folder: where to; made if it is not there.
@@ -81,7 +84,9 @@ def _drawings(
 ) -> dict[str, Callable[[], Figure]]:
     """Return what there is to draw, by name."""
     drawings: dict[str, Callable[[], Figure]] = {}
-    if {"x", "y"} <= set(steps.columns):
+    if kind_of(missions) is FLIGHTS:
+        drawings["flight"] = lambda: draw_flight(missions, steps)
+    elif {"x", "y"} <= set(steps.columns):
         drawings["trajectory"] = lambda: draw_trajectories(missions, steps, tracks)
     drawings["learning"] = lambda: draw_learning(missions, steps)
     if missions["method"].duplicated().any():

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 import pandas as pd
 
 from afm_rl.errors import ConfigurationError
+from afm_rl.report.kinds import kind_of
 
 FRONT = ["method", "track"]
-BACK = ["seed", "success_rate", "steps", "reached", "targets", "finished", "seconds", "mission"]
-STEPS = ["mission", "t", "error", "misaligned", "loss", "regime_active", "reached"]
+STEPS = ["mission", "t", "error", "misaligned", "loss", "regime_active"]
 
 
 def check_frames(missions: pd.DataFrame, steps: pd.DataFrame) -> None:
@@ -20,7 +20,12 @@ def check_frames(missions: pd.DataFrame, steps: pd.DataFrame) -> None:
         ConfigurationError: if there is no mission, a column is missing, a mission's number
             occurs twice, or a mission has no steps.
     """
-    for name, frame, wanted in (("missions", missions, FRONT + BACK), ("steps", steps, STEPS)):
+    kind = kind_of(missions)
+    wanted_of_missions, wanted_of_steps = [*FRONT, *kind.missions], [*STEPS, *kind.steps]
+    for name, frame, wanted in (
+        ("missions", missions, wanted_of_missions),
+        ("steps", steps, wanted_of_steps),
+    ):
         missing = [column for column in wanted if column not in frame]
         if missing:
             raise ConfigurationError(f"{name}: columns {', '.join(missing)} are missing")
@@ -49,7 +54,7 @@ def regime_names(missions: pd.DataFrame) -> list[str]:
 
 def order_columns(missions: pd.DataFrame) -> pd.DataFrame:
     """Return the missions with their columns in the order of the files; others come last."""
-    known = [*FRONT, *regime_names(missions), *BACK]
+    known = [*FRONT, *regime_names(missions), *kind_of(missions).missions]
     return missions[[*known, *(name for name in missions if name not in known)]]
 
 

@@ -14,12 +14,13 @@ from matplotlib.lines import Line2D
 from afm_rl.report import style
 from afm_rl.report.curve import ENDS, STARTS, draw_curve, mark_regime
 from afm_rl.report.frames import first_missions, left_out, steps_of
+from afm_rl.report.kinds import kind_of
 
 CELLS = 4
 BEYOND = 1.15  # of the longest mission that finished: how far the axis of steps goes
 LINEAR = 10.0  # losses up to here, of either sign, are drawn to a linear scale
 LETTERS = 55  # that a line under one column has room for
-ROWS = {"error": "prediction error\nper step (m, rad)", "loss": "model loss\n(NLL)"}
+ROWS = {"error": "prediction error\nper step ({units})", "loss": "model loss\n(NLL)"}
 
 
 def draw_learning(missions: pd.DataFrame, steps: pd.DataFrame) -> Figure:
@@ -48,7 +49,7 @@ def draw_learning(missions: pd.DataFrame, steps: pd.DataFrame) -> Figure:
             for row in rows.itertuples():
                 draw_curve(panel, curves[row.mission], column, styles[row.method])
                 mark_regime(panel, curves[row.mission], styles[row.method], len(rows) == 1)
-    _dress(grid, pd.concat(curves.values()))
+    _dress(grid, pd.concat(curves.values()), kind_of(missions).units)
     _legend(figure, styles)
     style.footnote(figure, left_out(missions, shown))
     return figure
@@ -84,10 +85,10 @@ def _step_label(missions: pd.DataFrame) -> str:
     return style.literal("\n".join(lines))
 
 
-def _dress(grid: np.ndarray, steps: pd.DataFrame) -> None:
+def _dress(grid: np.ndarray, steps: pd.DataFrame, units: str) -> None:
     """Give the axes ``(2, C)`` scales that show these steps, and labels."""
     for panels, label in zip(grid, ROWS.values(), strict=True):
-        panels[0].set_ylabel(label, fontsize=style.NORMAL)
+        panels[0].set_ylabel(label.format(units=units), fontsize=style.NORMAL)
         for panel in panels:
             panel.grid(axis="y", color="#eeeeee", linewidth=0.6)
             style.dress(panel)

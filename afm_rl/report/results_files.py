@@ -11,10 +11,10 @@ import pyarrow
 import pyarrow.parquet as parquet
 
 from afm_rl.errors import ConfigurationError
+from afm_rl.report.kinds import LAPS, kind_of
 
-MISSIONS = ["method", "track", "seed", "success_rate", "steps", "reached", "targets", "finished"]
 WORDS = ["method", "track", "regime"]  # text, whatever they look like
-NUMBERS = ["seed", "success_rate", "steps", "reached", "targets"]
+NO_NUMBERS = ["seconds", "finished", "mission"]  # not needed, or no numbers to check
 
 
 def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
@@ -29,10 +29,14 @@ def read_table(path: Path, columns: Sequence[str]) -> pd.DataFrame:
         raise ConfigurationError(f"{path}: {error.strerror}") from error
     except (ValueError, pd.errors.ParserError) as error:
         raise ConfigurationError(f"{path}: no table of values: {error}") from error
+    _check_columns(path, table, columns)
+    return table
+
+
+def _check_columns(path: Path, table: pd.DataFrame, columns: Sequence[str]) -> None:
     missing = [column for column in columns if column not in table]
     if missing:
         raise ConfigurationError(f"{path}: columns {', '.join(missing)} are missing")
-    return table
 
 
 def read_missions(path: Path) -> pd.DataFrame:
@@ -41,13 +45,18 @@ def read_missions(path: Path) -> pd.DataFrame:
     Raises:
         ConfigurationError: if it cannot be read, a column is missing, or a value cannot be.
     """
-    missions = read_table(path, [*MISSIONS, "mission"])
-    for name in NUMBERS:
+    missions = read_table(path, [])
+    kind = kind_of(missions)
+    numbers = [name for name in kind.missions if name not in NO_NUMBERS]
+    _check_columns(path, missions, ["method", "track", *numbers, "finished", "mission"])
+    for name in numbers:
         numeric = pd.api.types.is_numeric_dtype(missions[name])
         if len(missions) and not (numeric and np.isfinite(missions[name]).all()):
             raise ConfigurationError(f"{path}: {name}: expected a finite number in each row")
     if len(missions) and missions["finished"].dtype != bool:
         raise ConfigurationError(f"{path}: finished: expected True or False in each row")
+    if kind is not LAPS:
+        return missions
     # Single precision as text has seven digits: 6/34 is the same number in all files again.
     return missions.assign(success_rate=missions["success_rate"].astype(float).round(6))
 

@@ -8,6 +8,7 @@ import pandas as pd
 
 from afm_rl.report.frames import cell_names
 from afm_rl.report.interval import mean_interval
+from afm_rl.report.kinds import kind_of
 
 
 def summarise(missions: pd.DataFrame) -> pd.DataFrame:
@@ -17,7 +18,8 @@ def summarise(missions: pd.DataFrame) -> pd.DataFrame:
     reached, with ``success_low`` and ``success_high``; ``finished``, the share of missions
     that reached every target; ``steps``, the mean number of steps, with ``steps_low`` and
     ``steps_high`` (a mission that was given up counts with the steps it was given);
-    ``seconds``, in all. The bounds are 95 % bootstrap intervals over missions, NaN where
+    ``seconds``, in all. Flights have the errors of :data:`~afm_rl.report.kinds.FLIGHTS` in place
+    of success and steps. The bounds are 95 % bootstrap intervals over missions, NaN where
     there is only one mission or where all are alike.
 
     Args:
@@ -43,15 +45,11 @@ def _means(missions: pd.DataFrame, by: Sequence[str]) -> pd.DataFrame:
 
 
 def _mean(group: pd.DataFrame) -> dict[str, float]:
-    success, steps = mean_interval(group["success_rate"]), mean_interval(group["steps"])
-    return {
-        "missions": len(group),
-        "success": float(group["success_rate"].astype(float).mean()),
-        "success_low": success[0],
-        "success_high": success[1],
-        "finished": float(group["finished"].mean()),
-        "steps": float(group["steps"].mean()),
-        "steps_low": steps[0],
-        "steps_high": steps[1],
-        "seconds": float(group["seconds"].sum()),
-    }
+    row: dict[str, float] = {"missions": len(group)}
+    for place, measure in enumerate(kind_of(group).measures):
+        low, high = mean_interval(group[measure.column])
+        row[measure.name] = float(group[measure.column].astype(float).mean())
+        row |= {f"{measure.name}_low": low, f"{measure.name}_high": high}
+        if place == 0:
+            row["finished"] = float(group["finished"].mean())
+    return row | {"seconds": float(group["seconds"].sum())}

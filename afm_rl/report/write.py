@@ -15,8 +15,10 @@ from afm_rl.report.cells import cell_table
 from afm_rl.report.collect import collect
 from afm_rl.report.drawings import LoadTrack, all_figures
 from afm_rl.report.events import folder_names
+from afm_rl.report.flight_report import flight_figures, flight_tables
 from afm_rl.report.gather import Gathered, gather
 from afm_rl.report.heatmaps import mapped_cells
+from afm_rl.report.kinds import FLIGHTS, kind_of
 from afm_rl.report.outcomes import add_outcomes, budget_notes
 from afm_rl.report.page import Picture, render_page
 from afm_rl.report.pairs import compare, comparison_tables
@@ -43,7 +45,7 @@ def write_report(
     Files in ``out``: ``index.html``, which holds everything; ``tables/NAME.csv`` and
     ``tables/NAME.tex`` (for LaTeX with ``booktabs``); ``figures/NAME.png``; ``missing.csv``.
     Each is written whole or not at all; files of the same name are replaced. Partial results
-    are welcome: what is missing is said.
+    are welcome: what is missing is said. Flights have tables and figures of their own.
 
     Args:
         folders: of runs (``missions.csv``, ``steps.parquet``) or studies; of a mission that
@@ -63,14 +65,17 @@ def write_report(
             written.
     """
     collection, out = collect(folders), Path(out)
-    missions = add_outcomes(collection.missions)
+    flights = kind_of(collection.missions) is FLIGHTS
+    missions, notes = collection.missions, list(collection.notes)
+    if not flights:
+        missions = add_outcomes(missions)
+        notes += budget_notes(missions)
+        notes += [
+            f"There are no missions of {name}: comparisons with it are left out."
+            for name in dict.fromkeys([*baselines, oracle])
+            if name not in collection.methods
+        ]
     absent = find_absent(missions, collection.asked)
-    notes = [*collection.notes, *budget_notes(missions)]
-    notes += [
-        f"There are no missions of {name}: comparisons with it are left out."
-        for name in dict.fromkeys([*baselines, oracle])
-        if name not in collection.methods
-    ]
     cells = pd.concat([missions["cell"], collection.asked["cell"]]).nunique()
     summary = (
         f"{len(missions)} missions of {len(collection.methods)} methods in "
@@ -80,11 +85,15 @@ def write_report(
     for line in (summary, *notes, *absent_lines(absent, collection.methods, cells)):
         echo(line)
 
-    traced = traced_missions(missions[missions["file"] >= 0])
-    mapped = mapped_cells(missions) if figures else []
-    gathered = gather(collection, traced["mission"] if figures else [], mapped)
-    means = aggregate(missions, collection.compute, oracle)
-    tables = list(_tables(missions, means, gathered, baselines, oracle))
+    if flights:
+        tables, drawn = list(flight_tables(missions)), flight_figures(collection)
+    else:
+        traced = traced_missions(missions[missions["file"] >= 0])
+        mapped = mapped_cells(missions) if figures else []
+        gathered = gather(collection, traced["mission"] if figures else [], mapped)
+        means = aggregate(missions, collection.compute, oracle)
+        tables = list(_tables(missions, means, gathered, baselines, oracle))
+        drawn = all_figures(missions, means, traced, gathered, load_track)
     if len(absent):
         tables.insert(0, absent_table(absent, cells))
     for table in tables:
@@ -95,9 +104,7 @@ def write_report(
     echo(f"wrote {len(tables)} tables: {out / 'tables'}")
     pictures = []
     if figures:
-        for name, title, caption, figure in all_figures(
-            missions, means, traced, gathered, load_track
-        ):
+        for name, title, caption, figure in drawn:
             png = style.png_bytes(figure)
             write_whole(out / "figures" / f"{folder_names([name])[0]}.png", png)
             pictures.append(Picture(name, title, caption, png))

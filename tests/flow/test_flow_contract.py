@@ -7,8 +7,10 @@ import pytest
 import torch
 
 from afm_rl.artefacts import load_artefact, save_artefact
+from afm_rl.dynamics import Quadrotor
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.flow import ContextFlow, PaperFlow
+from afm_rl.regimes import MassFactor
 
 
 @pytest.fixture
@@ -76,3 +78,21 @@ def test_a_stored_flow_is_refused_where_it_does_not_fit(flow, box, tmp_path, mak
         load_artefact(path, other, other.signature)
     for name, value in other.state_dict().items():
         assert torch.equal(value, before[name])
+
+
+def test_training_states_lie_on_the_manifold(monkeypatch):
+    seen = []
+    forecast = Quadrotor.forecast
+
+    def spy(model, state, action):
+        seen.append(state)
+        return forecast(model, state, action)
+
+    monkeypatch.setattr(Quadrotor, "forecast", spy)
+    low, high = torch.tensor([0.0, -1.0, -1.0, -1.0]), torch.ones(4)
+    box = torch.zeros(13), torch.ones(13)
+    for flow in (ContextFlow(low, high), PaperFlow(low, high, [3, 4], 12)):
+        flow.examples(Quadrotor(), MassFactor(), box, 20, torch.Generator().manual_seed(0))
+    assert len(seen) >= 2
+    for state in seen:
+        torch.testing.assert_close(state[..., 6:10].norm(dim=-1), torch.ones(state.shape[:-1]))

@@ -1,0 +1,147 @@
+"""Missions of the quadrotor, composed as the command line composes them."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.missions import build, run
+from afm_rl.missions.checkpoint import Stopped
+
+QUICK = {"robot.schedule.times": [0.1, 0.3], "budget": 12}
+
+
+@pytest.fixture
+def fly(drive):
+    def go(*overrides, **settings):
+        return drive("robot=quadrotor", *overrides, **{**QUICK, **settings})
+
+    return go
+
+
+def same(left, right):
+    left, right = (table.drop(columns="seconds", errors="ignore") for table in (left, right))
+    pd.testing.assert_frame_equal(left, right, check_exact=True)
+
+
+def test_the_columns(fly):
+    flown = fly("method=physics", tracks="all")
+    names = list(flown.agent.robot.regime.names)
+    assert list(flown.missions) == [
+        *("mission", "method", "track", *names, "seed", "mse", "mse_z"),
+        *("mse_phase_0", "mse_phase_1", "mse_phase_2", "peak_z", "settle_1", "settle_2"),
+        *("steps", "finished", "seconds", "regime"),
+    ]
+    actions = ["thrust", "moment_x", "moment_y", "moment_z"]
+    assert list(flown.steps) == [
+        *("mission", "t", *flown.agent.robot.state_names, "goal_x", "goal_y", "goal_z"),
+        *(f"planned_{name}" for name in actions),
+        *(f"executed_{name}" for name in actions),
+        *("error", "miss", "misaligned", "loss", "regime_active"),
+        *("square_error_x", "square_error_y", "square_error_z", "phase"),
+    ]
+    assert flown.missions["track"].tolist() == list(flown.agent.robot.tracks)
+    assert flown.missions["mass"].eq(0.5).all()
+    assert flown.missions["regime"].eq("nominal; mass = 0.5; mass = 1.33333").all()
+    assert flown.missions["finished"].all() and flown.missions["steps"].eq(11).all()
+
+
+def test_the_tables_agree(fly):
+    flown = fly("method=physics")
+    steps, row = flown.steps, flown.missions.iloc[0]
+    square = steps[[f"square_error_{axis}" for axis in "xyz"]]
+    assert row["mse"] == pytest.approx(square.to_numpy().mean(), rel=1e-5)
+    assert row["mse_z"] == pytest.approx(square["square_error_z"].mean(), rel=1e-5)
+    assert steps["phase"].tolist() == [0] * 2 + [1] * 4 + [2] * 6
+    assert steps["regime_active"].tolist() == [0] * 2 + [1] * 10
+    for phase in range(3):
+        mean = square[steps["phase"] == phase].to_numpy().mean()
+        assert row[f"mse_phase_{phase}"] == pytest.approx(mean, rel=1e-5)
+    height = (steps["z"] - steps["goal_z"]).abs()
+    assert row["peak_z"] >= height.max()
+
+
+def test_published_errors_are_met(drive):
+    """R = 2 m, 8 s, one set-point held: Jiahao et al. 2022."""
+    speeds = {0.8: 0.0904, 1: 0.1280, 1.2: 0.1705}
+    settings = {"budget": 160, "robot.env.preview": False}
+    tracks = [f"circle_2m_{speed}mps" for speed in speeds]
+    flown = drive("robot=quadrotor", "method=physics", tracks=tracks, **settings)
+    assert flown.missions["mse"].tolist() == pytest.approx(list(speeds.values()), abs=5e-4)
+    assert flown.missions["peak_z"].between(0.3, 0.5).all()
+
+
+def test_who_knows_the_mass_keeps_the_height(fly):
+    physics, oracle = (fly(f"method={name}", budget=25).missions.iloc[0] for name in METHODS)
+    assert oracle["mse_z"] < 1e-6 < 1e-3 < physics["mse_z"]
+    assert oracle["settle_2"] == 0 < physics["settle_2"]
+
+
+METHODS = ("physics", "oracle")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_flight_alone_is_the_same_as_among_others(fly, method):
+    many = fly(f"method={method}", tracks=["circle_2m_0.8mps", "hover"], seeds=2)
+    one = fly(f"method={method}", tracks="hover", seeds=[1])
+    rows = many.steps[many.steps["mission"] == 3].assign(mission=np.int32(0))
+    pd.testing.assert_frame_equal(rows.reset_index(drop=True), one.steps, rtol=1e-5, atol=1e-6)
+
+
+def test_an_interrupted_run_goes_on_to_the_bit(make_agent, tmp_path):
+    def agent():
+        return make_agent("robot=quadrotor", "method=afm_physics", seeds=2, **QUICK)
+
+    whole, path = run(agent()), tmp_path / "checkpoint"
+    with pytest.raises(Stopped):
+        run(agent(), checkpoint=path, watch=lambda loop: loop.step == 5)
+    resumed = run(agent(), checkpoint=path)
+    same(whole.missions, resumed.missions)
+    same(whole.steps, resumed.steps)
+
+
+def test_a_lost_flight_leaves_the_batch(fly):
+    flown = fly("method=physics", **{"robot.env.limit": 0.05, "robot.schedule.times": [0.05, 5]})
+    assert not flown.missions["finished"].any()
+    assert flown.missions["steps"].lt(11).all()
+    assert np.isnan(flown.missions["mse_phase_2"]).all()
+
+
+def test_flows_correct_in_a_box_of_their_own(fly):
+    flown = fly("method=afm_physics")
+    flow, robot = flown.agent.transform.flow, flown.agent.robot
+    torch.testing.assert_close(flow.half_range, torch.tensor([0.575, 3e-4, 3e-4, 1e-4]))
+    steps = flown.steps
+    assert steps["misaligned"].sum() > 0
+    for name, low, high in zip(
+        robot.action_names, robot.action_low, robot.action_high, strict=True
+    ):
+        assert steps[f"executed_{name}"].between(low - 1e-7, high + 1e-7).all()
+    whole = dataclasses.replace(robot, flow_low=None, flow_high=None)
+    assert torch.equal(whole.flow_box[1], robot.action_box[1])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "complaint"),
+    [
+        (["method=afm_paper"], "flow=paper: robot=quadrotor has states with rotations; choose"),
+        (["planner=mppi"], "planner: .* 6 targets in a row in 'reference', .* takes one;"),
+        (["robot.env.horizon=7"], "planner: .* 8 targets in a row .* takes one or 21;"),
+        (["cost=goal_pose"], "planner: got PlanningEnv with GoalDistance; MPC needs"),
+        (["tracks=ethz_2"], "tracks='ethz_2': expected hover, a circle such as"),
+        (["robot.goal_names=[x]"], r"robot.goal_names=\['x'\]: expected 3 names"),
+        (["robot.score=null"], "robot.score=LapScore: reads goal, .* gives no goal, reached"),
+        (["robot.score=3"], "robot.score=3: expected a Score, or null"),
+        (["robot.score.band=0"], "score.band=0: expected a finite number"),
+        (["robot.flow_low=null"], r"robot.flow_low=\[\], .* expected 4 numbers each"),
+        (["robot.flow_low=[0, 1, 1, 1]"], "robot.flow_low=.* expected 4 numbers each, low <= high"),
+        (["robot.env.start=up"], "start='up': expected one of rest, moving"),
+        (["regimes=[{v_gain: 0.5}]"], "regimes: unknown parameter 'v_gain'"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(configure, no_training, overrides, complaint):
+    with pytest.raises(ConfigurationError, match=f"^{complaint}"):
+        build(configure("robot=quadrotor", *overrides))
