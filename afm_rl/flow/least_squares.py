@@ -63,13 +63,16 @@ def fit_friction(
         Gains, none smaller than 0.02 in size, and offsets, ``(*B, A)`` each.
     """
     weight, sign = weigh(valid, forgetting), executed.sign()
-    uu = (weight * executed.square()).sum(-2) + PRIOR
-    us = (weight * executed.abs()).sum(-2)
-    ss = (weight * sign.square()).sum(-2) + 10 * PRIOR  # the offset is the rarer of the two
-    ue = (weight * executed * effective).sum(-2) + PRIOR
-    se = (weight * sign * effective).sum(-2)
-    determinant = (uu * ss - us.square()).clamp_min(PRIOR**2)
-    gain, offset = (ss * ue - us * se) / determinant, (uu * se - us * ue) / determinant
+    square = (weight * executed.square()).sum(-2) + PRIOR
+    size = (weight * executed.abs()).sum(-2)
+    signs = (weight * sign.square()).sum(-2) + 10 * PRIOR  # the offset is the rarer of the two
+    cross = (weight * executed * effective).sum(-2) + PRIOR
+    signed = (weight * sign * effective).sum(-2)
+    determinant = (square * signs - size.square()).clamp_min(PRIOR**2)
+    gain, offset = (
+        (signs * cross - size * signed) / determinant,
+        (square * signed - size * cross) / determinant,
+    )
     return _not_zero(gain), offset
 
 

@@ -44,19 +44,19 @@ def intend(
     if mode == "clip":
         return intended
 
-    def possible(action: Tensor, effect: Tensor, *regime_now: Tensor) -> Tensor:
-        miss = (regime.apply(action, *regime_now) - effect).abs() / (0.5 * (high - low))
+    def possible(action: Tensor, effect: Tensor, now: Tensor, here: Tensor) -> Tensor:
+        miss = (regime.apply(action, now, here) - effect).abs() / (0.5 * (high - low))
         return (miss < TOLERANCE).all(-1, keepdim=True)
 
     short = ~possible(intended, planned, parameters, state).squeeze(-1)
     wanted = planned[short]
-    regime_now = [part.expand(*short.shape, -1)[short] for part in (parameters, state)]
+    now, here = (part.expand(*short.shape, -1)[short] for part in (parameters, state))
     scale = torch.zeros_like(wanted[..., :1])
     for k in range(1, ROUNDS + 1):
         trial = scale + 0.5**k
-        action = regime.inverse(trial * wanted, *regime_now, low, high)
-        scale = torch.where(possible(action, trial * wanted, *regime_now), trial, scale)
-    slower = regime.inverse(scale * wanted, *regime_now, low, high)
+        action = regime.inverse(trial * wanted, now, here, low, high)
+        scale = torch.where(possible(action, trial * wanted, now, here), trial, scale)
+    slower = regime.inverse(scale * wanted, now, here, low, high)
     intended = intended.clone()
     intended[short] = torch.where(scale == 0, intended[short], slower)
     return intended
