@@ -6,9 +6,8 @@ import sys
 import pandas as pd
 
 STUDY = "method=afm_physics tracks=all regimes=paper seeds=5 planner=mppi_paper cost=goal_pose"
-COLUMNS = (
-    "method track v_gain omega_gain seed success_rate steps reached targets finished "
-    "seconds mission"
+COLUMNS = (  # the last ones, after the parameters
+    "seed success_rate steps reached targets finished seconds mission regime"
 ).split()
 
 
