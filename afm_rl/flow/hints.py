@@ -45,8 +45,14 @@ def least_squares_hints(
     >>> hints[..., :1].round(decimals=2)
     tensor([-0.2000])
     """
+    kind = planned.dtype
+    # In double precision: where all commands are alike, gain and friction can hardly be told apart.
+    executed, effective, valid, planned = (
+        part.double() for part in (executed, effective, valid, planned)
+    )
     pairs = executed, effective, valid
-    actions, misses = [], []
+    actions: list[Tensor] = []
+    misses: list[Tensor] = []
 
     def add(action: Tensor, explained: Tensor, forgetting: float) -> None:
         weight = weigh(valid, forgetting)
@@ -63,4 +69,4 @@ def least_squares_hints(
     add(invert_friction(gain, offset, planned), explained, LONG)
     matrix, bias = fit_affine(*pairs, LONG)
     add(invert_affine(matrix, bias, planned), executed @ matrix.mT + bias.unsqueeze(-2), LONG)
-    return torch.cat([*actions, *misses], -1)
+    return torch.cat([*actions, *misses], -1).to(kind)

@@ -153,7 +153,7 @@ def test_a_mission_alone_is_the_same_as_among_others(drive, ring, spot, method):
     same(batch.missions.loc[[7], kept].reset_index(drop=True), single.missions[kept])
 
 
-@pytest.mark.parametrize(("method", "budget"), [("afm_physics", 30), ("online_pe", 6)])
+@pytest.mark.parametrize(("method", "budget"), [("afm_physics", 20), ("online_pe", 6)])
 def test_networks_alone_do_nearly_the_same_as_among_others(drive, ring, spot, method, budget):
     """Batched products may round the last bit another way, and learning makes it grow."""
     settings = {"regimes": [BACKWARDS], "budget": budget}
