@@ -22,7 +22,7 @@ class Method:
     done: int = 0
     """Missions of shards with results."""
     started: float | None = None
-    """When its first shard of this session was taken up."""
+    """When its first shard was taken up, this time."""
     before: float = 0.0
     """Share of the work that was done by then."""
     reports: dict[Shard, Report] = field(default_factory=dict)

@@ -28,7 +28,7 @@ class Report(NamedTuple):
     share: float = 0.0
     """Share of the work done, at least: missions that run may end before their budget."""
     rows: int = 0
-    """Steps of all missions, since the first one of this session."""
+    """Steps of all missions, since the first one, this time."""
     seconds: float = 0.0
     """Time for these steps (s)."""
     over: bool = False
