@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torchrl.envs import EnvBase
 
 from afm_rl.envs import ugv_settings as settings
 from afm_rl.envs import ugv_specs as specs
 from afm_rl.envs.course import Course
+from afm_rl.envs.mission_env import MissionEnv, check_action
 from afm_rl.envs.mission_noise import MissionNoise
 from afm_rl.envs.missions import MissionFormat
 from afm_rl.envs.rendering import canvas_of
@@ -23,8 +22,6 @@ from afm_rl.envs.track import Track
 from afm_rl.envs.ugv_simulation import UGVSimulation
 from afm_rl.errors import (
     AFMError,
-    ConfigurationError,
-    NonFiniteError,
     check_choice,
     check_count,
     check_number,
@@ -32,7 +29,7 @@ from afm_rl.errors import (
 from afm_rl.regimes import Regime, Schedule
 
 
-class UGVTrack(EnvBase):
+class UGVTrack(MissionEnv):
     r"""Dubins robots that drive along tracks, waypoint by waypoint, batched.
 
     .. math:: s_{t+1} = f(s_t, g(\mathrm{clamp}(a_t); \rho_t)) + \sigma \epsilon_t,
@@ -98,8 +95,6 @@ class UGVTrack(EnvBase):
     tensor([1, 1, 1, 1, 1])
     """
 
-    _supports_set_state = True
-
     def __init__(
         self,
         tracks: Sequence[str | Path | Track] = ("ethz_2",),
@@ -149,7 +144,6 @@ class UGVTrack(EnvBase):
                 check_choice("missions", key, ("track", "seed", "regime", "at", "ramp"))
             missions = self.mission(**missions)
         self._default = settings.check_missions(missions, batch)
-        self._last: TensorDictBase | None = None
         self._missions_of(None, batch)  # a wrong default fails here, not at the first reset
 
         mission = self.mission_format.spec(batch, self.device)
@@ -200,21 +194,8 @@ class UGVTrack(EnvBase):
         state = {name: value.clone() for name, value in state.items()}
         return self._remembered(self.simulation.describe(mission, pose, **state))
 
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if "mission" not in tensordict.keys() or "pose" not in tensordict.keys():
-            raise ConfigurationError("the tensordict has no mission or pose: start with reset()")
-        running = tensordict.get("_step", None)
-        if running is None:
-            return self._remembered(self._advance(tensordict))
-        # Some missions of a locked batch wait while others go on.
-        running = running.reshape(tensordict.batch_size)
-        out = tensordict.select(*self.observation_keys, *self.done_keys).clone()
-        out.update(self.full_reward_spec.zero())
-        out[running] = self._advance(tensordict[running])
-        return self._remembered(out)
-
     def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:
-        _check_finite(tensordict["action"])
+        check_action(tensordict["action"])
         seeds = tensordict["mission", "seed"]
         noise = self.noise.normal("process", seeds, dtype=self.dtype)
         actuator = None
@@ -225,31 +206,6 @@ class UGVTrack(EnvBase):
     def _remembered(self, out: TensorDictBase) -> TensorDictBase:
         self._last = out.select("pose", "goal", "mission")
         return out
-
-    def _missions_of(self, given: TensorDictBase | None, batch: torch.Size) -> TensorDictBase:
-        """Return the missions to reset: those given, else the last ones, else the default."""
-        mission = None if given is None else given.get("mission", None)
-        automatic = given is not None and "_reset" in given.keys()
-        if mission is None and automatic and self._last is not None:
-            if self._last.batch_size == batch:
-                return self._last["mission"]
-        if self._default is not None:
-            default = self._default.expand(batch)
-            mission = default if mission is None else default.clone().update(mission)
-        return self.mission_format.complete(mission, batch, self.seed, self.device)
-
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            self.seed = check_count("seed", seed, low=0)
-        self.noise.restart()
-
-    def get_extra_state(self) -> dict[str, dict[str, Tensor]]:
-        """Return the state of the noise streams, which ``state_dict`` contains."""
-        return self.noise.state_dict()
-
-    def set_extra_state(self, state: dict[str, dict[str, Tensor]]) -> None:
-        """Restore what :meth:`get_extra_state` returned."""
-        self.noise.load_state_dict(state)
 
     def render(
         self, tensordict: TensorDictBase | None = None, mode: str = "rgb_array"
@@ -270,12 +226,3 @@ class UGVTrack(EnvBase):
         first = data.reshape(-1)[0]
         canvas = canvas_of(self.tracks[int(first["mission", "track"])])
         return canvas.draw(first["pose"], first["goal"], reach=self.simulation.reach)
-
-
-def _check_finite(action: Tensor) -> None:
-    rows = (~action.isfinite().all(-1)).reshape(-1)
-    if rows.any():
-        where = rows.nonzero().flatten().tolist()
-        raise NonFiniteError(
-            f"`action` is NaN or infinite in missions {where}: the planner or policy broke down"
-        )
