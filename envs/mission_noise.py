@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
 from afm_rl.streams import Streams
-
-_SALTS = {"start": 0x55475653, "process": 0x55475650, "actuator": 0x55475641}
-_SIZES = {"start": 3, "process": 3, "actuator": 2}
 
 
 class MissionNoise:
@@ -18,6 +17,10 @@ class MissionNoise:
     rows that are left out of a call draw nothing. Rows with equal seeds share their numbers call
     by call: step them together, and they are paired.
 
+    Attributes:
+        salts: tell the streams of each kind apart from all others; other robots have their own.
+        sizes: how many numbers each kind draws, N.
+
     >>> noise = MissionNoise()
     >>> seeds = torch.tensor([3, 4, 3])
     >>> drawn = noise.normal("start", seeds, torch.tensor([True, False, True]))
@@ -25,8 +28,11 @@ class MissionNoise:
     (True, tensor([0., 0., 0.]))
     """
 
+    salts: Mapping[str, int] = {"start": 0x55475653, "process": 0x55475650, "actuator": 0x55475641}
+    sizes: Mapping[str, int] = {"start": 3, "process": 3, "actuator": 2}  # poses, actions
+
     def __init__(self) -> None:
-        self.streams = {name: Streams(salt=salt) for name, salt in _SALTS.items()}
+        self.streams = {name: Streams(salt=salt) for name, salt in self.salts.items()}
 
     def normal(
         self,
@@ -35,15 +41,15 @@ class MissionNoise:
         rows: Tensor | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> Tensor:
-        """Draw N(0, 1) numbers ``(*B, N)``: N is 3, for poses, or 2, for actions.
+        """Draw N(0, 1) numbers ``(*B, N)``.
 
         Args:
-            event: ``"start"``, ``"process"`` or ``"actuator"``.
+            event: a kind of noise, such as ``"start"``.
             seeds: seed of each mission, ``(*B)``.
             rows: missions that draw, booleans ``(*B)``; the others get zeros. All if None.
             dtype: floating-point type.
         """
-        size = _SIZES[event]
+        size = self.sizes[event]
         noise = torch.zeros(*seeds.shape, size, device=seeds.device, dtype=dtype)
         rows = torch.ones_like(seeds, dtype=torch.bool) if rows is None else rows
         if rows.any():
