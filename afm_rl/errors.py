@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 
 class AFMError(Exception):
@@ -100,4 +101,18 @@ def check_flag(name: str, value: bool) -> bool:
     """
     if not isinstance(value, bool):
         raise ConfigurationError(f"{name}={value!r}: expected true or false")
+    return value
+
+
+def check_instance(name: str, value: Any, kind: type) -> Any:
+    """Return ``value`` if it is an instance of ``kind``.
+
+    Raises:
+        ConfigurationError: otherwise, naming both types.
+
+    >>> check_instance("planner.env", 3, int)
+    3
+    """
+    if not isinstance(value, kind):
+        raise ConfigurationError(f"{name}: expected a {kind.__name__}, got {value!r:.80}")
     return value

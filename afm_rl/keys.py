@@ -6,11 +6,16 @@ from collections.abc import Iterable
 
 from tensordict import NestedKey
 
+from afm_rl.errors import ConfigurationError
+
 
 def as_key(key: str | Iterable[str]) -> NestedKey:
     """Return ``key`` as tensordict wants it: a string, or a tuple of strings.
 
     YAML has no tuples, so nested keys arrive as lists.
+
+    Raises:
+        ConfigurationError: if it is neither.
 
     >>> as_key(["afm", "executed_action"])
     ('afm', 'executed_action')
@@ -19,7 +24,9 @@ def as_key(key: str | Iterable[str]) -> NestedKey:
     """
     if isinstance(key, str):
         return key
-    parts = tuple(key)
+    parts = tuple(key) if isinstance(key, Iterable) else ()
+    if not parts or not all(isinstance(part, str) for part in parts):
+        raise ConfigurationError(f"key {key!r}: expected a text, or a list of texts")
     return parts[0] if len(parts) == 1 else parts
 
 

@@ -9,15 +9,13 @@ from typing import cast
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
-from torchrl.modules.planners.common import MPCPlannerBase
 
 from afm_rl.errors import ConfigurationError, check_choice, check_count
 from afm_rl.keys import as_key
 from afm_rl.manifold import Manifold, wrap_angle
 from afm_rl.planning.conic import load_casadi, solve_conic
 from afm_rl.planning.planning_env import PlanningEnv
-from afm_rl.planning.primer import ZeroPrimer
+from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.planning.riccati import LQProblem, LQSolution, solve_lq
 from afm_rl.planning.tracking import QuadraticCost
 
@@ -64,7 +62,7 @@ def _raw_difference(manifold: Manifold, state: Tensor, origin: Tensor) -> Tensor
     return torch.where(manifold.is_angle, wrap_angle(gap), gap)
 
 
-class MPC(MPCPlannerBase):
+class MPC(RecedingHorizonPlanner):
     r"""Nonlinear model predictive control, one linear-quadratic problem per tick.
 
     Minimises the cost of the N + 1 states and N actions from the measured state on, subject
@@ -131,14 +129,21 @@ class MPC(MPCPlannerBase):
                 f"planner: got {type(env).__name__}{cost}; MPC needs a PlanningEnv with a "
                 "quadratic cost, such as TrackingCost"
             )
-        super().__init__(env, action_key=as_key(action_key))
-        self.horizon = check_count("planner.horizon", horizon)
+        check_count("planner.horizon", horizon)
+        memory_key, size = as_key(memory_key), env.dynamics.action_size
+        root = memory_key if isinstance(memory_key, tuple) else (memory_key,)
+        memory = {
+            (*root, "states"): (horizon + 1, env.dynamics.state_size),
+            (*root, "actions"): (horizon, size),
+        }
+        super().__init__(env, memory, action_key)
+        self.horizon = horizon
         self.iterations = check_count("planner.iterations", iterations)
         self.first_iterations = check_count("planner.first_iterations", first_iterations)
         self.qp = check_choice("planner.qp", qp, SOLVERS)
         if qp == "hpipm":
             load_casadi()
-        space, size = self.action_spec.space, env.dynamics.action_size
+        space = self.action_spec.space
         within = list(range(size)) if bounded is None else list(bounded)
         if not all(isinstance(i, int) and 0 <= i < size for i in within):
             raise ConfigurationError(
@@ -149,55 +154,17 @@ class MPC(MPCPlannerBase):
         self.register_buffer("low", space.low.masked_fill(free, -torch.inf), persistent=False)
         self.register_buffer("high", space.high.masked_fill(free, torch.inf), persistent=False)
         self.register_buffer("middle", (space.low + space.high) / 2, persistent=False)
-        self.action_key = as_key(action_key)
-        memory_key = as_key(memory_key)
-        root = memory_key if isinstance(memory_key, tuple) else (memory_key,)
-        self.memory_keys = [(*root, "states"), (*root, "actions")]
-        self.next_memory_keys = [("next", *key) for key in self.memory_keys]
-        self.in_keys = [env.observation_key, *env.cost.in_keys, *self.memory_keys]
-        self.out_keys = [self.action_key, *self.next_memory_keys]
+        self.in_keys = [env.observation_key, *env.cost.in_keys, *self.memory]
         self.discarded = self.inexact = 0
-        self._told = False
-        states, actions = (torch.zeros(shape) for shape in self._shapes)
+        states, actions = (torch.zeros(shape) for shape in self.memory.values())
         task = [torch.zeros(1, size) for size in env.cost.in_sizes]
         env.cost.quadratic(states, actions, *task)  # it says what does not fit
 
-    @property
-    def _shapes(self) -> list[tuple[int, int]]:
-        dynamics = self.env.dynamics
-        return [
-            (self.horizon + 1, dynamics.state_size),
-            (self.horizon, dynamics.action_size),
-        ]
-
-    def make_tensordict_primer(self) -> ZeroPrimer:
-        """Return the transform that puts an empty memory into every reset."""
-        dtype = self.action_spec.dtype
-        pairs = zip(self.memory_keys, self._shapes, strict=True)
-        return ZeroPrimer(Composite({key: Unbounded(shape, dtype=dtype) for key, shape in pairs}))
-
-    def forward(
-        self,
-        tensordict: TensorDictBase,
-        tensordict_out: TensorDictBase | None = None,
-        **kwargs,
-    ) -> TensorDictBase:
-        """Write the action and the next memory."""
-        solution = self._plan(tensordict)
-        out = tensordict if tensordict_out is None else tensordict_out
-        for key, value in zip(self.next_memory_keys, solution, strict=True):
-            out.set(key, value)
-        return out.set(self.action_key, self.action_spec.project(solution[1][..., 0, :]))
-
-    def planning(self, td: TensorDictBase) -> Tensor:
-        """Return the action ``(*B, A)`` without writing anything."""
-        return self._plan(td)[1][..., 0, :]
-
     @torch.no_grad()
-    def _plan(self, td: TensorDictBase) -> list[Tensor]:
-        """Return states ``(*B, N + 1, S)`` and actions ``(*B, N, A)`` of the solution."""
+    def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
+        """Return the action, and states ``(*B, N + 1, S)`` and actions ``(*B, N, A)``."""
         measured, task = td.get(self.env.observation_key), self._task(td)
-        shifted = [torch.cat([old[..., 1:, :], old[..., -1:, :]], -2) for old in self._memory(td)]
+        shifted = [torch.cat([old[..., 1:, :], old[..., -1:, :]], -2) for old in self._recall(td)]
         states, actions = (old.to(measured) for old in shifted)
         new = (states == 0).flatten(-2).all(-1) & (actions == 0).flatten(-2).all(-1)
         alike = new[..., None, None]
@@ -228,7 +195,8 @@ class MPC(MPCPlannerBase):
                 stacklevel=4,
             )
         dtype = self.action_spec.dtype
-        return _choose(solved, [found.to(dtype) for found in guess], shifted)
+        solution = _choose(solved, [found.to(dtype) for found in guess], shifted)
+        return solution[1][..., 0, :], solution
 
     def _improve(
         self, guess: Sequence[Tensor], task: Sequence[Tensor]
@@ -259,22 +227,6 @@ class MPC(MPCPlannerBase):
                 )
             task.append(entry.unsqueeze(-2) if entry.shape == held else entry)
         return task
-
-    def _memory(self, td: TensorDictBase) -> list[Tensor]:
-        """Return the previous states and actions, zeros where there are none."""
-        memory = [td.get(key, None) for key in self.memory_keys]
-        if all(entry is not None for entry in memory):
-            return memory
-        if not self._told:
-            warnings.warn(
-                f"planner: no {self.memory_keys[0][:-1]} in the tensordict, so every plan starts "
-                "cold; append planner.make_tensordict_primer() to the environment",
-                stacklevel=5,
-            )
-            self._told = True
-        shapes = [(*td.batch_size, *shape) for shape in self._shapes]
-        dtype = self.action_spec.dtype
-        return [torch.zeros(shape, device=td.device, dtype=dtype) for shape in shapes]
 
 
 def _choose(where: Tensor, first: Sequence[Tensor], second: Sequence[Tensor]) -> list[Tensor]:

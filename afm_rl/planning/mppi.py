@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
-
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, Unbounded
 from torchrl.envs import EnvBase
-from torchrl.modules.planners.common import (
-    MPCPlannerBase,
-    _mask_post_done_reward,
-    _planning_done_keys,
-)
 
-from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
+from afm_rl.errors import check_choice, check_number
 from afm_rl.keys import as_key
-from afm_rl.planning.primer import ZeroPrimer
-from afm_rl.streams import Streams
+from afm_rl.planning.receding import action_spec_of
+from afm_rl.planning.sampling_planner import SamplingPlanner
 
 BOUND = 2.0  # exploration noise is truncated at two standard deviations
 
@@ -62,7 +54,7 @@ def path_weights(returns: Tensor, temperature: float) -> Tensor:
     return weights / weights.sum(-1, keepdim=True).clamp_min(torch.finfo(weights.dtype).tiny)
 
 
-class MPPI(MPCPlannerBase):
+class MPPI(SamplingPlanner):
     r"""MPPI with a warm-started mean plan, smoothed noise and log-sum-exp weights.
 
     Each step shifts the mean plan by one, draws N candidates around it,
@@ -72,7 +64,8 @@ class MPPI(MPCPlannerBase):
 
     rolls them out in the planning environment, and moves the mean to
     :math:`\sum_i w_i u^i`, :math:`w_i \propto \exp(R_i / \lambda)` (Nagabandi et al. 2020,
-    section 4.3; paper, section III-A). The action is the mean's first row.
+    section 4.3; paper, section III-A). The action is the mean's first row, whatever the
+    exploration type: there is nothing to explore beyond the candidates.
 
     The mean lives in the tensordict, so every mission of a batch has its own and resets
     start afresh: append :meth:`make_tensordict_primer` to the environment.
@@ -95,6 +88,9 @@ class MPPI(MPCPlannerBase):
         mean_key: where the mean plan is kept.
         seed_key: entry ``(*B)`` with each mission's seed: missions of one seed share their
             noise whoever else is in the batch. Without it noise is drawn for the batch.
+        box_key: entry ``(*B, 2, A)`` with the lowest and highest action to plan with, such as the
+            ``reach`` of :class:`~afm_rl.transforms.ActionFlowTransform`; the action's own bounds
+            where there is none.
         action_key: where the action goes.
         seed: seed of the noise without ``seed_key``.
 
@@ -125,121 +121,59 @@ class MPPI(MPCPlannerBase):
         backend: str | None = None,
         mean_key: NestedKey = ("mppi", "mean"),
         seed_key: NestedKey | None = None,
+        box_key: NestedKey | None = None,
         action_key: NestedKey = "action",
         seed: int = 0,
     ) -> None:
-        super().__init__(env, action_key=as_key(action_key))
-        self.horizon = check_count("planner.horizon", horizon)
-        self.population = check_count("planner.population", population)
-        self.iterations = check_count("planner.iterations", iterations)
+        super().__init__(
+            env,
+            {as_key(mean_key): (horizon, *action_spec_of(env).shape)},
+            horizon,
+            population,
+            iterations,
+            backend=backend,
+            seed_key=seed_key,
+            action_key=action_key,
+            seed=seed,
+        )
         self.temperature = check_number("planner.temperature", temperature, low=0, open_low=True)
         self.sigma = check_number("planner.sigma", sigma, low=0.0)
         self.beta = check_number("planner.beta", beta, low=0.0, high=1.0, open_low=True)
         self.noise = check_choice("planner.noise", noise, ("scaled", "unit"))
         self.past = check_choice("planner.past", past, ("previous", "shifted"))
-        if backend is None:
-            backend = "fast" if hasattr(env, "returns") else "env"
-        self.backend = check_choice("planner.backend", backend, ("fast", "env"))
-        if self.backend == "fast" and not hasattr(env, "returns"):
-            raise ConfigurationError(
-                f"planner.backend='fast': {type(env).__name__} has no `returns`; use 'env'"
-            )
-        self.mean_key = as_key(mean_key)
-        self.seed_key = None if seed_key is None else as_key(seed_key)
-        self.action_key = as_key(action_key)
-        mean_key = self.mean_key if isinstance(self.mean_key, tuple) else (self.mean_key,)
-        self.next_mean_key = ("next", *mean_key)
-        self.in_keys = [*env.observation_spec.keys(True, True), self.mean_key]
-        if self.seed_key is not None:
-            self.in_keys.append(self.seed_key)
-        self.out_keys = [self.action_key, self.next_mean_key]
-        self.streams = Streams(salt=1, seed=seed)
-        self.discarded = 0
+        self.box_key = None if box_key is None else as_key(box_key)
         space = self.action_spec.space
         half = (space.high - space.low) / 2
         self.register_buffer("scale", sigma * half if noise == "scaled" else torch.ones_like(half))
-        self._told = False
-
-    def make_tensordict_primer(self) -> ZeroPrimer:
-        """Return the transform that puts a zero mean plan into every reset."""
-        shape = (self.horizon, *self.action_spec.shape)
-        spec = Composite({self.mean_key: Unbounded(shape, dtype=self.action_spec.dtype)})
-        return ZeroPrimer(spec)
-
-    def forward(
-        self,
-        tensordict: TensorDictBase,
-        tensordict_out: TensorDictBase | None = None,
-        **kwargs,
-    ) -> TensorDictBase:
-        """Write the action and the next mean plan."""
-        mean = self._plan(tensordict)
-        action = self.action_spec.project(mean[..., 0, :])
-        out = tensordict if tensordict_out is None else tensordict_out
-        return out.set(self.action_key, action).set(self.next_mean_key, mean)
-
-    def planning(self, td: TensorDictBase) -> Tensor:
-        """Return the action ``(*B, A)`` without writing anything."""
-        return self._plan(td)[..., 0, :]
 
     @torch.no_grad()
-    def _plan(self, td: TensorDictBase) -> Tensor:
-        """Return the new mean plan ``(*B, H, A)``."""
-        mean = self._mean(td)
+    def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
+        """Return the first action of the new mean plan ``(*B, H, A)``, and that plan."""
+        (mean,) = self._recall(td)
         shifted = torch.cat([mean[..., 1:, :], mean[..., -1:, :]], -2)
         past = (mean if self.past == "previous" else shifted)[..., 0, :]
-        space = self.action_spec.space
+        low, high, scale = self._box(td)
         best = shifted
         for _ in range(self.iterations):
-            eps = self._noise(td, mean)
-            raw = best.unsqueeze(-3) + self.scale * eps
-            plans = smooth(raw, past.unsqueeze(-2), self.beta, space.low, space.high)
+            eps = self._noise(td, mean, self.population, BOUND)
+            raw = best.unsqueeze(-3) + scale.unsqueeze(-2) * eps
+            plans = smooth(raw, past.unsqueeze(-2), self.beta, low, high)
             best = self._blend(self._returns(td, plans), plans, best)
-        return best
+        return best[..., 0, :], [best]
 
-    def _mean(self, td: TensorDictBase) -> Tensor:
-        mean = td.get(self.mean_key, None)
-        if mean is not None:
-            return mean
-        if not self._told:
-            warnings.warn(
-                f"planner: no {self.mean_key} in the tensordict, so every plan starts cold; "
-                "append planner.make_tensordict_primer() to the environment",
-                stacklevel=4,
-            )
-            self._told = True
-        shape = (*td.batch_size, self.horizon, *self.action_spec.shape)
-        return torch.zeros(shape, device=td.device, dtype=self.action_spec.dtype)
+    def _box(self, td: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        """Return lowest and highest action and the noise's size, ``(*B, 1, A)`` or ``(A,)``."""
+        space = self.action_spec.space
+        box = None if self.box_key is None else td.get(self.box_key, None)
+        if box is None:
+            return space.low, space.high, self.scale
+        low, high = box.unsqueeze(-3).unbind(-2)
+        return low, high, self.scale * (high - low) / (space.high - space.low)
 
-    def _noise(self, td: TensorDictBase, like: Tensor) -> Tensor:
-        return self.streams.normal(
-            (self.population, *like.shape[-2:]),
-            batch=like.shape[:-2],
-            seeds=None if self.seed_key is None else td.get(self.seed_key),
-            bound=BOUND,
-            device=like.device,
-            dtype=like.dtype,
-        )
-
-    def _returns(self, td: TensorDictBase, plans: Tensor) -> Tensor:
-        """Return the return ``(*B, N)`` of each plan ``(*B, N, H, A)``."""
-        if self.backend == "fast":
-            task = [td.get(key) for key in self.env.cost.in_keys]
-            return self.env.returns(td.get(self.env.observation_key), plans, *task)
-        batch = plans.shape[:-2]
-        start = td.select(*self.env.observation_spec.keys(True, True), strict=False)
-        start = start.unsqueeze(-1).expand(batch).clone()
-        steps = iter(plans.unbind(-2))
-        rollout = self.env.rollout(
-            self.horizon,
-            policy=lambda now: now.set(self.action_key, next(steps)),
-            auto_reset=False,
-            tensordict=start,
-            break_when_any_done=False,
-            trust_policy=True,  # it takes the tensordict itself
-        )
-        rewards = _mask_post_done_reward(rollout, done_key=_planning_done_keys(self.env))
-        return rewards.sum((-2, -1))
+    def _allowed(self, action: Tensor, td: TensorDictBase) -> Tensor:
+        low, high, _ = self._box(td)
+        wide = action.unsqueeze(-2)
+        return torch.minimum(torch.maximum(wide, low), high).squeeze(-2)
 
     def _blend(self, returns: Tensor, plans: Tensor, fallback: Tensor) -> Tensor:
         """Return the weighted mean plan, or ``fallback`` where no return is finite."""
@@ -248,12 +182,5 @@ class MPPI(MPCPlannerBase):
         finite = returns.isfinite()
         if bool(finite.all()):
             return mean
-        self.discarded += int((~finite).sum())
-        lost = ~finite.any(-1)
-        if bool(lost.any()):
-            warnings.warn(
-                f"planner: no finite return for {int(lost.sum())} of {lost.numel()} plans; "
-                "the previous plan stands",
-                stacklevel=4,
-            )
-        return torch.where(lost[..., None, None], fallback, mean)
+        self._discard(finite)
+        return torch.where(finite.any(-1)[..., None, None], mean, fallback)

@@ -11,7 +11,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import ModelBasedEnvBase
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.keys import as_key
 from afm_rl.planning.costs import Cost
 
@@ -25,7 +25,7 @@ class PlanningEnv(ModelBasedEnvBase):
     Args:
         dynamics: the model; shared, not copied.
         cost: cost of a step; the reward is its negative.
-        action_low: lowest action, ``(A,)``.
+        action_low: lowest action, ``(A,)``; its precision is that of all entries.
         action_high: highest action, ``(A,)``.
         observation_key: where the state is.
         action_key: where the action is.
@@ -47,6 +47,8 @@ class PlanningEnv(ModelBasedEnvBase):
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
     ) -> None:
+        check_instance("planner.env: dynamics", dynamics, DynamicsModel)
+        check_instance("planner.env: cost", cost, Cost)
         super().__init__(dynamics, batch_size=torch.Size([]))
         self.dynamics = dynamics
         self.cost = cost
@@ -58,16 +60,20 @@ class PlanningEnv(ModelBasedEnvBase):
                 f"action bounds {low.tolist()}, {high.tolist()}: expected {dynamics.action_size} "
                 "finite numbers each, low < high"
             )
+        if self.observation_key in cost.in_keys:
+            raise ConfigurationError(
+                f"cost.in_keys={cost.in_keys}: {self.observation_key!r} holds the state already"
+            )
         sizes = {self.observation_key: dynamics.state_size}
         sizes.update(zip(cost.in_keys, cost.in_sizes, strict=True))
         self.observation_spec = Composite()
         self.state_spec = Composite()
         for key, size in sizes.items():
-            self.observation_spec[key] = Unbounded((size,))
-            self.state_spec[key] = Unbounded((size,))
+            self.observation_spec[key] = Unbounded((size,), dtype=low.dtype)
+            self.state_spec[key] = Unbounded((size,), dtype=low.dtype)
         spec = Bounded(low, high, shape=low.shape, dtype=low.dtype)
         self.full_action_spec = Composite({as_key(action_key): spec})
-        self.reward_spec = Unbounded((1,))
+        self.reward_spec = Unbounded((1,), dtype=low.dtype)
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
         batch = tensordict.batch_size if tensordict is not None else self.batch_size

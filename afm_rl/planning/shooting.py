@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import CEMPlanner, MPPIPlanner
 from torchrl.objectives.value import TDLambdaEstimator
 
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_count, check_instance, check_number
 
 
 def _check_elites(elites: int, population: int) -> int:
@@ -19,6 +19,14 @@ def _check_elites(elites: int, population: int) -> int:
             f"planner.elites={elites}: expected at most planner.population={population}"
         )
     return elites
+
+
+def _check_action_key(env: EnvBase) -> None:
+    if check_instance("planner.env", env, EnvBase).action_keys != ["action"]:
+        raise ConfigurationError(
+            f"planner: TorchRL's planners write 'action', but {type(env).__name__} reads "
+            f"{env.action_keys}; rename it, or choose MPPI or ICEM"
+        )
 
 
 class CEM(CEMPlanner):
@@ -30,6 +38,9 @@ class CEM(CEMPlanner):
         population: candidates per iteration.
         iterations: refinements per step.
         elites: candidates that the next iteration is fitted to.
+
+    Raises:
+        ConfigurationError: for a setting or environment that cannot be used.
     """
 
     def __init__(
@@ -40,6 +51,7 @@ class CEM(CEMPlanner):
         iterations: int = 3,
         elites: int = 30,
     ) -> None:
+        _check_action_key(env)
         check_count("planner.horizon", horizon)
         check_count("planner.population", population)
         check_count("planner.iterations", iterations)
@@ -73,6 +85,7 @@ class TorchRLMPPI(MPPIPlanner):
         elites: int = 30,
         temperature: float = 1.0,
     ) -> None:
+        _check_action_key(env)
         check_count("planner.horizon", horizon)
         check_count("planner.population", population)
         check_count("planner.iterations", iterations)

@@ -255,7 +255,7 @@ def test_a_missing_memory_is_told_once_and_taken_as_zero(box):
     td = situation(planner, 2, memory=0.0)
     expected = planner(td.clone())["action"]
     del td["mpc"]
-    with pytest.warns(UserWarning, match=r"no \('mpc',\).*make_tensordict_primer"):
+    with pytest.warns(UserWarning, match=r"no \('mpc', 'states'\).*make_tensordict_primer"):
         torch.testing.assert_close(planner(td.clone())["action"], expected)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

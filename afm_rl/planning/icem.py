@@ -1,0 +1,197 @@
+"""The improved cross-entropy method."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.keys import as_key
+from afm_rl.planning.receding import action_spec_of
+from afm_rl.planning.sampling_planner import SamplingPlanner
+
+WITHOUT_NOISE = (
+    ExplorationType.DETERMINISTIC,
+    ExplorationType.MEAN,
+    ExplorationType.MODE,
+    ExplorationType.MEDIAN,
+)
+
+
+def coloured(noise: Tensor, beta: float) -> Tensor:
+    r"""Colour white noise in time: power spectrum :math:`\propto f^{-\beta}`, variance 1.
+
+    The lowest frequency, 1/H, stands in for frequency 0.
+
+    Args:
+        noise: standard normal numbers, ``(*B, H, A)``.
+        beta: 0 leaves the noise white, 1 is pink, 2 red; large ones are all but constant.
+
+    >>> white = torch.randn(1000, 5, 2)
+    >>> torch.allclose(coloured(white, 0.0), white, atol=1e-5)
+    True
+    >>> red = coloured(white, 3.0)
+    >>> bool(red.diff(dim=1).std() < 0.8 * white.diff(dim=1).std())
+    True
+    """
+    steps = noise.shape[-2]
+    frequency = torch.fft.fftfreq(steps, device=noise.device, dtype=noise.dtype)
+    size = frequency.abs().clamp_min(1 / steps) ** (-beta / 2)
+    size = size / size.square().mean().sqrt()
+    return torch.fft.ifft(torch.fft.fft(noise, dim=-2) * size.unsqueeze(-1), dim=-2).real
+
+
+class ICEM(SamplingPlanner):
+    r"""Cross-entropy method with coloured noise and elites that are kept (iCEM).
+
+    Each step shifts the mean plan :math:`\mu` by one and starts with the standard deviation
+    :math:`\sigma_0`. Iteration i draws
+
+    .. math:: N_i = \max(N \gamma^{-i}, 2K),\qquad
+              u = \mathrm{clamp}(\mu + \sigma \odot C_\beta(\epsilon)),
+
+    puts the best plans of the iteration before (of the step before, shifted) in the place of
+    some candidates, in the last iteration the mean, too, and moves :math:`\mu, \sigma` to those
+    of the best K with momentum :math:`\alpha` (Pinneri et al. 2020, "Sample-efficient
+    Cross-Entropy Method for Real-time Planning"). The action is the first one of the best
+    candidate; under ``ExplorationType.DETERMINISTIC``, ``MEAN``, ``MODE`` and ``MEDIAN`` it is
+    the mean's.
+
+    Mean and elites live in the tensordict, so every mission of a batch has its own and resets
+    start afresh: append :meth:`make_tensordict_primer` to the environment. A mission whose
+    memory is zero is new: it starts from the middle of the action box, without elites.
+
+    Args:
+        env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
+        horizon: steps of a plan, H.
+        population: candidates of the first iteration, N, at least 2 K.
+        iterations: refinements per step.
+        elites: plans that mean and standard deviation are fitted to, K.
+        keep: share of the elites that goes on to the next iteration and step, in (0, 1].
+        decay: :math:`\gamma`, by which the population shrinks, at least 1.
+        sigma: :math:`\sigma_0`, as a fraction of the half range of each action.
+        beta: exponent of the noise's spectrum, see :func:`coloured`.
+        momentum: :math:`\alpha` in [0, 1]: weight of the old mean and standard deviation.
+        backend: see :class:`MPPI`, also for the arguments that follow.
+        memory_key: where ``mean`` ``(*B, H, A)`` and ``elites`` ``(*B, k, H, A)`` are kept.
+        seed_key: entry ``(*B)`` with each mission's seed.
+        action_key: where the action goes.
+        seed: seed of the noise without ``seed_key``.
+
+    >>> from tensordict import TensorDict
+    >>> from torchrl.envs import TransformedEnv
+    >>> from afm_rl.dynamics import Dubins
+    >>> from afm_rl.planning import GoalDistance, PlanningEnv
+    >>> world = PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5])
+    >>> planner = ICEM(world, horizon=5, population=32, elites=8)
+    >>> env = TransformedEnv(world, planner.make_tensordict_primer())
+    >>> env.rollout(3, planner)["action"].shape
+    torch.Size([3, 2])
+    """
+
+    scale: Tensor
+    middle: Tensor
+
+    def __init__(
+        self,
+        env: EnvBase,
+        horizon: int = 5,
+        population: int = 100,
+        iterations: int = 3,
+        elites: int = 10,
+        keep: float = 0.3,
+        decay: float = 1.25,
+        sigma: float = 0.5,
+        beta: float = 1.0,
+        momentum: float = 0.1,
+        backend: str | None = None,
+        memory_key: NestedKey = "icem",
+        seed_key: NestedKey | None = None,
+        action_key: NestedKey = "action",
+        seed: int = 0,
+    ) -> None:
+        check_count("planner.elites", elites)
+        check_number("planner.keep", keep, low=0.0, high=1.0, open_low=True)
+        kept = max(1, round(keep * elites))
+        memory_key = as_key(memory_key)
+        root = memory_key if isinstance(memory_key, tuple) else (memory_key,)
+        plan = (horizon, *action_spec_of(env).shape)
+        super().__init__(
+            env,
+            {(*root, "mean"): plan, (*root, "elites"): (kept, *plan)},
+            horizon,
+            population,
+            iterations,
+            backend=backend,
+            seed_key=seed_key,
+            action_key=action_key,
+            seed=seed,
+        )
+        if population < 2 * elites:
+            raise ConfigurationError(
+                f"planner.elites={elites}: expected at most half of planner.population={population}"
+            )
+        self.elites, self.kept = elites, kept
+        self.decay = check_number("planner.decay", decay, low=1.0)
+        self.sigma = check_number("planner.sigma", sigma, low=0.0)
+        self.beta = check_number("planner.beta", beta, low=0.0)
+        self.momentum = check_number("planner.momentum", momentum, low=0.0, high=1.0)
+        space = self.action_spec.space
+        self.register_buffer("scale", self.sigma * (space.high - space.low) / 2)
+        self.register_buffer("middle", (space.low + space.high) / 2)
+
+    @property
+    def counts(self) -> list[int]:
+        """Candidates of each iteration.
+
+        >>> from afm_rl.dynamics import Dubins
+        >>> from afm_rl.planning import GoalDistance, PlanningEnv
+        >>> ICEM(PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5])).counts
+        [100, 80, 64]
+        """
+        sizes = (self.population * self.decay**-i for i in range(self.iterations))
+        return [max(round(size), 2 * self.elites) for size in sizes]
+
+    @torch.no_grad()
+    def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
+        """Return the action, the mean plan and the elites that are kept."""
+        mean, elites = (torch.cat([x[..., 1:, :], x[..., -1:, :]], -2) for x in self._recall(td))
+        new = (elites == 0).flatten(-3).all(-1) & (mean == 0).flatten(-2).all(-1)
+        mean = torch.where(new[..., None, None], self.middle, mean)
+        space, std = self.action_spec.space, self.scale.expand_as(mean)
+        best, found = mean, ~new  # which missions have elites
+        for i, count in enumerate(self.counts):
+            noise = coloured(self._noise(td, mean, count), self.beta)
+            plans = mean.unsqueeze(-3) + std.unsqueeze(-3) * noise
+            plans[..., : self.kept, :, :] = torch.where(
+                found[..., None, None, None], elites, plans[..., : self.kept, :, :]
+            )
+            if i == self.iterations - 1:
+                plans[..., self.kept, :, :] = mean
+            plans = torch.minimum(torch.maximum(plans, space.low), space.high)
+            returns = self._returns(td, plans)
+            finite = returns.isfinite()
+            if not bool(finite.all()):
+                self._discard(finite)
+            top = torch.where(finite, returns, -torch.inf).topk(self.elites, -1)
+            index = top.indices[..., None, None].expand(*top.indices.shape, *plans.shape[-2:])
+            chosen, sound = plans.gather(-3, index), finite.any(-1)
+            here = sound[..., None, None]
+            weight = top.values.isfinite()[..., None, None].to(plans)
+            centre, spread = self._fit(chosen, weight)
+            best = torch.where(here, chosen[..., 0, :, :], best)
+            mean = torch.where(here, torch.lerp(centre, mean, self.momentum), mean)
+            std = torch.where(here, torch.lerp(spread, std, self.momentum), std)
+            few = torch.where(weight > 0, chosen, best.unsqueeze(-3))[..., : self.kept, :, :]
+            elites, found = torch.where(here.unsqueeze(-3), few, elites), found | sound
+        plan = mean if exploration_type() in WITHOUT_NOISE else best
+        return plan[..., 0, :], [mean, elites]
+
+    def _fit(self, plans: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation ``(*B, H, A)`` of plans ``(*B, K, H, A)``."""
+        share = weight / weight.sum(-3, keepdim=True).clamp_min(1.0)
+        mean = (share * plans).sum(-3)
+        return mean, (share * (plans - mean.unsqueeze(-3)).square()).sum(-3).sqrt()

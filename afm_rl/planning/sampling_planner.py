@@ -1,0 +1,115 @@
+"""What planners share that try many candidates."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.modules.planners.common import _mask_post_done_reward, _planning_done_keys
+
+from afm_rl.errors import ConfigurationError, check_choice, check_count
+from afm_rl.keys import as_key
+from afm_rl.planning.receding import RecedingHorizonPlanner
+from afm_rl.streams import Streams
+
+
+class SamplingPlanner(RecedingHorizonPlanner):
+    """A planner that draws candidates and rolls them out in the planning environment.
+
+    Args:
+        env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
+        memory: entries that are kept from plan to plan, with their shapes.
+        horizon: steps of a plan, H.
+        population: candidates per iteration, N.
+        iterations: refinements per step.
+        backend: ``"fast"`` uses ``env.returns``, ``"env"`` steps the environment, ``None``
+            takes the fast way where there is one. Both give the same plans.
+        seed_key: entry ``(*B)`` with each mission's seed: missions of one seed share their
+            noise whoever else is in the batch. Without it noise is drawn for the batch.
+        action_key: where the action goes.
+        seed: seed of the noise without ``seed_key``.
+
+    Returns that are not finite are ignored and counted in :attr:`discarded`; where all are,
+    the shifted plan stands and a warning is given.
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        memory: Mapping[NestedKey, Sequence[int]],
+        horizon: int,
+        population: int,
+        iterations: int,
+        backend: str | None = None,
+        seed_key: NestedKey | None = None,
+        action_key: NestedKey = "action",
+        seed: int = 0,
+    ) -> None:
+        super().__init__(env, memory, action_key)
+        self.horizon = check_count("planner.horizon", horizon)
+        self.population = check_count("planner.population", population)
+        self.iterations = check_count("planner.iterations", iterations)
+        if backend is None:
+            backend = "fast" if hasattr(env, "returns") else "env"
+        self.backend = check_choice("planner.backend", backend, ("fast", "env"))
+        if self.backend == "fast" and not hasattr(env, "returns"):
+            raise ConfigurationError(
+                f"planner.backend='fast': {type(env).__name__} has no `returns`; use 'env'"
+            )
+        self.seed_key = None if seed_key is None else as_key(seed_key)
+        self.in_keys = [*env.observation_spec.keys(True, True), *self.memory]
+        if self.seed_key is not None:
+            self.in_keys.append(self.seed_key)
+        self.streams = Streams(salt=1, seed=check_count("planner.seed", seed, low=0))
+        self.discarded = 0
+
+    def _noise(
+        self, td: TensorDictBase, like: Tensor, count: int, bound: float | None = None
+    ) -> Tensor:
+        """Draw standard normal numbers ``(*B, count, H, A)`` for plans like ``(*B, H, A)``."""
+        return self.streams.normal(
+            (count, *like.shape[-2:]),
+            batch=like.shape[:-2],
+            seeds=None if self.seed_key is None else td.get(self.seed_key),
+            bound=bound,
+            device=like.device,
+            dtype=like.dtype,
+        )
+
+    def _returns(self, td: TensorDictBase, plans: Tensor) -> Tensor:
+        """Return the return ``(*B, N)`` of each plan ``(*B, N, H, A)``."""
+        if self.backend == "fast":
+            task = [td.get(key) for key in self.env.cost.in_keys]
+            return self.env.returns(td.get(self.env.observation_key), plans, *task)
+        batch = plans.shape[:-2]
+        start = td.select(*self.env.observation_spec.keys(True, True), strict=False)
+        start = start.unsqueeze(-1).expand(batch).clone()
+        steps, action_key = iter(plans.unbind(-2)), self.env.action_key
+        rollout = self.env.rollout(
+            self.horizon,
+            policy=lambda now: now.set(action_key, next(steps)),
+            auto_reset=False,
+            tensordict=start,
+            break_when_any_done=False,
+            trust_policy=True,  # it takes the tensordict itself
+        )
+        rewards = _mask_post_done_reward(
+            rollout,
+            reward_key=("next", self.env.reward_key),
+            done_key=_planning_done_keys(self.env),
+        )
+        return rewards.sum((-2, -1))
+
+    def _discard(self, finite: Tensor) -> None:
+        """Count the returns ``(*B, N)`` that are not finite; warn where none is."""
+        self.discarded += int((~finite).sum())
+        lost = ~finite.any(-1)
+        if bool(lost.any()):
+            warnings.warn(
+                f"planner: no finite return for {int(lost.sum())} of {lost.numel()} plans; "
+                "the previous plan stands",
+                stacklevel=5,
+            )

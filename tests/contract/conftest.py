@@ -1,0 +1,208 @@
+"""Every public module in one table, so that one contract holds for all."""
+
+from functools import partial
+from typing import NamedTuple
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from afm_rl.dynamics import (
+    KNODE,
+    Calibrated,
+    Dubins,
+    Ensemble,
+    KnownDynamics,
+    Oracle,
+    Quadrotor,
+)
+from afm_rl.flow import CFMLoss, Context, ContextFlow, LeastSquares, PaperFlow, Window
+from afm_rl.learning import (
+    FreshAdam,
+    GaussianNLLLoss,
+    OnlineUpdater,
+    RLSUpdater,
+    StreamXUpdater,
+    Updater,
+)
+from afm_rl.manifold import Manifold
+from afm_rl.planning import (
+    CEM,
+    ICEM,
+    MPC,
+    MPPI,
+    GoalDistance,
+    PlanningEnv,
+    TorchRLMPPI,
+    TrackingCost,
+)
+from afm_rl.regimes import ActionGain
+
+BOX = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+
+
+class Case(NamedTuple):
+    """How a kind of module is made, and what it says."""
+
+    make: object
+    """``make(seed) -> module``, in single precision."""
+    say: object
+    """``say(module, batch, dtype=..., device=...) -> tensors``, each of leading shape ``batch``."""
+
+
+def push(state, action):
+    return state + 0.1 * torch.cat([action, action[..., :1]], -1)
+
+
+def small(seed=0, **settings):
+    manifold = Manifold(3, angles=[2])
+    return Ensemble(manifold, 2, features=[2], members=2, hidden=[8], seed=seed, **settings)
+
+
+def draw(batch, *shape, seed=0, dtype=torch.float32, device="cpu"):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(*batch, *shape, generator=generator, dtype=torch.float64).to(device, dtype)
+
+
+def transition(batch, **kind):
+    data = {"observation": draw(batch, 3, **kind), "action": draw(batch, 2, **kind)}
+    data["next"] = {"observation": draw(batch, 3, seed=1, **kind)}
+    return TensorDict(data, batch)
+
+
+def predict(model, batch, **kind):
+    state = draw(batch, model.state_size, **kind)
+    action = draw(batch, model.action_size, **kind)
+    expected, noise = model.forecast(state, action)
+    return model(state, action), expected, noise, model.jacobian(state, action)
+
+
+def correct(flow, batch, **kind):
+    rows = [draw(batch, flow.window, n, seed=n, **kind) for n in (3, 2, 2, 3)]
+    window = Window(*rows, draw(batch, flow.window, **kind) >= 0)
+    silent = torch.zeros(batch, **kind)
+    last = Context(draw(batch, flow.feature_size, **kind), silent, silent.bool())
+    context = flow.context(window, Dubins().to(**kind), last)
+    return *context[:2], *flow.correct(context, rows[0][..., -1, :], rows[1][..., -1, :])
+
+
+def plan(planner, batch, **kind):
+    entries = {key: draw(batch, size, **kind) for key, size in (("goal", 2), ("reference", 2))}
+    td = TensorDict({**entries, "observation": draw(batch, 3, **kind)}, batch)
+    for key, shape in getattr(planner, "memory", {}).items():
+        td[key] = draw(batch, *shape, **kind)
+    torch.manual_seed(0)  # TorchRL's own draw from the global generator
+    out = planner(td.select(*planner.in_keys))
+    return tuple(out[key] for key in planner.out_keys)
+
+
+def measure(loss, batch, **kind):
+    return (loss(transition(batch, **kind))["loss_nll"],)
+
+
+def match(loss, batch, **kind):
+    data = {"features": draw(batch, loss.flow.feature_size, **kind)}
+    for seed, name in enumerate(("planned", "intended")):
+        data[name] = draw(batch, 2, seed=seed, **kind)
+    return (loss(TensorDict(data, batch))["loss_cfm"],)
+
+
+def learn(updater, batch, **kind):
+    rows = transition(batch, **kind)
+    return updater(rows)["loss"], updater(rows)["loss"]
+
+
+def world(seed=0, cost=None, dtype=torch.float32):
+    box = (bound.to(dtype) for bound in BOX)
+    return PlanningEnv(small(seed).to(dtype), cost or GoalDistance(), *box)
+
+
+def planner(kind, seed=0, dtype=torch.float32, cost=None, **settings):
+    return kind(world(seed, cost, dtype), horizon=3, **settings)
+
+
+def updater(kind, *more, seed=0, dtype=torch.float32, **settings):
+    model = small(seed, **settings).to(dtype)
+    return kind(GaussianNLLLoss(model), *more)
+
+
+FEW = {"population": 12, "iterations": 2}
+ADAM = partial(FreshAdam, lr=1e-2)
+TRACKING = TrackingCost([1.0, 1.0, 0.0], [0.01, 0.01], coordinates=[0, 1])
+
+MODULES = {
+    "Dubins": Case(lambda seed: Dubins(), predict),
+    "Ensemble": Case(small, predict),
+    "Ensemble with running statistics": Case(
+        lambda seed: small(seed, init="sparse", layer_norm=True, running_count=10), predict
+    ),
+    "KnownDynamics": Case(lambda seed: KnownDynamics(push, Manifold(3), 2), predict),
+    "Calibrated": Case(lambda seed: Calibrated(small(seed), torch.ones(2)), predict),
+    "Oracle": Case(lambda seed: Oracle(Dubins(), ActionGain(["v", "omega"])), predict),
+    "Quadrotor": Case(lambda seed: Quadrotor(), predict),
+    "KNODE": Case(lambda seed: KNODE(Quadrotor()), predict),
+    "ContextFlow": Case(
+        lambda seed: ContextFlow(*BOX, window=3, hidden=[8], latent=4, seed=seed), correct
+    ),
+    "PaperFlow": Case(lambda seed: PaperFlow(*BOX, [2], 3, width=8, seed=seed), correct),
+    "LeastSquares gain": Case(lambda seed: LeastSquares(*BOX), correct),
+    "LeastSquares affine": Case(lambda seed: LeastSquares(*BOX, form="affine"), correct),
+    "MPPI": Case(partial(planner, MPPI, **FEW), plan),
+    "ICEM": Case(partial(planner, ICEM, **FEW, elites=3), plan),
+    "MPC": Case(partial(planner, MPC, cost=TRACKING), plan),
+    "CEM": Case(partial(planner, CEM, **FEW, elites=3), plan),
+    "TorchRLMPPI": Case(partial(planner, TorchRLMPPI, **FEW, elites=3), plan),
+    "GaussianNLLLoss": Case(lambda seed: GaussianNLLLoss(small(seed), reduction="none"), measure),
+    "CFMLoss": Case(
+        lambda seed: CFMLoss(PaperFlow(*BOX, [2], 3, width=8, seed=seed), reduction="none"), match
+    ),
+    "Updater": Case(partial(updater, Updater), learn),
+    "OnlineUpdater": Case(partial(updater, OnlineUpdater, ADAM), learn),
+    "RLSUpdater": Case(
+        lambda seed: RLSUpdater(GaussianNLLLoss(Calibrated(small(seed), torch.ones(2)))), learn
+    ),
+    "StreamXUpdater": Case(partial(updater, StreamXUpdater, init="sparse", layer_norm=True), learn),
+}
+BOUND_TO_VALUES = (
+    *("MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI"),
+    *("OnlineUpdater", "RLSUpdater", "StreamXUpdater"),
+)
+BUILT_IN_PRECISION = ("MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI")
+
+
+SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "OnlineUpdater", "StreamXUpdater")
+COMPILED = [
+    pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_TO_COMPILE else [])
+    for name in MODULES
+    if name not in ("CEM", "TorchRLMPPI")  # that is TorchRL's affair, and takes a minute
+]
+
+
+def case_of(name):
+    """Return ``make(seed=0, dtype=float32)`` and ``say(module, batch, dtype=...)`` of a module."""
+    made = MODULES[name]
+
+    def make(seed=0, dtype=torch.float32):
+        if name in BUILT_IN_PRECISION:
+            return made.make(seed=seed, dtype=dtype)
+        return made.make(seed=seed).to(dtype)
+
+    return Case(make, made.say)
+
+
+@pytest.fixture(params=MODULES)
+def case(request):
+    """Each module in turn."""
+    return case_of(request.param)
+
+
+@pytest.fixture(params=COMPILED)
+def compiled_case(request):
+    """Each module that can be compiled in reasonable time."""
+    return case_of(request.param)
+
+
+@pytest.fixture(params=[name for name in MODULES if name not in BOUND_TO_VALUES])
+def movable_case(request):
+    """Each module that computes without looking at its numbers."""
+    return case_of(request.param)

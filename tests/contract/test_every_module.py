@@ -1,0 +1,74 @@
+"""What holds for every public module: dynamics, flows, planners, losses, updaters."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from tensordict import unravel_key
+
+BATCHES = [(), (4,), (2, 3)]
+
+
+def same(left, right):
+    for one, other in zip(left, right, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("batch", BATCHES, ids=str)
+def test_any_batch_in_either_precision(case, batch, dtype):
+    said = case.say(case.make(dtype=dtype), batch, dtype=dtype)
+    for part in said:
+        assert part.shape[: len(batch)] == batch and part.dtype is dtype and part.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "double",
+    [copy.deepcopy, lambda module: pickle.loads(pickle.dumps(module))],
+    ids=["copied", "pickled"],
+)
+def test_a_double_says_the_same_and_is_independent(case, double):
+    module = case.make()
+    twin = double(module)
+    names = {name: value.clone() for name, value in twin.state_dict().items()}
+    first = case.say(module, (4,), dtype=torch.float32)
+    assert all(torch.equal(value, names[name]) for name, value in twin.state_dict().items())
+    same(case.say(twin, (4,), dtype=torch.float32), first)
+
+
+def test_the_state_dict_holds_all_that_was_learnt(case):
+    module, other = case.make(seed=0), case.make(seed=1)
+    other.load_state_dict(module.state_dict())
+    same(case.say(other, (4,), dtype=torch.float32), case.say(module, (4,), dtype=torch.float32))
+
+
+def test_nothing_is_left_on_another_device(movable_case):
+    make, say = movable_case
+    said = say(make().to("meta"), (2, 3), device="meta")  # mixing devices would be an error
+    assert all(part.is_meta and part.shape[:2] == (2, 3) for part in said)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_it_says_the_same_on_a_gpu(movable_case):
+    make, say = movable_case
+    expected = say(make(), (4,), device="cpu")
+    found = say(make().to("cuda"), (4,), device="cuda")
+    assert all(part.is_cuda for part in found)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one.cpu(), other, rtol=1e-3, atol=1e-4)
+
+
+def test_it_says_the_same_compiled(compiled_case):
+    make, say = compiled_case
+    expected = say(make(), (4,), dtype=torch.float32)
+    torch._dynamo.reset()
+    compiled = torch.compile(make(), backend="eager")
+    same(say(compiled, (4,), dtype=torch.float32), expected)
+
+
+def test_keys_are_given_as_torchrl_wants_them(case):
+    module = case.make()
+    for keys in (getattr(module, "in_keys", []), getattr(module, "out_keys", [])):
+        assert [unravel_key(key) for key in keys] == list(keys)

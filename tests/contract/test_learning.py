@@ -1,0 +1,175 @@
+"""Losses in a trainer; updaters in loops, collectors and trainers alike."""
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import RandomPolicy
+from torchrl.trainers import ReplayBufferTrainer, Trainer
+
+from afm_rl.dynamics import Dubins
+from afm_rl.envs import UGVTrack
+from afm_rl.errors import ConfigurationError
+from afm_rl.flow import CFMLoss, PaperFlow
+from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater, Updater, UpdaterHook
+from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+
+
+def adam(parameters):
+    return FreshAdam(parameters, lr=1e-3)
+
+
+def updater_of(model):
+    return OnlineUpdater(GaussianNLLLoss(model), adam)
+
+
+def weights(model):
+    return torch.cat([parameter.detach().flatten() for parameter in model.parameters()])
+
+
+def agent(model, box):
+    """An environment and a planner that shares the model."""
+    planner = MPPI(PlanningEnv(model, GoalDistance(), *box), 3, 12, seed_key=["mission", "seed"])
+    base = UGVTrack(batch_size=(2,), max_steps=5)
+    return TransformedEnv(base, Compose(planner.make_tensordict_primer())), planner
+
+
+def loop(model, box, steps):
+    env, planner = agent(model, box)
+    updater, td, losses = updater_of(model), env.reset(), []
+    for _ in range(steps):
+        whole, td = env.step_and_maybe_reset(planner(td))
+        losses.append(updater(whole)["loss"])
+    return torch.stack(losses, -1)
+
+
+def collected(model, box, steps, place, **settings):
+    env, planner = agent(model, box)
+    hook = UpdaterHook(updater_of(model))
+    collector = Collector(
+        *(env, planner),
+        **{"total_frames": 2 * steps, "use_buffers": False, place: hook, **settings},
+    )
+    data = torch.cat([batch.clone() for batch in collector], -1)
+    collector.shutdown()
+    return data
+
+
+def test_a_collector_with_the_hook_is_the_loop(make_ensemble, box):
+    models = [make_ensemble() for _ in range(2)]
+    expected = loop(models[0], box, 7)
+    data = collected(models[1], box, 7, "postproc", frames_per_batch=2)
+    torch.testing.assert_close(data["updater_loss"], expected)
+    torch.testing.assert_close(weights(models[1]), weights(models[0]))
+
+
+@pytest.mark.parametrize("place", ["postproc", "post_collect_hook"])
+def test_longer_batches_teach_each_transition_once_oldest_first(make_ensemble, box, place):
+    model, other = make_ensemble(), make_ensemble()
+    data = collected(model, box, 8, place, frames_per_batch=8)
+    updater = updater_of(other)
+    for row in data.unbind(-1):
+        updater(row)
+    torch.testing.assert_close(weights(other), weights(model))
+
+
+def test_the_hook_starts_the_updater_once():
+    class Counting(Updater):
+        started = 0
+
+        def start(self, tensordict):
+            self.started += 1
+
+    updater = Counting(GaussianNLLLoss(Dubins()))
+    hook, data = UpdaterHook(updater, ["my", "loss"]), UGVTrack(batch_size=(2,)).rollout(3)
+    for _ in range(2):
+        assert hook(data)["my", "loss"].shape == (2, 3)
+    assert updater.started == 1
+    with pytest.raises(ConfigurationError, match=r"shape \(\); expected \(\*B, T\)"):
+        hook(data[0, 0])
+
+
+def test_the_hook_keeps_its_state(make_ensemble):
+    data = UGVTrack(batch_size=(2,)).rollout(4)
+    first, second = (
+        UpdaterHook(OnlineUpdater(GaussianNLLLoss(make_ensemble(seed=seed)), torch.optim.Adam))
+        for seed in (0, 1)
+    )
+    first(data.clone())
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    again = [hook(data.clone())["updater_loss"] for hook in (first, second)]
+    torch.testing.assert_close(*again)
+    frozen = UpdaterHook(Updater(GaussianNLLLoss(Dubins())))
+    frozen.load_state_dict(frozen.state_dict())
+
+
+def trainer_of(loss, collector):
+    return Trainer(
+        collector=collector,
+        total_frames=24,
+        frame_skip=1,
+        optim_steps_per_batch=2,
+        loss_module=loss,
+        optimizer=torch.optim.Adam(loss.parameters(), lr=1e-2),
+        progress_bar=False,
+    )
+
+
+def random_driver():
+    env = UGVTrack(batch_size=(2,))
+    return Collector(env, RandomPolicy(env.action_spec), frames_per_batch=8, total_frames=24)
+
+
+def test_a_trainer_descends_the_likelihood(make_ensemble):
+    model = make_ensemble()
+    loss, before = GaussianNLLLoss(model), weights(model)
+    trainer = trainer_of(loss, random_driver())
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(24), batch_size=8)
+    ReplayBufferTrainer(buffer, flatten_tensordicts=True).register(trainer)
+    trainer.train()
+    assert not torch.equal(weights(model), before) and len(buffer) == 24
+
+
+def test_a_trainer_descends_the_flow_matching_loss(box):
+    flow = PaperFlow(*box, features=[2], state_size=3, width=8)
+    before = weights(flow)
+    batch = {"features": torch.randn(8, flow.feature_size)}
+    batch |= {name: torch.randn(8, 2) for name in ("planned", "intended")}
+    trainer = trainer_of(CFMLoss(flow), _Examples(TensorDict(batch, [8])))
+    trainer.train()
+    assert not torch.equal(weights(flow), before)
+
+
+class _Examples:
+    """Anything that gives batches will do for a trainer."""
+
+    requested_frames_per_batch, init_random_frames = 8, 0
+
+    def __init__(self, batch):
+        self.batch = batch
+
+    def __iter__(self):
+        return iter([self.batch] * 3)
+
+    def set_seed(self, seed, static_seed=False):
+        return seed
+
+    def shutdown(self):
+        pass
+
+
+def test_a_trainer_calls_the_hook_with_every_batch(make_ensemble):
+    model, seen = make_ensemble(), []
+    before = weights(model)
+    hook = UpdaterHook(updater_of(model))
+    trainer = trainer_of(GaussianNLLLoss(make_ensemble()), random_driver())
+    hook.register(trainer)
+    assert trainer.state_dict()["updater"].keys() == {"updater", "optimizer", "started"}
+    trainer.register_op("batch_process", lambda batch: seen.append(batch["updater_loss"]))
+    trainer.train()
+    assert [loss.shape for loss in seen] == [(2, 4)] * 3
+    assert not torch.equal(weights(model), before)

@@ -1,0 +1,169 @@
+"""The transform in collectors and worker processes, with terminal states and compiled."""
+
+import copy
+import os
+import pickle
+
+import gymnasium
+import pytest
+import torch
+from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, GymWrapper, ParallelEnv, TransformedEnv, VecGymEnvTransform
+from torchrl.envs.utils import step_mdp
+
+from afm_rl.dynamics import Dubins
+from afm_rl.envs import UGVTrack
+from afm_rl.errors import ConfigurationError
+from afm_rl.flow import ContextFlow, LeastSquares
+from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater, Updater
+from afm_rl.planning import ICEM, MPPI, GoalDistance, PlanningEnv
+from afm_rl.regimes import Schedule
+from afm_rl.transforms import ActionFlowTransform
+
+REVERSED = {"schedule": Schedule([]), "missions": {"regime": {"v_gain": -1.0}}}
+
+
+def afm(box, model=None):
+    return ActionFlowTransform(model or Dubins(), LeastSquares(*box))
+
+
+def car(box, *more, batch=(), model=None, **settings):
+    base = UGVTrack(batch_size=batch, process_noise=0.0, **{**REVERSED, **settings})
+    return TransformedEnv(base, Compose(afm(box, model), *more))
+
+
+@pytest.mark.parametrize("kind", [MPPI, ICEM])
+def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind):
+    planner = kind(PlanningEnv(Dubins(), GoalDistance(), *box), horizon=3, population=20)
+    env = car(box, planner.make_tensordict_primer(), batch=(2,), max_steps=5)
+    collector = Collector(env, planner, frames_per_batch=12, total_frames=12)
+    (data,) = list(collector)
+    collector.shutdown()
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(12), batch_size=12)
+    buffer.extend(data.reshape(-1))
+    sample = buffer.sample()
+    memory = sample["next", "afm"]
+    assert torch.equal(memory["planned_action"], sample["action"])
+    apart = (memory["executed_action"] != sample["action"]).any(-1)
+    assert torch.equal(apart, memory["misaligned"]) and apart.any()
+    assert (data["afm", "window", "valid"][:, 5] == 0).all()  # a new episode, a new memory
+
+
+def test_terminal_states_reach_the_window_and_resets_do_not(box):
+    env = car(box, batch=(2,), max_steps=3)
+    td = env.reset()
+    for step in range(7):
+        td = env.rand_action(td)
+        whole, td = env.step_and_maybe_reset(td)
+        after = whole["next", "afm", "window"]
+        torch.testing.assert_close(after["next_state"][:, -1], whole["next", "pose"])
+        torch.testing.assert_close(after["state"][:, -1], whole["pose"])
+        fresh = whole["next", "done"].squeeze(-1)
+        assert fresh.all() == (step % 3 == 2)
+        assert (td["afm", "window", "valid"].any(-1) != fresh).all()
+
+
+@pytest.mark.parametrize("mode", ["SAME_STEP", "DISABLED"])
+def test_vectorised_gymnasium_environments_keep_terminal_states(mode):
+    mode = gymnasium.vector.AutoresetMode(getattr(gymnasium.vector.AutoresetMode, mode))
+    envs = gymnasium.vector.SyncVectorEnv([Short] * 2, autoreset_mode=mode)
+    chain = [VecGymEnvTransform()] if mode is gymnasium.vector.AutoresetMode.SAME_STEP else []
+    box = -torch.ones(2), torch.ones(2)
+    env = TransformedEnv(GymWrapper(envs), Compose(*chain, afm(box)))
+    data = env.rollout(9, break_when_any_done=False)
+    assert data["next", "done"].sum() >= 4
+    assert float(data["next", "afm", "surprise"].max()) < 0.1
+
+
+class Short(gymnasium.Env):
+    """A Dubins car whose episodes last four steps."""
+
+    observation_space = gymnasium.spaces.Box(-100.0, 100.0, (3,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
+
+    def reset(self, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state, self.count = torch.tensor([5.0, -3.0, 1.0]), 0
+        return self.state.numpy(), {}
+
+    def step(self, action):
+        self.state, self.count = Dubins()(self.state, torch.as_tensor(action)), self.count + 1
+        return self.state.numpy(), 0.0, self.count == 4, False, {}
+
+
+def test_a_compiled_environment_steps_alike(box):
+    env = car(box, batch=(3,))
+    flow = ContextFlow(*box, window=3, hidden=[8], latent=4)
+    env.transform[0].flow = flow
+    start = env.rollout(3)[:, -1]
+    td = step_mdp(start).set("action", torch.full((3, 2), 0.4))
+    expected = env.step(td.clone())
+    torch._dynamo.reset()
+    transform = env.transform[0]
+    compiled = torch.compile(transform._inv_call, backend="eager")
+    executed = compiled(td.clone())["action"]
+    torch.testing.assert_close(executed, expected["next", "afm", "executed_action"])
+
+
+def taught(box, make_ensemble):
+    model = make_ensemble()
+    updater = OnlineUpdater(GaussianNLLLoss(model), lambda p: FreshAdam(p, lr=1e-3))
+    return model, updater
+
+
+def test_a_model_that_learns_elsewhere_is_refused(box, make_ensemble, monkeypatch):
+    model, updater = taught(box, make_ensemble)
+    env = car(box, model=model)
+    env.reset()
+    there = os.getpid() + 1
+    monkeypatch.setattr(os, "getpid", lambda: there)  # the copy in a worker process
+    with pytest.raises(ConfigurationError, match="learns in another process.* ParallelEnv"):
+        env.reset()
+    frozen = make_ensemble()
+    Updater(GaussianNLLLoss(frozen))
+    car(box, model=frozen).reset()
+
+
+def test_an_updater_that_moves_takes_its_model_along(make_ensemble, box, monkeypatch):
+    updater = Updater(GaussianNLLLoss(make_ensemble()))
+    assert pickle.loads(pickle.dumps(updater)).loss.model.taught_in is None
+    _, updater = taught(box, make_ensemble)
+    stored, there = pickle.dumps(updater), os.getpid() + 1
+    monkeypatch.setattr(os, "getpid", lambda: there)
+    moved = pickle.loads(stored)
+    car(box, model=moved.loss.model).reset()
+    assert copy.deepcopy(moved).loss.model.taught_in == there
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)  # workers import everything anew
+def test_worker_processes_with_a_frozen_model(box):
+    def make():
+        return car(box, model=Dubins(), max_steps=3)
+
+    settings = {"frames_per_batch": 6, "total_frames": 6, "cat_results": 0}
+    collector = MultiSyncCollector([make, make], **settings)
+    try:
+        (data,) = list(collector)
+    finally:
+        collector.shutdown()
+    memory = data["next", "afm"]
+    assert torch.equal(memory["planned_action"], data["action"])
+    assert not torch.equal(memory["executed_action"], data["action"])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)  # workers import everything anew
+def test_worker_processes_with_a_model_that_learns_are_refused(box, make_ensemble, capfd):
+    model, _ = taught(box, make_ensemble)
+
+    def make():
+        return car(box, model=model)
+
+    with pytest.raises(ConfigurationError, match="learns in another process"):
+        MultiSyncCollector([make, make], frames_per_batch=6, total_frames=6)
+    parallel = ParallelEnv(2, make, mp_start_method="fork")
+    with pytest.raises(RuntimeError, match="worker"):
+        parallel.reset()
+    assert "learns in another process" in capfd.readouterr().err

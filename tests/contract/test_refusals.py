@@ -1,0 +1,66 @@
+"""What cannot be used is refused where it is given, by name and value."""
+
+import re
+
+import pytest
+import torch
+
+from afm_rl.dynamics import Dubins, Ensemble, KnownDynamics
+from afm_rl.errors import ConfigurationError
+from afm_rl.flow import ContextFlow, LeastSquares
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, Updater, UpdaterHook
+from afm_rl.manifold import Manifold
+from afm_rl.planning import CEM, ICEM, MPC, MPPI, GoalDistance, PlanningEnv
+from afm_rl.transforms import ActionFlowTransform
+
+BOX = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+CAR = Manifold(3, angles=[2])
+
+
+def ensemble(**settings):
+    return Ensemble(CAR, **{"action_size": 2, "features": [2], "hidden": [4], **settings})
+
+
+REFUSED = {
+    "dynamics.action_size=0": lambda: ensemble(action_size=0),
+    "dynamics.features=['x']": lambda: ensemble(features=["x"]),
+    "dynamics.features=[3]": lambda: ensemble(features=[3]),
+    "dynamics.log_variance=[1]": lambda: ensemble(log_variance=[1]),
+    "dynamics.log_variance=[nan, 1]": lambda: ensemble(log_variance=[float("nan"), 1]),
+    "dynamics.seed='a'": lambda: ensemble(seed="a"),
+    "dynamics.step=3": lambda: KnownDynamics(3, CAR, 2),
+    "cost.goal_size=0": lambda: GoalDistance(goal_size=0),
+    "planner.env: dynamics: expected a DynamicsModel, got None": lambda: PlanningEnv(
+        None, GoalDistance(), *BOX
+    ),
+    "planner.env: cost: expected a Cost, got None": lambda: PlanningEnv(Dubins(), None, *BOX),
+    "cost.in_keys=['observation']: 'observation' holds the state": lambda: PlanningEnv(
+        Dubins(), GoalDistance(in_keys=["observation"]), *BOX
+    ),
+    "planner.env: expected a EnvBase, got 1": lambda: MPPI(1),
+    "planner.env: expected a EnvBase, got 2": lambda: ICEM(2),
+    "planner.env: expected a EnvBase, got 3": lambda: CEM(3),
+    "planner: got NoneType": lambda: MPC(None),
+    "key 5: expected a text": lambda: MPPI(PlanningEnv(Dubins(), GoalDistance(), *BOX), mean_key=5),
+    "loss.model: expected a DynamicsModel, got None": lambda: GaussianNLLLoss(None),
+    "loss.wrap=1": lambda: GaussianNLLLoss(Dubins(), wrap=1),
+    "updater.loss: expected a GaussianNLLLoss, got None": lambda: Updater(None),
+    "updater.optimizer=None": lambda: OnlineUpdater(GaussianNLLLoss(ensemble()), None),
+    "updater: expected a Updater, got None": lambda: UpdaterHook(None),
+    "transform.model: expected a DynamicsModel, got None": lambda: ActionFlowTransform(
+        None, LeastSquares(*BOX)
+    ),
+    "transform.flow: expected a Corrector, got None": lambda: ActionFlowTransform(Dubins(), None),
+    "key ('afm', 1): expected a text": lambda: ActionFlowTransform(
+        Dubins(), ContextFlow(*BOX), prefix=("afm", 1)
+    ),
+    "key []: expected a text": lambda: ActionFlowTransform(
+        Dubins(), ContextFlow(*BOX), observation_key=[]
+    ),
+}
+
+
+@pytest.mark.parametrize(("message", "make"), REFUSED.items(), ids=REFUSED)
+def test_it_is_refused(message, make):
+    with pytest.raises(ConfigurationError, match=re.escape(message)):
+        make()

@@ -1,0 +1,209 @@
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from afm_rl.airframe import QuadrotorBody, saturate
+from afm_rl.dynamics import Dubins, Quadrotor
+from afm_rl.dynamics.quadrotor_equations import quadrotor_path, quadrotor_step
+from afm_rl.envs import Circle, CrazyflieTrack, Hover
+from afm_rl.errors import ConfigurationError, NonFiniteError
+from afm_rl.planning import GeometricController, GoalDistance, PlanningEnv
+from afm_rl.planning.geometric import Gains, geometric_wrench
+from afm_rl.rotations import RigidBodySpace, body_z_axis, quaternion_exp
+
+BODY, DT = QuadrotorBody(), 0.05
+
+
+def controller(**settings):
+    return GeometricController(PlanningEnv(Quadrotor(), GoalDistance(), *BODY.bounds), **settings)
+
+
+def level(*batch, dtype=torch.float32):
+    return torch.zeros(*batch, 13, dtype=dtype).index_fill(-1, torch.tensor(9), 1.0)
+
+
+def steer(state, target=(0.0, 0.0, 0.0), **settings):
+    """Return the wrench towards a place to hover at."""
+    reference = torch.tensor([*target, 0.0, 0.0, 0.0]).to(state).expand(*state.shape[:-1], 6)
+    td = TensorDict({"observation": state, "reference": reference}, state.shape[:-1])
+    return controller(**settings)(td)["action"]
+
+
+def fly(state, ticks, target=(0.0, 0.0, 0.0), mass=1.0, **settings):
+    """Return the states ``(T + 1, *B, 13)`` of a flight, the action held for each tick."""
+    body, path = QuadrotorBody(mass=BODY.mass * mass), [state]
+    for _ in range(ticks):
+        action = steer(path[-1], target, **settings)
+        path.append(quadrotor_path(path[-1], action, DT, 25, body)[-1])
+    return torch.stack(path)
+
+
+def poles(thrust=1.0, inertia=1.0):
+    """Return the eigenvalues of one sampled tick about hovering, on the tangent space."""
+    space, origin = RigidBodySpace(), level(dtype=torch.float64)
+    nominal = controller()
+    gains = Gains(*(getattr(nominal, f"{name}_gains") for name in Gains._fields))
+    body = QuadrotorBody(inertia=tuple(inertia * x for x in BODY.inertia))
+    hover = torch.tensor([BODY.hover_thrust, 0.0, 0.0, 0.0], dtype=torch.float64)
+    still = torch.zeros(6, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+
+    def tick(tangent):
+        state = space.add(origin, tangent)
+        action = geometric_wrench(state, *still, BODY, gains, 0.8)
+        action = hover + (action - hover) * torch.tensor([thrust, 1.0, 1.0, 1.0])
+        return space.difference(quadrotor_step(state, action, DT, 1, body), origin)
+
+    steps = 1e-6 * torch.eye(12, dtype=torch.float64)
+    columns = [(tick(step) - tick(-step)) / 2e-6 for step in steps]
+    return torch.linalg.eigvals(torch.stack(columns, -1))
+
+
+def test_the_default_gains_put_the_poles_where_the_docstring_says():
+    found = poles()
+    slow = math.exp(-5 * DT)  # four about x, four about y; repeated poles are ill-conditioned
+    fast = math.exp(-10 * DT)
+    distance = (found[:, None] - torch.tensor([slow, fast])).abs()
+    assert (distance[:, 0] < 0.1).sum() >= 8 and (distance[:, 1] < 0.1).sum() >= 2
+    assert found.abs().max() < 0.88
+
+
+@pytest.mark.parametrize("inertia", [0.5, 2.0])
+def test_wrong_inertia_is_tolerated(inertia):
+    assert poles(inertia=inertia).abs().max() < 1.0
+
+
+@pytest.mark.parametrize("thrust", [0.4, 0.75, 2.0, 2.5])
+def test_the_height_tolerates_wrong_thrust(thrust):
+    assert poles(thrust=thrust).abs().max() < 1.0
+
+
+@pytest.mark.parametrize("mass", [0.4, 0.5, 4 / 3, 1.7])
+def test_wrong_mass_is_tolerated(mass):
+    start = level(1)
+    start[..., :3] = torch.tensor([0.3, -0.2, 0.1])
+    end = fly(start, 200, mass=mass)[-40:]
+    offset = -(mass - 1) * BODY.gravity / 62.0  # what the vertical gain leaves
+    torch.testing.assert_close(end[..., 2], torch.full((40, 1), offset), atol=2e-3, rtol=0)
+    assert end[..., :2].abs().max() < 0.01 and end[..., 3:6].abs().max() < 0.02
+
+
+def test_hovering_takes_the_weight_and_nothing_else():
+    action = steer(level())
+    torch.testing.assert_close(action, torch.tensor([BODY.hover_thrust, 0.0, 0.0, 0.0]))
+    flight = fly(level(), 40)
+    assert (flight[-1] - level()).abs().max() < 1e-5
+
+
+def test_a_step_is_made_good_without_much_overshoot():
+    target = (1.0, -0.5, 0.3)
+    flight = fly(level(), 80, target)
+    torch.testing.assert_close(flight[-1, :3], torch.tensor(target), atol=0.01, rtol=0)
+    share = flight[..., :3] / torch.tensor(target)
+    assert share.max() < 1.1
+    assert (flight[-1, 3:6].abs() < 0.05).all()
+
+
+@pytest.mark.parametrize("turn", [[1.2, 0.0, 0.0], [0.0, -1.2, 0.5], [2.2, 0.0, 0.0], [0, 0, 2.5]])
+def test_attitudes_far_from_level_are_recovered(turn):
+    start = level()
+    start[6:10] = quaternion_exp(torch.tensor(turn))
+    end = fly(start, 120)[-1]
+    assert end[:3].norm() < 0.02 and body_z_axis(end[6:10])[2] > 0.999
+
+
+def test_far_away_targets_ask_for_no_more_than_the_tilt():
+    flight = fly(level(), 60, (40.0, 0.0, 0.0), tilt=0.5)
+    assert torch.acos(body_z_axis(flight[..., 6:10])[..., 2]).max() < 0.5 + 0.1
+    assert flight[-1, 0] > 5.0
+
+
+def test_a_target_below_is_reached_without_turning_over():
+    flight = fly(level(), 160, (0.0, 0.0, -20.0))
+    assert body_z_axis(flight[..., 6:10])[..., 2].min() > 0.99
+    assert flight[-1, 2] < -15.0
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_flights_of_a_batch_are_independent(batch):
+    generator = torch.Generator().manual_seed(0)
+    tangent = 0.2 * torch.randn(*batch, 12, generator=generator)
+    state = RigidBodySpace().add(level(*batch), tangent)
+    action = steer(state)
+    assert action.shape == (*batch, 4)
+    alone = [steer(one) for one in state.reshape(-1, 13)]
+    assert torch.equal(action.reshape(-1, 4), torch.stack(alone))
+    torch.testing.assert_close(saturate(action, BODY), action)  # the motors can do it
+
+
+def test_double_precision_is_kept():
+    state = level(3, dtype=torch.float64)
+    gains = Gains(*torch.ones(4, 3, dtype=torch.float64))
+    still = torch.zeros(3, 6).double(), torch.zeros(3, 3).double()
+    assert geometric_wrench(state, *still, BODY, gains, 0.8).dtype == torch.float64
+
+
+def circle(speed=0.8, preview=True, ticks=100):
+    env = CrazyflieTrack([Circle(2.0, speed)], horizon=1, preview=preview, batch_size=(1,))
+    start = env.reset(set_state=False)
+    with torch.no_grad():
+        rolled = env.rollout(ticks, controller(), tensordict=start, auto_reset=False)
+    return rolled["next", "square_error"].mean().item()
+
+
+def test_a_previewed_circle_is_followed_to_millimetres():
+    assert circle() < 2e-5  # m^2
+
+
+def test_without_preview_the_missing_acceleration_is_an_offset():
+    lag = 0.8**2 / 2.0 / 3.8  # m, the acceleration over the gain
+    assert circle(preview=False) == pytest.approx(2 * lag**2 / 6, rel=0.25)
+
+
+def test_references_without_stages_are_taken_as_held():
+    td = TensorDict({"observation": level(2), "reference": torch.ones(2, 6)}, [2])
+    single = controller()(td.clone())["action"]
+    td["reference"] = torch.ones(2, 2, 6)
+    torch.testing.assert_close(single, controller()(td)["action"])
+
+
+@pytest.mark.parametrize("shape", [(2, 5), (2, 3, 6), (6,)])
+def test_references_of_another_shape_are_refused(shape):
+    td = TensorDict({"observation": level(2)}, [2])
+    td = td if shape == (6,) else td.set("reference", torch.zeros(shape))
+    with pytest.raises(ConfigurationError, match=r"planner: 'reference' (has shape|is missing)"):
+        controller()(td)
+
+
+def test_what_is_not_finite_is_not_hidden():
+    env = CrazyflieTrack([Hover()], horizon=1, batch_size=(1,))
+    data = env.reset(set_state=False)
+    data["observation"][..., 0] = math.nan
+    with pytest.raises(NonFiniteError):
+        env.step(controller()(data))
+
+
+@pytest.mark.parametrize(
+    ("setting", "name"),
+    [
+        ({"dt": 0.0}, "planner.dt"),
+        ({"horizon": 0}, "planner.horizon"),
+        ({"position": [1.0, 1.0]}, "planner.position"),
+        ({"position": 1.0}, "planner.position"),
+        ({"velocity": [1.0, math.nan, 1.0]}, "planner.velocity"),
+        ({"attitude": [-1.0, 1.0, 1.0]}, "planner.attitude"),
+        ({"rate": "abc"}, "planner.rate"),
+        ({"tilt": 1.6}, "planner.tilt"),
+        ({"body": "crazyflie"}, "body"),
+    ],
+)
+def test_bad_settings_are_refused(setting, name):
+    with pytest.raises(ConfigurationError, match=name):
+        controller(**setting)
+
+
+def test_other_robots_are_refused():
+    env = PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5])
+    with pytest.raises(ConfigurationError, match="robot=quadrotor"):
+        GeometricController(env)

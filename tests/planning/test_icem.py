@@ -1,0 +1,192 @@
+"""The improved cross-entropy method: its noise, its elites, its actions."""
+
+import math
+import warnings
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
+from afm_rl.planning import ICEM, GoalDistance, PlanningEnv
+from afm_rl.planning.icem import coloured
+
+SMALL = {"horizon": 4, "population": 32, "elites": 6, "iterations": 2}
+
+
+@pytest.fixture
+def world(box):
+    return PlanningEnv(Dubins(), GoalDistance(), *box)
+
+
+def situation(*batch, kept=2, seed=0):
+    """Where the robots are, where they shall go, and what they planned before."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.randn(*batch, *shape, generator=generator)
+
+    entries = {"observation": draw(3), "goal": 3 * draw(2)}
+    memory = {"mean": 0.3 * draw(4, 2), "elites": 0.3 * draw(kept, 4, 2)}
+    return TensorDict({**entries, "icem": TensorDict(memory, batch)}, batch)
+
+
+def spy(world):
+    """Record the candidates and returns of each iteration."""
+    real, seen = world.returns, []
+
+    def returns(state, plans, *task):
+        seen.append((plans.clone(), real(state, plans, *task)))
+        return seen[-1][1]
+
+    world.returns = returns
+    return seen
+
+
+@pytest.mark.parametrize("steps", [1, 2, 5, 8])
+@pytest.mark.parametrize("beta", [0.0, 1.0, 2.5])
+def test_coloured_noise_has_unit_variance_and_the_spectrum_asked_for(steps, beta):
+    noise = coloured(torch.randn(200_000, steps, 1, dtype=torch.float64), beta).squeeze(-1)
+    torch.testing.assert_close(noise.var(0), torch.ones(steps).double(), rtol=0.03, atol=0)
+    power = torch.fft.rfft(noise).abs().square().mean(0)
+    frequency = torch.fft.rfftfreq(steps).clamp_min(1 / steps).double() ** -beta
+    torch.testing.assert_close(power / power[0], frequency / frequency[0], rtol=0.03, atol=0)
+
+
+def test_the_population_shrinks_but_not_below_twice_the_elites(world):
+    planner = ICEM(world, population=60, iterations=4, elites=20, decay=1.2)
+    assert planner.counts == [60, 50, 42, 40]
+    seen = spy(world)
+    planner(situation(2, kept=6).exclude("icem").set("icem", _empty(planner, 2)))
+    assert [plans.shape[-3] for plans, _ in seen] == planner.counts
+
+
+def _empty(planner, *batch):
+    memory = {key[-1]: torch.zeros(*batch, *shape) for key, shape in planner.memory.items()}
+    return TensorDict(memory, batch)
+
+
+def test_elites_go_on_and_the_mean_joins_last(world, box):
+    seen, td = spy(world), situation(3)
+    out = ICEM(world, **SMALL)(td.clone())
+    (first, worth), (second, _) = seen
+    before = td["icem", "elites"]
+    shifted = torch.cat([before[..., 1:, :], before[..., -1:, :]], -2)
+    torch.testing.assert_close(first[:, :2], shifted.clamp(*box))
+    best = worth.topk(2).indices[..., None, None].expand(3, 2, 4, 2)
+    torch.testing.assert_close(second[:, :2], first.gather(1, best))
+    elites = first.gather(1, worth.topk(6).indices[..., None, None].expand(3, 6, 4, 2))
+    shifted = torch.cat([td["icem", "mean"][:, 1:], td["icem", "mean"][:, -1:]], 1)
+    torch.testing.assert_close(second[:, 2], 0.9 * elites.mean(1) + 0.1 * shifted)
+    best = seen[1][1].topk(2).indices[..., None, None].expand(3, 2, 4, 2)
+    torch.testing.assert_close(out["next", "icem", "elites"], second.gather(1, best))
+
+
+def test_the_noise_shrinks_to_the_spread_of_the_elites():
+    world = PlanningEnv(Dubins(), GoalDistance(), [-100.0, -100.0], [100.0, 100.0])
+    settings = {**SMALL, "population": 4000, "sigma": 0.005}
+    planner = ICEM(world, **settings, momentum=0.0, decay=1.0, beta=0.0)
+    seen = spy(world)
+    planner(situation(1))
+    (first, worth), (second, _) = seen
+    torch.testing.assert_close(first[0, 2:].std(0), torch.full((4, 2), 0.5), atol=0.03, rtol=0)
+    spread = first[0, worth[0].topk(6).indices].std(0, correction=0)
+    torch.testing.assert_close(second[0, 3:].std(0), spread, rtol=0.05, atol=0)
+
+
+def test_a_new_mission_starts_from_the_middle_of_the_box():
+    world = PlanningEnv(Dubins(), GoalDistance(), [0.5, -1.0], [1.5, 2.0])
+    planner, td = ICEM(world, **SMALL, sigma=0.0), situation(2)
+    td["icem"] = _empty(planner, 2)
+    memory = planner(td)["next", "icem"]
+    torch.testing.assert_close(memory["mean"], torch.tensor([1.0, 0.5]).expand(2, 4, 2))
+    torch.testing.assert_close(memory["elites"], torch.tensor([1.0, 0.5]).expand(2, 2, 4, 2))
+
+
+KINDS = {
+    None: "best",
+    ExplorationType.RANDOM: "best",
+    ExplorationType.MEAN: "mean",
+    ExplorationType.DETERMINISTIC: "mean",
+}
+
+
+@pytest.mark.parametrize(("kind", "wanted"), KINDS.items(), ids=str)
+def test_the_exploration_type_chooses_between_best_and_mean(world, kind, wanted):
+    with set_exploration_type(kind):
+        out = ICEM(world, **SMALL)(situation(4))
+    memory = out["next", "icem"]
+    expected = {"best": memory["elites"][:, 0, 0], "mean": memory["mean"][:, 0]}
+    torch.testing.assert_close(out["action"], expected[wanted])
+    assert not torch.allclose(*expected.values())
+
+
+def test_both_backends_plan_the_same_also_alone(world):
+    td = situation(3)
+    td["seed"] = torch.tensor([1, 2, 1])
+    fast, slow = (ICEM(world, **SMALL, backend=b, seed_key="seed") for b in ("fast", "env"))
+    found = fast(td.clone())
+    torch.testing.assert_close(slow(td.clone()), found, rtol=0, atol=1e-5)
+    for mission in range(3):
+        alone = ICEM(world, **SMALL, seed_key="seed")(td[mission].clone())
+        torch.testing.assert_close(alone, found[mission], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("lost", [1, 30, 32])
+def test_returns_that_are_not_finite_are_ignored(world, lost):
+    planner, td, real = ICEM(world, **{**SMALL, "iterations": 1}), situation(2), world.returns
+    world.returns = lambda *args: _broken(real(*args), lost)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        out = planner(td.clone())
+    assert planner.discarded == lost and all(v.isfinite().all() for v in out.values(True, True))
+    assert len([w for w in caught if "no finite return for 1 of 2" in str(w.message)]) == (
+        lost == 32
+    )
+    mean, elites = (out["next", "icem", name][1] for name in ("mean", "elites"))
+    for before, after in ((td["icem", "mean"][1], mean), (td["icem", "elites"][1], elites)):
+        shifted = torch.cat([before[..., 1:, :], before[..., -1:, :]], -2)
+        assert torch.equal(shifted, after) == (lost == 32)
+
+
+def _broken(returns, lost):
+    returns[1, :lost] = math.nan
+    return returns
+
+
+def test_it_drives_to_the_goal(world, box):
+    planner = ICEM(world, horizon=8, population=64)
+    td = TensorDict({"observation": torch.zeros(3, 3), "goal": 2 * torch.randn(3, 2)}, [3])
+    env = TransformedEnv(world, planner.make_tensordict_primer())
+    td = env.reset(td)
+    gaps = []
+    for _ in range(30):
+        td = env.step(planner(td))
+        assert ((td["action"] >= box[0]) & (td["action"] <= box[1])).all()
+        gaps.append((td["next", "observation"][:, :2] - td["goal"]).norm(dim=-1))
+        td = step_mdp(td)
+    assert (torch.stack(gaps).amin(0) < 0.2).all()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"elites": 0},
+        {"elites": 51},
+        {"keep": 0.0},
+        {"keep": 1.1},
+        {"decay": 0.9},
+        {"sigma": -1.0},
+        {"beta": -0.1},
+        {"momentum": 1.5},
+        {"horizon": 0},
+        {"seed": -1},
+    ],
+    ids=str,
+)
+def test_impossible_settings_are_refused(world, settings):
+    with pytest.raises(ConfigurationError, match=f"planner.{next(iter(settings))}="):
+        ICEM(world, **settings)

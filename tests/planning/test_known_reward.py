@@ -1,0 +1,36 @@
+"""Rewards of other people's tasks as costs."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from afm_rl.dynamics import KnownDynamics
+from afm_rl.errors import ConfigurationError
+from afm_rl.manifold import Manifold
+from afm_rl.planning import MPPI, KnownReward, PlanningEnv
+
+
+def test_the_cost_is_the_negative_reward():
+    cost = KnownReward(lambda s, a, after: s[..., 0] + 10 * a[..., 0] + 100 * after[..., 0])
+    assert cost.in_keys == [] and cost.in_sizes == []
+    ones = torch.ones(4, 5, 1)
+    assert (cost(1 * ones, 2 * ones, 3 * ones) == -321).all()
+
+
+def test_it_may_depend_on_the_task():
+    def near(state, action, after, goal):
+        return -(after - goal).norm(dim=-1)
+
+    cost = KnownReward(near, in_keys=[["task", "goal"]], in_sizes=[1])
+    assert cost.in_keys == [("task", "goal")]
+    push = KnownDynamics(lambda s, a: s + a, Manifold(1), action_size=1)
+    planner = MPPI(PlanningEnv(push, cost, [-1.0], [1.0]), horizon=1, population=500)
+    td = TensorDict({"observation": torch.zeros(2, 1)}, [2])
+    td["task", "goal"] = torch.tensor([[0.5], [-0.25]])
+    td["mppi", "mean"] = torch.zeros(2, 1, 1)
+    torch.testing.assert_close(planner(td)["action"], td["task", "goal"], rtol=0, atol=0.02)
+
+
+def test_sizes_and_keys_belong_together():
+    with pytest.raises(ConfigurationError, match=r"in_sizes=\[\]: expected one for each"):
+        KnownReward(lambda *_: None, in_keys=["goal"])
