@@ -12,6 +12,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.report.asked import asked_for
 from afm_rl.report.frames import short_cell_names
 from afm_rl.report.results_files import read_missions, read_table
+from afm_rl.report.sweep import sources
 
 KEY = ["method", "cell", "seed"]
 
@@ -43,7 +44,7 @@ class Collection:
 
 
 def collect(folders: Sequence[str | Path]) -> Collection:
-    """Read the folders of runs and studies and join them.
+    """Read the folders of runs, sweeps and studies and join them.
 
     Where two folders hold the same mission (method, cell and seed), the later one counts;
     ``notes`` says so.
@@ -56,14 +57,16 @@ def collect(folders: Sequence[str | Path]) -> Collection:
         raise ConfigurationError("folders=[]: expected at least one folder of results")
     files: list[Path] = []
     frames, asked, compute = [], [], []
-    for place, folder in enumerate(map(Path, folders)):
+    parts, notes = sources(folders)
+    for place, source in enumerate(parts):
+        folder = source.folder
         missions, own_files = _read(folder, len(files))
         files += own_files
-        frames.append(missions.assign(folder=place))
-        asked.append(asked_for(folder, missions))
+        frames.append(source.name(missions).assign(folder=place))
+        asked.append(source.name(asked_for(folder, missions)))
         if (folder / "compute.csv").is_file():
             table = read_table(folder / "compute.csv", ["method", "seconds", "missions"])
-            compute.append(table[["method", "seconds", "missions"]])
+            compute.append(source.name(table)[["method", "seconds", "missions"]])
     missions = pd.concat([frame for frame in frames if len(frame)] or frames, ignore_index=True)
     if missions.empty:
         names = ", ".join(str(folder) for folder in folders)
@@ -71,7 +74,7 @@ def collect(folders: Sequence[str | Path]) -> Collection:
     if "mse" in missions and missions["mse"].isna().any():
         names = ", ".join(str(folder) for folder in folders)
         raise ConfigurationError(f"{names}: hold flights and other missions; report on each alone")
-    notes = _replaced(missions, folders)
+    notes += _replaced(missions, [source.folder for source in parts])
     missions = missions.drop_duplicates(KEY, keep="last").drop(columns="folder")
     missions = missions.assign(mission=range(len(missions))).reset_index(drop=True)
     without = int((missions["file"] < 0).sum())

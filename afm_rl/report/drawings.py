@@ -46,7 +46,7 @@ def all_figures(
     if gathered.traces:
         steps = pd.concat(gathered.traces, ignore_index=True)
         yield from scenario_figures(traced, steps, styles)
-    tracks = _tracks(missions["track"].unique(), load_track)
+    tracks = load_tracks(missions["track"].unique(), load_track)
     yield from heat_figures(missions, gathered.places, tracks)
     if set(missions.columns) >= UGV_GAINS:
         yield "feasible", "Feasible dynamics", feasible.CAPTION, _feasible()
@@ -58,7 +58,7 @@ def _feasible() -> Figure:
     return feasible.draw_feasible(Dubins(), (-angle, angle), (-action, action))
 
 
-def _tracks(names: np.ndarray, load_track: LoadTrack | None) -> list[DrawableTrack]:
+def load_tracks(names: np.ndarray, load_track: LoadTrack | None) -> list[DrawableTrack]:
     """Return the tracks that can be loaded; a map without its road is a map."""
     tracks = []
     for name in names if load_track else ():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,9 @@ def draw_flight(missions: pd.DataFrame, steps: pd.DataFrame) -> Figure:
             flight, look = flights[mission.mission], styles[mission.method]
             _draw_space(space, flight, look)
             _draw_courses(panels, flight, look)
-        _dress(space, panels, row == len(cells) - 1)
-        _mark_regimes(panels, flights[group["mission"].iloc[0]])
+        dress_space(space)
+        _dress(panels, row == len(cells) - 1)
+        mark_regimes(panels, flights[group["mission"].iloc[0]])
     handles = [
         Line2D([], [], color=look.color, linestyle=look.linestyle) for look in styles.values()
     ]
@@ -100,15 +102,7 @@ def _draw_courses(panels: list[Axes], flight: pd.DataFrame, look: style.Style) -
     distance.plot(t, np.sqrt(square), **line, linewidth=1.3, gid="distance")
 
 
-def _dress(space: Any, panels: list[Axes], last: bool) -> None:
-    for name in "xyz":
-        getattr(space, f"set_{name}label")(f"{name} (m)", fontsize=style.SMALL, labelpad=-4)
-    space.set_box_aspect(None, zoom=0.8)  # room for the label of z
-    space.tick_params(labelsize=style.SMALL - 1, pad=-2)
-    space.locator_params(nbins=4)
-    low, high = space.get_zlim()
-    if high - low < 1.0:  # a level flight is level
-        space.set_zlim((low + high) / 2 - 0.5, (low + high) / 2 + 0.5)
+def _dress(panels: list[Axes], last: bool) -> None:
     for axes, label in zip(panels, PANELS.values(), strict=True):
         axes.set_ylabel(label, fontsize=style.SMALL)
         axes.grid(axis="y", color="#eeeeee", linewidth=0.6)
@@ -119,13 +113,30 @@ def _dress(space: Any, panels: list[Axes], last: bool) -> None:
     panels[2].set_yscale("log", nonpositive="mask")
 
 
-def _mark_regimes(panels: list[Axes], flight: pd.DataFrame) -> None:
-    """Shade the stretch under a changed regime, and draw a line where a phase begins."""
-    active, t = flight["regime_active"].to_numpy(dtype=bool), flight["t"].to_numpy()
+def dress_space(space: Any) -> None:
+    """Give axes in space their labels, and at least a metre of height."""
+    for name in "xyz":
+        getattr(space, f"set_{name}label")(f"{name} (m)", fontsize=style.SMALL, labelpad=-4)
+    space.set_box_aspect(None, zoom=0.8)  # room for the label of z
+    space.tick_params(labelsize=style.SMALL - 1, pad=-2)
+    space.locator_params(nbins=4)
+    low, high = space.get_zlim()
+    if high - low < 1.0:  # a level flight is level
+        space.set_zlim((low + high) / 2 - 0.5, (low + high) / 2 + 0.5)
+
+
+def mark_regimes(panels: Sequence[Axes], steps: pd.DataFrame) -> None:
+    """Shade the stretch under a changed regime; draw a line where a phase begins, if that is told.
+
+    Args:
+        panels: axes over ``t``.
+        steps: one mission's steps, with ``t``, ``regime_active`` and, of flights, ``phase``.
+    """
+    active, t = steps["regime_active"].to_numpy(dtype=bool), steps["t"].to_numpy()
     for axes in panels:
         top = axes.get_xaxis_transform()
         axes.fill_between(
             t, 0, 1, where=active, color=style.BAND, alpha=0.15, linewidth=0, transform=top
         )
-        for step in changes(flight):
+        for step in changes(steps) if "phase" in steps else ():
             axes.axvline(step, color=style.FAINT, linewidth=0.8, linestyle="--", gid="change")

@@ -1,0 +1,223 @@
+"""Films of missions."""
+
+import importlib.util
+import io
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.report import check_video, film_results, write_films, write_run
+from afm_rl.report.film import ENCODERS, FRAMES, LAST, frames
+from afm_rl.report.scenes import drive_scene, flight_scene
+
+
+def quiet(line):
+    pass
+
+
+@pytest.fixture
+def drive(make_results):
+    """Steps of one mission."""
+    return make_results(methods=("oracle",))[1]
+
+
+def fly(ticks=30, method="physics"):
+    """Tables of one flight."""
+    t, phase = np.arange(ticks), (np.arange(ticks) >= 10).astype(int)
+    x, y = 2 * np.cos(0.05 * t), 2 * np.sin(0.05 * t)
+    names = ("mission", "t", "x", "y", "z", "goal_x", "goal_y", "goal_z")
+    values = [np.zeros(ticks, dtype=int), t, x, y, 0.1 * phase, x, y, np.zeros(ticks)]
+    thrust = {"planned_thrust": np.full(ticks, 0.3), "executed_thrust": 0.3 - 0.15 * phase}
+    rest = {"misaligned": phase, "regime_active": phase, "phase": phase, "error": 0.0 * t}
+    squares = {f"square_error_{axis}": 0.0 * t for axis in "xyz"} | {"loss": 0.0 * t}
+    steps = pd.DataFrame(dict(zip(names, values, strict=True)) | thrust | rest | squares)
+    row = {"mission": 0, "method": method, "track": "circle", "mass": 0.5, "seed": 0, "mse": 0.1}
+    row |= {"mse_z": 0.3, "peak_z": 0.1, "steps": ticks - 1, "finished": True, "seconds": 1.0}
+    return pd.DataFrame([row]), steps
+
+
+def pictures(data):
+    """Return the pictures of a GIF ``(N, H, W, 3)`` and how long each is shown (ms)."""
+    film = Image.open(io.BytesIO(data))
+    shown, durations = [], []
+    for number in range(film.n_frames):
+        film.seek(number)
+        shown.append(np.asarray(film.convert("RGB")))
+        durations.append(film.info["duration"])
+    return np.stack(shown), durations
+
+
+def artists(scene, kind):
+    return [artist for artist in scene.moving if type(artist).__name__ == kind]
+
+
+def test_a_drive_is_shown_up_to_the_step(drive, ring):
+    scene = drive_scene("title", drive, ring)
+    scene.show(50)
+    before, changed, goal, cursor = artists(scene, "Line2D")
+    assert len(before.get_xdata()) == len(changed.get_xdata()) == 51
+    np.testing.assert_allclose(before.get_xydata()[-1], drive.loc[50, ["x", "y"]].astype(float))
+    np.testing.assert_allclose(goal.get_xydata()[0], drive.loc[50, ["goal_x", "goal_y"]].to_list())
+    assert np.isnan(changed.get_xdata()[:20]).all() and np.isfinite(changed.get_xdata()[22:]).all()
+    assert cursor.get_xdata() == [50, 50]
+    (said,) = artists(scene, "Text")
+    assert said.get_text() == "step 50: changed regime"
+
+
+def test_the_robot_points_where_it_heads(drive):
+    scene = drive_scene("title", drive)
+    scene.show(25)
+    (robot,) = artists(scene, "Polygon")
+    nose, tail = robot.get_xy()[0], robot.get_xy()[2]
+    theta = drive.loc[25, "theta"]
+    direction = (nose - tail) / np.linalg.norm(nose - tail)
+    np.testing.assert_allclose(direction, [np.cos(theta), np.sin(theta)], atol=1e-6)
+
+
+def test_arrows_show_what_is_planned_and_what_is_executed(drive):
+    drive = drive.assign(theta=0.0, planned_v=0.5, executed_v=-1.0, executed_omega=np.pi)
+    scene = drive_scene("title", drive)
+    scene.show(0)
+    planned, executed = (
+        np.subtract(*arrow._posA_posB[::-1]) for arrow in artists(scene, "FancyArrowPatch")
+    )
+    assert planned[0] > 0 and planned[1] == pytest.approx(0.0)
+    np.testing.assert_allclose(executed, [0.0, -2 * planned[0]], atol=1e-9)  # a quarter turn
+
+
+@pytest.mark.parametrize("column", ["error", "miss"])
+def test_the_miss_is_drawn_where_it_is_known(drive, column):
+    steps = drive.assign(miss=0.01) if column == "miss" else drive
+    curve = drive_scene("title", steps).figure.axes[1].lines[0]
+    np.testing.assert_allclose(curve.get_ydata(), steps[column])
+
+
+def test_a_flight_is_shown_up_to_the_step():
+    steps = fly()[1]
+    scene = flight_scene("title", steps)
+    scene.show(12)
+    path, goal, robot = artists(scene, "Line3D")
+    assert np.shape(path.get_data_3d()) == (3, 13)
+    np.testing.assert_allclose(np.ravel(robot.get_data_3d()), steps.loc[12, ["x", "y", "z"]])
+    assert np.ravel(goal.get_data_3d())[2] == 0.0
+    assert [line.get_xdata() for line in artists(scene, "Line2D")] == [[12, 12]] * 2
+    assert artists(scene, "Text")[0].get_text() == "step 12: changed regime, misaligned"
+
+
+def test_changed_regimes_are_shaded(drive):
+    for axes in drive_scene("title", drive).figure.axes[1:]:
+        assert len(axes.collections) == 1
+    for axes in flight_scene("title", fly()[1]).figure.axes[1:]:
+        assert len(axes.collections) == 1
+
+
+def test_a_film_moves_and_its_background_does_not(drive, ring):
+    steps = drive[::10].reset_index(drop=True)
+    shown, durations = pictures(ENCODERS["gif"](frames(drive_scene("a", steps, ring), len(steps))))
+    assert len(shown) == len(steps) and durations[-1] == LAST
+    assert shown.shape[1] % 16 == shown.shape[2] % 16 == 0  # as video codecs want it
+    assert (np.diff(shown.astype(int), axis=0) != 0).any((1, 2, 3)).all()
+    road = np.all(shown[0] == 0xE4, -1)
+    assert road.mean() > 0.05  # its colour is exact
+    assert (shown[:, :20, :20] == 255).all()
+    kept = (shown == shown[0]).all((0, 3)).mean()
+    assert kept > 0.7
+
+
+@pytest.mark.parametrize(("length", "expected"), [(1, 1), (2, 2), (FRAMES + 70, FRAMES)])
+def test_long_missions_are_shown_in_strides(length, expected):
+    scene = flight_scene("title", fly(length)[1])
+    rows = []
+    watched = scene._replace(show=lambda row: (rows.append(row), scene.show(row)))
+    assert len(list(frames(watched, length))) == expected
+    assert rows[1] == 0 and rows[-1] == length - 1
+
+
+def test_places_that_are_not_finite_are_left_out(drive):
+    lost = drive.assign(x=np.where(drive["t"] > 30, np.nan, drive["x"]))
+    scene = drive_scene("title", lost.iloc[:40])
+    assert len(list(frames(scene, 40))) == 40
+
+
+def test_one_film_per_method(tmp_path, make_results, ring):
+    said = []
+    missions, steps = make_results(methods=("oracle", "adaptive"), v_gains=(-1.0, 2.0))
+    missions["method"] = missions["method"].replace("oracle", "a/b")
+    steps = steps[steps["t"] % 20 == 0]
+    written = write_films(tmp_path / "new", missions, steps, [ring], echo=said.append)
+    assert written == [tmp_path / "new" / "a_b.gif", tmp_path / "new" / "adaptive.gif"]
+    assert said == [f"wrote {path}" for path in written]
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a_b.gif", "adaptive.gif"]
+    for path in written:
+        assert path.stat().st_size < 500_000
+
+
+def test_films_are_made_from_a_folder_alone(tmp_path, make_results, ring):
+    missions, steps = make_results(methods=("oracle",))
+    steps = steps[steps["t"] < 5]
+    write_run(tmp_path, missions, steps, figures=False, tensorboard=False, echo=quiet)
+    direct = write_films(tmp_path / "one", missions, steps, [ring], echo=quiet)
+    stored = film_results([tmp_path], tmp_path / "two", load_track=lambda name: ring, echo=quiet)
+    assert [path.read_bytes() for path in stored] == [path.read_bytes() for path in direct]
+
+
+def test_films_of_flights_from_a_folder(tmp_path):
+    missions, steps = fly(6)
+    write_run(tmp_path, missions, steps, figures=False, tensorboard=False, echo=quiet)
+    (path,) = film_results([tmp_path], tmp_path / "films", echo=quiet)
+    assert len(pictures(path.read_bytes())[0]) == 6
+
+
+def test_a_folder_without_steps_is_refused(tmp_path):
+    missions, steps = fly(6)
+    write_run(tmp_path, missions, steps, figures=False, tensorboard=False, echo=quiet)
+    (tmp_path / "steps.parquet").unlink()
+    with pytest.raises(ConfigurationError, match=r"no steps\.parquet; films"):
+        film_results([tmp_path], tmp_path / "films", echo=quiet)
+
+
+@pytest.mark.parametrize("lost", ["theta", "planned_v", "goal_x"])
+def test_what_a_film_needs_is_asked_for(tmp_path, make_results, lost):
+    missions, steps = make_results(methods=("oracle",))
+    for without in (steps.drop(columns=lost), steps.assign(**{lost: np.nan})):
+        with pytest.raises(ConfigurationError, match=f"video: the steps lack {lost}"):
+            write_films(tmp_path, missions, without, echo=quiet)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_that_breaks_off_leaves_the_old_one(tmp_path, monkeypatch):
+    def broken(pictures):
+        next(iter(pictures))
+        raise RuntimeError("a bug")
+
+    (old,) = write_films(tmp_path, *fly(3), echo=quiet)
+    before = old.read_bytes()
+    monkeypatch.setitem(ENCODERS, "gif", broken)
+    with pytest.raises(RuntimeError, match="a bug"):
+        write_films(tmp_path, *fly(3), echo=quiet)
+    assert old.read_bytes() == before and list(tmp_path.iterdir()) == [old]
+
+
+def test_the_other_form_is_a_video(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    from imageio.v3 import improps
+
+    (path,) = write_films(tmp_path, *fly(8), form=check_video("mp4"), echo=quiet)
+    assert path.suffix == ".mp4"
+    assert improps(path, plugin="FFMPEG").shape[1:] == (448, 960, 3)
+
+
+def test_a_form_that_cannot_be_written_is_refused(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert check_video("gif") == "gif"
+    with pytest.raises(ConfigurationError, match=r"video=mp4: .* install afm-rl\[video\]"):
+        check_video("mp4")
+
+
+@pytest.mark.parametrize("video", ["avi", "", 1, None])
+def test_unknown_forms_are_refused(video):
+    with pytest.raises(ConfigurationError, match="expected false, true, gif or mp4"):
+        check_video(video)
