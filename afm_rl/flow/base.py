@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -31,12 +31,27 @@ class Window(NamedTuple):
 class Context(NamedTuple):
     """What a corrector reads in a window."""
 
+    pairs: Tensor
+    """What it found each transition of the window to mean, ``(*B, K, R)``."""
+    evidence: Tensor
+    """How badly each of its hypotheses did of late, ``(*B, E)``."""
     features: Tensor
     """Description of the regime, ``(*B, C)``."""
     surprise: Tensor
     """Size of the misalignment, in the unit of the gate, ``(*B)``."""
     misaligned: Tensor
     """Is the model misaligned? ``(*B)``."""
+
+
+class Correction(NamedTuple):
+    """What to execute instead of a planned action."""
+
+    action: Tensor
+    """The action, ``(*B, A)``."""
+    spread: Tensor
+    """Its standard deviation over samples, ``(*B, A)``."""
+    reach: Tensor | None = None
+    """Lowest and highest effect that an action can have, ``(*B, 2, A)``; None: the box."""
 
 
 class Corrector(nn.Module, ABC):
@@ -80,6 +95,16 @@ class Corrector(nn.Module, ABC):
         """Number of context features, C."""
 
     @property
+    def pair_size(self) -> int:
+        """Numbers that are kept of each transition, R."""
+        return 0
+
+    @property
+    def evidence_size(self) -> int:
+        """Number of hypotheses, E."""
+        return 0
+
+    @property
     def signature(self) -> dict[str, object]:
         """What a stored corrector must agree in to be loaded."""
         return {
@@ -97,12 +122,18 @@ class Corrector(nn.Module, ABC):
         return self.centre + self.half_range * unit
 
     @abstractmethod
-    def context(self, window: Window, model: DynamicsModel, last: Context) -> Context:
-        """Describe the regime under the *present* model; ``last`` is the previous answer."""
+    def context(self, window: Window, model: DynamicsModel, last: Context | None = None) -> Context:
+        """Describe the regime under the *present* model.
+
+        Args:
+            window: the last transitions.
+            model: the dynamics model as it is now.
+            last: the answer one transition ago, so that not everything need be done again.
+        """
 
     @abstractmethod
-    def correct(self, context: Context, state: Tensor, planned: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the action to execute and its spread over samples, ``(*B, A)`` each."""
+    def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
+        """Return the action to execute for a planned one, ``(*B, A)``."""
 
 
 class Examples(NamedTuple):
@@ -114,14 +145,35 @@ class Examples(NamedTuple):
     """Planned action, ``(N, A)``."""
     intended: Tensor
     """Action to execute instead, ``(N, A)``."""
+    probe: Tensor
+    """Another executed action, ``(N, A)``."""
+    worth: Tensor
+    """Its effect, ``(N, A)``."""
 
 
 class Flow(Corrector):
     """A corrector that learns a velocity field from the planned action to the corrected one."""
 
+    def read(self, features: Tensor) -> Any:
+        """Return what the networks make of a context ``(*B, C)``; by default the features.
+
+        Done once for a context, however much is then asked about it.
+        """
+        return features
+
     @abstractmethod
-    def forward(self, features: Tensor, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:
-        """Return the velocity ``(*B, A)`` at ``point`` and time ``tau`` ``(*B, 1)``, in u."""
+    def forward(self, known: Any, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:
+        """Return the velocity ``(*B, A)`` at ``point`` and time ``tau`` ``(*B, 1)``, in u.
+
+        ``known`` is what :meth:`read` returned.
+        """
+
+    has_effect = False
+    """Does it also know what actions are worth?"""
+
+    def effect(self, known: Any, executed: Tensor) -> Tensor:
+        """Return what an executed action is expected to be worth, ``(*B, A)``, in u."""
+        raise NotImplementedError(f"{type(self).__name__} knows one direction only")
 
     @abstractmethod
     def source(self, planned: Tensor, noise: Tensor) -> Tensor:
@@ -132,12 +184,13 @@ class Flow(Corrector):
         self,
         model: DynamicsModel,
         regime: Regime,
-        state_box: tuple[Tensor, Tensor],
+        states: tuple[Tensor, Tensor] | Tensor,
         count: int,
         generator: torch.Generator,
         plans: int = 1,
     ) -> Examples:
         """Make ``count`` counterfactual examples: what the model would have been seen to do.
 
-        Where contexts are dear, several ``plans`` can be drawn for each.
+        Where contexts are dear, several ``plans`` can be drawn for each. ``states`` are a box,
+        lowest and highest, or a pool of observed ones ``(P, S)``.
         """

@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_count, check_number
 from afm_rl.flow.base import Context, Examples, Flow
+from afm_rl.flow.saturation import LIMIT
 from afm_rl.learning import InPlaceLoss
 from afm_rl.regimes import Regime
 
@@ -30,7 +31,10 @@ class CFMLoss(InPlaceLoss):
               x_\tau = (1-\tau) x_0 + \tau x_1,\quad \tau \sim U[0, 1]
 
     (Lipman et al. 2023; paper, eq. 6: its factor 1/(1-tau) cancels, since
-    :math:`(x_1 - x_\tau)/(1-\tau) = x_1 - x_0`.)
+    :math:`(x_1 - x_\tau)/(1-\tau) = x_1 - x_0`.) A flow that also knows what actions are worth
+    (:meth:`~afm_rl.flow.base.Flow.effect`) learns that with
+
+    .. math:: \mathcal{L}_e = \| \hat T(u) - u_\mathrm{eff} \|^2
 
     Args:
         flow: the flow to train.
@@ -38,7 +42,8 @@ class CFMLoss(InPlaceLoss):
         seed: seed of the times and source points drawn.
 
     Keys (change them with ``set_keys``): ``features`` ("features"), ``planned``
-    ("planned"), ``intended`` ("intended").
+    ("planned"), ``intended`` ("intended"), ``probe`` ("probe") and ``worth`` ("worth"), the last
+    two for flows with an effect only.
     """
 
     @dataclass
@@ -48,6 +53,8 @@ class CFMLoss(InPlaceLoss):
         features: NestedKey = "features"
         planned: NestedKey = "planned"
         intended: NestedKey = "intended"
+        probe: NestedKey = "probe"
+        worth: NestedKey = "worth"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -61,16 +68,31 @@ class CFMLoss(InPlaceLoss):
         self.flow = flow
         self._generator = torch.Generator().manual_seed(seed)
 
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """The entries read."""
+        keys = super().in_keys
+        return keys if self.flow.has_effect else keys[:3]
+
+    @in_keys.setter
+    def in_keys(self, keys: list[NestedKey]) -> None:
+        self._in_keys = keys
+
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_cfm`` for examples ``(*B)``."""
-        features, planned, intended = (tensordict.get(key) for key in self.in_keys)
-        unit, end = self.flow.normalise(planned), self.flow.normalise(intended)
+        features, *actions = (tensordict.get(key) for key in self.in_keys)
+        unit, end, *other = (self.flow.normalise(action) for action in actions)
         noise = torch.randn(unit.shape, generator=self._generator).to(unit)
         tau = torch.rand((*unit.shape[:-1], 1), generator=self._generator).to(unit)
         start = self.flow.source(unit, noise)
-        velocity = self.flow(features, unit, tau, torch.lerp(start, end, tau))
+        known = self.flow.read(features)
+        velocity = self.flow(known, unit, tau, torch.lerp(start, end, tau))
         loss = (velocity - (end - start)).square().mean(-1)
+        if other:
+            probe, worth = other
+            miss = self.flow.effect(known, probe) - worth.clamp(-LIMIT, LIMIT)
+            loss = loss + miss.square().mean(-1)
         return self._reduced(loss, tensordict)
 
 
@@ -78,7 +100,7 @@ def train_flow(
     flow: Flow,
     model: DynamicsModel,
     regime: Regime,
-    state_box: tuple[torch.Tensor, torch.Tensor],
+    states: tuple[torch.Tensor, torch.Tensor] | torch.Tensor,
     *,
     iterations: int = 10_000,
     batch_size: int = 512,
@@ -95,7 +117,8 @@ def train_flow(
         flow: trained in place.
         model: base dynamics model, not changed.
         regime: prior over regimes.
-        state_box: lowest and highest state, ``(S,)`` each.
+        states: lowest and highest state, ``(S,)`` each; or a pool of observed ones, ``(P, S)``,
+            where states keep to a small part of their box.
         iterations: gradient steps.
         batch_size: examples per step.
         lr: largest step size.
@@ -122,7 +145,7 @@ def train_flow(
 
     def draw(count: int) -> Examples:
         with torch.no_grad():
-            return flow.examples(model, regime, state_box, count, generator, plans)
+            return flow.examples(model, regime, states, count, generator, plans)
 
     if reuse == 1:
         batches = _fresh(draw, batch_size)
@@ -172,8 +195,9 @@ def _reused(
 @torch.no_grad()
 def held_out_error(flow: Flow, examples: Examples) -> float:
     """Return the RMSE of the corrected action in half ranges."""
-    silent = torch.zeros(len(examples.planned))
-    context = Context(examples.features, silent, silent.bool())
-    corrected, _ = flow.correct(context, examples.features[..., :0], examples.planned)
+    features = examples.features
+    nothing, silent = features[..., :0], features[..., 0]
+    context = Context(nothing, nothing, features, silent, silent.bool())
+    corrected = flow.correct(context, nothing, examples.planned).action
     miss = flow.normalise(corrected) - flow.normalise(examples.intended)
     return float(miss.square().mean().sqrt())

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import check_choice, check_number
-from afm_rl.flow.base import Context
+from afm_rl.flow.base import Context, Correction
 from afm_rl.flow.pairs import PairCorrector
 from afm_rl.flow.saturation import MODES, saturate
 
+STUCK = 5e-3  # half ranges: an action with less effect is held by friction
 PRIOR, LEAST = 1e-3, 0.02  # pull towards the nominal fit, and the smallest gain divided by
 
 
@@ -56,13 +57,15 @@ def fit_friction(
 ) -> tuple[Tensor, Tensor]:
     r"""Fit :math:`u_\mathrm{eff} = g \odot u + h \odot \mathrm{sign}(u)`, each axis for itself.
 
-    Dry friction, or a dead zone outside of it. Args and shapes as for :func:`fit_gain`, with a
-    ridge towards g = 1, h = 0.
+    Dry friction, or a dead zone: pairs without any effect are left out, see
+    :func:`apply_friction`. Args and shapes as for :func:`fit_gain`, with a ridge towards g = 1,
+    h = 0.
 
     Returns:
         Gains, none smaller than 0.02 in size, and offsets, ``(*B, A)`` each.
     """
-    weight, sign = weigh(valid, forgetting), executed.sign()
+    moved = effective.abs() > STUCK
+    weight, sign = weigh(valid, forgetting) * moved, executed.sign()
     square = (weight * executed.square()).sum(-2) + PRIOR
     size = (weight * executed.abs()).sum(-2)
     signs = (weight * sign.square()).sum(-2) + 10 * PRIOR  # the offset is the rarer of the two
@@ -74,6 +77,17 @@ def fit_friction(
         (square * signed - size * cross) / determinant,
     )
     return _not_zero(gain), offset
+
+
+def apply_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
+    """Return what ``unit`` ``(*B, A)`` is worth under :func:`fit_friction`: zero if it is held.
+
+    >>> apply_friction(torch.tensor(1.0), torch.tensor(-0.5), torch.tensor([-0.7, 0.2])).tolist()
+    [-0.19999998807907104, 0.0]
+    """
+    pull = gain * unit
+    worth = pull + offset * unit.sign()
+    return torch.where(worth * pull < 0, 0.0, worth)
 
 
 def invert_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
@@ -152,7 +166,7 @@ class LeastSquares(PairCorrector):
         )
         self.saturation = check_choice("flow.saturation", saturation, MODES)
 
-    def correct(self, context: Context, state: Tensor, planned: Tensor) -> tuple[Tensor, Tensor]:
+    def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
         """Invert the fit; the spread is zero."""
         unit, pairs = self.normalise(planned), self.pairs(context.features)
         if self.form == "gain":
@@ -160,4 +174,4 @@ class LeastSquares(PairCorrector):
         else:
             wanted = invert_affine(*fit_affine(*pairs, self.forgetting), unit)
         executed = self.denormalise(saturate(wanted, self.saturation))
-        return executed, torch.zeros_like(executed)
+        return Correction(executed, torch.zeros_like(executed))

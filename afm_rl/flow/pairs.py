@@ -9,8 +9,7 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_count
 from afm_rl.flow.base import Context, Corrector, Window
 from afm_rl.flow.effective import effective_action
-
-LIMIT = 4.0  # effective actions beyond 4 half ranges are clamped: they carry no more news
+from afm_rl.flow.saturation import LIMIT
 
 
 class PairCorrector(Corrector):
@@ -34,34 +33,60 @@ class PairCorrector(Corrector):
         """K (executed, effective, valid)."""
         return self.window * (2 * self.action_size + 1)
 
-    def features(self, executed: Tensor, effective: Tensor, valid: Tensor) -> Tensor:
-        """Return the context features ``(*B, C)`` of pairs ``(*B, K, A)``, ``(*B, K)``."""
-        pairs = torch.cat([self.normalise(executed), self.normalise(effective)], -1)
-        kept = torch.where(valid.unsqueeze(-1), pairs.clamp(-LIMIT, LIMIT), 0.0)
-        return torch.cat([kept, valid.unsqueeze(-1).to(kept)], -1).flatten(-2)
+    @property
+    def pair_size(self) -> int:
+        """Executed, effective, valid, surprise."""
+        return 2 * self.action_size + 2
 
-    def pairs(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Take features apart: executed and effective ``(*B, K, A)``, valid ``(*B, K, 1)``."""
-        rows = features.unflatten(-1, (self.window, -1))
-        executed, effective, valid = rows.split([self.action_size, self.action_size, 1], -1)
-        return executed, effective, valid
-
-    def describe(
+    def judge(
         self,
         model: DynamicsModel,
         state: Tensor,
         executed: Tensor,
         next_state: Tensor,
         valid: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Return features ``(*B, C)`` and surprise ``(*B)`` of K transitions ``(*B, K, ...)``."""
+    ) -> Tensor:
+        """Return what transitions ``(*B, K, ...)`` mean, ``(*B, K, R)``; zero if not valid."""
         seen = effective_action(model, state, executed, next_state, self.half_range)
         valid = valid & seen.effective.isfinite().all(-1) & seen.surprise.isfinite()
-        surprise = torch.where(valid, seen.surprise, 0.0).amax(-1)
-        return self.features(executed, seen.effective, valid), surprise
+        actions = torch.cat([self.normalise(executed), self.normalise(seen.effective)], -1)
+        rest = torch.stack([torch.ones_like(seen.surprise), seen.surprise], -1)
+        pairs = torch.cat([actions.clamp(-LIMIT, LIMIT), rest], -1)
+        return torch.where(valid.unsqueeze(-1), pairs, 0.0)
 
-    def context(self, window: Window, model: DynamicsModel, last: Context) -> Context:
-        """Describe the window under the present model."""
+    def remember(self, window: Window, model: DynamicsModel, last: Context | None) -> Tensor:
+        """Return the pairs ``(*B, M, R)`` of a window under the present model.
+
+        A model that stays as it is needs to be asked about the newest transition only, one that
+        learns about the newest :attr:`fresh`.
+        """
+        count = self.window if last is None else 1 if model.taught_in is None else self.fresh
         rows = window.state, window.executed, window.next_state, window.valid
-        features, surprise = self.describe(model, *rows)
-        return Context(features, surprise, surprise > self.gate)
+        newest = (part.narrow(window.valid.dim() - 1, self.window - count, count) for part in rows)
+        pairs = self.judge(model, *newest)
+        if last is None or count == self.window:
+            return pairs
+        return torch.cat([last.pairs[..., 1 : self.window - count + 1, :], pairs], -2)
+
+    @property
+    def fresh(self) -> int:
+        """Number of transitions about which a model that learns is asked anew at each step."""
+        return self.window
+
+    def surprise(self, pairs: Tensor) -> Tensor:
+        """Return the largest surprise ``(*B)`` of the newest :attr:`fresh` transitions."""
+        return pairs[..., -self.fresh :, -1].amax(-1)
+
+    def context(self, window: Window, model: DynamicsModel, last: Context | None = None) -> Context:
+        """Describe the window under the present model."""
+        pairs = self.remember(window, model, last)
+        surprise = self.surprise(pairs)
+        evidence = pairs.new_zeros(*surprise.shape, 0)
+        return Context(pairs, evidence, pairs[..., :-1].flatten(-2), surprise, surprise > self.gate)
+
+    def pairs(self, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Take features apart: executed and effective ``(*B, K, A)``, valid ``(*B, K, 1)``."""
+        size = self.action_size
+        rows = features.unflatten(-1, (-1, 2 * size + 1))
+        executed, effective, valid = rows.split([size, size, 1], -1)
+        return executed, effective, valid

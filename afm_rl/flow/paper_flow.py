@@ -9,11 +9,11 @@ from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_choice, check_count, check_flag
-from afm_rl.flow.base import Context, Examples, Flow, Window
+from afm_rl.flow.base import Context, Correction, Examples, Flow, Window
 from afm_rl.flow.network import mlp
 from afm_rl.flow.solver import midpoint
 from afm_rl.regimes import Regime
-from afm_rl.sampling import uniform
+from afm_rl.sampling import draw_states, uniform
 
 
 class PaperFlow(Flow):
@@ -85,9 +85,9 @@ class PaperFlow(Flow):
         """Return the planned action: the published path starts there."""
         return planned
 
-    def forward(self, features: Tensor, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:
+    def forward(self, known: Tensor, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:
         """Return the velocity at ``point``; the planned action is among the features."""
-        return self._velocity(self.regime_encoder(features), tau, point)
+        return self._velocity(self.regime_encoder(known), tau, point)
 
     def _velocity(self, regime: Tensor, tau: Tensor, point: Tensor) -> Tensor:
         action = self.action_encoder(torch.cat([tau, point], -1))
@@ -97,7 +97,7 @@ class PaperFlow(Flow):
         self,
         model: DynamicsModel,
         regime: Regime,
-        state_box: tuple[Tensor, Tensor],
+        states: tuple[Tensor, Tensor] | Tensor,
         count: int,
         generator: torch.Generator,
         plans: int = 1,
@@ -106,13 +106,14 @@ class PaperFlow(Flow):
 
         The plan is part of the context, so each has its own.
         """
-        state = model.manifold.project(uniform(*state_box, count, generator))
+        state = model.manifold.project(draw_states(states, count, generator))
         box = (self.centre - self.half_range, self.centre + self.half_range)
         planned, intended = (uniform(*box, count, generator) for _ in range(2))
         error = model.manifold.difference(model(state, intended), model(state, planned))
-        return Examples(self._features(state, planned, error), planned, intended)
+        features = self._features(state, planned, error)
+        return Examples(features, planned, intended, planned, intended)
 
-    def context(self, window: Window, model: DynamicsModel, last: Context) -> Context:
+    def context(self, window: Window, model: DynamicsModel, last: Context | None = None) -> Context:
         """Compare the last transition with the model's prediction."""
         row = Window(*(part.narrow(window.valid.dim() - 1, -1, 1) for part in window))
         action = row.planned if self.error_action == "planned" else row.executed
@@ -122,19 +123,21 @@ class PaperFlow(Flow):
         size = torch.where(row.valid, error.norm(dim=-1), 0.0).squeeze(-1)
         misaligned = size >= self.gate
         features = self._features(row.state, row.planned, error).squeeze(-2)
-        if self.latch:
+        if self.latch and last is not None:
             held = (last.misaligned & misaligned).unsqueeze(-1)
             features = torch.where(held, last.features, features)
-        return Context(features, size, misaligned)
+        nothing = features.new_zeros(*size.shape, 0)
+        pairs = features.new_zeros(*window.valid.shape, 0)
+        return Context(pairs, nothing, features, size, misaligned)
 
-    def correct(self, context: Context, state: Tensor, planned: Tensor) -> tuple[Tensor, Tensor]:
+    def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
         """Integrate the flow from the planned action."""
         regime = self.regime_encoder(context.features)
 
         def velocity(tau: float, point: Tensor) -> Tensor:
             return self._velocity(regime, torch.full_like(point[..., :1], tau), point)
 
-        return midpoint(velocity, planned, self.steps), torch.zeros_like(planned)
+        return Correction(midpoint(velocity, planned, self.steps), torch.zeros_like(planned))
 
     def _features(self, state: Tensor, planned: Tensor, error: Tensor) -> Tensor:
         return torch.cat([state[..., self.state_features], planned, error], -1)

@@ -7,7 +7,9 @@ from torch import Tensor
 
 from afm_rl.regimes import Regime
 
-MODES = ("direction", "clip")
+LIMIT = 4.0  # half ranges: effects beyond carry no more news
+MODES = ("mixed", "direction", "clip")
+LEAST = 0.3  # share of an action that must be had for "mixed" to clip it
 ROUNDS, TOLERANCE = 8, 0.01  # bisection of the scale; miss in half ranges that still counts
 
 
@@ -15,14 +17,18 @@ def saturate(unit: Tensor, mode: str) -> Tensor:
     """Bring an action in half ranges, ``(*B, A)``, into the box [-1, 1]^A.
 
     ``"clip"`` cuts each component for itself; ``"direction"`` shrinks all alike, so that the
-    robot does the same thing slower: the ratio of turning to driving is kept.
+    robot does the same thing slower: the ratio of turning to driving is kept. ``"mixed"``
+    clips what can be had to 30 % at least, and does the rest slower.
 
     >>> saturate(torch.tensor([0.5, 2.0]), "direction")
     tensor([0.2500, 1.0000])
     """
     if mode == "clip":
         return unit.clamp(-1.0, 1.0)
-    return unit / unit.abs().amax(-1, keepdim=True).clamp_min(1.0)
+    excess = unit.abs().amax(-1, keepdim=True).clamp_min(1.0)
+    if mode == "direction":
+        return unit / excess
+    return torch.where(excess * LEAST > 1.0, unit / excess, unit.clamp(-1.0, 1.0))
 
 
 def intend(
@@ -38,7 +44,8 @@ def intend(
 
     .. math:: u = T^{-1}(s\,a),\qquad s = \max\{s \in [0, 1] : s\,a \in T(\text{box})\}
 
-    with ``mode="direction"``; with ``"clip"`` s = 1 and u has the nearest effect there is.
+    with ``mode="direction"``; with ``"clip"``, or ``"mixed"`` and s > 0.3, u has the nearest
+    effect there is.
     """
     intended = regime.inverse(planned, parameters, state, low, high)
     if mode == "clip":
@@ -58,5 +65,6 @@ def intend(
         scale = torch.where(possible(action, trial * wanted, now, here), trial, scale)
     slower = regime.inverse(scale * wanted, now, here, low, high)
     intended = intended.clone()
-    intended[short] = torch.where(scale == 0, intended[short], slower)
+    nearest = scale == 0 if mode == "direction" else (scale == 0) | (scale > LEAST)
+    intended[short] = torch.where(nearest, intended[short], slower)
     return intended

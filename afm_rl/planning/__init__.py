@@ -1,6 +1,8 @@
 """Planners, and the world in which they imagine."""
 
-from afm_rl.planning.costs import Cost, GoalDistance
+from afm_rl.planning.costs import Cost, GoalDistance, KnownReward
+from afm_rl.planning.geometric import GeometricController
+from afm_rl.planning.icem import ICEM
 from afm_rl.planning.mpc import MPC
 from afm_rl.planning.mppi import MPPI
 from afm_rl.planning.planning_env import PlanningEnv
@@ -9,10 +11,13 @@ from afm_rl.planning.tracking import QuadraticCost, TrackingCost
 
 __all__ = [
     "CEM",
+    "ICEM",
     "MPC",
     "MPPI",
     "Cost",
+    "GeometricController",
     "GoalDistance",
+    "KnownReward",
     "PlanningEnv",
     "QuadraticCost",
     "TorchRLMPPI",

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
-from afm_rl.errors import ConfigurationError, check_choice, check_number
+from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
 from afm_rl.keys import as_keys
+
+SATURATIONS = ("mixed", "direction", "clip")  # what gives way when an action cannot be had
 
 
 class Cost(nn.Module, ABC):
@@ -46,7 +48,8 @@ class GoalDistance(Cost):
         weights: weight of each coordinate (1 each), in cost units per m or rad.
         saturation: what should give way when an action cannot be had in full, for whoever
             executes the plan: ``"direction"`` (be late, keep the path) suits a cost that can
-            wait, ``"clip"`` one that asks for a heading at every instant.
+            wait, ``"clip"`` one that asks for a heading at every instant, ``"mixed"`` (clip, but
+            be late where less than 30 % can be had) most others.
 
     >>> cost = GoalDistance([0, 1])
     >>> here = torch.zeros(3)
@@ -62,13 +65,15 @@ class GoalDistance(Cost):
         in_keys: Sequence[NestedKey] = ("goal",),
         goal_size: int = 2,
         weights: Sequence[float] | None = None,
-        saturation: str = "direction",
+        saturation: str = "mixed",
     ) -> None:
         super().__init__()
-        self.saturation = check_choice("cost.saturation", saturation, ("direction", "clip"))
+        self.saturation = check_choice(
+            "cost.saturation", saturation, ("mixed", "direction", "clip")
+        )
         self.coordinates = list(coordinates)
         self.in_keys = as_keys(in_keys)
-        self.in_sizes = [goal_size]
+        self.in_sizes = [check_count("cost.goal_size", goal_size)]
         if goal_size > len(self.coordinates):
             raise ConfigurationError(
                 f"cost.coordinates={self.coordinates}: expected at least one per goal "
@@ -92,3 +97,35 @@ class GoalDistance(Cost):
                 gap = gap - goal[..., k]
             total = total + (self.weights[k] * gap).square()
         return torch.as_tensor(total).sqrt()
+
+
+class KnownReward(Cost):
+    """The reward of somebody else's task, written down: the cost is its negative.
+
+    Args:
+        reward: ``reward(state, action, next_state, *task) -> reward``, batched.
+        in_keys: tensordict entries that describe the task, if it has any.
+        in_sizes: their sizes.
+
+    >>> upright = KnownReward(lambda state, action, next_state: -state[..., 0].square())
+    >>> upright(torch.tensor([3.0, 0.0]), torch.zeros(1), torch.zeros(2))
+    tensor(9.)
+    """
+
+    def __init__(
+        self,
+        reward: Callable[..., Tensor],
+        in_keys: Sequence[NestedKey] = (),
+        in_sizes: Sequence[int] = (),
+    ) -> None:
+        super().__init__()
+        self.reward = reward
+        self.in_keys, self.in_sizes = as_keys(in_keys), list(in_sizes)
+        if len(self.in_keys) != len(self.in_sizes):
+            raise ConfigurationError(
+                f"in_sizes={self.in_sizes}: expected one for each of in_keys={self.in_keys}"
+            )
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, *task: Tensor) -> Tensor:
+        """Return the negative reward ``(*B)``."""
+        return -self.reward(state, action, next_state, *task)

@@ -13,7 +13,7 @@ from torch import Tensor
 from afm_rl.errors import ConfigurationError, check_choice, check_number
 from afm_rl.keys import as_keys
 from afm_rl.manifold import wrap_angle
-from afm_rl.planning.costs import Cost
+from afm_rl.planning.costs import SATURATIONS, Cost
 
 
 class QuadraticCost(Cost):
@@ -55,7 +55,7 @@ class TrackingCost(QuadraticCost):
         angles: indices of the coordinates in rad, whose difference wraps.
         in_keys: the reference's key.
         saturation: what should give way when an action cannot be had in full, for whoever
-            executes the plan: ``"clip"`` or ``"direction"``.
+            executes the plan, see :class:`~afm_rl.planning.GoalDistance`.
 
     Raises:
         ConfigurationError: for settings that do not fit together.
@@ -82,7 +82,7 @@ class TrackingCost(QuadraticCost):
         saturation: str = "clip",
     ) -> None:
         super().__init__()
-        self.saturation = check_choice("cost.saturation", saturation, ("direction", "clip"))
+        self.saturation = check_choice("cost.saturation", saturation, SATURATIONS)
         size, self.in_keys = len(weights), as_keys(in_keys)
         if len(self.in_keys) != 1:
             raise ConfigurationError(f"cost.in_keys={self.in_keys}: expected one key")

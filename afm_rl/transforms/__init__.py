@@ -1,5 +1,6 @@
 """TorchRL transforms."""
 
 from afm_rl.transforms.action_flow import ActionFlowTransform
+from afm_rl.transforms.regime import RegimeTransform
 
-__all__ = ["ActionFlowTransform"]
+__all__ = ["ActionFlowTransform", "RegimeTransform"]

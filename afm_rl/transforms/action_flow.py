@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
+
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
-from torchrl.envs import Transform
+from torchrl.envs import FrameSkipTransform, Transform
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_flag
-from afm_rl.flow import Context, Corrector, Window
+from afm_rl.errors import ConfigurationError, check_flag, check_instance
+from afm_rl.flow import Context, Correction, Corrector, Window
 from afm_rl.keys import as_key
 
 
@@ -29,7 +32,9 @@ class ActionFlowTransform(Transform):
       stays the planned one, so losses should read the executed one,
     * ``(prefix, "misaligned")``: was the action corrected?
     * ``(prefix, "surprise")``: the misalignment, in the unit of the flow's gate,
-    * ``(prefix, "spread")``: standard deviation of the flow's samples, per action.
+    * ``(prefix, "spread")``: standard deviation of the flow's samples, per action,
+    * ``(prefix, "reach")``: lowest and highest effect that an action can have, ``(*B, 2, A)``, at
+      least the action box: for planners that can plan beyond it.
 
     Put it first in a ``Compose``: what follows may rescale the observation under another key
     and the action. It needs the state as the model knows it in ``observation_key``.
@@ -41,6 +46,7 @@ class ActionFlowTransform(Transform):
         action_key: the action.
         prefix: where the memory is kept.
         enabled: switch the correction off to watch only (see :attr:`enabled`).
+        widen: let planners know of effects beyond the action box, if the model can foresee them.
 
     >>> from torchrl.envs import TransformedEnv
     >>> from afm_rl.dynamics import Dubins
@@ -63,7 +69,10 @@ class ActionFlowTransform(Transform):
         action_key: NestedKey = "action",
         prefix: NestedKey = "afm",
         enabled: bool = True,
+        widen: bool = True,
     ) -> None:
+        check_instance("transform.model", model, DynamicsModel)
+        check_instance("transform.flow", flow, Corrector)
         observation_key, action_key = as_key(observation_key), as_key(action_key)
         super().__init__(in_keys=[observation_key], in_keys_inv=[action_key])
         if flow.action_size != model.action_size:
@@ -77,6 +86,7 @@ class ActionFlowTransform(Transform):
         self.action_key = action_key
         self.prefix = as_key(prefix)
         self.enabled = check_flag("transform.enabled", enabled)
+        self.widen = check_flag("transform.widen", widen)
 
     def key(self, *names: str) -> NestedKey:
         """Return the key of an entry of the memory."""
@@ -95,17 +105,40 @@ class ActionFlowTransform(Transform):
         last = Context(*(memory.get(name) for name in Context._fields))
         with torch.no_grad():
             context = self.flow.context(window, self.model, last)
-            corrected, spread = self.flow.correct(context, memory.get("state"), planned)
-        sound = corrected.isfinite().all(-1) & self.enabled
-        use = (context.misaligned & sound).unsqueeze(-1)
-        executed = torch.where(use, corrected, planned)
+            executed, spread, reach = self._correct(context, memory.get("state"), planned)
         executed = self.parent.full_action_spec[self.action_key].project(executed)
         memory = memory.clone(recurse=False)
         memory.update(context._asdict())
         memory.set("planned_action", planned)
         memory.set("executed_action", executed)
-        memory.set("spread", torch.where(use, spread, 0.0))
+        memory.set("spread", spread)
+        memory.set("reach", reach)
         return tensordict.set(self.prefix, memory).set(self.action_key, executed)
+
+    def _correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
+        """Return actions, spreads and reaches; those of the flow where the model is misaligned."""
+        executed, spread = planned.clone(), torch.zeros_like(planned)
+        reach = self._box(planned)
+        use = context.misaligned & self.enabled
+        if not bool(use.any()):
+            return Correction(executed, spread, reach)
+        shown = Context(*(part[use] for part in context))
+        found = self.flow.correct(shown, state[use], planned[use])
+        sound = found.action.isfinite().all(-1, keepdim=True)
+        executed[use] = torch.where(sound, found.action, planned[use])
+        spread[use] = torch.where(sound, found.spread, 0.0)
+        if found.reach is not None and self.widen and self.model.extrapolates:
+            # Never a smaller box: what cannot be had the flow cuts, and it knows better.
+            low, high = torch.where(sound.unsqueeze(-1), found.reach, 0.0).unbind(-2)
+            least, most = reach[use].unbind(-2)
+            widened = [torch.minimum(least, low), torch.maximum(most, high)]
+            reach[use] = torch.stack(widened, -2)
+        return Correction(executed, spread, reach)
+
+    def _box(self, like: Tensor) -> Tensor:
+        """Return the action box for actions ``(*B, A)``: ``(*B, 2, A)``."""
+        space = self.parent.full_action_spec[self.action_key].space
+        return torch.stack([space.low.expand_as(like), space.high.expand_as(like)], -2).to(like)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         memory = tensordict.get(self.prefix).clone(recurse=False)
@@ -124,8 +157,10 @@ class ActionFlowTransform(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        self._check_process()
         state = tensordict_reset.get(self.observation_key)
         memory = self._memory_spec(state.shape[:-1], state.dtype).to(state.device).zero()
+        memory.set("reach", self._box(memory.get("planned_action")))
         return tensordict_reset.set(self.prefix, memory.set("state", state.clone()))
 
     def _recall(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -136,6 +171,29 @@ class ActionFlowTransform(Transform):
                 "env.reset(), and carry its entries on"
             )
         return memory
+
+    def _check_process(self) -> None:
+        """Refuse a copy of a model that learns in another process: it would stay behind."""
+        if self.model.taught_in not in (None, os.getpid()):
+            raise ConfigurationError(
+                "ActionFlowTransform: the dynamics model learns in another process, so that its "
+                "copy in this one would never change; put the transform around ParallelEnv "
+                "instead of inside, use a Collector instead of MultiSyncCollector, or a model "
+                "that does not learn"
+            )
+
+    def _check_order(self) -> None:
+        """Refuse to stand before a frame skip, which would have each frame corrected again."""
+        chain = getattr(getattr(self.container, "transform", None), "transforms", [])
+        for other in reversed(chain):
+            if other is self:
+                return
+            if isinstance(other, FrameSkipTransform):
+                raise ConfigurationError(
+                    "ActionFlowTransform: a FrameSkipTransform follows it, and would have actions "
+                    "that are corrected already corrected again; put FrameSkipTransform before "
+                    "it, and give it a model of the whole stride"
+                )
 
     def _memory_spec(self, batch: torch.Size, dtype: torch.dtype) -> Composite:
         """Return the specs of the memory for a batch shape."""
@@ -158,16 +216,20 @@ class ActionFlowTransform(Transform):
         return Composite(
             state=real(states),
             window=rows,
+            pairs=real(window, self.flow.pair_size),
+            evidence=real(self.flow.evidence_size),
             features=real(self.flow.feature_size),
             surprise=real(),
             misaligned=flag(),
             planned_action=real(actions),
             executed_action=real(actions),
             spread=real(actions),
+            reach=real(2, actions),
             shape=batch,
         )
 
     def _with_memory(self, spec: Composite) -> Composite:
+        self._check_order()
         found = self.parent.full_observation_spec
         dtype = found[self.observation_key].dtype
         if found[self.observation_key].shape[-1] != self.model.state_size:
