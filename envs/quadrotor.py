@@ -41,9 +41,12 @@ class CrazyflieTrack(MissionEnv):
                                        (scalar-last), body rate (rad/s), with sensor noise
     ``reference``     ``(*B, N+1, 6)`` position and velocity to aim for, now and after
                                        each of the next N ticks
+    ``trace``         ``(*B, K+1, 13)`` with ``trace=True``: the observation before the last
+                                       tick, after each of its K plant steps but the last,
+                                       and after the tick; for learners
     ``square_error``  ``(*B, 3)``      mean over the last tick's plant steps of the squared
-                                       error per axis (m^2); the reference is taken one
-                                       plant step ahead, as in the published metric
+                                       error per axis (m^2); this and ``reference`` are
+                                       one plant step ahead, as in the published metric
     ``step``          ``(*B)``         number of ticks flown
     ``since``         ``(*B)``         tick at which the present phase began
     ``lost``          ``(*B)``         whether the flight is lost
@@ -70,8 +73,7 @@ class CrazyflieTrack(MissionEnv):
         body: the quadrotor, a Crazyflie if None.
         duration: length of a flight (s).
         horizon: ticks N by which ``reference`` looks ahead.
-        preview: whether it holds the future; otherwise it repeats the present set-point, which
-            like the metric is one plant step ahead.
+        preview: whether it holds the future; otherwise it repeats the present set-point.
         start: ``"moving"``, with the velocity of the reference, or ``"rest"``. Either starts at
             the reference, level.
         limit: distance from the reference at which a flight is lost (m).
@@ -79,7 +81,8 @@ class CrazyflieTrack(MissionEnv):
             (m), velocity (m/s), attitude (rad) and body rate (rad/s).
         start_noise: standard deviation of the start position per axis (m).
         dt: control tick (s).
-        substeps: plant steps per tick.
+        substeps: plant steps per tick, K.
+        trace: whether to publish the states in between.
         batch_size: number of flights, or ``()`` for any.
         seed: missions without a seed of their own get ``seed, seed + 1, ...``.
         device: where the tensors live.
@@ -117,6 +120,7 @@ class CrazyflieTrack(MissionEnv):
         start_noise: float = 0.0,
         dt: float = 0.05,
         substeps: int = 25,
+        trace: bool = False,
         batch_size: Sequence[int] = (),
         seed: int = 0,
         device: torch.device | str | None = None,
@@ -135,7 +139,8 @@ class CrazyflieTrack(MissionEnv):
         self.regime = settings.check_flight_regime(regime, self.body)
         self.start_noise = check_number("start_noise", start_noise, low=0.0)
         self.seed = check_count("seed", seed, low=0)
-        self.noise = FlightNoise()
+        substeps = check_count("substeps", substeps)
+        self.noise = FlightNoise(between=substeps - 1)
         dt = check_number("dt", dt, low=0.0, open_low=True)
         self.schedule = settings.check_flight_schedule(schedule, dt)
         self.simulation = QuadrotorSimulation(
@@ -144,13 +149,14 @@ class CrazyflieTrack(MissionEnv):
             schedule=self.schedule,
             body=self.body,
             dt=dt,
-            substeps=check_count("substeps", substeps),
+            substeps=substeps,
             steps=settings.check_steps(duration, dt),
             horizon=check_count("horizon", horizon),
             preview=check_flag("preview", preview),
             start=check_choice("start", start, ("rest", "moving")),
             limit=check_number("limit", limit, low=0.0, open_low=True),
             sensor_noise=settings.check_sensor_noise(sensor_noise),
+            trace=check_flag("trace", trace),
         )
 
         names = [reference.name for reference in self.references]
@@ -167,7 +173,7 @@ class CrazyflieTrack(MissionEnv):
         state = specs.state_spec(mission, self.dtype, self.regime.history)
         self.state_spec = state
         self.observation_spec = specs.observation_spec(
-            state, self.simulation.horizon, len(self.regime.names)
+            state, self.simulation.horizon, len(self.regime.names), substeps + 1 if trace else None
         )
         bounds = settings.check_action_box(action_low, action_high, self.body)
         self.full_action_spec = specs.action_spec(bounds, state)
@@ -235,9 +241,12 @@ class CrazyflieTrack(MissionEnv):
         actuator = None
         if self.regime.noisy:
             actuator = self.noise.normal("actuator", seeds, dtype=self.dtype)
-        return self.simulation.advance(tensordict, self._sensor(seeds), actuator)
+        between = self._sensor(seeds, event="between") if self.simulation.trace else None
+        return self.simulation.advance(tensordict, self._sensor(seeds), between, actuator)
 
-    def _sensor(self, seeds: Tensor, rows: Tensor | None = None) -> Tensor | None:
+    def _sensor(
+        self, seeds: Tensor, rows: Tensor | None = None, event: str = "sensor"
+    ) -> Tensor | None:
         if not self.simulation.sensor_noise.any():
             return None
-        return self.noise.normal("sensor", seeds, rows, self.dtype)
+        return self.noise.normal(event, seeds, rows, self.dtype)

@@ -41,6 +41,7 @@ class QuadrotorSimulation:
     start: str
     limit: float
     sensor_noise: Tensor
+    trace: bool = False
 
     def begin(self, mission: TensorDictBase, dtype: torch.dtype) -> dict[str, Tensor]:
         """Return the state at the beginning of flights: at the reference, level, not turning."""
@@ -62,14 +63,20 @@ class QuadrotorSimulation:
         return state
 
     def advance(
-        self, data: TensorDictBase, sensor: Tensor | None, actuator: Tensor | None
+        self,
+        data: TensorDictBase,
+        sensor: Tensor | None,
+        between: Tensor | None,
+        actuator: Tensor | None,
     ) -> TensorDict:
         """Return what one control tick leads to.
 
         Args:
             data: ``mission``, ``pose``, ``step``, ``since``, ``lost``, ``action`` and, for a
-                regime with a history, ``past``.
+                regime with a history, ``past``; ``observation``, where the trace begins.
             sensor: standard normal numbers for the observation, ``(*B, 12)``; None for none.
+            between: such numbers for the trace between two observations,
+                ``(*B, 12 (substeps - 1))``.
             actuator: standard normal numbers for a noisy regime, ``(*B, 4)``.
         """
         mission, pose, step = data["mission"], data["pose"], data["step"]
@@ -102,6 +109,11 @@ class QuadrotorSimulation:
         if past is not None:
             state["past"] = torch.cat([action.unsqueeze(-2), past[..., :-1, :]], -2)
         out = self.describe(mission, state, sensor)
+        if self.trace:
+            passed = torch.where(frozen.unsqueeze(-1), pose.unsqueeze(-2), path.movedim(0, -2))
+            passed = self._sense(passed[..., :-1, :], between)
+            ends = (data.get("observation", pose).unsqueeze(-2), out["observation"].unsqueeze(-2))
+            out["trace"] = torch.cat([ends[0], passed, ends[1]], -2)
         out["square_error"] = miss.square().mean(-2)
         out["reward"] = -out["square_error"].sum(-1, keepdim=True)
         out["terminated"] = frozen.clone()
@@ -115,13 +127,10 @@ class QuadrotorSimulation:
         """Return the state and what is seen of it; no error is known yet."""
         pose, step = state["pose"], state["step"]
         parameters = self.regime_now(mission, step, state["since"])
-        seen = pose.clone()
-        if sensor is not None:
-            seen = RigidBodySpace().add(pose, sensor * self.sensor_noise.to(pose))
+        seen = self._sense(pose, sensor)
         ticks = torch.arange(self.horizon + 1, device=pose.device) * self.preview
         times = ((step.unsqueeze(-1) + ticks) * self.dt).to(pose.dtype)
-        if not self.preview:  # the published set-point is as far ahead as the metric's
-            times = times + self.dt / self.substeps
+        times = times + self.dt / self.substeps  # as far ahead as the metric's
         entries = {
             **state,
             "mission": mission.clone(),
@@ -132,7 +141,16 @@ class QuadrotorSimulation:
             "regime": parameters,
             "regime_active": ~self.regime.is_identity(parameters),
         }
+        if self.trace:  # nothing has happened yet
+            entries["trace"] = seen.unsqueeze(-2).repeat_interleave(self.substeps + 1, -2)
         return TensorDict(entries, mission.batch_size, device=mission.device)
+
+    def _sense(self, pose: Tensor, numbers: Tensor | None) -> Tensor:
+        """Return states ``(*B, 13)`` as the sensors see them."""
+        if numbers is None:
+            return pose.clone()
+        numbers = numbers.reshape(*pose.shape[:-1], 12)
+        return RigidBodySpace().add(pose, numbers * self.sensor_noise.to(pose))
 
     def regime_now(self, mission: TensorDictBase, step: Tensor, since: Tensor) -> Tensor:
         """Return the parameters ``(*B, F)`` that act on the next action.

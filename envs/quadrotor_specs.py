@@ -28,8 +28,17 @@ def state_spec(mission: Composite, dtype: torch.dtype, history: int) -> Composit
     return spec
 
 
-def observation_spec(state: Composite, horizon: int, parameters: int) -> Composite:
-    """Return what reset and step emit: the state, so that it is carried, and views of it."""
+def observation_spec(
+    state: Composite, horizon: int, parameters: int, trace: int | None = None
+) -> Composite:
+    """Return what reset and step emit: the state, so that it is carried, and views of it.
+
+    Args:
+        state: see :func:`state_spec`.
+        horizon: ticks by which the reference looks ahead.
+        parameters: number of the regime's parameters.
+        trace: number of states in the trace; None for none.
+    """
     batch, device, dtype = state.shape, state.device, state["pose"].dtype
     spec = state.clone()
     sizes = {
@@ -38,6 +47,8 @@ def observation_spec(state: Composite, horizon: int, parameters: int) -> Composi
         "square_error": (3,),
         "regime": (parameters,),
     }
+    if trace is not None:
+        sizes["trace"] = (trace, 13)
     for name, size in sizes.items():
         spec[name] = Unbounded(shape=(*batch, *size), dtype=dtype, device=device)
     spec["phase"] = Unbounded(shape=batch, dtype=torch.int64, device=device)

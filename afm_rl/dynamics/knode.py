@@ -11,9 +11,10 @@ from torch import Tensor, nn
 from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.dynamics.hybrid_rate import HeldHybrid
 from afm_rl.dynamics.quadrotor import Quadrotor
-from afm_rl.dynamics.rates import FunctionRate, QuadrotorRate, Rate
+from afm_rl.dynamics.quadrotor_equations import QuadrotorRate
+from afm_rl.dynamics.rates import FunctionRate, Rate, on_tangent
 from afm_rl.dynamics.residual import Network, draw_network, network_shapes
-from afm_rl.dynamics.runge_kutta import runge_kutta, runge_kutta_tangent
+from afm_rl.dynamics.runge_kutta import runge_kutta, runge_kutta_tangent, undisturbed
 from afm_rl.errors import ConfigurationError, check_count, check_number
 
 
@@ -35,7 +36,7 @@ class KNODE(DynamicsModel):
         rate: f as a function, ``rate(state, action) -> (*B, S)``; None for a
             :class:`~afm_rl.dynamics.Quadrotor`, whose equations are known.
         dt: control tick (s); that of ``nominal`` if None.
-        hidden: units of each network.
+        units: hidden units of each network.
         pool: number of networks, P.
         features: indices of the state coordinates that the networks see; None for all, as
             published, although positions do not matter to a flight.
@@ -60,7 +61,7 @@ class KNODE(DynamicsModel):
         nominal: DynamicsModel,
         rate: Callable[[Tensor, Tensor], Tensor] | None = None,
         dt: float | None = None,
-        hidden: int = 64,
+        units: int = 64,
         pool: int = 3,
         features: Sequence[int] | None = None,
         substeps: int = 1,
@@ -75,7 +76,7 @@ class KNODE(DynamicsModel):
                 f"dynamics.dt=None: {type(nominal).__name__} has no dt, give the control tick (s)"
             )
         self.dt = check_number("dynamics.dt", given, low=0.0, open_low=True)
-        self.hidden = check_count("dynamics.hidden", hidden)
+        self.units = check_count("dynamics.units", units)
         self.pool = check_count("dynamics.pool", pool)
         self.substeps = check_count("dynamics.substeps", substeps)
         size = self.state_size
@@ -86,7 +87,7 @@ class KNODE(DynamicsModel):
                 f"dynamics.features={self.features}: expected distinct indices in 0..{size - 1}"
             )
         self._generator = torch.Generator().manual_seed(check_count("dynamics.seed", seed, low=0))
-        sizes = len(self.features) + self.action_size, self.hidden, size
+        sizes = len(self.features) + self.action_size, self.units, size
         for name, shape in zip(Network._fields, network_shapes(*sizes), strict=True):
             self.register_parameter(name, nn.Parameter(torch.zeros(self.pool, *shape)))
         shares = torch.exp(-torch.arange(self.pool, dtype=torch.float64))
@@ -174,29 +175,27 @@ class KNODE(DynamicsModel):
             ``(*L, *N, S, S + A)``.
         """
         rows, held, batch = self._held(state, action, newest)
-        slope = held.tangent(rows, self._start(rows))[1]
+        slope = held.tangent(rows, undisturbed(rows, self.action_size))[1]
         return slope.reshape(*batch, *slope.shape[-2:])
 
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return next state and derivatives, in closed form."""
-        rows, held, batch = self._held(state, action, None)
-        start = self._start(rows)
-        moved = runge_kutta_tangent(held.tangent, rows, start, self.dt, self.substeps)
-        ahead, through = self.rate.finish_tangent(*moved)
-        through = through.reshape(*batch, *through.shape[-2:])
+        ahead, through = self._through(state, action, slice(None))
         size = self.state_size
-        return ahead.reshape(*batch, size), through[..., :size], through[..., size:]
+        return ahead, through[..., :size], through[..., size:]
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the derivative by the action ``(*L, *N, D, A)`` on the tangent space."""
-        ahead, _, by_action = self.linearise(state, action)
-        columns = by_action.mT.contiguous()
-        wide = ahead.unsqueeze(-2).expand_as(columns).contiguous()
+        moved = self._through(state, action, slice(self.state_size, None))
+        return on_tangent(self.manifold, *moved, state)
 
-        def change(there: Tensor) -> Tensor:
-            return self.manifold.difference(there, state.unsqueeze(-2))
-
-        return torch.func.jvp(change, (wide,), (columns,))[1].mT
+    def _through(self, state: Tensor, action: Tensor, columns: slice) -> tuple[Tensor, Tensor]:
+        """Return the next state and those columns of its derivative by state and action."""
+        rows, held, batch = self._held(state, action, None)
+        start = undisturbed(rows, self.action_size)[..., columns]
+        moved = runge_kutta_tangent(held.tangent, rows, start, self.dt, self.substeps)
+        ahead, through = self.rate.finish_tangent(*moved)
+        return ahead.reshape(*batch, -1), through.reshape(*batch, *through.shape[-2:])
 
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return a single member's mean and unit variance, in the nominal model's units."""
@@ -233,7 +232,7 @@ class KNODE(DynamicsModel):
     @property
     def _sizes(self) -> tuple[int, int, int]:
         """Sizes of input, hidden layer and output of each network."""
-        return len(self.features) + self.action_size, self.hidden, self.state_size
+        return len(self.features) + self.action_size, self.units, self.state_size
 
     def _pushed(self, network: Network) -> Network:
         """Return the pool ``(*L, P, ...)`` as it is when ``network`` is the newest."""
@@ -283,12 +282,6 @@ class KNODE(DynamicsModel):
         network = self._merged(newest, state)
         features = None if whole else self.features
         return state, HeldHybrid(self.rate.hold(action), network, action, features), batch
-
-    def _start(self, rows: Tensor) -> Tensor:
-        """Return the derivative of states by themselves and the action."""
-        size = self.state_size
-        eye = torch.eye(size, size + self.action_size, dtype=rows.dtype, device=rows.device)
-        return eye.expand(*rows.shape[:-1], *eye.shape)
 
 
 def _rate_of(nominal: DynamicsModel, rate: Callable[[Tensor, Tensor], Tensor] | None) -> Rate:

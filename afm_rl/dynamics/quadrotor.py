@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 
-import torch
 from torch import Tensor
 
 from afm_rl.airframe import QuadrotorBody
 from afm_rl.dynamics.known import KnownDynamics
-from afm_rl.dynamics.quadrotor_equations import linearised_path, quadrotor_step
+from afm_rl.dynamics.quadrotor_equations import QuadrotorRate, aligned, quadrotor_step
+from afm_rl.dynamics.rates import on_tangent
+from afm_rl.dynamics.runge_kutta import runge_kutta_tangent, undisturbed
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.rotations import RigidBodySpace
 
@@ -40,6 +41,8 @@ class Quadrotor(KnownDynamics):
     (torch.Size([4, 13]), torch.Size([4, 13, 13]), torch.Size([4, 13, 4]))
     """
 
+    extrapolates = True
+
     def __init__(
         self,
         body: QuadrotorBody | None = None,
@@ -56,16 +59,22 @@ class Quadrotor(KnownDynamics):
 
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return next state and derivatives, in closed form."""
-        ahead, slope = linearised_path(state, action, self.dt, self.substeps, self.body)
+        state, action = aligned(state, action)
+        ahead, slope = self._through(state, action, undisturbed(state, self.action_size))
         return ahead, slope[..., :13], slope[..., 13:]
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the derivative by the action on the tangent space, ``(*B, 12, 4)``."""
-        ahead, _, by_action = self.linearise(state, action)
-        origin, columns = state.unsqueeze(-2), by_action.mT.contiguous()
-        wide = ahead.unsqueeze(-2).expand_as(columns).contiguous()
-        differ = partial(self.manifold.difference, origin=origin)
-        return torch.func.jvp(differ, (wide,), (columns,))[1].mT
+        state, action = aligned(state, action)
+        still = undisturbed(state, self.action_size)[..., 13:]
+        return on_tangent(self.manifold, *self._through(state, action, still), state)
+
+    def _through(self, state: Tensor, action: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the next state ``(*B, 13)`` and its derivatives ``(*B, 13, K)``."""
+        rate = QuadrotorRate(self.body)
+        tangent = rate.hold(action).tangent
+        moved = runge_kutta_tangent(tangent, state, start, self.dt, self.substeps)
+        return rate.finish_tangent(*moved)
 
 
 def check_body(body: QuadrotorBody | None) -> QuadrotorBody:

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from afm_rl.airframe import QuadrotorBody
+from afm_rl.dynamics.rates import HeldRate, Rate
+from afm_rl.dynamics.runge_kutta import runge_kutta_path
 from afm_rl.rotations import body_z_axis, quaternion_normalise
 
 
@@ -23,37 +25,75 @@ class _Tables(NamedTuple):
     weight: Tensor  # (3,) acceleration of gravity
 
 
-class _Held(NamedTuple):
-    """What stays constant while an action is held: rates are ``gain * products + offset``."""
+class HeldFlight(HeldRate):
+    """What :func:`quadrotor_rate` gives while an action is held: ``gain * products + offset``.
 
-    gain: Tensor  # (*B, 10)
-    offset: Tensor  # (*B, 10)
-    tables: _Tables
+    Args:
+        action: thrust (N) and moments (N m), ``(*B, 4)``.
+        body: the quadrotor.
+        wind: a further acceleration (m/s^2), ``(*B, 3)``.
+    """
+
+    def __init__(self, action: Tensor, body: QuadrotorBody, wind: Tensor | None = None) -> None:
+        self.body = body
+        self.tables = tables = _tables(body, action.dtype, action.device)
+        lift = action[..., :1] / body.mass
+        zero = torch.zeros_like(lift)
+        push = torch.cat([zero, zero, lift], -1) + tables.weight
+        push = push if wind is None else push + wind
+        still = zero.expand(*zero.shape[:-1], 4)
+        one = torch.ones_like(lift).expand(*zero.shape[:-1], 7)
+        self.gain = torch.cat([lift.expand(*lift.shape[:-1], 3), one], -1)
+        self.offset = torch.cat([push, still, action[..., 1:] * tables.inverse], -1)
+
+    def __call__(self, state: Tensor) -> Tensor:
+        """Return the rate of change ``(*B, 13)``."""
+        turning, tables = state[..., 6:], self.tables
+        pairs = turning.index_select(-1, tables.first) * turning.index_select(-1, tables.second)
+        # Not a matrix product: a flight shall be the same to the bit in any batch.
+        sums = (pairs.unflatten(-1, (3, 10)) * tables.factor).sum(-2)
+        return torch.cat([state[..., 3:6], torch.addcmul(self.offset, self.gain, sums)], -1)
+
+    def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rate of change and its derivative, the action in the last four columns."""
+        turning, tables = state[..., 6:], self.tables
+        slope = (turning @ tables.slope).unflatten(-1, (10, 7)) * self.gain.unsqueeze(-1)
+        rest = slope @ through[..., 6:, :]
+        rest[..., :3, -4] += body_z_axis(state[..., 6:10]) / self.body.mass
+        rest[..., 7:, -3:] += tables.inverse.diag()
+        return self(state), torch.cat([through[..., 3:6, :], rest], -2)
 
 
-def _hold(action: Tensor, body: QuadrotorBody, wind: Tensor | None = None) -> _Held:
-    """Prepare the equations for a constant action ``(*B, 4)``; see :func:`quadrotor_rate`."""
-    tables = _tables(body, action.dtype, action.device)
-    lift = action[..., :1] / body.mass
-    zero = torch.zeros_like(lift)
-    push = torch.cat([zero, zero, lift], -1) + tables.weight
-    push = push if wind is None else push + wind
-    still = zero.expand(*zero.shape[:-1], 4)
-    one = torch.ones_like(lift).expand(*zero.shape[:-1], 7)
-    gain = torch.cat([lift.expand(*lift.shape[:-1], 3), one], -1)
-    return _Held(gain, torch.cat([push, still, action[..., 1:] * tables.inverse], -1), tables)
+class QuadrotorRate(Rate):
+    """A quadrotor's rate of change, with derivatives in closed form.
 
+    Args:
+        body: the quadrotor.
 
-def _rate(state: Tensor, held: _Held) -> Tensor:
-    """Return the rate of change ``(*B, 13)`` while an action is held."""
-    sums = _sums(state, held.tables)
-    return torch.cat([state[..., 3:6], torch.addcmul(held.offset, held.gain, sums)], -1)
+    >>> rate = QuadrotorRate(QuadrotorBody())
+    >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
+    >>> rate.hold(torch.zeros(4))(level)[3:6]
+    tensor([ 0.0000,  0.0000, -9.8100])
+    """
 
+    def __init__(self, body: QuadrotorBody) -> None:
+        self.body = body
 
-def _sums(state: Tensor, tables: _Tables) -> Tensor:
-    turning = state[..., 6:]
-    pairs = turning.index_select(-1, tables.first) * turning.index_select(-1, tables.second)
-    return (pairs.unflatten(-1, (3, 10)) * tables.factor).sum(-2)
+    def hold(self, action: Tensor) -> HeldFlight:
+        """Return the rate of change under ``action``."""
+        return HeldFlight(action, self.body)
+
+    def finish(self, state: Tensor) -> Tensor:
+        """Scale the quaternions to length 1."""
+        return unit(state)
+
+    def finish_tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Scale the quaternions: :math:`d(q/|q|) = (dq - \hat q (\hat q \cdot dq)) / |q|`."""
+        size = state[..., 6:10].square().sum(-1, keepdim=True).sqrt().unsqueeze(-1)
+        state = unit(state)
+        turned, rows = state[..., 6:10].unsqueeze(-1), through[..., 6:10, :]
+        rows = (rows - turned * (turned * rows).sum(-2, keepdim=True)) / size
+        return state, torch.cat([through[..., :6, :], rows, through[..., 10:, :]], -2)
 
 
 def quadrotor_rate(
@@ -77,8 +117,8 @@ def quadrotor_rate(
     >>> quadrotor_rate(level, torch.tensor([2 * body.hover_thrust, 0, 0, 0]), body)[3:6]
     tensor([0.0000, 0.0000, 9.8100])
     """
-    state, action = _aligned(state, action)
-    return _rate(state, _hold(action, body, wind))
+    state, action = aligned(state, action)
+    return HeldFlight(action, body, wind)(state)
 
 
 def quadrotor_step(
@@ -117,17 +157,9 @@ def quadrotor_path(
     >>> fallen[:, 2]
     tensor([-1.2263, -4.9050])
     """
-    state, action = _aligned(state, action)
-    held, step, path = _hold(action, body, wind), dt / substeps, []
-    for _ in range(substeps):
-        first = _rate(state, held)
-        second = _rate(torch.add(state, first, alpha=step / 2), held)
-        third = _rate(torch.add(state, second, alpha=step / 2), held)
-        fourth = _rate(torch.add(state, third, alpha=step), held)
-        slope = torch.add(first + fourth, second + third, alpha=2.0)
-        state = torch.add(state, slope, alpha=step / 6)
-        path.append(state)
-    path[-1] = unit(state)
+    state, action = aligned(state, action)
+    path = runge_kutta_path(HeldFlight(action, body, wind), state, dt, substeps)
+    path[-1] = unit(path[-1])
     return torch.stack(path)
 
 
@@ -137,56 +169,8 @@ def unit(state: Tensor) -> Tensor:
     return torch.cat([state[..., :6], turned, state[..., 10:]], -1)
 
 
-def linearised_path(
-    state: Tensor, action: Tensor, dt: float, substeps: int, body: QuadrotorBody
-) -> tuple[Tensor, Tensor]:
-    r"""Return where a flight leads to, and how that depends on its start and action.
-
-    The chain rule through the stages of the Runge-Kutta steps:
-    :math:`dk_i = \tfrac{\partial f}{\partial s}(s_i)\,ds_i + \tfrac{\partial f}{\partial u}(s_i)`,
-    with :math:`ds_i` the derivative of stage i by start and action.
-
-    Args:
-        state: where to start, ``(*B, 13)``.
-        action: thrust (N) and moments (N m), ``(*B, 4)``.
-        dt: time (s).
-        substeps: number of Runge-Kutta steps.
-        body: the quadrotor.
-
-    Returns:
-        The state ``(*B, 13)``, and its derivative ``(*B, 13, 17)`` by start and action.
-    """
-    state, action = _aligned(state, action)
-    held, step = _hold(action, body), dt / substeps
-    eye = torch.eye(13, 17, dtype=state.dtype, device=state.device)
-    through = eye.expand(*state.shape[:-1], 13, 17)
-    for _ in range(substeps):
-        total, slope = torch.zeros_like(state), torch.zeros_like(through)
-        here, there = state, through
-        for weight, reach in ((1, 0.5), (2, 0.5), (2, 1.0), (1, 0.0)):
-            change, turn = _rate(here, held), _slope(here, there, held, body)
-            total, slope = total + weight * change, slope + weight * turn
-            here, there = state + reach * step * change, through + reach * step * turn
-        state, through = state + step / 6 * total, through + step / 6 * slope
-    size = state[..., 6:10].square().sum(-1, keepdim=True).sqrt().unsqueeze(-1)
-    state = unit(state)
-    turned, rows = state[..., 6:10].unsqueeze(-1), through[..., 6:10, :]
-    rows = (rows - turned * (turned * rows).sum(-2, keepdim=True)) / size
-    return state, torch.cat([through[..., :6, :], rows, through[..., 10:, :]], -2)
-
-
-def _slope(state: Tensor, through: Tensor, held: _Held, body: QuadrotorBody) -> Tensor:
-    """Return the derivative of the rate of change by start and action, ``(*B, 13, 17)``."""
-    turning, tables = state[..., 6:], held.tables
-    slope = (turning @ tables.slope).unflatten(-1, (10, 7)) * held.gain.unsqueeze(-1)
-    rest = slope @ through[..., 6:, :]
-    rest[..., :3, 13] += body_z_axis(state[..., 6:10]) / body.mass
-    rest[..., 7:, 14:] += tables.inverse.diag()
-    return torch.cat([through[..., 3:6, :], rest], -2)
-
-
-def _aligned(state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-    """Give both the same batch shape and type."""
+def aligned(state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    """Give states ``(*B, 13)`` and actions ``(*B, 4)`` the same batch shape and type."""
     batch = torch.broadcast_shapes(state.shape[:-1], action.shape[:-1])
     dtype = torch.promote_types(state.dtype, action.dtype)
     return state.expand(*batch, 13).to(dtype), action.expand(*batch, 4).to(dtype)

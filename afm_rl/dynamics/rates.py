@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from afm_rl.airframe import QuadrotorBody
-from afm_rl.dynamics.quadrotor_equations import _hold, _rate, _slope, unit
 from afm_rl.manifold import Manifold, wrap_angle
 
 
@@ -22,14 +21,14 @@ class HeldRate(ABC):
 
     @abstractmethod
     def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rate of change and its derivative by start and action.
+        """Return the rate of change and its derivative by K parameters, the action the last.
 
         Args:
             state: ``(*B, S)``.
-            through: derivative of ``state`` by start and action, ``(*B, S, S + A)``.
+            through: derivative of ``state`` by them, ``(*B, S, K)``.
 
         Returns:
-            ``(*B, S)`` and ``(*B, S, S + A)``.
+            ``(*B, S)`` and ``(*B, S, K)``.
         """
 
 
@@ -99,44 +98,20 @@ class _HeldFunction(HeldRate):
         return result[0][..., 0, :], result[1].mT
 
 
-class QuadrotorRate(Rate):
-    """A quadrotor's rate of change, with derivatives in closed form.
+def on_tangent(space: Manifold, state: Tensor, slope: Tensor, origin: Tensor) -> Tensor:
+    """Return the derivative of the difference of a state from an origin, ``(*B, D, K)``.
 
     Args:
-        body: the quadrotor.
+        space: the state space.
+        state: ``(*B, S)``.
+        slope: its derivative by K parameters in raw coordinates, ``(*B, S, K)``.
+        origin: does not move, ``(*B, S)``.
 
-    >>> rate = QuadrotorRate(QuadrotorBody())
-    >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
-    >>> rate.hold(torch.zeros(4))(level)[3:6]
-    tensor([ 0.0000,  0.0000, -9.8100])
+    >>> on_tangent(Manifold(2), torch.ones(2), torch.tensor([[3.0], [4.0]]), torch.zeros(2))
+    tensor([[3.],
+            [4.]])
     """
-
-    def __init__(self, body: QuadrotorBody) -> None:
-        self.body = body
-
-    def hold(self, action: Tensor) -> HeldRate:
-        """Return the rate of change under ``action``."""
-        return _HeldFlight(action, self.body)
-
-    def finish(self, state: Tensor) -> Tensor:
-        """Scale the quaternions to length 1."""
-        return unit(state)
-
-    def finish_tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Scale the quaternions: :math:`d(q/|q|) = (dq - \hat q (\hat q \cdot dq)) / |q|`."""
-        size = state[..., 6:10].square().sum(-1, keepdim=True).sqrt().unsqueeze(-1)
-        state = unit(state)
-        turned, rows = state[..., 6:10].unsqueeze(-1), through[..., 6:10, :]
-        rows = (rows - turned * (turned * rows).sum(-2, keepdim=True)) / size
-        return state, torch.cat([through[..., :6, :], rows, through[..., 10:, :]], -2)
-
-
-class _HeldFlight(HeldRate):
-    def __init__(self, action: Tensor, body: QuadrotorBody) -> None:
-        self.held, self.body = _hold(action, body), body
-
-    def __call__(self, state: Tensor) -> Tensor:
-        return _rate(state, self.held)
-
-    def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
-        return _rate(state, self.held), _slope(state, through, self.held, self.body)
+    columns = slope.mT.contiguous()
+    wide = state.unsqueeze(-2).expand_as(columns).contiguous()
+    differ = partial(space.difference, origin=origin.unsqueeze(-2))
+    return torch.func.jvp(differ, (wide,), (columns,))[1].mT

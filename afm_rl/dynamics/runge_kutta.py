@@ -11,18 +11,29 @@ from torch import Tensor
 def runge_kutta(
     rate: Callable[[Tensor], Tensor], state: Tensor, dt: float, substeps: int
 ) -> Tensor:
+    """Return the last state ``(*B, S)`` of :func:`runge_kutta_path`.
+
+    >>> runge_kutta(torch.neg, torch.ones(1), 1.0, 4)  # exp(-1) = 0.36788
+    tensor([0.3679])
+    """
+    return runge_kutta_path(rate, state, dt, substeps)[-1]
+
+
+def runge_kutta_path(
+    rate: Callable[[Tensor], Tensor], state: Tensor, dt: float, substeps: int
+) -> list[Tensor]:
     r"""Integrate :math:`x' = f(x)` for ``dt`` seconds.
 
     Args:
         rate: f, ``(*B, S) -> (*B, S)``.
         state: where to start, ``(*B, S)``.
         dt: time (s).
-        substeps: number of steps.
+        substeps: number of steps, N.
 
-    >>> runge_kutta(torch.neg, torch.ones(1), 1.0, 4)  # exp(-1) = 0.36788
-    tensor([0.3679])
+    Returns:
+        The N states after each step, ``(*B, S)``.
     """
-    step = dt / substeps
+    step, path = dt / substeps, []
     for _ in range(substeps):
         first = rate(state)
         second = rate(torch.add(state, first, alpha=step / 2))
@@ -30,7 +41,20 @@ def runge_kutta(
         fourth = rate(torch.add(state, third, alpha=step))
         slope = torch.add(first + fourth, second + third, alpha=2.0)
         state = torch.add(state, slope, alpha=step / 6)
-    return state
+        path.append(state)
+    return path
+
+
+def undisturbed(state: Tensor, actions: int) -> Tensor:
+    """Return the derivative of a start ``(*B, S)`` by itself and A actions, ``(*B, S, S + A)``.
+
+    >>> undisturbed(torch.zeros(2), 1)
+    tensor([[1., 0., 0.],
+            [0., 1., 0.]])
+    """
+    size = state.shape[-1]
+    eye = torch.eye(size, size + actions, dtype=state.dtype, device=state.device)
+    return eye.expand(*state.shape[:-1], *eye.shape)
 
 
 def runge_kutta_tangent(

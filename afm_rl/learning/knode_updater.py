@@ -127,6 +127,7 @@ class KNODEUpdater(Updater):
         )
         self.streams = Streams(salt=4, seed=check_count("updater.seed", seed, low=0))
         self.refused = 0
+        self.claim()
         self.window = FlightWindow()
         # Not persistent: what is under way belongs to flights, not to a stored model.
         for name, value in (("tick", 0), ("due", NONE), ("missions", 0)):

@@ -84,7 +84,8 @@ class MassEstimator(Updater):
         model = loss.model
         if not isinstance(model, Oracle) or not isinstance(model.model, Quadrotor):
             raise ConfigurationError(
-                f"updater: MassEstimator needs an Oracle of a Quadrotor, got {type(model).__name__}"
+                f"updater: MassEstimator needs an Oracle of a Quadrotor, got "
+                f"{type(model).__name__}; choose dynamics=oracle and robot=quadrotor"
             )
         if "mass" not in model.regime.names:
             raise ConfigurationError(
@@ -98,6 +99,7 @@ class MassEstimator(Updater):
         self.least = check_number("updater.least", least, low=0.0, open_low=True)
         self.most = check_number("updater.most", most, low=self.least, open_low=True)
         self.refused = 0
+        self.claim()
 
     @property
     def model(self) -> Oracle:

@@ -6,19 +6,20 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics import DynamicsModel, Oracle
 from afm_rl.dynamics.knode import KNODE
 from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.regimes import Regime
 from afm_rl.sampling import uniform
 
 
 def pretrain_knode(
     model: KNODE,
     teacher: DynamicsModel,
-    start: Tensor,
-    spread: Tensor,
+    state_box: tuple[Tensor, Tensor],
     action_box: tuple[Tensor, Tensor],
     *,
+    regime: Regime | None = None,
     flights: int = 64,
     ticks: int = 16,
     epochs: int = 200,
@@ -29,17 +30,17 @@ def pretrain_knode(
 ) -> float:
     """Fit a new network of a KNODE to short flights of a teacher; return its held-out error.
 
-    Each flight starts from a state around ``start`` and takes a new action from its box at every
-    tick. States are seen with noise. Full-batch Adam on the squared error of a tick in units of
+    Each flight starts from a state in its box and takes a new action from its box at every tick.
+    States are seen with noise. Full-batch Adam on the squared error of a tick in units of
     the model's own noise, through the integration. The published offline data are not public:
     this recipe is not theirs.
 
     Args:
         model: KNODE to teach, in place: the network is pushed first.
         teacher: model that flies.
-        start: middle of the first states, ``(S,)``.
-        spread: their standard deviation on the tangent space, ``(D,)``.
+        state_box: lowest and highest first state, ``(S,)`` each.
         action_box: lowest and highest action, ``(A,)`` each.
+        regime: every flight is under a regime of its own from this prior; nominal if None.
         flights: number of flights; a tenth as many more are held out.
         ticks: their length.
         epochs: steps of Adam.
@@ -56,9 +57,9 @@ def pretrain_knode(
 
     >>> from afm_rl.dynamics import Quadrotor
     >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
-    >>> box = torch.tensor([0.2, 0, 0, 0]), torch.tensor([0.4, 0, 0, 0])
-    >>> data = {"flights": 4, "ticks": 2, "epochs": 2}
-    >>> error = pretrain_knode(KNODE(Quadrotor()), Quadrotor(), level, torch.ones(12), box, **data)
+    >>> actions = torch.tensor([0.2, 0, 0, 0]), torch.tensor([0.4, 0, 0, 0])
+    >>> boxes, data = ((level, level + 0.1), actions), {"flights": 4, "ticks": 2, "epochs": 2}
+    >>> error = pretrain_knode(KNODE(Quadrotor()), Quadrotor(), *boxes, **data)
     >>> 0 < error < 100
     True
     """
@@ -74,10 +75,10 @@ def pretrain_knode(
     check_count("dynamics.pretrain.seed", seed, low=0)
     generator = torch.Generator().manual_seed(seed)
     space, total = model.manifold, flights + -(-flights // 10)
-    state = space.add(
-        start.expand(total, -1),
-        spread * torch.randn(total, space.tangent_size, generator=generator),
-    )
+    state = space.project(uniform(*state_box, total, generator))
+    if regime is not None:
+        teacher = Oracle(teacher, regime)
+        teacher.tell(regime.sample((total,), generator))
     path, actions = [state], uniform(*action_box, ticks * total, generator).split(total)
     with torch.no_grad():
         for action in actions:

@@ -6,6 +6,7 @@ exact: the nominal body under the effective action moves as the changed body doe
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -20,7 +21,61 @@ from afm_rl.regimes.settings import check_span, draw_between
 LEAST, MOST = 0.01, 100.0  # factors beyond these are typing errors
 
 
-class MassFactor(Regime):
+class FlightRegime(Regime):
+    """A regime in which neither the state, nor earlier actions, nor chance play a part."""
+
+    @abstractmethod
+    def worth(self, action: Tensor, parameters: Tensor) -> Tensor:
+        """Return what actions are worth, ``(*B, 4)``."""
+
+    @abstractmethod
+    def needed(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Return the actions that are worth ``effect``, in the box or not, ``(*B, 4)``."""
+
+    def apply(
+        self,
+        action: Tensor,
+        parameters: Tensor,
+        state: Tensor,
+        past: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """Return :meth:`worth`."""
+        return self.worth(action, parameters)
+
+    def inverse(
+        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
+    ) -> Tensor:
+        """Return :meth:`needed`, clamped."""
+        return self.needed(action, parameters).clamp(low, high)
+
+
+class _Divisor(FlightRegime):
+    """A factor that divides some components of the action."""
+
+    divided: tuple[bool, bool, bool, bool]
+
+    def __init__(self, span: Sequence[float]) -> None:
+        self.span = check_span("span", span, LEAST, MOST)
+
+    def worth(self, action: Tensor, parameters: Tensor) -> Tensor:
+        """Divide."""
+        return action / self._divisors(parameters)
+
+    def needed(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Multiply."""
+        return effect * self._divisors(parameters)
+
+    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
+        """Draw factors ``(*shape, 1)``, uniform."""
+        return draw_between(self.span, (*shape, 1), generator)
+
+    def _divisors(self, factor: Tensor) -> Tensor:
+        one = torch.ones_like(factor)
+        return torch.cat([factor if divided else one for divided in self.divided], -1)
+
+
+class MassFactor(_Divisor):
     r"""Another mass, c m: :math:`v' = g + T / (c m)\,b_3`. The inertia stays what it is.
 
     Args:
@@ -37,33 +92,13 @@ class MassFactor(Regime):
     names = ("mass",)
     identity = (1.0,)
     limits = {"mass": (LEAST, MOST)}
+    divided = (True, False, False, False)
 
     def __init__(self, span: Sequence[float] = (0.5, 1.5)) -> None:
-        self.span = check_span("span", span, LEAST, MOST)
-
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Divide the thrust by c; the state plays no part."""
-        return action / _divisors(parameters, torch.ones_like(parameters))
-
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Multiply and clamp."""
-        return (action * _divisors(parameters, torch.ones_like(parameters))).clamp(low, high)
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw factors ``(*shape, 1)``, uniform."""
-        return draw_between(self.span, (*shape, 1), generator)
+        super().__init__(span)
 
 
-class InertiaFactor(Regime):
+class InertiaFactor(_Divisor):
     r"""Other moments of inertia, c J: :math:`\omega' = J^{-1} (M / c - \omega \times J \omega)`.
 
     Args:
@@ -81,33 +116,13 @@ class InertiaFactor(Regime):
     names = ("inertia",)
     identity = (1.0,)
     limits = {"inertia": (LEAST, MOST)}
+    divided = (False, True, True, True)
 
     def __init__(self, span: Sequence[float] = (0.5, 2.0)) -> None:
-        self.span = check_span("span", span, LEAST, MOST)
-
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Divide the moments by c; the state plays no part."""
-        return action / _divisors(torch.ones_like(parameters), parameters)
-
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Multiply and clamp."""
-        return (action * _divisors(torch.ones_like(parameters), parameters)).clamp(low, high)
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw factors ``(*shape, 1)``, uniform."""
-        return draw_between(self.span, (*shape, 1), generator)
+        super().__init__(span)
 
 
-class MotorEfficiency(Regime):
+class MotorEfficiency(FlightRegime):
     r"""Motors of which each gives a share :math:`\eta_i` of its thrust and drag.
 
     .. math:: u_\mathrm{eff} = X\,\mathrm{diag}(\eta)\,X^{-1} u
@@ -137,30 +152,21 @@ class MotorEfficiency(Regime):
         self.body = QuadrotorBody() if body is None else body
         self.span = check_span("span", span, 0.0, 1.0)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Take away what is lost; the state plays no part."""
+    def worth(self, action: Tensor, parameters: Tensor) -> Tensor:
+        """Take away what is lost."""
         return action + mix(unmix(action, self.body) * (parameters - 1), self.body)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Ask each motor for more and clamp; nothing is asked of one that stands still."""
-        forces = unmix(action, self.body)
-        return (action + mix(divide(forces, parameters) - forces, self.body)).clamp(low, high)
+    def needed(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Ask each motor for more; nothing is asked of one that stands still."""
+        forces = unmix(effect, self.body)
+        return effect + mix(divide(forces, parameters) - forces, self.body)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw shares ``(*shape, 4)``, uniform."""
         return draw_between(self.span, (*shape, 4), generator)
 
 
-class Payload(Regime):
+class Payload(FlightRegime):
     r"""A small load of mass p m, fixed at (x, y) in the plane of the rotors.
 
     The centre of mass moves to :math:`d = p / (1 + p)\,(x, y)`; the thrust has a moment about it:
@@ -193,24 +199,15 @@ class Payload(Regime):
         self.share = check_span("share", share, 0.0, MOST)
         self.offset = check_span("offset", offset)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Share the thrust and tilt; the state plays no part."""
+    def worth(self, action: Tensor, parameters: Tensor) -> Tensor:
+        """Share the thrust and tilt."""
         thrust = action[..., :1]
         return action / self._weight(parameters) + thrust * self._levers(parameters)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Push more, lean against the tilt, and clamp."""
-        needed = action * self._weight(parameters)
-        return (needed - needed[..., :1] * self._levers(parameters)).clamp(low, high)
+    def needed(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Push more, and lean against the tilt."""
+        needed = effect * self._weight(parameters)
+        return needed - needed[..., :1] * self._levers(parameters)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw p, x and y ``(*shape, 3)``, uniform."""
@@ -219,7 +216,8 @@ class Payload(Regime):
 
     def _weight(self, parameters: Tensor) -> Tensor:
         share = parameters[..., :1]
-        return _divisors(1 + share, torch.ones_like(share))
+        one = torch.ones_like(share)
+        return torch.cat([1 + share, one, one, one], -1)
 
     def _levers(self, parameters: Tensor) -> Tensor:
         share, x, y = parameters.split(1, -1)
@@ -227,7 +225,7 @@ class Payload(Regime):
         return torch.cat([none, -moved * y, moved * x, none], -1)
 
 
-class Wind(Regime):
+class Wind(FlightRegime):
     """A steady wind, as an acceleration (m/s^2) in the world frame.
 
     No action does what it does, so :meth:`apply` leaves the action alone: simulators ask
@@ -250,22 +248,13 @@ class Wind(Regime):
     def __init__(self, span: Sequence[float] = (-1.0, 1.0)) -> None:
         self.span = check_span("span", span)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
+    def worth(self, action: Tensor, parameters: Tensor) -> Tensor:
         """Return the action."""
         return action
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Clamp."""
-        return action.clamp(low, high)
+    def needed(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Return the effect."""
+        return effect
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw accelerations ``(*shape, 3)``, uniform."""
@@ -303,8 +292,3 @@ def flight_regimes(body: QuadrotorBody | None = None) -> Compose:
         "wind": Wind(),
     }
     return Compose(families, prior=[[name] for name in families if name != "gain"])
-
-
-def _divisors(thrust: Tensor, moments: Tensor) -> Tensor:
-    """Return ``(*B, 4)``: one divisor ``(*B, 1)`` of the thrust, and one of all moments."""
-    return torch.cat([thrust, moments.expand(*moments.shape[:-1], 3)], -1)
