@@ -16,16 +16,16 @@ from afm_rl.flow.counterfactuals import excite, imagine, rows_filled, rows_of_no
 from afm_rl.flow.hints import ANSWERS, MISSES, Fits, fit_window
 from afm_rl.flow.network import mlp
 from afm_rl.flow.pairs import PairCorrector
-from afm_rl.flow.saturation import MODES, intend
+from afm_rl.flow.saturation import MODES, attainable, intend
 from afm_rl.flow.solver import midpoint
-from afm_rl.flow.views import VIEWS, Pairs, look, memory_of
+from afm_rl.flow.views import VIEWS, Memory, Pairs, memory_of
 from afm_rl.regimes import Regime
 from afm_rl.sampling import draw_states
 
 SILENT = "silent"  # the hypothesis that actions are worth what they are
 SILENT_DOUBT = 0.02
 TOLERATED = 0.25  # half ranges: a prediction that misses by so much does half as badly as can be
-PLANS = 32  # points at which the reach is asked for
+PROBES = 32  # actions whose effects are asked for the reach
 
 
 class Reading(NamedTuple):
@@ -62,7 +62,7 @@ class ContextFlow(PairCorrector, Flow):
       :math:`\rho(x) = x^2 / (x^2 + 0.25^2)`.
     * Which proposal is best? Where the flow's samples differ by more than ``unsure``, the
       context is ambiguous and their mean may mean nothing. Then that one is executed whose
-      expected effect comes nearest to the plan.
+      expected effect comes nearest to what can be had of the plan.
     * What can be had at all? The reach of effects, for planners that want to know.
 
     The model counts as misaligned while the largest surprise of the last K transitions exceeds
@@ -125,6 +125,7 @@ class ContextFlow(PairCorrector, Flow):
         self.place = list(place)
         self.place_scale = check_number("flow.place_scale", place_scale, low=0.0, open_low=True)
         self.views = _check_views(views, by_place=bool(self.place))
+        self._views = [VIEWS.get(name, VIEWS["recent"]) for name in self.views]
         self.forgetting = check_number("flow.forgetting", forgetting, low=0.0, high=1.0)
         self.samples = check_count("flow.samples", samples)
         self.source_std = check_number("flow.source_std", source_std, low=0.0)
@@ -149,7 +150,7 @@ class ContextFlow(PairCorrector, Flow):
         points = torch.cat([half, -half])[:samples]
         self.register_buffer("source_points", points, persistent=False)
         ends = torch.cat([torch.eye(size), -torch.eye(size)])
-        inner = 2 * torch.quasirandom.SobolEngine(size).draw(PLANS - 2 * size) - 1
+        inner = 2 * torch.quasirandom.SobolEngine(size).draw(max(1, PROBES - 2 * size)) - 1
         self.register_buffer("probes", torch.cat([ends, inner]), persistent=False)
         doubt = [VIEWS[name].doubt if name != SILENT else SILENT_DOUBT for name in self.views]
         self.register_buffer("doubt", torch.tensor(doubt), persistent=False)
@@ -255,43 +256,38 @@ class ContextFlow(PairCorrector, Flow):
         features = pairs.new_zeros(*shape, self.feature_size)
         if not bool(surprised.any()):  # nothing to explain
             return Context(pairs, evidence, features, surprise, surprised)
-        seen = Window(*(part[surprised] for part in window))
-        remembered = pairs[surprised]
-        loss, shown = self._compare(seen, remembered)
-        newest = remembered[:, -1, -2:-1]  # does it count?
-        evidence[surprised] = evidence[surprised] + newest * loss
+        memory = self._recall(window, pairs, surprised)
+        newest = memory.pairs.valid[:, -1]  # does it count?
+        evidence[surprised] = evidence[surprised] + newest * self._misses(memory)
         best = (evidence[surprised] + self.doubt).argmin(-1)
-        features[surprised] = shown[torch.arange(len(best), device=best.device), best]
+        features[surprised] = memory.now(self._views, best, self.shown)
         misaligned = surprised.clone()
         if SILENT in self.views:
             misaligned[surprised] = best != self.views.index(SILENT)
         return Context(pairs, evidence, features, surprise, misaligned)
 
-    def _compare(self, window: Window, remembered: Tensor) -> tuple[Tensor, Tensor]:
-        """Return how badly each view predicted the newest pair ``(N, V)``, and what it shows now.
-
-        The latter are features ``(N, V, C)``.
-        """
-        size = self.action_size
-        pairs = Pairs(*remembered[..., :-1].split([size, size, 1], -1))
-        end = self.window
-        views = [VIEWS.get(name, VIEWS["recent"]) for name in self.views]
-        states = torch.cat([window.state, window.next_state[:, -1:]], -2)
-        away = [self._away(states[:, :-1], states[:, k]) for k in (end - 1, end)]
-        before = look(pairs.rows(0, end - 1), views, self.shown, away[0][:, :-1])
-        now = look(pairs, views, self.shown, away[1])
-        late = torch.tensor([end - 1 - view.late for view in views], device=remembered.device)
-        acted = pairs.executed[:, late]
-        expected = self.effect(self.read(before), acted)
-        if SILENT in self.views:
-            expected[:, self.views.index(SILENT)] = acted[:, self.views.index(SILENT)]
-        miss = (expected - pairs.effective[:, -1:]).square()
-        return (miss / (miss + TOLERATED**2)).mean(-1), now
+    def _recall(self, window: Window, pairs: Tensor, rows: Tensor) -> Memory:
+        """Return what ``rows`` of the batch remember."""
+        size, state = self.action_size, window.state[rows]
+        seen = Pairs(*pairs[rows][..., :-1].split([size, size, 1], -1))
+        here = window.next_state[rows][:, -1]
+        away = [self._away(state, now) for now in (state[:, -1], here)]
+        return Memory(seen, *away)
 
     def _away(self, there: Tensor, here: Tensor) -> Tensor:
         """Return squared distances in place ``(N, M)`` of states ``(N, M, S)`` from ``(N, S)``."""
         apart = there[..., self.place] - here[:, None, self.place]
         return (apart / self.place_scale).square().sum(-1).nan_to_num(torch.inf)
+
+    def _misses(self, memory: Memory) -> Tensor:
+        """Return how badly each view predicted the newest pair, ``(N, V)``."""
+        before, acted, worth = memory.before(self._views, self.shown)
+        expected = self.effect(self.read(before), acted)
+        if SILENT in self.views:
+            silent = self.views.index(SILENT)
+            expected[:, silent] = acted[:, silent]
+        miss = (expected - worth).square()
+        return (miss / (miss + TOLERATED**2)).mean(-1)
 
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
         """Integrate the flow from every source point; return the best end, spread and reach."""
@@ -312,13 +308,13 @@ class ContextFlow(PairCorrector, Flow):
         proposals = torch.cat([mean, ends], -2).clamp(-1.0, 1.0)
         probes = self.probes.expand(*proposals.shape[:-2], *self.probes.shape)
         expected = self.effect(known.wide(), torch.cat([proposals, probes], -2))
-        count = proposals.shape[-2]
-        best = (expected[..., :count, :] - unit).square().sum(-1).argmin(-1)[..., None, None]
+        expected, found = expected.split([proposals.shape[-2], probes.shape[-2]], -2)
+        reach = torch.stack([found.amin(-2), found.amax(-2)], -2)
+        wanted = attainable(unit.squeeze(-2), *reach.unbind(-2), self.saturation)
+        best = (expected - wanted.unsqueeze(-2)).square().sum(-1).argmin(-1)[..., None, None]
         chosen = proposals.gather(-2, best.expand_as(mean)).squeeze(-2)
         unsure = spread.amax(-1, keepdim=True) > self.unsure
         action = torch.where(unsure, chosen, mean.squeeze(-2))
-        found = expected[..., count:, :]
-        reach = torch.stack([found.amin(-2), found.amax(-2)], -2)
         return Correction(
             self.denormalise(action), spread * self.half_range, self.denormalise(reach)
         )
@@ -334,7 +330,7 @@ def _about(known: Reading, answers: Tensor, unit: Tensor) -> Tensor:
 def _check_views(views: Sequence[str], by_place: bool) -> list[str]:
     """Return the names of the views, without those by place if places are not known."""
     allowed = (SILENT, *VIEWS)
-    if isinstance(views, str) or not list(views):
+    if isinstance(views, str) or not isinstance(views, Sequence) or not views:
         raise ConfigurationError(f"flow.views={views!r}: expected a list of {', '.join(allowed)}")
     for name in views:
         check_choice("flow.views", name, allowed)

@@ -65,7 +65,7 @@ class L1Augmentation(PairCorrector):
         bandwidth: of the low-pass, :math:`\omega` (rad/s).
         window: transitions that can be remembered, K.
         gate: in standard deviations of the model.
-        saturation: ``"clip"``, as is customary, or ``"direction"``.
+        saturation: ``"clip"``, as is customary, ``"direction"`` or ``"mixed"``.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.

@@ -143,7 +143,7 @@ class LeastSquares(PairCorrector):
         window: transitions that can be remembered, K.
         forgetting: weight of a transition relative to the next one, in (0, 1].
         gate: in standard deviations of the model.
-        saturation: ``"clip"``, as is customary, or ``"direction"``.
+        saturation: ``"clip"``, as is customary, ``"direction"`` or ``"mixed"``.
 
     >>> LeastSquares(torch.tensor([-1.0]), torch.tensor([1.0])).feature_size
     72

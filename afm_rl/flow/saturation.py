@@ -31,6 +31,26 @@ def saturate(unit: Tensor, mode: str) -> Tensor:
     return torch.where(excess * LEAST > 1.0, unit / excess, unit.clamp(-1.0, 1.0))
 
 
+def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
+    """Return the part of a planned action ``(*B, A)`` that should be had, in half ranges.
+
+    Args:
+        unit: the planned action.
+        low: lowest effect that can be had, ``(*B, A)``.
+        high: highest.
+        mode: see :func:`saturate`; ``"clip"`` still asks for all of it.
+
+    >>> half, most = torch.tensor([-1.0, -0.5]), torch.tensor([1.0, 0.5])
+    >>> attainable(torch.tensor([0.5, -1.0]), half, most, "direction")
+    tensor([ 0.2500, -0.5000])
+    """
+    if mode == "clip":
+        return unit
+    limit = torch.where(unit < 0, -low, high).clamp_min(0.0)
+    share = (limit / unit.abs().clamp_min(1e-6)).amin(-1, keepdim=True).clamp_max(1.0)
+    return unit * share if mode == "direction" else torch.where(share < LEAST, unit * share, unit)
+
+
 def intend(
     regime: Regime,
     planned: Tensor,

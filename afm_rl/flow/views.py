@@ -113,3 +113,35 @@ def _nearest(pairs: Pairs, away: Tensor | None, rows: int) -> Pairs:
         return part.gather(-2, chosen.expand(*chosen.shape[:-1], part.shape[-1]))
 
     return Pairs(*(pick(part) for part in pairs))
+
+
+class Memory(NamedTuple):
+    """What N robots remember, and how far from it they are."""
+
+    pairs: Pairs
+    """The pairs, ``(N, M, ...)``."""
+    away_before: Tensor
+    """Squared distance in place of each pair from where the robot was a step ago, ``(N, M)``."""
+    away: Tensor
+    """From where it is now."""
+
+    def before(self, views: Sequence[View], rows: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what each view showed a step ago, and what it should have foreseen.
+
+        Features ``(N, V, K (2 A + 1))``, the actions that were about to act ``(N, V, A)`` and the
+        effect that there was ``(N, 1, A)``.
+        """
+        newest = self.pairs.valid.shape[-2] - 1
+        shown = look(self.pairs.rows(0, newest), views, rows, self.away_before[:, :-1])
+        acted = self.pairs.executed[:, [newest - view.late for view in views]]
+        return shown, acted, self.pairs.effective[:, -1:]
+
+    def now(self, views: Sequence[View], chosen: Tensor, rows: int) -> Tensor:
+        """Return what the ``chosen`` views ``(N,)`` show now, features ``(N, K (2 A + 1))``."""
+        executed = self.pairs.executed
+        features = executed.new_empty(len(chosen), rows * (2 * executed.shape[-1] + 1))
+        for k in chosen.unique().tolist():
+            who = chosen == k
+            pairs = Pairs(*(part[who] for part in self.pairs))
+            features[who] = look(pairs, [views[k]], rows, self.away[who]).squeeze(-2)
+        return features

@@ -1,0 +1,117 @@
+"""Draw the figures of docs/afm.md.
+
+Run ``python examples/explain_afm/figures.py --out docs/images``.
+The first run trains two flows (some minutes); they are kept in the cache of ``afm-rl``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_module
+from matplotlib.axes import Axes
+
+from afm_rl.artefacts import write_whole
+from afm_rl.missions import Agent, build, prepare, run
+from afm_rl.report.style import dress, method_styles, new_figure, png_bytes
+
+FORMS = {
+    "no correction": ["method=physics"],
+    "as published": ["method=afm_physics", "flow=paper"],
+    "ours": ["method=afm_physics"],
+    "oracle": ["method=oracle"],
+}
+TURNED = "regimes=[{v_gain: -1, omega_gain: 2}]"  # a regime of the paper
+TRAPS = {
+    "reversed motors, commands two steps late": "regimes=[{v_gain: -1, delay: 2}]",
+    "patches of ground on which driving is reversed": "regimes=[{patch_v_gain: -1}]",
+}
+NAMES = {
+    "silent": "as they are",
+    "recent": "recent",
+    "newest": "newest",
+    "long": "long",
+    "mean": "averaged",
+    "late_1": "one step late",
+    "late_2": "two steps late",
+    "near": "near in place",
+    "nearest": "nearest in place",
+}
+
+
+def agent_of(*overrides: str) -> Agent:
+    """Return an agent on the first track, its parts trained or taken from the cache."""
+    with initialize_config_module("afm_rl.conf", version_base=None):
+        cfg = compose("config", ["tracks=ethz_1", "seeds=1", *overrides])
+    agent = build(cfg)
+    prepare(agent, cfg.cache, progress=True)
+    return agent
+
+
+def draw_progress(axes: Axes, budget: int) -> None:
+    """Draw the targets reached against steps, for each form of the method."""
+    styles = method_styles(FORMS)
+    for name, overrides in FORMS.items():
+        steps = run(agent_of(TURNED, f"budget={budget}", *overrides)).steps
+        lines = {"color": styles[name].color, "linestyle": styles[name].linestyle}
+        axes.plot(steps["t"], steps["reached"], label=name, **lines)
+        if name == "oracle":
+            turned = steps.loc[steps["regime_active"] > 0, "t"]
+            axes.axvspan(turned.min(), budget, color="#e69f00", alpha=0.15, lw=0)
+            axes.annotate("reversed, turning doubled", (turned.min() + 5, 1), fontsize=8)
+    axes.set(xlabel="step", ylabel="targets reached", xlim=(0, budget), ylim=(0, 35))
+    axes.legend(frameon=False, fontsize=8)
+
+
+@torch.no_grad()
+def draw_evidence(axes: Axes, regimes: str, budget: int) -> None:
+    """Draw how badly each view of the memory predicted of late, and which one is believed."""
+    agent = agent_of("method=afm_physics", regimes, f"budget={budget}")
+    start = agent.env.reset(agent.missions, set_state=False)
+    rollout = agent.env.rollout(budget, agent.planner, auto_reset=False, tensordict=start)
+    flow = agent.transform.flow
+    memory = rollout["next", "afm"][0]
+    evidence, active = memory["evidence"], memory["misaligned"]
+    believed = (evidence + flow.doubt).argmin(-1)
+    first = int(active.int().argmax()) - 5
+    shown = [name for name in flow.views if name in NAMES]
+    styles = method_styles(shown)
+    for k, name in enumerate(shown):
+        times = first + torch.arange(len(evidence[first : first + 80]))
+        lines = {"color": styles[name].color, "linestyle": styles[name].linestyle}
+        axes.plot(times, evidence[first : first + 80, k], label=NAMES[name], lw=1.2, **lines)
+        rows = [int(t) for t in times if active[t] and believed[t] == k]
+        axes.plot(rows, [-0.25] * len(rows), "s", ms=3, color=styles[name].color)
+    axes.set(xlabel="step", ylabel="recent misses $E_v$", ylim=(-0.5, None))
+
+
+def main() -> None:
+    """Draw all figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("outputs/explain_afm"))
+    parser.add_argument("--budget", type=int, default=900, help="steps of a mission")
+    asked = parser.parse_args()
+    asked.out.mkdir(parents=True, exist_ok=True)
+
+    figure = new_figure(6.0, 3.2)
+    axes = figure.subplots()
+    dress(axes)
+    draw_progress(axes, asked.budget)
+    write_whole(asked.out / "afm_forms.png", png_bytes(figure))
+
+    figure = new_figure(9.0, 3.6)
+    pair = figure.subplots(1, 2)
+    for axes, (title, regimes) in zip(pair, TRAPS.items(), strict=True):
+        dress(axes)
+        draw_evidence(axes, regimes, asked.budget)
+        axes.set_title(title, fontsize=9)
+    figure.legend(
+        *pair[1].get_legend_handles_labels(), loc="outside lower center", ncols=9, fontsize=7
+    )
+    write_whole(asked.out / "afm_views.png", png_bytes(figure))
+
+
+if __name__ == "__main__":
+    main()
