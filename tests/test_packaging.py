@@ -54,6 +54,20 @@ def run(*command: str | Path, cwd: Path, **env: str) -> str:
     return done.stdout
 
 
+def build_wheel(source: Path, folder: Path) -> None:
+    build = ["build", "--wheel", "--no-isolation", "--outdir", folder, source]
+    run(sys.executable, "-m", *build, cwd=folder)
+
+
+def install(folder: Path, *wheels: Path) -> Path:
+    """Make an environment that holds the wheels and nothing else; return its interpreter."""
+    python = folder / "venv" / "bin" / "python"
+    run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder)
+    pip = ["pip", "--python", python, "install", "--no-deps", "--no-index", "--no-compile"]
+    run(sys.executable, "-m", *pip, *wheels, cwd=folder)
+    return python
+
+
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory):
     """A new environment that holds the wheel and nothing else."""
@@ -65,13 +79,8 @@ def environment(tmp_path_factory):
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, folder / "source")
 
-    python = folder / "venv" / "bin" / "python"
-    build = ["build", "--wheel", "--no-isolation", "--outdir", folder, folder / "source"]
-    run(sys.executable, "-m", *build, cwd=folder)
-    run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder)
-    install = ["pip", "--python", python, "install", "--no-deps", "--no-index", "--no-compile"]
-    run(sys.executable, "-m", *install, *folder.glob("*.whl"), cwd=folder)
-    return python
+    build_wheel(folder / "source", folder)
+    return install(folder, *folder.glob("*.whl"))
 
 
 @pytest.fixture
@@ -80,16 +89,21 @@ def site_packages(environment):
     return folder
 
 
-@pytest.fixture
-def run_there(environment, tmp_path):
-    """Runs a command in the new environment, from a folder outside the repository.
+def borrowed() -> dict[str, str]:
+    """Lend the libraries of this environment to another.
 
-    It borrows the libraries of this environment, by a path on which `.pth` files have no effect: an
-    editable installation works through one, and would lend the wheel the modules that it lacks.
+    By a path on which `.pth` files have no effect: an editable installation works through one, and
+    would lend the wheel the modules that it lacks.
     """
     libraries = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
-    path = {"PYTHONPATH": os.pathsep.join(libraries), "PYTHONDONTWRITEBYTECODE": "1"}
-    return lambda *command: run(environment.parent / command[0], *command[1:], cwd=tmp_path, **path)
+    return {"PYTHONPATH": os.pathsep.join(libraries), "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+@pytest.fixture
+def run_there(environment, tmp_path):
+    """Runs a command in the new environment, from a folder outside the repository."""
+    there = environment.parent
+    return lambda name, *rest: run(there / name, *rest, cwd=tmp_path, **borrowed())
 
 
 patient = pytest.mark.timeout(300)  # whichever test comes first builds the wheel
@@ -118,3 +132,33 @@ def test_the_wheel_imports_from_anywhere(run_there, site_packages):
 @pytest.mark.parametrize("command", [["afm-rl"], ["python", "-m", "afm_rl.cli"]], ids=" ".join)
 def test_the_command_line_runs_from_anywhere(run_there, command):
     assert "planner" in run_there(*command, "--help")  # the help shows the composed configuration
+
+
+@pytest.mark.slow
+@patient
+def test_a_project_with_envs_and_conf_of_its_own_lives_beside_ours(environment, tmp_path):
+    shutil.copytree(ROOT / "examples" / "external_project", tmp_path / "project")
+    build_wheel(tmp_path / "project", tmp_path)
+    python = install(tmp_path, *tmp_path.glob("*.whl"), *environment.parents[2].glob("*.whl"))
+
+    def there(name, *rest):
+        return run(python.parent / name, *rest, cwd=tmp_path / "venv", **borrowed())
+
+    (site,) = (tmp_path / "venv").glob("lib/python*/site-packages")
+    names = ["envs", "conf", "afm_rl.envs", "afm_rl.conf"]
+    code = "from importlib import import_module as of; import sys\n"
+    code += "for name in sys.argv[1:]: print(of(name).__file__)"
+    found = there("python", "-c", code, *names).splitlines()
+    assert found == [f"{site}/{name.replace('.', '/')}/__init__.py" for name in names]
+
+    assert there("ferry").startswith("landed after ")  # with our planner, cost and transform
+    assert there("ferry", "transform.enabled=false").startswith("lost after ")
+
+    remove = ["pip", "--python", python, "uninstall", "--yes"]
+    run(sys.executable, "-m", *remove, "afm-rl", cwd=tmp_path)
+    assert {path.name for path in site.iterdir()} - {"ferry-1.0.dist-info"} == {
+        *("conf", "envs", "ferry")
+    }
+    assert there("python", "-c", "import envs; print(envs.__file__)") == f"{found[0]}\n"
+    run(sys.executable, "-m", *remove, "ferry", cwd=tmp_path)
+    assert list(site.iterdir()) == []

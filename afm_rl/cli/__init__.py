@@ -12,8 +12,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from afm_rl.cli.launchers import register
+from afm_rl.cli.launchers.base import SweepError
 from afm_rl.cli.mistakes import explain
-from afm_rl.cli.overrides import relaxed
+from afm_rl.cli.overrides import relaxed, with_sweep_folder
 
 
 @hydra.main(version_base="1.3", config_path="pkg://afm_rl.conf", config_name="config")
@@ -39,12 +41,13 @@ def _explained(sweep: bool = False) -> Iterator[None]:
         print(f"afm-rl: {message}", file=sys.stderr)
         if sweep:
             raise  # the other jobs go on; Hydra raises the first error again at the end
-        sys.exit(2)
+        sys.exit(1 if isinstance(error, SweepError) else 2)
 
 
 def main() -> None:
     """Run ``afm-rl``; a mistake in the settings ends in one line and exit status 2."""
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # hand errors to us instead of printing them
-    sys.argv[1:] = relaxed(sys.argv[1:])
+    sys.argv[1:] = with_sweep_folder(relaxed(sys.argv[1:]))
     with _explained():
+        register()
         _run()

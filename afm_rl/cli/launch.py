@@ -16,7 +16,7 @@ from afm_rl.artefacts import write_whole
 from afm_rl.cli.overrides import PARTS, has, optional
 from afm_rl.errors import ConfigurationError, check_count, check_flag
 from afm_rl.missions import build, prepare, run
-from afm_rl.report import print_summary, write_run
+from afm_rl.report import check_video, print_summary, write_films, write_run
 
 SWITCHES = ("overwrite", "progress", "figures", "tensorboard")
 
@@ -29,6 +29,7 @@ def launch(cfg: DictConfig) -> None:
     torch.set_num_threads(check_count("threads", cfg.threads))
     for name in SWITCHES:
         check_flag(name, cfg[name])
+    film = check_video(cfg.video)
     if not isinstance(cfg.cache, str):
         raise ConfigurationError(f"cache={cfg.cache!r}: expected a folder")
     job = HydraConfig.get()
@@ -40,6 +41,10 @@ def launch(cfg: DictConfig) -> None:
         )
     methods = _methods(cfg, list(job.overrides.task), job.runtime.choices.get("method"))
     if study is not None:
+        if film is not None:
+            raise ConfigurationError(
+                f"video={cfg.video}: a study makes no films; use afm-rl-report {folder} --video gif"
+            )
         from afm_rl.cli.study import launch_study  # file locks: not on every system
 
         launch_study(study, methods, folder, cfg.progress, cfg.figures)
@@ -56,6 +61,8 @@ def launch(cfg: DictConfig) -> None:
     tracks = {track.name: track for some in roads for track in some}
     shown = {"figures": cfg.figures, "tensorboard": cfg.tensorboard}
     write_run(folder, missions, steps, list(tracks.values()), **shown)
+    if film is not None:
+        write_films(folder / "video", missions, steps, list(tracks.values()), film)
     print_summary(missions)
     print(f"Results: {folder}")
 

@@ -12,12 +12,14 @@ from afm_rl.cli.mistakes import explain, one_line
 
 NAME = "afm-rl-report"
 ABOUT = """\
-Join the results of runs and studies; write tables (CSV, LaTeX), figures and one HTML page.
+Join the results of runs, sweeps and studies; write tables (CSV, LaTeX), figures and one HTML page.
 
   afm-rl-report outputs/demo                       one run: report in outputs/demo/report
+  afm-rl-report multirun/NAME                      a sweep: methods named after what is swept
   afm-rl-report study_a study_b --out report       several folders, joined
   afm-rl-report study --baselines physics          compare every method with physics
   afm-rl-report study --no-figures                 tables only, in seconds
+  afm-rl-report outputs/demo --video gif           films only, one per method, in report/video
 
 A folder is what `afm-rl` or a study has written: missions.csv, and steps.parquet for curves, maps
 and recovery times. A study may still be running: the report takes what is finished, and says
@@ -50,15 +52,21 @@ def main() -> None:
     )
     add("--oracle", metavar="METHOD", default="oracle", help="who knows the regime (oracle)")
     add("--no-figures", dest="figures", action="store_false", help="write tables only")
+    films = "write films only, of each method's first mission: gif, or mp4, which needs an extra"
+    add("--video", choices=("gif", "mp4"), help=films)
     options = parser.parse_args()
 
     from afm_rl.envs import load_track  # torch takes seconds: `--help` need not wait
+    from afm_rl.report.film import check_video, film_results
     from afm_rl.report.write import write_report
 
     out = options.out or options.folders[0] / "report"
     chosen = {"baselines": options.baselines, "oracle": options.oracle, "figures": options.figures}
     try:
-        write_report(options.folders, out, **chosen, load_track=load_track)
+        if form := check_video(options.video or False):
+            film_results(options.folders, out / "video", form, load_track)
+        else:
+            write_report(options.folders, out, **chosen, load_track=load_track)
     except BrokenPipeError:  # nobody reads on, as in `afm-rl-report study | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)

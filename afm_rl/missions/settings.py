@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 WITHOUT_INFLUENCE = (
-    *("progress", "figures", "tensorboard", "overwrite", "cache", "threads"),
+    *("progress", "figures", "video", "tensorboard", "overwrite", "cache", "threads"),
     *("compare", "study", "label"),
 )
 """Settings that change how a run is done, shown or called, but not its results."""

@@ -84,7 +84,7 @@ class Crew:
         except (EOFError, OSError):
             self.members.remove(member)
             member.process.join()
-            reason = _last_words(member.process.exitcode or 0)
+            reason = last_words(member.process.exitcode or 0)
             self.listen(member.shard, Report(over=True, failure=reason))
             return
         shard = member.shard
@@ -109,14 +109,14 @@ class Crew:
             member.process.join()
 
 
-def _last_words(status: int) -> str:
+def last_words(status: int) -> str:
     """Say how a process ended.
 
-    >>> _last_words(-9)
+    >>> last_words(-9)
     'its process was ended by SIGKILL; was there enough memory?'
-    >>> _last_words(3)
+    >>> last_words(3)
     'its process ended with status 3'
-    >>> _last_words(0)
+    >>> last_words(0)
     'its process was told to stop'
     """
     if status == 0:

@@ -29,6 +29,8 @@ physics         budget=${nope}                           nope
 physics         threads=0                                threads=0
 physics         overwrite=perhaps                        overwrite='perhaps'
 physics         figures=3                                figures=3
+physics         video=avi                                video='avi' gif mp4
+physics         video=true,study=ugv                     video=True afm-rl-report
 physics         ~tensorboard                             tensorboard
 physics         cache=null                               cache=None
 -               compare=[nope]                           method/nope afm_physics

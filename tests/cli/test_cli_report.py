@@ -78,6 +78,17 @@ def test_a_report_of_a_run(call, run_folder):
     assert (run_folder / "report" / "tables" / "paper_ethz_2_steps.tex").exists()
 
 
+def test_films_in_place_of_a_report(call, afm_rl, tmp_path):
+    chosen = ["method=physics", "budget=3", "planner.population=8", f"hydra.run.dir={tmp_path}"]
+    quick = ["progress=false", "figures=false", "tensorboard=false"]
+    assert afm_rl(*chosen, *quick, "video=true").status == 0
+    done = call(tmp_path, "--video", "gif")
+    film = tmp_path / "report" / "video" / "physics.gif"
+    assert (done.status, done.err, done.out) == (0, "", f"wrote {film}\n")
+    assert film.read_bytes() == (tmp_path / "video" / "physics.gif").read_bytes()
+    assert not (tmp_path / "report" / "index.html").exists()
+
+
 def test_tables_only_in_a_folder_of_one_s_choice(call, run_folder, tmp_path):
     done = call(run_folder, "--out", tmp_path / "elsewhere", "--no-figures", "--oracle", "physics")
     assert done.status == 0
@@ -93,6 +104,8 @@ def test_tables_only_in_a_folder_of_one_s_choice(call, run_folder, tmp_path):
         (["a", "--fast"], "unrecognized arguments: --fast"),
         (["nowhere"], "nowhere: no such folder"),
         (["nowhere", "--out"], "argument --out: expected one argument"),
+        (["nowhere", "--video", "gif"], "nowhere: no such folder"),
+        (["nowhere", "--video", "avi"], "argument --video: invalid choice: 'avi'"),
     ],
 )
 def test_mistakes_end_in_one_line(call, arguments, message):

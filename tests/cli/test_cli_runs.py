@@ -86,25 +86,6 @@ def test_results_are_not_overwritten_unless_told(afm_rl, tmp_path, quick):
     assert len(pd.read_csv(tmp_path / "missions.csv")) == 2
 
 
-def test_a_sweep_makes_a_folder_for_each_job(afm_rl, tmp_path, quick):
-    done = afm_rl(
-        "-m", "method=physics", "budget=2", "seeds=1,2", f"hydra.sweep.dir={tmp_path}", *quick
-    )
-    assert done.status == 0
-    folders = {path.parent.name: len(pd.read_csv(path)) for path in tmp_path.glob("*/missions.csv")}
-    assert sorted(folders.values()) == [1, 2]
-    assert all(f"seeds={count}" in name for name, count in folders.items())
-
-
-def test_a_sweep_goes_on_after_a_mistake_and_reports_it(afm_rl, tmp_path, quick):
-    done = afm_rl(
-        "-m", "method=physics", "budget=2", "seeds=0,1", f"hydra.sweep.dir={tmp_path}", *quick
-    )
-    assert done.status == 2
-    assert "afm-rl: seeds=0: expected a count" in done.err and "Traceback" not in done.err
-    assert len(list(tmp_path.glob("*/missions.csv"))) == 1
-
-
 def stored(folder):
     missions = pd.read_csv(folder / "missions.csv").drop(columns="seconds")
     return missions, pd.read_parquet(folder / "steps.parquet")

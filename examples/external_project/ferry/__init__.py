@@ -1,0 +1,1 @@
+"""A ferry, steered by afm-rl."""

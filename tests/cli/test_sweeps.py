@@ -1,0 +1,258 @@
+"""Sweeps: which jobs are run, where they go, and what is said of them."""
+
+import os
+import sys
+from contextlib import nullcontext
+from types import ModuleType, SimpleNamespace
+
+import pytest
+import yaml
+
+from afm_rl.cli.launchers import slurm
+from afm_rl.cli.launchers.base import needs
+from afm_rl.cli.launchers.job import FINISHED, Job, run
+from afm_rl.cli.overrides import with_sweep_folder
+from afm_rl.errors import ConfigurationError
+
+SWEEP = ["-m", "method=physics", "planner.horizon=3,5"]
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """Have jobs done at once, unless ``failing`` names one; return what was run."""
+    calls = SimpleNamespace(jobs=[], failing="none")
+
+    def work(job):
+        calls.jobs.append(job)
+        if calls.failing in job.name:
+            return "out of luck"
+        (job.folder / FINISHED).write_text(f"{job.digest}\n")
+        return None
+
+    monkeypatch.setattr("afm_rl.cli.launchers.local.run", work)
+    return calls
+
+
+@pytest.fixture
+def sweep(afm_rl, tmp_path, monkeypatch):
+    """Run a sweep in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    return lambda *settings: afm_rl(*settings, f"hydra.sweep.dir={tmp_path}/sweep")
+
+
+def test_every_job_has_a_numbered_folder_that_says_what_was_asked(sweep, ran, tmp_path):
+    done = sweep(*SWEEP, "launcher=basic", "hydra.verbose=true")
+    assert (done.status, done.err) == (0, "")
+    assert [job.folder for job in ran.jobs] == [tmp_path / "sweep" / str(n) for n in range(2)]
+    assert [job.name for job in ran.jobs] == ["planner.horizon=3", "planner.horizon=5"]
+    told = yaml.safe_load((tmp_path / "sweep" / "1" / "job.yaml").read_text())
+    assert told["command"] == "afm-rl method=physics planner.horizon=5"
+    assert told["overrides"] == ["method=physics", "planner.horizon=5"]
+    assert ran.jobs[1].arguments == (
+        *("--config-name=config", "--config-path=pkg://afm_rl.conf"),
+        *("method=physics", "planner.horizon=5", "hydra.verbose=true"),
+    )
+    assert "[2/2] job 1 (planner.horizon=5): done" in done.out
+    assert done.out.rstrip().endswith(f"Results: {tmp_path}/sweep")
+
+
+def test_finished_jobs_are_skipped_and_others_are_not(sweep, ran, tmp_path):
+    ran.failing = "planner.horizon=5"
+    done = sweep(*SWEEP)
+    assert done.status == 1
+    assert done.err == (
+        "afm-rl: job 1 (planner.horizon=5): failed: out of luck "
+        f"({tmp_path}/sweep/1/log.txt)\n"
+        "afm-rl: 1 of 2 jobs failed; the same command tries them again\n"
+    )
+    ran.jobs, ran.failing = [], "none"
+    done = sweep(*SWEEP, "launcher=basic", "progress=false")  # neither makes another job
+    assert done.status == 0 and "2 jobs in" in done.out and ", 1 with results" in done.out
+    assert [job.folder.name for job in ran.jobs] == ["1"]
+    ran.jobs = []
+    assert sweep(*SWEEP).status == 0
+    assert ran.jobs == []
+
+
+def test_another_configuration_runs_anew_and_replaces_nothing(sweep, ran):
+    assert sweep("-m", "method=physics", "seeds=1,2", "launcher=basic").status == 0
+    assert sweep("-m", "method=physics", "seeds=3,1", "launcher=basic").status == 0
+    assert [job.folder.name for job in ran.jobs] == ["0", "1", "2"]
+    assert sweep("-m", "method=physics", "seeds=1", "budget=7", "launcher=basic").status == 0
+    assert [job.folder.name for job in ran.jobs] == ["0", "1", "2", "3"]
+
+
+def test_what_is_asked_twice_is_run_once(sweep, ran):
+    assert sweep("-m", "method=physics", "seeds=1,1").status == 0
+    assert len(ran.jobs) == 1 and ran.jobs[0].name == ""
+
+
+@pytest.mark.parametrize(
+    "apart",
+    [
+        ["label=mine"],
+        ["compare=[physics]"],
+        ["study=ugv"],
+        ["dynamics=physics"],  # the same part, but the user's choice: no comparison any more
+        ["seeds=2"],
+    ],
+)
+def test_settings_that_make_another_job(sweep, ran, apart):
+    assert sweep("-m", "budget=5").status == 0
+    assert sweep("-m", "budget=5", *apart).status == 0
+    assert len(ran.jobs) == 2
+
+
+def test_a_setting_that_cannot_be_resolved_is_the_job_s_own_failure(sweep, ran):
+    assert sweep("-m", "method=physics", "budget=${nope},5").status == 0
+    assert len(ran.jobs) == 2
+
+
+def test_an_own_configuration_goes_to_the_jobs(sweep, ran, tmp_path):
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "mine.yaml").write_text("defaults: [config, _self_]\nbudget: 9\n")
+    assert (
+        sweep("-m", f"--config-dir={tmp_path}/own", "--config-name=mine", "seeds=1,2").status == 0
+    )
+    assert ran.jobs[0].arguments[:3] == (
+        *("--config-name=mine", "--config-path=pkg://afm_rl.conf"),
+        f"--config-dir={tmp_path}/own",
+    )
+
+
+def test_an_interrupted_sweep_says_how_to_go_on(sweep, monkeypatch, tmp_path):
+    def interrupt(job):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("afm_rl.cli.launchers.local.run", interrupt)
+    done = sweep(*SWEEP, "launcher=basic")
+    assert done.status == 130
+    assert done.err == f"afm-rl: interrupted; the same command goes on in {tmp_path}/sweep\n"
+
+
+def test_the_same_command_returns_to_the_same_folder(afm_rl, ran, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    for extra in (["hydra/launcher=basic"], ["figures=false"]):
+        assert afm_rl(*SWEEP, *extra).status == 0
+    assert len(ran.jobs) == 2
+    (folder,) = (tmp_path / "multirun").iterdir()
+    assert folder.name.startswith("planner.horizon-")
+    assert afm_rl(*SWEEP, "budget=3").status == 0
+    assert len(list((tmp_path / "multirun").iterdir())) == 2
+
+
+def test_folders_of_sweeps_are_named_after_what_is_swept():
+    named = with_sweep_folder(["-m", "+a/b=1,2", "tracks=[x,y]", "seeds=range(3)"])[-1]
+    assert named.startswith("hydra.sweep.dir=multirun/a_b-seeds-")
+    assert len(with_sweep_folder(["-m", "x" * 200 + "=1,2"])[-1]) < 90
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        (["hydra.launcher.n_jobs=0"], "hydra.launcher.n_jobs=0: expected"),
+        (["hydra.launcher.n_jobs=some"], "hydra.launcher.n_jobs='some': expected"),
+        (["launcher=submitit_local", "hydra.launcher.cluster=pbs"], "hydra.launcher.cluster='pbs'"),
+        (["launcher=ray", "hydra.launcher.num_cpus=-1"], "hydra.launcher.num_cpus=-1"),
+        (["launcher=nope"], "launcher/nope"),
+    ],
+)
+def test_launchers_that_cannot_be_used(sweep, settings, named):
+    done = sweep(*SWEEP, *settings)
+    assert (done.status, done.out) == (2, "")
+    assert named in done.err and done.err.count("\n") == 1
+
+
+def test_a_launcher_whose_package_is_missing_says_what_to_install():
+    with pytest.raises(ConfigurationError, match=r"nowhere: pip install 'afm-rl\[sweeps\]'"):
+        needs("nowhere", "sweeps")
+
+
+def test_a_job_that_cannot_be_started_has_a_reason(tmp_path):
+    job = Job(tmp_path, "0" * 64, "", (), tmp_path / "nowhere")
+    assert run(job) == f"{tmp_path}/nowhere: No such file or directory"
+
+
+def test_hydra_s_own_launchers_can_still_be_chosen(afm_rl, tmp_path, quick):
+    """They run the jobs in this process; one that fails does not stop the others."""
+    own = ["~launcher", "hydra/launcher=basic", f"hydra.sweep.dir={tmp_path}", *quick]
+    done = afm_rl("-m", "method=physics", "budget=2", "seeds=0,1", *own)
+    assert done.status == 2
+    assert "afm-rl: seeds=0: expected a count" in done.err and "Traceback" not in done.err
+    assert (tmp_path / "1" / "missions.csv").is_file()
+
+
+@pytest.fixture
+def slurm_cluster(monkeypatch, tmp_path):
+    """Stand-ins for SLURM's commands, which run an array of two jobs on this machine."""
+    commands = {
+        "sbatch": """
+            for task in 0 1; do
+              SLURM_JOB_ID=7$task SLURM_ARRAY_JOB_ID=7 SLURM_ARRAY_TASK_ID=$task sh "$1" &
+            done > /dev/null 2>&1
+            echo Submitted batch job 7
+        """,
+        "srun": """
+            export SLURM_PROCID=0 SLURM_LOCALID=0 SLURM_NODEID=0 SLURM_NTASKS=1
+            export SLURM_JOB_NUM_NODES=1 SLURM_JOB_NODELIST=here
+            while [ "${1#/}" = "$1" ] || [ "${1%log.*}" != "$1" ]; do shift; done
+            exec "$@"
+        """,
+        "sacct": "printf 'JobID|State\\n7_1|OUT_OF_MEMORY\\n'",
+    }
+    (tmp_path / "bin").mkdir()
+    for name, script in commands.items():
+        (tmp_path / "bin" / name).write_text(f"#!/bin/sh\n{script}\n")
+        (tmp_path / "bin" / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"), prepend=os.pathsep)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["submitit_local", "submitit_slurm"])
+def test_submitit_survives_jobs_whose_process_the_cluster_ends(
+    sweep, slurm_cluster, launcher, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(slurm, "POLL", 0.1)
+
+    def leave(job):  # here and not above: functions inside others are sent whole
+        import os
+
+        return os._exit(3) if "seeds=2" in job.name else None
+
+    monkeypatch.setattr(slurm, "run", leave)
+    done = sweep("-m", "method=physics", "seeds=1,2", f"launcher={launcher}")
+    assert done.status == 1
+    assert "job 0 (seeds=1): done" in done.out
+    assert "afm-rl: job 1 (seeds=2): failed: " in done.err
+    assert f"{tmp_path}/sweep/.submitit/" in done.err and "1 of 2 jobs failed" in done.err
+
+
+def test_a_cluster_that_is_not_there(sweep, monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    done = sweep(*SWEEP, "launcher=submitit_slurm")
+    assert done.status == 2
+    assert done.err.startswith("afm-rl: hydra.launcher: ") and done.err.count("\n") == 1
+
+
+def test_ray_survives_nodes_that_die(sweep, monkeypatch):
+    """With a stand-in for Ray; tests/cli/test_ray.py has the real one, where it is installed."""
+
+    class RayError(Exception):
+        pass
+
+    def get(job):
+        if "seeds=2" in job.name:
+            raise RayError("The node died.\nA long story follows.")
+
+    asked = []
+    fake = ModuleType("ray")
+    fake.exceptions = SimpleNamespace(RayError=RayError)
+    fake.init = lambda address, **settings: asked.append(address) or nullcontext()
+    fake.remote = lambda **resources: lambda run: SimpleNamespace(remote=lambda job: job)
+    fake.wait = lambda running: (running[:1], running[1:])
+    fake.get = get
+    monkeypatch.setitem(sys.modules, "ray", fake)
+    done = sweep("-m", "method=physics", "seeds=1,2", "launcher=ray", "hydra.launcher.address=auto")
+    assert (done.status, asked) == (1, ["auto"])
+    assert "job 0 (seeds=1): done" in done.out
+    assert "afm-rl: job 1 (seeds=2): failed: The node died. (" in done.err
