@@ -12,9 +12,9 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from afm_rl.dynamics import DynamicsModel, Oracle
+from afm_rl.dynamics import Calibrated, DynamicsModel, Oracle
 from afm_rl.errors import ConfigurationError, check_count
-from afm_rl.learning import GaussianNLLLoss, OracleUpdater, Updater
+from afm_rl.learning import GaussianNLLLoss, MassEstimator, OracleUpdater, RLSUpdater, Updater
 from afm_rl.missions.checks import blaming, check_cost, check_keys
 from afm_rl.missions.parts import Training
 from afm_rl.missions.robot import Robot
@@ -26,16 +26,17 @@ from afm_rl.missions.selection import (
     select_seeds,
     select_tracks,
 )
-from afm_rl.planning import MPC, PlanningEnv
+from afm_rl.planning import MPC, GeometricController, PlanningEnv
 from afm_rl.transforms import ActionFlowTransform
 
 ROBOT_SHAPES = (
     *("action_low", "action_high", "state_low", "state_high"),
-    *("features", "model", "regime", "flow_low", "flow_high"),
+    *("features", "model", "regime", "flow_low", "flow_high", "flow_reuse"),
 )
 AFTER_TRAINING = (
     *("gate", "samples", "steps", "error_action", "wrap", "latch", "checkpoint"),
     *("propagation", "precision"),
+    *("memory", "views", "forgetting", "unsure"),
 )
 
 
@@ -120,15 +121,21 @@ def build(cfg: DictConfig) -> Agent:
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=executed_key)
     updater = make("updater", loss)
-    if isinstance(model, Oracle) != isinstance(updater, OracleUpdater):
+    if isinstance(model, Oracle) != isinstance(updater, (OracleUpdater, MassEstimator)):
         raise ConfigurationError(
-            "dynamics=oracle and updater=oracle belong together: choose both or neither"
+            "dynamics=oracle and an updater that tells it the regime belong together: choose "
+            "both, dynamics=oracle with updater=oracle or updater=mass, or neither"
+        )
+    if isinstance(model, Calibrated) and updater.learns and not isinstance(updater, RLSUpdater):
+        raise ConfigurationError(
+            f"dynamics: a calibrated model stays as it is but for its calibration, and "
+            f"{type(updater).__name__} does not teach that; choose updater=rls or updater=frozen"
         )
     chain = [] if transform is None else [transform]
     if hasattr(planner, "make_tensordict_primer"):
         chain.append(planner.make_tensordict_primer())
     whole = TransformedEnv(env, Compose(*chain))
-    stages = planner.horizon + 1 if isinstance(planner, MPC) else None
+    stages = planner.horizon + 1 if isinstance(planner, (MPC, GeometricController)) else None
     check_cost(cost, model, whole, stages)
     check_keys("planner", planner, whole)
     check_keys("updater", updater, whole)
@@ -152,4 +159,6 @@ def _shaping(settings: Mapping[str, Any], group: str) -> dict[str, Any]:
     """Return those settings of a group that shape a trained part, for its place in the cache."""
     if group == "robot":
         return {name: settings[group][name] for name in ROBOT_SHAPES if name in settings[group]}
-    return {name: value for name, value in settings[group].items() if name not in AFTER_TRAINING}
+    chosen = settings[group]
+    chosen = chosen.get("base", chosen)  # what is calibrated is trained before its calibration
+    return {name: value for name, value in chosen.items() if name not in AFTER_TRAINING}

@@ -10,13 +10,22 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
 from torch import nn
 
 from afm_rl.artefacts import load_artefact
-from afm_rl.dynamics import DynamicsModel, Ensemble, Oracle
-from afm_rl.errors import AFMError, ConfigurationError
-from afm_rl.flow import ContextFlow, Corrector, Flow, LeastSquares, PaperFlow, train_flow
-from afm_rl.learning import pretrain_ensemble
+from afm_rl.dynamics import KNODE, Calibrated, DynamicsModel, Ensemble, Oracle, Quadrotor
+from afm_rl.errors import AFMError, ConfigurationError, check_flag
+from afm_rl.flow import (
+    ContextFlow,
+    Corrector,
+    Flow,
+    L1Augmentation,
+    LeastSquares,
+    PaperFlow,
+    train_flow,
+)
+from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
 from afm_rl.missions.robot import Robot
 from afm_rl.transforms import ActionFlowTransform
@@ -54,6 +63,18 @@ def oracle(robot: Robot) -> Part:
     return Part(Oracle(robot.model, robot.regime))
 
 
+def calibrated(robot: Robot, base: Callable[[Robot], Part]) -> Part:
+    """Return another model, frozen, with a calibration per mission.
+
+    Args:
+        robot: whose action box gives the unit.
+        base: makes the model.
+    """
+    part = base(robot)
+    low, high = robot.flow_box
+    return part._replace(module=Calibrated(part.module, (high - low) / 2))
+
+
 def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part:
     """Return an ensemble to be pre-trained on the nominal physics."""
     nominal = robot.model
@@ -66,6 +87,45 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
         return pretrain_ensemble(model, nominal, *boxes, progress=progress, **pretrain)
 
     return Part(model, Training("ensemble", model, train, "standard deviations of the data"))
+
+
+def knode(
+    robot: Robot,
+    pretrain: Mapping[str, Any] | None = None,
+    randomised: bool = False,
+    **settings: Any,
+) -> Part:
+    """Return the nominal physics plus networks, the first of them to be pre-trained if told.
+
+    Args:
+        robot: a quadrotor.
+        pretrain: settings of the pre-training; None for no network yet.
+        randomised: pre-train on flights under regimes of the prior, not under the nominal one.
+        settings: further arguments of :class:`~afm_rl.dynamics.KNODE`.
+
+    Raises:
+        ConfigurationError: for another robot, whose rate of change is not known.
+    """
+    nominal = robot.model
+    if not isinstance(nominal, Quadrotor):
+        raise ConfigurationError(
+            f"dynamics=knode: robot={robot.name}: the rate of change of {type(nominal).__name__} "
+            "is not known; choose robot=quadrotor, or dynamics=pe"
+        )
+    model = KNODE(nominal, **settings)
+    check_flag("dynamics.randomised", randomised)
+    if pretrain is None:
+        return Part(model)
+    check_training("dynamics.pretrain", pretrain_knode, pretrain)
+
+    def train(progress: bool) -> float:
+        (low, high), (least, most) = robot.action_box, robot.flow_box
+        actions = torch.maximum(low, least), torch.minimum(high, most)
+        regime = robot.regime if randomised else None
+        boxes = robot.state_box, actions
+        return pretrain_knode(model, nominal, *boxes, regime=regime, progress=progress, **pretrain)
+
+    return Part(model, Training("KNODE", model, train, "standard deviations of the model"))
 
 
 def no_flow(robot: Robot, model: DynamicsModel) -> Part:
@@ -81,7 +141,8 @@ def context_flow(
     **settings: Any,
 ) -> Part:
     """Return the context flow, to be trained over ``model``."""
-    flow = ContextFlow(*robot.flow_box, **settings)
+    where = {"place": list(robot.place), "place_scale": robot.place_scale}
+    flow = ContextFlow(*robot.flow_box, **where, **settings)
     return _trained(flow, robot, model, train, checkpoint, "half ranges")
 
 
@@ -112,6 +173,11 @@ def least_squares(robot: Robot, model: DynamicsModel, **settings: Any) -> Part:
     return Part(LeastSquares(*robot.flow_box, **settings))
 
 
+def l1(robot: Robot, model: DynamicsModel, **settings: Any) -> Part:
+    """Return L1 adaptive augmentation, which needs no training."""
+    return Part(L1Augmentation(*robot.flow_box, **settings))
+
+
 def _trained(
     flow: Flow,
     robot: Robot,
@@ -120,6 +186,8 @@ def _trained(
     checkpoint: str | None,
     unit: str,
 ) -> Part:
+    if settings.get("reuse") is None:
+        settings = {**settings, "reuse": robot.flow_reuse}
     check_training("flow.train", train_flow, settings, batch_size=2)
     if checkpoint is not None:
         if not isinstance(checkpoint, str):

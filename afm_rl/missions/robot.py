@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.missions.laps import LapScore
 from afm_rl.missions.score import Score
 from afm_rl.regimes import Regime, Schedule
@@ -44,6 +44,10 @@ class Robot:
         flow_low: lowest corner of the box in which flows correct actions; the actions' if None.
             Where planned actions keep to a small part of their box, a smaller one helps.
         flow_high: its highest corner.
+        flow_reuse: how often the training of a flow uses an example, where its settings leave
+            that open; None leaves it to the training. More saves time where models are slow.
+        place: indices of the state coordinates in which the ground may differ, if any.
+        place_scale: distance at which ground counts as other ground, in their unit.
     """
 
     name: str
@@ -65,6 +69,9 @@ class Robot:
     score: Score | None = None
     flow_low: Sequence[float] | None = None
     flow_high: Sequence[float] | None = None
+    flow_reuse: int | None = None
+    place: Sequence[int] = ()
+    place_scale: float = 1.0
 
     def __post_init__(self) -> None:
         """Check that boxes, names and features fit the model.
@@ -78,14 +85,19 @@ class Robot:
             names = list(getattr(self, f"{kind}_names"))
             if len(names) != size:
                 raise ConfigurationError(f"robot.{kind}_names={names}: expected {size} names")
-        size, features = self.model.state_size, list(self.features)
-        if not all(type(index) is int and 0 <= index < size for index in features):
-            raise ConfigurationError(
-                f"robot.features={features}: expected indices in 0..{size - 1}"
-            )
+        size = self.model.state_size
+        for name in ("features", "place"):
+            indices = list(getattr(self, name))
+            if not all(type(index) is int and 0 <= index < size for index in indices):
+                raise ConfigurationError(
+                    f"robot.{name}={indices}: expected indices in 0..{size - 1}"
+                )
+        check_number("robot.place_scale", self.place_scale, low=0.0, open_low=True)
 
         if self.flow_low is not None or self.flow_high is not None:
             self._check_box("flow", self.model.action_size)
+        if self.flow_reuse is not None:
+            check_count("robot.flow_reuse", self.flow_reuse)
         if self.score is not None and not isinstance(self.score, Score):
             raise ConfigurationError(f"robot.score={self.score!r}: expected a Score, or null")
 
