@@ -13,3 +13,21 @@ def uniform(low: Tensor, high: Tensor, count: int, generator: torch.Generator) -
     torch.Size([5, 2])
     """
     return low + (high - low) * torch.rand(count, len(low), generator=generator)
+
+
+def draw_states(
+    states: tuple[Tensor, Tensor] | Tensor, count: int, generator: torch.Generator
+) -> Tensor:
+    """Draw ``count`` states from a box or, with replacement, from a pool: ``(count, S)``.
+
+    Args:
+        states: lowest and highest state, ``(S,)`` each; or observed states, ``(P, S)``.
+        count: how many.
+        generator: of the numbers.
+
+    >>> draw_states(torch.tensor([[7.0, 8.0]]), 2, torch.Generator()).tolist()
+    [[7.0, 8.0], [7.0, 8.0]]
+    """
+    if isinstance(states, Tensor):
+        return states[torch.randint(len(states), (count,), generator=generator)]
+    return uniform(*states, count, generator)

@@ -1,11 +1,14 @@
 """What all tests share: one thread, fixed seeds, and small trained models."""
 
 import copy
+import functools
 
 import pytest
 import torch
 from hypothesis import settings
 
+import afm_rl.flow
+import afm_rl.learning
 from afm_rl.dynamics import Dubins, Ensemble
 from afm_rl.flow import ContextFlow, train_flow
 from afm_rl.learning import pretrain_ensemble
@@ -112,3 +115,18 @@ def trained_flow(_trained_flow):
 def trained_flow_error(_trained_flow):
     """Its held-out error."""
     return _trained_flow[1]
+
+
+@pytest.fixture
+def short_trainings(monkeypatch):
+    """Cut every training short."""
+    for module, name, small in (
+        (afm_rl.flow, "train_flow", {"iterations": 5}),
+        (afm_rl.learning, "pretrain_ensemble", {"samples": 512, "epochs": 1}),
+    ):
+        whole = getattr(module, name)
+
+        def short(*args, _whole=whole, _small=small, **settings):
+            return _whole(*args, **{**settings, **_small, "progress": False})
+
+        monkeypatch.setattr(module, name, functools.wraps(whole)(short))

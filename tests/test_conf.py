@@ -26,6 +26,11 @@ SMALL = {  # settings that are there are made small
     "dynamics.hidden": [8, 8],
     "dynamics.pretrain.samples": 256,
     "dynamics.pretrain.epochs": 1,
+    "dynamics.pretrain.flights": 4,
+    "dynamics.base.members": 2,
+    "dynamics.base.hidden": [8, 8],
+    "dynamics.base.pretrain.samples": 256,
+    "dynamics.base.pretrain.epochs": 1,
     "flow.hidden": [8, 8],
     "flow.latent": 8,
     "flow.width": 8,
@@ -34,11 +39,24 @@ SMALL = {  # settings that are there are made small
 }
 PARTNERS = {  # what else must be chosen for a choice to make sense
     "dynamics=oracle": ["updater=oracle"],
+    "dynamics=knode": ["robot=quadrotor"],
+    "dynamics=knode_offline": ["robot=quadrotor"],
     "updater=oracle": ["dynamics=oracle"],
     "updater=online": ["dynamics=pe"],
+    "updater=rls": ["dynamics=calibrated"],
+    "updater=rls_unmatched": ["dynamics=calibrated"],
     "updater=stream_x": ["dynamics=pe_stream_x"],
     "updater=stream_x_literal": ["dynamics=pe_stream_x"],
+    "updater=knode": ["dynamics=knode", "robot=quadrotor"],
+    "updater=mass": ["dynamics=oracle", "robot=quadrotor"],
     "planner=mpc": ["robot=quadrotor"],
+    "planner=geometric": ["robot=quadrotor"],
+    "method=geometric": ["robot=quadrotor"],
+    "method=mass_estimator": ["robot=quadrotor"],
+    "method=offline_knode": ["robot=quadrotor"],
+    "method=online_knode": ["robot=quadrotor"],
+    "method=afm_offline_knode": ["robot=quadrotor"],
+    "method=afm_online_knode": ["robot=quadrotor"],
     "cost=tracking": ["robot=quadrotor"],
     "transform=afm": ["flow=context"],
     "transform=none": [],
@@ -50,11 +68,18 @@ def choices(*groups):
     """Name every combination of choices, with the partners that they need."""
     for names in itertools.product(*(GROUPS[group] for group in groups)):
         chosen = [f"{group}={name}" for group, name in zip(groups, names, strict=True)]
-        yield chosen + [partner for choice in chosen for partner in PARTNERS.get(choice, [])]
+        partners = [partner for choice in chosen for partner in PARTNERS.get(choice, [])]
+        yield [*dict.fromkeys(chosen + partners)]
+
+
+def fits(dynamics, planner, *_):
+    """Tell whether a model that only flies has a planner for flights."""
+    flies = "robot=quadrotor"
+    return flies not in PARTNERS.get(dynamics, []) or flies in PARTNERS.get(planner, [])
 
 
 PAIRS = [
-    *choices("dynamics", "planner"),
+    *(pair for pair in choices("dynamics", "planner") if fits(*pair)),
     *(["method=online_pe", "seeds=2", *planner] for planner in choices("planner")),
 ]
 SINGLES = [
@@ -122,7 +147,14 @@ def test_a_method_chooses_four_parts_and_nothing_else(method):
     loaded = OmegaConf.create(text)
     assert list(loaded) == ["defaults"]
     parts = [next(iter(entry)).removeprefix("override /") for entry in loaded.defaults]
-    assert parts == ["dynamics", "updater", "transform", "flow"]
+    planner = ["planner"] if method == "geometric" else []  # which is a planner of its own
+    assert parts == ["dynamics", "updater", "transform", "flow", *planner]
+
+
+def test_a_method_has_the_last_word_on_its_planner_but_for_the_user():
+    chosen = ["robot=quadrotor", "method=geometric"]
+    assert composed(*chosen).planner._target_ == "afm_rl.planning.GeometricController"
+    assert composed(*chosen, "planner=mpc").planner._target_ == "afm_rl.planning.MPC"
 
 
 def test_a_robot_may_choose_a_cost_and_a_planner_but_the_user_has_the_last_word():

@@ -1,8 +1,8 @@
-"""Points drawn uniformly in a box."""
+"""Points drawn uniformly in a box, or from a pool."""
 
 import torch
 
-from afm_rl.sampling import uniform
+from afm_rl.sampling import draw_states, uniform
 
 
 def test_points_fill_their_box_evenly():
@@ -21,3 +21,12 @@ def test_the_generator_alone_decides():
         torch.rand(seed)  # must not matter
         drawn.append(uniform(low, high, 50, torch.Generator().manual_seed(seed)))
     assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
+
+
+def test_states_come_from_a_pool_or_a_box():
+    pool = torch.arange(10.0).unsqueeze(-1)
+    drawn = draw_states(pool, 500, torch.Generator().manual_seed(0))
+    assert drawn.shape == (500, 1) and drawn.unique().tolist() == list(range(10))
+    box = torch.zeros(1), torch.ones(1)
+    same = [torch.Generator().manual_seed(1) for _ in range(2)]
+    assert torch.equal(draw_states(box, 9, same[0]), uniform(*box, 9, same[1]))

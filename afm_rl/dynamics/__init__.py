@@ -1,6 +1,7 @@
 """Dynamics models: interchangeable ``(state, action) -> next state``."""
 
 from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.dynamics.calibrated import Calibrated
 from afm_rl.dynamics.dubins import Dubins, dubins_step
 from afm_rl.dynamics.ensemble import Ensemble
 from afm_rl.dynamics.knode import KNODE
@@ -10,6 +11,7 @@ from afm_rl.dynamics.quadrotor import Quadrotor
 
 __all__ = [
     "KNODE",
+    "Calibrated",
     "DynamicsModel",
     "Dubins",
     "Ensemble",

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from afm_rl.errors import check_count
 from afm_rl.manifold import Manifold
 
 
@@ -25,10 +26,16 @@ class DynamicsModel(nn.Module, ABC):
         action_size: number of action components, A.
     """
 
+    taught_in: int | None = None
+    """Number of the process in which an updater changes the model; None: it stays as it is."""
+
+    extrapolates: bool = False
+    """Can it foresee what actions beyond their box would do? Equations can, networks cannot."""
+
     def __init__(self, manifold: Manifold, action_size: int) -> None:
         super().__init__()
         self.manifold = manifold
-        self.action_size = action_size
+        self.action_size = check_count("dynamics.action_size", action_size)
 
     @property
     def state_size(self) -> int:
@@ -78,7 +85,8 @@ class DynamicsModel(nn.Module, ABC):
             torch.func.jvp(change, (action,), (axis.expand_as(action),))[1]
             for axis in torch.eye(self.action_size, device=action.device, dtype=action.dtype)
         ]
-        return torch.stack(columns, -1)
+        # Torch differentiates single numbers times Python's in double precision.
+        return torch.stack(columns, -1).to(action.dtype)
 
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         r"""Return the next state and its derivatives by state and action.

@@ -46,6 +46,8 @@ class Dubins(KnownDynamics):
     torch.Size([4, 3])
     """
 
+    extrapolates = True
+
     def __init__(self, dt: float = 0.2, noise_std: float = 1e-3) -> None:
         dt = check_number("dynamics.dt", dt, low=0.0, open_low=True)
         super().__init__(partial(dubins_step, dt=dt), Manifold(3, angles=[2]), 2, noise_std)

@@ -92,21 +92,21 @@ class Ensemble(DynamicsModel):
     ) -> None:
         super().__init__(manifold, action_size)
         self.features = list(features)
-        if not all(0 <= i < manifold.size for i in self.features):
+        if not all(isinstance(i, int) and 0 <= i < manifold.size for i in self.features):
             raise ConfigurationError(
                 f"dynamics.features={self.features}: expected indices in 0..{manifold.size - 1}"
             )
         self.members = check_count("dynamics.members", members)
         self.hidden = check_counts("dynamics.hidden", hidden)
+        if len(log_variance) != 2 or not log_variance[0] < log_variance[1]:
+            raise ConfigurationError(f"dynamics.log_variance={log_variance}: expected low < high")
         low, high = log_variance
-        if not low < high:
-            raise ConfigurationError(f"dynamics.log_variance=[{low}, {high}]: expected low < high")
         self.log_variance = (float(low), float(high))
         self.propagation = check_choice("dynamics.propagation", propagation, PROPAGATIONS)
         check_choice("dynamics.precision", precision, ("float32", "bfloat16"))
         self.precision, self._copies = precision, Copies(torch.bfloat16)
         self.layer_norm = check_flag("dynamics.layer_norm", layer_norm)
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = torch.Generator().manual_seed(check_count("dynamics.seed", seed, low=0))
         inputs, targets = len(self.features) + action_size, manifold.tangent_size
         sizes = [inputs, *self.hidden, 2 * targets]
         draw = INITS[check_choice("dynamics.init", init, INITS)]

@@ -40,6 +40,8 @@ class KnownDynamics(DynamicsModel):
         noise_std: float | Sequence[float] = 1e-3,
     ) -> None:
         super().__init__(manifold, action_size)
+        if not callable(step):
+            raise ConfigurationError(f"dynamics.step={step!r}: expected a function")
         self.step = step
         given = [noise_std] if isinstance(noise_std, int | float) else list(noise_std)
         size = manifold.tangent_size

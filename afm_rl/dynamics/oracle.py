@@ -35,6 +35,7 @@ class Oracle(DynamicsModel):
     def __init__(self, model: DynamicsModel, regime: Regime) -> None:
         super().__init__(model.manifold, model.action_size)
         self.model = model
+        self.extrapolates = model.extrapolates
         self.regime = regime
         self.register_buffer("parameters_now", torch.tensor(regime.identity), persistent=False)
 

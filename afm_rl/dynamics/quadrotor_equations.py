@@ -51,7 +51,7 @@ class HeldFlight(HeldRate):
         turning, tables = state[..., 6:], self.tables
         pairs = turning.index_select(-1, tables.first) * turning.index_select(-1, tables.second)
         # Not a matrix product: a flight shall be the same to the bit in any batch.
-        sums = (pairs.unflatten(-1, (3, 10)) * tables.factor).sum(-2)
+        sums = (pairs.reshape(*pairs.shape[:-1], 3, 10) * tables.factor).sum(-2)
         return torch.cat([state[..., 3:6], torch.addcmul(self.offset, self.gain, sums)], -1)
 
     def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
@@ -171,6 +171,8 @@ def unit(state: Tensor) -> Tensor:
 
 def aligned(state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
     """Give states ``(*B, 13)`` and actions ``(*B, 4)`` the same batch shape and type."""
+    if state.shape[:-1] == action.shape[:-1] and state.dtype == action.dtype:
+        return state, action
     batch = torch.broadcast_shapes(state.shape[:-1], action.shape[:-1])
     dtype = torch.promote_types(state.dtype, action.dtype)
     return state.expand(*batch, 13).to(dtype), action.expand(*batch, 4).to(dtype)

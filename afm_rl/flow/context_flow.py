@@ -309,15 +309,14 @@ class ContextFlow(PairCorrector, Flow):
         probes = self.probes.expand(*proposals.shape[:-2], *self.probes.shape)
         expected = self.effect(known.wide(), torch.cat([proposals, probes], -2))
         expected, found = expected.split([proposals.shape[-2], probes.shape[-2]], -2)
-        reach = torch.stack([found.amin(-2), found.amax(-2)], -2)
-        wanted = attainable(unit.squeeze(-2), *reach.unbind(-2), self.saturation)
+        low, high = found.amin(-2), found.amax(-2)
+        wanted = attainable(unit.squeeze(-2), low, high, self.saturation)
         best = (expected - wanted.unsqueeze(-2)).square().sum(-1).argmin(-1)[..., None, None]
         chosen = proposals.gather(-2, best.expand_as(mean)).squeeze(-2)
         unsure = spread.amax(-1, keepdim=True) > self.unsure
         action = torch.where(unsure, chosen, mean.squeeze(-2))
-        return Correction(
-            self.denormalise(action), spread * self.half_range, self.denormalise(reach)
-        )
+        reach = self.denormalise(torch.stack([low, high], -2))
+        return Correction(self.denormalise(action), spread * self.half_range, reach)
 
 
 def _about(known: Reading, answers: Tensor, unit: Tensor) -> Tensor:

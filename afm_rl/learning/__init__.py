@@ -1,6 +1,9 @@
 """Learning: losses, updaters, optimisers, pre-training."""
 
+from afm_rl.learning.collect import collect
+from afm_rl.learning.fitting import fit_ensemble
 from afm_rl.learning.fresh_adam import FreshAdam
+from afm_rl.learning.hook import UpdaterHook
 from afm_rl.learning.knode_updater import KNODEUpdater
 from afm_rl.learning.loss import InPlaceLoss
 from afm_rl.learning.mass_estimator import MassEstimator
@@ -8,6 +11,7 @@ from afm_rl.learning.nll import GaussianNLLLoss, gaussian_nll
 from afm_rl.learning.obgd import ObGD
 from afm_rl.learning.pretrain import pretrain_ensemble
 from afm_rl.learning.pretrain_knode import pretrain_knode
+from afm_rl.learning.rls_updater import RLSUpdater
 from afm_rl.learning.stream_x import StreamXUpdater
 from afm_rl.learning.updater import OnlineUpdater, OracleUpdater, Updater
 
@@ -20,8 +24,12 @@ __all__ = [
     "ObGD",
     "OnlineUpdater",
     "OracleUpdater",
+    "RLSUpdater",
     "StreamXUpdater",
     "Updater",
+    "UpdaterHook",
+    "collect",
+    "fit_ensemble",
     "gaussian_nll",
     "pretrain_ensemble",
     "pretrain_knode",

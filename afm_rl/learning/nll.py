@@ -10,6 +10,7 @@ from tensordict.nn import dispatch
 from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import check_flag, check_instance
 from afm_rl.learning.loss import InPlaceLoss
 
 
@@ -69,8 +70,8 @@ class GaussianNLLLoss(InPlaceLoss):
 
     def __init__(self, model: DynamicsModel, reduction: str = "mean", wrap: bool = True) -> None:
         super().__init__(reduction)
-        self.model = model
-        self.wrap = wrap
+        self.model = check_instance("loss.model", model, DynamicsModel)
+        self.wrap = check_flag("loss.wrap", wrap)
 
     def target(self, state: Tensor, next_state: Tensor) -> Tensor:
         """Return the standardised state change ``(*B, D)``."""

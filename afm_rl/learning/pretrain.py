@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from afm_rl.dynamics import DynamicsModel, Ensemble
 from afm_rl.errors import check_count, check_number
-from afm_rl.learning.nll import gaussian_nll
+from afm_rl.learning.fitting import fit_changes
 from afm_rl.sampling import uniform
 
 
@@ -60,44 +59,16 @@ def pretrain_ensemble(
     factor = 1 + action_noise * (2 * torch.rand(action.shape, generator=generator) - 1)
     with torch.no_grad():
         change = teacher.manifold.difference(teacher(state, action * factor), state)
-    model.normalise_(model.inputs(state, action)[:samples], change[:samples])
-    target = model.standardise(change)
-    optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=True)
-    steps = samples // batch_size
-    cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=steps * epochs)
-    best, kept = float("inf"), None
-    bar = tqdm(
-        total=steps * epochs, desc="pre-training the ensemble", disable=None if progress else True
+    return fit_changes(
+        model,
+        state,
+        action,
+        change,
+        samples=samples,
+        epochs=epochs,
+        batch_size=batch_size,
+        lr=lr,
+        generator=generator,
+        title="pre-training the ensemble",
+        progress=progress,
     )
-    with bar, torch.enable_grad():
-        for _ in range(epochs):
-            order = torch.rand(model.members, samples, generator=generator).argsort(-1)
-            for rows in order[:, : steps * batch_size].split(batch_size, -1):
-                loss = _member_nll(model, state, action, target, rows)
-                optimizer.zero_grad(set_to_none=True)
-                loss.backward()
-                optimizer.step()
-                cycle.step()
-                bar.update()
-            error = held_out_error(model, state[samples:], action[samples:], target[samples:])
-            bar.set_postfix(held_out=f"{error:.4f}")
-            if error < best:
-                best, kept = error, {k: v.clone() for k, v in model.state_dict().items()}
-    if kept is not None:
-        model.load_state_dict(kept)
-    return best
-
-
-def _member_nll(
-    model: Ensemble, state: Tensor, action: Tensor, target: Tensor, rows: Tensor
-) -> Tensor:
-    """Return the loss, each member ``e`` on its own samples ``rows[e]``."""
-    mean, log_variance = model.member_moments(state[rows], action[rows])
-    return gaussian_nll(mean, log_variance, target[rows]).mean((-2, -1)).sum()
-
-
-@torch.no_grad()
-def held_out_error(model: Ensemble, state: Tensor, action: Tensor, target: Tensor) -> float:
-    """Return the RMSE of the members' mean in standardised units."""
-    mean, _ = model.moments(state, action)
-    return float((mean.mean(-2) - target).square().mean().sqrt())

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from afm_rl.dynamics import Oracle
-from afm_rl.errors import ConfigurationError, check_flag
+from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.keys import as_key
 from afm_rl.learning.nll import GaussianNLLLoss
 
@@ -40,8 +41,17 @@ class Updater(nn.Module):
 
     def __init__(self, loss: GaussianNLLLoss) -> None:
         super().__init__()
-        loss.reduction = "none"
+        check_instance("updater.loss", loss, GaussianNLLLoss).reduction = "none"
         self.loss = loss
+
+    def claim(self) -> None:
+        """Note on the model that it changes in this process: copies in others stay behind."""
+        self.loss.model.taught_in = os.getpid()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        if self.loss.model.taught_in is not None:
+            self.claim()
 
     def start(self, tensordict: TensorDictBase) -> None:
         """Look at the tensordict of a reset, before the first plan."""
@@ -84,9 +94,15 @@ class OnlineUpdater(Updater):
                 "updater: the dynamics model has nothing to learn; choose dynamics=pe, or "
                 "updater=frozen"
             )
+        if not callable(optimizer):
+            raise ConfigurationError(
+                f"updater.optimizer={optimizer!r}: expected a function of parameters, such as "
+                "torch.optim.Adam"
+            )
         self.optimizer = optimizer(loss.model.parameters())
         self.mask_key = None if mask_key is None else as_key(mask_key)
         self.refused = 0
+        self.claim()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Measure the loss, then take one step."""
@@ -136,6 +152,7 @@ class OracleUpdater(Updater):
     def __init__(self, loss: GaussianNLLLoss, regime_key: NestedKey = "regime") -> None:
         super().__init__(loss)
         self.regime_key = as_key(regime_key)
+        self.claim()
 
     @property
     def oracle(self) -> Oracle:

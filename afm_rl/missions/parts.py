@@ -141,8 +141,8 @@ def context_flow(
     **settings: Any,
 ) -> Part:
     """Return the context flow, to be trained over ``model``."""
-    where = {"place": list(robot.place), "place_scale": robot.place_scale}
-    flow = ContextFlow(*robot.flow_box, **where, **settings)
+    place, scale = list(robot.place), robot.place_scale
+    flow = ContextFlow(*robot.flow_box, place=place, place_scale=scale, **settings)
     return _trained(flow, robot, model, train, checkpoint, "half ranges")
 
 

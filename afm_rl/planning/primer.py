@@ -20,6 +20,10 @@ class ZeroPrimer(TensorDictPrimer):
         super().__init__(spec, default_value=0.0, expand_specs=True)
         self.bare = spec.clone()
 
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Put the entries into a tensordict of any batch shape, where there is no environment."""
+        return self._reset_func(tensordict, tensordict)
+
     def _reset_func(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:

@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import os
 
-import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from torch import Tensor
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Composite
 from torchrl.envs import FrameSkipTransform, Transform
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
-from afm_rl.flow import Context, Correction, Corrector, Window
+from afm_rl.flow import Corrector
 from afm_rl.keys import as_key
+from afm_rl.transforms.memory import begin, correct, memory_spec, observe
 
 
 class ActionFlowTransform(Transform):
     r"""Action Flow Matching: the planned action goes in, the action that does it comes out.
 
     On the way to the environment the transform looks at its window of past transitions,
-    asks the *present* dynamics model what each executed action was worth, and, while the
-    model is misaligned, replaces the planned action by the flow's answer (paper, section
-    IV-D). On the way back it adds the transition to the window. It never learns and never
-    changes the model, which it shares with planner and updater.
+    asks the dynamics model what each executed action was worth (of a model that learns, the
+    *present* one about the latest transitions again), and, while the model is misaligned,
+    replaces the planned action by the flow's answer (paper, section IV-D). On the way back it
+    adds the transition to the window. It never learns and never changes the model, which it
+    shares with planner and updater.
 
     The whole memory lives in the tensordict, under ``prefix``: every mission of a batch has
     its own, and resets, branches and resumed rollouts are exact. Of use to others are
@@ -48,6 +48,7 @@ class ActionFlowTransform(Transform):
         enabled: switch the correction off to watch only (see :attr:`enabled`).
         widen: let planners know of effects beyond the action box, if the model can foresee them.
 
+    >>> import torch
     >>> from torchrl.envs import TransformedEnv
     >>> from afm_rl.dynamics import Dubins
     >>> from afm_rl.flow import ContextFlow
@@ -99,59 +100,20 @@ class ActionFlowTransform(Transform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.parent is None:  # inside a replay buffer: nothing to execute
             return tensordict
-        planned = tensordict.get(self.action_key)
-        memory = self._recall(tensordict)
-        window = Window(*(memory.get(("window", name)) for name in Window._fields))
-        last = Context(*(memory.get(name) for name in Context._fields))
-        with torch.no_grad():
-            context = self.flow.context(window, self.model, last)
-            executed, spread, reach = self._correct(context, memory.get("state"), planned)
-        executed = self.parent.full_action_spec[self.action_key].project(executed)
-        memory = memory.clone(recurse=False)
-        memory.update(context._asdict())
-        memory.set("planned_action", planned)
-        memory.set("executed_action", executed)
-        memory.set("spread", spread)
-        memory.set("reach", reach)
-        return tensordict.set(self.prefix, memory).set(self.action_key, executed)
-
-    def _correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
-        """Return actions, spreads and reaches; those of the flow where the model is misaligned."""
-        executed, spread = planned.clone(), torch.zeros_like(planned)
-        reach = self._box(planned)
-        use = context.misaligned & self.enabled
-        if not bool(use.any()):
-            return Correction(executed, spread, reach)
-        shown = Context(*(part[use] for part in context))
-        found = self.flow.correct(shown, state[use], planned[use])
-        sound = found.action.isfinite().all(-1, keepdim=True)
-        executed[use] = torch.where(sound, found.action, planned[use])
-        spread[use] = torch.where(sound, found.spread, 0.0)
-        if found.reach is not None and self.widen and self.model.extrapolates:
-            # Never a smaller box: what cannot be had the flow cuts, and it knows better.
-            low, high = torch.where(sound.unsqueeze(-1), found.reach, 0.0).unbind(-2)
-            least, most = reach[use].unbind(-2)
-            widened = [torch.minimum(least, low), torch.maximum(most, high)]
-            reach[use] = torch.stack(widened, -2)
-        return Correction(executed, spread, reach)
-
-    def _box(self, like: Tensor) -> Tensor:
-        """Return the action box for actions ``(*B, A)``: ``(*B, 2, A)``."""
-        space = self.parent.full_action_spec[self.action_key].space
-        return torch.stack([space.low.expand_as(like), space.high.expand_as(like)], -2).to(like)
+        memory = correct(
+            self._recall(tensordict),
+            tensordict.get(self.action_key),
+            self.model,
+            self.flow,
+            self.parent.full_action_spec[self.action_key],
+            self.enabled,
+            self.widen,
+        )
+        tensordict.set(self.action_key, memory.get("executed_action"))
+        return tensordict.set(self.prefix, memory)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        memory = tensordict.get(self.prefix).clone(recurse=False)
-        state, next_state = memory.get("state"), next_tensordict.get(self.observation_key)
-        planned, executed = memory.get("planned_action"), memory.get("executed_action")
-        valid = next_state.isfinite().all(-1) & state.isfinite().all(-1)
-        newest = Window(state, planned, executed, next_state, valid)
-        window = memory.get("window").clone(recurse=False)
-        for name, value in newest._asdict().items():
-            kept = window.get(name).narrow(valid.dim(), 1, self.flow.window - 1)
-            window.set(name, torch.cat([kept, value.unsqueeze(valid.dim())], valid.dim()))
-        memory.set("window", window)
-        memory.set("state", next_state.clone())
+        memory = observe(tensordict.get(self.prefix), next_tensordict.get(self.observation_key))
         return next_tensordict.set(self.prefix, memory)
 
     def _reset(
@@ -159,9 +121,9 @@ class ActionFlowTransform(Transform):
     ) -> TensorDictBase:
         self._check_process()
         state = tensordict_reset.get(self.observation_key)
-        memory = self._memory_spec(state.shape[:-1], state.dtype).to(state.device).zero()
-        memory.set("reach", self._box(memory.get("planned_action")))
-        return tensordict_reset.set(self.prefix, memory.set("state", state.clone()))
+        action_spec = self.parent.full_action_spec[self.action_key]
+        memory = begin(self.model, self.flow, state, action_spec)
+        return tensordict_reset.set(self.prefix, memory)
 
     def _recall(self, tensordict: TensorDictBase) -> TensorDictBase:
         memory = tensordict.get(self.prefix, None)
@@ -195,39 +157,6 @@ class ActionFlowTransform(Transform):
                     "it, and give it a model of the whole stride"
                 )
 
-    def _memory_spec(self, batch: torch.Size, dtype: torch.dtype) -> Composite:
-        """Return the specs of the memory for a batch shape."""
-        states, actions, window = self.model.state_size, self.model.action_size, self.flow.window
-
-        def real(*shape: int) -> Unbounded:
-            return Unbounded((*batch, *shape), dtype=dtype)
-
-        def flag(*shape: int) -> Binary:
-            return Binary(shape=(*batch, *shape), dtype=torch.bool)
-
-        rows = Composite(
-            state=real(window, states),
-            planned=real(window, actions),
-            executed=real(window, actions),
-            next_state=real(window, states),
-            valid=flag(window),
-            shape=batch,
-        )
-        return Composite(
-            state=real(states),
-            window=rows,
-            pairs=real(window, self.flow.pair_size),
-            evidence=real(self.flow.evidence_size),
-            features=real(self.flow.feature_size),
-            surprise=real(),
-            misaligned=flag(),
-            planned_action=real(actions),
-            executed_action=real(actions),
-            spread=real(actions),
-            reach=real(2, actions),
-            shape=batch,
-        )
-
     def _with_memory(self, spec: Composite) -> Composite:
         self._check_order()
         found = self.parent.full_observation_spec
@@ -238,7 +167,8 @@ class ActionFlowTransform(Transform):
                 f"{found[self.observation_key].shape[-1]} numbers, but the dynamics model's "
                 f"state has {self.model.state_size}"
             )
-        spec[self.prefix] = self._memory_spec(spec.shape, dtype).to(spec.device)
+        memory = memory_spec(self.model, self.flow, spec.shape, dtype)
+        spec[self.prefix] = memory.to(spec.device)
         return spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -37,6 +37,7 @@ from afm_rl.planning import (
     TrackingCost,
 )
 from afm_rl.regimes import ActionGain
+from afm_rl.transforms import ActionFlowPolicy
 
 BOX = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 
@@ -80,10 +81,12 @@ def predict(model, batch, **kind):
 def correct(flow, batch, **kind):
     rows = [draw(batch, flow.window, n, seed=n, **kind) for n in (3, 2, 2, 3)]
     window = Window(*rows, draw(batch, flow.window, **kind) >= 0)
+    sizes = (flow.window, flow.pair_size), (flow.evidence_size,), (flow.feature_size,)
     silent = torch.zeros(batch, **kind)
-    last = Context(draw(batch, flow.feature_size, **kind), silent, silent.bool())
+    last = Context(*(draw(batch, *size, **kind) for size in sizes), silent, silent.bool())
     context = flow.context(window, Dubins().to(**kind), last)
-    return *context[:2], *flow.correct(context, rows[0][..., -1, :], rows[1][..., -1, :])
+    found = flow.correct(context, rows[0][..., -1, :], rows[1][..., -1, :])
+    return *context[:4], *(part for part in found if part is not None)
 
 
 def plan(planner, batch, **kind):
@@ -96,13 +99,24 @@ def plan(planner, batch, **kind):
     return tuple(out[key] for key in planner.out_keys)
 
 
+def execute(policy, batch, **kind):
+    td = policy.make_tensordict_primer()(TensorDict({}, batch))
+    executed = []
+    for seed in range(3):
+        td["observation"], td["action"] = (draw(batch, n, seed=seed, **kind) for n in (3, 2))
+        td = policy(td)
+        executed.append(td["action"])
+        td = td.update(td.pop("next"))
+    return tuple(executed)
+
+
 def measure(loss, batch, **kind):
     return (loss(transition(batch, **kind))["loss_nll"],)
 
 
 def match(loss, batch, **kind):
     data = {"features": draw(batch, loss.flow.feature_size, **kind)}
-    for seed, name in enumerate(("planned", "intended")):
+    for seed, name in enumerate(loss.in_keys[1:]):
         data[name] = draw(batch, 2, seed=seed, **kind)
     return (loss(TensorDict(data, batch))["loss_cfm"],)
 
@@ -126,6 +140,15 @@ def updater(kind, *more, seed=0, dtype=torch.float32, **settings):
     return kind(GaussianNLLLoss(model), *more)
 
 
+SMALL_FLOW = {"window": 3, "memory": 7, "hidden": [8], "latent": 4}
+
+
+def policy(seed=0, dtype=torch.float32):
+    model = Dubins().to(dtype)
+    flow = ContextFlow(*BOX, window=3, hidden=[8], latent=4, seed=seed).to(dtype)
+    return ActionFlowPolicy(model, flow, world(dtype=dtype).action_spec)
+
+
 FEW = {"population": 12, "iterations": 2}
 ADAM = partial(FreshAdam, lr=1e-2)
 TRACKING = TrackingCost([1.0, 1.0, 0.0], [0.01, 0.01], coordinates=[0, 1])
@@ -142,7 +165,7 @@ MODULES = {
     "Quadrotor": Case(lambda seed: Quadrotor(), predict),
     "KNODE": Case(lambda seed: KNODE(Quadrotor()), predict),
     "ContextFlow": Case(
-        lambda seed: ContextFlow(*BOX, window=3, hidden=[8], latent=4, seed=seed), correct
+        lambda seed: ContextFlow(*BOX, **SMALL_FLOW, place=[0, 1], seed=seed), correct
     ),
     "PaperFlow": Case(lambda seed: PaperFlow(*BOX, [2], 3, width=8, seed=seed), correct),
     "LeastSquares gain": Case(lambda seed: LeastSquares(*BOX), correct),
@@ -152,9 +175,13 @@ MODULES = {
     "MPC": Case(partial(planner, MPC, cost=TRACKING), plan),
     "CEM": Case(partial(planner, CEM, **FEW, elites=3), plan),
     "TorchRLMPPI": Case(partial(planner, TorchRLMPPI, **FEW, elites=3), plan),
+    "ActionFlowPolicy": Case(policy, execute),
     "GaussianNLLLoss": Case(lambda seed: GaussianNLLLoss(small(seed), reduction="none"), measure),
     "CFMLoss": Case(
         lambda seed: CFMLoss(PaperFlow(*BOX, [2], 3, width=8, seed=seed), reduction="none"), match
+    ),
+    "CFMLoss with effects": Case(
+        lambda seed: CFMLoss(ContextFlow(*BOX, **SMALL_FLOW, seed=seed), reduction="none"), match
     ),
     "Updater": Case(partial(updater, Updater), learn),
     "OnlineUpdater": Case(partial(updater, OnlineUpdater, ADAM), learn),
@@ -164,10 +191,11 @@ MODULES = {
     "StreamXUpdater": Case(partial(updater, StreamXUpdater, init="sparse", layer_norm=True), learn),
 }
 BOUND_TO_VALUES = (
-    *("MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI"),
+    *("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI"),
     *("OnlineUpdater", "RLSUpdater", "StreamXUpdater"),
 )
-BUILT_IN_PRECISION = ("MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI")
+LOOKS_AT_VALUES = ("ContextFlow",)  # only what is surprising is looked at closely
+BUILT_IN_PRECISION = ("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI")
 
 
 SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "OnlineUpdater", "StreamXUpdater")
@@ -204,5 +232,13 @@ def compiled_case(request):
 
 @pytest.fixture(params=[name for name in MODULES if name not in BOUND_TO_VALUES])
 def movable_case(request):
+    """Each module that can be moved to another device once it is made."""
+    return case_of(request.param)
+
+
+@pytest.fixture(
+    params=[name for name in MODULES if name not in (*BOUND_TO_VALUES, *LOOKS_AT_VALUES)]
+)
+def blind_case(request):
     """Each module that computes without looking at its numbers."""
     return case_of(request.param)

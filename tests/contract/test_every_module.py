@@ -43,8 +43,8 @@ def test_the_state_dict_holds_all_that_was_learnt(case):
     same(case.say(other, (4,), dtype=torch.float32), case.say(module, (4,), dtype=torch.float32))
 
 
-def test_nothing_is_left_on_another_device(movable_case):
-    make, say = movable_case
+def test_nothing_is_left_on_another_device(blind_case):
+    make, say = blind_case
     said = say(make().to("meta"), (2, 3), device="meta")  # mixing devices would be an error
     assert all(part.is_meta and part.shape[:2] == (2, 3) for part in said)
 

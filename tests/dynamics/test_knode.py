@@ -8,7 +8,7 @@ import torch
 
 from afm_rl.airframe import QuadrotorBody
 from afm_rl.dynamics import KNODE, Dubins, DynamicsModel, KnownDynamics, Quadrotor
-from afm_rl.dynamics.rates import QuadrotorRate
+from afm_rl.dynamics.quadrotor_equations import QuadrotorRate
 from afm_rl.dynamics.residual import Network
 from afm_rl.dynamics.runge_kutta import runge_kutta_tangent
 from afm_rl.errors import ConfigurationError
@@ -81,7 +81,7 @@ def test_without_networks_it_is_the_nominal_model():
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"features": range(3, 13)}, {"substeps": 3, "hidden": 8}, {"nominal": {"dt": 0.1}}],
+    [{}, {"features": range(3, 13)}, {"substeps": 3, "units": 8}, {"nominal": {"dt": 0.1}}],
     ids=str,
 )
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)], ids=str)
@@ -110,7 +110,7 @@ def test_closed_forms_equal_finite_differences():
 
 
 def test_any_rate_of_change_will_do():
-    model = KNODE(Dubins(), rate=car_rate, substeps=2, hidden=8).push_().double()
+    model = KNODE(Dubins(), rate=car_rate, substeps=2, units=8).push_().double()
     generator = torch.Generator().manual_seed(0)
     state, action = (torch.randn(6, n, generator=generator).double() for n in (3, 2))
     state[:, 2] = 3.14  # some of them cross pi
@@ -223,7 +223,7 @@ def test_single_precision_stays():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"hidden": 0}, "dynamics.hidden=0"),
+        ({"units": 0}, "dynamics.units=0"),
         ({"pool": 0}, "dynamics.pool=0"),
         ({"substeps": 0}, "dynamics.substeps=0"),
         ({"dt": 0.0}, "dynamics.dt=0.0"),

@@ -10,6 +10,7 @@ from torchrl.envs.utils import check_env_specs
 
 from afm_rl.airframe import QuadrotorBody, saturate
 from afm_rl.dynamics import Quadrotor
+from afm_rl.dynamics.quadrotor_equations import quadrotor_path
 from afm_rl.envs import Circle, CrazyflieTrack, Hover, Reference, schedule_in_seconds
 from afm_rl.errors import ConfigurationError, NonFiniteError
 from afm_rl.regimes import ActionGain, Delay, GainNoise, MassFactor, Schedule, flight_regimes
@@ -86,8 +87,51 @@ def test_the_reference_is_previewed_or_held():
         env = CrazyflieTrack(circle, preview=preview, horizon=4)
         seen = fly(env, env.reset(), 3)["reference"][-1]
         ticks = torch.arange(3, 8) if preview else torch.full((5,), 3)
-        ahead = 0.0 if preview else 0.002  # the metric's
-        torch.testing.assert_close(seen, circle.at(ticks * 0.05 + ahead))
+        torch.testing.assert_close(seen, circle.at(ticks * 0.05 + 0.002))  # the metric's
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("settings", [{}, {"sensor_noise": 0.01}, {"substeps": 1}], ids=str)
+def test_specs_hold_with_a_trace(batch, settings):
+    check_env_specs(CrazyflieTrack(batch_size=batch, duration=0.15, trace=True, **settings))
+
+
+def test_the_trace_is_the_flight_between_two_ticks():
+    env = CrazyflieTrack(dtype=torch.float64, trace=True, substeps=5)
+    data = env.reset(TensorDict(batch_size=[2]))
+    assert (data["trace"] == data["observation"].unsqueeze(-2)).all()
+    action = torch.tensor([0.4, 1e-5, 0.0, 0.0], dtype=torch.float64)
+    first = act(env, data, action)
+    expected = quadrotor_path(data["pose"], action.expand(2, 4), 0.05, 5, BODY).movedim(0, -2)
+    torch.testing.assert_close(first["trace"][:, 1:], expected, rtol=1e-12, atol=1e-12)
+    second = act(env, env.step_mdp(data), action)
+    for trace, before, after in ((first, data, first), (second, first, second)):
+        assert (trace["trace"][:, 0] == before["observation"]).all()
+        assert (trace["trace"][:, -1] == after["observation"]).all()
+    assert "trace" not in CrazyflieTrack().reset()
+
+
+def test_sensors_see_the_trace():
+    env = CrazyflieTrack(Hover(), sensor_noise=[0.1, 0.2, 0.3, 0.4], trace=True, substeps=3)
+    data = env.reset(TensorDict(batch_size=[3000]))
+    after = act(env, data)
+    assert (after["trace"][:, 0] == data["observation"]).all()
+    assert (after["trace"][:, -1] == after["observation"]).all()
+    seen, pose = after["trace"], data["pose"].unsqueeze(-2)  # it hovers
+    spread = Quadrotor().manifold.difference(seen, pose.expand_as(seen)).std(0)
+    expected = torch.tensor([0.1, 0.2, 0.3, 0.4]).repeat_interleave(3).expand(4, 12)
+    torch.testing.assert_close(spread, expected, rtol=0.1, atol=0)
+    quiet = CrazyflieTrack(Hover(), sensor_noise=[0.1, 0.2, 0.3, 0.4], substeps=3)
+    same = act(quiet, quiet.reset(TensorDict(batch_size=[3000])))
+    assert (same["observation"] == after["observation"]).all()  # whether there is a trace or not
+
+
+def test_a_lost_flight_leaves_a_finite_trace():
+    env = CrazyflieTrack(Hover(), limit=0.1, trace=True)
+    record = fly(env, env.reset(), 8, [0.575, 0, 0, 0])
+    lost = record["lost"]
+    assert lost[-1] and not lost[0]
+    assert (record["trace"][lost] == record["pose"][lost].unsqueeze(-2)).all()
 
 
 def test_the_error_is_the_mean_over_the_plant_steps():
@@ -345,6 +389,7 @@ class Halfway(Reference):
         ({"start_noise": -0.1}, "start_noise=-0.1"),
         ({"dt": 0.0}, "dt=0.0"),
         ({"substeps": 0}, "substeps=0"),
+        ({"trace": 1}, "trace=1: expected true or false"),
         ({"missions": {"mass": 0.5}}, "missions='mass': expected one of"),
         ({"missions": {"regime": {"mass": 0.0}}}, "mass=0.0"),
         ({"missions": {"times": [5.0, 2.0]}}, "expected increasing"),

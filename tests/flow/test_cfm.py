@@ -9,24 +9,42 @@ from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import CFMLoss, ContextFlow, Examples, train_flow
+from afm_rl.flow import CFMLoss, ContextFlow, Correction, Examples, train_flow
 from afm_rl.flow.cfm import BLOCK, POOL, held_out_error
+from afm_rl.flow.saturation import LIMIT
 
 TINY = {"window": 3, "hidden": [8], "latent": 4}
 
 
-class Exact(ContextFlow):
-    """Knows the right answer: it is in the context, in half ranges."""
+class Bare(ContextFlow):
+    """Makes nothing of a context, and knows one direction only."""
+
+    has_effect = False
+
+    def read(self, features):
+        return features
 
     def forward(self, features, planned, tau, point):
-        return (features - point) / (1 - tau)
+        return torch.zeros_like(point)
+
+
+class Exact(Bare):
+    """Knows the right answers: they are in the context, in half ranges."""
+
+    has_effect = True
+
+    def forward(self, features, planned, tau, point):
+        return (features[..., :2] - point) / (1 - tau)
+
+    def effect(self, features, executed):
+        return features[..., 2:] + self.off
 
 
 @pytest.fixture
 def examples(box):
     low, high = box
-    planned, intended = (low + (high - low) * torch.rand(64, 2) for _ in range(2))
-    return {"planned": planned, "intended": intended}
+    drawn = [low + (high - low) * torch.rand(64, 2) for _ in range(4)]
+    return dict(zip(("planned", "intended", "probe", "worth"), drawn, strict=True))
 
 
 @pytest.fixture
@@ -44,19 +62,39 @@ def same(left, right):
     return all(torch.equal(value, right[name]) for name, value in left.state_dict().items())
 
 
-def test_the_exact_velocity_costs_nothing(box, examples):
+@pytest.mark.parametrize("off", [0.0, 0.1])
+def test_the_exact_velocity_costs_nothing_and_a_wrong_effect_its_square(box, examples, off):
     flow = Exact(*box, **TINY)
-    td = TensorDict({**examples, "features": flow.normalise(examples["intended"])}, [64])
-    loss = CFMLoss(flow)(td)["loss_cfm"]
+    flow.off = off
+    features = torch.cat([flow.normalise(examples[name]) for name in ("intended", "worth")], -1)
+    loss = CFMLoss(flow)(TensorDict({**examples, "features": features}, [64]))["loss_cfm"]
+    assert float(loss) == pytest.approx(off**2, abs=1e-6)
+
+
+def test_effects_beyond_the_limit_are_cut(box, examples):
+    flow = Exact(*box, **TINY)
+    flow.off = 0.0
+    far = {**examples, "worth": 100 * torch.ones(64, 2)}
+    features = torch.cat([flow.normalise(examples["intended"]), torch.full((64, 2), LIMIT)], -1)
+    loss = CFMLoss(flow)(TensorDict({**far, "features": features}, [64]))["loss_cfm"]
     assert float(loss) == pytest.approx(0, abs=1e-6)
 
 
-def test_a_still_flow_pays_for_the_way(box, examples):
-    class Still(ContextFlow):
-        def forward(self, features, planned, tau, point):
-            return torch.zeros_like(point)
+def test_what_is_read_depends_on_what_the_flow_knows(box, examples):
+    loss = CFMLoss(ContextFlow(*box, **TINY))
+    assert loss.in_keys == ["features", "planned", "intended", "probe", "worth"]
+    plain = CFMLoss(Bare(*box, **TINY))
+    assert plain.in_keys == ["features", "planned", "intended"]
+    features = torch.zeros(64, plain.flow.feature_size)
+    few = {name: examples[name] for name in ("planned", "intended")}
+    by_name = plain(features=features, **few)
+    assert by_name.shape == () and by_name > 0
+    loss.set_keys(probe=("probe", "action"), worth="effect")
+    assert loss.in_keys[3:] == [("probe", "action"), "effect"]
 
-    flow = Still(*box, source_std=0.0, **TINY)
+
+def test_a_still_flow_pays_for_the_way(box, examples):
+    flow = Bare(*box, source_std=0.0, **TINY)
     td = TensorDict({**examples, "features": torch.zeros(64, flow.feature_size)}, [64])
     way = flow.normalise(examples["intended"]) - flow.normalise(examples["planned"])
     each = CFMLoss(flow, reduction="none")(td)["loss_cfm"]
@@ -68,7 +106,7 @@ def test_a_still_flow_pays_for_the_way(box, examples):
 def test_times_and_sources_are_drawn_as_they_should(box, examples):
     drawn = {}
 
-    class Spy(ContextFlow):
+    class Spy(Bare):
         def forward(self, features, planned, tau, point):
             drawn.update(tau=tau, point=point)
             return torch.zeros_like(point)
@@ -91,8 +129,9 @@ def test_keys_can_be_chosen_and_entries_come_by_name(box, examples):
     torch.testing.assert_close(CFMLoss(flow)(features=features, **examples), expected)
     loss = CFMLoss(flow)
     loss.set_keys(planned=("plan", "action"), features="context")
-    assert loss.in_keys == ["context", ("plan", "action"), "intended"]
-    td = TensorDict({"context": features, "intended": examples["intended"]}, [64])
+    assert loss.in_keys == ["context", ("plan", "action"), "intended", "probe", "worth"]
+    rest = {name: value for name, value in examples.items() if name != "planned"}
+    td = TensorDict({"context": features, **rest}, [64])
     td["plan", "action"] = examples["planned"]
     torch.testing.assert_close(loss(td)["loss_cfm"], expected)
     loss.in_keys = ["context"]
@@ -121,11 +160,11 @@ def test_training_helps(trained_flow, trained_flow_error, states, gains):
 def test_the_held_out_error_is_in_half_ranges(box, examples):
     class Idle(ContextFlow):
         def correct(self, context, state, planned):
-            return planned, torch.zeros_like(planned)
+            return Correction(planned, torch.zeros_like(planned))
 
     flow = Idle(*box, **TINY)
     features = torch.zeros(64, flow.feature_size)
-    given = Examples(features, examples["planned"], examples["intended"])
+    given = Examples(features, **examples)
     gap = (examples["planned"] - examples["intended"]) / flow.half_range
     assert held_out_error(flow, given) == pytest.approx(float(gap.square().mean().sqrt()))
 
@@ -149,14 +188,14 @@ def test_examples_are_used_again_when_the_model_is_slow(box, states, gains, make
 
     def made(reuse, model=None):
         counts.clear()
-        settings = {"iterations": 20, "batch_size": 32, "reuse": reuse}
+        settings = {"iterations": 20, "batch_size": 8, "reuse": reuse}
         train_flow(Counting(*box, **TINY), model or Dubins(), gains, states, **settings)
         return sum(counts[:-1])  # the last are held out
 
     counts = []
-    assert made(1) == 3 * BLOCK * 32  # the last block is not used up
-    assert made(4) == POOL * 32 + 20 * 8
-    assert made(64) == POOL * 32 + 3 * 4  # four of them every eight steps
+    assert made(1) == 3 * BLOCK * 8  # the last block is not used up
+    assert made(4) == POOL * 8 + 20 * 2
+    assert made(64) == POOL * 8 + 3 * 1  # one of them every eight steps
     assert made(None) == made(1)
     assert made(None, make_ensemble()) < made(8)
 
@@ -198,7 +237,8 @@ def test_impossible_settings_are_refused(train, settings):
 def test_plans_share_a_context(box, states, gains):
     flow, generator = ContextFlow(*box, **TINY), torch.Generator().manual_seed(0)
     found = flow.examples(Dubins(), gains, states, 10, generator, plans=4)
-    assert len(found.features) == len(found.planned) == len(found.intended) == 10
+    assert [len(part) for part in found] == [10] * 5
     assert torch.equal(found.features[0], found.features[3])
     assert not torch.equal(found.features[3], found.features[4])
     assert not torch.equal(found.planned[0], found.planned[1])
+    assert not torch.equal(found.probe[0], found.probe[1])

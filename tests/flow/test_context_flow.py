@@ -1,4 +1,4 @@
-"""The flow on a window of effective actions."""
+"""The flow on a window of effective actions: what it reads, and what it is trained on."""
 
 import math
 
@@ -7,33 +7,20 @@ import torch
 
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import Context, ContextFlow, Window, midpoint
-from afm_rl.flow.pairs import LIMIT
+from afm_rl.flow import ContextFlow, Window, midpoint
+from afm_rl.flow.saturation import LIMIT
 from afm_rl.regimes import ActionGain
 
-SILENT = Context(torch.zeros(1), torch.zeros(1), torch.zeros(1, dtype=torch.bool))
-
 
 @pytest.fixture
-def flow(box):
-    return ContextFlow(*box, window=4, hidden=[16], latent=8)
+def loud(box):
+    """A flow that is never silent about a surprise."""
+    views = ["recent", "late_1", "mean"]
+    return ContextFlow(*box, window=4, memory=9, hidden=[16], latent=8, views=views)
 
 
-@pytest.fixture
-def window_of(transitions):
-    """Make a full window of transitions under a gain."""
-
-    def make(gain, *batch, rows=4):
-        state, action = transitions(*batch, rows)
-        reached = Dubins()(state, action * torch.tensor(gain))
-        valid = torch.ones(*batch, rows, dtype=torch.bool)
-        return Window(state, action, action, reached, valid)
-
-    return make
-
-
-def context_of(flow, window):
-    return flow.context(window, Dubins(), SILENT)
+def context_of(flow, window, last=None):
+    return flow.context(window, Dubins(), last)
 
 
 def grid(box):
@@ -44,8 +31,8 @@ def grid(box):
 
 def test_a_reversed_motor_is_corrected_by_reversing_the_action(trained_flow, window_of, box):
     planned = grid(box)
-    window = window_of([-1.0, 1.0], len(planned))
-    corrected, _ = trained_flow.correct(context_of(trained_flow, window), None, planned)
+    window = window_of([-1.0, 1.0], len(planned), rows=trained_flow.window)
+    corrected = trained_flow.correct(context_of(trained_flow, window), None, planned).action
     right = planned * torch.tensor([-1.0, 1.0])
     miss = (corrected - right) / trained_flow.half_range
     assert miss.square().mean().sqrt() < 0.2
@@ -55,124 +42,151 @@ def test_a_reversed_motor_is_corrected_by_reversing_the_action(trained_flow, win
     assert (reached - wanted).norm() < 0.3 * (uncorrected - wanted).norm()
 
 
-def test_a_nominal_window_changes_little(trained_flow, window_of, box):
+def test_a_nominal_window_changes_little(trained_flow, window_of, box, told):
     planned = grid(box)
-    context = context_of(trained_flow, window_of([1.0, 1.0], len(planned)))
-    assert not context.misaligned.any()
-    corrected, _ = trained_flow.correct(context, None, planned)
+    context = context_of(trained_flow, window_of([1.0, 1.0], 25, rows=trained_flow.window))
+    assert not context.misaligned.any() and not context.features.any()
+    pairs = context.pairs[:, -trained_flow.shown :, :-1].flatten(-2)
+    corrected = trained_flow.correct(told(pairs), None, planned).action
     miss = (corrected - planned) / trained_flow.half_range
     assert miss.square().mean().sqrt() < 0.2
 
 
-def test_the_context_holds_pairs_in_half_ranges(flow, window_of):
+def test_the_pairs_are_in_half_ranges(flow, window_of):
     window = window_of([2.0, -0.5], 3)
-    features = context_of(flow, window).features.unflatten(-1, (4, 5))
-    torch.testing.assert_close(features[..., :2], window.executed / flow.half_range)
+    pairs = context_of(flow, window).pairs
+    assert pairs.shape == (3, flow.window, flow.pair_size)
+    torch.testing.assert_close(pairs[..., :2], window.executed / flow.half_range)
     effective = window.executed * torch.tensor([2.0, -0.5]) / flow.half_range
-    torch.testing.assert_close(features[..., 2:4], effective, rtol=0, atol=1e-3)
-    assert (features[..., 4] == 1).all()
+    torch.testing.assert_close(pairs[..., 2:4], effective, rtol=0, atol=1e-3)
+    assert (pairs[..., 4] == 1).all()
+    expected = Dubins()(window.state, window.executed)
+    error = Dubins().manifold.difference(window.next_state, expected).abs().amax(-1)
+    torch.testing.assert_close(pairs[..., 5], error / 1e-3, rtol=1e-2, atol=0.1)
+
+
+def test_the_context_is_what_the_best_view_shows(box, window_of):
+    flow = ContextFlow(*box, window=4, memory=9, views=["recent"], hidden=[16], latent=8)
+    context = context_of(flow, window_of([2.0, -0.5], 3))
+    features = context.features.unflatten(-1, (4, 5))
+    assert not features[:, :2].any()
+    assert torch.equal(features[:, 2:], context.pairs[:, -2:, :-1])
 
 
 def test_the_executed_not_the_planned_action_is_judged(flow, window_of):
     window = window_of([-1.0, 1.0], 3)
-    other = window._replace(planned=torch.randn(3, 4, 2))
-    assert torch.equal(context_of(flow, other).features, context_of(flow, window).features)
+    other = window._replace(planned=torch.randn(3, 9, 2))
+    for found, expected in zip(context_of(flow, other), context_of(flow, window), strict=True):
+        assert torch.equal(found, expected)
 
 
-def test_missing_rows_are_blank_and_silent(flow, window_of):
+def test_missing_rows_are_blank_and_silent(loud, window_of):
+    flow = loud
     window = window_of([-1.0, 1.0], 3)
-    window.valid[:, :2] = False
+    window.valid[:, :7] = False
     context = context_of(flow, window)
-    features = context.features.unflatten(-1, (4, 5))
-    assert (features[:, :2] == 0).all() and (features[:, 2:, 4] == 1).all()
+    assert (context.pairs[:, :7] == 0).all() and (context.pairs[:, 7:, 4] == 1).all()
+    assert context.features.isfinite().all() and context.misaligned.all()
     window.valid[:] = False
     empty = context_of(flow, window)
-    assert (empty.features == 0).all() and (empty.surprise == 0).all()
-    assert not empty.misaligned.any()
+    assert all((part == 0).all() for part in empty)
 
 
-def test_one_surprise_in_the_window_opens_the_gate(flow, window_of):
-    window = window_of([1.0, 1.0], 3)
+def test_one_surprise_among_the_newest_opens_the_gate(loud, window_of):
+    flow = loud
+    window = window_of([1.0, 1.0], 4)
     noise_std = 1e-3
     assert not context_of(flow, window).misaligned.any()
-    window.next_state[1, 0, 0] += 1.01 * flow.gate * noise_std
-    window.next_state[2, 3, 1] -= 0.95 * flow.gate * noise_std
+    window.next_state[1, -flow.shown, 0] += 1.01 * flow.gate * noise_std
+    window.next_state[2, -1, 1] -= 0.95 * flow.gate * noise_std
+    window.next_state[3, -flow.shown - 1, 0] += 9.0 * flow.gate * noise_std  # long ago
     context = context_of(flow, window)
-    assert context.misaligned.tolist() == [False, True, False]
-    expected = torch.tensor([0.0, 1.01, 0.95]) * flow.gate
+    assert context.misaligned.tolist() == [False, True, False, False]
+    expected = torch.tensor([0.0, 1.01, 0.95, 0.0]) * flow.gate
     torch.testing.assert_close(context.surprise, expected, rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize("fault", [math.nan, math.inf, 1e38])
-def test_faulty_rows_count_as_missing(flow, window_of, fault):
+def test_faulty_rows_count_as_missing(box, window_of, fault):
+    flow = ContextFlow(*box, window=4, memory=9, hidden=[16], latent=8, place=[0, 1])
     window = window_of([-1.0, 1.0], 3)
     expected = context_of(flow, window)
-    window.next_state[1, 2] = fault
+    window.next_state[1, 7] = fault
+    window.state[1, 8] = fault
     context = context_of(flow, window)
-    assert context.features.isfinite().all() and context.surprise.isfinite().all()
+    assert all(part.isfinite().all() for part in context)
     assert torch.equal(context.features[[0, 2]], expected.features[[0, 2]])
     if not fault < math.inf:
-        assert (context.features.unflatten(-1, (4, 5))[1, 2] == 0).all()
+        assert (context.pairs[1, 7:] == 0).all() and not context.evidence[1].any()
 
 
 def test_outliers_are_clamped(flow, window_of):
     window = window_of([1.0, 1.0], 2)
-    window.next_state[0, 0] += 1000.0
-    features = context_of(flow, window).features
-    assert features.abs().max() == LIMIT
+    window.next_state[0, -1] += 1000.0
+    context = context_of(flow, window)
+    assert context.pairs[..., :-1].abs().max() == LIMIT == context.features.abs().max()
 
 
-def test_the_correction_integrates_the_velocity_from_every_source_point(flow, window_of, box):
-    context = context_of(flow, window_of([-1.0, 1.0], 25))
+def test_the_correction_integrates_the_velocity_from_every_source_point(flow, window_of, box, told):
+    flow.unsure = math.inf
+    features = context_of(flow, window_of([-1.0, 1.0], 25)).features
     planned = grid(box)
-    corrected, spread = flow.correct(context, None, planned)
-    unit = (planned / flow.half_range).unsqueeze(-2).expand(-1, flow.samples, -1)
-    features = context.features.unsqueeze(-2).expand(-1, flow.samples, -1)
+    corrected = flow.correct(told(features), None, planned)
+    unit = planned / flow.half_range
+    wide = unit.unsqueeze(-2).expand(-1, flow.samples, -1)
+    known = flow.read(features).wide()
 
     def velocity(tau, point):
-        return flow(features, unit, torch.full_like(point[..., :1], tau), point)
+        return flow(known, wide, torch.full_like(point[..., :1], tau), point)
 
-    start = unit + flow.source_std * flow.source_points
-    end = midpoint(velocity, start, flow.steps)
-    torch.testing.assert_close(corrected, end.mean(-2) * flow.half_range)
-    torch.testing.assert_close(spread, end.std(-2, correction=0) * flow.half_range)
+    end = midpoint(velocity, wide + flow.source_std * flow.source_points, flow.steps)
+    expected = end.mean(-2) * flow.half_range
+    torch.testing.assert_close(corrected.action, expected)
+    torch.testing.assert_close(corrected.spread, end.std(-2, correction=0) * flow.half_range)
 
 
 def test_a_batch_equals_single_missions(flow, window_of, box):
     window, planned = window_of([-1.0, 1.0], 6), grid(box)[:6]
     context = context_of(flow, window)
-    corrected, spread = flow.correct(context, None, planned)
+    together = flow.correct(context, None, planned)
     for k in range(6):
         alone = context_of(flow, Window(*(part[k] for part in window)))
         torch.testing.assert_close(alone.features, context.features[k])
         single = flow.correct(alone, None, planned[k])
-        torch.testing.assert_close(single, (corrected[k], spread[k]))
+        for found, expected in zip(single, together, strict=True):
+            torch.testing.assert_close(found, expected[k])
 
 
 def test_source_points_cancel_and_a_point_source_has_no_spread(box, window_of):
     flow = ContextFlow(*box, window=4, hidden=[16], latent=8, samples=6)
     assert flow.source_points.shape == (6, 2)
     torch.testing.assert_close(flow.source_points.sum(0), torch.zeros(2))
-    still = ContextFlow(*box, window=4, hidden=[16], latent=8, source_std=0.0)
-    _, spread = still.correct(context_of(still, window_of([1.0, 1.0], 25)), None, grid(box))
+    still = ContextFlow(*box, window=4, memory=9, hidden=[16], latent=8, source_std=0.0)
+    context = context_of(still, window_of([1.0, 1.0], 25))
+    spread = still.correct(context, None, grid(box)).spread
     torch.testing.assert_close(spread, torch.zeros(25, 2), rtol=0, atol=1e-6)
 
 
-def test_examples_show_the_regime_and_its_inverse(flow, states, box):
+def test_examples_show_the_regime_its_inverse_and_its_effects(flow, states, box):
     twice = ActionGain(["v_gain", "omega_gain"], low=2.0, high=2.0, nominal=0.0)
     generator = torch.Generator().manual_seed(0)
-    made = flow.examples(Dubins(), twice, states, 500, generator)
-    assert made.features.shape == (500, flow.feature_size)
+    made = flow.examples(Dubins(), twice, states, 2000, generator)
+    assert made.features.shape == (2000, flow.feature_size)
     rows = made.features.unflatten(-1, (4, 5))
     executed, effective, valid = rows[..., :2], rows[..., 2:4], rows[..., 4] > 0
     assert executed.abs().max() <= 1 and valid[:, -1].all()
-    assert (made.planned >= box[0]).all() and (made.planned <= box[1]).all()
     moving = executed[:, -1].abs() > 0.1
     gain = torch.where(moving, effective[:, -1] / executed[:, -1], 2.0)
     torch.testing.assert_close(gain.abs(), torch.full_like(gain, 2.0), rtol=0, atol=0.3)
-    known = moving.all(-1)
-    expected = made.planned / (2.0 * gain.sign())
-    torch.testing.assert_close(made.intended[known], expected[known])
+    known, sign = moving.all(-1), 2.0 * gain.sign()
+    torch.testing.assert_close(made.intended[known], (made.planned / sign)[known])
+    torch.testing.assert_close(made.worth[known], (made.probe * sign)[known])
+    for part in (made.intended, made.probe):
+        assert (part >= box[0]).all() and (part <= box[1]).all()
+    inside = ((made.planned >= box[0]) & (made.planned <= box[1])).all(-1)
+    share = float(inside.float().mean())
+    assert share == pytest.approx(0.5 + 0.5 / 4, abs=0.05)  # others ask for what can be had
+    assert (made.planned.abs() <= 2 * box[1]).all()
 
 
 def test_examples_straddle_changes_and_begin_with_missions(flow, states, gains):
@@ -180,8 +194,10 @@ def test_examples_straddle_changes_and_begin_with_missions(flow, states, gains):
     made = flow.examples(Dubins(), gains, states, 4000, generator)
     valid = made.features.unflatten(-1, (4, 5))[..., 4]
     assert (valid.diff(dim=-1) >= 0).all()  # what is missing is the oldest
-    short = float((valid.sum(-1) < 4).float().mean())
-    assert 0.03 < short < 0.1
+    share = torch.bincount(valid.sum(-1).long(), minlength=5) / 4000
+    # A quarter each: a sixth (one row), a half, all; and any number.
+    expected = torch.tensor([0.0, 0.25 + 0.0625, 0.25 + 0.0625, 0.0625, 0.25 + 0.0625])
+    torch.testing.assert_close(share, expected, rtol=0, atol=0.03)
     rows = made.features.unflatten(-1, (4, 5))
     gain = (rows[..., 2:4] / rows[..., :2]).where(rows[..., :2].abs() > 0.2, torch.nan)
     steady = (gain.amax(1) - gain.amin(1)).abs() < 0.2
@@ -201,16 +217,27 @@ def test_initial_weights_follow_the_seed_alone(box):
         assert not torch.equal(value, other.state_dict()[name])
 
 
+def test_many_actions_are_no_trouble():
+    flow = ContextFlow(-torch.ones(17), torch.ones(17), window=2, memory=5, hidden=[8], latent=4)
+    assert flow.probes.shape == (35, 17) and flow.probes.abs().max() <= 1
+
+
 @pytest.mark.parametrize(
     "settings",
     [
         {"window": 0},
+        {"memory": 0},
         {"gate": -1.0},
         {"gate": math.nan},
         {"samples": 0},
         {"source_std": -0.1},
         {"steps": 0},
         {"saturation": "fold"},
+        {"unsure": -0.1},
+        {"forgetting": 1.1},
+        {"place_scale": 0.0},
+        {"hidden": [0]},
+        {"latent": 0},
     ],
     ids=str,
 )

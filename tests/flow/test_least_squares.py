@@ -3,8 +3,9 @@ import torch
 
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import Context, LeastSquares, Window
+from afm_rl.flow import LeastSquares, Window
 from afm_rl.flow.least_squares import fit_affine, fit_gain
+from afm_rl.flow.saturation import MODES
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 
@@ -50,29 +51,31 @@ def test_recent_pairs_outweigh_old_ones():
 
 
 @pytest.mark.parametrize("form", ["gain", "affine"])
-def test_the_corrected_action_has_the_planned_effect(form):
+def test_the_corrected_action_has_the_planned_effect(unknown, form):
     gains, model = torch.tensor([-0.8, 0.9]), Dubins()
     state, executed = torch.zeros(5, 24, 3), actions(5, 24) * HIGH
     seen = Window(
         state, executed, executed, model(state, gains * executed), torch.ones(5, 24).bool()
     )
     corrector = LeastSquares(LOW, HIGH, form=form, forgetting=0.95)
-    nothing = Context(torch.zeros(5, 120), torch.zeros(5), torch.zeros(5).bool())
-    context = corrector.context(seen, model, nothing)
+    context = corrector.context(seen, model)
+    again = corrector.context(seen, model, context._replace(pairs=context.pairs.roll(1, -2)))
+    torch.testing.assert_close(again, context)  # asked about the newest pair only
+    begun = corrector.context(seen, model, unknown(corrector, 5))
+    assert torch.equal(begun.pairs[:, -1], context.pairs[:, -1]) and not begun.pairs[:, :-1].any()
     assert context.misaligned.all()
     planned = 0.5 * actions(5) * HIGH
-    corrected, spread = corrector.correct(context, state[:, 0], planned)
-    assert torch.allclose(gains * corrected, planned, atol=0.02)
-    assert not spread.any()
+    corrected = corrector.correct(context, state[:, 0], planned)
+    assert torch.allclose(gains * corrected.action, planned, atol=0.02)
+    assert not corrected.spread.any() and corrected.reach is None
 
 
 @pytest.mark.parametrize("form", ["gain", "affine"])
-@pytest.mark.parametrize("saturation", ["clip", "direction"])
-def test_actions_stay_in_the_box(form, saturation):
+@pytest.mark.parametrize("saturation", MODES)
+def test_actions_stay_in_the_box(shown, form, saturation):
     corrector = LeastSquares(LOW, HIGH, form=form, saturation=saturation)
-    features = corrector.features(actions(7, 24), 0.01 * actions(7, 24), torch.ones(7, 24).bool())
-    context = Context(features, torch.ones(7), torch.ones(7).bool())
-    corrected, _ = corrector.correct(context, torch.zeros(7, 3), HIGH.expand(7, 2))
+    context = shown(corrector, actions(7, 24), 0.01 * actions(7, 24))
+    corrected = corrector.correct(context, torch.zeros(7, 3), HIGH.expand(7, 2)).action
     assert ((corrected >= LOW - 1e-6) & (corrected <= HIGH + 1e-6)).all()
 
 

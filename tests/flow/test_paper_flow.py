@@ -22,7 +22,8 @@ def make(box):
 
 def last_of(flow, count, misaligned=False):
     features = torch.full((count, flow.feature_size), 7.0)
-    return Context(features, torch.zeros(count), torch.full((count,), misaligned))
+    none = torch.zeros(count, 1, 0), torch.zeros(count, 0)
+    return Context(*none, features, torch.zeros(count), torch.full((count,), misaligned))
 
 
 def window_of(state, planned, next_state, executed=None):
@@ -118,13 +119,13 @@ def test_examples_register_one_action_as_if_it_were_another(make, states, box):
 def test_the_correction_integrates_from_the_planned_action(make, transitions):
     flow, (state, planned) = make(steps=4), transitions(6)
     context = last_of(flow, 6)._replace(features=torch.randn(6, flow.feature_size))
-    corrected, spread = flow.correct(context, state, planned)
+    corrected = flow.correct(context, state, planned)
 
     def velocity(tau, point):
         return flow(context.features, planned, torch.full((6, 1), tau), point)
 
-    torch.testing.assert_close(corrected, midpoint(velocity, planned, 4))
-    assert (spread == 0).all()
+    torch.testing.assert_close(corrected.action, midpoint(velocity, planned, 4))
+    assert (corrected.spread == 0).all() and corrected.reach is None
 
 
 def test_it_works_in_raw_units_from_the_planned_action(make):
@@ -133,6 +134,13 @@ def test_it_works_in_raw_units_from_the_planned_action(make):
     assert torch.equal(flow.denormalise(action), action)
     assert torch.equal(flow.source(action, torch.randn(2)), action)
     assert (flow.window, flow.feature_size) == (1, 6)
+
+
+def test_it_knows_one_direction_only(make):
+    flow = make()
+    assert not flow.has_effect and (flow.pair_size, flow.evidence_size) == (0, 0)
+    with pytest.raises(NotImplementedError, match="PaperFlow knows one direction only"):
+        flow.effect(torch.zeros(1, 6), torch.zeros(1, 2))
 
 
 def test_it_learns_what_it_is_taught(make, states, gains):

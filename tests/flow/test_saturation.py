@@ -5,15 +5,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afm_rl.flow.saturation import ROUNDS, TOLERANCE, intend, saturate
+from afm_rl.flow.saturation import MODES, ROUNDS, TOLERANCE, attainable, intend, saturate
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 
 
 @given(st.lists(st.floats(-10, 10), min_size=2, max_size=2))
-def test_both_modes_end_in_the_box_and_keep_what_fits(values):
+def test_all_modes_end_in_the_box_and_keep_what_fits(values):
     unit = torch.tensor(values, dtype=torch.float64)
-    for mode in ("direction", "clip"):
+    for mode in MODES:
         result = saturate(unit, mode)
         assert result.abs().max() <= 1 + 1e-12
         if unit.abs().max() <= 1:
@@ -24,6 +24,25 @@ def test_one_mode_keeps_the_direction_the_other_the_components():
     unit = torch.tensor([[0.5, -2.0], [4.0, 2.0]])
     assert saturate(unit, "clip").tolist() == [[0.5, -1.0], [1.0, 1.0]]
     assert saturate(unit, "direction").tolist() == [[0.25, -1.0], [1.0, 0.5]]
+
+
+def test_the_third_clips_what_can_be_had_to_thirty_percent():
+    unit = torch.tensor([[1.0, 3.3], [1.0, 3.4], [-9.0, 4.5]])
+    slower = [[1 / 3.4, 1.0], [-1.0, 0.5]]
+    expected = torch.tensor([[1.0, 1.0], *slower])
+    torch.testing.assert_close(saturate(unit, "mixed"), expected)
+
+
+@pytest.mark.parametrize(
+    ("mode", "share"),
+    [("clip", (1, 1, 1, 1)), ("direction", (1, 0.5, 0.2, 0)), ("mixed", (1, 1, 0.2, 0))],
+)
+def test_of_a_plan_the_part_is_asked_for_that_can_be_had(mode, share):
+    unit = torch.tensor([[0.8, -0.5], [0.8, -0.5], [0.8, -0.5], [0.8, 0.0]])
+    low = torch.tensor([[-1.0, -0.5], [-1.0, -0.25], [-1.0, -0.1], [-1.0, -1.0]])
+    high = torch.tensor([[2.0, 2.0], [0.9, 2.0], [0.9, 2.0], [-0.1, 2.0]])  # it cannot go there
+    expected = torch.tensor(share).unsqueeze(-1) * unit
+    torch.testing.assert_close(attainable(unit, low, high, mode), expected)
 
 
 @pytest.fixture
@@ -60,7 +79,32 @@ def test_an_action_that_can_be_had_is_had(gains, wishes):
     torch.testing.assert_close(found[whole], exact[whole])
 
 
-def test_where_no_scale_helps_the_nearest_effect_is_taken(gains):
+@pytest.mark.parametrize(("gain", "clipped"), [(0.35, True), (0.25, False), (-0.25, False)])
+def test_the_third_way_depends_on_what_can_be_had(gains, gain, clipped):
+    planned = torch.tensor([[1.0, 0.2], [-0.5, 0.2]])  # of the second enough can be had
+    rows = torch.tensor([gain, 1.0]).expand(2, 2)
+    clip, slow, mixed = (
+        intend(gains, planned, rows, torch.zeros(2, 3), LOW, HIGH, mode)
+        for mode in ("clip", "direction", "mixed")
+    )
+    assert not torch.allclose(clip[0], slow[0])
+    torch.testing.assert_close(mixed[0], clip[0] if clipped else slow[0])
+    torch.testing.assert_close(mixed[1], clip[1])
+
+
+def test_the_third_way_is_the_same_for_samples_as_for_regimes(gains, wishes):
+    planned, rows, state = wishes
+    exact = planned / rows / HIGH
+    # The scale is searched for, and small misses count for nothing.
+    clear = (exact.abs().amax(-1) * 0.3 - 1).abs() > 0.1
+    clear = clear & (rows.abs() > 0.2).all(-1) & (planned.abs() > 0.1).all(-1)
+    assert clear.sum() > 100
+    found = intend(gains, planned, rows, state, LOW, HIGH, "mixed") / HIGH
+    torch.testing.assert_close(found[clear], saturate(exact, "mixed")[clear], rtol=0, atol=0.05)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_where_no_scale_helps_the_nearest_effect_is_taken(gains, mode):
     planned, rows = torch.tensor([0.5, 1.0]), torch.tensor([0.0, 2.0])
-    found = intend(gains, planned, rows, torch.zeros(3), LOW, HIGH, "direction")
+    found = intend(gains, planned, rows, torch.zeros(3), LOW, HIGH, mode)
     assert found.isfinite().all() and (found.abs() <= HIGH).all()

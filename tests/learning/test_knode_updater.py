@@ -141,7 +141,7 @@ def test_random_numbers_are_of_the_seed_and_paired_by_missions():
 
 def test_the_published_numbers_repeat_themselves():
     ticks = stream(3) * 3  # the same window again and again
-    settings = {"pool": 1, "hidden": 8}  # no older networks
+    settings = {"pool": 1, "units": 8}  # no older networks
     quirk, updater = teach(model=KNODE(Quadrotor(), **settings), published_random=True)
     free, other = teach(model=KNODE(Quadrotor(), **settings))
     found = {quirk: [], free: []}

@@ -8,7 +8,7 @@ import torch
 
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
-from afm_rl.learning import pretrain, pretrain_ensemble
+from afm_rl.learning import fitting, pretrain_ensemble
 
 SHORT = {"samples": 512, "epochs": 2, "batch_size": 64}
 
@@ -47,13 +47,13 @@ def test_the_best_epoch_is_kept_and_its_error_returned(fit, monkeypatch):
         seen.append(copy.deepcopy(model))
         return next(errors)
 
-    monkeypatch.setattr(pretrain, "held_out_error", judge)
+    monkeypatch.setattr(fitting, "held_out_error", judge)
     model, best = fit(epochs=4)
     assert best == 0.2 and [same(model, other) for other in seen] == [False, True, False, False]
 
 
 def test_training_that_breaks_down_is_reported_as_such(fit, monkeypatch):
-    monkeypatch.setattr(pretrain, "held_out_error", lambda *_: math.nan)
+    monkeypatch.setattr(fitting, "held_out_error", lambda *_: math.nan)
     assert fit()[1] == math.inf
 
 

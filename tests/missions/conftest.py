@@ -20,6 +20,7 @@ SMALL = {  # settings that are there are made small
     "dynamics.hidden": [16, 16],
     "dynamics.pretrain.samples": 512,
     "dynamics.pretrain.epochs": 1,
+    "dynamics.pretrain.flights": 4,
     "flow.hidden": [16, 16],
     "flow.latent": 8,
     "flow.width": 8,

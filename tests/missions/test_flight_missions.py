@@ -136,6 +136,7 @@ def test_flows_correct_in_a_box_of_their_own(fly):
         (["robot.score=null"], "robot.score=LapScore: reads goal, .* gives no goal, reached"),
         (["robot.score=3"], "robot.score=3: expected a Score, or null"),
         (["robot.score.band=0"], "score.band=0: expected a finite number"),
+        (["robot.flow_reuse=0"], "robot.flow_reuse=0"),
         (["robot.flow_low=null"], r"robot.flow_low=\[\], .* expected 4 numbers each"),
         (["robot.flow_low=[0, 1, 1, 1]"], "robot.flow_low=.* expected 4 numbers each, low <= high"),
         (["robot.env.start=up"], "start='up': expected one of rest, moving"),
@@ -145,3 +146,43 @@ def test_flows_correct_in_a_box_of_their_own(fly):
 def test_settings_that_do_not_fit_are_refused(configure, no_training, overrides, complaint):
     with pytest.raises(ConfigurationError, match=f"^{complaint}"):
         build(configure("robot=quadrotor", *overrides))
+
+
+@pytest.mark.parametrize("method", ["mass_estimator", "online_knode"])
+def test_who_learns_keeps_the_height_better(fly, method):
+    settings = {"budget": 40, **({"updater.begin": 0.1} if method == "online_knode" else {})}
+    physics, learner = (
+        fly(f"method={name}", **(settings if name == method else {"budget": 40})).missions.iloc[0]
+        for name in ("physics", method)
+    )
+    assert learner["mse_z"] < 0.2 * physics["mse_z"]
+
+
+def test_networks_learn_from_the_plants_own_steps_and_by_seed(fly):
+    settings = {"updater.begin": 0.0, "updater.epochs": 2, "budget": 5}
+    flown = fly("method=online_knode", seeds=2, **settings)
+    # three ticks went into a network, which came a tick later; two wait for the next
+    assert flown.agent.updater.window.rows.state.shape == (2, 1, 2 * 25, 13)
+    first, second = (rows["loss"].to_numpy() for _, rows in flown.steps.groupby("mission"))
+    assert (first[:4] == second[:4]).all() and first[4] != second[4]
+
+
+@pytest.mark.parametrize("randomised", [False, True])
+def test_a_network_may_be_trained_before_the_flight(make_agent, randomised):
+    settings = {"dynamics.randomised": randomised, **QUICK}
+    agent = make_agent("robot=quadrotor", "method=offline_knode", **settings)
+    assert [part.title for part in agent.trainings] == ["KNODE"]
+    assert agent.model.networks.inner[0].any() and not agent.model.networks.inner[1:].any()
+    assert np.isfinite(run(agent).steps.to_numpy(dtype=float)).all()
+
+
+def test_flows_use_examples_as_often_as_the_robot_says(make_agent, monkeypatch):
+    used = []
+    monkeypatch.setattr(
+        "afm_rl.missions.parts.train_flow", lambda *args, reuse, **rest: used.append(reuse) or 0.0
+    )
+    monkeypatch.setattr("afm_rl.missions.parts.check_training", lambda *args, **least: None)
+    for k, given in enumerate((None, 3)):
+        settings = {"flow.train.reuse": given, "flow.train.seed": 77 + k, **QUICK}
+        make_agent("robot=quadrotor", "method=afm_physics", **settings)
+    assert used == [32, 3]

@@ -16,6 +16,7 @@ from afm_rl.flow import ContextFlow, PaperFlow
 from afm_rl.missions import build, prepare
 from afm_rl.missions.checks import blaming, check_training
 
+FLIERS = ("geometric", "mass_estimator")  # need a quadrotor
 METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 SHAPE = {"window": 4, "hidden": [8], "latent": 4}
@@ -23,18 +24,23 @@ SHAPE = {"window": 4, "hidden": [8], "latent": 4}
 
 @pytest.mark.parametrize("method", METHODS)
 def test_planner_transform_and_updater_share_one_model(configure, no_training, method):
-    cfg = configure(f"method={method}")
+    flies = ["robot=quadrotor"] if "knode" in method or method in FLIERS else []
+    cfg = configure(f"method={method}", *flies)
     agent = build(cfg)
     assert agent.label == method
-    assert agent.planner.env.dynamics is agent.model
+    if method != "geometric":  # which has no use for a model
+        assert agent.planner.env.dynamics is agent.model
     assert agent.updater.loss.model is agent.model
     assert (agent.transform is None) == cfg.transform._target_.endswith("no_transform")
     if agent.transform is not None:
         assert agent.transform.model is agent.model
         assert unravel_key(agent.executed_key) == ("next", "afm", "executed_action")
-    assert [part.module for part in agent.trainings if part.title == "ensemble"] == [
-        agent.model for _ in agent.trainings if "pretrain" in cfg.dynamics
-    ][:1]
+    models = [part.module for part in agent.trainings if part.title in ("ensemble", "KNODE")]
+    calibrated = "base" in cfg.dynamics
+    trained, settings = (
+        (agent.model.model, cfg.dynamics.base) if calibrated else (agent.model, cfg.dynamics)
+    )
+    assert models == [trained] * (settings.get("pretrain") is not None)
 
 
 def test_an_agent_without_a_name(configure):
@@ -51,8 +57,16 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
     [
         (["transform=afm"], "transform=afm: needs a flow; choose flow=context or flow=paper"),
         (["flow=context"], "flow: nothing uses it; choose transform=afm, or flow=none"),
-        (["dynamics=oracle"], "dynamics=oracle and updater=oracle belong together"),
-        (["updater=oracle"], "dynamics=oracle and updater=oracle belong together"),
+        (["dynamics=oracle"], "dynamics=oracle and an updater .* belong together"),
+        (["updater=oracle"], "both, dynamics=oracle with updater=oracle or updater=mass"),
+        (["updater=mass"], "MassEstimator needs an Oracle of a Quadrotor, got Dubins; choose"),
+        (["updater=mass", "dynamics=oracle"], "choose dynamics=oracle and robot=quadrotor"),
+        (["dynamics=knode"], "robot=ugv: the rate of change of Dubins .* choose robot=quadrotor"),
+        (["updater=knode"], "KNODEUpdater teaches a KNODE, got Dubins; choose dynamics=knode"),
+        (["robot=quadrotor", "dynamics=knode", "updater=oracle"], "belong together"),
+        (["robot=quadrotor", "dynamics=knode", "dynamics.randomised=1"], "randomised=1"),
+        (["robot=quadrotor", "dynamics=knode", "+dynamics.pretrain.lr=0"], "pretrain.lr=0"),
+        (["robot=quadrotor", "dynamics=knode", "planner=mppi"], "choose planner=mpc"),
         (["updater=online"], "updater: the dynamics model has nothing to learn"),
         (["+planner.horizn=3"], "planner: .* unexpected keyword argument 'horizn'"),
         (["+robot.env.horizn=3"], "robot.env: .* unexpected keyword argument 'horizn'"),
@@ -113,10 +127,10 @@ NAN = float("nan")
         ("physics", "robot.regime.regimes.gain.names", ["a", "a"], "names=.*expected distinct"),
         ("online_pe", "dynamics.members", 1.5, "dynamics.members=1.5: expected a whole number"),
         ("online_pe", "dynamics.hidden", [0], "dynamics.hidden=0: expected a whole number"),
-        ("online_pe", "dynamics.log_variance", [1], "dynamics: not enough values"),
+        ("online_pe", "dynamics.log_variance", [1], "dynamics.log_variance="),
         ("online_pe", "dynamics.log_variance", [NAN, 1], "dynamics.log_variance=.*low < high"),
         ("online_pe", "dynamics.propagation", "foo", "dynamics.propagation='foo': expected one"),
-        ("online_pe", "dynamics.seed", "abc", "dynamics: "),
+        ("online_pe", "dynamics.seed", "abc", "dynamics.seed="),
         ("online_pe", "dynamics.pretrain", 3, "dynamics: 'int' object"),
         ("online_pe", "dynamics.pretrain.epochs", 0, "dynamics.pretrain.epochs=0: expected"),
         ("online_pe", "dynamics.pretrain.batch_size", 0, "dynamics.pretrain.batch_size=0: exp"),

@@ -270,3 +270,51 @@ def test_it_drives_to_the_goal(world, settings):
 def test_impossible_settings_are_refused(world, settings):
     with pytest.raises(ConfigurationError, match=f"planner.{next(iter(settings))}"):
         MPPI(world, **settings)
+
+
+def test_a_box_per_mission_replaces_that_of_the_actions(world, box):
+    low, high = box
+    td = situation(3, 4)
+    td["goal"] = td["goal"] * 100
+    td["observation"] = torch.zeros(3, 4, 3)
+    wide, narrow = torch.stack([low, 2.5 * high]), torch.stack([0.2 * low, 0.1 * high])
+    boxes = torch.stack([wide, narrow, narrow]).unsqueeze(1)
+    td["afm", "reach"] = boxes.expand(3, 4, 2, 2).clone()
+    planner = MPPI(world, horizon=4, population=256, box_key=["afm", "reach"])
+    out = planner(td.clone())
+    least, most = td["afm", "reach"].unsqueeze(-3).unbind(-2)
+    for planned in (out["next", "mppi", "mean"], out["action"].unsqueeze(-2)):
+        assert (planned >= least - 1e-6).all() and (planned <= most + 1e-6).all()
+    assert (out["action"][0] > high).any() and (out["action"][0] >= low).all()
+    plain = MPPI(world, horizon=4, population=256)(td.clone())["action"]
+    assert (plain >= low).all() and (plain <= high).all()
+
+
+@pytest.mark.parametrize("key", [None, "box", ("afm", "reach")])
+def test_without_a_box_or_with_that_of_the_actions_plans_are_the_same(world, box, key):
+    td = situation(3)
+    expected = plan(MPPI(world, **SMALL), td)
+    if key == "box":
+        td["box"] = torch.stack(box).expand(3, 2, 2).clone()
+    torch.testing.assert_close(plan(MPPI(world, box_key=key, **SMALL), td), expected)
+
+
+def test_noise_grows_with_the_box(world, box):
+    td = situation(2)
+    td["mppi", "mean"] = torch.zeros(2, 4, 2)
+    td["box"] = torch.stack([torch.stack(box), 2 * torch.stack(box)])
+    seen = []
+    planner = MPPI(world, horizon=4, population=500, beta=1.0, seed_key="seed", box_key="box")
+    td["seed"] = torch.tensor([3, 3])
+    planner._returns = lambda td, plans: seen.append(plans) or torch.zeros(2, 500)
+    planner(td)
+    torch.testing.assert_close(seen[0][1], 2 * seen[0][0])
+
+
+@pytest.mark.parametrize("backend", ["fast", "env"])
+def test_both_backends_plan_beyond_the_actions(world, box, backend):
+    td = situation(3)
+    td["box"] = 2.5 * torch.stack(box).expand(3, 2, 2).clone()
+    planned = plan(MPPI(world, backend=backend, box_key="box", **SMALL), td)
+    expected = plan(MPPI(world, backend="fast", box_key="box", **SMALL), td)
+    torch.testing.assert_close(planned, expected, rtol=0, atol=1e-5)

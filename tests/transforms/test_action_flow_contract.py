@@ -26,10 +26,12 @@ from afm_rl.flow import ContextFlow, PaperFlow
 from afm_rl.planning import GoalDistance, PlanningEnv
 from afm_rl.transforms import ActionFlowTransform
 
+ROWS = 7
+
 
 def transform(**settings):
     low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
-    flow = ContextFlow(low, high, window=3, hidden=[8], latent=4)
+    flow = ContextFlow(low, high, window=3, memory=ROWS, hidden=[8], latent=4)
     return ActionFlowTransform(Dubins(), flow, **settings)
 
 
@@ -146,7 +148,8 @@ def test_two_prefixes_live_together():
     check_env_specs(both, break_when_any_done="both")
     data = both.rollout(3)
     assert data["next", "agent", "second", "executed_action"].shape == (2, 3, 2)
-    assert data["next", "first", "window", "valid"].shape == (2, 3, 3)
+    assert data["next", "first", "window", "valid"].shape == (2, 3, ROWS)
+    assert data["next", "first", "pairs"].shape == (2, 3, ROWS, 6)
 
 
 def test_keys_may_be_nested_and_come_from_yaml(box):

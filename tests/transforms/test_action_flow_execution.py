@@ -1,6 +1,7 @@
 """Which action is executed."""
 
 import math
+import os
 
 import pytest
 import torch
@@ -8,12 +9,13 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, Transform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from afm_rl.dynamics import Dubins, dubins_step
+from afm_rl.dynamics import Calibrated, Dubins, Oracle, dubins_step
 from afm_rl.envs import UGVTrack
-from afm_rl.flow import Context, ContextFlow, Corrector
+from afm_rl.errors import ConfigurationError
+from afm_rl.flow import Context, ContextFlow, Correction, Corrector
 from afm_rl.learning import GaussianNLLLoss
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
-from afm_rl.regimes import Schedule
+from afm_rl.regimes import ActionGain, Schedule
 from afm_rl.transforms import ActionFlowTransform
 
 LOW, HIGH = torch.tensor([-1.0, -math.pi / 2]), torch.tensor([1.0, math.pi / 2])
@@ -24,16 +26,20 @@ class Stub(Corrector):
 
     feature_size = 1
 
-    def __init__(self, answer, window=2):
+    def __init__(self, answer, window=2, reach=None):
         super().__init__(LOW, HIGH, gate=0.0, window=window)
-        self.answer = answer
+        self.answer, self.reach, self.asked = answer, reach, []
 
     def context(self, window, model, last):
         size = window.valid.sum(-1).to(window.state)
-        return Context(size.unsqueeze(-1), size, size > 0)
+        none = size.unsqueeze(-1)[..., :0]
+        pairs = none.unsqueeze(-2).expand(*window.valid.shape, 0)
+        return Context(pairs, none, size.unsqueeze(-1), size, size > 0)
 
     def correct(self, context, state, planned):
-        return self.answer(planned), torch.full_like(planned, 0.1)
+        self.asked.append((context, state, planned))
+        reach = None if self.reach is None else self.reach.expand(*planned.shape[:-1], 2, 2)
+        return Correction(self.answer(planned), torch.full_like(planned, 0.1), reach)
 
 
 class Blind(Transform):
@@ -54,11 +60,11 @@ class Blind(Transform):
         return tensordict_reset
 
 
-def env(answer, *before, batch=(4,), **settings):
+def env(answer, *before, batch=(4,), reach=None, model=None, **settings):
     base = UGVTrack(batch_size=batch, process_noise=0.0)
-    return TransformedEnv(
-        base, Compose(*before, ActionFlowTransform(Dubins(), Stub(answer), **settings))
-    )
+    stub = Stub(answer, reach=reach)
+    chain = ActionFlowTransform(model or Dubins(), stub, **settings)
+    return TransformedEnv(base, Compose(*before, chain))
 
 
 def test_the_plan_stays_and_its_correction_is_executed():
@@ -82,6 +88,75 @@ def test_the_action_given_is_not_overwritten():
     whole.step(td)
     assert torch.equal(action, torch.full((4, 2), 0.4)) and td["action"] is not None
     assert torch.equal(td["action"], torch.full((4, 2), 0.4))
+
+
+def test_only_what_is_misaligned_is_corrected():
+    chain = ActionFlowTransform(Dubins(), Stub(lambda planned: -planned))
+    whole = TransformedEnv(UGVTrack(batch_size=(4,)), chain)
+    td = whole.reset()
+    action = torch.arange(8.0).view(4, 2) / 10
+    td["action"] = action.clone()
+    td = step_mdp(whole.step(td))
+    td["afm", "window", "valid"][:2] = False  # two have just begun
+    td["action"] = action.clone()
+    executed = whole.step(td)["next", "afm", "executed_action"]
+    assert torch.equal(executed, torch.cat([action[:2], -action[2:]]))
+    ((context, state, planned),) = chain.flow.asked
+    assert torch.equal(planned, action[2:]) and torch.equal(state, td["afm", "state"][2:])
+    assert [len(part) for part in context] == [2] * len(context)
+
+
+BOX = torch.stack([LOW, HIGH])
+
+
+@pytest.mark.parametrize(
+    ("reach", "expected"),
+    [
+        (None, BOX),
+        (0.5 * BOX, BOX),
+        (2.5 * BOX, 2.5 * BOX),
+        (torch.stack([2 * LOW, 0.1 * HIGH]), torch.stack([2 * LOW, HIGH])),
+        (torch.full((2, 2), math.nan), BOX),
+        (torch.full((2, 2), math.inf), BOX),
+    ],
+    ids=["none", "less", "more", "either", "nan", "inf"],
+)
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
+def test_the_reach_is_never_less_than_the_box(reach, expected, batch):
+    data = env(lambda planned: planned, batch=batch, reach=reach).rollout(3)
+    found = data["next", "afm", "reach"].movedim(len(batch), 0)
+    torch.testing.assert_close(
+        data["afm", "reach"].movedim(len(batch), 0)[0], BOX.expand(*batch, 2, 2)
+    )
+    torch.testing.assert_close(found[0], BOX.expand(*batch, 2, 2))  # the gate is closed
+    torch.testing.assert_close(found[1:], expected.expand(2, *batch, 2, 2))
+
+
+def test_a_box_without_zero_stays_one():
+    stub = Stub(lambda planned: planned * math.nan, reach=BOX)
+    base = PlanningEnv(Dubins(), GoalDistance(), 0.5 * HIGH, HIGH)
+    data = TransformedEnv(base, ActionFlowTransform(Dubins(), stub)).rollout(3)
+    expected = torch.stack([0.5 * HIGH, HIGH]).expand(3, 2, 2)
+    torch.testing.assert_close(data["next", "afm", "reach"], expected)
+
+
+def test_planners_hear_of_more_only_if_they_may_and_the_model_can_foresee_it(make_ensemble):
+    known = {
+        "widened": {},
+        "not wished": {"widen": False},
+        "switched off": {"enabled": False},
+        "a network": {"model": make_ensemble()},
+        "calibrated": {"model": Calibrated(Dubins(), HIGH)},
+        "calibrated network": {"model": Calibrated(make_ensemble(), HIGH)},
+        "oracle": {"model": Oracle(Dubins(), ActionGain(["v", "omega"]))},
+    }
+    for name, settings in known.items():
+        data = env(lambda planned: planned, reach=2.5 * BOX, **settings).rollout(3)
+        wider = name in ("widened", "calibrated", "oracle")
+        expected = (2.5 if wider else 1.0) * BOX.expand(4, 2, 2)
+        torch.testing.assert_close(data["next", "afm", "reach"][:, -1], expected, msg=name)
+    with pytest.raises(ConfigurationError, match="transform.widen"):
+        env(lambda planned: planned, widen="yes")
 
 
 @pytest.mark.parametrize("size", [3.0, 1e30])
@@ -110,8 +185,13 @@ def test_an_answer_that_is_not_finite_is_not_executed(value):
         answered[1, 1] = value
         return answered
 
-    data = env(answer).rollout(4)
+    far = 3 * torch.stack([LOW, HIGH])
+
+    data = env(answer, reach=far).rollout(4)
     executed, planned = data["next", "afm", "executed_action"], data["action"]
+    reach = data["next", "afm", "reach"]
+    assert torch.equal(reach[:2], (far / 3).expand(2, 4, 2, 2))  # nothing that came with it either
+    torch.testing.assert_close(reach[2:, 1:], far.expand(2, 3, 2, 2))
     assert torch.equal(executed[:2], planned[:2])
     torch.testing.assert_close(executed[2:, 1:], -planned[2:, 1:])
     assert (data["next", "afm", "spread"][:2] == 0).all()
@@ -144,7 +224,7 @@ def test_with_two_the_last_hears_the_planner_first():
 
 @pytest.mark.parametrize("fault", [math.nan, math.inf, -math.inf, 1e30])
 def test_a_faulty_sensor_does_not_reach_the_motors(fault, box):
-    flow = ContextFlow(*box, window=3, hidden=[8], latent=4)
+    flow = ContextFlow(*box, window=3, memory=7, hidden=[8], latent=4)
     chain = Compose(Blind([4, 5], fault), ActionFlowTransform(Dubins(), flow))
     whole = TransformedEnv(UGVTrack(batch_size=(4,), process_noise=0.0), chain)
     data = whole.rollout(12)
@@ -158,18 +238,21 @@ def test_a_faulty_sensor_does_not_reach_the_motors(fault, box):
         valid = memory["window", "valid"]
         touched = torch.tensor([step in (3, 4, 5) for step in range(12)])  # next or last pose
         assert torch.equal(valid[0, :, -1], ~touched)
-        assert valid[1].all(-1)[3:].all()
+        assert valid[1].all(-1)[flow.window :].all()
 
 
 def test_the_present_model_is_asked(make_ensemble, box):
     model = make_ensemble()
-    flow = ContextFlow(*box, window=3, hidden=[8], latent=4)
+    flow = ContextFlow(*box, window=3, memory=7, hidden=[8], latent=4)
     whole = TransformedEnv(UGVTrack(batch_size=(4,)), ActionFlowTransform(model, flow))
     td = step_mdp(whole.rollout(4)[:, -1])
     td["action"] = torch.zeros(4, 2)
+    pairs = td["afm", "pairs"]
     before = whole.step(td.clone())["next", "afm", "surprise"]
     for parameter in model.parameters():
         parameter.data *= 0.5
+    assert torch.equal(whole.step(td.clone())["next", "afm", "pairs"][:, :-1], pairs[:, 1:])
+    model.taught_in = os.getpid()  # it learns: what was found before no longer holds
     after = whole.step(td.clone())["next", "afm", "surprise"]
     assert not torch.allclose(before, after)
     for parameter in model.parameters():

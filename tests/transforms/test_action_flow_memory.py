@@ -12,7 +12,8 @@ from afm_rl.flow import ContextFlow
 from afm_rl.regimes import Schedule
 from afm_rl.transforms import ActionFlowTransform
 
-ROWS = 3
+ROWS = 5
+VIEWS = ["recent", "long", "late_1"]  # and never silent
 
 
 @pytest.fixture
@@ -20,7 +21,7 @@ def make(box):
     """Make an environment with a reversed drive, which the flow does correct somehow."""
 
     def build(batch=(4,), max_steps=100):
-        flow = ContextFlow(*box, window=ROWS, hidden=[8], latent=4)
+        flow = ContextFlow(*box, window=3, memory=ROWS, hidden=[8], latent=4, views=VIEWS)
         base = UGVTrack(
             batch_size=batch,
             max_steps=max_steps,
@@ -48,10 +49,13 @@ def same(left, right):
     return all((left.get(key) == right.get(key)).all() for key in left.keys(True, True))
 
 
-def test_it_is_empty_at_the_start_but_for_the_state(make):
-    td = make().reset()
+def test_it_is_empty_at_the_start_but_for_state_and_box(make):
+    env = make()
+    td = env.reset()
     memory = td["afm"].clone()
     torch.testing.assert_close(memory.pop("state"), td["observation"])
+    space = env.full_action_spec["action"].space
+    torch.testing.assert_close(memory.pop("reach"), torch.stack([space.low, space.high], -2))
     assert all((value == 0).all() for value in memory.values(True, True))
 
 
@@ -108,7 +112,7 @@ def test_missions_end_at_times_of_their_own(make):
         td["action"] = torch.full((4, 2), 0.1)
         _, td = env.step_and_maybe_reset(td)
         counts.append(td["afm", "window", "valid"].sum(-1).tolist())
-    assert counts == [[0, 1, 1, 1], [1, 0, 2, 2], [2, 1, 0, 3], [3, 2, 1, 3]]
+    assert counts == [[0, 1, 1, 1], [1, 0, 2, 2], [2, 1, 0, 3], [3, 2, 1, 4]]
 
 
 @pytest.mark.parametrize("cut", [1, 2, 5])
@@ -154,7 +158,7 @@ def test_a_batch_equals_single_missions(make):
 
 @pytest.mark.parametrize("more", [[], [StepCounter()]], ids=["alone", "in company"])
 def test_a_tensordict_without_memory_is_refused_clearly(make, box, more):
-    flow = ContextFlow(*box, window=ROWS, hidden=[8], latent=4)
+    flow = ContextFlow(*box, window=3, hidden=[8], latent=4)
     chain = Compose(ActionFlowTransform(Dubins(), flow, prefix=["my", "afm"]), *more)
     env = TransformedEnv(UGVTrack(), chain)
     td = env.reset().exclude("my")

@@ -1,6 +1,6 @@
 """Put Action Flow Matching into an environment that is not ours.
 
-    python examples/transform_in_your_env.py
+    python examples/transform/your_env.py
 
 A cart on a line from gymnasium (MountainCarContinuous) whose motor is reversed half-way. Its
 nominal dynamics are written down in three lines; everything else is the library.

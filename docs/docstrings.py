@@ -1,0 +1,32 @@
+"""Docstrings as Markdown, for the API page: doctests and formulas in fences, roles as code."""
+
+import re
+import textwrap
+
+from griffe import Extension
+
+ROLE = re.compile(r":(?:class|func|meth|attr|mod|data):`~?(?:[\w.]+\.)?(\w+)`")
+MATH = re.compile(r":math:`([^`]+)`", re.DOTALL)
+FORMULA = re.compile(r"^( *)\.\. math::(.*(?:\n(?:\1 +.*| *$))*)", re.MULTILINE)
+DOCTEST = re.compile(r"^( *)>>> .*(?:\n\1\S.*)*", re.MULTILINE)
+
+
+def fenced(kind: str, text: str, indent: str) -> str:
+    """Return a fenced block, indented."""
+    return textwrap.indent(f"\n```{kind}\n{text.strip()}\n```\n", indent)
+
+
+def as_markdown(text: str) -> str:
+    """Translate what docstrings here hold of reStructuredText."""
+    text = ROLE.sub(r"`\1`", text)
+    text = MATH.sub(lambda found: f"`{' '.join(found[1].split())}`", text)
+    text = FORMULA.sub(lambda m: fenced("latex", textwrap.dedent(f" {m[2]}"), m[1]), text)
+    return DOCTEST.sub(lambda m: fenced("pycon", textwrap.dedent(m[0]), m[1]), text)
+
+
+class Docstrings(Extension):
+    """Translates each docstring before it is parsed."""
+
+    def on_object(self, *, obj, **kwargs) -> None:
+        if obj.docstring:
+            obj.docstring.value = as_markdown(obj.docstring.value)

@@ -1,0 +1,157 @@
+"""A model behind a calibration of its action."""
+
+import math
+
+import pytest
+import torch
+
+from afm_rl.dynamics import Calibrated, Dubins, Quadrotor
+from afm_rl.dynamics.hammerstein import PLAIN, shaped, shaped_slope
+from afm_rl.errors import ConfigurationError
+
+HALF = torch.tensor([1.0, 1.5])
+LEADS = [(), (4,), (2, 3)]
+
+
+def calibrated(base=None, missions=None, dtype=torch.float64):
+    """Make a calibration far from the identity, another one for each mission."""
+    base = base or Dubins()
+    model = Calibrated(base, torch.linspace(0.5, 1.5, base.action_size)).to(dtype)
+    if missions is not None:
+        model.expand_(missions)
+    draw = torch.Generator().manual_seed(1)
+
+    def normal(*shape):
+        return torch.randn(*model.lead, *shape, generator=draw, dtype=dtype)
+
+    size = base.action_size
+    shape = torch.tensor([0.1, 0.7, 0.4], dtype=dtype) + 0.01 * normal(3).abs()
+    matrix, bias = torch.eye(size) + 0.3 * normal(size, size), 0.1 * normal(size)
+    offset = 0.01 * normal(base.manifold.tangent_size)
+    model.tell_(matrix=matrix, bias=bias, shape=shape, offset=offset)
+    return model
+
+
+def flights(*batch):
+    draw = torch.Generator().manual_seed(0)
+    state = 0.3 * torch.randn(*batch, 13, generator=draw, dtype=torch.float64)
+    state[..., 6:10] = torch.nn.functional.normalize(state[..., 6:10] + torch.eye(4)[3], dim=-1)
+    action = torch.rand(*batch, 4, generator=draw, dtype=torch.float64)
+    return state, action * torch.tensor([0.3, 1e-3, 1e-3, 1e-3], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("batch", LEADS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_at_the_start_it_is_the_model_to_the_bit(transitions, batch, dtype):
+    base = Dubins().to(dtype)
+    model = Calibrated(base, HALF).to(dtype)
+    state, action = transitions(*batch, dtype=dtype)
+    assert torch.equal(model(state, action), base(state, action))
+    assert torch.equal(model.jacobian(state, action), base.jacobian(state, action))
+    pairs = [*zip(model.moments(state, action), base.moments(state, action), strict=True)]
+    pairs += zip(model.forecast(state, action), base.forecast(state, action), strict=True)
+    assert all(torch.equal(*pair) and pair[0].dtype is dtype for pair in pairs)
+
+
+def test_missions_without_a_calibration_stay_as_they_are_beside_others(transitions):
+    base, model = Dubins(), Calibrated(Dubins(), HALF).expand_(3)
+    matrix, offset = model.matrix.clone(), model.offset.clone()
+    matrix[1], offset[1] = 2.0, 0.1
+    model.tell_(matrix=matrix, offset=offset)
+    state, action = transitions(3, 50)
+    same = (model(state, action) == base(state, action)).flatten(1).all(-1)
+    assert same.tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("missions", [None, 4])
+def test_what_it_predicts(transitions, missions):
+    model = calibrated(missions=missions)
+    state, action = transitions(4, 7, dtype=torch.float64)
+
+    def wide(part):
+        lead = model.lead
+        return part.reshape(*lead, *(1,) * (2 - len(lead)), *part.shape[len(lead) :])
+
+    unit = shaped(action / model.half_range, wide(model.shape))
+    moved = (wide(model.matrix) @ unit.unsqueeze(-1)).squeeze(-1) + wide(model.bias)
+    moved = moved * model.half_range
+    expected = model.manifold.add(model.model(state, moved), wide(model.offset))
+    torch.testing.assert_close(model(state, action), expected)
+    ahead, noise = model.forecast(state, action)
+    torch.testing.assert_close(ahead, expected)
+    assert torch.equal(noise, model.noise_scale(state, action))
+    mean, log_variance = model.moments(state, action)
+    change = model.standardise(model.manifold.difference(expected, state))
+    torch.testing.assert_close(mean.squeeze(-2), change)
+    assert not log_variance.any()
+
+
+@pytest.mark.parametrize(
+    ("base", "make"), [(Dubins(), None), (Quadrotor(), flights)], ids=["flat", "turning"]
+)
+@pytest.mark.parametrize("offset", [False, True])
+def test_derivatives_are_those_of_the_prediction(base, make, offset, transitions):
+    state, action = make(3, 2) if make else transitions(3, 2, dtype=torch.float64)
+    model = calibrated(base.double(), missions=3)
+    if make:  # its actions are small against the half ranges
+        model.tell_(shape=torch.tensor(PLAIN))
+    if not offset:
+        model.tell_(offset=torch.zeros(model.manifold.tangent_size))
+    ahead, by_state, by_action = model.linearise(state, action)
+    expected = super(Calibrated, model).linearise(state, action)
+    for found, wanted in zip((ahead, by_state, by_action), expected, strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-9)
+    wanted = super(Calibrated, model).jacobian(state, action)
+    torch.testing.assert_close(model.jacobian(state, action), wanted, rtol=1e-6, atol=1e-9)
+
+
+def test_missions_expand_and_leave(transitions):
+    model = calibrated()
+    state, action = transitions(4, 5, dtype=torch.float64)
+    before = model(state, action)
+    assert model.select_(torch.tensor([0])) is model and model.lead == ()
+    assert torch.equal(model.expand_(4)(state, action), before) and model.lead == (4,)
+    with pytest.raises(ConfigurationError, match=r"already expanded to \(4,\)"):
+        model.expand_(2)
+    model = calibrated(missions=4)
+    before, index = model(state, action), torch.tensor([3, 1])
+    model.select_(index)
+    assert torch.equal(model(state[index], action[index]), before[index])
+    assert model.missions.tolist() == [3, 1]
+    with pytest.raises(ConfigurationError, match=r"holds \(2,\) missions, got .*\(4, 5\)"):
+        model(state, action)
+
+
+def test_the_state_dict_holds_the_calibration(transitions):
+    model, other = calibrated(missions=4), Calibrated(Dubins(), HALF).double().expand_(4)
+    other.load_state_dict(model.state_dict())
+    other.half_range = model.half_range
+    state, action = transitions(4, dtype=torch.float64)
+    assert torch.equal(other(state, action), model(state, action))
+
+
+def test_what_cannot_be_calibrated(make_ensemble):
+    with pytest.raises(ConfigurationError, match=r"holds \(3,\) missions"):
+        Calibrated(make_ensemble().expand_(3), HALF)
+    for half in (torch.ones(3), torch.tensor([1.0, 0.0])):
+        with pytest.raises(ConfigurationError, match="dynamics.half_range=.*2 numbers > 0"):
+            Calibrated(Dubins(), half)
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected"),
+    [
+        (PLAIN, [-0.8, -0.1, 0.0, 0.3, 0.9]),
+        ((0.2, math.inf, 0.0), [-0.6, 0.0, 0.0, 0.1, 0.7]),
+        ((0.0, 0.5, 0.0), [-0.5, -0.1, 0.0, 0.3, 0.5]),
+        ((0.2, 0.5, 0.0), [-0.3, 0.0, 0.0, 0.1, 0.3]),
+        ((0.0, math.inf, 1.0), [u * math.exp(-abs(u)) for u in (-0.8, -0.1, 0.0, 0.3, 0.9)]),
+    ],
+)
+def test_shapes_and_their_slopes(shape, expected):
+    unit = torch.tensor([-0.8, -0.1, 0.0, 0.3, 0.9], dtype=torch.float64)
+    shape = torch.tensor(shape, dtype=torch.float64)
+    torch.testing.assert_close(shaped(unit, shape), torch.tensor(expected, dtype=torch.float64))
+    step = 1e-7
+    slope = (shaped(unit + step, shape) - shaped(unit - step, shape)) / (2 * step)
+    torch.testing.assert_close(shaped_slope(unit, shape), slope, atol=1e-6, rtol=0)

@@ -1,0 +1,270 @@
+"""The fast learner: least squares on the calibration of a model."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from afm_rl.dynamics import Calibrated, Dubins
+from afm_rl.dynamics.hammerstein import PLAIN, shaped
+from afm_rl.errors import ConfigurationError
+from afm_rl.learning import GaussianNLLLoss, RLSUpdater
+from afm_rl.learning.recursive_least_squares import Information, absorb, solve
+
+HALF = torch.tensor([1.0, 1.5], dtype=torch.float64)
+EYE = torch.eye(2, dtype=torch.float64)
+
+
+class World:
+    """A robot whose actuators do what they are told to, and its learner."""
+
+    def __init__(self, missions=None, seed=0, model=None, dtype=torch.float64, **settings):
+        self.model = Calibrated(model or Dubins(), HALF.to(dtype)).to(dtype)
+        if missions is not None:
+            self.model.expand_(missions)
+        self.updater = RLSUpdater(GaussianNLLLoss(self.model), **settings)
+        self.draw, self.dtype = torch.Generator().manual_seed(seed), dtype
+        self.errors = []
+
+    def drive(self, steps, matrix=EYE, bias=0.0, shape=PLAIN, wind=0.0, batch=None, **more):
+        """Take random actions; remember how well each was predicted, ``(*batch)``."""
+        batch = self.model.lead if batch is None else batch
+        shape = torch.tensor(shape, dtype=self.dtype)
+        for _ in range(steps):
+            state, unit = (
+                2 * torch.rand(*batch, size, generator=self.draw, dtype=self.dtype) - 1
+                for size in (3, 2)
+            )
+            worth = (matrix.to(self.dtype) @ shaped(unit, shape).unsqueeze(-1)).squeeze(-1) + bias
+            half = self.model.half_range
+            after = Dubins()(state, worth * half) + wind
+            self.feed(state, unit * half, after, **more)
+        return self.errors[-1]
+
+    def feed(self, state, action, after, **more):
+        """Show it one transition."""
+        td = TensorDict({"observation": state, "action": action, **more}, state.shape[:-1])
+        error = self.model.manifold.difference(after, self.model(state, action)).norm(dim=-1)
+        self.errors.append(error)
+        return self.updater(td.set(("next", "observation"), after))
+
+    def recovered(self, since, level=1e-5):
+        """Return the steps after ``since`` until errors stay low."""
+        errors = torch.stack(self.errors[since:])
+        late = errors.reshape(len(errors), -1).amax(-1) > level
+        return 1 + int(late.nonzero().max()) if bool(late.any()) else 0
+
+    @property
+    def plain(self):
+        """Is the calibration the identity, exactly?"""
+        model = self.model
+        told = torch.equal(model.matrix, EYE.to(self.dtype).expand_as(model.matrix))
+        told = told and not model.bias.any() and not model.offset.any()
+        return told and torch.equal(
+            model.shape, torch.tensor(PLAIN).to(model.shape).expand_as(model.shape)
+        )
+
+
+GAINS = torch.diag(torch.tensor([-1.0, 0.5], dtype=torch.float64))
+TURN = torch.tensor([[0.5, -0.9], [0.9, 0.5]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("regime", "steps"),
+    [
+        ({"matrix": GAINS}, 5),
+        ({"matrix": TURN}, 8),
+        ({"bias": torch.tensor([0.3, -0.2], dtype=torch.float64)}, 8),
+        ({"matrix": TURN @ GAINS, "bias": torch.tensor([0.3, -0.2], dtype=torch.float64)}, 10),
+        ({"shape": (0.3, math.inf, 0.0)}, 30),
+        ({"shape": (0.0, 0.4, 0.0), "matrix": GAINS}, 30),
+        ({"shape": (0.0, math.inf, 3.0), "matrix": 4 * GAINS}, 30),
+    ],
+    ids=["gains", "coupling", "bias", "affine", "dead zone", "limit", "slip"],
+)
+@pytest.mark.parametrize("missions", [None, 3])
+def test_regimes_are_learnt_and_left_again(regime, steps, missions):
+    world = World(missions, window=32)
+    world.drive(20)
+    assert world.plain and not torch.stack(world.errors).any()
+    world.drive(60, **regime)
+    assert 2 <= world.recovered(20, level=1e-4) <= steps
+    world.drive(10)
+    assert world.recovered(80, level=0.0) == 2 and world.plain
+    if "shape" not in regime:
+        return
+    world.drive(20, **regime)
+    world.drive(20, matrix=GAINS)  # straight into another one
+    torch.testing.assert_close(world.model.matrix, GAINS.expand_as(world.model.matrix))
+    assert (world.model.shape[..., 2] == 0).all()
+
+
+def test_the_fit_is_exact_without_noise():
+    draw = torch.Generator().manual_seed(0)
+    truth = torch.randn(5, 2, 3, generator=draw, dtype=torch.float64)
+    known = Information(torch.zeros(5, 2, 3, 3).double(), torch.zeros(5, 2, 3).double())
+    for _ in range(20):
+        features = torch.randn(5, 3, generator=draw, dtype=torch.float64)
+        target = (truth @ features.unsqueeze(-1)).squeeze(-1)
+        known = absorb(known, features, target, torch.ones(5, 2).double(), forgetting=0.9)
+    theta, covariance = solve(
+        known, torch.full((5, 2, 3), 1e-12).double(), torch.zeros(5, 2, 3).double()
+    )
+    torch.testing.assert_close(theta, truth)
+    torch.testing.assert_close(covariance @ known.gram, torch.eye(3).double().expand(5, 2, 3, 3))
+
+
+@pytest.mark.parametrize("regime", [{}, {"matrix": GAINS}], ids=["nominal", "changed"])
+def test_an_outlier_moves_nothing(regime):
+    world = World()
+    world.drive(20, **regime)
+    before = world.model.state_dict()
+    world.drive(1, wind=torch.tensor([20.0, -20.0, 0.5]), **regime)
+    assert all(torch.equal(now, before[name]) for name, now in world.model.state_dict().items())
+    world.drive(20, **regime)
+    assert torch.stack(world.errors[21:]).max() < 1e-5
+
+
+def test_without_confirmation_an_outlier_does_harm():
+    world = World(confirm=False)
+    world.drive(20, matrix=GAINS)
+    world.drive(1, wind=torch.tensor([20.0, -20.0, 0.5]), matrix=GAINS)
+    world.drive(1, matrix=GAINS)
+    assert world.errors[-1] > 1e-2
+
+
+def test_without_restarts_the_past_fades_slowly():
+    quick, slow = World(window=0), World(window=0, restart=False)
+    for world in (quick, slow):
+        world.drive(40, matrix=GAINS)
+        world.drive(20, matrix=TURN)
+    assert quick.errors[-1] < 1e-5 < 1e-3 < slow.errors[-1]
+
+
+def test_it_goes_home_once_the_nominal_model_is_as_good():
+    world = World(window=0)
+    for step in range(60):  # gains that come back slowly: no surprise tells
+        share = min(1.0, step / 40)
+        world.drive(1, matrix=torch.lerp(GAINS.abs(), EYE, share))
+    world.drive(60)
+    assert world.plain
+
+
+def test_what_explains_nothing_is_not_believed():
+    world = World(window=0)
+    noise = torch.Generator().manual_seed(5)
+    for _ in range(100):  # actuators that do as they please
+        matrix = torch.randn(2, 2, generator=noise, dtype=torch.float64)
+        world.drive(1, matrix=matrix)
+    assert (~world.updater.matched.memory.parts.better).all() and world.plain
+
+
+def test_what_no_action_explains_becomes_the_offset():
+    wind = torch.tensor([0.03, -0.05, 0.0], dtype=torch.float64)
+    for part in ("unmatched", "all"):
+        world = World(missions=3, part=part)
+        world.drive(10)
+        world.drive(60, wind=wind)
+        torch.testing.assert_close(world.model.offset, wind.expand(3, 3), atol=1e-4, rtol=0)
+        assert world.errors[-1].max() < 1e-3
+        world.drive(20)
+        assert world.plain
+    world = World(part="matched")
+    world.drive(30, wind=wind)
+    assert not world.model.offset.any()
+
+
+def test_the_unmatched_part_leaves_actions_alone():
+    world = World(part="unmatched")
+    world.drive(30, matrix=GAINS)
+    assert world.plain
+
+
+def test_missions_learn_for_themselves_and_leave_one_by_one():
+    matrices = torch.stack([GAINS, EYE, TURN])
+    world, index = World(missions=3), torch.tensor([2, 0])
+    world.drive(12, matrix=matrices)
+    torch.testing.assert_close(world.model.matrix, matrices, atol=1e-5, rtol=0)
+    world.model.select_(index)
+    world.drive(12, matrix=matrices[index])
+    torch.testing.assert_close(world.model.matrix, matrices[index], atol=1e-6, rtol=0)
+    assert world.errors[12].max() < 1e-5
+    alone = World()
+    alone.drive(1)
+    assert alone.updater.start(
+        None
+    ) is None and alone.updater.matched.memory.parts.age.tolist() == [0]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_one_calibration_learns_from_simultaneous_transitions(batch, dtype):
+    world = World(dtype=dtype)
+    world.drive(8, matrix=TURN, batch=batch)
+    found = world.updater(
+        TensorDict(
+            {
+                "observation": torch.zeros(*batch, 3, dtype=dtype),
+                "action": torch.zeros(*batch, 2, dtype=dtype),
+                "next": {"observation": torch.zeros(*batch, 3, dtype=dtype)},
+            },
+            batch,
+        )
+    )["loss"]
+    assert found.shape == batch and found.dtype is dtype
+    torch.testing.assert_close(world.model.matrix, TURN.to(dtype), atol=1e-3, rtol=0)
+
+
+def test_a_learned_base_is_put_right(trained_ensemble):
+    world = World(model=trained_ensemble, dtype=torch.float32)
+    world.drive(30)
+    nominal = torch.stack(world.errors).mean()
+    world.drive(30, matrix=GAINS)
+    assert torch.stack(world.errors[-10:]).mean() < 3 * nominal
+    assert not any(p.grad is not None for p in world.model.parameters())
+
+
+def test_faulty_transitions_are_refused():
+    world = World(missions=3)
+    world.drive(10, matrix=GAINS)
+    state, action = torch.zeros(3, 3).double(), torch.ones(3, 2).double()
+    after = Dubins()(state, torch.tensor([-1.0, 0.5]).double().expand(3, 2))
+    after[1, 0], after[2, 1] = math.nan, 1e15
+    before = world.model.state_dict()
+    loss = world.feed(state, action, after)["loss"]
+    assert loss.isfinite().tolist() == [True, False, False] and world.updater.refused == 2
+    for name, now in world.model.state_dict().items():
+        assert torch.equal(now[1:], before[name][1:])
+    world.drive(5, matrix=GAINS)
+    assert world.errors[-1].max() < 1e-6
+
+
+def test_a_mask_says_what_to_learn_from():
+    world = World(missions=2, mask_key="mask")
+    world.drive(10, matrix=GAINS, mask=torch.tensor([True, False]).unsqueeze(-1))
+    torch.testing.assert_close(world.model.matrix, torch.stack([GAINS, EYE]))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"part": "some"}, "updater.part='some'"),
+        ({"forgetting": 0.0}, "updater.forgetting=0.0"),
+        ({"gate": 0.0}, "updater.gate=0.0"),
+        ({"patience": 0}, "updater.patience=0"),
+        ({"confirm": 1}, "updater.confirm=1"),
+        ({"restart": None}, "updater.restart=None"),
+        ({"window": -1}, "updater.window=-1"),
+        ({"spread": 0.0}, "updater.spread=0.0"),
+    ],
+    ids=str,
+)
+def test_impossible_settings_are_refused(settings, message):
+    with pytest.raises(ConfigurationError, match=message):
+        World(**settings)
+
+
+def test_other_models_are_refused():
+    with pytest.raises(ConfigurationError, match="teaches a Calibrated model, got Dubins"):
+        RLSUpdater(GaussianNLLLoss(Dubins()))

@@ -1,0 +1,67 @@
+"""Missions whose model is calibrated on the way."""
+
+import pandas as pd
+import pytest
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.missions import build, run
+from afm_rl.missions.checkpoint import Stopped
+
+BASE = {
+    "dynamics.base.members": 2,
+    "dynamics.base.hidden": [16, 16],
+    "dynamics.base.pretrain.samples": 512,
+    "dynamics.base.pretrain.epochs": 1,
+}
+
+
+def same(left, right):
+    for one, other in ((left.missions, right.missions), (left.steps, right.steps)):
+        one, other = (t.drop(columns=["seconds", "method"], errors="ignore") for t in (one, other))
+        pd.testing.assert_frame_equal(one, other, check_exact=True)
+
+
+def test_nothing_changes_where_nothing_changed(make_agent, ring):
+    settings = {"tracks": [ring], "regimes": "none", "seeds": 2, "budget": 20}
+    same(*(run(make_agent(f"method={name}", **settings)) for name in ("rls", "physics")))
+
+
+@pytest.mark.parametrize("stop", [5, 11, 15])
+def test_interrupted_runs_are_bit_identical(make_agent, ring, spot, tmp_path, stop):
+    settings = {"tracks": [ring, spot], "seeds": 2, "budget": 18, "regimes": [{"v_gain": -1.0}]}
+    settings["robot.schedule"] = {
+        "_target_": "afm_rl.regimes.Schedule", "by": "step", "at": [6, 14],
+    }  # fmt: skip
+    whole, path = run(make_agent("method=rls", **settings)), tmp_path / "run.safetensors"
+    with pytest.raises(Stopped):
+        stopped = {"checkpoint": path, "watch": lambda loop: loop.step == stop}
+        run(make_agent("method=rls", **settings), **stopped)
+    same(whole, run(make_agent("method=rls", **settings), checkpoint=path))
+    assert whole.steps["regime_active"].any()
+    late = whole.steps[(whole.steps["mission"] == 0) & whole.steps["t"].between(9, 13)]
+    assert (late["error"] < 1e-2).all()  # learnt in two steps, with a little left
+
+
+@pytest.mark.parametrize(
+    ("method", "plain"), [("rls_pe", "frozen_pe"), ("afm_rls", "afm_physics")], ids=str
+)
+def test_parts_are_trained_once_with_or_without_a_calibration(configure, method, plain):
+    base = {key.replace("base.", ""): value for key, value in BASE.items()}
+    cfg = [configure(f"method={method}", **(BASE if method == "rls_pe" else {}))]
+    cfg.append(configure(f"method={plain}", **(base if method == "rls_pe" else {})))
+    one, other = ([(t.title, t.settings) for t in build(c).trainings] for c in cfg)
+    assert one == other and len(one) == 1
+
+
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        (["dynamics=physics", "updater=rls"], "teaches a Calibrated model, got Dubins"),
+        (["dynamics=calibrated_pe", "updater=online"], "OnlineUpdater does not teach that"),
+    ],
+    ids=str,
+)
+def test_what_does_not_go_together(configure, choices, message):
+    settings = BASE if "dynamics=calibrated_pe" in choices else {}
+    with pytest.raises(ConfigurationError, match=message):
+        build(configure(*choices, **settings))

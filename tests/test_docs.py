@@ -1,0 +1,121 @@
+"""What the pages for users show works: files, snippets and commands, from top to bottom."""
+
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from hydra import compose, initialize_config_module
+
+from afm_rl.missions import build
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = [
+    *(DOCS / "quickstart.md", DOCS / "torchrl.md"),
+    *sorted((DOCS / "howto").glob("*.md")),
+    *sorted((DOCS / "methods").glob("*.md")),
+]
+FENCE = re.compile(r"^```(python|yaml|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+NAME = re.compile(r"# (\S+\.(?:py|yaml))\n")
+PATHS = re.compile(r"`((?:afm_rl|envs|conf|examples|notebooks|tests|benchmarks)/[\w./]+)`")
+
+
+def name_of(page):
+    return str(page.relative_to(DOCS))
+
+
+def blocks(page, kind):
+    return [text for found, text in FENCE.findall(page.read_text()) if found == kind]
+
+
+def commands():
+    """Find the command lines of all pages that start one run."""
+    found = []
+    for page in PAGES:
+        inline = re.findall(r"`(afm-rl [^`]+)`", re.sub(FENCE, "", page.read_text()))
+        for line in [*"".join(blocks(page, "sh")).splitlines(), *inline]:
+            words = shlex.split(line, comments=True)
+            while words and re.fullmatch(r"[A-Z]+=\S*", words[0]):  # of the environment
+                words.pop(0)
+            asked = words[1:]
+            if words[:1] == ["afm-rl"] and "=" in line and not {"-m", "--cfg"} & set(asked):
+                found.append(pytest.param(page, asked, id=f"{name_of(page)}: {' '.join(asked)}"))
+    return found
+
+
+@pytest.fixture
+def desk(monkeypatch, tmp_path):
+    """Work in an empty folder, from which modules are imported."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    sys.modules.pop("mine", None)
+
+
+def write_files(page, folder):
+    """Write the blocks that are files; return the other Python blocks."""
+    rest = []
+    for kind in ("python", "yaml"):
+        for text in blocks(page, kind):
+            named = NAME.match(text)
+            if named:
+                path = folder / named[1]
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text[named.end() :])
+            elif kind == "python":
+                rest.append(text)
+    return rest
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=name_of)
+def test_snippets_run(page, desk):
+    rest = write_files(page, desk)
+    exec(compile("\n".join(rest), str(page), "exec"), {"__name__": "page"})
+
+
+@pytest.mark.parametrize(("page", "asked"), commands())
+def test_commands_can_be_run(page, asked, desk):
+    write_files(page, desk)
+    if "--config-dir" in asked:
+        at = asked.index("--config-dir")
+        folder = desk / asked[at + 1]
+        asked = [*asked[:at], *asked[at + 2 :], f"hydra.searchpath=[file://{folder}]"]
+    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+        agent = build(compose("config", asked))
+    assert len(agent.missions)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_pages_are_short_and_what_they_name_exists(page):
+    text = page.read_text()
+    links = [link for link in re.findall(r"\]\(([^)#:]+)", text) if not link.startswith("http")]
+    assert [link for link in links if not (page.parent / link).exists()] == []
+    assert [path for path in PATHS.findall(text) if not (ROOT / path).exists()] == []
+    if page.parent.name == "methods":
+        assert text.count("\n") <= 60
+
+
+def test_every_page_is_in_the_navigation():
+    nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+
+    def leaves(entry):
+        if isinstance(entry, str):
+            return {entry}
+        return set().union(*map(leaves, entry.values() if isinstance(entry, dict) else entry))
+
+    assert leaves(nav) >= {name_of(page) for page in DOCS.rglob("*.md")}
+
+
+def test_docstrings_become_markdown(monkeypatch):
+    pytest.importorskip("griffe")
+    monkeypatch.syspath_prepend(str(DOCS))
+    import docstrings
+
+    text = "See :class:`~afm_rl.Flow`, :math:`a^0`.\n\n.. math:: a,\n  b\n\n>>> 1\n1\n\nEnd"
+    found = docstrings.as_markdown(text)
+    assert found.startswith("See `Flow`, `a^0`.") and found.endswith("End")
+    assert "```latex\na," in found and "```pycon\n>>> 1\n1\n```" in found

@@ -1,0 +1,42 @@
+"""The examples run, by the line on top of each file, with less to do."""
+
+import re
+import runpy
+import shlex
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LESS = {
+    "transform": "",
+    "plan": "--steps 20",
+    "learn": "--batches 2 --samples 512",
+    "compare": "--methods physics oracle --budget 10",
+    "deploy": "--iterations 5 --steps 20",
+}
+FILES = [path for verb in LESS for path in sorted((ROOT / "examples" / verb).glob("*.py"))]
+
+
+def lines_on_top(path):
+    """Find the commands in a file's docstring."""
+    return re.findall(r"(?:^ {4}|``)(python examples/\S+[^\n`]*)", path.read_text(), re.MULTILINE)
+
+
+def test_every_example_says_how_to_run_it():
+    found = [path for path in (ROOT / "examples").glob("*/*.py") if lines_on_top(path)]
+    assert {path.parent.name for path in found} >= {*LESS, "gymnasium_tasks", "explain_afm"}
+    for path in found:
+        (line,) = lines_on_top(path)
+        assert ROOT / shlex.split(line)[1] == path
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.parent.name)
+def test_examples_run(path, short_trainings, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    (line,) = lines_on_top(path)
+    arguments = shlex.split(line)[2:] + shlex.split(LESS[path.parent.name])
+    monkeypatch.setattr("sys.argv", [str(path), *arguments])
+    runpy.run_path(str(path), run_name="__main__")
+    assert capsys.readouterr().out

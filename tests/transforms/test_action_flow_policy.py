@@ -1,0 +1,136 @@
+"""The action flow as the end of a policy: the same actions as the transform's."""
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs, step_mdp
+
+from afm_rl.dynamics import Dubins
+from afm_rl.envs import UGVTrack
+from afm_rl.errors import ConfigurationError
+from afm_rl.flow import ContextFlow, LeastSquares
+from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+from afm_rl.regimes import Schedule
+from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
+
+STEPS = 8
+
+
+@pytest.fixture
+def track(box):
+    """Make a robot that goes backwards, and faster than planned."""
+    low, high = (bound.tolist() for bound in box)
+
+    def make(batch=(3,)):
+        regime = {"schedule": Schedule([]), "missions": {"regime": {"v_gain": -2.5}}}
+        return UGVTrack(
+            batch_size=batch, process_noise=0.0, action_low=low, action_high=high, **regime
+        )
+
+    return make
+
+
+@pytest.fixture
+def planner(box):
+    """Make a planner that knows how far actions reach."""
+    world = PlanningEnv(Dubins(), GoalDistance(), *box)
+    return MPPI(world, horizon=3, population=20, box_key=["afm", "reach"])
+
+
+@pytest.fixture
+def flow(box):
+    """A flow that answers something, and knows how far actions reach."""
+    return ContextFlow(*box, hidden=[8], latent=4)
+
+
+@pytest.fixture
+def agent(planner, flow):
+    """Planner and correction as one policy."""
+    return TensorDictSequential(planner, ActionFlowPolicy(Dubins(), flow, planner.action_spec))
+
+
+def primers(agent):
+    return Compose(*(part.make_tensordict_primer() for part in agent))
+
+
+def test_actions_are_those_of_the_transform(track, agent, flow):
+    planner, policy = copy.deepcopy(agent)
+    chain = Compose(ActionFlowTransform(Dubins(), flow), planner.make_tensordict_primer())
+    expected = TransformedEnv(track(), chain).rollout(STEPS, planner)
+    found = TransformedEnv(track(), primers(agent)).rollout(STEPS, agent)
+    assert expected["next", "afm", "misaligned"].any()
+    assert torch.equal(found["action"], expected["next", "afm", "executed_action"])
+    for name in ("planned_action", "surprise", "spread", "reach"):
+        assert torch.equal(found["next", "afm", name], expected["next", "afm", name])
+
+
+def test_a_loop_without_an_environment_takes_the_same_actions(track, agent):
+    twin = copy.deepcopy(agent)
+    expected = TransformedEnv(track(), primers(agent)).rollout(STEPS, agent)["action"]
+    robot = track()
+    seen, td = robot.reset(), TensorDict({}, [3])
+    td, taken = primers(twin)(td), []
+    for _ in range(STEPS):
+        td = twin(td.update(seen.select("observation", "goal")))
+        taken.append(td["action"])
+        seen = step_mdp(robot.step(seen.set("action", td["action"])))
+        td = step_mdp(td)
+    torch.testing.assert_close(torch.stack(taken, 1), expected)
+
+
+def test_the_first_state_is_no_transition(track, agent):
+    data = TransformedEnv(track(), primers(agent)).rollout(3)
+    assert data["afm", "state"].isnan().all() and not data["afm", "window", "valid"].any()
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_any_batch(track, agent, batch):
+    env = TransformedEnv(track(batch), primers(agent))
+    check_env_specs(env, break_when_any_done="both")
+    assert env.rollout(2, agent)["action"].shape == (*batch, 2, 2)
+
+
+def test_keys_are_declared_and_may_be_nested(planner, flow):
+    policy = ActionFlowPolicy(
+        Dubins(),
+        flow,
+        planner.action_spec,
+        ["robot", "pose"],
+        ["robot", "action"],
+        ["robot", "afm"],
+    )
+    given = {"pose": torch.zeros(3), "action": torch.ones(2)}
+    td = policy.make_tensordict_primer()(TensorDict({"robot": given}))
+    out = policy(td.select(*policy.in_keys))
+    assert set(policy.out_keys) <= set(out.keys(True, True))
+    assert torch.equal(out["next", "robot", "afm", "planned_action"], torch.ones(2))
+
+
+def test_it_may_only_watch(track, planner, flow):
+    policy = ActionFlowPolicy(Dubins(), flow, planner.action_spec, enabled=False)
+    agent = TensorDictSequential(planner, policy)
+    data = TransformedEnv(track(), primers(agent)).rollout(4, agent)
+    assert data["next", "afm", "misaligned"].any()
+    assert torch.equal(data["action"], data["next", "afm", "planned_action"])
+
+
+def test_the_flow_is_owned_and_the_model_is_shared(planner, flow):
+    policy = ActionFlowPolicy(Dubins(), flow, planner.action_spec)
+    assert {name.partition(".")[0] for name in policy.state_dict()} == {"flow"}
+
+
+def test_without_its_memory_it_says_what_is_missing(agent):
+    td = TensorDict({"observation": torch.zeros(3), "action": torch.zeros(2)})
+    with pytest.raises(KeyError, match="no 'afm' in the tensordict; apply make_tensordict_primer"):
+        agent[1](td)
+
+
+def test_sizes_that_contradict_each_other_are_refused(planner, flow):
+    with pytest.raises(ConfigurationError, match=r"policy: flow, .* \(\(1,\)"):
+        ActionFlowPolicy(Dubins(), LeastSquares([-1.0], [1.0]), planner.action_spec)
+    with pytest.raises(ConfigurationError, match="policy.action_spec"):
+        ActionFlowPolicy(Dubins(), flow, None)

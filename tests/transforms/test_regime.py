@@ -1,0 +1,270 @@
+"""The regime transform: any regime on any environment."""
+
+import copy
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import (
+    Compose,
+    GymEnv,
+    GymWrapper,
+    ObservationNorm,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
+from torchrl.envs.utils import check_env_specs, step_mdp
+
+from afm_rl.dynamics import KnownDynamics
+from afm_rl.errors import ConfigurationError
+from afm_rl.flow import ContextFlow
+from afm_rl.manifold import Manifold
+from afm_rl.planning import KnownReward, PlanningEnv
+from afm_rl.regimes import ActionGain, Delay, GainNoise, Regime
+from afm_rl.regimes import Compose as Regimes
+from afm_rl.transforms import ActionFlowTransform, RegimeTransform
+
+GAIN = ActionGain(["torque"])
+LATE = Regimes({"delay": Delay(), "gain": GAIN})
+
+
+def pendulum(steps=200):
+    return GymEnv("Pendulum-v1", max_episode_steps=steps)
+
+
+def reversal(at=3, **settings):
+    return RegimeTransform(GAIN, [{}, {"torque": -1.0}], at=[at], **settings)
+
+
+def rows(*gains):
+    """Return phases ``(B, 2, 1)``: nominal, then one gain for each environment."""
+    return torch.stack([torch.tensor([[1.0], [gain]]) for gain in gains])
+
+
+def ratio(data, prefix="regime"):
+    effect = data["next"][prefix]["effective_action"] / data["action"]
+    return effect.squeeze(-1).round(decimals=4).tolist()
+
+
+def push(state, action):
+    return state + 0.1 * action
+
+
+def line(dtype=torch.float32):
+    """Return a stateless environment of any batch shape: a point on a line."""
+    model = KnownDynamics(push, Manifold(1), action_size=1)
+    low, high = torch.tensor([-1.0], dtype=dtype), torch.tensor([1.0], dtype=dtype)
+    return PlanningEnv(model, KnownReward(lambda s, a, after: -after[..., 0].abs()), low, high)
+
+
+@pytest.mark.parametrize("regime", [GAIN, LATE], ids=["gain", "delay"])
+@pytest.mark.parametrize("make", [pendulum, lambda: SerialEnv(2, pendulum), line])
+def test_the_specs_hold(make, regime):
+    chain = RegimeTransform(regime, [{}, {"torque": 0.5}], at=[1])
+    check_env_specs(TransformedEnv(make(), chain), break_when_any_done="both")
+
+
+def test_inside_a_serial_environment():
+    whole = SerialEnv(2, lambda: TransformedEnv(pendulum(), reversal(2)))
+    check_env_specs(whole, break_when_any_done="both")
+    assert ratio(whole.rollout(4)) == [[1.0, 1.0, -1.0, -1.0]] * 2
+
+
+def test_the_change_comes_after_so_many_steps():
+    data = TransformedEnv(pendulum(), reversal(3)).rollout(5)
+    assert ratio(data) == [1.0, 1.0, 1.0, -1.0, -1.0]
+    assert data["regime", "parameters"].flatten().tolist() == [1.0, 1.0, 1.0, -1.0, -1.0]
+    assert data["regime", "step"].tolist() == [0, 1, 2, 3, 4]
+
+
+def test_the_environment_really_gets_the_effect():
+    changed, plain = TransformedEnv(pendulum(), reversal(0)), TransformedEnv(pendulum())
+    ends = []
+    for env, sign in ((changed, 1.0), (plain, -1.0)):
+        env.set_seed(7)
+        ends.append(env.step(env.reset().set("action", torch.tensor([sign])))["next"])
+    torch.testing.assert_close(ends[0]["observation"], ends[1]["observation"])
+
+
+def test_each_environment_has_its_own_regime():
+    chain = RegimeTransform(GAIN, rows(0.5, -1.0, 1.0), at=[2])
+    data = TransformedEnv(SerialEnv(3, pendulum), chain).rollout(3)
+    assert ratio(data) == [[1.0, 1.0, 0.5], [1.0, 1.0, -1.0], [1.0, 1.0, 1.0]]
+
+
+@pytest.mark.parametrize("clip, largest", [(True, 2.0), (False, 4.0)])
+def test_actuators_saturate_unless_told_otherwise(clip, largest):
+    given = []
+
+    class Spy(gymnasium.Wrapper):
+        def step(self, action):
+            given.append(float(np.asarray(action)[0]))
+            return self.env.step(action)
+
+    chain = RegimeTransform(GAIN, [{"torque": 2.0}], clip=clip)
+    env = TransformedEnv(GymWrapper(Spy(gymnasium.make("Pendulum-v1"))), chain)
+    for action in (0.5, 2.0):
+        data = env.step(env.reset().set("action", torch.tensor([action])))
+        assert data["action"].item() == action  # the command stays what it was
+        assert data["next", "regime", "effective_action"].item() == given[-1]
+    assert given == [1.0, largest]
+
+
+def test_late_commands_arrive_late_and_none_outlives_a_reset():
+    chain = RegimeTransform(LATE, [{"delay": 1}])
+    env = TransformedEnv(SerialEnv(2, pendulum), Compose(chain, StepCounter(3)))
+    data = env.rollout(5, break_when_any_done=False)
+    effect, command = data["next", "regime", "effective_action"], data["action"]
+    torch.testing.assert_close(effect[:, 1:3], command[:, :2])
+    torch.testing.assert_close(effect[:, 4], command[:, 3])
+    assert (effect[:, [0, 3]] == 0).all()
+
+
+def test_a_reset_of_some_leaves_the_others_alone():
+    env = TransformedEnv(SerialEnv(3, pendulum), reversal(2))
+    td = env.reset()
+    for _ in range(3):
+        td = step_mdp(env.rand_step(td))
+    before = td["regime"].clone()
+    reset = torch.tensor([[False], [True], [False]])
+    after = env.reset(td.clone().set("_reset", reset))["regime"]
+    assert after["step"].tolist() == [3, 0, 3]
+    assert after["parameters"].flatten().tolist() == [-1.0, 1.0, -1.0]
+    torch.testing.assert_close(after["state"][[0, 2]], before["state"][[0, 2]])
+    assert not torch.equal(after["state"][1], before["state"][1])
+
+
+def test_episodes_that_end_start_the_schedule_anew():
+    env = TransformedEnv(pendulum(steps=3), reversal(2))
+    data = env.rollout(6, break_when_any_done=False)
+    assert ratio(data) == [1.0, 1.0, -1.0] * 2
+
+
+def test_a_branch_goes_on_from_its_own_memory():
+    env = TransformedEnv(line(), reversal(1))
+    start = env.reset()
+    first = env.step(start.clone().set("action", torch.tensor([0.5])))
+    env.rollout(5)  # must not matter
+    second = env.step(step_mdp(first).set("action", torch.tensor([0.5])))
+    assert second["next", "regime", "effective_action"].item() == -0.5
+    again = env.step(start.clone().set("action", torch.tensor([0.5])))
+    assert again["next", "regime", "effective_action"].item() == 0.5
+
+
+@pytest.mark.parametrize("batch", [(4,), (2, 3)])
+def test_any_batch_shape(batch):
+    env = TransformedEnv(line(), reversal(1))
+    td = env.reset(TensorDict({"observation": torch.zeros(*batch, 1)}, batch))
+    for sign in (1.0, -1.0):
+        td = env.step(td.set("action", torch.full((*batch, 1), 0.5)))
+        effect = td["next", "regime", "effective_action"]
+        torch.testing.assert_close(effect, torch.full((*batch, 1), 0.5 * sign))
+        td = step_mdp(td)
+    torch.testing.assert_close(td["observation"], torch.zeros(*batch, 1))
+
+
+def test_the_corrected_action_is_what_is_affected():
+    model = KnownDynamics(push, Manifold(1), action_size=1)
+    flow = ContextFlow(torch.tensor([-1.0]), torch.tensor([1.0]), window=2, hidden=[8], latent=4)
+    flow.gate = 0.0
+    chain = Compose(reversal(2), ActionFlowTransform(model, flow), StepCounter())
+    env = TransformedEnv(line(), chain)
+    check_env_specs(env)
+    td, signs = env.reset(), [1.0, 1.0, -1.0, -1.0]
+    for sign in signs:
+        td = env.step(td.set("action", torch.tensor([0.5])))
+        executed = td["next", "afm", "executed_action"]
+        torch.testing.assert_close(td["next", "regime", "effective_action"], sign * executed)
+        torch.testing.assert_close(td["next", "afm", "window", "executed"][-1], executed)
+        td = step_mdp(td)
+    assert not torch.equal(executed, torch.tensor([0.5]))  # it has been corrected
+
+
+class Above(Regime):
+    """The motor works only where the cosine is above a limit."""
+
+    names, identity = ("limit",), (-2.0,)
+
+    def apply(self, action, parameters, state, past=None, noise=None):
+        return torch.where(state[..., :1] > parameters, action, 0.0)
+
+    def sample(self, shape, generator=None):
+        return torch.zeros(*shape, 1)
+
+
+def test_a_later_normaliser_does_not_disturb_the_state_it_acts_in():
+    effects = []
+    for out_key in ("elsewhere", "observation"):
+        norm = ObservationNorm(9.0, 3.0, in_keys=["observation"], out_keys=[out_key])
+        chain = Compose(RegimeTransform(Above(), [{"limit": -0.7}]), norm)
+        env = TransformedEnv(pendulum(), chain)
+        env.set_seed(1)
+        data = env.rollout(40, lambda td: td.set("action", torch.tensor([1.0])))
+        effects.append(data["next", "regime", "effective_action"].flatten().tolist())
+    assert effects[0] == effects[1] and set(effects[0]) == {0.0, 1.0}
+
+
+def test_noise_depends_on_the_seed_only():
+    effects = []
+    for seed in (0, 0, 1):
+        chain = RegimeTransform(GainNoise(), [{"gain_noise": 0.3}], seed=seed)
+        env = TransformedEnv(SerialEnv(2, pendulum), chain)
+        td = env.reset().set("action", torch.ones(2, 1))
+        effects.append(env.step(td)["next", "regime", "effective_action"])
+    assert torch.equal(effects[0], effects[1]) and not torch.equal(effects[0], effects[2])
+    assert effects[0][0] != effects[0][1]
+
+
+def test_keys_and_prefix_may_be_nested():
+    model = KnownDynamics(push, Manifold(1), action_size=1)
+    reward = KnownReward(lambda s, a, after: after[..., 0])
+    robot = (["robot", "position"], ["robot", "force"])
+    world = PlanningEnv(model, reward, torch.tensor([-1.0]), torch.tensor([1.0]), *robot)
+    keys = dict(zip(("observation_key", "action_key"), robot, strict=True))
+    chain = reversal(0, prefix=["robot", "regime"], **keys)
+    env = TransformedEnv(world, chain)
+    check_env_specs(env)
+    assert chain.key("parameters") == ("robot", "regime", "parameters")
+    assert env.rollout(2)["next", "robot", "regime", "parameters"].tolist() == [[-1.0], [-1.0]]
+
+
+def test_without_an_environment():
+    td = TensorDict({"observation": torch.randn(5, 3), "action": torch.randn(5, 1)}, [5])
+    assert (reversal()(td.clone()) == td).all()
+    assert (reversal().inv(td.clone()) == td).all()
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(5), batch_size=5, transform=reversal()
+    )
+    buffer.extend(td)
+    assert set(buffer.sample()["action"].flatten().tolist()) <= set(td["action"].flatten().tolist())
+
+
+def test_without_its_memory():
+    env = TransformedEnv(line(), reversal())
+    td = TensorDict({"observation": torch.zeros(1), "action": torch.ones(1)}, [])
+    with pytest.raises(KeyError, match="no 'regime' in the tensordict; start from"):
+        env.step(td)
+
+
+def test_copies_behave_alike():
+    env = TransformedEnv(line(), reversal(1))
+    assert ratio(copy.deepcopy(env).rollout(3)) == ratio(env.rollout(3)) == [1.0, -1.0, -1.0]
+
+
+@pytest.mark.parametrize(
+    "phases, at",
+    [([{}], [3]), ([{}, {}], []), ([], []), (torch.ones(2, 2), [3]), (torch.ones(3, 1), [3])],
+    ids=["few", "many", "none", "wide", "long"],
+)
+def test_phases_that_do_not_fit_are_refused(phases, at):
+    with pytest.raises(ConfigurationError, match=r"phases=.*one more than at=.*torque"):
+        RegimeTransform(GAIN, phases, at=at)
+
+
+def test_actions_that_are_no_vectors_are_refused():
+    with pytest.raises(ConfigurationError, match="action_key='action': .* vector of real numbers"):
+        TransformedEnv(GymEnv("CartPole-v1"), reversal()).reset()
