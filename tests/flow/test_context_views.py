@@ -7,7 +7,7 @@ import torch
 
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import ContextFlow, LeastSquares
+from afm_rl.flow import ContextFlow, LeastSquares, Window
 from afm_rl.flow.views import VIEWS, Pairs, look
 
 MANY, STEPS = 24, 24
@@ -134,8 +134,6 @@ def test_evidence_fades_where_nothing_surprises(fitted, live):
 
 
 def _window_of_last(flow):
-    from afm_rl.flow import Window
-
     state, executed, _ = drive(reversed_, steps=flow.window)
     valid = torch.ones(MANY, flow.window, dtype=torch.bool)
     return Window(state, executed, executed, Dubins()(state, executed), valid)

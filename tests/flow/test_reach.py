@@ -93,6 +93,7 @@ def test_samples_are_judged_by_what_can_be_had_of_the_plan(
     torch.testing.assert_close(found.action / flow.half_range, proposals[best])
 
 
+@torch.no_grad()
 def test_a_mission_that_is_sure_keeps_its_mean_beside_one_that_is_not(box, told, trained_flow):
     features = torch.stack([torch.zeros(trained_flow.feature_size)] * 2)
     features[1] = torch.randn(trained_flow.feature_size)

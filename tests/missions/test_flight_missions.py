@@ -111,7 +111,7 @@ def test_a_lost_flight_leaves_the_batch(fly):
 
 
 def test_flows_correct_in_a_box_of_their_own(fly):
-    flown = fly("method=afm_physics")
+    flown = fly("method=afm_physics", "flow.views=[recent]")
     flow, robot = flown.agent.transform.flow, flown.agent.robot
     torch.testing.assert_close(flow.half_range, torch.tensor([0.575, 3e-4, 3e-4, 1e-4]))
     steps = flown.steps

@@ -9,13 +9,12 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, Transform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from afm_rl.dynamics import Calibrated, Dubins, Oracle, dubins_step
+from afm_rl.dynamics import Dubins, dubins_step
 from afm_rl.envs import UGVTrack
-from afm_rl.errors import ConfigurationError
 from afm_rl.flow import Context, ContextFlow, Correction, Corrector
 from afm_rl.learning import GaussianNLLLoss
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
-from afm_rl.regimes import ActionGain, Schedule
+from afm_rl.regimes import Schedule
 from afm_rl.transforms import ActionFlowTransform
 
 LOW, HIGH = torch.tensor([-1.0, -math.pi / 2]), torch.tensor([1.0, math.pi / 2])
@@ -26,9 +25,9 @@ class Stub(Corrector):
 
     feature_size = 1
 
-    def __init__(self, answer, window=2, reach=None):
+    def __init__(self, answer, window=2):
         super().__init__(LOW, HIGH, gate=0.0, window=window)
-        self.answer, self.reach, self.asked = answer, reach, []
+        self.answer, self.asked = answer, []
 
     def context(self, window, model, last):
         size = window.valid.sum(-1).to(window.state)
@@ -38,8 +37,7 @@ class Stub(Corrector):
 
     def correct(self, context, state, planned):
         self.asked.append((context, state, planned))
-        reach = None if self.reach is None else self.reach.expand(*planned.shape[:-1], 2, 2)
-        return Correction(self.answer(planned), torch.full_like(planned, 0.1), reach)
+        return Correction(self.answer(planned), torch.full_like(planned, 0.1))
 
 
 class Blind(Transform):
@@ -60,10 +58,9 @@ class Blind(Transform):
         return tensordict_reset
 
 
-def env(answer, *before, batch=(4,), reach=None, model=None, **settings):
+def env(answer, *before, batch=(4,), **settings):
     base = UGVTrack(batch_size=batch, process_noise=0.0)
-    stub = Stub(answer, reach=reach)
-    chain = ActionFlowTransform(model or Dubins(), stub, **settings)
+    chain = ActionFlowTransform(Dubins(), Stub(answer), **settings)
     return TransformedEnv(base, Compose(*before, chain))
 
 
@@ -106,59 +103,6 @@ def test_only_what_is_misaligned_is_corrected():
     assert [len(part) for part in context] == [2] * len(context)
 
 
-BOX = torch.stack([LOW, HIGH])
-
-
-@pytest.mark.parametrize(
-    ("reach", "expected"),
-    [
-        (None, BOX),
-        (0.5 * BOX, BOX),
-        (2.5 * BOX, 2.5 * BOX),
-        (torch.stack([2 * LOW, 0.1 * HIGH]), torch.stack([2 * LOW, HIGH])),
-        (torch.full((2, 2), math.nan), BOX),
-        (torch.full((2, 2), math.inf), BOX),
-    ],
-    ids=["none", "less", "more", "either", "nan", "inf"],
-)
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
-def test_the_reach_is_never_less_than_the_box(reach, expected, batch):
-    data = env(lambda planned: planned, batch=batch, reach=reach).rollout(3)
-    found = data["next", "afm", "reach"].movedim(len(batch), 0)
-    torch.testing.assert_close(
-        data["afm", "reach"].movedim(len(batch), 0)[0], BOX.expand(*batch, 2, 2)
-    )
-    torch.testing.assert_close(found[0], BOX.expand(*batch, 2, 2))  # the gate is closed
-    torch.testing.assert_close(found[1:], expected.expand(2, *batch, 2, 2))
-
-
-def test_a_box_without_zero_stays_one():
-    stub = Stub(lambda planned: planned * math.nan, reach=BOX)
-    base = PlanningEnv(Dubins(), GoalDistance(), 0.5 * HIGH, HIGH)
-    data = TransformedEnv(base, ActionFlowTransform(Dubins(), stub)).rollout(3)
-    expected = torch.stack([0.5 * HIGH, HIGH]).expand(3, 2, 2)
-    torch.testing.assert_close(data["next", "afm", "reach"], expected)
-
-
-def test_planners_hear_of_more_only_if_they_may_and_the_model_can_foresee_it(make_ensemble):
-    known = {
-        "widened": {},
-        "not wished": {"widen": False},
-        "switched off": {"enabled": False},
-        "a network": {"model": make_ensemble()},
-        "calibrated": {"model": Calibrated(Dubins(), HIGH)},
-        "calibrated network": {"model": Calibrated(make_ensemble(), HIGH)},
-        "oracle": {"model": Oracle(Dubins(), ActionGain(["v", "omega"]))},
-    }
-    for name, settings in known.items():
-        data = env(lambda planned: planned, reach=2.5 * BOX, **settings).rollout(3)
-        wider = name in ("widened", "calibrated", "oracle")
-        expected = (2.5 if wider else 1.0) * BOX.expand(4, 2, 2)
-        torch.testing.assert_close(data["next", "afm", "reach"][:, -1], expected, msg=name)
-    with pytest.raises(ConfigurationError, match="transform.widen"):
-        env(lambda planned: planned, widen="yes")
-
-
 @pytest.mark.parametrize("size", [3.0, 1e30])
 def test_what_is_executed_is_in_the_box(size):
     whole = env(lambda planned: size * planned.sign())
@@ -185,13 +129,8 @@ def test_an_answer_that_is_not_finite_is_not_executed(value):
         answered[1, 1] = value
         return answered
 
-    far = 3 * torch.stack([LOW, HIGH])
-
-    data = env(answer, reach=far).rollout(4)
+    data = env(answer).rollout(4)
     executed, planned = data["next", "afm", "executed_action"], data["action"]
-    reach = data["next", "afm", "reach"]
-    assert torch.equal(reach[:2], (far / 3).expand(2, 4, 2, 2))  # nothing that came with it either
-    torch.testing.assert_close(reach[2:, 1:], far.expand(2, 3, 2, 2))
     assert torch.equal(executed[:2], planned[:2])
     torch.testing.assert_close(executed[2:, 1:], -planned[2:, 1:])
     assert (data["next", "afm", "spread"][:2] == 0).all()
