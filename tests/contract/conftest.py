@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from pushing import push
 from tensordict import TensorDict
 
 from afm_rl.dynamics import (
@@ -49,10 +50,6 @@ class Case(NamedTuple):
     """``make(seed) -> module``, in single precision."""
     say: object
     """``say(module, batch, dtype=..., device=...) -> tensors``, each of leading shape ``batch``."""
-
-
-def push(state, action):
-    return state + 0.1 * torch.cat([action, action[..., :1]], -1)
 
 
 def small(seed=0, **settings):
