@@ -68,9 +68,7 @@ class GoalDistance(Cost):
         saturation: str = "mixed",
     ) -> None:
         super().__init__()
-        self.saturation = check_choice(
-            "cost.saturation", saturation, ("mixed", "direction", "clip")
-        )
+        self.saturation = check_choice("cost.saturation", saturation, SATURATIONS)
         self.coordinates = list(coordinates)
         self.in_keys = as_keys(in_keys)
         self.in_sizes = [check_count("cost.goal_size", goal_size)]
