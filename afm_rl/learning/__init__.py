@@ -13,6 +13,7 @@ from afm_rl.learning.pretrain import pretrain_ensemble
 from afm_rl.learning.pretrain_knode import pretrain_knode
 from afm_rl.learning.rls_updater import RLSUpdater
 from afm_rl.learning.stream_x import StreamXUpdater
+from afm_rl.learning.unmatched_updater import UnmatchedUpdater
 from afm_rl.learning.updater import OnlineUpdater, OracleUpdater, Updater
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "OracleUpdater",
     "RLSUpdater",
     "StreamXUpdater",
+    "UnmatchedUpdater",
     "Updater",
     "UpdaterHook",
     "collect",

@@ -24,6 +24,7 @@ from afm_rl.learning import (
     OnlineUpdater,
     RLSUpdater,
     StreamXUpdater,
+    UnmatchedUpdater,
     Updater,
 )
 from afm_rl.manifold import Manifold
@@ -186,16 +187,19 @@ MODULES = {
         lambda seed: RLSUpdater(GaussianNLLLoss(Calibrated(small(seed), torch.ones(2)))), learn
     ),
     "StreamXUpdater": Case(partial(updater, StreamXUpdater, init="sparse", layer_norm=True), learn),
+    "UnmatchedUpdater": Case(
+        partial(updater, UnmatchedUpdater, partial(OnlineUpdater, optimizer=ADAM), BOX[1]), learn
+    ),
 }
 BOUND_TO_VALUES = (
     *("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI"),
-    *("OnlineUpdater", "RLSUpdater", "StreamXUpdater"),
+    *("OnlineUpdater", "RLSUpdater", "StreamXUpdater", "UnmatchedUpdater"),
 )
 LOOKS_AT_VALUES = ("ContextFlow",)  # only what is surprising is looked at closely
 BUILT_IN_PRECISION = ("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI")
 
 
-SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "OnlineUpdater", "StreamXUpdater")
+SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "OnlineUpdater", "StreamXUpdater", "UnmatchedUpdater")
 COMPILED = [
     pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_TO_COMPILE else [])
     for name in MODULES

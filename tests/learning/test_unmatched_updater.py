@@ -1,0 +1,119 @@
+"""The learner beside AFM: what actions can undo is not its business."""
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from afm_rl.dynamics import Dubins, Ensemble
+from afm_rl.errors import ConfigurationError
+from afm_rl.learning import (
+    FreshAdam,
+    GaussianNLLLoss,
+    OnlineUpdater,
+    StreamXUpdater,
+    UnmatchedUpdater,
+    pretrain_ensemble,
+)
+from afm_rl.manifold import Manifold
+
+LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+GRADIENT = partial(OnlineUpdater, optimizer=partial(FreshAdam, lr=1e-3))
+
+
+@pytest.fixture(scope="module")
+def taught():
+    """Return the weights of an ensemble that knows the car."""
+    model = blank()
+    box = torch.tensor([0.0, 0.0, -3.14]), torch.tensor([0.0, 0.0, 3.14])
+    pretrain_ensemble(model, Dubins(), box, (LOW, HIGH), samples=40_000, epochs=10)
+    return model.state_dict()
+
+
+def blank():
+    return Ensemble(Manifold(3, angles=[2]), 2, features=[2], members=2, hidden=[32, 32])
+
+
+def learner(state, updater=GRADIENT, **settings):
+    model = blank()
+    model.load_state_dict(state)
+    settings = {"gate": 2.0, **settings}  # the small model is a rough one
+    return UnmatchedUpdater(GaussianNLLLoss(model.expand_(8)), updater, HIGH, **settings)
+
+
+def transitions(gain, push=0.0):
+    generator = torch.Generator().manual_seed(0)
+    state = torch.rand(8, 3, generator=generator)
+    action = (2 * torch.rand(8, 2, generator=generator) - 1) * HIGH
+    after = Dubins()(state, action * gain)
+    side = torch.stack([-state[:, 2].sin(), state[:, 2].cos(), torch.zeros(8)], -1)
+    td = TensorDict({"observation": state, "action": action}, [8])
+    return td.set(("next", "observation"), after + push * side)
+
+
+def weights(updater):
+    return torch.cat([part.detach().flatten(1) for part in updater.loss.model.parameters()], 1)
+
+
+def test_what_an_action_can_undo_is_not_learnt(taught):
+    updater = learner(taught)
+    before = weights(updater)
+    losses = [updater(transitions(-1.0))["loss"] for _ in range(5)]
+    assert torch.equal(weights(updater), before)
+    assert bool((losses[0] == losses[-1]).all())
+    assert bool((losses[0] > learner(taught)(transitions(1.0))["loss"]).all())  # but it is seen
+
+
+@pytest.mark.parametrize(
+    "updater", [GRADIENT, partial(StreamXUpdater, lr=0.1)], ids=["gradient", "stream_x"]
+)
+def test_what_no_action_can_undo_is_learnt(taught, updater):
+    learning = learner(taught, updater)
+    pushed = transitions(-1.0, push=0.3)
+    for _ in range(30):
+        learning(pushed)
+    explained = TensorDict({**pushed, "action": -pushed["action"]}, [8])
+    after = GaussianNLLLoss(learning.loss.model)(explained)["loss_nll"]
+    before = GaussianNLLLoss(learner(taught).loss.model)(explained)["loss_nll"]
+    assert after < before / 2
+
+
+def test_missions_without_such_an_error_stay_as_they_are(taught):
+    updater = learner(taught)
+    before = weights(updater)
+    pushed, plain = transitions(1.0, push=0.3), transitions(1.0)
+    half = TensorDict.cat([pushed[:4], plain[4:]])
+    updater(half)
+    changed = (weights(updater) != before).any(1)
+    assert changed.tolist() == [True] * 4 + [False] * 4
+
+
+def test_faults_are_refused(taught):
+    updater = learner(taught)
+    before = weights(updater)
+    td = transitions(1.0, push=0.3)
+    td["action"][2] = torch.nan
+    td["next", "observation"][5] = torch.inf
+    loss = updater(td)["loss"]
+    assert loss.isnan().nonzero().squeeze(-1).tolist() == [2, 5]
+    assert updater.refused == 2
+    changed = (weights(updater) != before).any(1)
+    assert changed.tolist() == [k not in (2, 5) for k in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"scale": [1.0]}, "updater.scale=.*expected 2 positive numbers"),
+        ({"scale": [1.0, 0.0]}, "updater.scale="),
+        ({"scale": [1.0, float("nan")]}, "updater.scale="),
+        ({"gate": -1.0}, "updater.gate=-1"),
+        ({"updater": partial(GRADIENT, mask_key="mine")}, "updater.updater.mask_key='mine'"),
+        ({"updater": lambda loss: loss}, "updater.updater"),
+    ],
+)
+def test_settings_are_checked(settings, words):
+    settings = {"updater": GRADIENT, "scale": HIGH, **settings}
+    with pytest.raises(ConfigurationError, match=words):
+        UnmatchedUpdater(GaussianNLLLoss(blank()), **settings)
