@@ -63,6 +63,27 @@ def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
     return vector + quaternion[..., 3:] * across + torch.linalg.cross(axis, across)
 
 
+def rotate_slope(quaternion: Tensor, vector: Tensor) -> Tensor:
+    r"""Return the derivative of :func:`rotate` by the quaternion's four numbers, ``(*B, 3, 4)``.
+
+    .. math:: \partial R(q) x = [\,2 (\vec q \cdot x) I + 2 \vec q x^\top - 4 x \vec q^\top
+              - 2 q_w [x]_\times,\; 2\,\vec q \times x\,]
+
+    >>> rotate_slope(torch.tensor([0.0, 0.0, 0.0, 1.0]), torch.tensor([0.0, 0.0, 1.0]))
+    tensor([[ 0.,  2.,  0.,  0.],
+            [-2.,  0.,  0.,  0.],
+            [ 0.,  0.,  0.,  0.]])
+    """
+    axis, vector = torch.broadcast_tensors(quaternion[..., :3], vector)
+    eye = torch.eye(3, dtype=axis.dtype, device=axis.device)
+    outer = axis.unsqueeze(-1) * vector.unsqueeze(-2)
+    inner = (axis * vector).sum(-1)[..., None, None]
+    axes = eye.expand_as(outer)
+    across = torch.linalg.cross(vector.unsqueeze(-2).expand_as(axes), axes).mT  # [x] times
+    by_axis = 2 * (inner * eye + outer) - 4 * outer.mT - 2 * quaternion[..., 3:, None] * across
+    return torch.cat([by_axis, 2 * torch.linalg.cross(axis, vector).unsqueeze(-1)], -1)
+
+
 def body_z_axis(quaternion: Tensor) -> Tensor:
     r"""Return the body's z axis in the world frame ``(*B, 3)``.
 

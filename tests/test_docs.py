@@ -71,7 +71,9 @@ def write_files(page, folder):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=name_of)
+@pytest.mark.parametrize(
+    "page", [p for p in sorted(DOCS.rglob("*.md")) if blocks(p, "python")], ids=name_of
+)
 def test_snippets_run(page, desk):
     rest = write_files(page, desk)
     exec(compile("\n".join(rest), str(page), "exec"), {"__name__": "page"})

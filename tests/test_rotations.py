@@ -16,6 +16,7 @@ from afm_rl.rotations import (
     quaternion_multiply,
     quaternion_normalise,
     rotate,
+    rotate_slope,
 )
 
 IDENTITY = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
@@ -84,6 +85,17 @@ def test_derivatives_match_finite_differences(angle):
     torch.autograd.gradcheck(quaternion_exp, vector, check_forward_ad=True)
     both = lambda x: quaternion_log(quaternion_exp(x))  # noqa: E731
     torch.autograd.gradcheck(both, vector, check_forward_ad=True)
+
+
+@pytest.mark.parametrize("batch", [(), (7,), (2, 3)])
+def test_the_derivative_of_turned_vectors(batch):
+    quaternion, vector = (torch.randn(*batch, size, dtype=torch.float64) for size in (4, 3))
+    for slope, q, x in zip(
+        *(rotate_slope(quaternion, vector).reshape(-1, 3, 4), quaternion.reshape(-1, 4)),
+        vector.reshape(-1, 3),
+        strict=True,
+    ):
+        torch.testing.assert_close(slope, torch.func.jacfwd(rotate)(q, x))
 
 
 @pytest.mark.parametrize("batch", [(), (7,), (2, 3)])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from afm_rl.dynamics.body_frame import to_world, to_world_slope
 from afm_rl.dynamics.rates import HeldRate
 from afm_rl.dynamics.residual import Network, residual, residual_slope
 
@@ -17,6 +18,8 @@ class HeldHybrid(HeldRate):
         network: N, one per leading index.
         action: u, ``(l, n, A)``; states are ``(l, n, S)``.
         features: indices of the state coordinates that the network sees, None for all.
+        turned: whether the network speaks in the frame of a rigid body, see
+            :func:`~afm_rl.dynamics.body_frame.to_world`.
 
     >>> from afm_rl.dynamics.rates import FunctionRate
     >>> from afm_rl.dynamics.residual import draw_network
@@ -29,9 +32,14 @@ class HeldHybrid(HeldRate):
     """
 
     def __init__(
-        self, nominal: HeldRate, network: Network, action: Tensor, features: list[int] | None
+        self,
+        nominal: HeldRate,
+        network: Network,
+        action: Tensor,
+        features: list[int] | None,
+        turned: bool = False,
     ) -> None:
-        self.nominal, self.network, self.action = nominal, network, action
+        self.nominal, self.network, self.action, self.turned = nominal, network, action, turned
         self.features: slice | list[int] = slice(None) if features is None else features
 
     def inputs(self, state: Tensor) -> Tensor:
@@ -40,13 +48,20 @@ class HeldHybrid(HeldRate):
 
     def __call__(self, state: Tensor) -> Tensor:
         """Return the rate of change ``(l, n, S)``."""
-        return self.nominal(state) + residual(self.inputs(state), self.network)
+        value = residual(self.inputs(state), self.network)
+        if self.turned:
+            value = (to_world(state) @ value.unsqueeze(-1)).squeeze(-1)
+        return self.nominal(state) + value
 
     def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rate of change and its derivative, the action in the last columns."""
         rate, turn = self.nominal.tangent(state, through)
         value, slope = residual_slope(self.inputs(state), self.network)
         actions = self.action.shape[-1]
+        if self.turned:
+            matrix = to_world(state)
+            turn = turn + to_world_slope(state, value) @ through
+            value, slope = (matrix @ value.unsqueeze(-1)).squeeze(-1), matrix @ slope
         by_state, by_action = slope.split([slope.shape[-1] - actions, actions], -1)
         turn = turn + by_state @ through[..., self.features, :]
         turn[..., -actions:] += by_action

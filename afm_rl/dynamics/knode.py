@@ -15,7 +15,7 @@ from afm_rl.dynamics.quadrotor_equations import QuadrotorRate
 from afm_rl.dynamics.rates import FunctionRate, Rate, on_tangent
 from afm_rl.dynamics.residual import Network, draw_network, network_shapes
 from afm_rl.dynamics.runge_kutta import runge_kutta, runge_kutta_tangent, undisturbed
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
 
 
 class KNODE(DynamicsModel):
@@ -41,6 +41,9 @@ class KNODE(DynamicsModel):
         features: indices of the state coordinates that the networks see; None for all, as
             published, although positions do not matter to a flight.
         substeps: Runge-Kutta steps per tick.
+        frame: ``"world"``, as published, or ``"body"``: the networks then give accelerations along
+            the axes of a quadrotor's body, in which a lost mass or a weak motor stays put while
+            the body turns: what they saw for a moment then holds for as long as a plan.
         seed: seed of the networks that :meth:`push_` draws.
 
     Raises:
@@ -65,6 +68,7 @@ class KNODE(DynamicsModel):
         pool: int = 3,
         features: Sequence[int] | None = None,
         substeps: int = 1,
+        frame: str = "world",
         seed: int = 0,
     ) -> None:
         super().__init__(nominal.manifold, nominal.action_size)
@@ -79,6 +83,12 @@ class KNODE(DynamicsModel):
         self.units = check_count("dynamics.units", units)
         self.pool = check_count("dynamics.pool", pool)
         self.substeps = check_count("dynamics.substeps", substeps)
+        self.turned = check_choice("dynamics.frame", frame, ("world", "body")) == "body"
+        if self.turned and not isinstance(nominal, Quadrotor):
+            raise ConfigurationError(
+                f"dynamics.frame={frame!r}: expected 'world'; only a Quadrotor has a body to turn "
+                f"with, got {type(nominal).__name__}"
+            )
         size = self.state_size
         self.features = list(range(size)) if features is None else list(features)
         fits = all(isinstance(i, int) and 0 <= i < size for i in self.features)
@@ -281,7 +291,8 @@ class KNODE(DynamicsModel):
         whole = len(self.features) == self.state_size
         network = self._merged(newest, state)
         features = None if whole else self.features
-        return state, HeldHybrid(self.rate.hold(action), network, action, features), batch
+        hold = self.rate.hold(action)
+        return state, HeldHybrid(hold, network, action, features, self.turned), batch
 
 
 def _rate_of(nominal: DynamicsModel, rate: Callable[[Tensor, Tensor], Tensor] | None) -> Rate:

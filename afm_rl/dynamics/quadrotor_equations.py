@@ -11,18 +11,19 @@ from torch import Tensor
 from afm_rl.airframe import QuadrotorBody
 from afm_rl.dynamics.rates import HeldRate, Rate
 from afm_rl.dynamics.runge_kutta import runge_kutta_path
-from afm_rl.rotations import body_z_axis, quaternion_normalise
+from afm_rl.rotations import quaternion_normalise
 
 
 class _Tables(NamedTuple):
     """The products of two attitude and rate components that make up a rate of change."""
 
-    first: Tensor  # (30,) index of one factor
+    first: Tensor  # (30,) index of one factor in the state
     second: Tensor  # (30,) index of the other
     factor: Tensor  # (3, 10) up to three products for each of b_3, q' and the gyroscopic w'
     slope: Tensor  # (7, 70) derivative of these sums by (q, w), linear in (q, w)
     inverse: Tensor  # (3,) one over the moments of inertia
     weight: Tensor  # (3,) acceleration of gravity
+    up: Tensor  # (3,) what the products leave out of b_3
 
 
 class HeldFlight(HeldRate):
@@ -48,20 +49,26 @@ class HeldFlight(HeldRate):
 
     def __call__(self, state: Tensor) -> Tensor:
         """Return the rate of change ``(*B, 13)``."""
-        turning, tables = state[..., 6:], self.tables
-        pairs = turning.index_select(-1, tables.first) * turning.index_select(-1, tables.second)
-        # Not a matrix product: a flight shall be the same to the bit in any batch.
-        sums = (pairs.reshape(*pairs.shape[:-1], 3, 10) * tables.factor).sum(-2)
-        return torch.cat([state[..., 3:6], torch.addcmul(self.offset, self.gain, sums)], -1)
+        return self._rate(state, self._sums(state))
 
     def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rate of change and its derivative, the action in the last four columns."""
-        turning, tables = state[..., 6:], self.tables
-        slope = (turning @ tables.slope).unflatten(-1, (10, 7)) * self.gain.unsqueeze(-1)
+        tables, sums = self.tables, self._sums(state)
+        slope = (state[..., 6:] @ tables.slope).unflatten(-1, (10, 7)) * self.gain.unsqueeze(-1)
         rest = slope @ through[..., 6:, :]
-        rest[..., :3, -4] += body_z_axis(state[..., 6:10]) / self.body.mass
+        rest[..., :3, -4] += (sums[..., :3] + tables.up) / self.body.mass  # b_3 / m
         rest[..., 7:, -3:] += tables.inverse.diag()
-        return self(state), torch.cat([through[..., 3:6, :], rest], -2)
+        return self._rate(state, sums), torch.cat([through[..., 3:6, :], rest], -2)
+
+    def _sums(self, state: Tensor) -> Tensor:
+        """Return the sums of products that b_3, q' and w' are made of, ``(*B, 10)``."""
+        tables = self.tables
+        pairs = state.index_select(-1, tables.first) * state.index_select(-1, tables.second)
+        # Not a matrix product: a flight shall be the same to the bit in any batch.
+        return (pairs.reshape(*pairs.shape[:-1], 3, 10) * tables.factor).sum(-2)
+
+    def _rate(self, state: Tensor, sums: Tensor) -> Tensor:
+        return torch.cat([state[..., 3:6], torch.addcmul(self.offset, self.gain, sums)], -1)
 
 
 class QuadrotorRate(Rate):
@@ -204,6 +211,7 @@ def _tables(body: QuadrotorBody, dtype: torch.dtype, device: torch.device) -> _T
                 slope[i, row, j] += value
         inertia = torch.tensor(body.inertia, dtype=torch.float64)
         weight = torch.tensor([0.0, 0.0, -body.gravity], dtype=torch.float64)
-        floats = (factor, slope.flatten(1), 1 / inertia, weight)
-        indices = (first.flatten().to(device), second.flatten().to(device))
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        floats = (factor, slope.flatten(1), 1 / inertia, weight, up)
+        indices = (6 + index.flatten().to(device) for index in (first, second))
         return _Tables(*indices, *(table.to(device, dtype) for table in floats))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from afm_rl.dynamics.body_frame import to_world
 from afm_rl.dynamics.knode import KNODE
 from afm_rl.dynamics.residual import Network
 from afm_rl.manifold import wrap_angle
@@ -110,6 +111,8 @@ def _fast(model: KNODE, rows: Triple, share: Tensor, dt: float) -> Gradient:
     eye = torch.eye(size, dtype=gap.dtype, device=gap.device)
     moved = dt * model.slope(state, action, none)[..., :size]
     reach = dt * (eye + moved @ (eye + moved / 3) / 2)
+    if model.turned:
+        reach = reach @ to_world(state)
     inputs = torch.cat([state[..., model.features], action], -1)
     rows_of = share.shape[:2]
     inputs, gap = (part.reshape(*rows_of, -1) for part in (inputs, gap))

@@ -53,7 +53,7 @@ class UnmatchedFit(nn.Module):
         theta, covariance = self._fit()
         across = effect.across / effect.noise.unsqueeze(-2)
         total = effect.rest + (across @ told.unsqueeze(-1)).squeeze(-1)
-        miss = (total - (across @ theta.mT).squeeze(-1)).abs()
+        miss = (total - (across @ theta.unsqueeze(-1)).squeeze(-1)).abs()
         doubt = (across @ covariance * across).sum(-1)
         doubt = where(memory.active, doubt, torch.zeros_like(doubt))
         surprise, error, usual = (

@@ -33,6 +33,7 @@ ROBOT_SHAPES = (
     *("action_low", "action_high", "state_low", "state_high"),
     *("features", "model", "regime", "flow_low", "flow_high", "flow_reuse"),
 )
+NOMINAL = {"_target_": "afm_rl.missions.parts.physics", "_partial_": True}
 AFTER_TRAINING = (
     *("gate", "samples", "steps", "error_action", "wrap", "latch", "checkpoint"),
     *("propagation", "precision"),
@@ -105,8 +106,10 @@ def build(cfg: DictConfig) -> Agent:
 
     dynamics = make("dynamics", robot)
     base = dynamics.module
-    flow = make("flow", robot, base)
+    flow = make("flow", robot, robot.model if dynamics.nominal else base)
     shapes = [_shaping(settings, group) for group in ("robot", "dynamics", "flow")]
+    if dynamics.nominal:  # all such flows are one and the same
+        shapes[1] = NOMINAL
     trainings = [
         part.training._replace(settings=shaping)
         for part, shaping in ((dynamics, shapes[:2]), (flow, shapes))

@@ -51,11 +51,13 @@ class Part(NamedTuple):
 
     module: Any
     training: Training | None = None
+    nominal: bool = False
+    """Does it predict what the nominal physics do, as yet? Flows are then trained over these."""
 
 
 def physics(robot: Robot) -> Part:
     """Return the robot's nominal physics."""
-    return Part(robot.model)
+    return Part(robot.model, nominal=True)
 
 
 def oracle(robot: Robot) -> Part:
@@ -115,7 +117,7 @@ def knode(
     model = KNODE(nominal, **settings)
     check_flag("dynamics.randomised", randomised)
     if pretrain is None:
-        return Part(model)
+        return Part(model, nominal=True)
     check_training("dynamics.pretrain", pretrain_knode, pretrain)
 
     def train(progress: bool) -> float:

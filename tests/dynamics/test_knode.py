@@ -81,7 +81,10 @@ def test_without_networks_it_is_the_nominal_model():
 
 @pytest.mark.parametrize(
     "settings",
-    [{}, {"features": range(3, 13)}, {"substeps": 3, "units": 8}, {"nominal": {"dt": 0.1}}],
+    [
+        *({}, {"features": range(3, 13)}, {"substeps": 3, "units": 8}, {"nominal": {"dt": 0.1}}),
+        *({"frame": "body"}, {"frame": "body", "features": range(3, 13), "substeps": 2}),
+    ],
     ids=str,
 )
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)], ids=str)
@@ -145,6 +148,21 @@ def test_the_newest_network_counts_most_and_the_oldest_leaves():
         newest = [10.0**k for k in range(count, max(0, count - 3), -1)]
         expected = sum(x * math.exp(-i) for i, x in enumerate(newest))
         torch.testing.assert_close(found, torch.tensor(expected))
+
+
+def test_what_is_lost_along_the_body_stays_so_while_it_turns():
+    """Half of the mass, seen in one attitude, is half of the mass in every other."""
+    heavy, light = Quadrotor(), Quadrotor(QuadrotorBody(mass=0.015))
+    state, action = flights(6)
+    state[:, 10:], action[:, 1:], action[:, 0] = 0.0, 0.0, 0.2
+    model = KNODE(heavy, frame="body").double()
+    more = [0.0] * 13
+    more[5] = 0.2 / 0.015 - 0.2 / 0.03  # along the body's z axis, m/s^2
+    model.push_(constant(model, *more))
+    torch.testing.assert_close(model(state, action), light(state, action), rtol=0, atol=1e-6)
+    model = KNODE(heavy).double()
+    model.push_(constant(model, *more))
+    assert (model(state, action) - light(state, action)).abs().max() > 0.1
 
 
 def test_a_network_can_be_tried_before_it_is_pushed():
@@ -228,6 +246,7 @@ def test_single_precision_stays():
         ({"substeps": 0}, "dynamics.substeps=0"),
         ({"dt": 0.0}, "dynamics.dt=0.0"),
         ({"seed": -1}, "dynamics.seed=-1"),
+        ({"frame": "sun"}, "dynamics.frame='sun': expected one of world, body"),
         ({"features": [13]}, r"dynamics.features=\[13\]: expected distinct indices in 0..12"),
         ({"features": [1, 1]}, "expected distinct indices"),
     ],
@@ -239,6 +258,8 @@ def test_impossible_settings_are_refused(settings, message):
 
 
 def test_models_whose_equations_are_not_known_are_refused():
+    with pytest.raises(ConfigurationError, match="dynamics.frame='body': expected 'world'; .* Dub"):
+        KNODE(Dubins(), rate=car_rate, frame="body")
     with pytest.raises(ConfigurationError, match="dynamics.rate=None: .* of Dubins"):
         KNODE(Dubins())
     with pytest.raises(ConfigurationError, match="dynamics.dt=None: KnownDynamics has no dt"):

@@ -240,12 +240,13 @@ def test_start_forgets_the_flight_but_not_the_pool():
     assert not any("window" in name or name == "tick" for name in updater.state_dict())
 
 
-def test_the_fast_gradient_is_the_exact_one_to_first_order():
+@pytest.mark.parametrize("frame", ["world", "body"])
+def test_the_fast_gradient_is_the_exact_one_to_first_order(frame):
     (td,) = stream(1)
     trace = td["next", "trace"].double()
     state, after = trace[:, :-1].flatten(0, 1), trace[:, 1:].flatten(0, 1)
     action = td["action"].double().unsqueeze(1).expand(-1, 25, -1).flatten(0, 1)
-    model = KNODE(Quadrotor()).push_().push_()
+    model = KNODE(Quadrotor(), frame=frame).push_().push_()
     network = model.draw(torch.randn(1, model.numbers, dtype=torch.float64))
     share = torch.full((1, len(state), 1), 1 / (13 * len(state)), dtype=torch.float64)
     model.double()

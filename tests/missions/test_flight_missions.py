@@ -91,6 +91,19 @@ def test_a_flight_alone_is_the_same_as_among_others(fly, method):
     pd.testing.assert_frame_equal(rows.reset_index(drop=True), one.steps, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("method", ["rls", "l1", "mass_estimator", "online_knode"])
+def test_what_befalls_others_changes_nothing(fly, method):
+    """Each learns from its own flight, whatever others go through."""
+    regimes = [{"mass": 0.5}, {"wind_x": 1.0}, {"payload": 0.3, "payload_x": 2e-3}]
+    settings = {"robot.schedule.times": [0.1], "budget": 16}
+    if method == "online_knode":
+        settings |= {"updater.begin": 0.1, "updater.epochs": 5}
+    many = fly(f"method={method}", regimes=regimes, **settings).steps
+    one = fly(f"method={method}", regimes=regimes[1:2], **settings).steps
+    rows = many[many["mission"] == 1].assign(mission=np.int32(0)).reset_index(drop=True)
+    pd.testing.assert_frame_equal(rows, one, rtol=1e-4, atol=1e-5)
+
+
 def test_an_interrupted_run_goes_on_to_the_bit(make_agent, tmp_path):
     def agent():
         return make_agent("robot=quadrotor", "method=afm_physics", seeds=2, **QUICK)
@@ -137,6 +150,7 @@ def test_flows_correct_in_a_box_of_their_own(fly):
         (["robot.score=3"], "robot.score=3: expected a Score, or null"),
         (["robot.score.band=0"], "score.band=0: expected a finite number"),
         (["robot.flow_reuse=0"], "robot.flow_reuse=0"),
+        (["robot.flow_iterations=0"], "robot.flow_iterations=0"),
         (["robot.flow_low=null"], r"robot.flow_low=\[\], .* expected 4 numbers each"),
         (["robot.flow_low=[0, 1, 1, 1]"], "robot.flow_low=.* expected 4 numbers each, low <= high"),
         (["robot.env.start=up"], "start='up': expected one of rest, moving"),
@@ -186,3 +200,18 @@ def test_flows_use_examples_as_often_as_the_robot_says(make_agent, monkeypatch):
         settings = {"flow.train.reuse": given, "flow.train.seed": 77 + k, **QUICK}
         make_agent("robot=quadrotor", "method=afm_physics", **settings)
     assert used == [32, 3]
+
+
+@pytest.mark.parametrize(("robot", "views", "steps"), [("quadrotor", 4, 4000), ("ugv", 9, 14000)])
+def test_robots_say_how_flows_are_made_for_them(composed, robot, views, steps):
+    flow = composed(f"robot={robot}", "method=afm_physics").flow
+    assert len(flow.views) == views and flow.train.iterations == steps
+    own = composed(f"robot={robot}", "method=afm_physics", "flow.views=[recent]").flow
+    assert list(own.views) == ["recent"]
+
+
+def test_before_it_learns_a_model_shares_the_flow_of_the_physics(configure):
+    methods = ("afm_physics", "afm_online_knode", "afm_rls", "afm_offline_knode")
+    agents = [build(configure("robot=quadrotor", f"method={method}")) for method in methods]
+    first, *others, offline = [agent.trainings[-1].settings for agent in agents]
+    assert others == [first, first] and offline != first
