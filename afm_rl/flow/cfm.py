@@ -13,7 +13,7 @@ from tensordict.nn import dispatch
 from tqdm.auto import tqdm
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import check_count, check_number
+from afm_rl.errors import check_count, check_instance, check_number
 from afm_rl.flow.base import Context, Examples, Flow
 from afm_rl.flow.saturation import LIMIT
 from afm_rl.learning import InPlaceLoss
@@ -65,8 +65,8 @@ class CFMLoss(InPlaceLoss):
 
     def __init__(self, flow: Flow, reduction: str = "mean", seed: int = 0) -> None:
         super().__init__(reduction)
-        self.flow = flow
-        self._generator = torch.Generator().manual_seed(seed)
+        self.flow = check_instance("loss.flow", flow, Flow)
+        self._generator = torch.Generator().manual_seed(check_count("loss.seed", seed, low=0))
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -136,6 +136,7 @@ def train_flow(
     if reuse is None:
         reuse = 32 if any(True for _ in model.parameters()) else 1
     check_count("flow.train.reuse", reuse)
+    check_count("flow.train.seed", seed, low=0)
     check_number("flow.train.lr", lr, low=0.0, open_low=True)
     plans = 1 if reuse == 1 else PLANS
     generator = torch.Generator().manual_seed(seed)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,33 +10,19 @@ from torch import Tensor
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_counts, check_number
 from afm_rl.flow.base import Context, Correction, Examples, Flow, Window
-from afm_rl.flow.counterfactuals import excite, imagine, rows_filled, rows_of_now
-from afm_rl.flow.hints import ANSWERS, MISSES, Fits, fit_window
+from afm_rl.flow.counterfactuals import anywhere, draw_plans, imagine_windows
+from afm_rl.flow.hints import fit_window
 from afm_rl.flow.network import mlp
 from afm_rl.flow.pairs import PairCorrector
+from afm_rl.flow.proposals import nearest_of, probes_of, source_points_of
+from afm_rl.flow.reading import TOLD, Reading
+from afm_rl.flow.recall import Memory, recall
 from afm_rl.flow.saturation import MODES, attainable, intend
 from afm_rl.flow.solver import midpoint
-from afm_rl.flow.views import VIEWS, Memory, Pairs, memory_of
+from afm_rl.flow.views import SILENT, VIEWS, Layout, check_views, lay_out, memory_of
 from afm_rl.regimes import Regime
-from afm_rl.sampling import draw_states
 
-SILENT = "silent"  # the hypothesis that actions are worth what they are
-SILENT_DOUBT = 0.02
 TOLERATED = 0.25  # half ranges: a prediction that misses by so much does half as badly as can be
-PROBES = 32  # actions whose effects are asked for the reach
-
-
-class Reading(NamedTuple):
-    """What the networks read in a context."""
-
-    code: Tensor
-    """The encoder's, ``(*B, latent)``."""
-    fits: Fits
-    """Least squares of the window."""
-
-    def wide(self) -> Reading:
-        """Return the reading with one more dimension, to be asked of many actions."""
-        return Reading(self.code.unsqueeze(-2), self.fits.wide())
 
 
 class ContextFlow(PairCorrector, Flow):
@@ -74,7 +58,7 @@ class ContextFlow(PairCorrector, Flow):
         action_high: highest action, ``(A,)``.
         window: pairs that a view shows, K.
         memory: transitions that are remembered, M; at least what the views read.
-        views: names of :data:`~afm_rl.flow.views.VIEWS`, or ``silent``.
+        views: names of :data:`~afm_rl.flow.views.VIEWS`, at least one beside ``silent``.
         place: coordinates of the state in which the ground may differ, for views by place;
             those are left out if there are none.
         place_scale: distance at which ground counts as other ground, in their unit.
@@ -106,7 +90,7 @@ class ContextFlow(PairCorrector, Flow):
         action_high: Tensor,
         window: int = 12,
         memory: int = 40,
-        views: Sequence[str] = (SILENT, *VIEWS),
+        views: Sequence[str] = tuple(VIEWS),
         place: Sequence[int] = (),
         place_scale: float = 0.5,
         forgetting: float = 0.7,
@@ -124,36 +108,35 @@ class ContextFlow(PairCorrector, Flow):
         self.shown = check_count("flow.window", window)
         self.place = list(place)
         self.place_scale = check_number("flow.place_scale", place_scale, low=0.0, open_low=True)
-        self.views = _check_views(views, by_place=bool(self.place))
-        self._views = [VIEWS.get(name, VIEWS["recent"]) for name in self.views]
+        self.views = check_views(views, by_place=bool(self.place))
         self.forgetting = check_number("flow.forgetting", forgetting, low=0.0, high=1.0)
         self.samples = check_count("flow.samples", samples)
         self.source_std = check_number("flow.source_std", source_std, low=0.0)
         self.steps = check_count("flow.steps", steps)
         self.unsure = check_number("flow.unsure", unsure, low=0.0)
         self.saturation = check_choice("flow.saturation", saturation, MODES)
-        least = memory_of([VIEWS[name] for name in self.views if name != SILENT], window)
-        if memory < least:
+        ways = [VIEWS[name] for name in self.views]
+        if memory < memory_of(ways, window):
             raise ConfigurationError(
-                f"flow.memory={memory!r}: expected at least {least} for flow.window={window} and "
-                f"the views {', '.join(self.views)}"
+                f"flow.memory={memory!r}: expected at least {memory_of(ways, window)} for "
+                f"flow.window={window} and the views {', '.join(self.views)}"
             )
         hidden = check_counts("flow.hidden", hidden)
         check_count("flow.latent", latent)
         size = self.action_size
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(check_count("flow.seed", seed, low=0))
         self.encoder = mlp([self.feature_size, *hidden, latent], generator)
-        known = latent + (ANSWERS + MISSES + 1) * size  # with what is asked about
+        known = latent + TOLD * size
         self.velocity = mlp([known + size + 1, *hidden, size], generator)
         self.worth = mlp([known, *hidden, size], generator)
-        half = torch.randn((samples + 1) // 2, size, generator=torch.Generator().manual_seed(0))
-        points = torch.cat([half, -half])[:samples]
-        self.register_buffer("source_points", points, persistent=False)
-        ends = torch.cat([torch.eye(size), -torch.eye(size)])
-        inner = 2 * torch.quasirandom.SobolEngine(size).draw(max(1, PROBES - 2 * size)) - 1
-        self.register_buffer("probes", torch.cat([ends, inner]), persistent=False)
-        doubt = [VIEWS[name].doubt if name != SILENT else SILENT_DOUBT for name in self.views]
-        self.register_buffer("doubt", torch.tensor(doubt), persistent=False)
+        fixed = {
+            "source_points": source_points_of(samples, size),
+            "probes": probes_of(size),
+            "doubt": torch.tensor([view.doubt for view in ways]),
+        }
+        rows = {f"rows_{name}": part for name, part in lay_out(ways, window)._asdict().items()}
+        for name, value in (fixed | rows).items():
+            self.register_buffer(name, value, persistent=False)
 
     @property
     def feature_size(self) -> int:
@@ -185,12 +168,11 @@ class ContextFlow(PairCorrector, Flow):
 
     def forward(self, known: Reading, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:
         """Return the velocity ``(*B, A)`` at ``point``, all actions in half ranges."""
-        answers = known.fits.execute(planned, self.saturation)
-        return self.velocity(torch.cat([_about(known, answers, planned), point, tau], -1))
+        return self.velocity(torch.cat([known.of_plan(planned, self.saturation), point, tau], -1))
 
     def effect(self, known: Reading, executed: Tensor) -> Tensor:
         """Return what an action ``(*B, A)`` is expected to be worth, in half ranges."""
-        return self.worth(_about(known, known.fits.effect(executed), executed))
+        return self.worth(known.of_effect(executed))
 
     def examples(
         self,
@@ -207,30 +189,13 @@ class ContextFlow(PairCorrector, Flow):
         the regime before; some windows are not full. Half of the plans are in the action box,
         the others are effects that can be had.
         """
-        contexts, rows = math.ceil(count / plans), self.shown
-        size = (contexts, rows)
-        now, before = regime.sample((2, contexts), generator)
-        row = torch.arange(rows).expand(size)
-        fresh = row >= rows - rows_of_now(contexts, rows, generator)
-        parameters = torch.where(fresh.unsqueeze(-1), now.unsqueeze(1), before.unsqueeze(1))
-        valid = row >= rows - rows_filled(contexts, rows, generator)
-        drawn = draw_states(states, contexts * rows, generator).view(*size, -1)
-        state = model.manifold.project(drawn)
-        executed = self.denormalise(excite(*size, self.action_size, generator))
-        low, high = self.centre - self.half_range, self.centre + self.half_range
-        effect = regime.apply(executed, parameters, state)
-        realised = imagine(model, state, effect, low, high, generator)
-        pairs = self.judge(model, state, executed, realised, valid)
+        size = -(-count // plans), self.shown
+        window, ruling = imagine_windows(self, model, regime, states, size, generator)
+        pairs = self.judge(model, *window)
         chosen = torch.arange(count) // plans
-        here, ruled = state[chosen, -1], now[chosen]
-
-        def anywhere() -> Tensor:
-            unit = 2 * torch.rand(count, self.action_size, generator=generator) - 1
-            return self.denormalise(unit)
-
-        inside = torch.rand(count, 1, generator=generator) < 0.5
-        planned = torch.where(inside, anywhere(), regime.apply(anywhere(), ruled, here))
-        probe = anywhere()
+        here, ruled = window.state[chosen, -1], ruling[chosen]
+        planned = draw_plans(self, regime, ruled, here, generator)
+        probe = anywhere(self, count, generator)
         return Examples(
             pairs[..., :-1].flatten(-2)[chosen],
             planned,
@@ -256,32 +221,25 @@ class ContextFlow(PairCorrector, Flow):
         features = pairs.new_zeros(*shape, self.feature_size)
         if not bool(surprised.any()):  # nothing to explain
             return Context(pairs, evidence, features, surprise, surprised)
-        memory = self._recall(window, pairs, surprised)
+        states = window.state[surprised], window.next_state[surprised]
+        memory = recall(pairs[surprised], *states, self.place, self.place_scale)
         newest = memory.pairs.valid[:, -1]  # does it count?
-        evidence[surprised] = evidence[surprised] + newest * self._misses(memory)
-        best = (evidence[surprised] + self.doubt).argmin(-1)
-        features[surprised] = memory.now(self._views, best, self.shown)
+        believed = evidence[surprised] + newest * self._misses(memory)
+        evidence[surprised] = believed
+        best = (believed + self.doubt).argmin(-1)
+        features[surprised] = memory.now(self._layout, best)
         misaligned = surprised.clone()
         if SILENT in self.views:
             misaligned[surprised] = best != self.views.index(SILENT)
         return Context(pairs, evidence, features, surprise, misaligned)
 
-    def _recall(self, window: Window, pairs: Tensor, rows: Tensor) -> Memory:
-        """Return what ``rows`` of the batch remember."""
-        size, state = self.action_size, window.state[rows]
-        seen = Pairs(*pairs[rows][..., :-1].split([size, size, 1], -1))
-        here = window.next_state[rows][:, -1]
-        away = [self._away(state, now) for now in (state[:, -1], here)]
-        return Memory(seen, *away)
-
-    def _away(self, there: Tensor, here: Tensor) -> Tensor:
-        """Return squared distances in place ``(N, M)`` of states ``(N, M, S)`` from ``(N, S)``."""
-        apart = there[..., self.place] - here[:, None, self.place]
-        return (apart / self.place_scale).square().sum(-1).nan_to_num(torch.inf)
+    @property
+    def _layout(self) -> Layout:
+        return Layout(*(getattr(self, f"rows_{name}") for name in Layout._fields))
 
     def _misses(self, memory: Memory) -> Tensor:
         """Return how badly each view predicted the newest pair, ``(N, V)``."""
-        before, acted, worth = memory.before(self._views, self.shown)
+        before, acted, worth = memory.before(self._layout)
         expected = self.effect(self.read(before), acted)
         if SILENT in self.views:
             silent = self.views.index(SILENT)
@@ -291,52 +249,25 @@ class ContextFlow(PairCorrector, Flow):
 
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
         """Integrate the flow from every source point; return the best end, spread and reach."""
-        unit = self.normalise(planned).unsqueeze(-2)
-        start = self.source(unit, self.source_points)
-        known = self.read(context.features)
-        wanted = unit.squeeze(-2)
-        fixed = _about(known, known.fits.execute(wanted, self.saturation), wanted)
-        fixed = fixed.unsqueeze(-2).expand(*start.shape[:-1], -1)
+        unit, known = self.normalise(planned), self.read(context.features)
+        start = self.source(unit.unsqueeze(-2), self.source_points)
+        told = known.of_plan(unit, self.saturation).unsqueeze(-2).expand(*start.shape[:-1], -1)
+        told = told.flatten(end_dim=-2)
 
         def velocity(tau: float, point: Tensor) -> Tensor:
             time = torch.full_like(point[..., :1], tau)
-            return self.velocity(torch.cat([fixed, point, time], -1))
+            return self.velocity(torch.cat([told, point, time], -1))
 
-        ends = midpoint(velocity, start, self.steps)
-        spread = ends.std(-2, correction=0)
-        mean = ends.mean(-2, keepdim=True)
+        ends = midpoint(velocity, start.flatten(end_dim=-2), self.steps).view_as(start)
+        mean, spread = ends.mean(-2, keepdim=True), ends.std(-2, correction=0)
         proposals = torch.cat([mean, ends], -2).clamp(-1.0, 1.0)
-        probes = self.probes.expand(*proposals.shape[:-2], *self.probes.shape)
-        expected = self.effect(known.wide(), torch.cat([proposals, probes], -2))
-        expected, found = expected.split([proposals.shape[-2], probes.shape[-2]], -2)
+        asked = torch.cat([proposals, self.probes.expand(*unit.shape[:-1], -1, -1)], -2)
+        expected = self.effect(known.wide(), asked)
+        expected, found = expected.tensor_split([proposals.shape[-2]], -2)
         low, high = found.amin(-2), found.amax(-2)
-        wanted = attainable(unit.squeeze(-2), low, high, self.saturation)
-        best = (expected - wanted.unsqueeze(-2)).square().sum(-1).argmin(-1)[..., None, None]
-        chosen = proposals.gather(-2, best.expand_as(mean)).squeeze(-2)
+        wanted = attainable(unit, low, high, self.saturation)
+        best = nearest_of(proposals, expected, wanted)
         unsure = spread.amax(-1, keepdim=True) > self.unsure
-        action = torch.where(unsure, chosen, mean.squeeze(-2))
+        action = torch.where(unsure, best, mean.squeeze(-2))
         reach = self.denormalise(torch.stack([low, high], -2))
         return Correction(self.denormalise(action), spread * self.half_range, reach)
-
-
-def _about(known: Reading, answers: Tensor, unit: Tensor) -> Tensor:
-    """Return what a network is told: the code, what the fits answer, how well they fit, and u."""
-    code = known.code.expand(*unit.shape[:-1], -1)
-    misses = known.fits.misses.expand(*unit.shape[:-1], -1)
-    return torch.cat([code, answers, misses, unit], -1)
-
-
-def _check_views(views: Sequence[str], by_place: bool) -> list[str]:
-    """Return the names of the views, without those by place if places are not known."""
-    allowed = (SILENT, *VIEWS)
-    if isinstance(views, str) or not isinstance(views, Sequence) or not views:
-        raise ConfigurationError(f"flow.views={views!r}: expected a list of {', '.join(allowed)}")
-    for name in views:
-        check_choice("flow.views", name, allowed)
-    kept = [name for name in views if by_place or not VIEWS.get(name, VIEWS["recent"]).near]
-    if not set(kept) - {SILENT}:
-        raise ConfigurationError(
-            f"flow.views={list(views)!r}: expected one beside {SILENT}, and robot.place for views "
-            "by place"
-        )
-    return kept

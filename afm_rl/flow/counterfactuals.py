@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel
+from afm_rl.flow.base import Corrector
+from afm_rl.regimes import Regime
+from afm_rl.sampling import draw_states
 
 EDGE = 1.6  # actions are drawn about centres in this box of half ranges, and cut: many saturate
 
@@ -52,3 +57,69 @@ def excite(count: int, window: int, size: int, generator: torch.Generator) -> Te
     reach = 0.4 * torch.rand(count, 1, size, generator=generator)
     narrow = (around + reach * wide).clamp(-1, 1)
     return torch.where(torch.rand(count, 1, 1, generator=generator) < 0.5, wide, narrow)
+
+
+class Seen(NamedTuple):
+    """Windows of K transitions."""
+
+    state: Tensor
+    """``(N, K, S)``."""
+    executed: Tensor
+    """``(N, K, A)``."""
+    next_state: Tensor
+    """``(N, K, S)``."""
+    valid: Tensor
+    """Which rows hold a transition, ``(N, K)``."""
+
+
+def imagine_windows(
+    flow: Corrector,
+    model: DynamicsModel,
+    regime: Regime,
+    states: tuple[Tensor, Tensor] | Tensor,
+    size: tuple[int, int],
+    generator: torch.Generator,
+) -> tuple[Seen, Tensor]:
+    """Return windows under regimes drawn from a prior, and the present regimes ``(N, F)``.
+
+    The older rows of half of them come from the regime before.
+
+    Args:
+        flow: whose actions they are.
+        model: the world, before anything happens to it.
+        regime: the prior.
+        states: lowest and highest state, or a pool of them, ``(P, S)``.
+        size: windows and their rows, (N, K).
+        generator: of all that is drawn.
+    """
+    count, rows = size
+    now, before = regime.sample((2, count), generator)
+    row = torch.arange(rows).expand(size)
+    fresh = row >= rows - rows_of_now(count, rows, generator)
+    parameters = torch.where(fresh.unsqueeze(-1), now.unsqueeze(1), before.unsqueeze(1))
+    valid = row >= rows - rows_filled(count, rows, generator)
+    state = model.manifold.project(draw_states(states, count * rows, generator).view(*size, -1))
+    executed = flow.denormalise(excite(*size, flow.action_size, generator))
+    effect = regime.apply(executed, parameters, state)
+    low, high = flow.centre - flow.half_range, flow.centre + flow.half_range
+    reached = imagine(model, state, effect, low, high, generator)
+    return Seen(state, executed, reached, valid), now
+
+
+def anywhere(flow: Corrector, count: int, generator: torch.Generator) -> Tensor:
+    """Return actions ``(N, A)`` from all over the box."""
+    return flow.denormalise(2 * torch.rand(count, flow.action_size, generator=generator) - 1)
+
+
+def draw_plans(
+    flow: Corrector,
+    regime: Regime,
+    parameters: Tensor,
+    state: Tensor,
+    generator: torch.Generator,
+) -> Tensor:
+    """Return plans ``(N, A)``: half of them in the box, the others effects that can be had."""
+    count = len(state)
+    inside = torch.rand(count, 1, generator=generator) < 0.5
+    plan, action = (anywhere(flow, count, generator) for _ in range(2))
+    return torch.where(inside, plan, regime.apply(action, parameters, state))

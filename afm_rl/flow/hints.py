@@ -40,10 +40,8 @@ class Fits(NamedTuple):
     tensor([-0.8000])
     """
 
-    quick: Tensor
-    """Gain with short memory, ``(*B, A)``."""
-    slow: Tensor
-    """Gain with long memory, ``(*B, A)``."""
+    gains: Tensor
+    """Gains with short and with long memory, ``(*B, 2, A)``."""
     rub: Tensor
     """Gain beside friction, ``(*B, A)``."""
     friction: Tensor
@@ -58,14 +56,14 @@ class Fits(NamedTuple):
     """Executed actions of the window, ``(*B, K, A)``."""
     effective: Tensor
     """What they were worth, ``(*B, K, A)``."""
-    weight: Tensor
-    """How much they count, ``(*B, K, 1)``."""
+    trust: Tensor
+    """Logarithm of how much they count, ``(*B, K, 1)``."""
 
     def wide(self) -> Fits:
         """Return the fits with one more dimension, to be asked many questions."""
-        tall = {"matrix", "executed", "effective", "weight"}
+        flat = {"rub", "friction", "bias", "misses"}
         parts = self._asdict().items()
-        return Fits(*(part.unsqueeze(-3 if name in tall else -2) for name, part in parts))
+        return Fits(*(part.unsqueeze(-2 if name in flat else -3) for name, part in parts))
 
     def execute(self, planned: Tensor, saturation: str) -> Tensor:
         """Return answers ``(*B, 6 A)`` to a plan ``(*B, A)``.
@@ -74,15 +72,12 @@ class Fits(NamedTuple):
         plan, and that effect.
         """
         unit = planned.double()
-        wanted = [
-            unit / self.quick,
-            unit / self.slow,
-            invert_friction(self.rub, self.friction, unit),
-            invert_affine(self.matrix, self.bias, unit),
-        ]
-        answers = [saturate(action, saturation) for action in wanted]
-        answers += self._nearest(self.effective, unit)[:2]
-        return torch.cat(answers, -1).to(planned)
+        rubbed = invert_friction(self.rub, self.friction, unit)
+        affine = invert_affine(self.matrix, self.bias, unit)
+        exact = torch.cat([unit.unsqueeze(-2) / self.gains, torch.stack([rubbed, affine], -2)], -2)
+        share = self._likeness(self.effective, unit).softmax(-2)
+        tried = [(share * part).sum(-2) for part in (self.executed, self.effective)]
+        return torch.cat([saturate(exact, saturation).flatten(-2), *tried], -1).to(planned)
 
     def effect(self, executed: Tensor) -> Tensor:
         """Return answers ``(*B, 6 A)`` about an action ``(*B, A)``.
@@ -91,22 +86,21 @@ class Fits(NamedTuple):
         near they are.
         """
         unit = executed.double()
-        _, worth, nearness = self._nearest(self.executed, unit)
-        answers = [*self._effects(unit), worth, nearness]
+        likeness = self._likeness(self.executed, unit)
+        worth = (likeness.softmax(-2) * self.effective).sum(-2)
+        nearness = likeness.logsumexp(-2).exp().clamp_max(1.0)
+        answers = [self._expected(unit).flatten(-2), worth, nearness]
         return torch.cat(answers, -1).clamp(-LIMIT, LIMIT).to(executed)
 
-    def _nearest(self, among: Tensor, unit: Tensor) -> list[Tensor]:
-        """Return means ``(*B, A)`` of the pairs nearest to ``unit`` on each axis, and nearness."""
-        apart = ((among - unit.unsqueeze(-2)) / NEAR).square()
-        score = self.weight.clamp_min(TINY**2).log() - apart
-        share = score.softmax(-2)
-        means = [(share * part).sum(-2) for part in (self.executed, self.effective)]
-        return [*means, score.logsumexp(-2).exp().clamp_max(1.0)]
+    def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
+        """Return how much each pair tells of ``unit`` ``(*B, A)``, logits ``(*B, K, A)``."""
+        return self.trust - ((among - unit.unsqueeze(-2)) / NEAR).square()
 
-    def _effects(self, unit: Tensor) -> list[Tensor]:
-        affine = (self.matrix @ unit.unsqueeze(-1)).squeeze(-1) + self.bias
+    def _expected(self, unit: Tensor) -> Tensor:
+        """Return what each fit expects ``unit`` ``(*B, A)`` to be worth, ``(*B, 4, A)``."""
         rubbed = apply_friction(self.rub, self.friction, unit)
-        return [self.quick * unit, self.slow * unit, rubbed, affine]
+        affine = (self.matrix * unit.unsqueeze(-2)).sum(-1) + self.bias
+        return torch.cat([self.gains * unit.unsqueeze(-2), torch.stack([rubbed, affine], -2)], -2)
 
 
 def fit_window(executed: Tensor, effective: Tensor, valid: Tensor) -> Fits:
@@ -120,21 +114,19 @@ def fit_window(executed: Tensor, effective: Tensor, valid: Tensor) -> Fits:
     kind = executed.dtype
     # In double precision: where all commands are alike, gain and friction can hardly be told apart.
     executed, effective, valid = (part.double() for part in (executed, effective, valid))
-    pairs = executed, effective, valid
+    short, long = weigh(valid, SHORT), weigh(valid, LONG)
+    both = torch.stack([short, long], -3)
     fits = Fits(
-        fit_gain(*pairs, SHORT),
-        fit_gain(*pairs, LONG),
-        *fit_friction(*pairs, LONG),
-        *fit_affine(*pairs, LONG),
+        fit_gain(executed.unsqueeze(-3), effective.unsqueeze(-3), both),
+        *fit_friction(executed, effective, long),
+        *fit_affine(executed, effective, long),
         executed,  # until the misses are known
         executed,
         effective,
-        weigh(valid, LONG),
+        long.clamp_min(TINY**2).log(),
     )
-    weights = (weigh(valid, forgetting) for forgetting in (SHORT, LONG, LONG, LONG))
-    misses = []
-    for explained, weight in zip(fits.wide()._effects(executed), weights, strict=True):
-        left = (weight * (effective - explained).square()).sum(-2)
-        mean = (left / weight.sum(-2).clamp_min(TINY)).clamp_min(0.0)
-        misses.append((mean.sqrt() + TINY).log())
-    return fits._replace(misses=torch.cat(misses, -1).to(kind))
+    weight = torch.cat([short, long, long, long], -1).unsqueeze(-1)  # of each fit
+    miss = effective.unsqueeze(-2) - fits.wide()._expected(executed)
+    left = (weight * miss.square()).sum(-3) / weight.sum(-3).clamp_min(TINY)
+    misses = (left.clamp_min(0.0).sqrt() + TINY).log()
+    return fits._replace(misses=misses.flatten(-2).to(kind))

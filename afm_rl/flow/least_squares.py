@@ -25,36 +25,31 @@ def weigh(valid: Tensor, forgetting: float) -> Tensor:
     return valid * (forgetting**age).unsqueeze(-1)
 
 
-def fit_gain(executed: Tensor, effective: Tensor, valid: Tensor, forgetting: float) -> Tensor:
+def fit_gain(executed: Tensor, effective: Tensor, weight: Tensor) -> Tensor:
     r"""Fit :math:`u_\mathrm{eff} = g \odot u`, each axis for itself.
 
-    .. math:: g = \frac{\sum_k \lambda^k u_k u_{\mathrm{eff},k} + \rho}
-                        {\sum_k \lambda^k u_k^2 + \rho}
+    .. math:: g = \frac{\sum_k w_k u_k u_{\mathrm{eff},k} + \rho}
+                        {\sum_k w_k u_k^2 + \rho}
 
-    with k the age of a pair and a small ridge towards gain 1.
+    with a small ridge towards gain 1.
 
     Args:
-        executed: u, ``(*B, K, A)``, oldest first.
+        executed: u, ``(*B, K, A)``.
         effective: what it was worth, ``(*B, K, A)``.
-        valid: which pairs count, ``(*B, K, 1)``, 0 or 1.
-        forgetting: :math:`\lambda` in (0, 1].
+        weight: how much pairs count, ``(*B, K, 1)``, see :func:`weigh`.
 
     Returns:
         Gains ``(*B, A)``, none smaller than 0.02 in size.
 
     >>> u = torch.tensor([[0.5], [-1.0]])
-    >>> fit_gain(u, -2 * u, torch.ones(2, 1), 0.8).round(decimals=2)
+    >>> fit_gain(u, -2 * u, weigh(torch.ones(2, 1), 0.8)).round(decimals=2)
     tensor([-2.])
     """
-    weight = weigh(valid, forgetting)
-    cross = (weight * executed * effective).sum(-2) + PRIOR
-    gain = cross / ((weight * executed.square()).sum(-2) + PRIOR)
-    return _not_zero(gain)
+    cross = (weight * (executed * effective)).sum(-2) + PRIOR
+    return _not_zero(cross / ((weight * executed.square()).sum(-2) + PRIOR))
 
 
-def fit_friction(
-    executed: Tensor, effective: Tensor, valid: Tensor, forgetting: float
-) -> tuple[Tensor, Tensor]:
+def fit_friction(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     r"""Fit :math:`u_\mathrm{eff} = g \odot u + h \odot \mathrm{sign}(u)`, each axis for itself.
 
     Dry friction, or a dead zone: pairs without any effect are left out, see
@@ -64,19 +59,15 @@ def fit_friction(
     Returns:
         Gains, none smaller than 0.02 in size, and offsets, ``(*B, A)`` each.
     """
-    moved = effective.abs() > STUCK
-    weight, sign = weigh(valid, forgetting) * moved, executed.sign()
-    square = (weight * executed.square()).sum(-2) + PRIOR
-    size = (weight * executed.abs()).sum(-2)
-    signs = (weight * sign.square()).sum(-2) + 10 * PRIOR  # the offset is the rarer of the two
-    cross = (weight * executed * effective).sum(-2) + PRIOR
-    signed = (weight * sign * effective).sum(-2)
-    determinant = (square * signs - size.square()).clamp_min(PRIOR**2)
-    gain, offset = (
-        (signs * cross - size * signed) / determinant,
-        (square * signed - size * cross) / determinant,
-    )
-    return _not_zero(gain), offset
+    size, sign = executed.abs(), executed.sign()
+    terms = [size * size, size, sign.abs(), executed * effective, sign * effective]
+    moved = weight * (effective.abs() > STUCK)
+    square, mixed, signs, cross, signed = (moved * torch.stack(terms)).sum(-2)
+    square, cross = square + PRIOR, cross + PRIOR
+    signs = signs + 10 * PRIOR  # the offset is the rarer of the two
+    determinant = (square * signs - mixed.square()).clamp_min(PRIOR**2)
+    gain = (signs * cross - mixed * signed) / determinant
+    return _not_zero(gain), (square * signed - mixed * cross) / determinant
 
 
 def apply_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
@@ -96,12 +87,10 @@ def invert_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
 
 
 def _not_zero(gain: Tensor) -> Tensor:
-    return torch.where(gain.abs() < LEAST, torch.where(gain < 0, -LEAST, LEAST), gain)
+    return gain.abs().clamp_min(LEAST).copysign(gain)
 
 
-def fit_affine(
-    executed: Tensor, effective: Tensor, valid: Tensor, forgetting: float
-) -> tuple[Tensor, Tensor]:
+def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     r"""Fit :math:`u_\mathrm{eff} = D u + b` with a small ridge towards D = 1, b = 0.
 
     Args and shapes as for :func:`fit_gain`.
@@ -109,13 +98,12 @@ def fit_affine(
     Returns:
         D ``(*B, A, A)`` and b ``(*B, A)``.
     """
-    weight = weigh(valid, forgetting)
-    inputs = torch.cat([executed, torch.ones_like(executed[..., :1])], -1)
+    inputs = torch.nn.functional.pad(executed, (0, 1), value=1.0)
     size = inputs.shape[-1]
     nominal = torch.eye(size, device=inputs.device, dtype=inputs.dtype)
-    gram = (weight * inputs).mT @ inputs + PRIOR * nominal
-    cross = (weight * inputs).mT @ effective + PRIOR * nominal[:, :-1]
-    solution = torch.linalg.solve(gram, cross).mT  # (*B, A, A + 1)
+    moments = (weight * inputs).mT @ torch.cat([inputs, effective], -1)
+    moments = moments + PRIOR * torch.cat([nominal, nominal[:, :-1]], -1)
+    solution = torch.linalg.solve(moments[..., :size], moments[..., size:]).mT  # (*B, A, A + 1)
     return solution[..., :-1], solution[..., -1]
 
 
@@ -125,7 +113,7 @@ def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:
     A small ridge keeps it finite where the matrix is all but singular.
     """
     ridge = LEAST**2 * torch.eye(unit.shape[-1], device=unit.device, dtype=unit.dtype)
-    target = matrix.mT @ (unit - bias).unsqueeze(-1)
+    target = (matrix * (unit - bias).unsqueeze(-1)).sum(-2, keepdim=True).mT
     return torch.linalg.solve(matrix.mT @ matrix + ridge, target).squeeze(-1)
 
 
@@ -168,10 +156,12 @@ class LeastSquares(PairCorrector):
 
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
         """Invert the fit; the spread is zero."""
-        unit, pairs = self.normalise(planned), self.pairs(context.features)
+        unit = self.normalise(planned)
+        executed, effective, valid = self.pairs(context.features)
+        pairs = executed, effective, weigh(valid, self.forgetting)
         if self.form == "gain":
-            wanted = unit / fit_gain(*pairs, self.forgetting)
+            wanted = unit / fit_gain(*pairs)
         else:
-            wanted = invert_affine(*fit_affine(*pairs, self.forgetting), unit)
-        executed = self.denormalise(saturate(wanted, self.saturation))
-        return Correction(executed, torch.zeros_like(executed))
+            wanted = invert_affine(*fit_affine(*pairs), unit)
+        action = self.denormalise(saturate(wanted, self.saturation))
+        return Correction(action, torch.zeros_like(action))

@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import check_choice, check_count, check_flag
+from afm_rl.errors import (
+    ConfigurationError,
+    check_choice,
+    check_count,
+    check_counts,
+    check_flag,
+)
 from afm_rl.flow.base import Context, Correction, Examples, Flow, Window
 from afm_rl.flow.network import mlp
 from afm_rl.flow.solver import midpoint
@@ -38,6 +44,9 @@ class PaperFlow(Flow):
         latch: keep the transition that opened the gate until it closes (as published)
             instead of using the latest.
         seed: seed of the initial weights.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
     """
 
     def __init__(
@@ -55,15 +64,20 @@ class PaperFlow(Flow):
         seed: int = 0,
     ) -> None:
         super().__init__(action_low, action_high, gate, window=1)
-        self.state_features = list(features)
         self.state_size = check_count("flow.state_size", state_size)
+        self.state_features = check_counts("flow.features", features, low=0)
+        if max(self.state_features, default=0) >= state_size:
+            raise ConfigurationError(
+                f"flow.features={self.state_features}: expected indices of the {state_size} "
+                f"state coordinates, 0 to {state_size - 1}"
+            )
         self.steps = check_count("flow.steps", steps)
         self.error_action = check_choice("flow.error_action", error_action, ("planned", "executed"))
         self.wrap = check_flag("flow.wrap", wrap)
         self.latch = check_flag("flow.latch", latch)
         check_count("flow.width", width)
         size = self.action_size
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(check_count("flow.seed", seed, low=0))
         self.regime_encoder = mlp([self.feature_size, width, width], generator)
         self.action_encoder = mlp([1 + size, width, width], generator)
         self.head = mlp([2 * width, width, width, size], generator)

@@ -142,6 +142,8 @@ class MPPI(SamplingPlanner):
         self.noise = check_choice("planner.noise", noise, ("scaled", "unit"))
         self.past = check_choice("planner.past", past, ("previous", "shifted"))
         self.box_key = None if box_key is None else as_key(box_key)
+        if self.box_key is not None:
+            self.in_keys.append(self.box_key)
         space = self.action_spec.space
         half = (space.high - space.low) / 2
         self.register_buffer("scale", sigma * half if noise == "scaled" else torch.ones_like(half))

@@ -9,10 +9,10 @@ from torchrl.data import Composite
 from torchrl.envs import FrameSkipTransform, Transform
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_flag, check_instance
+from afm_rl.errors import ConfigurationError
 from afm_rl.flow import Corrector
 from afm_rl.keys import as_key
-from afm_rl.transforms.memory import begin, correct, memory_spec, observe
+from afm_rl.transforms.memory import begin, check_parts, correct, memory_spec, observe
 
 
 class ActionFlowTransform(Transform):
@@ -72,22 +72,15 @@ class ActionFlowTransform(Transform):
         enabled: bool = True,
         widen: bool = True,
     ) -> None:
-        check_instance("transform.model", model, DynamicsModel)
-        check_instance("transform.flow", flow, Corrector)
+        check_parts("transform", model, flow, enabled, widen)
         observation_key, action_key = as_key(observation_key), as_key(action_key)
         super().__init__(in_keys=[observation_key], in_keys_inv=[action_key])
-        if flow.action_size != model.action_size:
-            raise ConfigurationError(
-                f"flow: made for {flow.action_size} actions, but the dynamics model has "
-                f"{model.action_size}"
-            )
         self.__dict__["model"] = model  # shared with planner and updater, so not registered
         self.flow = flow
         self.observation_key = observation_key
         self.action_key = action_key
         self.prefix = as_key(prefix)
-        self.enabled = check_flag("transform.enabled", enabled)
-        self.widen = check_flag("transform.widen", widen)
+        self.enabled, self.widen = enabled, widen
 
     def key(self, *names: str) -> NestedKey:
         """Return the key of an entry of the memory."""

@@ -8,7 +8,28 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
 from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.flow import Context, Correction, Corrector, Window
+
+
+def check_parts(
+    owner: str, model: DynamicsModel, flow: Corrector, enabled: bool, widen: bool
+) -> None:
+    """Check what corrects actions, for an ``owner`` such as ``transform``.
+
+    Raises:
+        ConfigurationError: if a part is not what it should be, or flow and model are of
+            different actions.
+    """
+    check_instance(f"{owner}.model", model, DynamicsModel)
+    check_instance(f"{owner}.flow", flow, Corrector)
+    check_flag(f"{owner}.enabled", enabled)
+    check_flag(f"{owner}.widen", widen)
+    if flow.action_size != model.action_size:
+        raise ConfigurationError(
+            f"flow: made for {flow.action_size} actions, but the dynamics model has "
+            f"{model.action_size}"
+        )
 
 
 def memory_spec(

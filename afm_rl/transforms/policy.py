@@ -8,11 +8,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Bounded, Composite, TensorSpec
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_flag, check_instance
+from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.flow import Corrector
 from afm_rl.keys import as_key
 from afm_rl.planning.primer import ZeroPrimer
-from afm_rl.transforms.memory import begin, correct, memory_spec, observe
+from afm_rl.transforms.memory import begin, check_parts, correct, memory_spec, observe
 
 
 class ActionFlowPolicy(TensorDictModuleBase):
@@ -67,20 +67,18 @@ class ActionFlowPolicy(TensorDictModuleBase):
         widen: bool = True,
     ) -> None:
         super().__init__()
-        check_instance("policy.model", model, DynamicsModel)
-        self.flow = check_instance("policy.flow", flow, Corrector)
+        check_parts("policy", model, flow, enabled, widen)
+        self.flow = flow
         self.action_spec = check_instance("policy.action_spec", action_spec, Bounded)
-        sizes = (flow.action_size,), (model.action_size,), tuple(action_spec.shape)
-        if len(set(sizes)) > 1:
+        if action_spec.shape != (flow.action_size,):
             raise ConfigurationError(
-                f"policy: flow, model and action_spec are of actions of the shapes {sizes}; "
-                "expected one shape"
+                f"policy.action_spec: of the shape {tuple(action_spec.shape)}, expected "
+                f"({flow.action_size},), as flow and model have it"
             )
         self.__dict__["model"] = model  # shared with the planner, so not registered
         self.observation_key, self.action_key = as_key(observation_key), as_key(action_key)
         self.prefix = as_key(prefix)
-        self.enabled = check_flag("policy.enabled", enabled)
-        self.widen = check_flag("policy.widen", widen)
+        self.enabled, self.widen = enabled, widen
         names = memory_spec(model, flow, torch.Size(), action_spec.dtype).keys(True, True)
         kept = [unravel_key((self.prefix, name)) for name in names]
         self.in_keys = [self.observation_key, self.action_key, *kept]

@@ -227,11 +227,24 @@ def test_progress_can_be_shown_on_a_terminal(train, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "settings", [{"iterations": 0}, {"batch_size": 1}, {"reuse": 0}, {"lr": 0.0}], ids=str
+    "settings",
+    [{"iterations": 0}, {"batch_size": 1}, {"reuse": 0}, {"lr": 0.0}, {"seed": 1.5}],
+    ids=str,
 )
 def test_impossible_settings_are_refused(train, settings):
     with pytest.raises(ConfigurationError, match=f"flow.train.{next(iter(settings))}"):
         train(**settings)
+
+
+@pytest.mark.parametrize("flow", [None, torch.nn.Linear(2, 2)], ids=str)
+def test_a_loss_is_of_a_flow(flow):
+    with pytest.raises(ConfigurationError, match="loss.flow: expected a Flow, got"):
+        CFMLoss(flow)
+
+
+def test_a_loss_draws_from_a_whole_seed(box):
+    with pytest.raises(ConfigurationError, match="loss.seed=1.5"):
+        CFMLoss(ContextFlow(*box, **TINY), seed=1.5)
 
 
 def test_plans_share_a_context(box, states, gains):

@@ -238,6 +238,8 @@ def test_many_actions_are_no_trouble():
         {"place_scale": 0.0},
         {"hidden": [0]},
         {"latent": 0},
+        {"seed": 1.5},
+        {"seed": None},
     ],
     ids=str,
 )

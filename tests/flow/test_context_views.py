@@ -8,7 +8,8 @@ import torch
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
 from afm_rl.flow import ContextFlow, LeastSquares, Window
-from afm_rl.flow.views import VIEWS, Pairs, look
+from afm_rl.flow.recall import Pairs, look, recall
+from afm_rl.flow.views import VIEWS, lay_out
 
 MANY, STEPS = 24, 24
 
@@ -58,7 +59,7 @@ def shares(flow, contexts):
     return dict(zip(flow.views, counts.tolist(), strict=True))
 
 
-ALL = ["silent", *VIEWS]
+ALL = list(VIEWS)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +95,7 @@ def test_what_is_believed_is_shown(fitted, live):
     found = live(flow, *drive(late))[-1]
     size = flow.action_size
     pairs = Pairs(*found.pairs[..., :-1].split([size, size, 1], -1))
-    expected = look(pairs, [VIEWS["late_1"]], flow.shown).squeeze(-2)
+    expected = look(pairs, lay_out([VIEWS["late_1"]], flow.shown)).squeeze(-2)
     believed = found.evidence.argmin(-1) == 1
     assert believed.float().mean() > 0.8
     assert torch.equal(found.features[believed], expected[believed])
@@ -240,7 +241,8 @@ def test_views_by_place_need_a_place(box):
         ContextFlow(*box, views=["near", "silent"])
 
 
-def test_distances_are_in_units_of_the_scale(box):
-    flow = ContextFlow(*box, place=[0, 1], place_scale=2.0)
-    there = torch.tensor([[[2.0, 0.0, 9.0], [2.0, 4.0, 0.0]]])
-    assert flow._away(there, torch.zeros(1, 3)).tolist() == [[1.0, 5.0]]
+def test_distances_are_in_units_of_the_scale():
+    state = torch.tensor([[[2.0, 0.0, 9.0], [2.0, 4.0, 0.0]]])
+    memory = recall(torch.zeros(1, 2, 6), state, torch.zeros(1, 2, 3), [0, 1], 2.0)
+    assert memory.away.tolist() == [[1.0, 5.0]]  # from where it came to
+    assert memory.away_before.tolist() == [[4.0, 0.0]]  # from where it acted last

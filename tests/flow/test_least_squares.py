@@ -4,7 +4,7 @@ import torch
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
 from afm_rl.flow import LeastSquares, Window
-from afm_rl.flow.least_squares import fit_affine, fit_gain
+from afm_rl.flow.least_squares import fit_affine, fit_gain, weigh
 from afm_rl.flow.saturation import MODES
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
@@ -17,14 +17,14 @@ def actions(*shape):
 def test_gains_are_found_per_mission():
     gains = torch.tensor([[-1.0, 2.0], [0.5, -0.3]])
     u = actions(2, 24)
-    fitted = fit_gain(u, gains.unsqueeze(-2) * u, torch.ones(2, 24, 1), 0.8)
+    fitted = fit_gain(u, gains.unsqueeze(-2) * u, weigh(torch.ones(2, 24, 1), 0.8))
     assert torch.allclose(fitted, gains, atol=5e-3)
 
 
 def test_an_affine_map_is_found():
     matrix, bias = torch.tensor([[0.6, -0.8], [0.8, 0.6]]), torch.tensor([0.2, -0.1])
     u = actions(24)
-    fitted = fit_affine(u, u @ matrix.mT + bias, torch.ones(24, 1), 0.95)
+    fitted = fit_affine(u, u @ matrix.mT + bias, weigh(torch.ones(24, 1), 0.95))
     assert torch.allclose(fitted[0], matrix, atol=5e-3)
     assert torch.allclose(fitted[1], bias, atol=5e-3)
 
@@ -33,13 +33,13 @@ def test_weights_equal_plain_weighted_least_squares():
     u, seen = actions(9), actions(3, 9)[0]
     weights = 0.7 ** torch.arange(8.0, -1.0, -1.0)
     by_hand = (weights[:, None] * u * seen).sum(0) / (weights[:, None] * u**2).sum(0)
-    assert torch.allclose(fit_gain(u, seen, torch.ones(9, 1), 0.7), by_hand, atol=1e-2)
+    assert torch.allclose(fit_gain(u, seen, weigh(torch.ones(9, 1), 0.7)), by_hand, atol=1e-2)
 
 
 def test_without_evidence_the_fit_is_nominal():
     nothing = torch.zeros(24, 2), torch.zeros(24, 2), torch.zeros(24, 1)
-    assert torch.allclose(fit_gain(*nothing, 0.8), torch.ones(2))
-    matrix, bias = fit_affine(*nothing, 0.8)
+    assert torch.allclose(fit_gain(*nothing), torch.ones(2))
+    matrix, bias = fit_affine(*nothing)
     assert torch.allclose(matrix, torch.eye(2), atol=1e-5)
     assert torch.allclose(bias, torch.zeros(2), atol=1e-5)
 
@@ -47,7 +47,7 @@ def test_without_evidence_the_fit_is_nominal():
 def test_recent_pairs_outweigh_old_ones():
     u = actions(24)
     seen = torch.cat([u[:16], -u[16:]])
-    assert (fit_gain(u, seen, torch.ones(24, 1), 0.5) < -0.9).all()
+    assert (fit_gain(u, seen, weigh(torch.ones(24, 1), 0.5)) < -0.9).all()
 
 
 @pytest.mark.parametrize("form", ["gain", "affine"])

@@ -153,7 +153,16 @@ def test_it_learns_what_it_is_taught(make, states, gains):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"state_size": 0}, {"steps": 0}, {"error_action": "wished"}, {"gate": -1.0}],
+    [
+        {"state_size": 0},
+        {"steps": 0},
+        {"error_action": "wished"},
+        {"gate": -1.0},
+        {"features": [3]},
+        {"features": [-1]},
+        {"features": 2},
+        {"seed": 1.5},
+    ],
     ids=str,
 )
 def test_impossible_settings_are_refused(box, settings):

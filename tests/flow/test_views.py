@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from afm_rl.flow.views import VIEWS, Pairs, View, look, memory_of
+from afm_rl.flow.recall import Pairs, look
+from afm_rl.flow.views import VIEWS, View, lay_out, memory_of
 
 AGES = torch.arange(12.0).unsqueeze(-1)
 PAIRS = Pairs(AGES, 100 + AGES, torch.ones(12, 1))
@@ -11,7 +12,7 @@ PAIRS = Pairs(AGES, 100 + AGES, torch.ones(12, 1))
 
 def rows_of(view, rows=4, pairs=PAIRS, away=None):
     """Return executed, effective and valid of what one view shows, ``(K,)`` each."""
-    shown = look(pairs, [view], rows, away)
+    shown = look(pairs, lay_out([view], rows), away)
     assert shown.shape == (1, 3 * rows)
     return shown[0].unflatten(-1, (rows, 3)).unbind(-1)
 
@@ -75,17 +76,17 @@ def test_what_does_not_count_fills_a_row_with_nothing():
 
 def test_a_view_by_place_needs_places():
     with pytest.raises(ValueError, match="needs distances"):
-        look(PAIRS, [VIEWS["near"]], 4)
+        look(PAIRS, lay_out([VIEWS["near"]], 4))
 
 
 @pytest.mark.parametrize("view", [*VIEWS.values(), View(share=1.0, merge=3), View(late=5)])
 def test_the_memory_is_as_long_as_views_look_back_and_no_longer(view):
     count = memory_of([view], 3) - 1  # one step back
     pairs = Pairs(*(part[:count] for part in PAIRS))
-    look(pairs, [view], 3, torch.zeros(count))
+    look(pairs, lay_out([view], 3), torch.zeros(count))
     if not view.near and (view.late or view.merge > 1):
         with pytest.raises((RuntimeError, IndexError, ValueError)):
-            look(pairs.rows(1, count), [view], 3)
+            look(pairs.rows(1, count), lay_out([view], 3))
 
 
 def test_batches_are_read_row_by_row():
@@ -94,10 +95,21 @@ def test_batches_are_read_row_by_row():
         *(torch.rand(2, 3, 9, 2, generator=generator) for _ in range(2)), torch.ones(2, 3, 9, 1)
     )
     away = torch.rand(2, 3, 9, generator=generator)
-    views = list(VIEWS.values())
-    together = look(pairs, views, 4, away)
-    assert together.shape == (2, 3, len(views), 20)
+    layout = lay_out(list(VIEWS.values()), 4)
+    together = look(pairs, layout, away)
+    assert together.shape == (2, 3, len(VIEWS), 20)
     for k in range(2):
         for i in range(3):
-            single = look(Pairs(*(part[k, i] for part in pairs)), views, 4, away[k, i])
+            single = look(Pairs(*(part[k, i] for part in pairs)), layout, away[k, i])
             assert torch.equal(single, together[k, i])
+
+
+@pytest.mark.parametrize("merges", [(1, 2), (1, 3), (2, 3)])
+def test_views_that_average_differently_stand_side_by_side(merges):
+    views = [View(share=1.0, merge=merge) for merge in merges]
+    together = look(PAIRS, lay_out(views, 4))
+    for view, shown in zip(views, together, strict=True):
+        torch.testing.assert_close(shown, look(PAIRS, lay_out([view], 4))[0])
+        executed = shown.unflatten(-1, (4, 3))[:, 0]
+        expected = AGES[-4 * view.merge :, 0].unflatten(0, (4, view.merge)).mean(-1)
+        torch.testing.assert_close(executed, expected)

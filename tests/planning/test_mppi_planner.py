@@ -281,6 +281,7 @@ def test_a_box_per_mission_replaces_that_of_the_actions(world, box):
     boxes = torch.stack([wide, narrow, narrow]).unsqueeze(1)
     td["afm", "reach"] = boxes.expand(3, 4, 2, 2).clone()
     planner = MPPI(world, horizon=4, population=256, box_key=["afm", "reach"])
+    assert ("afm", "reach") in planner.in_keys
     out = planner(td.clone())
     least, most = td["afm", "reach"].unsqueeze(-3).unbind(-2)
     for planned in (out["next", "mppi", "mean"], out["action"].unsqueeze(-2)):

@@ -130,7 +130,14 @@ def test_without_its_memory_it_says_what_is_missing(agent):
 
 
 def test_sizes_that_contradict_each_other_are_refused(planner, flow):
-    with pytest.raises(ConfigurationError, match=r"policy: flow, .* \(\(1,\)"):
+    with pytest.raises(ConfigurationError, match="made for 1 actions, but .* has 2"):
         ActionFlowPolicy(Dubins(), LeastSquares([-1.0], [1.0]), planner.action_spec)
-    with pytest.raises(ConfigurationError, match="policy.action_spec"):
-        ActionFlowPolicy(Dubins(), flow, None)
+    with pytest.raises(ConfigurationError, match=r"policy.action_spec: of the shape \(3, 2\)"):
+        ActionFlowPolicy(Dubins(), flow, planner.action_spec.expand(3, 2))
+
+
+@pytest.mark.parametrize("part", ["model", "flow", "action_spec", "enabled", "widen"])
+def test_parts_of_the_wrong_kind_are_refused(planner, flow, part):
+    parts = {"model": Dubins(), "flow": flow, "action_spec": planner.action_spec, part: None}
+    with pytest.raises(ConfigurationError, match=f"policy.{part}"):
+        ActionFlowPolicy(**parts)

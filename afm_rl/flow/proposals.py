@@ -1,0 +1,40 @@
+"""What a context flow asks about, and how it chooses among its samples."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+PROBES = 32  # actions whose effects are asked for the reach
+
+
+def source_points_of(count: int, size: int) -> Tensor:
+    """Return normal points ``(count, A)``, the same ones always; each has its opposite."""
+    half = torch.randn((count + 1) // 2, size, generator=torch.Generator().manual_seed(0))
+    return torch.cat([half, -half])[:count]
+
+
+def probes_of(size: int) -> Tensor:
+    """Return actions ``(P, A)`` in half ranges: ends of the axes, and between them.
+
+    >>> probes_of(1)[:2].tolist()
+    [[1.0], [-1.0]]
+    """
+    ends = torch.cat([torch.eye(size), -torch.eye(size)])
+    inner = torch.quasirandom.SobolEngine(size).draw(max(1, PROBES - 2 * size))
+    return torch.cat([ends, 2 * inner - 1])
+
+
+def nearest_of(proposals: Tensor, effects: Tensor, wanted: Tensor) -> Tensor:
+    """Return the proposal ``(*B, A)`` whose effect comes nearest to what is wanted.
+
+    Args:
+        proposals: ``(*B, P, A)``.
+        effects: what they are expected to be worth, ``(*B, P, A)``.
+        wanted: ``(*B, A)``.
+
+    >>> nearest_of(torch.tensor([[1.0], [2.0]]), torch.tensor([[0.5], [0.9]]), torch.ones(1))
+    tensor([2.])
+    """
+    best = (effects - wanted.unsqueeze(-2)).square().sum(-1).argmin(-1)[..., None, None]
+    return proposals.take_along_dim(best, -2).squeeze(-2)
