@@ -12,6 +12,7 @@ from afm_rl.errors import ConfigurationError, check_choice, check_count, check_c
 from afm_rl.flow.base import Context, Correction, Examples, Flow, Window
 from afm_rl.flow.counterfactuals import anywhere, draw_plans, imagine_windows
 from afm_rl.flow.hints import fit_window
+from afm_rl.flow.kriging import krige
 from afm_rl.flow.network import mlp
 from afm_rl.flow.pairs import PairCorrector
 from afm_rl.flow.proposals import nearest_of, probes_of, source_points_of
@@ -49,6 +50,9 @@ class ContextFlow(PairCorrector, Flow):
       expected effect comes nearest to what can be had of the plan.
     * What can be had at all? The reach of effects, for planners that want to know.
 
+    Near actions that were tried, what was seen corrects what this network expects of them
+    (:func:`~afm_rl.flow.kriging.krige`).
+
     The model counts as misaligned while the largest surprise of the last K transitions exceeds
     ``gate`` standard deviations of the model's own noise, unless no correction at all (the view
     ``silent``) would have predicted best.
@@ -68,6 +72,8 @@ class ContextFlow(PairCorrector, Flow):
         source_std: :math:`\sigma`, in half ranges.
         steps: midpoint steps.
         unsure: standard deviation of the samples above which they are judged, in half ranges.
+        length_scale: distance within which an action that was tried tells of another, in half
+            ranges; 0: expect what the network expects.
         hidden: units of the hidden layers of all three networks.
         latent: size of the encoded context.
         saturation: what gives way when the planned action cannot be had in full, see
@@ -99,6 +105,7 @@ class ContextFlow(PairCorrector, Flow):
         source_std: float = 0.3,
         steps: int = 3,
         unsure: float = 0.1,
+        length_scale: float = 0.2,
         hidden: Sequence[int] = (128, 128),
         latent: int = 64,
         saturation: str = "mixed",
@@ -114,6 +121,7 @@ class ContextFlow(PairCorrector, Flow):
         self.source_std = check_number("flow.source_std", source_std, low=0.0)
         self.steps = check_count("flow.steps", steps)
         self.unsure = check_number("flow.unsure", unsure, low=0.0)
+        self.length_scale = check_number("flow.length_scale", length_scale, low=0.0)
         self.saturation = check_choice("flow.saturation", saturation, MODES)
         ways = [VIEWS[name] for name in self.views]
         if memory < memory_of(ways, window):
@@ -247,6 +255,15 @@ class ContextFlow(PairCorrector, Flow):
         miss = (expected - worth).square()
         return (miss / (miss + TOLERATED**2)).mean(-1)
 
+    def foresee(self, features: Tensor, known: Reading, asked: Tensor) -> Tensor:
+        """Return what actions ``(*B, P, A)`` are expected to be worth, given what was seen."""
+        if not self.length_scale:
+            return self.effect(known.wide(), asked)
+        tried, worth, valid = self.pairs(features)
+        expected = self.effect(known.wide(), torch.cat([asked, tried], -2))
+        expected, was = expected.tensor_split([asked.shape[-2]], -2)
+        return expected + krige(asked, tried, worth - was, valid, self.length_scale)
+
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
         """Integrate the flow from every source point; return the best end, spread and reach."""
         unit, known = self.normalise(planned), self.read(context.features)
@@ -262,11 +279,11 @@ class ContextFlow(PairCorrector, Flow):
         mean, spread = ends.mean(-2, keepdim=True), ends.std(-2, correction=0)
         proposals = torch.cat([mean, ends], -2).clamp(-1.0, 1.0)
         asked = torch.cat([proposals, self.probes.expand(*unit.shape[:-1], -1, -1)], -2)
-        expected = self.effect(known.wide(), asked)
+        expected = self.foresee(context.features, known, asked)
         expected, found = expected.tensor_split([proposals.shape[-2]], -2)
         low, high = found.amin(-2), found.amax(-2)
         wanted = attainable(unit, low, high, self.saturation)
-        best = nearest_of(proposals, expected, wanted)
+        best = nearest_of(proposals, expected, wanted, 0.5 * (high - low))
         unsure = spread.amax(-1, keepdim=True) > self.unsure
         action = torch.where(unsure, best, mean.squeeze(-2))
         reach = self.denormalise(torch.stack([low, high], -2))

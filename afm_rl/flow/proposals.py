@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 PROBES = 32  # actions whose effects are asked for the reach
+LEAST_REACH = 0.01  # half ranges
 
 
 def source_points_of(count: int, size: int) -> Tensor:
@@ -25,16 +26,24 @@ def probes_of(size: int) -> Tensor:
     return torch.cat([ends, 2 * inner - 1])
 
 
-def nearest_of(proposals: Tensor, effects: Tensor, wanted: Tensor) -> Tensor:
+def nearest_of(proposals: Tensor, effects: Tensor, wanted: Tensor, reach: Tensor) -> Tensor:
     """Return the proposal ``(*B, A)`` whose effect comes nearest to what is wanted.
+
+    Squared errors count by one over what can be had at all on their axis: midway between
+    absolute ones, which forget an axis of which little can be had, and relative ones, for which
+    it is everything.
 
     Args:
         proposals: ``(*B, P, A)``.
         effects: what they are expected to be worth, ``(*B, P, A)``.
         wanted: ``(*B, A)``.
+        reach: half of the range of effects that can be had, ``(*B, A)``.
 
-    >>> nearest_of(torch.tensor([[1.0], [2.0]]), torch.tensor([[0.5], [0.9]]), torch.ones(1))
+    >>> proposals, effects = torch.tensor([[1.0], [2.0]]), torch.tensor([[0.5], [0.9]])
+    >>> nearest_of(proposals, effects, torch.ones(1), torch.ones(1))
     tensor([2.])
     """
-    best = (effects - wanted.unsqueeze(-2)).square().sum(-1).argmin(-1)[..., None, None]
+    errors = (effects - wanted.unsqueeze(-2)).square()
+    cost = (errors / reach.clamp_min(LEAST_REACH).unsqueeze(-2)).sum(-1)
+    best = cost.argmin(-1)[..., None, None]
     return proposals.take_along_dim(best, -2).squeeze(-2)
