@@ -16,6 +16,7 @@ from afm_rl.learning import (
     GaussianNLLLoss,
     OnlineUpdater,
     OracleUpdater,
+    UnmatchedUpdater,
     Updater,
     collect,
     fit_ensemble,
@@ -145,8 +146,11 @@ def compose(task: Task, method: str, learned: Learned, seed: int, lr: float = 1e
     if "afm" in method:
         transforms.insert(1, ActionFlowTransform(model, flow))
         loss.set_keys(action=EXECUTED)
-    if "online" in method:
-        updater = OnlineUpdater(loss, partial(FreshAdam, lr=lr))
+    learner = partial(OnlineUpdater, optimizer=partial(FreshAdam, lr=lr))
+    if method == "online":
+        updater = learner(loss)
+    elif method == "afm_online":  # the transform undoes what actions can: learn the rest
+        updater = UnmatchedUpdater(loss, learner, flow.half_range, flow.gate)
     elif method == "oracle":
         updater = OracleUpdater(loss, regime_key=("regime", "parameters"))
     else:
