@@ -14,6 +14,7 @@ from rich.text import Text
 from afm_rl.report.kinds import Kind, kind_of
 from afm_rl.report.summary import summarise, summarise_cells
 
+ABREAST = 6  # methods side by side in a table of cells; more get a table below
 WIDE = 1000  # columns: numbers that are cut off are worse than lines that wrap
 
 
@@ -38,15 +39,16 @@ def print_summary(missions: pd.DataFrame, file: IO[str] | None = None) -> None:
     cells, kind = summarise_cells(missions), kind_of(missions)
     console.print(_table(summarise(missions), kind))
     if cells["cell"].nunique() > 1:
-        console.print(_grid(cells, kind))
+        methods = list(dict.fromkeys(cells["method"]))
+        for first in range(0, len(methods), ABREAST):
+            console.print(_grid(cells, kind, methods[first : first + ABREAST]))
 
 
-def _grid(cells: pd.DataFrame, kind: Kind) -> Table:
-    """Return one row per cell: what counts, of every method, the best one bold."""
+def _grid(cells: pd.DataFrame, kind: Kind, methods: list[str]) -> Table:
+    """Return one row per cell: what counts, of some methods, the best one of all bold."""
     heads = [measure.head.removesuffix(" %") for measure in kind.measures[: len(kind.short)]]
     caption = f"{' and '.join(heads)}, means"
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption=caption)
-    methods = list(dict.fromkeys(cells["method"]))
     table.add_column("cell")
     for method in methods:
         table.add_column(method, justify="right")

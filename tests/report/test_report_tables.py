@@ -126,3 +126,15 @@ def test_one_mission_has_no_interval(four):
 
 def test_names_are_no_markup(four):
     assert "[bold]x[/bold]" in table(four.replace("a", "[bold]x[/bold]"), io.StringIO())
+
+
+def test_many_methods_get_tables_below_one_another(four):
+    rings = [four.assign(track=track) for track in ("ring", "oval")]
+    many = [frame.assign(method=frame["method"] + str(k)) for frame in rings for k in range(4)]
+    lines = table(pd.concat(many, ignore_index=True), io.StringIO()).splitlines()
+    heads = [line.split()[1:] for line in lines if line.split()[:1] == ["cell"]]
+    assert [name for head in heads for name in head] == list(
+        dict.fromkeys(name for k in range(4) for name in (f"a{k}", f"b{k}"))
+    )
+    assert [len(head) for head in heads] == [6, 2]
+    assert max(map(len, lines)) < 120
