@@ -72,8 +72,8 @@ class ContextFlow(PairCorrector, Flow):
         source_std: :math:`\sigma`, in half ranges.
         steps: midpoint steps.
         unsure: standard deviation of the samples above which they are judged, in half ranges.
-        length_scale: distance within which an action that was tried tells of another, in half
-            ranges; 0: expect what the network expects.
+        length_scale: distance within which an action that was tried tells of another, relative
+            to the largest one tried; 0: expect what the network expects.
         hidden: units of the hidden layers of all three networks.
         latent: size of the encoded context.
         saturation: what gives way when the planned action cannot be had in full, see

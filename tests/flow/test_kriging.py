@@ -32,6 +32,15 @@ def test_rows_that_do_not_count_change_nothing():
     torch.testing.assert_close(found, fewer)
 
 
+def test_small_actions_are_told_apart_as_well_as_large_ones():
+    asked, tried, missed = draw(5, 2), draw(6, 2), draw(6, 2)
+    valid = torch.ones(6, 1)
+    found = krige(asked, tried, missed, valid, 0.3)
+    torch.testing.assert_close(krige(0.02 * asked, 0.02 * tried, missed, valid, 0.3), found)
+    none = torch.zeros(6, 2)
+    assert krige(none, none, missed, valid, 0.3).isfinite().all()
+
+
 def test_repeats_are_averaged():
     tried, valid = torch.zeros(50, 1), torch.ones(50, 1)
     missed = 1.0 + 0.3 * torch.randn(50, 1, generator=GENERATOR)
