@@ -15,7 +15,7 @@ from afm_rl.flow.hints import fit_window
 from afm_rl.flow.kriging import krige
 from afm_rl.flow.network import mlp
 from afm_rl.flow.pairs import PairCorrector
-from afm_rl.flow.proposals import nearest_of, probes_of, source_points_of
+from afm_rl.flow.proposals import beside, nearest_of, probes_of, refine, source_points_of
 from afm_rl.flow.reading import TOLD, Reading
 from afm_rl.flow.recall import Memory, recall
 from afm_rl.flow.saturation import MODES, attainable, intend
@@ -51,7 +51,9 @@ class ContextFlow(PairCorrector, Flow):
     * What can be had at all? The reach of effects, for planners that want to know.
 
     Near actions that were tried, what was seen corrects what this network expects of them
-    (:func:`~afm_rl.flow.kriging.krige`).
+    (:func:`~afm_rl.flow.kriging.krige`). An answer that is not in doubt then takes one Newton
+    step towards what was planned (:func:`~afm_rl.flow.proposals.refine`): the flow knows where
+    to look, the pairs say how far it is off.
 
     The model counts as misaligned while the largest surprise of the last K transitions exceeds
     ``gate`` standard deviations of the model's own noise, unless no correction at all (the view
@@ -74,6 +76,8 @@ class ContextFlow(PairCorrector, Flow):
         unsure: standard deviation of the samples above which they are judged, in half ranges.
         length_scale: distance within which an action that was tried tells of another, relative
             to the largest one tried; 0: expect what the network expects.
+        refine: longest step along an axis by which an answer that is not in doubt comes nearer
+            to its effect, in half ranges; 0: it stays as it is.
         hidden: units of the hidden layers of all three networks.
         latent: size of the encoded context.
         saturation: what gives way when the planned action cannot be had in full, see
@@ -106,6 +110,7 @@ class ContextFlow(PairCorrector, Flow):
         steps: int = 3,
         unsure: float = 0.1,
         length_scale: float = 0.2,
+        refine: float = 0.2,
         hidden: Sequence[int] = (128, 128),
         latent: int = 64,
         saturation: str = "mixed",
@@ -122,6 +127,7 @@ class ContextFlow(PairCorrector, Flow):
         self.steps = check_count("flow.steps", steps)
         self.unsure = check_number("flow.unsure", unsure, low=0.0)
         self.length_scale = check_number("flow.length_scale", length_scale, low=0.0)
+        self.refine = check_number("flow.refine", refine, low=0.0)
         self.saturation = check_choice("flow.saturation", saturation, MODES)
         ways = [VIEWS[name] for name in self.views]
         if memory < memory_of(ways, window):
@@ -267,6 +273,24 @@ class ContextFlow(PairCorrector, Flow):
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
         """Integrate the flow from every source point; return the best end, spread and reach."""
         unit, known = self.normalise(planned), self.read(context.features)
+        ends = self._ends(known, unit)
+        mean, spread = ends.mean(-2).clamp(-1.0, 1.0), ends.std(-2, correction=0)
+        proposals = torch.cat([mean.unsqueeze(-2), ends.clamp(-1.0, 1.0)], -2)
+        asked = proposals, beside(mean), self.probes.expand(*unit.shape[:-1], -1, -1)
+        expected = self.foresee(context.features, known, torch.cat(asked, -2))
+        effects, around, found = expected.split([part.shape[-2] for part in asked], -2)
+        low, high = found.amin(-2), found.amax(-2)
+        wanted = attainable(unit, low, high, self.saturation)
+        best = nearest_of(proposals, effects, wanted, 0.5 * (high - low))
+        if self.refine:
+            mean = refine(mean, effects[..., 0, :], around, wanted, self.refine)
+        unsure = spread.amax(-1, keepdim=True) > self.unsure
+        action = torch.where(unsure, best, mean)
+        reach = self.denormalise(torch.stack([low, high], -2))
+        return Correction(self.denormalise(action), spread * self.half_range, reach)
+
+    def _ends(self, known: Reading, unit: Tensor) -> Tensor:
+        """Return where the flow leads from its source points, ``(*B, samples, A)``."""
         start = self.source(unit.unsqueeze(-2), self.source_points)
         told = known.of_plan(unit, self.saturation).unsqueeze(-2).expand(*start.shape[:-1], -1)
         told = told.flatten(end_dim=-2)
@@ -275,16 +299,4 @@ class ContextFlow(PairCorrector, Flow):
             time = torch.full_like(point[..., :1], tau)
             return self.velocity(torch.cat([told, point, time], -1))
 
-        ends = midpoint(velocity, start.flatten(end_dim=-2), self.steps).view_as(start)
-        mean, spread = ends.mean(-2, keepdim=True), ends.std(-2, correction=0)
-        proposals = torch.cat([mean, ends], -2).clamp(-1.0, 1.0)
-        asked = torch.cat([proposals, self.probes.expand(*unit.shape[:-1], -1, -1)], -2)
-        expected = self.foresee(context.features, known, asked)
-        expected, found = expected.tensor_split([proposals.shape[-2]], -2)
-        low, high = found.amin(-2), found.amax(-2)
-        wanted = attainable(unit, low, high, self.saturation)
-        best = nearest_of(proposals, expected, wanted, 0.5 * (high - low))
-        unsure = spread.amax(-1, keepdim=True) > self.unsure
-        action = torch.where(unsure, best, mean.squeeze(-2))
-        reach = self.denormalise(torch.stack([low, high], -2))
-        return Correction(self.denormalise(action), spread * self.half_range, reach)
+        return midpoint(velocity, start.flatten(end_dim=-2), self.steps).view_as(start)

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 PROBES = 32  # actions whose effects are asked for the reach
+APART = 0.05  # half ranges: so far to either side effects are compared for their slopes
+DAMPING = 0.03  # a slope below says little about how far to go
 LEAST_REACH = 0.01  # half ranges
 
 
@@ -47,3 +49,40 @@ def nearest_of(proposals: Tensor, effects: Tensor, wanted: Tensor, reach: Tensor
     cost = (errors / reach.clamp_min(LEAST_REACH).unsqueeze(-2)).sum(-1)
     best = cost.argmin(-1)[..., None, None]
     return proposals.take_along_dim(best, -2).squeeze(-2)
+
+
+def beside(action: Tensor) -> Tensor:
+    """Return neighbours ``(*B, 2 A, A)`` of an action ``(*B, A)``: up each axis, then down.
+
+    >>> beside(torch.zeros(1))
+    tensor([[ 0.0500],
+            [-0.0500]])
+    """
+    step = APART * torch.eye(action.shape[-1], device=action.device, dtype=action.dtype)
+    return action.unsqueeze(-2) + torch.cat([step, -step])
+
+
+def refine(action: Tensor, effect: Tensor, around: Tensor, wanted: Tensor, most: float) -> Tensor:
+    r"""Return an action ``(*B, A)`` whose effect is nearer to what is wanted.
+
+    One damped Newton step in the box, with slopes S from differences:
+
+    .. math:: u \leftarrow u + (S^\top S + \rho^2 I)^{-1} S^\top (w - \hat T(u))
+
+    Args:
+        action: u, ``(*B, A)``.
+        effect: what it is expected to be worth, ``(*B, A)``.
+        around: what its neighbours are, see :func:`beside`, ``(*B, 2 A, A)``.
+        wanted: w, ``(*B, A)``.
+        most: longest step along an axis.
+
+    >>> action, wanted = torch.zeros(1), torch.tensor([0.1])
+    >>> refine(action, -2 * action, -2 * beside(action), wanted, 1.0).round(decimals=3)
+    tensor([-0.0500])
+    """
+    up, down = around.chunk(2, -2)
+    slope = (up - down) / (2 * APART)  # (*B, A, A), transposed
+    ridge = DAMPING**2 * torch.eye(action.shape[-1], device=action.device, dtype=action.dtype)
+    miss = (slope * (wanted - effect).unsqueeze(-2)).sum(-1)
+    step = torch.linalg.solve(slope @ slope.mT + ridge, miss)
+    return (action + step.clamp(-most, most)).clamp(-1.0, 1.0)

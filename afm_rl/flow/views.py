@@ -42,8 +42,9 @@ VIEWS = {
     "mean": View(share=1.0, merge=2, doubt=0.02),
     "late_1": View(late=1, doubt=0.05),
     "late_2": View(late=2, doubt=0.05),
-    "near": View(near=True, doubt=0.05),
-    "nearest": View(share=1 / 6, near=True, doubt=0.05),
+    "near": View(near=True, doubt=0.03),
+    "nearest": View(share=1 / 6, near=True),  # where ground changes, place tells more than time
+    "here": View(share=1 / 12, near=True, doubt=0.01),  # at the very edge
 }
 
 

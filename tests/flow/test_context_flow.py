@@ -128,7 +128,7 @@ def test_outliers_are_clamped(flow, window_of):
 
 
 def test_the_correction_integrates_the_velocity_from_every_source_point(flow, window_of, box, told):
-    flow.unsure = math.inf
+    flow.unsure, flow.refine = math.inf, 0.0
     features = context_of(flow, window_of([-1.0, 1.0], 25)).features
     planned = grid(box)
     corrected = flow.correct(told(features), None, planned)
@@ -140,7 +140,7 @@ def test_the_correction_integrates_the_velocity_from_every_source_point(flow, wi
         return flow(known, wide, torch.full_like(point[..., :1], tau), point)
 
     end = midpoint(velocity, wide + flow.source_std * flow.source_points, flow.steps)
-    expected = end.mean(-2) * flow.half_range
+    expected = end.mean(-2).clamp(-1, 1) * flow.half_range
     torch.testing.assert_close(corrected.action, expected)
     torch.testing.assert_close(corrected.spread, end.std(-2, correction=0) * flow.half_range)
 
@@ -234,6 +234,7 @@ def test_many_actions_are_no_trouble():
         {"steps": 0},
         {"saturation": "fold"},
         {"unsure": -0.1},
+        {"refine": -0.2},
         {"forgetting": 1.1},
         {"place_scale": 0.0},
         {"hidden": [0]},

@@ -24,7 +24,8 @@ def test_recent_pairs_are_the_newest_and_fill_half():
 
 
 @pytest.mark.parametrize(
-    ("name", "filled"), [("newest", 2), ("recent", 6), ("long", 12), ("nearest", 2), ("near", 6)]
+    ("name", "filled"),
+    [("newest", 2), ("recent", 6), ("long", 12), ("here", 1), ("nearest", 2), ("near", 6)],
 )
 def test_views_fill_their_share_and_one_row_at_least(name, filled):
     pairs = Pairs(*(part.repeat(2, 1) for part in PAIRS))
