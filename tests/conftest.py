@@ -80,7 +80,7 @@ def make_ensemble():
 @pytest.fixture(scope="session")
 def _trained_ensemble():
     model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], members=3, hidden=[48, 48])
-    settings = {"samples": 32_000, "epochs": 15, "lr": 1e-2}
+    settings = {"samples": 16_000, "epochs": 20, "lr": 1e-2}
     error = pretrain_ensemble(model, Dubins(), STATES, (LOW, HIGH), **settings)
     return model, error
 
