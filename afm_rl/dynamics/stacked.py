@@ -66,21 +66,21 @@ def stacked_mlp_tangent(
     Returns:
         Directional derivatives ``(M, N, A, out)``.
     """
-    moved = torch.cat([inputs.unsqueeze(2), tangents.expand(*inputs.shape[:2], *tangents.shape)], 2)
+    axes = tangents.unsqueeze(1).expand(len(inputs), -1, *inputs.shape[1:])
+    moved = torch.cat([inputs.unsqueeze(1), axes], 1)  # (M, 1 + A, N, in): values, then tangents
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-        rows = moved.shape[1:3]
-        moved = torch.bmm(moved.flatten(1, 2), weight).unflatten(1, rows)
+        planes = moved.shape[1:3]
+        moved = torch.bmm(moved.flatten(1, 2), weight).unflatten(1, planes)
         if layer < len(weights) - 1:
-            value, change = moved[:, :, :1] + bias.unsqueeze(2), moved[:, :, 1:]
+            value = moved[:, :1].add_(bias.unsqueeze(1))
             if layer_norm:
-                value, change = _layer_norm_tangent(value, change)
-            slope = torch.where(value > 0, 1.0, SLOPE).to(value.dtype)
-            moved = torch.cat([value, change], 2) * slope
-    return moved[:, :, 1:]
+                moved = torch.cat(_layer_norm_tangent(value, moved[:, 1:]), 1)
+            moved *= torch.where(moved[:, :1] > 0, 1.0, SLOPE).to(moved.dtype)
+    return moved[:, 1:].transpose(1, 2)
 
 
 def _layer_norm_tangent(value: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a layer norm's value ``(..., 1, D)`` and its tangents ``(..., A, D)``.
+    """Return a layer norm's value ``(*B, D)`` and its tangents ``(*B, D)``.
 
     With ``n = (v - mean v) / s``, ``s`` the root of the variance plus a small constant:
     ``dn = (dv - mean dv - n mean(n dv)) / s``.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -178,19 +177,14 @@ def _fresh(draw: Callable[[int], Examples], size: int) -> Iterator[Examples]:
 def _reused(
     draw: Callable[[int], Examples], size: int, reuse: int, generator: torch.Generator
 ) -> Iterator[Examples]:
-    """Yield batches from a pool in which new examples take the place of the oldest."""
-    chunk = math.ceil(size / min(reuse, 8))
-    pause = max(1, reuse * chunk // size)  # batches between fresh chunks
+    """Yield batches from a pool in which a new batch now and then takes the oldest one's place."""
     pool = draw(POOL * size)
-    cursor, count = 0, POOL * size
-    for step in itertools.count():
-        if step % pause == 0:
-            rows = (cursor + torch.arange(chunk)) % count
-            for kept, new in zip(pool, draw(chunk), strict=True):
-                kept[rows] = new
-            cursor = (cursor + chunk) % count
-        chosen = torch.randint(count, (size,), generator=generator)
-        yield Examples(*(part[chosen] for part in pool))
+    for oldest in itertools.cycle(range(POOL)):
+        for _ in range(reuse):
+            chosen = torch.randint(POOL * size, (size,), generator=generator)
+            yield Examples(*(part[chosen] for part in pool))
+        for kept, new in zip(pool, draw(size), strict=True):
+            kept[oldest * size : (oldest + 1) * size] = new
 
 
 @torch.no_grad()

@@ -205,7 +205,8 @@ class ContextFlow(PairCorrector, Flow):
         """
         size = -(-count // plans), self.shown
         window, ruling = imagine_windows(self, model, regime, states, size, generator)
-        pairs = self.judge(model, *window)
+        pairs = window.executed.new_zeros(*size, self.pair_size)
+        pairs[window.valid] = self.judge(model, *(part[window.valid] for part in window))
         chosen = torch.arange(count) // plans
         here, ruled = window.state[chosen, -1], ruling[chosen]
         planned = draw_plans(self, regime, ruled, here, generator)

@@ -28,11 +28,12 @@ def imagine(
     A learned model knows nothing outside the box, so it is continued linearly from its edge.
     """
     inside = torch.minimum(torch.maximum(effect, low), high)
-    state_at_edge, noise = model.forecast(state, inside)
-    slope = model.jacobian(state, inside)
-    beyond = (slope @ (effect - inside).unsqueeze(-1)).squeeze(-1)
-    error = noise * torch.randn(noise.shape, generator=generator)
-    return model.manifold.add(state_at_edge, beyond + error)
+    expected, noise = model.forecast(state, inside)
+    change = noise * torch.randn(noise.shape, generator=generator)
+    out = (effect != inside).any(-1)  # derivatives are dear, and few effects are beyond the box
+    slope = model.jacobian(state[out], inside[out])
+    change[out] += (slope @ (effect - inside)[out].unsqueeze(-1)).squeeze(-1)
+    return model.manifold.add(expected, change)
 
 
 def rows_of_now(count: int, window: int, generator: torch.Generator) -> Tensor:
@@ -102,7 +103,8 @@ def imagine_windows(
     executed = flow.denormalise(excite(*size, flow.action_size, generator))
     effect = regime.apply(executed, parameters, state)
     low, high = flow.centre - flow.half_range, flow.centre + flow.half_range
-    reached = imagine(model, state, effect, low, high, generator)
+    reached = state.clone()  # rows that do not count need no model
+    reached[valid] = imagine(model, state[valid], effect[valid], low, high, generator)
     return Seen(state, executed, reached, valid), now
 
 

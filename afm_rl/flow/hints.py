@@ -89,18 +89,20 @@ class Fits(NamedTuple):
         likeness = self._likeness(self.executed, unit)
         worth = (likeness.softmax(-2) * self.effective).sum(-2)
         nearness = likeness.logsumexp(-2).exp().clamp_max(1.0)
-        answers = [self._expected(unit).flatten(-2), worth, nearness]
+        answers = [*self._expected(unit), worth, nearness]
         return torch.cat(answers, -1).clamp(-LIMIT, LIMIT).to(executed)
 
     def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
         """Return how much each pair tells of ``unit`` ``(*B, A)``, logits ``(*B, K, A)``."""
         return self.trust - ((among - unit.unsqueeze(-2)) / NEAR).square()
 
-    def _expected(self, unit: Tensor) -> Tensor:
-        """Return what each fit expects ``unit`` ``(*B, A)`` to be worth, ``(*B, 4, A)``."""
+    def _expected(self, unit: Tensor) -> list[Tensor]:
+        """Return what each fit expects ``unit`` ``(*B, A)`` to be worth, ``(*B, A)`` each."""
+        gained = [gain * unit for gain in self.gains.unbind(-2)]
         rubbed = apply_friction(self.rub, self.friction, unit)
-        affine = (self.matrix * unit.unsqueeze(-2)).sum(-1) + self.bias
-        return torch.cat([self.gains * unit.unsqueeze(-2), torch.stack([rubbed, affine], -2)], -2)
+        axes = zip(self.matrix.unbind(-1), unit.split(1, -1), strict=True)
+        affine = sum((column * part for column, part in axes), self.bias)
+        return [*gained, rubbed, affine]
 
 
 def fit_window(executed: Tensor, effective: Tensor, valid: Tensor) -> Fits:
@@ -125,8 +127,11 @@ def fit_window(executed: Tensor, effective: Tensor, valid: Tensor) -> Fits:
         effective,
         long.clamp_min(TINY**2).log(),
     )
-    weight = torch.cat([short, long, long, long], -1).unsqueeze(-1)  # of each fit
-    miss = effective.unsqueeze(-2) - fits.wide()._expected(executed)
-    left = (weight * miss.square()).sum(-3) / weight.sum(-3).clamp_min(TINY)
-    misses = (left.clamp_min(0.0).sqrt() + TINY).log()
-    return fits._replace(misses=misses.flatten(-2).to(kind))
+    # Fit by fit: products and sums over more dimensions, the last ones tiny, are slow.
+    weights, answers = (short, long, long, long), fits.wide()._expected(executed)
+    left = [
+        (weight * (effective - answer).square()).sum(-2) / weight.sum(-2).clamp_min(TINY)
+        for weight, answer in zip(weights, answers, strict=True)
+    ]
+    misses = (torch.cat(left, -1).clamp_min(0.0).sqrt() + TINY).log()
+    return fits._replace(misses=misses.to(kind))
