@@ -22,7 +22,7 @@ from afm_rl.learning import (
     fit_ensemble,
 )
 from afm_rl.manifold import Manifold
-from afm_rl.planning import MPPI, KnownReward, PlanningEnv
+from afm_rl.planning import ICEM, MPPI, KnownReward, PlanningEnv
 from afm_rl.regimes import ActionGain, Bias, Regime
 from afm_rl.regimes import Compose as Regimes
 from afm_rl.transforms import ActionFlowTransform, RegimeTransform
@@ -51,11 +51,11 @@ def regimes_of(env: EnvBase) -> Regime:
     return Regimes({"gain": gains, "bias": biases}, prior=[["gain"], ["bias"], ["gain", "bias"]])
 
 
-def plan(task: Task, model, env: EnvBase, seed: int) -> MPPI:
+def plan(task: Task, model, env: EnvBase, seed: int) -> MPPI | ICEM:
     """Return the planner over a model."""
     space = env.action_spec_unbatched.space
     world = PlanningEnv(model, KnownReward(task.reward), space.low, space.high)
-    return MPPI(world, seed=seed, **task.planner)
+    return task.search(world, seed=seed, **task.planner)
 
 
 @dataclass
@@ -84,7 +84,12 @@ def learn(task: Task, seed: int, iterations: int = 2000) -> Learned:
         settings = {"hidden": task.hidden, "propagation": "member", "seed": seed}
         model = Ensemble(states, len(space.low), range(size), **settings)
         error = fit_ensemble(model, data, seed=seed, **task.fit)
-        print(f"{len(data)} transitions: held-out error {error:.3f}", flush=True)
+        reward = parts[-1]["next", "reward"].mean()
+        print(
+            f"{len(data)} transitions, the latest with a reward of {reward:.2f} per step: "
+            f"held-out error {error:.3f}",
+            flush=True,
+        )
     flow = ContextFlow(space.low, space.high, seed=seed, saturation="clip")
     regime = regimes_of(env)
     error = train_flow(
@@ -113,7 +118,7 @@ class Agent:
     """Environment, planner and updater of one method, sharing one model."""
 
     env: TransformedEnv
-    planner: MPPI
+    planner: MPPI | ICEM
     updater: Updater
 
     @torch.no_grad()
