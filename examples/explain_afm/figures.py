@@ -38,6 +38,7 @@ NAMES = {
     "late_2": "two steps late",
     "near": "near in place",
     "nearest": "nearest in place",
+    "here": "the one nearest",
 }
 
 
@@ -108,7 +109,7 @@ def main() -> None:
         draw_evidence(axes, regimes, asked.budget)
         axes.set_title(title, fontsize=9)
     figure.legend(
-        *pair[1].get_legend_handles_labels(), loc="outside lower center", ncols=9, fontsize=7
+        *pair[1].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=7
     )
     write_whole(asked.out / "afm_views.png", png_bytes(figure))
 
