@@ -202,7 +202,7 @@ def test_flows_use_examples_as_often_as_the_robot_says(make_agent, monkeypatch):
     assert used == [32, 3]
 
 
-@pytest.mark.parametrize(("robot", "views", "steps"), [("quadrotor", 4, 4000), ("ugv", 9, 14000)])
+@pytest.mark.parametrize(("robot", "views", "steps"), [("quadrotor", 4, 4000), ("ugv", 10, 14000)])
 def test_robots_say_how_flows_are_made_for_them(composed, robot, views, steps):
     flow = composed(f"robot={robot}", "method=afm_physics").flow
     assert len(flow.views) == views and flow.train.iterations == steps
