@@ -50,7 +50,7 @@ def main() -> None:
     planner = MPPI(world, horizon=HORIZON, population=POPULATION)
     env = TransformedEnv(world, planner.make_tensordict_primer())
     td = env.reset().set("goal", torch.ones(2))
-    world_of = {  # model, robot, and what the flow may believe
+    cases = {  # model, robot, and what the flow may believe
         "silent, over physics": (Dubins(), Dubins(), list(VIEWS)),
         "correcting, over the ensemble": (model, ensemble(1), CORRECTING),
         "correcting, over physics": (Dubins(), model, CORRECTING),
@@ -63,7 +63,7 @@ def main() -> None:
         start = warm(env)
         return lambda: env.step(start.clone())
 
-    jobs = {f"with AFM, {name}": with_afm(*parts) for name, parts in world_of.items()}
+    jobs = {f"with AFM, {name}": with_afm(*parts) for name, parts in cases.items()}
     plain_td = world.reset().set("action", torch.ones(2))
     learner = ensemble(0)
     updater = OnlineUpdater(GaussianNLLLoss(learner), FreshAdam)

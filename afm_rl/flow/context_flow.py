@@ -15,7 +15,7 @@ from afm_rl.flow.hints import fit_window
 from afm_rl.flow.kriging import krige
 from afm_rl.flow.network import mlp
 from afm_rl.flow.pairs import PairCorrector
-from afm_rl.flow.proposals import beside, nearest_of, probes_of, refine, source_points_of
+from afm_rl.flow.proposals import beside, nearest_of, newton_step, probes_of, source_points_of
 from afm_rl.flow.reading import TOLD, Reading
 from afm_rl.flow.recall import Memory, recall
 from afm_rl.flow.saturation import MODES, attainable, intend
@@ -52,7 +52,7 @@ class ContextFlow(PairCorrector, Flow):
 
     Near actions that were tried, what was seen corrects what this network expects of them
     (:func:`~afm_rl.flow.kriging.krige`). An answer that is not in doubt then takes one Newton
-    step towards what was planned (:func:`~afm_rl.flow.proposals.refine`): the flow knows where
+    step towards what was planned (:func:`~afm_rl.flow.proposals.newton_step`): the flow knows where
     to look, the pairs say how far it is off.
 
     The model counts as misaligned while the largest surprise of the last K transitions exceeds
@@ -284,7 +284,7 @@ class ContextFlow(PairCorrector, Flow):
         wanted = attainable(unit, low, high, self.saturation)
         best = nearest_of(proposals, effects, wanted, 0.5 * (high - low))
         if self.refine:
-            mean = refine(mean, effects[..., 0, :], around, wanted, self.refine)
+            mean = newton_step(mean, effects[..., 0, :], around, wanted, self.refine)
         unsure = spread.amax(-1, keepdim=True) > self.unsure
         action = torch.where(unsure, best, mean)
         reach = self.denormalise(torch.stack([low, high], -2))

@@ -62,7 +62,9 @@ def beside(action: Tensor) -> Tensor:
     return action.unsqueeze(-2) + torch.cat([step, -step])
 
 
-def refine(action: Tensor, effect: Tensor, around: Tensor, wanted: Tensor, most: float) -> Tensor:
+def newton_step(
+    action: Tensor, effect: Tensor, around: Tensor, wanted: Tensor, most: float
+) -> Tensor:
     r"""Return an action ``(*B, A)`` whose effect is nearer to what is wanted.
 
     One damped Newton step in the box, with slopes S from differences:
@@ -77,7 +79,7 @@ def refine(action: Tensor, effect: Tensor, around: Tensor, wanted: Tensor, most:
         most: longest step along an axis.
 
     >>> action, wanted = torch.zeros(1), torch.tensor([0.1])
-    >>> refine(action, -2 * action, -2 * beside(action), wanted, 1.0).round(decimals=3)
+    >>> newton_step(action, -2 * action, -2 * beside(action), wanted, 1.0).round(decimals=3)
     tensor([-0.0500])
     """
     up, down = around.chunk(2, -2)

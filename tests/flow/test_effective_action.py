@@ -36,9 +36,10 @@ def test_gains_are_recovered_about_from_an_ensemble(trained_ensemble, gains, tra
     state, action = transitions(300)
     rows = torch.tensor([-0.8, 1.2])
     found = seen(trained_ensemble, state, action, Dubins()(state, rows * action))
-    miss = ((found.effective - rows * action) / HALF).abs().median()
-    nothing = ((action - rows * action) / HALF).abs().median()
-    assert miss < 0.17 * nothing  # the mean is that of few where a network's slope misleads
+    miss, nothing = ((part - rows * action) / HALF for part in (found.effective, action))
+    assert miss.abs().median() < 0.17 * nothing.abs().median()
+    # The mean square is that of few where a network's slope misleads: it differs with rounding.
+    assert miss.square().mean() < 0.5**2 * nothing.square().mean()
 
 
 def test_the_told_oracle_sees_nothing_amiss(gains, transitions):

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from afm_rl.flow.proposals import APART, beside, refine
+from afm_rl.flow.proposals import APART, beside, newton_step
 
 GAINS = 1  # a fit
 MATRIX = torch.tensor([[-0.8, 0.3], [0.2, 1.5]])
@@ -19,7 +19,7 @@ def worth(action):
 def test_an_affine_effect_is_reached_in_one_step(batch):
     generator = torch.Generator().manual_seed(0)
     action, wanted = (0.3 * torch.randn(*batch, 2, generator=generator) for _ in range(2))
-    found = refine(action, worth(action), worth(beside(action)), wanted, 10.0)
+    found = newton_step(action, worth(action), worth(beside(action)), wanted, 10.0)
     inside = found.abs().amax(-1) < 1
     assert inside.any()
     left = (worth(found) - wanted).abs().amax(-1)
@@ -28,16 +28,16 @@ def test_an_affine_effect_is_reached_in_one_step(batch):
 
 def test_it_keeps_to_its_longest_step_and_to_the_box():
     action, wanted = torch.zeros(2), worth(torch.tensor([0.5, -0.9]))
-    near = refine(action, worth(action), worth(beside(action)), wanted, 0.2)
+    near = newton_step(action, worth(action), worth(beside(action)), wanted, 0.2)
     torch.testing.assert_close(near, torch.tensor([0.2, -0.2]))
     far = worth(torch.tensor([3.0, -3.0]))
-    found = refine(action, worth(action), worth(beside(action)), far, 10.0)
+    found = newton_step(action, worth(action), worth(beside(action)), far, 10.0)
     torch.testing.assert_close(found, torch.tensor([1.0, -1.0]))
 
 
 def test_where_no_action_does_anything_it_stays():
     action = torch.tensor([0.4, -0.1])
-    found = refine(action, torch.zeros(2), torch.zeros(4, 2), torch.ones(2), 0.2)
+    found = newton_step(action, torch.zeros(2), torch.zeros(4, 2), torch.ones(2), 0.2)
     torch.testing.assert_close(found, action)
 
 
