@@ -36,7 +36,7 @@ class Context(NamedTuple):
     evidence: Tensor
     """How badly each of its hypotheses did of late, ``(*B, E)``."""
     features: Tensor
-    """Description of the regime, ``(*B, C)``."""
+    """Description of the regime, ``(*B, D)``."""
     surprise: Tensor
     """Size of the misalignment, in the unit of the gate, ``(*B)``."""
     misaligned: Tensor
@@ -52,6 +52,8 @@ class Correction(NamedTuple):
     """Its standard deviation over samples, ``(*B, A)``."""
     reach: Tensor | None = None
     """Lowest and highest effect that an action can have, ``(*B, 2, A)``; None: the box."""
+    expected: Tensor | None = None
+    """What the action is expected to be worth, ``(*B, A)``; None: what was planned."""
 
 
 class Corrector(nn.Module, ABC):
@@ -93,6 +95,11 @@ class Corrector(nn.Module, ABC):
     @abstractmethod
     def feature_size(self) -> int:
         """Number of context features, C."""
+
+    @property
+    def context_size(self) -> int:
+        """Numbers of a context that are remembered, in ``Context.features``."""
+        return self.feature_size
 
     @property
     def pair_size(self) -> int:
@@ -160,6 +167,11 @@ class Flow(Corrector):
         Done once for a context, however much is then asked about it.
         """
         return features
+
+    def told(self, features: Tensor) -> Context:
+        """Return the context ``(*B)`` of a model that is off, in which features are all there is."""
+        nothing, size = features[..., :0], features[..., 0]
+        return Context(nothing, nothing, features, size, size.bool())
 
     @abstractmethod
     def forward(self, known: Any, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:

@@ -13,13 +13,14 @@ from tqdm.auto import tqdm
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_count, check_instance, check_number
-from afm_rl.flow.base import Context, Examples, Flow
+from afm_rl.flow.base import Examples, Flow
 from afm_rl.flow.saturation import LIMIT
 from afm_rl.learning import InPlaceLoss
 from afm_rl.regimes import Regime
 
 POOL = 16  # batches kept of the examples that are used more than once
 PLANS = 4  # plans per context among them
+WEIGHT, PRECISE = 0.2, 0.02  # of the loss of effects; half ranges: smaller misses count less
 BLOCK = 8  # batches made at once where each example is used once: many small calls are slow
 
 
@@ -33,7 +34,11 @@ class CFMLoss(InPlaceLoss):
     :math:`(x_1 - x_\tau)/(1-\tau) = x_1 - x_0`.) A flow that also knows what actions are worth
     (:meth:`~afm_rl.flow.base.Flow.effect`) learns that with
 
-    .. math:: \mathcal{L}_e = \| \hat T(u) - u_\mathrm{eff} \|^2
+    .. math:: \mathcal{L}_e = \kappa\,(\sqrt{r^2 + \epsilon^2} - \epsilon),\qquad
+              r = \hat T(u) - u_\mathrm{eff},
+
+    the mean over axes, which forgives what cannot be known and asks for precision where it can
+    be had.
 
     Args:
         flow: the flow to train.
@@ -91,7 +96,8 @@ class CFMLoss(InPlaceLoss):
         if other:
             probe, worth = other
             miss = self.flow.effect(known, probe) - worth.clamp(-LIMIT, LIMIT)
-            loss = loss + miss.square().mean(-1)
+            size = (miss.square() + PRECISE**2).sqrt() - PRECISE
+            loss = loss + WEIGHT * size.mean(-1)
         return self._reduced(loss, tensordict)
 
 
@@ -190,9 +196,7 @@ def _reused(
 @torch.no_grad()
 def held_out_error(flow: Flow, examples: Examples) -> float:
     """Return the RMSE of the corrected action in half ranges."""
-    features = examples.features
-    nothing, silent = features[..., :0], features[..., 0]
-    context = Context(nothing, nothing, features, silent, silent.bool())
-    corrected = flow.correct(context, nothing, examples.planned).action
+    context = flow.told(examples.features)
+    corrected = flow.correct(context, examples.features[..., :0], examples.planned).action
     miss = flow.normalise(corrected) - flow.normalise(examples.intended)
     return float(miss.square().mean().sqrt())

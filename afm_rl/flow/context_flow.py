@@ -11,11 +11,10 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_counts, check_number
 from afm_rl.flow.base import Context, Correction, Examples, Flow, Window
 from afm_rl.flow.counterfactuals import anywhere, draw_plans, imagine_windows
-from afm_rl.flow.hints import fit_window
-from afm_rl.flow.kriging import krige
-from afm_rl.flow.network import mlp
+from afm_rl.flow.hints import GUESSES, fit_window, shapes_of
+from afm_rl.flow.network import blend, mlp
 from afm_rl.flow.pairs import PairCorrector
-from afm_rl.flow.proposals import beside, nearest_of, newton_step, probes_of, source_points_of
+from afm_rl.flow.proposals import nearest_of, probes_of, source_points_of
 from afm_rl.flow.reading import TOLD, Reading
 from afm_rl.flow.recall import Memory, recall
 from afm_rl.flow.saturation import MODES, attainable, intend
@@ -23,6 +22,7 @@ from afm_rl.flow.solver import midpoint
 from afm_rl.flow.views import SILENT, VIEWS, Layout, check_views, lay_out, memory_of
 from afm_rl.regimes import Regime
 
+SOON = 0.1  # of the way left: nobody need be there sooner
 TOLERATED = 0.25  # half ranges: a prediction that misses by so much does half as badly as can be
 
 
@@ -45,15 +45,12 @@ class ContextFlow(PairCorrector, Flow):
       (:mod:`~afm_rl.flow.views`); the one whose predictions did best of late is believed:
       :math:`E_v \leftarrow \lambda E_v + \rho(\hat T_v(u) - u_\mathrm{eff})`,
       :math:`\rho(x) = x^2 / (x^2 + 0.25^2)`.
-    * Which proposal is best? Where the flow's samples differ by more than ``unsure``, the
-      context is ambiguous and their mean may mean nothing. Then that one is executed whose
-      expected effect comes nearest to what can be had of the plan.
+    * Which sample is best? The one whose expected effect comes nearest to what can be had of the
+      plan; or their mean.
     * What can be had at all? The reach of effects, for planners that want to know.
 
-    Near actions that were tried, what was seen corrects what this network expects of them
-    (:func:`~afm_rl.flow.kriging.krige`). An answer that is not in doubt then takes one Newton
-    step towards what was planned (:func:`~afm_rl.flow.proposals.newton_step`): the flow knows where
-    to look, the pairs say how far it is off.
+    Least-squares fits of the window are told to both networks, which answer with a mixture of them
+    and of an answer of their own (:func:`~afm_rl.flow.network.blend`): exact where a fit is.
 
     The model counts as misaligned while the largest surprise of the last K transitions exceeds
     ``gate`` standard deviations of the model's own noise, unless no correction at all (the view
@@ -73,11 +70,6 @@ class ContextFlow(PairCorrector, Flow):
         samples: source points; even.
         source_std: :math:`\sigma`, in half ranges.
         steps: midpoint steps.
-        unsure: standard deviation of the samples above which they are judged, in half ranges.
-        length_scale: distance within which an action that was tried tells of another, relative
-            to the largest one tried; 0: expect what the network expects.
-        refine: longest step along an axis by which an answer that is not in doubt comes nearer
-            to its effect, in half ranges; 0: it stays as it is.
         hidden: units of the hidden layers of all three networks.
         latent: size of the encoded context.
         saturation: what gives way when the planned action cannot be had in full, see
@@ -105,12 +97,9 @@ class ContextFlow(PairCorrector, Flow):
         place_scale: float = 0.5,
         forgetting: float = 0.7,
         gate: float = 5.0,
-        samples: int = 8,
+        samples: int = 16,
         source_std: float = 0.3,
-        steps: int = 3,
-        unsure: float = 0.1,
-        length_scale: float = 0.2,
-        refine: float = 0.2,
+        steps: int = 1,
         hidden: Sequence[int] = (128, 128),
         latent: int = 64,
         saturation: str = "mixed",
@@ -125,9 +114,6 @@ class ContextFlow(PairCorrector, Flow):
         self.samples = check_count("flow.samples", samples)
         self.source_std = check_number("flow.source_std", source_std, low=0.0)
         self.steps = check_count("flow.steps", steps)
-        self.unsure = check_number("flow.unsure", unsure, low=0.0)
-        self.length_scale = check_number("flow.length_scale", length_scale, low=0.0)
-        self.refine = check_number("flow.refine", refine, low=0.0)
         self.saturation = check_choice("flow.saturation", saturation, MODES)
         ways = [VIEWS[name] for name in self.views]
         if memory < memory_of(ways, window):
@@ -136,13 +122,14 @@ class ContextFlow(PairCorrector, Flow):
                 f"flow.window={window} and the views {', '.join(self.views)}"
             )
         hidden = check_counts("flow.hidden", hidden)
-        check_count("flow.latent", latent)
+        self.latent = check_count("flow.latent", latent)
         size = self.action_size
         generator = torch.Generator().manual_seed(check_count("flow.seed", seed, low=0))
         self.encoder = mlp([self.feature_size, *hidden, latent], generator)
         known = latent + TOLD * size
-        self.velocity = mlp([known + size + 1, *hidden, size], generator)
-        self.worth = mlp([known, *hidden, size], generator)
+        mixed = (GUESSES + 2) * size
+        self.velocity = mlp([known + size + 1, *hidden, mixed], generator)
+        self.worth = mlp([known, *hidden, mixed], generator)
         fixed = {
             "source_points": source_points_of(samples, size),
             "probes": probes_of(size),
@@ -156,6 +143,16 @@ class ContextFlow(PairCorrector, Flow):
     def feature_size(self) -> int:
         """K (executed, effective, valid)."""
         return self.shown * (2 * self.action_size + 1)
+
+    @property
+    def context_size(self) -> int:
+        """What is read in each view."""
+        return len(self.views) * self._reading_size
+
+    @property
+    def _reading_size(self) -> int:
+        shapes = shapes_of(self.shown, self.action_size)
+        return self.latent + sum(shape.numel() for shape in shapes)
 
     @property
     def evidence_size(self) -> int:
@@ -182,11 +179,18 @@ class ContextFlow(PairCorrector, Flow):
 
     def forward(self, known: Reading, planned: Tensor, tau: Tensor, point: Tensor) -> Tensor:
         """Return the velocity ``(*B, A)`` at ``point``, all actions in half ranges."""
-        return self.velocity(torch.cat([known.of_plan(planned, self.saturation), point, tau], -1))
+        told = known.of_plan(planned, self.saturation)
+        return self._velocity(told, known.guesses(told), tau, point)
+
+    def _velocity(self, told: Tensor, guesses: Tensor, tau: Tensor, point: Tensor) -> Tensor:
+        """Return the velocity, in shares the network's own and those that lead to the guesses."""
+        ahead = (guesses - point.unsqueeze(-2)) / (1 - tau).clamp_min(SOON).unsqueeze(-1)
+        return blend(self.velocity(torch.cat([told, point, tau], -1)), ahead)
 
     def effect(self, known: Reading, executed: Tensor) -> Tensor:
         """Return what an action ``(*B, A)`` is expected to be worth, in half ranges."""
-        return self.worth(known.of_effect(executed))
+        told = known.of_effect(executed)
+        return blend(self.worth(told), known.guesses(told))
 
     def examples(
         self,
@@ -225,7 +229,7 @@ class ContextFlow(PairCorrector, Flow):
         return intend(regime, planned, parameters, state, low, high, self.saturation)
 
     def context(self, window: Window, model: DynamicsModel, last: Context | None = None) -> Context:
-        """Describe the window under the present model, through the view that did best of late."""
+        """Describe the window under the present model, and judge each view of it."""
         pairs = self.remember(window, model, last)
         surprise = self.surprise(pairs)
         surprised = surprise > self.gate
@@ -233,71 +237,90 @@ class ContextFlow(PairCorrector, Flow):
         evidence = pairs.new_zeros(*shape, self.evidence_size)
         if last is not None:
             evidence = self.forgetting * last.evidence
-        features = pairs.new_zeros(*shape, self.feature_size)
+        features = pairs.new_zeros(*shape, self.context_size)
         if not bool(surprised.any()):  # nothing to explain
             return Context(pairs, evidence, features, surprise, surprised)
         states = window.state[surprised], window.next_state[surprised]
         memory = recall(pairs[surprised], *states, self.place, self.place_scale)
-        newest = memory.pairs.valid[:, -1]  # does it count?
-        believed = evidence[surprised] + newest * self._misses(memory)
-        evidence[surprised] = believed
-        best = (believed + self.doubt).argmin(-1)
-        features[surprised] = memory.now(self._layout, best)
+        if last is not None:
+            ready = last.surprise[surprised] > self.gate  # was anything foreseen?
+            counts = memory.pairs.valid[:, -1] * ready.unsqueeze(-1)
+            evidence[surprised] += counts * self._misses(memory, last.features[surprised])
+        features[surprised] = self._described(memory)
         misaligned = surprised.clone()
         if SILENT in self.views:
-            misaligned[surprised] = best != self.views.index(SILENT)
+            misaligned &= self._believed(evidence) != self.views.index(SILENT)
         return Context(pairs, evidence, features, surprise, misaligned)
+
+    def told(self, features: Tensor) -> Context:
+        """Return the context in which every view shows the same."""
+        described = self.read(features).pack().unsqueeze(-2)
+        described = described.expand(*features.shape[:-1], len(self.views), -1)
+        nothing, size = features[..., :0], features[..., 0]
+        evidence = features.new_zeros(*size.shape, self.evidence_size)
+        return Context(nothing, evidence, described.flatten(-2), size, size.bool())
+
+    def _believed(self, evidence: Tensor) -> Tensor:
+        """Return the index of the view that did best of late, ``(*B)``."""
+        return (evidence + self.doubt).argmin(-1)
 
     @property
     def _layout(self) -> Layout:
         return Layout(*(getattr(self, f"rows_{name}") for name in Layout._fields))
 
-    def _misses(self, memory: Memory) -> Tensor:
-        """Return how badly each view predicted the newest pair, ``(N, V)``."""
-        before, acted, worth = memory.before(self._layout)
-        expected = self.effect(self.read(before), acted)
+    @torch.inference_mode()
+    def _described(self, memory: Memory) -> Tensor:
+        """Return what is read in each view, ``(N, V P)``."""
+        return self.read(memory.shown(self._layout)).pack().flatten(-2)
+
+    @torch.inference_mode()
+    def _misses(self, memory: Memory, features: Tensor) -> Tensor:
+        """Return how badly each view, as read a step ago, predicted the newest pair, ``(N, V)``."""
+        acted = memory.acted(self._layout)
+        expected = self.effect(self._unpack(self._parts(features)), acted)
         if SILENT in self.views:
             silent = self.views.index(SILENT)
             expected[:, silent] = acted[:, silent]
-        miss = (expected - worth).square()
+        miss = (expected - memory.pairs.effective[:, -1:]).square()
         return (miss / (miss + TOLERATED**2)).mean(-1)
 
-    def foresee(self, features: Tensor, known: Reading, asked: Tensor) -> Tensor:
-        """Return what actions ``(*B, P, A)`` are expected to be worth, given what was seen."""
-        if not self.length_scale:
-            return self.effect(known.wide(), asked)
-        tried, worth, valid = self.pairs(features)
-        expected = self.effect(known.wide(), torch.cat([asked, tried], -2))
-        expected, was = expected.tensor_split([asked.shape[-2]], -2)
-        return expected + krige(asked, tried, worth - was, valid, self.length_scale)
+    def _parts(self, features: Tensor) -> Tensor:
+        """Return what was read in each view, ``(*B, V, P)``."""
+        return features.unflatten(-1, (len(self.views), -1))
+
+    def _unpack(self, packed: Tensor) -> Reading:
+        return Reading.unpack(packed, self.latent, self.shown, self.action_size)
 
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
         """Integrate the flow from every source point; return the best end, spread and reach."""
-        unit, known = self.normalise(planned), self.read(context.features)
+        with torch.inference_mode():
+            found = self._correct(context, self.normalise(planned))
+        return Correction(*(part.clone() for part in found))
+
+    def _correct(self, context: Context, unit: Tensor) -> tuple[Tensor, ...]:
+        believed = self._believed(context.evidence)[..., None, None]
+        known = self._unpack(self._parts(context.features).take_along_dim(believed, -2))
         ends = self._ends(known, unit)
-        mean, spread = ends.mean(-2).clamp(-1.0, 1.0), ends.std(-2, correction=0)
-        proposals = torch.cat([mean.unsqueeze(-2), ends.clamp(-1.0, 1.0)], -2)
-        asked = proposals, beside(mean), self.probes.expand(*unit.shape[:-1], -1, -1)
-        expected = self.foresee(context.features, known, torch.cat(asked, -2))
-        effects, around, found = expected.split([part.shape[-2] for part in asked], -2)
+        mean, spread = ends.mean(-2, keepdim=True), ends.std(-2, correction=0)
+        proposals = torch.cat([mean, ends], -2).clamp(-1.0, 1.0)
+        probes = self.probes.expand(*unit.shape[:-1], -1, -1)
+        expected = self.effect(known, torch.cat([proposals, probes], -2))
+        effects, found = expected.tensor_split([proposals.shape[-2]], -2)
         low, high = found.amin(-2), found.amax(-2)
         wanted = attainable(unit, low, high, self.saturation)
-        best = nearest_of(proposals, effects, wanted, 0.5 * (high - low))
-        if self.refine:
-            mean = newton_step(mean, effects[..., 0, :], around, wanted, self.refine)
-        unsure = spread.amax(-1, keepdim=True) > self.unsure
-        action = torch.where(unsure, best, mean)
+        best = nearest_of(effects, wanted, 0.5 * (high - low))
+        action, effect = (part.take_along_dim(best, -2).squeeze(-2) for part in (proposals, effects))
         reach = self.denormalise(torch.stack([low, high], -2))
-        return Correction(self.denormalise(action), spread * self.half_range, reach)
+        return self.denormalise(action), spread * self.half_range, reach, self.denormalise(effect)
 
     def _ends(self, known: Reading, unit: Tensor) -> Tensor:
         """Return where the flow leads from its source points, ``(*B, samples, A)``."""
         start = self.source(unit.unsqueeze(-2), self.source_points)
-        told = known.of_plan(unit, self.saturation).unsqueeze(-2).expand(*start.shape[:-1], -1)
-        told = told.flatten(end_dim=-2)
+        told = known.of_plan(unit.unsqueeze(-2), self.saturation)
+        told = told.expand(*start.shape[:-1], -1).flatten(end_dim=-2)
+        guesses = known.guesses(told)
 
         def velocity(tau: float, point: Tensor) -> Tensor:
-            time = torch.full_like(point[..., :1], tau)
-            return self.velocity(torch.cat([told, point, time], -1))
+            return self._velocity(told, guesses, torch.full_like(point[..., :1], tau), point)
 
         return midpoint(velocity, start.flatten(end_dim=-2), self.steps).view_as(start)

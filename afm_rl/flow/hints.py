@@ -21,6 +21,7 @@ from afm_rl.flow.saturation import LIMIT, saturate
 SHORT, LONG = 0.5, 0.9  # forgetting: trusts the newest rows, or all of them
 NEAR = 0.15  # half ranges: pairs so far from what is asked tell half as much as it does itself
 FITS = 4
+GUESSES = FITS + 1  # answers that may be right as they are
 ANSWERS, MISSES = FITS + 2, FITS  # hints per axis: what is answered, and how well the fits fit
 TINY = 1e-3  # half ranges: misses below are all the same
 
@@ -105,6 +106,17 @@ class Fits(NamedTuple):
         return [*gained, rubbed, affine]
 
 
+def shapes_of(rows: int, size: int) -> list[torch.Size]:
+    """Return the shapes of the parts of :class:`Fits`, for K ``rows`` and actions of a size.
+
+    >>> sum(shape.numel() for shape in shapes_of(12, 2))
+    82
+    """
+    one, pairs = (size,), (rows, size)
+    shapes = (2, size), one, one, (size, size), one, (FITS * size,), pairs, pairs, (rows, 1)
+    return [torch.Size(shape) for shape in shapes]
+
+
 def fit_window(executed: Tensor, effective: Tensor, valid: Tensor) -> Fits:
     """Fit a window.
 
@@ -127,11 +139,12 @@ def fit_window(executed: Tensor, effective: Tensor, valid: Tensor) -> Fits:
         effective,
         long.clamp_min(TINY**2).log(),
     )
-    # Fit by fit: products and sums over more dimensions, the last ones tiny, are slow.
-    weights, answers = (short, long, long, long), fits.wide()._expected(executed)
-    left = [
-        (weight * (effective - answer).square()).sum(-2) / weight.sum(-2).clamp_min(TINY)
-        for weight, answer in zip(weights, answers, strict=True)
-    ]
-    misses = (torch.cat(left, -1).clamp_min(0.0).sqrt() + TINY).log()
+    answers = torch.cat(fits.wide()._expected(executed), -1)
+    square = (effective.repeat(*[1] * (effective.dim() - 1), FITS) - answers).square()
+    share = torch.cat([short, long], -1)
+    share = share / share.sum(-2, keepdim=True).clamp_min(TINY)
+    early, late = (share.mT @ square).unbind(-2)
+    size = executed.shape[-1]
+    left = torch.cat([early[..., :size], late[..., size:]], -1)
+    misses = (left.clamp_min(0.0).sqrt() + TINY).log()
     return fits._replace(misses=misses.to(kind))

@@ -23,10 +23,6 @@ class Pairs(NamedTuple):
     valid: Tensor
     """Which count, ``(*B, M, 1)``, 0 or 1."""
 
-    def rows(self, first: int, last: int) -> Pairs:
-        """Return the pairs from ``first`` on and before ``last``."""
-        return Pairs(*(part[..., first:last, :] for part in self))
-
 
 def look(pairs: Pairs, layout: Layout, away: Tensor | None = None) -> Tensor:
     """Return what each view shows, as features ``(*B, V, K (2 A + 1))``.
@@ -77,27 +73,17 @@ class Memory(NamedTuple):
 
     pairs: Pairs
     """The pairs, ``(N, M, ...)``."""
-    away_before: Tensor
-    """Squared distance in place of each pair from where the robot was a step ago, ``(N, M)``."""
     away: Tensor
-    """From where it is now."""
+    """Squared distance in place of each pair from where the robot is now, ``(N, M)``."""
 
-    def before(self, layout: Layout) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what each view showed a step ago, and what it should have foreseen.
+    def shown(self, layout: Layout) -> Tensor:
+        """Return what each view shows, features ``(N, V, K (2 A + 1))``."""
+        return look(self.pairs, layout, self.away)
 
-        Features ``(N, V, K (2 A + 1))``, the actions that were about to act ``(N, V, A)`` and the
-        effect that there was ``(N, 1, A)``.
-        """
-        newest = self.pairs.valid.shape[-2] - 1
-        shown = look(self.pairs.rows(0, newest), layout, self.away_before[:, :-1])
+    def acted(self, layout: Layout) -> Tensor:
+        """Return the action that acted last, as each view has it, ``(N, V, A)``."""
         late = (layout.command - layout.effect)[:, 0, 0]
-        acted = self.pairs.executed[:, newest - late]
-        return shown, acted, self.pairs.effective[:, -1:]
-
-    def now(self, layout: Layout, chosen: Tensor) -> Tensor:
-        """Return what the ``chosen`` views ``(N,)`` show now, features ``(N, K (2 A + 1))``."""
-        own = Layout(*(part[chosen].unsqueeze(-3) for part in layout))
-        return look(self.pairs, own, self.away).squeeze(-2)
+        return self.pairs.executed[:, self.pairs.valid.shape[-2] - 1 - late]
 
 
 def recall(
@@ -114,9 +100,5 @@ def recall(
     """
     size = pairs.shape[-1] // 2 - 1
     seen = Pairs(*pairs[..., :-1].split([size, size, 1], -1))
-    there, here = state[..., place], next_state[:, -1:, place]
-    before, now = (
-        ((there - robot) / scale).square().sum(-1).nan_to_num(torch.inf)
-        for robot in (there[:, -1:], here)
-    )
-    return Memory(seen, before, now)
+    apart = (state[..., place] - next_state[:, -1:, place]) / scale
+    return Memory(seen, apart.square().sum(-1).nan_to_num(torch.inf))

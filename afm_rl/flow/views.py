@@ -86,8 +86,8 @@ def lay_out(views: Sequence[View], rows: int) -> Layout:
 
 
 def memory_of(views: Sequence[View], rows: int) -> int:
-    """Return how many pairs the views of K ``rows`` read at most, one step back."""
-    return 1 + max(max(rows * view.merge, rows + view.late) for view in views)
+    """Return how many pairs the views of K ``rows`` read at most."""
+    return max(max(rows * view.merge, rows + view.late) for view in views)
 
 
 def check_views(names: Sequence[str], by_place: bool) -> list[str]:

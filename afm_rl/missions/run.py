@@ -117,9 +117,12 @@ def _advance(agent: Agent, loop: Loop) -> None:
     """Take one step with every mission that runs, in place."""
     td, ids = agent.env.step(agent.planner(loop.td)), loop.ids
     error, surprise = _error(agent, td)
-    miss = error if agent.transform is None else _miss(agent, td)
+    miss = unforeseen = error
+    if agent.transform is not None:
+        expected = td["next", agent.transform.key("expected_action")]
+        miss, unforeseen = (_distance(agent, td, action) for action in (td["action"], expected))
     loss = agent.updater(td)["loss"]
-    loop.log.add(ids, loop.step, _row(agent, td, error, miss, surprise, loss))
+    loop.log.add(ids, loop.step, _row(agent, td, (error, miss, unforeseen), surprise, loss))
     done = td["next", "done"].squeeze(-1)
     loop.ends["steps"][ids] = loop.step
     agent.robot.judge.add(loop.ends, ids, td)
@@ -139,10 +142,10 @@ def _error(agent: Agent, td: TensorDictBase) -> tuple[Tensor, Tensor]:
     return error.norm(dim=-1), (error.abs() / noise).amax(-1)
 
 
-def _miss(agent: Agent, td: TensorDictBase) -> Tensor:
-    """Return how far the robot is from where the plan wanted it, ``(B,)``: judges the transform."""
-    intended, _ = agent.model.forecast(td["observation"], td["action"])
-    return agent.model.manifold.difference(td["next", "observation"], intended).norm(dim=-1)
+def _distance(agent: Agent, td: TensorDictBase, action: Tensor) -> Tensor:
+    """Return how far the robot is from where the model would have it after ``action``, ``(B,)``."""
+    there, _ = agent.model.forecast(td["observation"], action)
+    return agent.model.manifold.difference(td["next", "observation"], there).norm(dim=-1)
 
 
 def _columns(agent: Agent) -> list[str]:
@@ -154,6 +157,7 @@ def _columns(agent: Agent) -> list[str]:
         *(f"executed_{name}" for name in actions),
         "error",
         "miss",
+        "unforeseen",
         "misaligned",
         "loss",
         "regime_active",
@@ -161,11 +165,12 @@ def _columns(agent: Agent) -> list[str]:
     ]
 
 
-def _row(agent: Agent, td: TensorDictBase, error, miss, surprise, loss) -> Tensor:
+def _row(agent: Agent, td: TensorDictBase, errors, surprise, loss) -> Tensor:
     """Return one step's values ``(B, C)``, in the order of :func:`_columns`."""
     transform = agent.transform
     flag = surprise > SILENT if transform is None else td["next", transform.key("misaligned")]
-    scalars = torch.stack([x.float() for x in (error, miss, flag, loss, td["regime_active"])], -1)
+    scalars = (*errors, flag, loss, td["regime_active"])
+    scalars = torch.stack([x.float() for x in scalars], -1)
     score, executed = agent.robot.judge, td.get(agent.executed_key)
     parts = [td["observation"], score.goal(td), td["action"], executed, scalars, score.row(td)]
     return torch.cat(parts, -1)

@@ -12,7 +12,7 @@ from afm_rl.report.collect import Collection
 from afm_rl.report.recovery import recovery_times
 from afm_rl.report.results_files import read_steps
 
-COLUMNS = ["error", "miss", "loss", "regime_active", "reached", "x", "y"]
+COLUMNS = ["error", "miss", "unforeseen", "loss", "regime_active", "reached", "x", "y"]
 TRACES = ["mission", "t", "error", "loss", "regime_active"]
 POINTS = 240  # of each curve of progress
 

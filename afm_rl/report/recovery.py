@@ -11,16 +11,17 @@ from afm_rl.report.table import Table, number
 STAY = 20  # steps that the error must stay low
 QUANTILE, FACTOR = 0.95, 1.5  # of the errors before the first change: the nominal level
 FLOOR = 1e-4  # m, rad: below this every robot counts as well predicted
-MEASURES = {"miss": "motion", "error": "model"}  # columns of the steps, and what they judge
+MEASURES = {"miss": "motion", "unforeseen": "agent", "error": "model"}  # columns: what they judge
 NOTE = (
     f"Steps from a change of the regime until the one-step error has come under the "
     f"nominal level and stays there for {STAY} steps. The nominal level of a mission is {FACTOR} "
     f"times the {100 * QUANTILE:.0f}th percentile of its errors before the first change, at least "
     f"{FLOOR:g}. The median is over all changes, those never recovered from included as ∞; "
     f"changes with fewer than {STAY} steps to the next one or to the end cannot tell and are left "
-    "out. Two errors are judged: that of the motion, against what the plan intended, and that of "
-    "the model, against what it predicts of the action that was executed. A method that corrects "
-    "actions over a frozen model recovers its motion, and its model never."
+    "out. Three errors are judged: that of the motion, against what the plan intended, had or not; "
+    "that of the agent, against what it foresaw, model and correction together; and that of the "
+    "model alone, against what it predicts of the action that was executed. A method that corrects "
+    "actions over a frozen model foresees its motion again, and its model never does."
 )
 
 
@@ -32,7 +33,7 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
     is a mission that changes at once: it shows no nominal level.
 
     Args:
-        steps: one mission's steps, in order; without a column ``miss`` only models are judged.
+        steps: one mission's steps, in order; what has no column is not judged.
 
     >>> active, error = [0] * 30 + [1] * 50, [1e-3] * 30 + [1] * 7 + [1e-3] * 43
     >>> steps = pd.DataFrame({"regime_active": active, "error": error})

@@ -30,6 +30,8 @@ class ActionFlowTransform(Transform):
 
     * ``(prefix, "planned_action")`` and ``(prefix, "executed_action")``: the root action
       stays the planned one, so losses should read the executed one,
+    * ``(prefix, "expected_action")``: what the executed action is expected to be worth; where
+      nothing is corrected, itself,
     * ``(prefix, "misaligned")``: was the action corrected?
     * ``(prefix, "surprise")``: the misalignment, in the unit of the flow's gate,
     * ``(prefix, "spread")``: standard deviation of the flow's samples, per action,

@@ -57,11 +57,12 @@ def memory_spec(
         window=rows,
         pairs=real(window, flow.pair_size),
         evidence=real(flow.evidence_size),
-        features=real(flow.feature_size),
+        features=real(flow.context_size),
         surprise=real(),
         misaligned=flag(),
         planned_action=real(actions),
         executed_action=real(actions),
+        expected_action=real(actions),
         spread=real(actions),
         reach=real(2, actions),
         shape=batch,
@@ -104,13 +105,16 @@ def correct(
     with torch.no_grad():
         context = flow.context(window, model, last)
         use = context.misaligned & enabled
-        found = Correction(planned.clone(), torch.zeros_like(planned), box)
+        found = Correction(planned.clone(), torch.zeros_like(planned), box, planned.clone())
         if bool(use.any()):
             found = _corrected(found, use, context, memory.get("state"), model, flow, widen)
+    executed = found.action.clamp(*box.unbind(-2))
+    expected = torch.where(use.unsqueeze(-1), found.expected, executed)
     memory = memory.clone(recurse=False)
     memory.update(context._asdict())
     memory.set("planned_action", planned)
-    memory.set("executed_action", action_spec.project(found.action))
+    memory.set("executed_action", executed)
+    memory.set("expected_action", expected)
     memory.set("spread", found.spread)
     return memory.set("reach", found.reach)
 
@@ -146,17 +150,20 @@ def _corrected(
     widen: bool,
 ) -> Correction:
     """Put the flow's answers where ``use`` ``(*B)`` says so, in place."""
-    executed, spread, reach = found
+    executed, spread, reach, expected = found
     planned = executed[use]
     shown = Context(*(part[use] for part in context))
     answer = flow.correct(shown, state[use], planned)
     sound = answer.action.isfinite().all(-1, keepdim=True)
     executed[use] = torch.where(sound, answer.action, planned)
     spread[use] = torch.where(sound, answer.spread, 0.0)
+    if answer.expected is not None:
+        known = sound & answer.expected.isfinite().all(-1, keepdim=True)
+        expected[use] = torch.where(known, answer.expected, planned)
     if answer.reach is not None and reach is not None and widen and model.extrapolates:
         # Never a smaller box: what cannot be had the flow cuts, and it knows better.
-        known = sound.unsqueeze(-1) & answer.reach.isfinite()
-        low, high = torch.where(known, answer.reach, reach[use]).unbind(-2)
+        told = sound.unsqueeze(-1) & answer.reach.isfinite()
+        low, high = torch.where(told, answer.reach, reach[use]).unbind(-2)
         least, most = reach[use].unbind(-2)
         widened = [torch.minimum(least, low), torch.maximum(most, high)]
         reach[use] = torch.stack(widened, -2)

@@ -79,7 +79,7 @@ def predict(model, batch, **kind):
 def correct(flow, batch, **kind):
     rows = [draw(batch, flow.window, n, seed=n, **kind) for n in (3, 2, 2, 3)]
     window = Window(*rows, draw(batch, flow.window, **kind) >= 0)
-    sizes = (flow.window, flow.pair_size), (flow.evidence_size,), (flow.feature_size,)
+    sizes = (flow.window, flow.pair_size), (flow.evidence_size,), (flow.context_size,)
     silent = torch.zeros(batch, **kind)
     last = Context(*(draw(batch, *size, **kind) for size in sizes), silent, silent.bool())
     context = flow.context(window, Dubins().to(**kind), last)

@@ -50,12 +50,13 @@ def window_of(transitions):
 
 @pytest.fixture
 def told():
-    """Make the context of a misaligned model from its features alone."""
+    """Make the context of a misaligned model from features alone."""
 
-    def make(features):
-        size = features[..., 0]
-        none = features[..., :0]
-        return Context(none, none, features, torch.ones_like(size), torch.ones_like(size).bool())
+    def make(corrector, features):
+        if hasattr(corrector, "told"):
+            return corrector.told(features)
+        size, none = features[..., 0], features[..., :0]
+        return Context(none, none, features, size, size.bool())
 
     return make
 
@@ -95,7 +96,7 @@ def shown(told):
         count = torch.ones_like(executed[..., :1]) if valid is None else valid.unsqueeze(-1)
         pairs = [corrector.normalise(executed), corrector.normalise(effective)]
         rows = torch.cat([*pairs, torch.ones_like(executed[..., :1])], -1)
-        return told((rows * count).flatten(-2))
+        return told(corrector, (rows * count).flatten(-2))
 
     return make
 
@@ -107,7 +108,7 @@ def unknown():
     def make(corrector, *batch):
         pairs = torch.zeros(*batch, corrector.window, corrector.pair_size)
         evidence = torch.zeros(*batch, corrector.evidence_size)
-        features, silent = torch.zeros(*batch, corrector.feature_size), torch.zeros(batch)
+        features, silent = torch.zeros(*batch, corrector.context_size), torch.zeros(batch)
         return Context(pairs, evidence, features, silent, silent.bool())
 
     return make

@@ -82,12 +82,12 @@ def test_a_view_by_place_needs_places():
 
 @pytest.mark.parametrize("view", [*VIEWS.values(), View(share=1.0, merge=3), View(late=5)])
 def test_the_memory_is_as_long_as_views_look_back_and_no_longer(view):
-    count = memory_of([view], 3) - 1  # one step back
+    count = memory_of([view], 3)
     pairs = Pairs(*(part[:count] for part in PAIRS))
     look(pairs, lay_out([view], 3), torch.zeros(count))
     if not view.near and (view.late or view.merge > 1):
         with pytest.raises((RuntimeError, IndexError, ValueError)):
-            look(pairs.rows(1, count), lay_out([view], 3))
+            look(Pairs(*(part[1:] for part in pairs)), lay_out([view], 3))
 
 
 def test_batches_are_read_row_by_row():

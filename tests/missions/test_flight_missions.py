@@ -40,7 +40,7 @@ def test_the_columns(fly):
         *("mission", "t", *flown.agent.robot.state_names, "goal_x", "goal_y", "goal_z"),
         *(f"planned_{name}" for name in actions),
         *(f"executed_{name}" for name in actions),
-        *("error", "miss", "misaligned", "loss", "regime_active"),
+        *("error", "miss", "unforeseen", "misaligned", "loss", "regime_active"),
         *("square_error_x", "square_error_y", "square_error_z", "phase"),
     ]
     assert flown.missions["track"].tolist() == list(flown.agent.robot.tracks)
@@ -202,7 +202,7 @@ def test_flows_use_examples_as_often_as_the_robot_says(make_agent, monkeypatch):
     assert used == [32, 3]
 
 
-@pytest.mark.parametrize(("robot", "views", "steps"), [("quadrotor", 4, 4000), ("ugv", 10, 14000)])
+@pytest.mark.parametrize(("robot", "views", "steps"), [("quadrotor", 4, 4000), ("ugv", 10, 12000)])
 def test_robots_say_how_flows_are_made_for_them(composed, robot, views, steps):
     flow = composed(f"robot={robot}", "method=afm_physics").flow
     assert len(flow.views) == views and flow.train.iterations == steps
