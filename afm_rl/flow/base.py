@@ -56,6 +56,15 @@ class Correction(NamedTuple):
     """What the action is expected to be worth, ``(*B, A)``; None: what was planned."""
 
 
+def rows_of(mask: Tensor) -> Any:
+    """Return an index of the missions of a mask ``(*B)``: of all of them one that copies nothing.
+
+    >>> rows_of(torch.tensor([True, True])), rows_of(torch.tensor([True, False]))
+    (Ellipsis, tensor([ True, False]))
+    """
+    return ... if bool(mask.all()) else mask
+
+
 class Corrector(nn.Module, ABC):
     """Turns planned actions into executed ones, given what the window shows.
 

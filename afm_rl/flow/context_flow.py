@@ -9,7 +9,7 @@ from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_counts, check_number
-from afm_rl.flow.base import Context, Correction, Examples, Flow, Window
+from afm_rl.flow.base import Context, Correction, Examples, Flow, Window, rows_of
 from afm_rl.flow.counterfactuals import anywhere, draw_plans, imagine_windows
 from afm_rl.flow.hints import GUESSES, fit_window, shapes_of
 from afm_rl.flow.network import blend, mlp
@@ -23,6 +23,7 @@ from afm_rl.flow.views import SILENT, VIEWS, Layout, check_views, lay_out, memor
 from afm_rl.regimes import Regime
 
 SOON = 0.1  # of the way left: nobody need be there sooner
+CHOICES = ("best", "mean")
 TOLERATED = 0.25  # half ranges: a prediction that misses by so much does half as badly as can be
 
 
@@ -45,8 +46,8 @@ class ContextFlow(PairCorrector, Flow):
       (:mod:`~afm_rl.flow.views`); the one whose predictions did best of late is believed:
       :math:`E_v \leftarrow \lambda E_v + \rho(\hat T_v(u) - u_\mathrm{eff})`,
       :math:`\rho(x) = x^2 / (x^2 + 0.25^2)`.
-    * Which sample is best? The one whose expected effect comes nearest to what can be had of the
-      plan; or their mean.
+    * Which sample is best? Their mean may mean nothing where they disagree. The one is executed,
+      or the mean, whose expected effect comes nearest to what can be had of the plan.
     * What can be had at all? The reach of effects, for planners that want to know.
 
     Least-squares fits of the window are told to both networks, which answer with a mixture of them
@@ -70,6 +71,7 @@ class ContextFlow(PairCorrector, Flow):
         samples: source points; even.
         source_std: :math:`\sigma`, in half ranges.
         steps: midpoint steps.
+        choose: the ``"best"`` sample by its expected effect, or always their ``"mean"``.
         hidden: units of the hidden layers of all three networks.
         latent: size of the encoded context.
         saturation: what gives way when the planned action cannot be had in full, see
@@ -100,6 +102,7 @@ class ContextFlow(PairCorrector, Flow):
         samples: int = 16,
         source_std: float = 0.3,
         steps: int = 1,
+        choose: str = "best",
         hidden: Sequence[int] = (128, 128),
         latent: int = 64,
         saturation: str = "mixed",
@@ -114,6 +117,7 @@ class ContextFlow(PairCorrector, Flow):
         self.samples = check_count("flow.samples", samples)
         self.source_std = check_number("flow.source_std", source_std, low=0.0)
         self.steps = check_count("flow.steps", steps)
+        self.choose = check_choice("flow.choose", choose, CHOICES)
         self.saturation = check_choice("flow.saturation", saturation, MODES)
         ways = [VIEWS[name] for name in self.views]
         if memory < memory_of(ways, window):
@@ -240,13 +244,14 @@ class ContextFlow(PairCorrector, Flow):
         features = pairs.new_zeros(*shape, self.context_size)
         if not bool(surprised.any()):  # nothing to explain
             return Context(pairs, evidence, features, surprise, surprised)
-        states = window.state[surprised], window.next_state[surprised]
-        memory = recall(pairs[surprised], *states, self.place, self.place_scale)
+        these = rows_of(surprised)
+        states = window.state[these], window.next_state[these]
+        memory = recall(pairs[these], *states, self.place, self.place_scale)
         if last is not None:
-            ready = last.surprise[surprised] > self.gate  # was anything foreseen?
-            counts = memory.pairs.valid[:, -1] * ready.unsqueeze(-1)
-            evidence[surprised] += counts * self._misses(memory, last.features[surprised])
-        features[surprised] = self._described(memory)
+            ready = last.surprise[these] > self.gate  # was anything foreseen?
+            counts = memory.pairs.valid[..., -1, :] * ready.unsqueeze(-1)
+            evidence[these] += counts * self._misses(memory, last.features[these])
+        features[these] = self._described(memory)
         misaligned = surprised.clone()
         if SILENT in self.views:
             misaligned &= self._believed(evidence) != self.views.index(SILENT)
@@ -270,18 +275,18 @@ class ContextFlow(PairCorrector, Flow):
 
     @torch.inference_mode()
     def _described(self, memory: Memory) -> Tensor:
-        """Return what is read in each view, ``(N, V P)``."""
+        """Return what is read in each view, ``(*B, V P)``."""
         return self.read(memory.shown(self._layout)).pack().flatten(-2)
 
     @torch.inference_mode()
     def _misses(self, memory: Memory, features: Tensor) -> Tensor:
-        """Return how badly each view, as read a step ago, predicted the newest pair, ``(N, V)``."""
+        """Return how badly each view, as read a step ago, predicted the newest pair, ``(*B, V)``."""
         acted = memory.acted(self._layout)
         expected = self.effect(self._unpack(self._parts(features)), acted)
         if SILENT in self.views:
             silent = self.views.index(SILENT)
-            expected[:, silent] = acted[:, silent]
-        miss = (expected - memory.pairs.effective[:, -1:]).square()
+            expected[..., silent, :] = acted[..., silent, :]
+        miss = (expected - memory.pairs.effective[..., -1:, :]).square()
         return (miss / (miss + TOLERATED**2)).mean(-1)
 
     def _parts(self, features: Tensor) -> Tensor:
@@ -302,7 +307,8 @@ class ContextFlow(PairCorrector, Flow):
         known = self._unpack(self._parts(context.features).take_along_dim(believed, -2))
         ends = self._ends(known, unit)
         mean, spread = ends.mean(-2, keepdim=True), ends.std(-2, correction=0)
-        proposals = torch.cat([mean, ends], -2).clamp(-1.0, 1.0)
+        proposals = mean if self.choose == "mean" else torch.cat([mean, ends], -2)
+        proposals = proposals.clamp(-1.0, 1.0)
         probes = self.probes.expand(*unit.shape[:-1], -1, -1)
         expected = self.effect(known, torch.cat([proposals, probes], -2))
         effects, found = expected.tensor_split([proposals.shape[-2]], -2)

@@ -72,7 +72,7 @@ class Fits(NamedTuple):
         What each fit would execute, saturated; the action tried whose effect came nearest to the
         plan, and that effect.
         """
-        unit = planned.double()
+        unit = planned.to(self.rub)
         rubbed = invert_friction(self.rub, self.friction, unit)
         affine = invert_affine(self.matrix, self.bias, unit)
         exact = torch.cat([unit.unsqueeze(-2) / self.gains, torch.stack([rubbed, affine], -2)], -2)
@@ -86,10 +86,10 @@ class Fits(NamedTuple):
         What each fit expects it to be worth; what the actions nearest to it were worth, and how
         near they are.
         """
-        unit = executed.double()
+        unit = executed.to(self.rub)
         likeness = self._likeness(self.executed, unit)
         worth = (likeness.softmax(-2) * self.effective).sum(-2)
-        nearness = likeness.logsumexp(-2).exp().clamp_max(1.0)
+        nearness = likeness.exp().sum(-2).clamp_max(1.0)
         answers = [*self._expected(unit), worth, nearness]
         return torch.cat(answers, -1).clamp(-LIMIT, LIMIT).to(executed)
 

@@ -31,7 +31,7 @@ class Reading(NamedTuple):
         """Return what was packed, for K ``rows`` and actions of a size."""
         code, fits = packed.tensor_split([latent], -1)
         shapes = shapes_of(rows, size)
-        parts = fits.double().split([shape.numel() for shape in shapes], -1)
+        parts = fits.split([shape.numel() for shape in shapes], -1)
         pairs = zip(parts, shapes, strict=True)
         return cls(code, Fits(*(part.unflatten(-1, shape) for part, shape in pairs)))
 

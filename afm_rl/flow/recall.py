@@ -69,36 +69,36 @@ def _nearest(valid: Tensor, away: Tensor | None, rows: int) -> Tensor:
 
 
 class Memory(NamedTuple):
-    """What N robots remember, and how far from it they are."""
+    """What robots remember, and how far from it they are."""
 
     pairs: Pairs
-    """The pairs, ``(N, M, ...)``."""
+    """The pairs, ``(*B, M, ...)``."""
     away: Tensor
-    """Squared distance in place of each pair from where the robot is now, ``(N, M)``."""
+    """Squared distance in place of each pair from where the robot is now, ``(*B, M)``."""
 
     def shown(self, layout: Layout) -> Tensor:
-        """Return what each view shows, features ``(N, V, K (2 A + 1))``."""
+        """Return what each view shows, features ``(*B, V, K (2 A + 1))``."""
         return look(self.pairs, layout, self.away)
 
     def acted(self, layout: Layout) -> Tensor:
-        """Return the action that acted last, as each view has it, ``(N, V, A)``."""
+        """Return the action that acted last, as each view has it, ``(*B, V, A)``."""
         late = (layout.command - layout.effect)[:, 0, 0]
-        return self.pairs.executed[:, self.pairs.valid.shape[-2] - 1 - late]
+        return self.pairs.executed[..., self.pairs.valid.shape[-2] - 1 - late, :]
 
 
 def recall(
     pairs: Tensor, state: Tensor, next_state: Tensor, place: Sequence[int], scale: float
 ) -> Memory:
-    """Return what N robots remember.
+    """Return what robots remember.
 
     Args:
-        pairs: executed, effective, valid, surprise, ``(N, M, 2 A + 2)``, oldest first.
-        state: where they acted, ``(N, M, S)``.
-        next_state: where they came to, ``(N, M, S)``.
+        pairs: executed, effective, valid, surprise, ``(*B, M, 2 A + 2)``, oldest first.
+        state: where they acted, ``(*B, M, S)``.
+        next_state: where they came to, ``(*B, M, S)``.
         place: coordinates of the state that make a place.
         scale: distance at which one is another.
     """
     size = pairs.shape[-1] // 2 - 1
     seen = Pairs(*pairs[..., :-1].split([size, size, 1], -1))
-    apart = (state[..., place] - next_state[:, -1:, place]) / scale
+    apart = (state[..., place] - next_state[..., -1:, place]) / scale
     return Memory(seen, apart.square().sum(-1).nan_to_num(torch.inf))

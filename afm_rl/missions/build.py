@@ -37,7 +37,7 @@ NOMINAL = {"_target_": "afm_rl.missions.parts.physics", "_partial_": True}
 AFTER_TRAINING = (
     *("gate", "samples", "steps", "error_action", "wrap", "latch", "checkpoint"),
     *("propagation", "precision"),
-    *("memory", "views", "forgetting"),
+    *("memory", "views", "forgetting", "choose"),
 )
 
 

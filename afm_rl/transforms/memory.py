@@ -10,6 +10,7 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.flow import Context, Correction, Corrector, Window
+from afm_rl.flow.base import rows_of
 
 
 def check_parts(
@@ -151,7 +152,8 @@ def _corrected(
 ) -> Correction:
     """Put the flow's answers where ``use`` ``(*B)`` says so, in place."""
     executed, spread, reach, expected = found
-    planned = executed[use]
+    use = rows_of(use)
+    planned = executed[use].clone()
     shown = Context(*(part[use] for part in context))
     answer = flow.correct(shown, state[use], planned)
     sound = answer.action.isfinite().all(-1, keepdim=True)

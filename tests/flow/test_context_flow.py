@@ -237,6 +237,7 @@ def test_many_actions_are_no_trouble():
         {"gate": -1.0},
         {"gate": math.nan},
         {"samples": 0},
+        {"choose": "worst"},
         {"source_std": -0.1},
         {"steps": 0},
         {"saturation": "fold"},

@@ -55,10 +55,13 @@ def test_missions_without_times_may_come_first():
     assert recovery_table(joined).numbers["median"].tolist() == [5]
 
 
-def test_motion_is_judged_where_it_was_logged():
+def test_motion_and_agent_are_judged_where_they_were_logged():
     steps = mission((0, LOW, 50), (1, HIGH, 50)).assign(miss=LOW)
     found = recovery_times(steps).set_index("of")["time"].to_dict()
     assert found == {"motion": 0, "model": np.inf}
+    steps["unforeseen"] = np.where(np.arange(100) < 57, steps["error"], LOW)
+    found = recovery_times(steps).set_index("of")["time"].to_dict()
+    assert found == {"motion": 0, "agent": 7, "model": np.inf}
     assert recovery_times(steps.assign(miss=np.nan))["of"].tolist() == ["model"]
 
 

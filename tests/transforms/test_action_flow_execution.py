@@ -25,9 +25,9 @@ class Stub(Corrector):
 
     feature_size = 1
 
-    def __init__(self, answer, window=2):
+    def __init__(self, answer, window=2, foresee=None):
         super().__init__(LOW, HIGH, gate=0.0, window=window)
-        self.answer, self.asked = answer, []
+        self.answer, self.foresee, self.asked = answer, foresee, []
 
     def context(self, window, model, last):
         size = window.valid.sum(-1).to(window.state)
@@ -37,7 +37,9 @@ class Stub(Corrector):
 
     def correct(self, context, state, planned):
         self.asked.append((context, state, planned))
-        return Correction(self.answer(planned), torch.full_like(planned, 0.1))
+        expected = None if self.foresee is None else self.foresee(planned)
+        spread = torch.full_like(planned, 0.1)
+        return Correction(self.answer(planned), spread, expected=expected)
 
 
 class Blind(Transform):
@@ -75,6 +77,27 @@ def test_the_plan_stays_and_its_correction_is_executed():
     assert torch.equal(memory["misaligned"], (factor < 0).squeeze(-1).expand(4, 6))
     spread = 0.1 * (factor < 0).expand(4, 6, 2)
     torch.testing.assert_close(memory["spread"], spread)
+
+
+def half_foreseen(planned):
+    foreseen = 0.25 * planned
+    foreseen[0] = math.nan
+    return foreseen
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+@pytest.mark.parametrize("foresee", [None, half_foreseen])
+def test_what_is_expected_of_an_action_is_told(enabled, foresee):
+    """An aligned model expects what is executed; who says nothing, or no number, what is planned."""
+    chain = ActionFlowTransform(Dubins(), Stub(torch.neg, foresee=foresee), enabled=enabled)
+    data = TransformedEnv(UGVTrack(batch_size=(4,)), chain).rollout(4)
+    memory, planned = data["next", "afm"], data["action"]
+    wanted = memory["executed_action"].clone()
+    if enabled:
+        wanted[:, 1:] = planned[:, 1:]
+        if foresee is not None:
+            wanted[1:, 1:] = 0.25 * planned[1:, 1:]
+    torch.testing.assert_close(memory["expected_action"], wanted)
 
 
 def test_the_action_given_is_not_overwritten():
