@@ -62,7 +62,8 @@ def test_motion_and_agent_are_judged_where_they_were_logged():
     steps["unforeseen"] = np.where(np.arange(100) < 57, steps["error"], LOW)
     found = recovery_times(steps).set_index("of")["time"].to_dict()
     assert found == {"motion": 0, "agent": 7, "model": np.inf}
-    assert recovery_times(steps.assign(miss=np.nan))["of"].tolist() == ["model"]
+    blind = steps.assign(miss=np.nan, unforeseen=np.nan)
+    assert recovery_times(blind)["of"].tolist() == ["model"]
 
 
 @pytest.mark.parametrize(("factor", "time"), [(1.4, 0), (1.6, np.inf)])
