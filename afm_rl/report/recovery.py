@@ -13,10 +13,10 @@ QUANTILE, FACTOR = 0.95, 1.5  # of the errors before the first change: the nomin
 FLOOR = 1e-4  # m, rad: below this every robot counts as well predicted
 MEASURES = {"miss": "motion", "unforeseen": "agent", "error": "model"}  # columns: what they judge
 NOTE = (
-    f"Steps from a change of the regime until the one-step error has come under the "
-    f"nominal level and stays there for {STAY} steps. The nominal level of a mission is {FACTOR} "
+    f"Steps from a change of the regime until the one-step error is back under the nominal level "
+    f"for the first time, and until it stays there for {STAY} steps. The nominal level of a mission is {FACTOR} "
     f"times the {100 * QUANTILE:.0f}th percentile of its errors before the first change, at least "
-    f"{FLOOR:g}. The median is over all changes, those never recovered from included as ∞; "
+    f"{FLOOR:g}. Medians are over all changes, those never recovered from included as ∞; "
     f"changes with fewer than {STAY} steps to the next one or to the end cannot tell and are left "
     "out. Three errors are judged: that of the motion, against what the plan intended, had or not; "
     "that of the agent, against what it foresaw, model and correction together; and that of the "
@@ -26,10 +26,10 @@ NOTE = (
 
 
 def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
-    """Return one row per change and measure: ``of``, ``change`` (from 1) and ``time`` (steps).
+    """Return one row per change and measure: ``of``, ``change`` (from 1), ``first``, ``time``.
 
-    ``time`` is 0 where the error never left the nominal level, inf where it stays above it
-    until the next change or the end. Changes that are too near to those are left out, and so
+    ``first`` and ``time`` are steps until the error is under the nominal level and until it stays
+    there: 0 where it never left, inf where it does not happen until the next change or the end. Changes that are too near to those are left out, and so
     is a mission that changes at once: it shows no nominal level.
 
     Args:
@@ -38,7 +38,7 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
     >>> active, error = [0] * 30 + [1] * 50, [1e-3] * 30 + [1] * 7 + [1e-3] * 43
     >>> steps = pd.DataFrame({"regime_active": active, "error": error})
     >>> recovery_times(steps).to_dict("records")
-    [{'of': 'model', 'change': 1, 'time': 7.0}]
+    [{'of': 'model', 'change': 1, 'first': 7.0, 'time': 7.0}]
     """
     active = steps["regime_active"].to_numpy()
     changes = np.flatnonzero(np.diff(active)) + 1
@@ -46,20 +46,27 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
     for column, of in MEASURES.items():
         if len(changes) and column in steps and steps[column].notna().all():
             times = _times(steps[column].to_numpy(dtype=float), changes)
-            rows += [{"of": of, "change": change, "time": time} for change, time in times]
-    table = pd.DataFrame(rows, columns=["of", "change", "time"])
-    return table.astype({"change": int, "time": float})  # also without rows: tables are joined
+            rows += [(of, *row) for row in times]
+    table = pd.DataFrame(rows, columns=["of", "change", "first", "time"])
+    kinds = {"change": int, "first": float, "time": float}
+    return table.astype(kinds)  # also without rows: tables are joined
 
 
-def _times(error: np.ndarray, changes: np.ndarray) -> list[tuple[int, float]]:
-    """Return changes, from 1, and their recovery times; ``changes`` are places in ``error``."""
+def _times(error: np.ndarray, changes: np.ndarray) -> list[tuple[int, float, float]]:
+    """Return changes, from 1, and their two times; ``changes`` are places in ``error``."""
     level = max(FLOOR, FACTOR * float(np.quantile(error[: changes[0]], QUANTILE)))
     times = []
     for count, (start, end) in enumerate(zip(changes, [*changes[1:], len(error)], strict=True)):
         if end - start >= STAY:
-            low = sliding_window_view(error[start:end] <= level, STAY).all(-1)
-            times.append((count + 1, float(low.argmax()) if low.any() else np.inf))
+            low = error[start:end] <= level
+            stays = sliding_window_view(low, STAY).all(-1)
+            times.append((count + 1, _first(low), _first(stays)))
     return times
+
+
+def _first(flags: np.ndarray) -> float:
+    """Return the place of the first flag that is set, or infinity."""
+    return float(flags.argmax()) if flags.any() else np.inf
 
 
 def recovery_table(times: pd.DataFrame) -> Table:
@@ -77,6 +84,7 @@ def recovery_table(times: pd.DataFrame) -> Table:
                 "of": of,
                 "change": change,
                 "changes": len(group),
+                "first": float(group["first"].quantile(0.5, interpolation="lower")),
                 "never": float(np.isinf(group["time"]).mean()),
                 "median": float(quartiles[0.5]),
                 "lower_quartile": float(quartiles[0.25]),
@@ -90,11 +98,12 @@ def recovery_table(times: pd.DataFrame) -> Table:
             "of the": numbers["of"],
             "change": numbers["change"].astype(str),
             "changes seen": numbers["changes"].astype(str),
-            "never recovered %": [number(100 * share) for share in numbers["never"]],
-            "median steps": numbers["median"].map(number),
+            "first, median steps": numbers["first"].map(number),
+            "to stay, median steps": numbers["median"].map(number),
             "quartiles": numbers["lower_quartile"].map(number)
             + " to "
             + numbers["upper_quartile"].map(number),
+            "never %": [number(100 * share) for share in numbers["never"]],
         }
     )
     return Table("recovery", "Recovery after each change of the regime", NOTE, numbers, shown)
