@@ -155,13 +155,18 @@ class LeastSquares(PairCorrector):
         self.saturation = check_choice("flow.saturation", saturation, MODES)
 
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
-        """Invert the fit; the spread is zero."""
+        """Invert the fit, which also tells the effect; the spread is zero."""
         unit = self.normalise(planned)
         executed, effective, valid = self.pairs(context.features)
         pairs = executed, effective, weigh(valid, self.forgetting)
         if self.form == "gain":
-            wanted = unit / fit_gain(*pairs)
+            gain = fit_gain(*pairs)
+            found = saturate(unit / gain, self.saturation)
+            expected = gain * found
         else:
-            wanted = invert_affine(*fit_affine(*pairs), unit)
-        action = self.denormalise(saturate(wanted, self.saturation))
-        return Correction(action, torch.zeros_like(action))
+            matrix, bias = fit_affine(*pairs)
+            found = saturate(invert_affine(matrix, bias, unit), self.saturation)
+            expected = (matrix @ found.unsqueeze(-1)).squeeze(-1) + bias
+        action = self.denormalise(found)
+        nothing = torch.zeros_like(action)
+        return Correction(action, nothing, expected=self.denormalise(expected))

@@ -68,6 +68,8 @@ def test_the_corrected_action_has_the_planned_effect(unknown, form):
     corrected = corrector.correct(context, state[:, 0], planned)
     assert torch.allclose(gains * corrected.action, planned, atol=0.02)
     assert not corrected.spread.any() and corrected.reach is None
+    far = corrector.correct(context, state[:, 0], HIGH.expand(5, 2))  # cannot be had
+    torch.testing.assert_close(far.expected, gains * far.action, rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize("form", ["gain", "affine"])
