@@ -178,7 +178,7 @@ class Flow(Corrector):
         return features
 
     def told(self, features: Tensor) -> Context:
-        """Return the context ``(*B)`` of a model that is off, in which features are all there is."""
+        """Return the context ``(*B)`` of a model that is off, of which features tell all."""
         nothing, size = features[..., :0], features[..., 0]
         return Context(nothing, nothing, features, size, size.bool())
 

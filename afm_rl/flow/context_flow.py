@@ -280,7 +280,7 @@ class ContextFlow(PairCorrector, Flow):
 
     @torch.inference_mode()
     def _misses(self, memory: Memory, features: Tensor) -> Tensor:
-        """Return how badly each view, as read a step ago, predicted the newest pair, ``(*B, V)``."""
+        """Return how badly each view foresaw the newest pair a step ago, ``(*B, V)``."""
         acted = memory.acted(self._layout)
         expected = self.effect(self._unpack(self._parts(features)), acted)
         if SILENT in self.views:
@@ -315,7 +315,9 @@ class ContextFlow(PairCorrector, Flow):
         low, high = found.amin(-2), found.amax(-2)
         wanted = attainable(unit, low, high, self.saturation)
         best = nearest_of(effects, wanted, 0.5 * (high - low))
-        action, effect = (part.take_along_dim(best, -2).squeeze(-2) for part in (proposals, effects))
+        action, effect = (
+            part.take_along_dim(best, -2).squeeze(-2) for part in (proposals, effects)
+        )
         reach = self.denormalise(torch.stack([low, high], -2))
         return self.denormalise(action), spread * self.half_range, reach, self.denormalise(effect)
 

@@ -169,8 +169,8 @@ def _row(agent: Agent, td: TensorDictBase, errors, surprise, loss) -> Tensor:
     """Return one step's values ``(B, C)``, in the order of :func:`_columns`."""
     transform = agent.transform
     flag = surprise > SILENT if transform is None else td["next", transform.key("misaligned")]
-    scalars = (*errors, flag, loss, td["regime_active"])
-    scalars = torch.stack([x.float() for x in scalars], -1)
+    figures = (*errors, flag, loss, td["regime_active"])
+    scalars = torch.stack([x.float() for x in figures], -1)
     score, executed = agent.robot.judge, td.get(agent.executed_key)
     parts = [td["observation"], score.goal(td), td["action"], executed, scalars, score.row(td)]
     return torch.cat(parts, -1)

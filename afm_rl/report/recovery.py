@@ -5,17 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike
 
 from afm_rl.report.table import Table, number
 
 STAY = 20  # steps that the error must stay low
 QUANTILE, FACTOR = 0.95, 1.5  # of the errors before the first change: the nominal level
 FLOOR = 1e-4  # m, rad: below this every robot counts as well predicted
-MEASURES = {"miss": "motion", "unforeseen": "agent", "error": "model"}  # columns: what they judge
+MEASURES = {"miss": "motion", "unforeseen": "agent", "error": "model"}  # columns, judged
 NOTE = (
-    f"Steps from a change of the regime until the one-step error is back under the nominal level "
-    f"for the first time, and until it stays there for {STAY} steps. The nominal level of a mission is {FACTOR} "
-    f"times the {100 * QUANTILE:.0f}th percentile of its errors before the first change, at least "
+    "Steps from a change of the regime until the one-step error is back under the nominal level "
+    f"for the first time, and until it stays there for {STAY} steps. The nominal level of a "
+    f"mission is {FACTOR} times the {100 * QUANTILE:.0f}th percentile of its errors before the "
+    f"first change, at least "
     f"{FLOOR:g}. Medians are over all changes, those never recovered from included as ∞; "
     f"changes with fewer than {STAY} steps to the next one or to the end cannot tell and are left "
     "out. Three errors are judged: that of the motion, against what the plan intended, had or not; "
@@ -29,8 +31,9 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
     """Return one row per change and measure: ``of``, ``change`` (from 1), ``first``, ``time``.
 
     ``first`` and ``time`` are steps until the error is under the nominal level and until it stays
-    there: 0 where it never left, inf where it does not happen until the next change or the end. Changes that are too near to those are left out, and so
-    is a mission that changes at once: it shows no nominal level.
+    there: 0 where it never left, inf where it does not happen until the next change or the end.
+    Changes that are too near to those are left out, and so is a mission that changes at once: it
+    shows no nominal level.
 
     Args:
         steps: one mission's steps, in order; what has no column is not judged.
@@ -64,9 +67,10 @@ def _times(error: np.ndarray, changes: np.ndarray) -> list[tuple[int, float, flo
     return times
 
 
-def _first(flags: np.ndarray) -> float:
+def _first(flags: ArrayLike) -> float:
     """Return the place of the first flag that is set, or infinity."""
-    return float(flags.argmax()) if flags.any() else np.inf
+    places = np.flatnonzero(flags)
+    return float(places[0]) if len(places) else np.inf
 
 
 def recovery_table(times: pd.DataFrame) -> Table:

@@ -106,11 +106,13 @@ def correct(
     with torch.no_grad():
         context = flow.context(window, model, last)
         use = context.misaligned & enabled
-        found = Correction(planned.clone(), torch.zeros_like(planned), box, planned.clone())
+        expected = planned.clone()
+        found = Correction(planned.clone(), torch.zeros_like(planned), box, expected)
         if bool(use.any()):
-            found = _corrected(found, use, context, memory.get("state"), model, flow, widen)
+            state = memory.get("state")
+            found = _corrected(found, expected, use, context, state, model, flow, widen)
     executed = found.action.clamp(*box.unbind(-2))
-    expected = torch.where(use.unsqueeze(-1), found.expected, executed)
+    expected = torch.where(use.unsqueeze(-1), expected, executed)
     memory = memory.clone(recurse=False)
     memory.update(context._asdict())
     memory.set("planned_action", planned)
@@ -143,6 +145,7 @@ def box_of(action_spec: TensorSpec, like: Tensor) -> Tensor:
 
 def _corrected(
     found: Correction,
+    expected: Tensor,
     use: Tensor,
     context: Context,
     state: Tensor,
@@ -151,7 +154,7 @@ def _corrected(
     widen: bool,
 ) -> Correction:
     """Put the flow's answers where ``use`` ``(*B)`` says so, in place."""
-    executed, spread, reach, expected = found
+    executed, spread, reach, _ = found
     use = rows_of(use)
     planned = executed[use].clone()
     shown = Context(*(part[use] for part in context))

@@ -87,7 +87,13 @@ BY_TIME = [name for name, view in VIEWS.items() if not view.near]
 def test_the_view_made_for_a_regime_is_believed(
     fitted, live, regime, view, among, steps, forgetting
 ):
-    settings = {"window": 6, "memory": 13, "place": [0], "place_scale": 0.1, "forgetting": forgetting}
+    settings = {
+        "window": 6,
+        "memory": 13,
+        "place": [0],
+        "place_scale": 0.1,
+        "forgetting": forgetting,
+    }
     flow, steady = fitted(views=among, **settings), regime is turned_and_noisy
     found = live(flow, *drive(regime, steps=steps[1], steady=steady))[steps[0] :]
     share = shares(flow, found)

@@ -61,7 +61,9 @@ def test_the_reach_is_what_actions_in_the_box_are_worth(
 
 def test_the_reach_is_learnt(trained_flow, context_under):
     for gain, least, most in ((2.0, 1.5, 2.5), (0.5, 0.25, 0.8)):
-        found = trained_flow.correct(context_under(trained_flow, lambda u, g=gain: g * u), None, torch.zeros(2))
+        found = trained_flow.correct(
+            context_under(trained_flow, lambda u, g=gain: g * u), None, torch.zeros(2)
+        )
         size = (found.reach / trained_flow.half_range).abs()
         assert (size > least).all() and (size < most).all()
 

@@ -88,7 +88,7 @@ def half_foreseen(planned):
 @pytest.mark.parametrize("enabled", [True, False])
 @pytest.mark.parametrize("foresee", [None, half_foreseen])
 def test_what_is_expected_of_an_action_is_told(enabled, foresee):
-    """An aligned model expects what is executed; who says nothing, or no number, what is planned."""
+    """Of an aligned model what is executed; of who says nothing, or no number, what is planned."""
     chain = ActionFlowTransform(Dubins(), Stub(torch.neg, foresee=foresee), enabled=enabled)
     data = TransformedEnv(UGVTrack(batch_size=(4,)), chain).rollout(4)
     memory, planned = data["next", "afm"], data["action"]
