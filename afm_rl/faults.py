@@ -1,0 +1,117 @@
+"""Faulty readings and unsafe actions: pure functions for transforms, updaters and loops.
+
+A reading is *whole* if all its numbers are finite and of a possible size. It is *stale* if the
+sensor has sent the previous reading again. Whoever keeps transitions keeps the number of
+repetitions beside the state and asks for both ends of a transition::
+
+    after = count_repeats(next_state, state, count)
+    valid = trusted(state, count) & trusted(next_state, after)
+
+Both ends count: the first fresh reading after a stale one seems to be a jump.
+
+How a stale sensor and a robot that stands still are told apart:
+
+* With a time stamp: the reading is stale if and only if the stamp stands still.
+* Without one: real sensors and noisy simulators never send the same bits twice, so a reading
+  that is bit-equal in all coordinates counts as stale. A robot that does not move in a
+  simulator without noise looks the same. Therefore only the first ``patience`` repetitions in a
+  row count as stale; after that the reading is taken for true, and its transitions say that the
+  actuators are dead. Until then nothing wrong is learned, only less. Where noise is certain, use
+  ``patience=math.inf``.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+ABSURD = 1e12  # in any unit: a reading beyond it is a fault, also where an angle would wrap it
+PATIENCE = 20  # repetitions in a row that count as a stale sensor
+
+
+def whole(reading: Tensor) -> Tensor:
+    """Return whether readings ``(*B, S)`` are finite and of a possible size, ``(*B)``.
+
+    >>> whole(torch.tensor([[1.0, 2.0], [1.0, torch.nan], [1e30, 0.0]]))
+    tensor([ True, False, False])
+    """
+    return (reading.abs() < ABSURD).all(-1)  # false for NaN
+
+
+def count_repeats(
+    reading: Tensor,
+    last: Tensor,
+    count: Tensor,
+    stamp: Tensor | None = None,
+    last_stamp: Tensor | None = None,
+) -> Tensor:
+    """Return how many times in a row the sensor has sent this reading again, ``(*B)``.
+
+    Args:
+        reading: the present reading, ``(*B, S)``.
+        last: the reading before, ``(*B, S)``.
+        count: what this function returned for it, ``(*B)``; 0 at first.
+        stamp: time of the present reading, ``(*B)``; None where there is none.
+        last_stamp: time of the reading before.
+
+    >>> count_repeats(torch.ones(2, 3), torch.tensor([[1.0], [2.0]]), torch.tensor([4, 4]))
+    tensor([5, 0])
+    """
+    same = (reading == last).all(-1) if stamp is None else stamp == last_stamp
+    return torch.where(same, count + 1, 0)
+
+
+def trusted(reading: Tensor, count: Tensor, patience: float = PATIENCE) -> Tensor:
+    """Return whether readings ``(*B, S)`` are whole and not stale, ``(*B)``.
+
+    Args:
+        reading: the readings.
+        count: see :func:`count_repeats`.
+        patience: repetitions in a row that count as a stale sensor; infinite with time stamps.
+
+    >>> trusted(torch.zeros(3, 2), torch.tensor([0, 1, 21]))
+    tensor([ True, False,  True])
+    """
+    return whole(reading) & ((count == 0) | (count > patience))
+
+
+def as_reading(found: Tensor, like: Tensor) -> tuple[Tensor, str]:
+    """Return a reading of the shape and type of ``like``, and what was wrong with it.
+
+    Real numbers of another precision are converted. Anything else of another shape or type is no
+    reading: NaN.
+
+    Args:
+        found: what the sensor gave.
+        like: a tensor ``(*B, S)`` of the shape and type that is expected.
+
+    >>> as_reading(torch.zeros(2), torch.zeros(3))
+    (tensor([nan, nan, nan]), 'shape (2,), expected (3,)')
+    """
+    if found.shape != like.shape:
+        fault = f"shape {tuple(found.shape)}, expected {tuple(like.shape)}"
+    elif not found.is_floating_point():
+        fault = f"type {found.dtype}, expected {like.dtype}"
+    else:
+        return found.to(like.dtype), ""
+    return torch.full_like(like, torch.nan), fault
+
+
+def safe_action(action: Tensor, low: Tensor, high: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+    """Return actions that can be executed ``(*B, A)``, and where the last one is held ``(*B)``.
+
+    Args:
+        action: any action.
+        low: lowest action, ``(A,)`` or more dimensions.
+        high: highest action.
+        last: what is executed where ``action`` has a number that is not finite, ``(*B, A)``.
+
+    >>> low, high = -torch.ones(2), torch.ones(2)
+    >>> wild = torch.tensor([[3.0, 0.5], [torch.nan, 0.0]])
+    >>> safe_action(wild, low, high, torch.zeros(2, 2))
+    (tensor([[1.0000, 0.5000],
+            [0.0000, 0.0000]]), tensor([False,  True]))
+    """
+    held = ~action.isfinite().all(-1)
+    sound = torch.where(held.unsqueeze(-1), last.nan_to_num(), action.to(last.dtype))
+    return sound.clamp(low, high), held

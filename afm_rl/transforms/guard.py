@@ -1,0 +1,167 @@
+"""The last thing before an environment: only actions that can be executed pass."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.data import Binary, Composite, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.faults import PATIENCE, as_reading, count_repeats, safe_action, trusted
+from afm_rl.keys import as_key
+
+
+class Guard(Transform):
+    r"""Finite actions inside the action spec, whatever came before; and a look at the readings.
+
+    .. math:: a_\mathrm{exec} = \min(\max(a, l), h), \quad
+              \text{the last executed action where } a \text{ is not finite}
+
+    The guard knows no model, planner or corrector. Put it *first* in a ``Compose``: on the way
+    to the environment it is then the last. At the start of an episode the last executed action
+    is the one of the spec that is nearest to zero. A reading of another shape or type than the
+    observation spec says becomes NaN, with a warning that names both.
+
+    The memory lives in the tensordict, under ``prefix``, one per environment of a batch:
+
+    * ``(prefix, "executed_action")`` ``(*B, A)``: what the environment was given,
+    * ``(prefix, "held")`` ``(*B)``: the action was not finite, and the last one was held,
+    * ``(prefix, "sound")`` ``(*B)``: readings at both ends of the last transition are finite and
+      not stale (:mod:`afm_rl.faults`); use it as ``mask`` of an updater,
+    * ``(prefix, "repeats")`` ``(*B)``: how often in a row the present reading has been sent again.
+
+    Args:
+        observation_key: the state's reading, ``(*B, S)``.
+        action_key: the action, ``(*B, A)``, of a spec of real numbers.
+        prefix: where the memory is kept.
+        stamp_key: time of a reading, ``(*B)`` or ``(*B, 1)``; None where there is none.
+        patience: repetitions of a reading that count as a stale sensor; not used with stamps.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used, or an action of another shape.
+
+    >>> from torchrl.envs import Compose, GymEnv, TransformedEnv
+    >>> env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(Guard()))
+    >>> td = env.reset()
+    >>> td["action"] = torch.tensor([50.0])
+    >>> env.step(td)["next", "guard", "executed_action"]
+    tensor([2.])
+    """
+
+    def __init__(
+        self,
+        observation_key: NestedKey = "observation",
+        action_key: NestedKey = "action",
+        prefix: NestedKey = "guard",
+        stamp_key: NestedKey | None = None,
+        patience: float = PATIENCE,
+    ) -> None:
+        self.observation_key, self.action_key = as_key(observation_key), as_key(action_key)
+        super().__init__(in_keys=[self.observation_key], in_keys_inv=[self.action_key])
+        self.prefix = as_key(prefix)
+        self.stamp_key = None if stamp_key is None else as_key(stamp_key)
+        if patience != math.inf:
+            check_number("patience", patience, low=0.0)
+        self.patience = math.inf if stamp_key is not None else patience
+
+    def key(self, name: str) -> NestedKey:
+        """Return the key of an entry of the memory."""
+        return unravel_key((self.prefix, name))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the tensordict as it is: a replay buffer or a policy executes nothing."""
+        return tensordict
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.parent is None:  # inside a replay buffer: nothing to execute
+            return tensordict
+        memory = tensordict.get(self.prefix, None)
+        if memory is None:
+            raise KeyError(
+                f"Guard: no {self.prefix!r} in the tensordict; start from env.reset(), and carry "
+                "its entries on"
+            )
+        action, last = tensordict.get(self.action_key), memory.get("executed_action")
+        if action.shape != last.shape:
+            raise ConfigurationError(
+                f"{self.action_key!r}: shape {tuple(action.shape)}, expected {tuple(last.shape)}"
+            )
+        space = self._action_spec.space
+        executed, held = safe_action(action, space.low, space.high, last)
+        memory = memory.clone(recurse=False).set("executed_action", executed).set("held", held)
+        return tensordict.set(self.prefix, memory).set(self.action_key, executed)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        memory = tensordict.get(self.prefix).clone(recurse=False)
+        last, count = memory.get("reading"), memory.get("repeats")
+        reading, fault = as_reading(next_tensordict.get(self.observation_key), last)
+        if fault:
+            warnings.warn(f"{self.observation_key!r}: {fault}: taken for no reading", stacklevel=2)
+            next_tensordict.set(self.observation_key, reading)
+        stamps = self._stamp(next_tensordict), memory.get("stamp", None)
+        repeats = count_repeats(reading, last, count, *stamps)
+        sound = trusted(last, count, self.patience) & trusted(reading, repeats, self.patience)
+        memory.update({"reading": reading.clone(), "repeats": repeats, "sound": sound})
+        if self.stamp_key is not None:
+            memory.set("stamp", stamps[0])
+        return next_tensordict.set(self.prefix, memory)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        reading = tensordict_reset.get(self.observation_key)
+        memory = self._memory_spec(tensordict_reset.batch_size).to(reading.device).zero()
+        space = self._action_spec.space
+        rest, _ = safe_action(memory["executed_action"], space.low, space.high, torch.zeros(()))
+        memory.update({"executed_action": rest, "sound": torch.ones_like(memory["sound"])})
+        memory.set("reading", as_reading(reading, memory["reading"])[0].clone())
+        if self.stamp_key is not None:
+            memory.set("stamp", self._stamp(tensordict_reset))
+        return tensordict_reset.set(self.prefix, memory)
+
+    def _stamp(self, tensordict: TensorDictBase) -> Tensor | None:
+        if self.stamp_key is None:
+            return None
+        return tensordict.get(self.stamp_key).reshape(tensordict.batch_size).clone()
+
+    @property
+    def _action_spec(self) -> TensorSpec:
+        return self.parent.full_action_spec[self.action_key]
+
+    def _memory_spec(self, batch: torch.Size) -> Composite:
+        action = self.parent.full_action_spec_unbatched[self.action_key]
+        seen = self.parent.full_observation_spec_unbatched
+        reading = seen[self.observation_key]
+        if not (action.dtype.is_floating_point and action.ndim == 1 and reading.ndim == 1):
+            raise ConfigurationError(
+                f"{self.action_key!r}, {self.observation_key!r}: expected vectors of real numbers, "
+                f"got {action} and {reading}"
+            )
+        found = Composite(
+            executed_action=Unbounded((*batch, *action.shape), dtype=action.dtype),
+            reading=Unbounded((*batch, *reading.shape), dtype=reading.dtype),
+            repeats=Unbounded(batch, dtype=torch.int64),
+            held=Binary(shape=batch, dtype=torch.bool),
+            sound=Binary(shape=batch, dtype=torch.bool),
+            shape=batch,
+        )
+        if self.stamp_key is not None:
+            found["stamp"] = Unbounded(batch, dtype=seen[self.stamp_key].dtype)
+        return found
+
+    def _with_memory(self, spec: Composite) -> Composite:
+        spec[self.prefix] = self._memory_spec(spec.shape).to(spec.device)
+        return spec
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the memory."""
+        return self._with_memory(observation_spec)
+
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        """Add the memory: it is an input of the next step."""
+        return self._with_memory(state_spec)

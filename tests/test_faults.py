@@ -1,0 +1,90 @@
+"""Which readings are trusted, and which actions pass."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from afm_rl.faults import PATIENCE, as_reading, count_repeats, safe_action, trusted
+
+WILD = st.one_of(st.floats(width=32), st.sampled_from([math.nan, math.inf, -math.inf, 1e30, -0.0]))
+
+
+def believed(readings, stamps=None, patience=PATIENCE):
+    """Which transitions between readings ``(T, S)`` may be learned from."""
+    count, answer = torch.tensor(0), []
+    for t in range(len(readings) - 1):
+        pair = () if stamps is None else (stamps[t + 1], stamps[t])
+        after = count_repeats(readings[t + 1], readings[t], count, *pair)
+        ends = trusted(readings[t], count, patience), trusted(readings[t + 1], after, patience)
+        answer.append(bool(ends[0] & ends[1]))
+        count = after
+    return answer
+
+
+def noisy(steps):
+    return torch.randn(steps, 3, generator=torch.Generator().manual_seed(0)).cumsum(0)
+
+
+@pytest.mark.parametrize("frozen", [1, 2, 10])
+def test_nothing_is_believed_of_a_frozen_sensor_and_of_the_jump_after_it(frozen):
+    readings = noisy(30)
+    readings[6 : 6 + frozen] = readings[5]
+    wrong = [step for step, sound in enumerate(believed(readings)) if not sound]
+    assert wrong == list(range(5, 6 + frozen))  # the transitions into stale readings, and out
+
+
+@pytest.mark.parametrize("fault", [math.nan, math.inf, -1e30])
+def test_a_bad_reading_spoils_two_transitions(fault):
+    readings = noisy(9)
+    readings[4, 1] = fault
+    assert believed(readings) == [True] * 3 + [False] * 2 + [True] * 3
+
+
+def test_a_dead_robot_is_believed_after_a_while():
+    readings = torch.cat([noisy(3), noisy(3)[-1:].expand(60, 3), noisy(3)])
+    sound = believed(readings)
+    assert sound[:2] == [True] * 2
+    assert sound[2 : 3 + PATIENCE] == [False] * (PATIENCE + 1)
+    assert all(sound[3 + PATIENCE :])
+    assert not any(believed(readings, patience=math.inf)[2:-2])
+
+
+def test_a_time_stamp_decides_alone():
+    dead, clock = torch.ones(40, 3), torch.arange(40)
+    assert all(believed(dead, clock, math.inf))
+    clock[30:34] = clock[29]
+    alive = [step for step, sound in enumerate(believed(noisy(40), clock, math.inf)) if not sound]
+    assert alive == [29, 30, 31, 32, 33]
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(WILD, min_size=6, max_size=6), st.lists(WILD, min_size=2, max_size=2))
+def test_only_finite_actions_inside_the_box_pass(actions, last):
+    low, high = torch.tensor([-1.0, 0.25]), torch.tensor([1.0, 0.5])
+    given, before = torch.tensor(actions).reshape(3, 2), torch.tensor(last).expand(3, 2)
+    executed, held = safe_action(given, low, high, before)
+    assert ((executed >= low) & (executed <= high)).all()
+    assert torch.equal(held, ~given.isfinite().all(-1))
+    inside = ~held & ((given >= low) & (given <= high)).all(-1)
+    assert torch.equal(executed[inside], given[inside])
+
+
+@pytest.mark.parametrize(
+    ("found", "fault"),
+    [
+        (torch.zeros(4, 2), "shape (4, 2), expected (4, 3)"),
+        (torch.zeros(4, 3, dtype=torch.int64), "type torch.int64, expected torch.float32"),
+        (torch.zeros(4, 3, dtype=torch.complex64), "type torch.complex64, expected torch.float32"),
+    ],
+)
+def test_a_malformed_reading_is_no_reading(found, fault):
+    reading, said = as_reading(found, torch.zeros(4, 3))
+    assert said == fault and reading.isnan().all() and reading.dtype == torch.float32
+
+
+def test_a_reading_of_double_precision_is_converted():
+    reading, fault = as_reading(torch.ones(2, 3, dtype=torch.float64), torch.zeros(2, 3))
+    assert not fault and torch.equal(reading, torch.ones(2, 3))

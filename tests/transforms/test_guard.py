@@ -1,0 +1,165 @@
+"""The guard: whatever planner, policy or corrector answer, the environment gets safe actions."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import Compose, GymEnv, SerialEnv, Transform, TransformedEnv
+from torchrl.envs.utils import check_env_specs, step_mdp
+
+from afm_rl.envs import CrazyflieTrack, UGVTrack
+from afm_rl.errors import ConfigurationError
+from afm_rl.transforms import Guard
+
+BAD = [math.nan, math.inf, -math.inf, 1e30, -1e30, 3.0, -3.0, 0.5]
+MISSIONS = 6
+
+
+class Answers(Transform):
+    """A corrector that answers anything, written in place as well."""
+
+    def __init__(self, answers):
+        super().__init__(in_keys_inv=["action"])
+        self.answers = answers
+
+    def _inv_call(self, tensordict):
+        action = torch.as_tensor(next(self.answers)).to(tensordict["action"])
+        tensordict["action"].copy_(action)
+        return tensordict.set("action", action)
+
+
+class Readings(Transform):
+    """A sensor that gives anything instead of the observation."""
+
+    def __init__(self, change):
+        super().__init__(in_keys=["observation"])
+        self.change = change
+
+    def _step(self, tensordict, next_tensordict):
+        seen = self.change(int(next_tensordict["step"][0]), next_tensordict["observation"].clone())
+        return next_tensordict.set("observation", seen)
+
+    def _reset(self, tensordict, tensordict_reset):
+        return tensordict_reset
+
+
+class Watch(Transform):
+    """Keeps what the environment is given."""
+
+    def __init__(self):
+        super().__init__(in_keys_inv=["action"])
+        self.given = []
+
+    def _inv_call(self, tensordict):
+        self.given.append(tensordict["action"].clone())
+        return tensordict
+
+
+def drive(base, chain, steps, action=0.0):
+    env, rows = TransformedEnv(base, Compose(*chain)), []
+    td = env.reset()
+    for _ in range(steps):
+        td["action"] = torch.full((*td.batch_size, *base.action_spec.shape[-1:]), action)
+        td = env.step(td)
+        rows.append(td["next"])
+        td = step_mdp(td)
+    return rows
+
+
+@pytest.mark.parametrize("make", [UGVTrack, CrazyflieTrack], ids=["ugv", "quadrotor"])
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data())
+def test_any_answer_becomes_a_safe_action(make, data):
+    base = make(batch_size=(MISSIONS,))
+    size, spec = base.action_spec.shape, base.action_spec
+    numbers = st.one_of(st.sampled_from(BAD), st.floats(width=32))
+    answers = [
+        torch.tensor(data.draw(st.lists(numbers, min_size=size.numel(), max_size=size.numel())))
+        for _ in range(4)
+    ]
+    watch = Watch()
+    chain = [watch, Guard(), Answers(iter([answer.reshape(size) for answer in answers]))]
+    rows = drive(base, chain, len(answers))
+    last = spec.zero().clamp(spec.space.low, spec.space.high)
+    for given, answer, row in zip(watch.given, answers, rows, strict=True):
+        assert spec.is_in(given) and given.isfinite().all()
+        held = ~answer.reshape(size).isfinite().all(-1)
+        assert torch.equal(row["guard", "held"], held)
+        assert torch.equal(given[held], last[held])
+        assert torch.equal(row["guard", "executed_action"], given)
+        last = given
+
+
+def test_one_frozen_sensor_among_others():
+    def freeze(step, seen):
+        if step == 4:
+            freeze.kept = seen[2].clone()
+        if 4 < step < 10:
+            seen[2] = freeze.kept
+        return seen
+
+    rows = drive(UGVTrack(batch_size=(4,)), [Readings(freeze), Guard()], 14, action=0.3)
+    sound = torch.stack([row["guard", "sound"] for row in rows], 1)
+    assert sound[[0, 1, 3]].all()
+    assert (~sound[2]).nonzero().flatten().tolist() == [4, 5, 6, 7, 8, 9]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (lambda seen: seen[..., :2], "'observation': shape .4, 2., expected .4, 3."),
+        (lambda seen: seen.round().long(), "'observation': type torch.int64"),
+    ],
+)
+def test_a_malformed_reading_is_named_and_is_no_reading(wrong, words):
+    chain = [Readings(lambda step, seen: wrong(seen) if step == 3 else seen), Guard()]
+    with pytest.warns(UserWarning, match=words):
+        rows = drive(UGVTrack(batch_size=(4,)), chain, 6, action=0.3)
+    sound = torch.stack([row["guard", "sound"] for row in rows], 1)
+    assert sound.tolist() == [[True, True, False, False, True, True]] * 4
+    assert rows[2]["observation"].isnan().all() and rows[2]["observation"].shape == (4, 3)
+
+
+def test_a_time_stamp_that_stands_still():
+    guard, base = Guard(stamp_key="step"), CrazyflieTrack(batch_size=(2,))
+    rows = drive(base, [guard], 5, action=0.1)
+    assert all(row["guard", "sound"].all() for row in rows)
+    stopped = Guard(stamp_key="since")  # stands still until the phase changes
+    assert not drive(base, [stopped], 1)[0]["guard", "sound"].any()
+
+
+def test_an_action_of_another_shape_is_refused():
+    env = TransformedEnv(UGVTrack(batch_size=(4,)), Compose(Guard()))
+    td = env.reset().set("action", torch.zeros(4, 3))
+    with pytest.raises(ConfigurationError, match=r"'action': shape \(4, 3\), expected \(4, 2\)"):
+        env.step(td)
+
+
+def pendulum():
+    return GymEnv("Pendulum-v1")
+
+
+@pytest.mark.parametrize("make", [pendulum, lambda: SerialEnv(2, pendulum), UGVTrack])
+def test_the_specs_hold(make):
+    check_env_specs(TransformedEnv(make(), Compose(Guard())), break_when_any_done="both")
+
+
+def test_a_replay_buffer_and_a_tensordict_without_memory():
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(4), transform=Guard(), batch_size=2)
+    buffer.extend(TensorDict({"observation": torch.zeros(4, 3), "action": torch.ones(4, 2)}, [4]))
+    assert buffer.sample()["action"].shape == (2, 2)
+    env = TransformedEnv(UGVTrack(batch_size=(1,)), Compose(Guard()))
+    td = env.reset().exclude("guard").set("action", torch.zeros(1, 2))
+    with pytest.raises(KeyError, match="start from env.reset"):
+        env.step(td)
+
+
+def test_discrete_actions_are_refused():
+    with pytest.raises(ConfigurationError, match="expected vectors of real numbers"):
+        TransformedEnv(GymEnv("CartPole-v1"), Compose(Guard())).reset()
