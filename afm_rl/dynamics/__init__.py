@@ -4,6 +4,7 @@ from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.dynamics.calibrated import Calibrated
 from afm_rl.dynamics.dubins import Dubins, dubins_step
 from afm_rl.dynamics.ensemble import Ensemble
+from afm_rl.dynamics.inverse import EffectiveAction, effective_action
 from afm_rl.dynamics.knode import KNODE
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.oracle import Oracle
@@ -14,9 +15,11 @@ __all__ = [
     "Calibrated",
     "DynamicsModel",
     "Dubins",
+    "EffectiveAction",
     "Ensemble",
     "KnownDynamics",
     "Oracle",
     "Quadrotor",
     "dubins_step",
+    "effective_action",
 ]

@@ -29,6 +29,12 @@ class DynamicsModel(nn.Module, ABC):
     taught_in: int | None = None
     """Number of the process in which an updater changes the model; None: it stays as it is."""
 
+    affine: bool = False
+    """Is the next state affine in the action? Then one Gauss-Newton step inverts the model."""
+
+    stiff: bool = False
+    """Does rounding to single precision matter? Contacts and stiff joints magnify it."""
+
     extrapolates: bool = False
     """Can it foresee what actions beyond their box would do? Equations can, networks cannot."""
 
@@ -82,7 +88,7 @@ class DynamicsModel(nn.Module, ABC):
             return self.manifold.difference(self(state, act), state)
 
         columns = [
-            torch.func.jvp(change, (action,), (axis.expand_as(action),))[1]
+            torch.func.jvp(change, (action.contiguous(),), (axis.expand_as(action),))[1]
             for axis in torch.eye(self.action_size, device=action.device, dtype=action.dtype)
         ]
         # Torch differentiates single numbers times Python's in double precision.

@@ -46,6 +46,7 @@ class Dubins(KnownDynamics):
     torch.Size([4, 3])
     """
 
+    affine = True
     extrapolates = True
 
     def __init__(self, dt: float = 0.2, noise_std: float = 1e-3) -> None:

@@ -1,20 +1,19 @@
-"""Which action would have done the same."""
+"""The action that explains a displacement."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics import DynamicsModel, effective_action
 
-ROUNDS = 10
 Box = tuple[Tensor, Tensor]
 
 
 def explain(model: DynamicsModel, state: Tensor, change: Tensor, box: Box) -> tuple[Tensor, Tensor]:
-    r"""Return the actions with which a model comes nearest to given displacements.
+    """Return the actions of a box with which a model comes near to given displacements.
 
-    Projected Gauss-Newton: :math:`a \leftarrow \mathrm{clamp}(a + J^+ (\Delta - f(s, a) + s))`.
+    The effective action (:func:`~afm_rl.dynamics.effective_action`) of the displacement, clipped.
 
     Args:
         model: the base model.
@@ -33,10 +32,9 @@ def explain(model: DynamicsModel, state: Tensor, change: Tensor, box: Box) -> tu
     (tensor([-0.5000,  1.0000]), True)
     """
     low, high = box
-    action = ((low + high) / 2).expand(*change.shape[:-1], len(low))
-    for _ in range(ROUNDS):
-        miss = change - model.manifold.difference(model(state, action), state)
-        step = torch.linalg.pinv(model.jacobian(state, action)) @ miss.unsqueeze(-1)
-        action = torch.minimum(torch.maximum(action + step.squeeze(-1), low), high)
+    middle = ((low + high) / 2).expand(*change.shape[:-1], len(low))
+    reached = model.manifold.add(state, change)
+    action = effective_action(model, state, middle, reached, (high - low) / 2).action
+    action = torch.minimum(torch.maximum(action, low), high)
     rest = change - model.manifold.difference(model(state, action), state)
     return action, rest.norm(dim=-1)

@@ -1,0 +1,103 @@
+"""The action that a model needs to explain a transition."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from afm_rl.dynamics.base import DynamicsModel
+
+UNSEEN = 4.0  # half ranges: standard deviation of an axis of which a transition shows nothing
+ENOUGH = 0.1  # squared standard deviations: what less a round promises is not worth the next one
+
+
+class EffectiveAction(NamedTuple):
+    """An executed action, as a transition shows it through a model."""
+
+    action: Tensor
+    """Effective action, ``(*B, A)``, in the units of the action."""
+    std: Tensor
+    """Standard deviation of each component, ``(*B, A)``; at most four half ranges."""
+    innovation: Tensor
+    """Largest normalised error of the executed action's forecast, ``(*B)``."""
+
+
+def effective_action(
+    model: DynamicsModel,
+    state: Tensor,
+    action: Tensor,
+    next_state: Tensor,
+    half_range: Tensor,
+    rounds: int = 3,
+) -> EffectiveAction:
+    r"""Express a prediction error in action space, for any model and robot.
+
+    .. math:: v = \arg\min_v \; \| \Sigma^{-1/2} (s_{t+1} \ominus f(s_t, a + h v)) \|^2
+
+    by Gauss-Newton: with J the derivative of the normalised forecast by v, and e the error,
+
+    .. math:: v \leftarrow v + C J^\top e,\qquad C = (J^\top J + 4^{-2} I)^{-1}
+
+    The small prior gives an axis without any influence a standard deviation of four half ranges
+    and leaves it where it is. The noise :math:`\Sigma` is that of the executed action's forecast;
+    ``std`` is the square root of C's diagonal, in units of the action.
+
+    A model that is affine in its action takes one round. With others, a round moves each axis by
+    half a range at most, a row is only changed where its error becomes smaller (its next step is
+    a quarter as long where it does not), and the rounds end early when little is left that an
+    action can explain.
+
+    A row with a number that is not finite tells nothing: the executed action, the largest
+    ``std``, innovation 0.
+
+    Args:
+        model: f, as it is now.
+        state: ``(*B, S)``.
+        action: the action that was executed, ``(*B, A)``.
+        next_state: the realised next state, ``(*B, S)``.
+        half_range: h, half ranges of the action box, ``(A,)``.
+        rounds: Gauss-Newton steps at most.
+
+    >>> from afm_rl.dynamics import Dubins
+    >>> s, a = torch.zeros(3), torch.tensor([0.5, 0.2])
+    >>> seen = Dubins()(s, -a)  # both motors reversed
+    >>> found = effective_action(Dubins(), s, a, seen, torch.ones(2))
+    >>> found.action, found.std
+    (tensor([-0.5000, -0.2000]), tensor([0.0050, 0.0050]))
+    """
+    dtype = action.dtype
+    if model.stiff:
+        state, action, next_state = state.double(), action.double(), next_state.double()
+    half_range = half_range.to(action)
+    expected, noise = model.forecast(state, action)
+    error = model.manifold.difference(next_state, expected) / noise
+    innovation = error.abs().amax(-1)
+    effective, limit = action, 1.0
+    for last in (False,) * (rounds - 1) + (True,):
+        jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()
+        precision = jacobian.mT @ jacobian
+        precision.diagonal(dim1=-2, dim2=-1).add_(UNSEEN**-2)
+        covariance = torch.cholesky_inverse(torch.linalg.cholesky_ex(precision).L)
+        slope = jacobian.mT @ error.unsqueeze(-1).double()
+        step = (covariance @ slope).squeeze(-1)
+        if model.affine:
+            effective = effective + step.to(action) * half_range
+            break
+        trial = effective + (step.clamp(-limit, limit) * half_range).to(action)
+        remaining = model.manifold.difference(next_state, model(state, trial)) / noise
+        better = remaining.square().sum(-1, True) < error.square().sum(-1, True)
+        effective = torch.where(better, trial, effective)
+        error = torch.where(better, remaining, error)
+        limit = limit * torch.where(better, 1.0, 0.25)
+        if last or not bool(((step * slope.squeeze(-1)).sum(-1) > ENOUGH).any()):
+            break
+    std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    known = innovation + std.sum(-1) < torch.inf
+    row = known.unsqueeze(-1)
+    return EffectiveAction(
+        torch.where(row, effective, action.nan_to_num()).to(dtype),
+        (torch.where(row, std, UNSEEN) * half_range).to(dtype),
+        torch.where(known, innovation, 0.0).to(dtype),
+    )

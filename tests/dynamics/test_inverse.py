@@ -1,0 +1,192 @@
+"""The inverse of a dynamics model."""
+
+import math
+
+import pytest
+import torch
+
+from afm_rl.dynamics import Dubins, KnownDynamics, Oracle, effective_action
+from afm_rl.manifold import Manifold
+
+HALF = torch.tensor([1.0, 1.5])
+
+
+def seen(model, state, action, next_state):
+    half = HALF.to(state.dtype)
+    return effective_action(model, state, action, next_state, half)
+
+
+@pytest.mark.parametrize("batch", [(), (200,), (4, 6)])
+def test_gains_are_recovered_exactly_from_the_nominal_robot(gains, transitions, batch):
+    state, action = transitions(*batch, dtype=torch.float64)
+    rows = gains.sample(batch, torch.Generator().manual_seed(0)).double()
+    found = seen(Dubins(), state, action, Dubins()(state, rows * action))
+    torch.testing.assert_close(found.action, rows * action, rtol=1e-4, atol=1e-4)
+
+
+def test_a_right_model_finds_the_executed_action(trained_ensemble, transitions):
+    for model in (Dubins(), trained_ensemble):
+        state, action = transitions(50)
+        found = seen(model, state, action, model(state, action))
+        torch.testing.assert_close(found.action, action, rtol=0, atol=1e-3)
+        assert float(found.innovation.max()) < 0.01
+
+
+def test_gains_are_recovered_about_from_an_ensemble(trained_ensemble, gains, transitions):
+    state, action = transitions(300)
+    rows = torch.tensor([-0.8, 1.2])
+    found = seen(trained_ensemble, state, action, Dubins()(state, rows * action))
+    miss, nothing = ((part - rows * action) / HALF for part in (found.action, action))
+    assert miss.abs().median() < 0.17 * nothing.abs().median()
+    # The mean square is that of few where a network's slope misleads: it differs with rounding.
+    assert miss.square().mean() < 0.5**2 * nothing.square().mean()
+
+
+def test_the_told_oracle_sees_nothing_amiss(gains, transitions):
+    oracle = Oracle(Dubins(), gains)
+    oracle.tell(gains.encode({"v_gain": -1.5}))
+    state, action = transitions(20)
+    reached = oracle(state, action)
+    assert float(seen(oracle, state, action, reached).innovation.max()) < 1e-2
+    assert float(seen(Dubins(), state, action, reached).innovation.max()) > 5
+
+
+def test_the_innovation_is_the_largest_error_in_standard_deviations():
+    model = Dubins(noise_std=0.01)
+    state, action = torch.zeros(3), torch.tensor([0.5, 0.5])
+    reached = model(state, action) + torch.tensor([0.03, -0.07, 0.02])
+    assert float(seen(model, state, action, reached).innovation) == pytest.approx(7, rel=1e-4)
+
+
+def test_crossing_the_seam_is_no_surprise():
+    model = Dubins()
+    state = torch.stack([torch.zeros(100), torch.zeros(100), torch.linspace(2.9, 3.14, 100)], -1)
+    action = torch.tensor([0.5, 1.5]).expand(100, 2)
+    reached = model(state, action)
+    assert (reached[:, 2] < 0).sum() > 50
+    found = seen(model, state, action, reached)
+    assert float(found.innovation.max()) < 0.01
+    torch.testing.assert_close(found.action, action, rtol=0, atol=1e-4)
+
+
+def test_an_axis_without_influence_stays_where_it_is(transitions):
+    class Rail(Dubins):
+        """Cannot turn, whatever omega."""
+
+        def forward(self, state, action):
+            return super().forward(state, action * torch.tensor([1.0, 0.0]).to(action))
+
+        def jacobian(self, state, action):
+            return super().jacobian(state, action) * torch.tensor([1.0, 0.0]).to(action)
+
+    state, action = transitions(30, dtype=torch.float64)
+    reached = Dubins()(state, action * torch.tensor([-1.0, 3.0]).double())
+    found = seen(Rail(), state, action, reached)
+    torch.testing.assert_close(found.action[:, 1], action[:, 1])
+    torch.testing.assert_close(found.action[:, 0], -action[:, 0], rtol=1e-4, atol=1e-4)
+
+
+def test_the_unit_of_the_action_does_not_matter(gains, transitions):
+    class Percent(Dubins):
+        """Takes v in percent."""
+
+        def forward(self, state, action):
+            return super().forward(state, action / torch.tensor([100.0, 1.0]).to(action))
+
+        def jacobian(self, state, action):
+            return super().jacobian(state, action) / torch.tensor([100.0, 1.0]).to(action)
+
+    state, action = transitions(30, dtype=torch.float64)
+    unit = torch.tensor([100.0, 1.0]).double()
+    reached = Dubins()(state, -0.5 * action) + 0.01
+    usual = seen(Dubins(), state, action, reached)
+    percent = effective_action(Percent(), state, action * unit, reached, HALF.double() * unit)
+    torch.testing.assert_close(percent.action / unit, usual.action)
+    torch.testing.assert_close(percent.innovation, usual.innovation)
+
+
+@pytest.mark.parametrize("fault", [math.nan, math.inf, -math.inf, 1e30])
+@pytest.mark.parametrize("where", [0, 1, 2])
+def test_a_faulty_row_does_not_disturb_the_others(trained_ensemble, transitions, fault, where):
+    for model in (Dubins(), trained_ensemble):
+        state, action = transitions(4)
+        reached = Dubins()(state, -action)
+        expected = seen(model, state, action, reached)
+        parts = [state.clone(), action.clone(), reached.clone()]
+        parts[where][2] = fault
+        found = seen(model, *parts)
+        rows = torch.tensor([0, 1, 3])
+        torch.testing.assert_close(found.action[rows], expected.action[rows])
+        torch.testing.assert_close(found.innovation[rows], expected.innovation[rows])
+        assert all(part.isfinite().all() for part in found)
+
+
+def test_a_row_that_is_not_finite_tells_nothing(transitions):
+    state, action = transitions(3)
+    reached = Dubins()(state, -action)
+    reached[1, 0] = math.nan
+    found = seen(Dubins(), state, action, reached)
+    torch.testing.assert_close(found.action[1], action[1])
+    torch.testing.assert_close(found.std[1], 4 * HALF)
+    assert float(found.innovation[1]) == 0
+
+
+class Counting(Dubins):
+    """Counts how often it is asked."""
+
+    calls = 0
+
+    def forward(self, state, action):
+        self.calls += 1
+        return super().forward(state, action)
+
+
+def test_a_model_that_is_affine_in_the_action_is_asked_once(transitions):
+    model = Counting()
+    state, action = transitions(5)
+    seen(model, state, action, Dubins()(state, -action))
+    assert model.calls == 1
+
+
+def bent(state, action):
+    """Bends twice within the box: single Gauss-Newton steps from afar mislead."""
+    drive = action + 0.3 * torch.sin(3 * action)
+    return state + torch.stack([drive[..., 0] + 0.2 * drive[..., 1].square(), drive[..., 1]], -1)
+
+
+BENT = KnownDynamics(bent, Manifold(2), 2, noise_std=0.01)
+
+
+def test_rounds_bring_a_bent_model_to_the_true_action():
+    generator = torch.Generator().manual_seed(0)
+    executed, true = (2 * torch.rand(2, 400, 2, generator=generator, dtype=torch.float64) - 1) * 0.9
+    state = torch.zeros_like(true)
+    median = []
+    for rounds in (1, 3, 8):
+        found = effective_action(BENT, state, executed, bent(state, true), torch.ones(2), rounds)
+        median.append(float((found.action - true).abs().amax(-1).median()))
+        before, after = (
+            (bent(state, true) - bent(state, action)).norm(dim=-1)
+            for action in (executed, found.action)
+        )
+        assert bool((after <= before).all())
+    assert median[1] < 0.1 * median[0]
+    assert median[2] < 1e-3
+
+
+def test_the_standard_deviation_is_that_of_repeated_transitions():
+    generator = torch.Generator().manual_seed(0)
+    state, true = torch.zeros(4000, 2).double(), torch.tensor([0.3, -0.2]).double()
+    noise = 0.01 * torch.randn(4000, 2, generator=generator, dtype=torch.float64)
+    reached = bent(state, true.expand(4000, 2)) + noise
+    found = effective_action(BENT, state, true.expand(4000, 2), reached, torch.ones(2))
+    torch.testing.assert_close(found.action.std(0), found.std.mean(0), rtol=0.05, atol=0)
+
+
+def test_a_dead_axis_has_the_largest_standard_deviation():
+    model = KnownDynamics(lambda s, a: s + a[..., :1], Manifold(1), 2, noise_std=0.01)
+    found = effective_action(
+        model, torch.zeros(1), torch.zeros(2), torch.ones(1), torch.tensor([1.0, 2.0])
+    )
+    torch.testing.assert_close(found.std, torch.tensor([0.01, 8.0]), rtol=1e-3, atol=0)
+    torch.testing.assert_close(found.action, torch.tensor([1.0, 0.0]), rtol=1e-3, atol=1e-3)
