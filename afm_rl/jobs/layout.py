@@ -1,0 +1,88 @@
+"""The folders of runs, comparisons, sweeps and studies.
+
+A *run* is the missions of one method in one folder::
+
+    FOLDER/
+      missions.csv         one row per mission; nothing in it depends on the clock
+      steps.parquet        one row per mission and step
+      compute.csv          method, missions, steps, seconds: the time that the run took
+      config.yaml          the settings, resolved
+      figures/, video/, tensorboard/
+      manifest.json        the SHA-256 of all of these; a folder with a manifest is finished
+      log.txt              what its process printed, if it had one of its own
+      unfinished/          until then: config.yaml, checkpoints, progress.json
+
+A comparison, a sweep and a study are a *batch*: several runs, called jobs, each as above::
+
+    FOLDER/
+      jobs.yaml            command: what was asked; jobs: their names, in the order of the tables
+      jobs/NAME/           a run; NAME is such as physics, physics+planner.horizon=5 or
+                           physics+seed=3, with _ for what a file name cannot hold
+      missions.csv         the missions of all jobs, numbered through: written at the end
+      compute.csv          one row per method
+      figures/, video/, tensorboard/ or report/
+      manifest.json        of the files above that are not in a job's folder
+
+``config.yaml`` of a job names its method in ``label``, and its ``seeds``, ``tracks`` and
+``regimes``. The column ``method`` of its tables is this label. Labels of a sweep's jobs name the
+settings that are swept: ``physics+planner.horizon=5``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from yaml import YAMLError, safe_load
+
+from afm_rl.errors import ArtefactError
+from afm_rl.manifest import MANIFEST
+
+JOBS, RECORD, UNFINISHED = "jobs", "jobs.yaml", "unfinished"
+MISSIONS, STEPS, COMPUTE = "missions.csv", "steps.parquet", "compute.csv"
+CONFIG, LOG = "config.yaml", "log.txt"
+
+
+def is_batch(folder: Path) -> bool:
+    """Return whether a folder holds several runs."""
+    return (folder / JOBS).is_dir()
+
+
+def is_finished(folder: Path) -> bool:
+    """Return whether a run has its results. What they hold is checked by ``check_manifest``."""
+    return (folder / MANIFEST).is_file()
+
+
+def run_folders(folder: Path) -> list[Path]:
+    """Return the folders of the runs of a batch, finished or not, or the folder of a run itself.
+
+    They come in the order of ``jobs.yaml``; those that it does not name follow by name.
+
+    Raises:
+        ArtefactError: if ``jobs.yaml`` cannot be read.
+    """
+    if not is_batch(folder):
+        return [folder]
+    there = sorted(path for path in (folder / JOBS).iterdir() if path.is_dir())
+    rank = {name: place for place, name in enumerate(recorded(folder))}
+    return sorted(there, key=lambda path: rank.get(path.name, len(rank)))
+
+
+def recorded(folder: Path) -> list[str]:
+    """Return the names of a batch's jobs in the order of the tables, from ``jobs.yaml``.
+
+    Raises:
+        ArtefactError: if it cannot be read.
+    """
+    path = folder / RECORD
+    if not path.exists():
+        return []
+    try:
+        return [str(name) for name in safe_load(path.read_bytes())["jobs"]]
+    except (YAMLError, TypeError, KeyError, UnicodeDecodeError, RecursionError):
+        raise ArtefactError(f"{path}: damaged; delete it") from None
+
+
+def config_of(folder: Path) -> Path:
+    """Return where the settings of a run are."""
+    done = folder / CONFIG
+    return done if done.exists() else folder / UNFINISHED / CONFIG
