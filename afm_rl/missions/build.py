@@ -97,7 +97,7 @@ def build(cfg: DictConfig) -> Agent:
             action_low=robot.action_low,
             action_high=robot.action_high,
         )
-    robot.judge.check(env, robot.goal_names)
+    robot.metrics.check(env, robot.goal_names)
     missions = build_missions(env, tracks, regimes, seeds)
 
     def make(group: str, *args: Any) -> Any:

@@ -40,7 +40,7 @@ class Robot:
         paper_regimes: the regimes of the published study.
         families: regimes of which every seed gets a draw of its own, by name; see
             :class:`~afm_rl.missions.families.Family`.
-        score: what missions are judged by; targets reached if None.
+        score: the metrics of missions; targets reached if None.
         flow_low: lowest corner of the box in which flows correct actions; the actions' if None.
             Where planned actions keep to a small part of their box, a smaller one helps.
         flow_high: its highest corner.
@@ -120,8 +120,8 @@ class Robot:
             )
 
     @property
-    def judge(self) -> Score:
-        """The score."""
+    def metrics(self) -> Score:
+        """What is measured of missions."""
         return LapScore() if self.score is None else self.score
 
     @property
