@@ -90,7 +90,7 @@ class Corrector(nn.Module, ABC):
                 f"flow: action bounds {low.tolist()}, {high.tolist()}: expected two lists of "
                 "one size, finite, low < high"
             )
-        self.gate = check_number("flow.gate", gate, low=0.0)
+        self.gate = check_number("corrector.gate", gate, low=0.0)
         self.window = window
         self.register_buffer("centre", (low + high) / 2, persistent=False)
         self.register_buffer("half_range", (high - low) / 2, persistent=False)

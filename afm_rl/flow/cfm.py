@@ -136,13 +136,13 @@ def train_flow(
     Returns:
         Root mean square error of the corrected action, in half ranges, on new examples.
     """
-    check_count("flow.train.iterations", iterations)
-    check_count("flow.train.batch_size", batch_size, low=2)
+    check_count("corrector.train.iterations", iterations)
+    check_count("corrector.train.batch_size", batch_size, low=2)
     if reuse is None:
         reuse = 32 if any(True for _ in model.parameters()) else 1
-    check_count("flow.train.reuse", reuse)
-    check_count("flow.train.seed", seed, low=0)
-    check_number("flow.train.lr", lr, low=0.0, open_low=True)
+    check_count("corrector.train.reuse", reuse)
+    check_count("corrector.train.seed", seed, low=0)
+    check_number("corrector.train.lr", lr, low=0.0, open_low=True)
     plans = 1 if reuse == 1 else PLANS
     generator = torch.Generator().manual_seed(seed)
     loss_module = CFMLoss(flow, seed=seed + 1)

@@ -108,25 +108,25 @@ class ContextFlow(PairCorrector, Flow):
         saturation: str = "mixed",
         seed: int = 0,
     ) -> None:
-        super().__init__(action_low, action_high, check_count("flow.memory", memory), gate)
-        self.shown = check_count("flow.window", window)
+        super().__init__(action_low, action_high, check_count("corrector.memory", memory), gate)
+        self.shown = check_count("corrector.window", window)
         self.place = list(place)
         self.place_scale = check_number("flow.place_scale", place_scale, low=0.0, open_low=True)
         self.views = check_views(views, by_place=bool(self.place))
-        self.forgetting = check_number("flow.forgetting", forgetting, low=0.0, high=1.0)
-        self.samples = check_count("flow.samples", samples)
-        self.source_std = check_number("flow.source_std", source_std, low=0.0)
-        self.steps = check_count("flow.steps", steps)
-        self.choose = check_choice("flow.choose", choose, CHOICES)
-        self.saturation = check_choice("flow.saturation", saturation, MODES)
+        self.forgetting = check_number("corrector.forgetting", forgetting, low=0.0, high=1.0)
+        self.samples = check_count("corrector.samples", samples)
+        self.source_std = check_number("corrector.source_std", source_std, low=0.0)
+        self.steps = check_count("corrector.steps", steps)
+        self.choose = check_choice("corrector.choose", choose, CHOICES)
+        self.saturation = check_choice("corrector.saturation", saturation, MODES)
         ways = [VIEWS[name] for name in self.views]
         if memory < memory_of(ways, window):
             raise ConfigurationError(
-                f"flow.memory={memory!r}: expected at least {memory_of(ways, window)} for "
-                f"flow.window={window} and the views {', '.join(self.views)}"
+                f"corrector.memory={memory!r}: expected at least {memory_of(ways, window)} for "
+                f"corrector.window={window} and the views {', '.join(self.views)}"
             )
-        hidden = check_counts("flow.hidden", hidden)
-        self.latent = check_count("flow.latent", latent)
+        hidden = check_counts("corrector.hidden", hidden)
+        self.latent = check_count("corrector.latent", latent)
         size = self.action_size
         generator = torch.Generator().manual_seed(check_count("flow.seed", seed, low=0))
         self.encoder = mlp([self.feature_size, *hidden, latent], generator)

@@ -86,8 +86,8 @@ class L1Augmentation(PairCorrector):
     ) -> None:
         super().__init__(action_low, action_high, window, gate)
         self.dt = check_number("flow.dt", dt, low=0.0, open_low=True)
-        self.bandwidth = check_number("flow.bandwidth", bandwidth, low=0.0, open_low=True)
-        self.saturation = check_choice("flow.saturation", saturation, MODES)
+        self.bandwidth = check_number("corrector.bandwidth", bandwidth, low=0.0, open_low=True)
+        self.saturation = check_choice("corrector.saturation", saturation, MODES)
 
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
         """Take the disturbance off; the spread is zero."""

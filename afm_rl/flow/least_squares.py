@@ -148,11 +148,11 @@ class LeastSquares(PairCorrector):
         saturation: str = "clip",
     ) -> None:
         super().__init__(action_low, action_high, window, gate)
-        self.form = check_choice("flow.form", form, ("gain", "affine"))
+        self.form = check_choice("corrector.form", form, ("gain", "affine"))
         self.forgetting = check_number(
-            "flow.forgetting", forgetting, low=0.0, high=1.0, open_low=True
+            "corrector.forgetting", forgetting, low=0.0, high=1.0, open_low=True
         )
-        self.saturation = check_choice("flow.saturation", saturation, MODES)
+        self.saturation = check_choice("corrector.saturation", saturation, MODES)
 
     def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
         """Invert the fit, which also tells the effect; the spread is zero."""

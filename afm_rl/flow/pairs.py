@@ -26,7 +26,7 @@ class PairCorrector(Corrector):
     """
 
     def __init__(self, action_low: Tensor, action_high: Tensor, window: int, gate: float) -> None:
-        super().__init__(action_low, action_high, gate, check_count("flow.window", window))
+        super().__init__(action_low, action_high, gate, check_count("corrector.window", window))
 
     @property
     def feature_size(self) -> int:

@@ -71,11 +71,13 @@ class PaperFlow(Flow):
                 f"flow.features={self.state_features}: expected indices of the {state_size} "
                 f"state coordinates, 0 to {state_size - 1}"
             )
-        self.steps = check_count("flow.steps", steps)
-        self.error_action = check_choice("flow.error_action", error_action, ("planned", "executed"))
-        self.wrap = check_flag("flow.wrap", wrap)
-        self.latch = check_flag("flow.latch", latch)
-        check_count("flow.width", width)
+        self.steps = check_count("corrector.steps", steps)
+        self.error_action = check_choice(
+            "corrector.error_action", error_action, ("planned", "executed")
+        )
+        self.wrap = check_flag("corrector.wrap", wrap)
+        self.latch = check_flag("corrector.latch", latch)
+        check_count("corrector.width", width)
         size = self.action_size
         generator = torch.Generator().manual_seed(check_count("flow.seed", seed, low=0))
         self.regime_encoder = mlp([self.feature_size, width, width], generator)

@@ -100,13 +100,15 @@ def check_views(names: Sequence[str], by_place: bool) -> list[str]:
     ['silent', 'recent']
     """
     if isinstance(names, str) or not isinstance(names, Sequence) or not names:
-        raise ConfigurationError(f"flow.views={names!r}: expected a list of {', '.join(VIEWS)}")
+        raise ConfigurationError(
+            f"corrector.views={names!r}: expected a list of {', '.join(VIEWS)}"
+        )
     for name in names:
-        check_choice("flow.views", name, VIEWS)
+        check_choice("corrector.views", name, VIEWS)
     kept = [name for name in names if by_place or not VIEWS[name].near]
     if not set(kept) - {SILENT}:
         raise ConfigurationError(
-            f"flow.views={list(names)!r}: expected one beside {SILENT}, and robot.place for views "
-            "by place"
+            f"corrector.views={list(names)!r}: expected one beside {SILENT}, and robot.place for "
+            "views by place"
         )
     return kept

@@ -48,7 +48,8 @@ class ActionFlowTransform(Transform):
         action_key: the action.
         prefix: where the memory is kept.
         enabled: switch the correction off to watch only (see :attr:`enabled`).
-        widen: let planners know of effects beyond the action box, if the model can foresee them.
+        extend_action_box: let planners know of effects beyond the action box, if the model can
+            foresee them.
 
     >>> import torch
     >>> from torchrl.envs import TransformedEnv
@@ -72,9 +73,9 @@ class ActionFlowTransform(Transform):
         action_key: NestedKey = "action",
         prefix: NestedKey = "afm",
         enabled: bool = True,
-        widen: bool = True,
+        extend_action_box: bool = True,
     ) -> None:
-        check_parts("transform", model, flow, enabled, widen)
+        check_parts("transform", model, flow, enabled, extend_action_box)
         observation_key, action_key = as_key(observation_key), as_key(action_key)
         super().__init__(in_keys=[observation_key], in_keys_inv=[action_key])
         self.__dict__["model"] = model  # shared with planner and updater, so not registered
@@ -82,7 +83,7 @@ class ActionFlowTransform(Transform):
         self.observation_key = observation_key
         self.action_key = action_key
         self.prefix = as_key(prefix)
-        self.enabled, self.widen = enabled, widen
+        self.enabled, self.extend_action_box = enabled, extend_action_box
 
     def key(self, *names: str) -> NestedKey:
         """Return the key of an entry of the memory."""
@@ -102,7 +103,7 @@ class ActionFlowTransform(Transform):
             self.flow,
             self.parent.full_action_spec[self.action_key],
             self.enabled,
-            self.widen,
+            self.extend_action_box,
         )
         tensordict.set(self.action_key, memory.get("executed_action"))
         return tensordict.set(self.prefix, memory)

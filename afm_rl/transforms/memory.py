@@ -14,7 +14,7 @@ from afm_rl.flow.base import rows_of
 
 
 def check_parts(
-    owner: str, model: DynamicsModel, flow: Corrector, enabled: bool, widen: bool
+    owner: str, model: DynamicsModel, flow: Corrector, enabled: bool, extend_action_box: bool
 ) -> None:
     """Check what corrects actions, for an ``owner`` such as ``transform``.
 
@@ -25,7 +25,7 @@ def check_parts(
     check_instance(f"{owner}.model", model, DynamicsModel)
     check_instance(f"{owner}.flow", flow, Corrector)
     check_flag(f"{owner}.enabled", enabled)
-    check_flag(f"{owner}.widen", widen)
+    check_flag(f"{owner}.extend_action_box", extend_action_box)
     if flow.action_size != model.action_size:
         raise ConfigurationError(
             f"flow: made for {flow.action_size} actions, but the dynamics model has "
@@ -87,7 +87,7 @@ def correct(
     flow: Corrector,
     action_spec: TensorSpec,
     enabled: bool = True,
-    widen: bool = True,
+    extend_action_box: bool = True,
 ) -> TensorDictBase:
     """Return the memory with what was planned ``(*B, A)`` and what should be executed.
 
@@ -98,7 +98,7 @@ def correct(
         flow: the correction.
         action_spec: actions that can be executed.
         enabled: False to watch only.
-        widen: note effects beyond the action box, if the model can foresee them.
+        extend_action_box: note effects beyond the action box, if the model can foresee them.
     """
     window = Window(*(memory.get(("window", name)) for name in Window._fields))
     last = Context(*(memory.get(name) for name in Context._fields))
@@ -110,7 +110,7 @@ def correct(
         found = Correction(planned.clone(), torch.zeros_like(planned), box, expected)
         if bool(use.any()):
             state = memory.get("state")
-            found = _corrected(found, expected, use, context, state, model, flow, widen)
+            found = _corrected(found, expected, use, context, state, model, flow, extend_action_box)
     executed = found.action.clamp(*box.unbind(-2))
     expected = torch.where(use.unsqueeze(-1), expected, executed)
     memory = memory.clone(recurse=False)
@@ -151,7 +151,7 @@ def _corrected(
     state: Tensor,
     model: DynamicsModel,
     flow: Corrector,
-    widen: bool,
+    extend_action_box: bool,
 ) -> Correction:
     """Put the flow's answers where ``use`` ``(*B)`` says so, in place."""
     executed, spread, reach, _ = found
@@ -165,7 +165,7 @@ def _corrected(
     if answer.expected is not None:
         known = sound & answer.expected.isfinite().all(-1, keepdim=True)
         expected[use] = torch.where(known, answer.expected, planned)
-    if answer.reach is not None and reach is not None and widen and model.extrapolates:
+    if answer.reach is not None and reach is not None and extend_action_box and model.extrapolates:
         # Never a smaller box: what cannot be had the flow cuts, and it knows better.
         told = sound.unsqueeze(-1) & answer.reach.isfinite()
         low, high = torch.where(told, answer.reach, reach[use]).unbind(-2)

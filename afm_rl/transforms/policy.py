@@ -34,7 +34,8 @@ class ActionFlowPolicy(TensorDictModuleBase):
         action_key: where the planned action is, and the executed one goes.
         prefix: where the memory is kept.
         enabled: False to watch only.
-        widen: let planners know of effects beyond the action box, if the model can foresee them.
+        extend_action_box: let planners know of effects beyond the action box, if the model can
+            foresee them.
 
     Raises:
         ConfigurationError: for parts that do not fit each other.
@@ -64,10 +65,10 @@ class ActionFlowPolicy(TensorDictModuleBase):
         action_key: NestedKey = "action",
         prefix: NestedKey = "afm",
         enabled: bool = True,
-        widen: bool = True,
+        extend_action_box: bool = True,
     ) -> None:
         super().__init__()
-        check_parts("policy", model, flow, enabled, widen)
+        check_parts("policy", model, flow, enabled, extend_action_box)
         self.flow = flow
         self.action_spec = check_instance("policy.action_spec", action_spec, Bounded)
         if action_spec.shape != (flow.action_size,):
@@ -78,7 +79,7 @@ class ActionFlowPolicy(TensorDictModuleBase):
         self.__dict__["model"] = model  # shared with the planner, so not registered
         self.observation_key, self.action_key = as_key(observation_key), as_key(action_key)
         self.prefix = as_key(prefix)
-        self.enabled, self.widen = enabled, widen
+        self.enabled, self.extend_action_box = enabled, extend_action_box
         names = memory_spec(model, flow, torch.Size(), action_spec.dtype).keys(True, True)
         kept = [unravel_key((self.prefix, name)) for name in names]
         self.in_keys = [self.observation_key, self.action_key, *kept]
@@ -103,7 +104,7 @@ class ActionFlowPolicy(TensorDictModuleBase):
                 "make_tensordict_primer() to the first one, and carry the entries of 'next' on"
             )
         planned = tensordict.get(self.action_key)
-        settings = self.model, self.flow, self.action_spec, self.enabled, self.widen
+        settings = self.model, self.flow, self.action_spec, self.enabled, self.extend_action_box
         memory = observe(memory, tensordict.get(self.observation_key))
         memory = correct(memory, planned, *settings)
         tensordict.set(unravel_key(("next", self.prefix)), memory)
