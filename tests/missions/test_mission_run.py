@@ -227,7 +227,7 @@ def test_actions_are_planned_and_executed_inside_the_box(drive, ring):
 
 def test_a_transform_that_only_watches_executes_what_was_planned(drive, ring):
     settings = {"tracks": ring, "regimes": [BACKWARDS], "budget": 60}
-    watch = {"transform.enabled": False, **NAIVE}
+    watch = {"corrector.enabled": False, **NAIVE}
     watching = drive("method=afm_physics", **settings, **watch).steps
     physics = drive("method=physics", **settings).steps
     assert watching["misaligned"].sum() > 0
