@@ -15,7 +15,7 @@ from afm_rl.missions import build
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [
-    *(DOCS / "quickstart.md", DOCS / "torchrl.md"),
+    *(DOCS / "quickstart.md", DOCS / "torchrl.md", DOCS / "reliability.md"),
     *sorted((DOCS / "howto").glob("*.md")),
     *sorted((DOCS / "methods").glob("*.md")),
 ]
@@ -153,3 +153,18 @@ def test_notebooks_are_small_and_hold_no_errors(path):
     outputs = [output for cell in cells for output in cell["outputs"]]
     assert not any(output["output_type"] == "error" for output in outputs)
     assert path.stat().st_size < 400_000
+
+
+def test_imports_point_downwards(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS / "theme"))
+    import layers
+
+    upwards = {
+        pair: paths
+        for pair, paths in layers.imports().items()
+        if layers.floor_of(pair[0]) >= layers.floor_of(pair[1])
+    }
+    assert upwards == {}
+    # environments are found by name: only the command line imports them
+    assert {here for here, there in layers.imports() if there == "envs"} <= {"cli"}
+    assert layers.draw().count("<rect") == sum(map(len, layers.FLOORS))

@@ -1,4 +1,4 @@
-r"""Docstrings as Markdown, for the API page: doctests in fences, formulas as $...$, roles as code."""
+r"""Docstrings as Markdown, for the API page: formulas as $...$, doctests in fences."""
 
 import re
 import textwrap

@@ -1,9 +1,10 @@
-"""What the site needs beyond its pages: README and notebooks as pages, formulas as MathML."""
+"""What the site needs beyond its pages: copies, notebooks, a picture of the imports, formulas."""
 
 import html
 import re
 from pathlib import Path
 
+import layers  # beside this file
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 from nbconvert import MarkdownExporter
@@ -48,6 +49,7 @@ def on_files(files, config):
         files.append(File.generated(config, f"notebooks/{path.stem}.md", content=text))
         for name, image in made["outputs"].items():
             files.append(File.generated(config, f"notebooks/{name}", content=image))
+    files.append(File.generated(config, "images/layers.svg", content=layers.draw()))
     return files
 
 
