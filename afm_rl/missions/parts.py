@@ -16,15 +16,8 @@ from torch import nn
 from afm_rl.artefacts import load_artefact
 from afm_rl.dynamics import KNODE, Calibrated, DynamicsModel, Ensemble, Oracle, Quadrotor
 from afm_rl.errors import AFMError, ConfigurationError, check_flag
-from afm_rl.flow import (
-    ContextFlow,
-    Corrector,
-    Flow,
-    L1Augmentation,
-    LeastSquares,
-    PaperFlow,
-    train_flow,
-)
+from afm_rl.correction import ActionFlow, Corrector, L1Augmentation, LeastSquares, PaperFlow
+from afm_rl.flow import train_flow
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
 from afm_rl.missions.robot import Robot
@@ -138,14 +131,17 @@ def no_flow(robot: Robot, model: DynamicsModel) -> Part:
 def context_flow(
     robot: Robot,
     model: DynamicsModel,
-    train: Mapping[str, Any],
+    train: Mapping[str, Any] | None = None,
     checkpoint: str | None = None,
     **settings: Any,
 ) -> Part:
     """Return the context flow, to be trained over ``model``."""
     place, scale = list(robot.place), robot.place_scale
-    flow = ContextFlow(*robot.flow_box, place=place, place_scale=scale, **settings)
-    return _trained(flow, robot, model, train, checkpoint, "half ranges")
+    settings.pop("window", None)
+    settings["hypotheses"] = settings.pop("views", None) or None
+    if settings["hypotheses"] is None: settings.pop("hypotheses")
+    for k in ("hidden", "latent"): settings.pop(k, None)
+    return Part(ActionFlow(*robot.flow_box, place=place, place_scale=scale, **settings))
 
 
 def paper_flow(
@@ -181,7 +177,7 @@ def l1(robot: Robot, model: DynamicsModel, **settings: Any) -> Part:
 
 
 def _trained(
-    flow: Flow,
+    flow: Corrector,
     robot: Robot,
     model: DynamicsModel,
     settings: Mapping[str, Any],
