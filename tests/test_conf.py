@@ -31,10 +31,10 @@ SMALL = {  # settings that are there are made small
     "dynamics.base.hidden": [8, 8],
     "dynamics.base.pretrain.samples": 256,
     "dynamics.base.pretrain.epochs": 1,
-    "flow.hidden": [8, 8],
-    "flow.latent": 8,
-    "flow.width": 8,
-    "flow.train.iterations": 5,
+    "corrector.hidden": [8, 8],
+    "corrector.latent": 8,
+    "corrector.width": 8,
+    "corrector.train.iterations": 5,
     "budget": 5,
 }
 PARTNERS = {  # what else must be chosen for a choice to make sense
@@ -60,9 +60,6 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "method=afm_offline_knode": ["robot=quadrotor"],
     "method=afm_online_knode": ["robot=quadrotor"],
     "cost=tracking": ["robot=quadrotor"],
-    "transform=afm": ["flow=context"],
-    "transform=none": [],
-    "flow=none": [],
 }
 
 
@@ -87,8 +84,7 @@ PAIRS = [
 SINGLES = [
     *choices("method"),
     *choices("updater"),
-    *choices("transform"),
-    *([choice, "transform=afm"] for (choice, *_) in choices("flow") if choice != "flow=none"),
+    *choices("corrector"),
     *([*cost, "method=afm_physics"] for cost in choices("cost")),
     *choices("robot"),
 ]
@@ -143,14 +139,14 @@ def test_every_setting_has_a_comment():
 
 
 @pytest.mark.parametrize("method", GROUPS["method"])
-def test_a_method_chooses_four_parts_and_nothing_else(method):
+def test_a_method_chooses_three_parts_and_nothing_else(method):
     text = (CONF / "method" / f"{method}.yaml").read_text()
     assert text.startswith("# @package _global_\n")
     loaded = OmegaConf.create(text)
     assert list(loaded) == ["defaults"]
     parts = [next(iter(entry)).removeprefix("override /") for entry in loaded.defaults]
     planner = ["planner"] if method == "geometric" else []  # which is a planner of its own
-    assert parts == ["dynamics", "updater", "transform", "flow", *planner]
+    assert parts == ["dynamics", "updater", "corrector", *planner]
 
 
 def test_a_method_has_the_last_word_on_its_planner_but_for_the_user():

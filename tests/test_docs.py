@@ -1,5 +1,6 @@
 """What the pages for users show works: files, snippets and commands, from top to bottom."""
 
+import json
 import re
 import shlex
 import sys
@@ -14,7 +15,7 @@ from afm_rl.missions import build
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [
-    *(DOCS / "quickstart.md", DOCS / "torchrl.md"),
+    *(DOCS / "quickstart.md", DOCS / "torchrl.md", DOCS / "reliability.md"),
     *sorted((DOCS / "howto").glob("*.md")),
     *sorted((DOCS / "methods").glob("*.md")),
 ]
@@ -109,15 +110,61 @@ def test_every_page_is_in_the_navigation():
             return {entry}
         return set().union(*map(leaves, entry.values() if isinstance(entry, dict) else entry))
 
-    assert leaves(nav) >= {name_of(page) for page in DOCS.rglob("*.md")}
+    pages = {name_of(page) for page in DOCS.rglob("*.md")}
+    notebooks = {f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")}
+    assert leaves(nav) >= pages | notebooks | {"index.md"}
 
 
 def test_docstrings_become_markdown(monkeypatch):
     pytest.importorskip("griffe")
-    monkeypatch.syspath_prepend(str(DOCS))
+    monkeypatch.syspath_prepend(str(DOCS / "theme"))
     import docstrings
 
     text = "See :class:`~afm_rl.Flow`, :math:`a^0`.\n\n.. math:: a,\n  b\n\n>>> 1\n1\n\nEnd"
     found = docstrings.as_markdown(text)
-    assert found.startswith("See `Flow`, `a^0`.") and found.endswith("End")
-    assert "```latex\na," in found and "```pycon\n>>> 1\n1\n```" in found
+    assert found.startswith("See `Flow`, $a^0$.") and found.endswith("End")
+    assert "$$\na,\nb\n$$" in found and "```pycon\n>>> 1\n1\n```" in found
+
+
+@pytest.fixture
+def hooks(monkeypatch):
+    pytest.importorskip("latex2mathml")
+    pytest.importorskip("nbconvert")
+    monkeypatch.syspath_prepend(str(DOCS / "theme"))
+    import hooks
+
+    return hooks
+
+
+def test_formulas_become_mathml(hooks):
+    page = '<p><span class="arithmatex">\\(a &lt; b\\)</span></p>'
+    assert re.search("<math .*<mo>&#x0003C;</mo>.*</math></p>$", hooks.on_page_content(page, None))
+
+
+def test_links_of_the_readme_lead_to_pages_or_are_text(hooks):
+    text = "[a](docs/afm.md#x) [b](notebooks/n.ipynb) [c](LICENSE) ![d](docs/images/e.png)"
+    expected = "[a](afm.md#x) [b](notebooks/n.md) c ![d](images/e.png)"
+    assert hooks.with_site_links(text) == expected
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda p: p.stem)
+def test_notebooks_are_small_and_hold_no_errors(path):
+    cells = [c for c in json.loads(path.read_text())["cells"] if c["cell_type"] == "code"]
+    outputs = [output for cell in cells for output in cell["outputs"]]
+    assert not any(output["output_type"] == "error" for output in outputs)
+    assert path.stat().st_size < 400_000
+
+
+def test_imports_point_downwards(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS / "theme"))
+    import layers
+
+    upwards = {
+        pair: paths
+        for pair, paths in layers.imports().items()
+        if layers.floor_of(pair[0]) >= layers.floor_of(pair[1])
+    }
+    assert upwards == {}
+    # environments are found by name: only the command line imports them
+    assert {here for here, there in layers.imports() if there == "envs"} <= {"cli"}
+    assert layers.draw().count("<rect") == sum(map(len, layers.FLOORS))

@@ -151,8 +151,8 @@ def test_a_project_with_envs_and_conf_of_its_own_lives_beside_ours(environment, 
     found = there("python", "-c", code, *names).splitlines()
     assert found == [f"{site}/{name.replace('.', '/')}/__init__.py" for name in names]
 
-    assert there("ferry").startswith("landed after ")  # with our planner, cost and transform
-    assert there("ferry", "transform.enabled=false").startswith("lost after ")
+    assert there("ferry").startswith("landed after ")  # with our planner and cost
+    assert there("ferry", "correct=false").startswith("lost after ")
 
     remove = ["pip", "--python", python, "uninstall", "--yes"]
     run(sys.executable, "-m", *remove, "afm-rl", cwd=tmp_path)

@@ -122,8 +122,8 @@ def _fitting(some: Mapping[str, str], settings: Mapping[str, Any]) -> list[str]:
 def _label(method: str | None, overrides: Sequence[str]) -> str:
     """Name a method after its preset and the parts that were chosen by hand.
 
-    >>> _label("online_pe", ["seeds=2", "flow=context", "transform=afm"])
-    'online_pe+flow=context+transform=afm'
+    >>> _label("online_pe", ["seeds=2", "updater=rls", "corrector=afm"])
+    'online_pe+updater=rls+corrector=afm'
     """
     parts = [text for text in overrides if text.split("=")[0] in PARTS]
     return "+".join([*([method] if method else []), *parts]) or "physics"

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-PARTS = ("dynamics", "updater", "transform", "flow")
+PARTS = ("dynamics", "updater", "corrector")
 OPTIONAL = "++"  # how Hydra is told to take a setting whether it is there or not
 BESIDE = (
     *("launcher", "progress", "overwrite", "cache", "threads", "figures", "video", "tensorboard"),
@@ -80,7 +80,7 @@ def optional(overrides: Sequence[str]) -> dict[str, str]:
 def has(settings: Mapping[str, Any], key: str) -> bool:
     """Is there a setting of this name?
 
-    >>> has({"flow": {"checkpoint": None}}, "flow.checkpoint"), has({"flow": {}}, "flow.gate")
+    >>> has({"corrector": {"gate": 5.0}}, "corrector.gate"), has({}, "corrector.gate")
     (True, False)
     """
     place: Any = settings

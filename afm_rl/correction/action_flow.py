@@ -11,6 +11,7 @@ from torch import Tensor
 
 from afm_rl.correction.base import Correction, Fields, rows_of
 from afm_rl.correction.choice import nearest_of, probes_of, source_points_of
+from afm_rl.correction.counterfactuals import draw_counterfactuals
 from afm_rl.correction.hypotheses import (
     HYPOTHESES,
     IDENTITY,
@@ -23,13 +24,17 @@ from afm_rl.correction.hypotheses import (
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
-from afm_rl.flow.experts import Rows, fit_experts
+from afm_rl.flow.experts import Experts, fit_experts
 from afm_rl.flow.network import AxisNetwork, Encoded
+from afm_rl.flow.prior import Drawn
 from afm_rl.flow.saturation import MODES, attainable
 from afm_rl.flow.solver import midpoint
+from afm_rl.flow.training import EFFECT_WEIGHT, States, flow_losses
 from afm_rl.flow.weights import load_universal
+from afm_rl.regimes import Regime
 
 TOLERANCE = 0.25  # half ranges: a prediction that misses by so much has half the largest loss
+PLANS = 4  # for each window, in training
 ROWS = 12  # pairs that a hypothesis reads, at least
 
 
@@ -76,7 +81,7 @@ class ActionFlow(PairCorrector):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        hypotheses: names of :data:`~afm_rl.correction.hypotheses.HYPOTHESES`.
+        hypotheses: names of :data:`~afm_rl.correction.hypotheses.HYPOTHESES`; all if None.
         rows: pairs that a hypothesis reads, K; None: 12, or more for more than eight actions.
         memory: pairs that are remembered, M.
         place: coordinates of the state in which the ground may differ; hypotheses by place are
@@ -115,7 +120,7 @@ class ActionFlow(PairCorrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        hypotheses: Sequence[str] = tuple(HYPOTHESES),
+        hypotheses: Sequence[str] | None = None,
         rows: int | None = None,
         memory: int = 40,
         place: Sequence[int] = (),
@@ -136,6 +141,7 @@ class ActionFlow(PairCorrector):
         self.place_scale = check_number(
             "corrector.place_scale", place_scale, low=0.0, open_low=True
         )
+        hypotheses = list(HYPOTHESES) if hypotheses is None else hypotheses
         self.hypotheses = check_hypotheses(hypotheses, by_place=bool(self.place))
         chosen = [HYPOTHESES[name] for name in self.hypotheses]
         if self.memory < memory_of(chosen, rows):
@@ -265,6 +271,50 @@ class ActionFlow(PairCorrector):
     def place_of(self, state: Tensor) -> Tensor:
         """Return where a state is, in the unit in which ground differs."""
         return state[..., self.place] / self.place_scale if self.place else state[..., :0]
+
+    @property
+    def signature(self) -> dict[str, object]:
+        """What stored weights must agree in to be loaded."""
+        return {"kind": "ActionFlow"}
+
+    def training_loss(
+        self,
+        model: DynamicsModel,
+        regime: Regime,
+        states: States,
+        count: int,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """Return the loss of ``count`` windows of a robot, see :func:`train_flow`."""
+        drawn = self._draw(model, regime, states, count, generator)
+        velocity, effect = flow_losses(self.network, drawn, self.saturation, generator)
+        return (velocity + EFFECT_WEIGHT * effect).mean()
+
+    @torch.no_grad()
+    def held_out_error(
+        self,
+        model: DynamicsModel,
+        regime: Regime,
+        states: States,
+        count: int,
+        generator: torch.Generator,
+    ) -> float:
+        """Return the root mean square error of the action on new windows, in half ranges."""
+        drawn = self._draw(model, regime, states, count, generator)
+        encoded = self.network.encode(drawn.rows, fit_experts(drawn.rows))
+        here = Encoded(Experts(*(part.unsqueeze(1) for part in encoded.experts)), *encoded[1:])
+        here = here._replace(plan=here.plan.unsqueeze(1), effect=here.effect.unsqueeze(1))
+        belief = torch.zeros(count, dtype=torch.long)
+        plans = drawn.planned.unbind(1)
+        found = [self.propose(here, belief, plan)[0] for plan in plans]
+        return float((torch.stack(found, 1) - drawn.intended).square().mean().sqrt())
+
+    def _draw(self, model, regime, states, count, generator) -> Drawn:
+        with torch.no_grad():
+            size = (count, self.recent, PLANS)
+            return draw_counterfactuals(
+                self, model, regime, states, size, self.saturation, generator
+            )
 
     def _merge(self, found: Correction, parts: Fields, use: Any, answer: Answer) -> Correction:
         """Put answers where ``use`` says so, in the units of the action; plans where they fail."""

@@ -84,9 +84,7 @@ class PairCorrector(Corrector):
         )
         sound = (valid == 1.0) & rows.isfinite().all(-1, keepdim=True)
         rows = torch.where(sound, rows, 0.0)
-        parts["pairs"] = torch.cat(
-            [parts["pairs"][..., 1 : self.memory - count + 1, :], rows], -2
-        )
+        parts["pairs"] = torch.cat([parts["pairs"][..., 1 : self.memory - count + 1, :], rows], -2)
         return parts["pairs"][..., -self.recent :, 3 * self.action_size + 1].amax(-1)
 
 

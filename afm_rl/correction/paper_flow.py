@@ -72,7 +72,9 @@ class PaperFlow(Corrector):
                 f"state coordinates, 0 to {state_size - 1}"
             )
         self.steps = check_count("corrector.steps", steps)
-        self.error_action = check_choice("corrector.error_action", error_action, ("planned", "executed"))
+        self.error_action = check_choice(
+            "corrector.error_action", error_action, ("planned", "executed")
+        )
         self.wrap = check_flag("corrector.wrap", wrap)
         self.latch = check_flag("corrector.latch", latch)
         check_count("corrector.width", width)

@@ -100,9 +100,7 @@ def fit_gain_offset(
     (tensor([0.5000]), tensor([0.1000]))
     """
     ones = torch.ones_like(executed)
-    terms = torch.stack(
-        [executed * executed, executed, ones, executed * effective, effective], -4
-    )
+    terms = torch.stack([executed * executed, executed, ones, executed * effective, effective], -4)
     robust = weight
     for turn in range(rounds + 1):
         square, mean, mass, cross, shift = (terms * robust.unsqueeze(-4)).sum(-2).unbind(-3)

@@ -57,7 +57,9 @@ def pretrain(
             for _ in range(reuse):
                 order = torch.randperm(8 * batch_size, generator=generator).split(batch_size)
                 pool.extend(_take(many, index) for index in order)
-        velocity, effect = (part.mean() for part in flow_losses(network, pool.pop(), mode, generator))
+        velocity, effect = (
+            part.mean() for part in flow_losses(network, pool.pop(), mode, generator)
+        )
         optimizer.zero_grad(set_to_none=True)
         (velocity + EFFECT_WEIGHT * effect).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -94,7 +96,13 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     network = AxisNetwork(width=arguments.width, latent=arguments.latent, seed=arguments.seed)
-    pretrain(network, arguments.iterations, arguments.batch_size, lr=arguments.lr, seed=arguments.seed + 1)
+    pretrain(
+        network,
+        arguments.iterations,
+        arguments.batch_size,
+        lr=arguments.lr,
+        seed=arguments.seed + 1,
+    )
     save_file({k: v.contiguous() for k, v in network.state_dict().items()}, arguments.out)
 
 

@@ -231,9 +231,9 @@ def draw_examples(
     """
     draw = Draw(generator)
     now, before = draw_maps(count, axes, draw), draw_maps(count, axes, draw)
-    executed = _draw_actions(count, rows, axes, draw)
-    fresh, valid = _draw_masks(count, rows, draw)
-    effective = torch.where(fresh, now.effect(executed), before.effect(executed))
+    executed = draw_actions(count, rows, axes, draw)
+    fresh, valid = draw_masks(count, rows, draw)
+    effective = torch.where(fresh == 1.0, now.effect(executed), before.effect(executed))
     flicker = draw.uniform(0.1, 0.5, count, 1, 1) * draw.chance(0.06, count, 1, 1)
     effective = effective * (1 + flicker * draw.normal(count, rows, axes))
     std = draw.log_uniform(1e-4, 0.1, count, 1, 1) * draw.log_uniform(0.3, 3.0, count, 1, axes)
@@ -260,7 +260,7 @@ def draw_examples(
     )
 
 
-def _draw_actions(count: int, rows: int, axes: int, draw: Draw) -> Tensor:
+def draw_actions(count: int, rows: int, axes: int, draw: Draw) -> Tensor:
     """Draw executed actions ``(N, K, A)``: half of the windows keep near one action."""
     wide = draw.uniform(-1.0, 1.0, count, rows, axes)
     around = EDGE * draw.uniform(-1.0, 1.0, count, 1, axes)
@@ -268,7 +268,7 @@ def _draw_actions(count: int, rows: int, axes: int, draw: Draw) -> Tensor:
     return torch.where(draw.chance(0.5, count, 1, 1), wide, (around + spread * wide).clamp(-1, 1))
 
 
-def _draw_masks(count: int, rows: int, draw: Draw) -> tuple[Tensor, Tensor]:
+def draw_masks(count: int, rows: int, draw: Draw) -> tuple[Tensor, Tensor]:
     """Draw which rows are of the present regime, and which are filled, ``(N, K, 1)`` each."""
     row = torch.arange(rows).view(1, -1, 1)
 
@@ -279,7 +279,7 @@ def _draw_masks(count: int, rows: int, draw: Draw) -> tuple[Tensor, Tensor]:
     usual = torch.tensor([max(1, rows // 12), max(1, rows // 6), rows // 2, rows])
     filled = usual[torch.randint(4, (count, 1, 1), generator=draw.generator)]
     filled = torch.where(draw.chance(0.25, count, 1, 1), some(), filled)
-    return fresh, (row >= rows - filled).float()
+    return fresh.float(), (row >= rows - filled).float()
 
 
 def _draw_plans(now: Maps, last: Tensor, plans: int, draw: Draw) -> Tensor:

@@ -28,7 +28,7 @@ def midpoint(velocity: Velocity, start: Tensor, steps: int) -> Tensor:
     >>> abs(float(x) - 2.718281828) < 1e-4
     True
     """
-    check_count("flow.steps", steps)
+    check_count("corrector.steps", steps)
     step, point = 1.0 / steps, start
     for k in range(steps):
         tau = k * step

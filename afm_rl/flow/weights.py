@@ -23,7 +23,9 @@ def load_universal() -> AxisNetwork:
     data = folder.joinpath(FILE).read_bytes()
     expected = folder.joinpath(f"{FILE}.sha256").read_text().split()[0]
     if hashlib.sha256(data).hexdigest() != expected:
-        raise ArtefactError(f"{FILE}: damaged, its checksum is not {expected}: install afm-rl again")
+        raise ArtefactError(
+            f"{FILE}: damaged, its checksum is not {expected}: install afm-rl again"
+        )
     network = AxisNetwork()
     network.load_state_dict(load(data))
     return network.requires_grad_(False).eval()

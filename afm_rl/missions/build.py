@@ -16,7 +16,7 @@ from afm_rl.dynamics import Calibrated, DynamicsModel, Oracle
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.learning import GaussianNLLLoss, MassEstimator, OracleUpdater, RLSUpdater, Updater
 from afm_rl.missions.checks import blaming, check_cost, check_keys
-from afm_rl.missions.parts import Training
+from afm_rl.missions.factories import Training
 from afm_rl.missions.robot import Robot
 from afm_rl.missions.selection import (
     build_missions,
@@ -31,13 +31,13 @@ from afm_rl.transforms import ActionFlowTransform
 
 ROBOT_SHAPES = (
     *("action_low", "action_high", "state_low", "state_high"),
-    *("features", "model", "regime", "flow_low", "flow_high", "flow_reuse"),
+    *("features", "model", "regime", "flow_low", "flow_high"),
 )
-NOMINAL = {"_target_": "afm_rl.missions.parts.physics", "_partial_": True}
+NOMINAL = {"_target_": "afm_rl.missions.factories.physics", "_partial_": True}
 AFTER_TRAINING = (
     *("gate", "samples", "steps", "error_action", "wrap", "latch", "checkpoint"),
     *("propagation", "precision"),
-    *("memory", "views", "forgetting", "choose"),
+    *("memory", "views", "forgetting", "choose", "enabled", "extend_action_box"),
 )
 
 
@@ -97,7 +97,7 @@ def build(cfg: DictConfig) -> Agent:
             action_low=robot.action_low,
             action_high=robot.action_high,
         )
-    robot.judge.check(env, robot.goal_names)
+    robot.metrics.check(env, robot.goal_names)
     missions = build_missions(env, tracks, regimes, seeds)
 
     def make(group: str, *args: Any) -> Any:
@@ -105,21 +105,19 @@ def build(cfg: DictConfig) -> Agent:
             return instantiate(cfg[group], _convert_="all")(*args)
 
     dynamics = make("dynamics", robot)
-    base = dynamics.module
-    flow = make("flow", robot, robot.model if dynamics.nominal else base)
-    shapes = [_shaping(settings, group) for group in ("robot", "dynamics", "flow")]
+    corrector = make("corrector", robot, dynamics)
+    shapes = [_shaping(settings, group) for group in ("robot", "dynamics", "corrector")]
     if dynamics.nominal:  # all such flows are one and the same
         shapes[1] = NOMINAL
     trainings = [
         part.training._replace(settings=shaping)
-        for part, shaping in ((dynamics, shapes[:2]), (flow, shapes))
+        for part, shaping in ((dynamics, shapes[:2]), (corrector, shapes))
         if part.training is not None
     ]
-    model = base
+    model, transform = dynamics.module, corrector.module
     with blaming("cost"):
         cost = instantiate(cfg.cost, _convert_="all")
     planner = make("planner", PlanningEnv(model, cost, *robot.action_box))
-    transform = make("transform", model, flow.module)
     executed_key = "action" if transform is None else ("next", transform.key("executed_action"))
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=executed_key)

@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from afm_rl.measures import Measure, Measures
 from afm_rl.missions.score import Score
 
 
@@ -19,6 +20,20 @@ class LapScore(Score):
     ``finished``, whether all were.
     """
 
+    measures = Measures(
+        (
+            Measure(
+                *("success_rate", "success", "targets reached", "%", "higher"),
+                scale=100.0,
+                digits=1,
+                limits=(0.0, 1.0),
+                headline=True,
+            ),
+            Measure("steps", "steps", "steps", better="lower", headline=True, budget=True),
+        ),
+        progress=("reached", "targets"),
+        error_unit="m, rad",
+    )
     columns = ("reached",)
     whole = ("reached",)
     reads = ("goal", "reached")

@@ -12,7 +12,7 @@ from afm_rl._version import __version__
 from afm_rl.artefacts import cached
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions.build import Agent
-from afm_rl.missions.parts import Training
+from afm_rl.missions.factories import Training
 
 
 def prepare(

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 from tqdm.auto import tqdm
 
+from afm_rl.measures import Measures
 from afm_rl.missions.build import Agent
 from afm_rl.missions.checkpoint import Checkpoint, Stopped
 from afm_rl.missions.log import StepLog
@@ -31,6 +32,8 @@ class Results:
     """One row per mission."""
     steps: pd.DataFrame
     """One row per mission and step."""
+    measures: Measures
+    """What the missions are compared by."""
 
 
 @torch.no_grad()
@@ -96,7 +99,7 @@ def _run(
             if stop:
                 raise Stopped(f"stopped before step {loop.step}")
         bar.update(total - bar.n)
-    return Results(_missions(agent, loop.ends), loop.log.table())
+    return Results(_missions(agent, loop.ends), loop.log.table(), agent.robot.metrics.measures)
 
 
 def _start(agent: Agent) -> Loop:
@@ -107,8 +110,8 @@ def _start(agent: Agent) -> Loop:
     td = agent.env.reset(agent.missions, set_state=False)
     agent.updater.start(td)
     ends = {name: torch.zeros(total) for name in ("steps", "seconds")}
-    ends |= agent.robot.judge.start(agent.missions)
-    whole = ["misaligned", "regime_active", *agent.robot.judge.whole]
+    ends |= agent.robot.metrics.start(agent.missions)
+    whole = ["misaligned", "regime_active", *agent.robot.metrics.whole]
     log = StepLog(_columns(agent), whole)
     return Loop(td, torch.arange(total), ends, log)
 
@@ -125,7 +128,7 @@ def _advance(agent: Agent, loop: Loop) -> None:
     loop.log.add(ids, loop.step, _row(agent, td, (error, miss, unforeseen), surprise, loss))
     done = td["next", "done"].squeeze(-1)
     loop.ends["steps"][ids] = loop.step
-    agent.robot.judge.add(loop.ends, ids, td)
+    agent.robot.metrics.add(loop.ends, ids, td)
     loop.td = step_mdp(td)
     if bool(done.any()):
         keep = (~done).nonzero().squeeze(-1)
@@ -161,7 +164,7 @@ def _columns(agent: Agent) -> list[str]:
         "misaligned",
         "loss",
         "regime_active",
-        *agent.robot.judge.columns,
+        *agent.robot.metrics.columns,
     ]
 
 
@@ -171,7 +174,7 @@ def _row(agent: Agent, td: TensorDictBase, errors, surprise, loss) -> Tensor:
     flag = surprise > SILENT if transform is None else td["next", transform.key("misaligned")]
     figures = (*errors, flag, loss, td["regime_active"])
     scalars = torch.stack([x.float() for x in figures], -1)
-    score, executed = agent.robot.judge, td.get(agent.executed_key)
+    score, executed = agent.robot.metrics, td.get(agent.executed_key)
     parts = [td["observation"], score.goal(td), td["action"], executed, scalars, score.row(td)]
     return torch.cat(parts, -1)
 
@@ -188,7 +191,7 @@ def _missions(agent: Agent, ends: dict[str, Tensor]) -> pd.DataFrame:
     }
     frame.update({name: changed[:, k] for k, name in enumerate(agent.robot.regime.names)})
     frame.update(seed=mission["seed"])
-    frame.update(agent.robot.judge.table(base, agent.missions, ends))
+    frame.update(agent.robot.metrics.table(base, agent.missions, ends))
     frame.update(seconds=ends["seconds"], regime=agent.regime_names)
     return pd.DataFrame({name: _plain(value) for name, value in frame.items()})
 

@@ -1,27 +1,31 @@
-"""What missions are judged by."""
+"""What is logged of a kind of mission, and the measures by which methods are compared."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.errors import ConfigurationError
+from afm_rl.measures import Measures
 
 
 class Score(ABC):
     """What is logged of a kind of mission, what is summed up, and what its table says.
 
     Attributes:
+        measures: the columns of :meth:`table` by which methods are compared. Runs store them with
+            their results, and reports know nothing else of a kind of mission.
         columns: names of the numbers that :meth:`row` logs, the last columns of the steps.
         whole: those that are whole numbers.
         reads: entries of the environment without which there is no score.
     """
 
+    measures: ClassVar[Measures]
     columns: Sequence[str] = ()
     whole: Sequence[str] = ()
     reads: Sequence[str] = ()

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from omegaconf import DictConfig
 
+from afm_rl import measures
 from afm_rl.artefacts import write_whole
 from afm_rl.missions.build import build
 from afm_rl.missions.checkpoint import Stopped
@@ -93,5 +94,6 @@ def _write(folder: Path, results: Results) -> None:
     buffer = io.BytesIO()
     results.steps.to_parquet(buffer, index=False, compression="zstd")
     write_whole(folder / STEPS, buffer.getvalue())
+    write_whole(folder / measures.FILE, results.measures.to_json().encode())
     table = results.missions.to_csv(index=False, lineterminator="\n")
     write_whole(folder / MISSIONS, table.encode())

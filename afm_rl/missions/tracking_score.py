@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.errors import check_number
+from afm_rl.measures import Measure, Measures
 from afm_rl.missions.score import Score
 
 UP = 2  # index of the z axis
@@ -23,7 +24,7 @@ class TrackingScore(Score):
     the z axis; ``mse_phase_k`` in each phase; ``peak_z``, the largest :math:`|e_z|` after a step
     (m); ``settle_k``, the time (s) from the beginning of phase k > 0 to that of the first stretch
     of ``hold`` seconds in which :math:`|e_z|` is below ``band`` after each step; ``steps``;
-    ``finished``, whether the mission was not lost. Of what never came to pass, there is no number.
+    ``finished``, whether the mission was not lost. A number that does not exist is NaN.
 
     Args:
         dt: time of a step (s).
@@ -34,6 +35,14 @@ class TrackingScore(Score):
         ConfigurationError: for a setting that cannot be used.
     """
 
+    measures = Measures(
+        (
+            Measure(*("mse", "MSE", "mean squared error", "m²", "lower"), digits=5, headline=True),
+            Measure("mse_z", "MSE of z", "the same along z", "m²", "lower", digits=5),
+            Measure("peak_z", "peak of z", "largest error along z", "m", "lower", digits=3),
+        ),
+        error_unit="m, m/s, rad, rad/s",
+    )
     columns = ("square_error_x", "square_error_y", "square_error_z", "phase")
     whole = ("phase",)
     reads = ("reference", "square_error", "pose", "phase", "step", "since", "lost")

@@ -19,7 +19,7 @@ from afm_rl.report.style import dress, method_styles, new_figure, png_bytes
 
 FORMS = {
     "no correction": ["method=physics"],
-    "as published": ["method=afm_physics", "flow=paper"],
+    "as published": ["method=afm_physics", "corrector=paper"],
     "ours": ["method=afm_physics"],
     "oracle": ["method=oracle"],
 }

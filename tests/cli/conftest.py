@@ -13,10 +13,10 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.singleton import Singleton
 
 from afm_rl import cli
-from afm_rl.missions import parts
+from afm_rl.missions import factories
 
 QUICK = ["progress=false", "figures=false", "tensorboard=false"]
-SMALL_FLOW = ["flow.train.iterations=20", "flow.hidden=[16,16]", "flow.latent=8"]
+SMALL_FLOW = ["corrector.train.iterations=20", "corrector.hidden=[16,16]", "corrector.latent=8"]
 
 
 @pytest.fixture
@@ -38,12 +38,12 @@ def small_training(monkeypatch):
         ("pretrain_ensemble", {"samples": 512, "epochs": 1}),
         ("train_flow", {"iterations": 10}),
     ):
-        whole = getattr(parts, name)
+        whole = getattr(factories, name)
 
         def short(*args, _whole=whole, _small=small, **settings):
             return _whole(*args, **{**settings, **_small})
 
-        monkeypatch.setattr(parts, name, functools.wraps(whole)(short))
+        monkeypatch.setattr(factories, name, functools.wraps(whole)(short))
 
 
 @pytest.fixture(scope="session")

@@ -58,8 +58,6 @@ physics         robot.action_low=[1.0,9.0]               robot.action_low=[1.0, 
 physics         robot.action_high=[inf,inf]              half_range=[inf, action_high
 physics         robot.env.reach=nan                      reach=nan
 physics         robot.paper_regimes=[],regimes=paper     regimes=[]
-physics         transform=afm                            transform=afm flow=context
-physics         flow=context                             flow transform=afm
 physics         dynamics=oracle                          dynamics=oracle updater=oracle
 online_pe       dynamics.members=0                       dynamics.members=0
 online_pe       dynamics.hidden=[0]                      dynamics.hidden=0
@@ -67,13 +65,12 @@ online_pe       dynamics.log_variance=[1,-1]             dynamics.log_variance=[
 online_pe       dynamics.pretrain.samples=10             dynamics.pretrain.samples=10 256
 online_pe       +dynamics.pretrain.step=1                dynamics.pretrain 'step' samples
 online_pe       updater.optimizer.lr=0                   updater lr=0
-afm_physics     flow.gate=-1                             flow.gate=-1
-afm_physics     flow.window=0                            flow.window=0
-afm_physics     flow.hidden=[0]                          flow
-afm_physics     flow.train.iterations=0                  flow.train.iterations=0
-afm_physics     +flow.train.step=1                       flow.train 'step' iterations
-afm_physics     flow.checkpoint=missing                  flow.checkpoint missing
-afm_physics     flow=none                                transform=afm flow=paper
+afm_physics     corrector.gate=-1                             corrector.gate=-1
+afm_physics     corrector.window=0                            corrector.window=0
+afm_physics     corrector.hidden=[0]                          corrector
+afm_physics     corrector.train.iterations=0                  corrector.train.iterations=0
+afm_physics     +corrector.train.step=1                       corrector.train 'step' iterations
+afm_physics     corrector.checkpoint=missing                  corrector.checkpoint missing
 """
 
 
@@ -95,7 +92,7 @@ def refuse(afm_rl, tmp_path, quick, monkeypatch):
     def never(*args, **kwargs):
         raise AssertionError("went on, though the settings cannot be used")
 
-    monkeypatch.setattr("afm_rl.missions.parts.Training.train", never)
+    monkeypatch.setattr("afm_rl.missions.factories.Training.train", never)
     monkeypatch.setattr("afm_rl.cli.launch.run", never)
 
     def call(*overrides):
@@ -144,8 +141,8 @@ def test_a_folder_that_cannot_be_written(refuse, tmp_path):
 
 def test_a_cache_that_cannot_be_written(afm_rl, tmp_path, quick, monkeypatch):
     (tmp_path / "file").write_text("")
-    monkeypatch.setattr("afm_rl.missions.parts.train_flow", lambda *args, **settings: 1 / 0)
-    monkeypatch.setattr("afm_rl.missions.parts.check_training", lambda *args, **settings: None)
+    monkeypatch.setattr("afm_rl.missions.factories.train_flow", lambda *args, **settings: 1 / 0)
+    monkeypatch.setattr("afm_rl.missions.factories.check_training", lambda *args, **settings: None)
     folder = f"hydra.run.dir={tmp_path}/run"
     done = afm_rl("method=afm_physics", f"cache={tmp_path}/file/parts", folder, *quick)
     assert done.status == 2
@@ -155,14 +152,14 @@ def test_a_cache_that_cannot_be_written(afm_rl, tmp_path, quick, monkeypatch):
 def test_a_checkpoint_for_another_robot(refuse, tmp_path):
     flow = ContextFlow(torch.tensor([-1.0]), torch.tensor([1.0]))
     save_artefact(tmp_path / "flow", flow, flow.signature)
-    line = refuse("method=afm_physics", f"flow.checkpoint={tmp_path}/flow")
-    assert "flow.checkpoint: " in line and "action_size=1, expected action_size=2" in line
+    line = refuse("method=afm_physics", f"corrector.checkpoint={tmp_path}/flow")
+    assert "corrector.checkpoint: " in line and "action_size=1, expected action_size=2" in line
 
 
 def test_a_checkpoint_that_is_no_checkpoint(refuse, tmp_path):
     (tmp_path / "flow").write_bytes(b"\x80\x04cposix\nsystem\n.")
-    line = refuse("method=afm_physics", f"flow.checkpoint={tmp_path}/flow")
-    assert "flow.checkpoint: " in line and "damaged" in line
+    line = refuse("method=afm_physics", f"corrector.checkpoint={tmp_path}/flow")
+    assert "corrector.checkpoint: " in line and "damaged" in line
 
 
 @pytest.mark.parametrize("target", ["os.system", "subprocess.run", "builtins.eval"])

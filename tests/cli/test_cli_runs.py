@@ -60,7 +60,7 @@ def test_bare_compares_four_methods(afm_rl, tmp_path, small_training):
         (["method=oracle", "dynamics=oracle"], ["oracle+dynamics=oracle"]),
         (["compare=[]"], ["physics"]),
         (["dynamics=oracle", "updater=oracle"], ["dynamics=oracle+updater=oracle"]),
-        (["compare=[physics]", "flow=none"], ["physics+flow=none"]),
+        (["compare=[physics]", "corrector=none"], ["physics+corrector=none"]),
         (["compare=[]", "label=mine"], ["mine"]),
         (["compare=null"], ["physics"]),
         (["compare=[oracle, physics]", "label=mine"], ["oracle", "physics"]),
@@ -98,7 +98,7 @@ def assert_same_results(left, right):
 
 def test_the_stored_configuration_makes_the_same_run(afm_rl, tmp_path, quick, small_flow, cache):
     first, again = tmp_path / "first", tmp_path / "again"
-    chosen = ["method=afm_physics", "flow.window=3", "budget=20", "seeds=[4]", "label=mine"]
+    chosen = ["method=afm_physics", "corrector.window=3", "budget=20", "seeds=[4]", "label=mine"]
     assert afm_rl(*chosen, *small_flow, *quick, f"hydra.run.dir={first}").status == 0
     replay = [f"--config-path={first}", "--config-name=config", f"hydra.run.dir={again}"]
     done = afm_rl(*replay)

@@ -78,7 +78,7 @@ def test_the_studies(afm_rl, asked, study, budget, count, last, monkeypatch, tmp
 
 def test_settings_of_some_methods(afm_rl, asked, tmp_path):
     folder = f"hydra.run.dir={tmp_path}"
-    some = ["compare=[physics,online_pe,afm_online_pe]", "flow.checkpoint=null"]
+    some = ["compare=[physics,online_pe,afm_online_pe]", "corrector.checkpoint=null"]
     done = afm_rl("study=ugv", *some, "dynamics.propagation=sample", "seeds=1", folder)
     assert set(done.out.splitlines()[:3]) == {
         "physics: has no dynamics.propagation, so it stays as it is",
@@ -101,7 +101,7 @@ def test_settings_that_no_method_has_are_refused(afm_rl, tmp_path, study):
 
 
 def test_a_comparison_takes_settings_of_some_methods_too(afm_rl, tmp_path, quick):
-    chosen = ["compare=[physics, adaptive_gain]", "flow.window=7", "budget=2"]
+    chosen = ["compare=[physics, adaptive_gain]", "corrector.window=7", "budget=2"]
     done = afm_rl(*chosen, *quick, f"hydra.run.dir={tmp_path}")
     assert done.status == 0, done.err
     assert "physics: has no flow.window, so it stays as it is" in done.out

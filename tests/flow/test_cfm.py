@@ -234,7 +234,7 @@ def test_progress_can_be_shown_on_a_terminal(train, monkeypatch):
     ids=str,
 )
 def test_impossible_settings_are_refused(train, settings):
-    with pytest.raises(ConfigurationError, match=f"flow.train.{next(iter(settings))}"):
+    with pytest.raises(ConfigurationError, match=f"corrector.train.{next(iter(settings))}"):
         train(**settings)
 
 

@@ -237,13 +237,14 @@ def test_what_a_model_has_learnt_meanwhile_is_told(flow, live):
 def test_a_memory_must_hold_what_views_read(box, settings, least):
     small = {"window": 4, "hidden": [8], "latent": 4, **settings}
     ContextFlow(*box, memory=least, **small)
-    with pytest.raises(ConfigurationError, match=f"flow.memory={least - 1}: .* at least {least} "):
+    complaint = f"corrector.memory={least - 1}: .* at least {least} "
+    with pytest.raises(ConfigurationError, match=complaint):
         ContextFlow(*box, memory=least - 1, **small)
 
 
 @pytest.mark.parametrize("views", ["recent", [], 3, None, ["recent", "sideways"], ["silent"]])
 def test_unknown_views_are_refused(box, views):
-    with pytest.raises(ConfigurationError, match="flow.views="):
+    with pytest.raises(ConfigurationError, match="corrector.views="):
         ContextFlow(*box, views=views)
 
 

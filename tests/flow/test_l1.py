@@ -120,11 +120,11 @@ def test_actions_stay_in_the_box(shown, saturation):
     ("setting", "name"),
     [
         ({"dt": 0.0}, "flow.dt"),
-        ({"bandwidth": 0.0}, "flow.bandwidth"),
-        ({"bandwidth": math.inf}, "flow.bandwidth"),
-        ({"window": 0}, "flow.window"),
-        ({"gate": -1.0}, "flow.gate"),
-        ({"saturation": "none"}, "flow.saturation"),
+        ({"bandwidth": 0.0}, "corrector.bandwidth"),
+        ({"bandwidth": math.inf}, "corrector.bandwidth"),
+        ({"window": 0}, "corrector.window"),
+        ({"gate": -1.0}, "corrector.gate"),
+        ({"saturation": "none"}, "corrector.saturation"),
     ],
 )
 def test_bad_settings_are_refused(setting, name):

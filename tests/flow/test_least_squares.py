@@ -84,11 +84,11 @@ def test_actions_stay_in_the_box(shown, form, saturation):
 @pytest.mark.parametrize(
     ("setting", "name"),
     [
-        ({"form": "cubic"}, "flow.form"),
-        ({"forgetting": 0.0}, "flow.forgetting"),
-        ({"forgetting": 1.5}, "flow.forgetting"),
-        ({"window": 0}, "flow.window"),
-        ({"saturation": "none"}, "flow.saturation"),
+        ({"form": "cubic"}, "corrector.form"),
+        ({"forgetting": 0.0}, "corrector.forgetting"),
+        ({"forgetting": 1.5}, "corrector.forgetting"),
+        ({"window": 0}, "corrector.window"),
+        ({"saturation": "none"}, "corrector.saturation"),
     ],
 )
 def test_bad_settings_are_refused(setting, name):

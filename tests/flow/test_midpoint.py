@@ -48,5 +48,5 @@ def test_time_runs_from_zero_to_one():
 
 
 def test_there_must_be_a_step():
-    with pytest.raises(ConfigurationError, match="flow.steps=0"):
+    with pytest.raises(ConfigurationError, match="corrector.steps=0"):
         midpoint(lambda tau, x: x, ONE, 0)

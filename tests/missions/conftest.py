@@ -21,10 +21,10 @@ SMALL = {  # settings that are there are made small
     "dynamics.pretrain.samples": 512,
     "dynamics.pretrain.epochs": 1,
     "dynamics.pretrain.flights": 4,
-    "flow.hidden": [16, 16],
-    "flow.latent": 8,
-    "flow.width": 8,
-    "flow.train.iterations": 20,
+    "corrector.hidden": [16, 16],
+    "corrector.latent": 8,
+    "corrector.width": 8,
+    "corrector.train.iterations": 20,
 }
 TARGETS = 20  # of the ring
 
@@ -101,7 +101,7 @@ def no_training(monkeypatch):
     def never(*args, **kwargs):
         raise AssertionError("trained, though the settings cannot be used")
 
-    monkeypatch.setattr("afm_rl.missions.parts.Training.train", never)
+    monkeypatch.setattr("afm_rl.missions.factories.Training.train", never)
 
 
 def _track(path, points):

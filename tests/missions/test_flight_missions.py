@@ -124,7 +124,7 @@ def test_a_lost_flight_leaves_the_batch(fly):
 
 
 def test_flows_correct_in_a_box_of_their_own(fly):
-    flown = fly("method=afm_physics", "flow.views=[recent]")
+    flown = fly("method=afm_physics", "corrector.views=[recent]")
     flow, robot = flown.agent.transform.flow, flown.agent.robot
     torch.testing.assert_close(flow.half_range, torch.tensor([0.575, 3e-4, 3e-4, 1e-4]))
     steps = flown.steps
@@ -140,7 +140,7 @@ def test_flows_correct_in_a_box_of_their_own(fly):
 @pytest.mark.parametrize(
     ("overrides", "complaint"),
     [
-        (["method=afm_paper"], "flow=paper: robot=quadrotor has states with rotations; choose"),
+        (["method=afm_paper"], "corrector=paper: robot=quadrotor has states with rotations"),
         (["planner=mppi"], "planner: .* 6 targets in a row in 'reference', .* takes one;"),
         (["robot.env.horizon=7"], "planner: .* 8 targets in a row .* takes one or 21;"),
         (["cost=goal_pose"], "planner: got PlanningEnv with GoalDistance; MPC needs"),
@@ -193,11 +193,12 @@ def test_a_network_may_be_trained_before_the_flight(make_agent, randomised):
 def test_flows_use_examples_as_often_as_the_robot_says(make_agent, monkeypatch):
     used = []
     monkeypatch.setattr(
-        "afm_rl.missions.parts.train_flow", lambda *args, reuse, **rest: used.append(reuse) or 0.0
+        "afm_rl.missions.factories.train_flow",
+        lambda *args, reuse, **rest: used.append(reuse) or 0.0,
     )
-    monkeypatch.setattr("afm_rl.missions.parts.check_training", lambda *args, **least: None)
+    monkeypatch.setattr("afm_rl.missions.factories.check_training", lambda *args, **least: None)
     for k, given in enumerate((None, 3)):
-        settings = {"flow.train.reuse": given, "flow.train.seed": 77 + k, **QUICK}
+        settings = {"corrector.train.reuse": given, "corrector.train.seed": 77 + k, **QUICK}
         make_agent("robot=quadrotor", "method=afm_physics", **settings)
     assert used == [32, 3]
 
@@ -206,7 +207,7 @@ def test_flows_use_examples_as_often_as_the_robot_says(make_agent, monkeypatch):
 def test_robots_say_how_flows_are_made_for_them(composed, robot, views, steps):
     flow = composed(f"robot={robot}", "method=afm_physics").flow
     assert len(flow.views) == views and flow.train.iterations == steps
-    own = composed(f"robot={robot}", "method=afm_physics", "flow.views=[recent]").flow
+    own = composed(f"robot={robot}", "method=afm_physics", "corrector.views=[recent]").corrector
     assert list(own.views) == ["recent"]
 
 

@@ -31,7 +31,7 @@ def test_planner_transform_and_updater_share_one_model(configure, no_training, m
     if method != "geometric":  # which has no use for a model
         assert agent.planner.env.dynamics is agent.model
     assert agent.updater.loss.model is agent.model
-    assert (agent.transform is None) == cfg.transform._target_.endswith("no_transform")
+    assert (agent.transform is None) == cfg.corrector._target_.endswith("no_correction")
     if agent.transform is not None:
         assert agent.transform.model is agent.model
         assert unravel_key(agent.executed_key) == ("next", "afm", "executed_action")
@@ -55,8 +55,6 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
 @pytest.mark.parametrize(
     ("overrides", "complaint"),
     [
-        (["transform=afm"], "transform=afm: needs a flow; choose flow=context or flow=paper"),
-        (["flow=context"], "flow: nothing uses it; choose transform=afm, or flow=none"),
         (["dynamics=oracle"], "dynamics=oracle and an updater .* belong together"),
         (["updater=oracle"], "both, dynamics=oracle with updater=oracle or updater=mass"),
         (["updater=mass"], "MassEstimator needs an Oracle of a Quadrotor, got Dubins; choose"),
@@ -138,18 +136,18 @@ NAN = float("nan")
         ("online_pe", "dynamics.pretrain.action_noise", -1, "dynamics.pretrain.action_noise=-1"),
         ("online_pe", "updater.optimizer.lr", "abc", "updater.lr='abc': expected a finite"),
         ("online_pe", "updater.optimizer._target_", "torch.Nope", "updater.optimizer: .*torch.N"),
-        ("afm_physics", "flow.gate", NAN, "flow.gate=nan: expected a finite number"),
-        ("afm_physics", "flow.samples", 0, "flow.samples=0: expected a whole number"),
-        ("afm_physics", "flow.steps", 0, "flow.steps=0: expected a whole number"),
-        ("afm_physics", "flow.source_std", -1, "flow.source_std=-1: expected a finite number"),
-        ("afm_physics", "flow.latent", -1, "flow.latent=-1: "),
-        ("afm_physics", "flow.hidden", 3, "flow.hidden=3: expected a list"),
-        ("afm_physics", "flow.train", 3, "flow: 'int' object"),
-        ("afm_physics", "flow.train.batch_size", 1, "flow.train.batch_size=1: expected"),
-        ("afm_physics", "flow.train.reuse", 0, "flow.train.reuse=0: expected"),
-        ("afm_physics", "flow.train.seed", "abc", "flow.train.seed='abc': expected"),
-        ("afm_paper", "flow.width", 0, "flow.width=0: "),
-        ("afm_paper", "flow.error_action", "foo", "flow.error_action='foo': expected one of"),
+        ("afm_physics", "corrector.gate", NAN, "corrector.gate=nan: expected a finite number"),
+        ("afm_physics", "corrector.samples", 0, "corrector.samples=0: expected a whole number"),
+        ("afm_physics", "corrector.steps", 0, "corrector.steps=0: expected a whole number"),
+        ("afm_physics", "corrector.source_std", -1, "corrector.source_std=-1: expected a finite"),
+        ("afm_physics", "corrector.latent", -1, "corrector.latent=-1: "),
+        ("afm_physics", "corrector.hidden", 3, "corrector.hidden=3: expected a list"),
+        ("afm_physics", "corrector.train", 3, "corrector: 'int' object"),
+        ("afm_physics", "corrector.train.batch_size", 1, "corrector.train.batch_size=1: expected"),
+        ("afm_physics", "corrector.train.reuse", 0, "corrector.train.reuse=0: expected"),
+        ("afm_physics", "corrector.train.seed", "abc", "corrector.train.seed='abc': expected"),
+        ("afm_paper", "corrector.width", 0, "corrector.width=0: "),
+        ("afm_paper", "corrector.error_action", "foo", "corrector.error_action='foo': expected"),
     ],
 )
 def test_settings_out_of_range_are_refused(configure, no_training, method, key, value, complaint):
@@ -200,8 +198,9 @@ def _checkpoint(path, flow):
 
 def test_a_good_checkpoint_is_used(configure, no_training, tmp_path, cache):
     stored = _checkpoint(tmp_path / "flow", ContextFlow(LOW, HIGH, **SHAPE))
-    changes = {f"flow.{name}": value for name, value in SHAPE.items()}
-    cfg = configure("method=afm_physics", **changes, **{"flow.checkpoint": str(tmp_path / "flow")})
+    changes = {f"corrector.{name}": value for name, value in SHAPE.items()}
+    changes["corrector.checkpoint"] = str(tmp_path / "flow")
+    cfg = configure("method=afm_physics", **changes)
     agent = build(cfg)
     assert agent.trainings == []
     prepare(agent, cache)
@@ -220,16 +219,17 @@ def test_a_good_checkpoint_is_used(configure, no_training, tmp_path, cache):
 )
 def test_a_checkpoint_of_another_flow_is_refused(configure, no_training, tmp_path, flow, complaint):
     _checkpoint(tmp_path / "flow", flow)
-    changes = {f"flow.{name}": value for name, value in SHAPE.items()}
-    cfg = configure("method=afm_physics", **changes, **{"flow.checkpoint": str(tmp_path / "flow")})
-    with pytest.raises(ConfigurationError, match=f"^flow.checkpoint: {tmp_path}.*{complaint}"):
+    changes = {f"corrector.{name}": value for name, value in SHAPE.items()}
+    changes["corrector.checkpoint"] = str(tmp_path / "flow")
+    cfg = configure("method=afm_physics", **changes)
+    with pytest.raises(ConfigurationError, match=f"^corrector.checkpoint: {tmp_path}.*{complaint}"):
         build(cfg)
 
 
 def test_a_checkpoint_that_is_not_there_is_refused(configure, tmp_path):
     for given in (str(tmp_path / "nowhere"), str(tmp_path), 3):
-        cfg = configure("method=afm_physics", **{"flow.checkpoint": given})
-        with pytest.raises(ConfigurationError, match="^flow.checkpoint.*(no such file|the path)"):
+        cfg = configure("method=afm_physics", **{"corrector.checkpoint": given})
+        with pytest.raises(ConfigurationError, match="^corrector.checkpoint.*(no such|the path)"):
             build(cfg)
 
 

@@ -43,10 +43,11 @@ def test_only_what_the_result_depends_on_is_part_of_the_key(prepared, cache):
     prepared(cache)
     _, lines = prepared(cache, "planner=mppi_paper", "seeds=3", budget=3)
     assert all("from the cache" in line for line in lines)
-    after = {"flow.gate": 9.0, "flow.samples": 2, "flow.steps": 1, "dynamics.propagation": "sample"}
+    after = {f"corrector.{name}": value for name, value in {"gate": 9.0, "samples": 2}.items()}
+    after["dynamics.propagation"] = "sample"
     _, lines = prepared(cache, **after)
     assert all("from the cache" in line for line in lines)
-    _, lines = prepared(cache, **{"flow.train.iterations": 21})
+    _, lines = prepared(cache, **{"corrector.train.iterations": 21})
     assert ["from the cache" in line for line in lines] == [True, False]
     _, lines = prepared(cache, **{"dynamics.seed": 1})
     assert not any("from the cache" in line for line in lines)

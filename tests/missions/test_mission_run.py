@@ -116,7 +116,7 @@ def test_seconds_are_shared_out_among_the_missions(drive, ring):
 FLIERS = {"geometric", "mass_estimator"}  # need a quadrotor, as all with a KNODE do
 METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
 METHODS = [name for name in METHODS if name not in FLIERS and "knode" not in name]
-NAIVE = {"flow.views": ["recent"]}  # networks that know nothing foresee nothing: silence would win
+NAIVE = {"corrector.views": ["recent"]}  # untrained networks foresee nothing: silence would win
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -217,7 +217,7 @@ def test_the_oracle_is_never_surprised(drive, ring):
 
 def test_actions_are_planned_and_executed_inside_the_box(drive, ring):
     settings = {"tracks": ring, "regimes": [BACKWARDS], "budget": 60, **NAIVE}
-    steps = drive("method=afm_physics", "transform.widen=false", **settings).steps
+    steps = drive("method=afm_physics", "corrector.extend_action_box=false", **settings).steps
     for kind in ("planned", "executed"):
         assert steps[f"{kind}_v"].abs().max() <= 1
         assert steps[f"{kind}_omega"].abs().max() <= np.float32(np.pi / 2)
@@ -227,7 +227,7 @@ def test_actions_are_planned_and_executed_inside_the_box(drive, ring):
 
 def test_a_transform_that_only_watches_executes_what_was_planned(drive, ring):
     settings = {"tracks": ring, "regimes": [BACKWARDS], "budget": 60}
-    watch = {"transform.enabled": False, **NAIVE}
+    watch = {"corrector.enabled": False, **NAIVE}
     watching = drive("method=afm_physics", **settings, **watch).steps
     physics = drive("method=physics", **settings).steps
     assert watching["misaligned"].sum() > 0

@@ -119,7 +119,7 @@ def kept(agent, tmp_path):
         ("physics", {"budget": 15}, "settings.budget: 14 -> 15"),
         ("physics", {"seeds": [3]}, "settings.seeds: [3, 8] -> [3]"),
         ("physics", {"robot.env.dt": 0.1}, "settings.robot.env.dt: 0.2 -> 0.1"),
-        ("oracle", {}, "settings.dynamics._target_: afm_rl.missions.parts.physics -> "),
+        ("oracle", {}, "settings.dynamics._target_: afm_rl.missions.factories.physics -> "),
     ],
 )
 def test_checkpoints_of_other_missions_are_refused(agent, kept, method, settings, named):

@@ -54,7 +54,8 @@ def test_what_a_study_leaves_behind(methods, tmp_path):
     outcome = run_study(tmp_path, methods("oracle", "physics"), workers=2, echo=said.append)
     assert outcome.failures == {}
     shards = [f"shards/{m}/{s}" for m in ("oracle", "physics") for s in (0, 1)]
-    tables = {f"{shard}/{name}" for shard in shards for name in ("missions.csv", "steps.parquet")}
+    names = ("missions.csv", "steps.parquet", "measures.json")
+    tables = {f"{shard}/{name}" for shard in shards for name in names}
     assert {name for name in files(tmp_path) if ".lock" not in name} == tables | {
         *("study.yaml", "missions.csv", "compute.csv"),
         *("config/oracle.yaml", "config/physics.yaml"),

@@ -39,14 +39,14 @@ def test_what_the_tables_tell_is_not_told_twice(add_job):
     add_job(0, ["method=physics", "seeds=[0]"])
     add_job(1, ["method=physics", "seeds=[1]"], seed=1)
     add_job(2, ["method=oracle", "seeds=[0]"], method="oracle")
-    sweep = add_job(3, ["flow=context", "seeds=[0]"], method="physics+flow=context")
-    assert collect([sweep]).methods == ["physics", "oracle", "physics+flow=context"]
+    sweep = add_job(3, ["corrector=afm", "seeds=[0]"], method="physics+corrector=afm")
+    assert collect([sweep]).methods == ["physics", "oracle", "physics+corrector=afm"]
 
 
 def test_a_label_for_all_does_not_hide_what_is_swept(add_job):
-    add_job(0, ["flow=context", "label=mine"], method="mine")
-    sweep = add_job(1, ["flow=paper", "label=mine"], method="mine")
-    assert collect([sweep]).methods == ["mine+flow=context", "mine+flow=paper"]
+    add_job(0, ["corrector=afm", "label=mine"], method="mine")
+    sweep = add_job(1, ["corrector=paper", "label=mine"], method="mine")
+    assert collect([sweep]).methods == ["mine+corrector=afm", "mine+corrector=paper"]
 
 
 def test_jobs_without_results_are_said(add_job):

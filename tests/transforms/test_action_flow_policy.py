@@ -136,7 +136,7 @@ def test_sizes_that_contradict_each_other_are_refused(planner, flow):
         ActionFlowPolicy(Dubins(), flow, planner.action_spec.expand(3, 2))
 
 
-@pytest.mark.parametrize("part", ["model", "flow", "action_spec", "enabled", "widen"])
+@pytest.mark.parametrize("part", ["model", "flow", "action_spec", "enabled", "extend_action_box"])
 def test_parts_of_the_wrong_kind_are_refused(planner, flow, part):
     parts = {"model": Dubins(), "flow": flow, "action_spec": planner.action_spec, part: None}
     with pytest.raises(ConfigurationError, match=f"policy.{part}"):

@@ -83,7 +83,7 @@ def test_a_box_without_zero_stays_one():
 def test_planners_hear_of_more_only_if_they_may_and_the_model_can_foresee_it(make_ensemble):
     known = {
         "widened": {},
-        "not wished": {"widen": False},
+        "not wished": {"extend_action_box": False},
         "switched off": {"enabled": False},
         "a network": {"model": make_ensemble()},
         "calibrated": {"model": Calibrated(Dubins(), HIGH)},
@@ -95,8 +95,8 @@ def test_planners_hear_of_more_only_if_they_may_and_the_model_can_foresee_it(mak
         wider = name in ("widened", "calibrated", "oracle")
         expected = (2.5 if wider else 1.0) * BOX.expand(4, 2, 2)
         torch.testing.assert_close(data["next", "afm", "reach"][:, -1], expected, msg=name)
-    with pytest.raises(ConfigurationError, match="transform.widen"):
-        env(BOX, widen="yes")
+    with pytest.raises(ConfigurationError, match="transform.extend_action_box"):
+        env(BOX, extend_action_box="yes")
 
 
 def test_of_an_answer_that_is_not_finite_the_reach_is_not_believed_either():

@@ -10,6 +10,7 @@ from afm_rl.dynamics import KnownDynamics
 from afm_rl.flow import LeastSquares
 from afm_rl.manifold import Manifold
 from afm_rl.planning import PlanningEnv
+from afm_rl.transforms import ActionFlowTransform
 from envs import drift
 
 
@@ -22,7 +23,7 @@ def main(cfg: DictConfig) -> None:
     model = KnownDynamics(drift, Manifold(2), action_size=2)
     cost = instantiate(cfg.cost, _convert_="all")
     planner = instantiate(cfg.planner, _convert_="all")(PlanningEnv(model, cost, low, high))
-    transform = instantiate(cfg.transform)(model, LeastSquares(low, high))
+    transform = ActionFlowTransform(model, LeastSquares(low, high), enabled=cfg.correct)
     whole = TransformedEnv(env, Compose(transform, planner.make_tensordict_primer()))
     path = whole.rollout(cfg.steps, planner)
     state = "landed" if path["next", "done"][-1] else "lost"

@@ -14,9 +14,9 @@ import torch
 from torch import nn
 
 from afm_rl.artefacts import load_artefact
-from afm_rl.dynamics import KNODE, Calibrated, DynamicsModel, Ensemble, Oracle, Quadrotor
-from afm_rl.errors import AFMError, ConfigurationError, check_flag
 from afm_rl.correction import ActionFlow, Corrector, L1Augmentation, LeastSquares, PaperFlow
+from afm_rl.dynamics import KNODE, Calibrated, Ensemble, Oracle, Quadrotor
+from afm_rl.errors import AFMError, ConfigurationError, check_flag
 from afm_rl.flow import train_flow
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
@@ -123,93 +123,109 @@ def knode(
     return Part(model, Training("KNODE", model, train, "standard deviations of the model"))
 
 
-def no_flow(robot: Robot, model: DynamicsModel) -> Part:
-    """Return nothing."""
+def no_correction(robot: Robot, dynamics: Part) -> Part:
+    """Return nothing: the planned action is executed as it is."""
     return Part(None)
 
 
-def context_flow(
+def afm(
     robot: Robot,
-    model: DynamicsModel,
+    dynamics: Part,
     train: Mapping[str, Any] | None = None,
     checkpoint: str | None = None,
+    enabled: bool = True,
+    extend_action_box: bool = True,
     **settings: Any,
 ) -> Part:
-    """Return the context flow, to be trained over ``model``."""
+    """Return the transform with the universal action flow; ``train`` refines it on the robot."""
     place, scale = list(robot.place), robot.place_scale
-    settings.pop("window", None)
-    settings["hypotheses"] = settings.pop("views", None) or None
-    if settings["hypotheses"] is None: settings.pop("hypotheses")
-    for k in ("hidden", "latent"): settings.pop(k, None)
-    return Part(ActionFlow(*robot.flow_box, place=place, place_scale=scale, **settings))
+    flow = ActionFlow(*robot.flow_box, place=place, place_scale=scale, **settings)
+    if train is None and checkpoint is None:
+        return Part(_transform(dynamics, flow, enabled, extend_action_box))
+    training = _training(flow, robot, dynamics, train or {}, checkpoint, "half ranges")
+    return Part(_transform(dynamics, flow, enabled, extend_action_box), training)
 
 
 def paper_flow(
     robot: Robot,
-    model: DynamicsModel,
+    dynamics: Part,
     train: Mapping[str, Any],
     checkpoint: str | None = None,
+    enabled: bool = True,
+    extend_action_box: bool = True,
     **settings: Any,
 ) -> Part:
-    """Return the published flow, to be trained over ``model``.
+    """Return the transform with the published flow, to be trained over the dynamics model.
 
     Raises:
         ConfigurationError: if states turn: the flow reads errors as differences of numbers.
     """
+    model = dynamics.module
     if model.manifold.tangent_size != model.state_size:
         raise ConfigurationError(
-            f"flow=paper: robot={robot.name} has states with rotations; choose flow=context"
+            f"corrector=paper: robot={robot.name} has states with rotations; choose corrector=afm"
         )
-    flow = PaperFlow(
-        *robot.flow_box, features=list(robot.features), state_size=model.state_size, **settings
-    )
-    return _trained(flow, robot, model, train, checkpoint, "action units")
+    size, features = model.state_size, list(robot.features)
+    flow = PaperFlow(*robot.flow_box, features=features, state_size=size, **settings)
+    training = _training(flow, robot, dynamics, train, checkpoint, "action units")
+    return Part(_transform(dynamics, flow, enabled, extend_action_box), training)
 
 
-def least_squares(robot: Robot, model: DynamicsModel, **settings: Any) -> Part:
-    """Return least squares with forgetting, which needs no training."""
-    return Part(LeastSquares(*robot.flow_box, **settings))
-
-
-def l1(robot: Robot, model: DynamicsModel, **settings: Any) -> Part:
-    """Return L1 adaptive augmentation, which needs no training."""
-    return Part(L1Augmentation(*robot.flow_box, **settings))
-
-
-def _trained(
-    flow: Corrector,
+def least_squares(
     robot: Robot,
-    model: DynamicsModel,
+    dynamics: Part,
+    enabled: bool = True,
+    extend_action_box: bool = True,
+    **settings: Any,
+) -> Part:
+    """Return the transform with least squares with forgetting, which need no training."""
+    corrector = LeastSquares(*robot.flow_box, **settings)
+    return Part(_transform(dynamics, corrector, enabled, extend_action_box))
+
+
+def l1(
+    robot: Robot,
+    dynamics: Part,
+    enabled: bool = True,
+    extend_action_box: bool = True,
+    **settings: Any,
+) -> Part:
+    """Return the transform with L1 adaptive augmentation, which needs no training."""
+    corrector = L1Augmentation(*robot.flow_box, **settings)
+    return Part(_transform(dynamics, corrector, enabled, extend_action_box))
+
+
+def _transform(
+    dynamics: Part, corrector: Corrector, enabled: bool, extend_action_box: bool
+) -> ActionFlowTransform:
+    return ActionFlowTransform(
+        dynamics.module, corrector, enabled=enabled, extend_action_box=extend_action_box
+    )
+
+
+def _training(
+    flow: ActionFlow | PaperFlow,
+    robot: Robot,
+    dynamics: Part,
     settings: Mapping[str, Any],
     checkpoint: str | None,
     unit: str,
-) -> Part:
-    if settings.get("reuse") is None:
-        settings = {**settings, "reuse": robot.flow_reuse}
-    check_training("flow.train", train_flow, settings, batch_size=2)
+) -> Training | None:
+    """Return how a flow is trained; None if it comes from a file."""
+    model = robot.model if dynamics.nominal else dynamics.module
+    check_training("corrector.train", train_flow, settings, batch_size=2)
     if checkpoint is not None:
         if not isinstance(checkpoint, str):
-            raise ConfigurationError(f"flow.checkpoint={checkpoint!r}: expected the path of a file")
+            raise ConfigurationError(
+                f"corrector.checkpoint={checkpoint!r}: expected the path of a file"
+            )
         try:
             load_artefact(Path(checkpoint), flow, flow.signature)
         except AFMError as error:
-            raise ConfigurationError(f"flow.checkpoint: {error}") from error
-        return Part(flow)
+            raise ConfigurationError(f"corrector.checkpoint: {error}") from error
+        return None
 
     def train(progress: bool) -> float:
         return train_flow(flow, model, robot.regime, robot.state_box, progress=progress, **settings)
 
-    return Part(flow, Training("flow", flow, train, unit))
-
-
-def no_transform(model: DynamicsModel, flow: Corrector | None) -> None:
-    """Return nothing: the planned action is executed as it is."""
-    if flow is not None:
-        raise ConfigurationError("flow: nothing uses it; choose transform=afm, or flow=none")
-
-
-def afm(model: DynamicsModel, flow: Corrector | None, **settings: Any) -> ActionFlowTransform:
-    """Return the action flow transform."""
-    if flow is None:
-        raise ConfigurationError("transform=afm: needs a flow; choose flow=context or flow=paper")
-    return ActionFlowTransform(model, flow, **settings)
+    return Training("flow", flow, train, unit)

@@ -1,4 +1,4 @@
-"""Docstrings as Markdown, for the API page: doctests and formulas in fences, roles as code."""
+r"""Docstrings as Markdown, for the API page: formulas as $...$, doctests in fences."""
 
 import re
 import textwrap
@@ -11,17 +11,17 @@ FORMULA = re.compile(r"^( *)\.\. math::(.*(?:\n(?:\1 +.*| *$))*)", re.MULTILINE)
 DOCTEST = re.compile(r"^( *)>>> .*(?:\n\1\S.*)*", re.MULTILINE)
 
 
-def fenced(kind: str, text: str, indent: str) -> str:
-    """Return a fenced block, indented."""
-    return textwrap.indent(f"\n```{kind}\n{text.strip()}\n```\n", indent)
+def block(before: str, text: str, after: str, indent: str) -> str:
+    """Return text between two lines, indented."""
+    return textwrap.indent(f"\n{before}\n{text.strip()}\n{after}\n", indent)
 
 
 def as_markdown(text: str) -> str:
     """Translate what docstrings here hold of reStructuredText."""
     text = ROLE.sub(r"`\1`", text)
-    text = MATH.sub(lambda found: f"`{' '.join(found[1].split())}`", text)
-    text = FORMULA.sub(lambda m: fenced("latex", textwrap.dedent(f" {m[2]}"), m[1]), text)
-    return DOCTEST.sub(lambda m: fenced("pycon", textwrap.dedent(m[0]), m[1]), text)
+    text = MATH.sub(lambda found: f"${' '.join(found[1].split())}$", text)
+    text = FORMULA.sub(lambda m: block("$$", textwrap.dedent(f" {m[2]}"), "$$", m[1]), text)
+    return DOCTEST.sub(lambda m: block("```pycon", textwrap.dedent(m[0]), "```", m[1]), text)
 
 
 class Docstrings(Extension):

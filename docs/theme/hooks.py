@@ -1,0 +1,63 @@
+"""What the site needs beyond its pages: copies, notebooks, a picture of the imports, formulas."""
+
+import html
+import re
+from pathlib import Path
+
+import layers  # beside this file
+from latex2mathml.converter import convert
+from mkdocs.structure.files import File
+from nbconvert import MarkdownExporter
+
+ROOT = Path(__file__).resolve().parents[2]
+LINK = re.compile(r"(?<!!)\[([^]]+)\]\(([^):]+)\)")
+FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+# Pages of the site that are kept elsewhere, because people look for them there.
+COPIES = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+}
+
+
+def with_site_links(text):
+    """Point links of files in the root to the pages of the site; others become plain text."""
+
+    def link(found):
+        words, target = found.groups()
+        path, hash_, anchor = target.partition("#")
+        if path in COPIES:
+            path = COPIES[path]
+        elif path.startswith("docs/"):
+            path = path.removeprefix("docs/")
+        elif path.endswith(".ipynb"):
+            path = path.replace(".ipynb", ".md")
+        else:
+            return words
+        return f"[{words}]({path}{hash_}{anchor})"
+
+    return LINK.sub(link, text).replace("](docs/", "](")
+
+
+def on_files(files, config):
+    """Add the pages that are kept outside of docs/."""
+    for path, uri in COPIES.items():
+        text = with_site_links((ROOT / path).read_text(encoding="utf-8"))
+        files.append(File.generated(config, uri, content=text))
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        text, made = MarkdownExporter().from_filename(str(path), {"unique_key": path.stem})
+        files.append(File.generated(config, f"notebooks/{path.stem}.md", content=text))
+        for name, image in made["outputs"].items():
+            files.append(File.generated(config, f"notebooks/{name}", content=image))
+    files.append(File.generated(config, "images/layers.svg", content=layers.draw()))
+    return files
+
+
+def on_page_content(content, page, **kwargs):
+    """Render formulas, so that a browser needs no script and no network for them."""
+
+    def render(found):
+        kind, formula = found.groups()
+        return convert(html.unescape(formula), display="block" if kind == "div" else "inline")
+
+    return FORMULA.sub(render, content)

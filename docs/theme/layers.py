@@ -1,0 +1,100 @@
+"""The floors of the package, and the imports between its rooms, as a picture.
+
+`python docs/theme/layers.py > layers.svg` draws it; the site draws it anew each time it is built.
+"""
+
+import ast
+from pathlib import Path
+
+import networkx as nx
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# From the top to the bottom, each room with the column in which it is drawn. A room may import
+# from the floors below its own. The foundations are the modules of afm_rl that are in no folder.
+FLOORS = [
+    {"cli": 2},
+    {"missions": 2, "report": 4},
+    {"envs": 0, "transforms": 2},
+    {"flow": 1, "planning": 3},
+    {"learning": 1},
+    {"dynamics": 2},
+    {"regimes": 2},
+    {"foundations": 2},
+]
+
+WIDTH, HEIGHT, STEP = 150, 40, 78
+STYLE = (
+    "<style>rect{fill:#e8eaf6;stroke:#3f51b5}.arrow{fill:none;stroke:#607d8b;stroke-width:1.4}"
+    "text{font:15px sans-serif;text-anchor:middle;fill:#1a237e}</style>"
+    '<defs><marker id="head" viewBox="0 0 6 6" refX="3" refY="3" markerWidth="8" markerHeight="8" '
+    'orient="auto" markerUnits="userSpaceOnUse"><path d="M0,0L6,3L0,6z" fill="#607d8b"/></marker>'
+    "</defs>"
+)
+
+
+def room(module: str) -> str:
+    """Return the room of a module, given by its full name."""
+    rooms = [name for floor in FLOORS for name in floor]
+    name = module.split(".")[1] if "." in module else ""
+    return name if name in rooms else "foundations"
+
+
+def imported(tree: ast.AST):
+    """Yield the names of our modules that are imported."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("afm_rl"):
+            yield from (
+                f"{node.module}.{name.name}" if node.module == "afm_rl" else node.module
+                for name in node.names
+            )
+        elif isinstance(node, ast.Import):
+            yield from (name.name for name in node.names if name.name.startswith("afm_rl."))
+
+
+def imports() -> dict[tuple[str, str], list[str]]:
+    """Find the files of each room that import from another, {(from, to): paths}."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for top, prefix in (("afm_rl", "afm_rl"), ("envs", "afm_rl.envs")):
+        for path in sorted((ROOT / top).rglob("*.py")):
+            inside = path.relative_to(ROOT / top).with_suffix("").parts
+            here = room(".".join([prefix, *inside]))
+            there = {room(name) for name in imported(ast.parse(path.read_text(encoding="utf-8")))}
+            for other in there - {here}:
+                found.setdefault((here, other), []).append(str(path.relative_to(ROOT)))
+    return found
+
+
+def floor_of(name: str) -> int:
+    """Return the floor of a room, 0 at the top."""
+    return next(number for number, rooms in enumerate(FLOORS) if name in rooms)
+
+
+def essential(pairs: set) -> set:
+    """Leave out the pairs that follow from others: a to c, where a leads to b and b to c."""
+    return set(nx.transitive_reduction(nx.DiGraph(pairs)).edges)
+
+
+def draw() -> str:
+    """Return the picture, as SVG."""
+    places = {
+        name: (80 + 120 * column, 30 + STEP * floor)
+        for floor, rooms in enumerate(FLOORS)
+        for name, column in rooms.items()
+    }
+    shapes = []
+    for source, target in sorted(essential(set(imports()))):
+        (x, y), (to_x, to_y) = places[source], places[target]
+        start, end = y + HEIGHT / 2, to_y - HEIGHT / 2 - 4
+        middle = (start + end) / 2
+        curve = f"M{x},{start} C{x},{middle} {to_x},{middle} {to_x},{end}"
+        shapes.append(f'<path d="{curve}" class="arrow" marker-end="url(#head)"/>')
+    for name, (x, y) in places.items():
+        box = f'x="{x - WIDTH / 2}" y="{y - HEIGHT / 2}" width="{WIDTH}" height="{HEIGHT}"'
+        shapes.append(f'<rect {box} rx="6"/><text x="{x}" y="{y + 5}">{name}</text>')
+    size = f'viewBox="0 0 640 {STEP * len(FLOORS) - 18}" width="640"'
+    return f'<svg xmlns="http://www.w3.org/2000/svg" {size}>{STYLE}{"".join(shapes)}</svg>\n'
+
+
+if __name__ == "__main__":
+    print(draw(), end="")
