@@ -1,10 +1,10 @@
-"""Regimes without a robot: what the universal flow is trained on.
+r"""Regimes without a robot: what the universal flow is trained on.
 
 An action u in half ranges has the effect
 
-.. math:: T(u) = M\\,\\phi(u) + b
+.. math:: T(u) = M\,\phi(u) + b
 
-with a scalar map :math:`\\phi_a` per axis (gains, dead zone, saturation, slip, asymmetry, smooth
+with a scalar map :math:`\phi_a` per axis (gains, dead zone, saturation, slip, asymmetry, smooth
 distortion, quantisation; tabulated), a mixing matrix M (rotation, permutation, coupling) and a
 bias b.
 """
