@@ -54,6 +54,25 @@ class Manifold(nn.Module):
         """Return the states ``(*B, S)`` that numbers drawn from a box stand for: themselves."""
         return raw
 
+    def encode(self, state: Tensor, coordinates: Sequence[int] | None = None) -> Tensor:
+        """Return the numbers ``(*B, F)`` that a network reads: they do not jump where angles wrap.
+
+        Coordinates that are no angles come first, as they are, then the cosines and the sines of
+        the angles.
+
+        Args:
+            state: ``(*B, S)``.
+            coordinates: indices of the coordinates to encode; None for all.
+
+        >>> turned = torch.tensor([5.0, torch.pi])
+        >>> Manifold(2, angles=[1]).encode(turned).round(decimals=4) + 0.0
+        tensor([ 5., -1.,  0.])
+        """
+        chosen = range(self.size) if coordinates is None else coordinates
+        plain, angles = ([i for i in chosen if bool(self.is_angle[i]) == turns] for turns in (0, 1))
+        angle = state[..., angles]
+        return torch.cat([state[..., plain], angle.cos(), angle.sin()], -1)
+
     def difference(self, state: Tensor, origin: Tensor) -> Tensor:
         """Return the tangent vector ``(*B, D)`` that leads from ``origin`` to ``state``."""
         raw = state - origin

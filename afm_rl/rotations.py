@@ -7,6 +7,8 @@ identity, and keep float32 and float64.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -157,6 +159,19 @@ class RigidBodySpace(Manifold):
         """Scale the quaternions in ``(*B, 13)`` to length 1."""
         turned = quaternion_normalise(raw[..., 6:10])
         return torch.cat([raw[..., :6], turned, raw[..., 10:]], -1)
+
+    def encode(self, state: Tensor, coordinates: Sequence[int] | None = None) -> Tensor:
+        """Return what a network reads: the rotation matrix's nine entries for the quaternion.
+
+        The other coordinates come first. A quaternion and its negative give the same numbers.
+        """
+        chosen = range(self.size) if coordinates is None else coordinates
+        plain = [i for i in chosen if i not in range(6, 10)]
+        if len(plain) == len(chosen):
+            return state[..., plain]
+        axes = torch.eye(3, dtype=state.dtype, device=state.device)
+        matrix = rotate(state[..., None, 6:10], axes.expand(*state.shape[:-1], 3, 3))
+        return torch.cat([state[..., plain], matrix.flatten(-2)], -1)
 
     def difference(self, state: Tensor, origin: Tensor) -> Tensor:
         """Return the tangent vector ``(*B, 12)`` that leads from ``origin`` to ``state``."""

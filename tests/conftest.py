@@ -68,8 +68,8 @@ def make_ensemble():
     def make(**settings):
         settings = {"members": 3, "hidden": [16, 16], **settings}
         model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], **settings)
-        model.input_mean.copy_(torch.tensor([0.1, -0.2, 0.3]))
-        model.input_std.copy_(torch.tensor([1.5, 0.5, 0.8]))
+        model.input_mean.copy_(torch.tensor([0.1, 0.0, -0.2, 0.3]))
+        model.input_std.copy_(torch.tensor([1.5, 0.7, 0.5, 0.8]))
         model.target_mean.copy_(torch.tensor([0.01, -0.02, 0.03]))
         model.target_std.copy_(torch.tensor([0.1, 0.2, 0.3]))
         return model
@@ -81,8 +81,8 @@ def make_ensemble():
 def _trained_ensemble():
     model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], members=3, hidden=[48, 48])
     settings = {"samples": 16_000, "epochs": 20, "lr": 1e-2}
-    error = pretrain_ensemble(model, Dubins(), STATES, (LOW, HIGH), **settings)
-    return model, error
+    report = pretrain_ensemble(model, Dubins(), STATES, (LOW, HIGH), **settings)
+    return model, report.error
 
 
 @pytest.fixture

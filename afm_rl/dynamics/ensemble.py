@@ -35,14 +35,18 @@ class Ensemble(DynamicsModel):
 
     Each member maps the standardised features of state and action to mean and
     log-variance of the standardised state change,
-    :math:`(s_{t+1} \ominus s_t - m) / c`. The prediction is the mean over members of their
-    means (``propagation="mean"``), or of one sample each (``"sample"``, as published). With
-    ``"member"`` candidate i, counted along the last batch dimension, goes through member i
+    :math:`(s_{t+1} \ominus s_t - m) / c`. Networks read cosine and sine of every angle and the
+    matrix of a rotation (:meth:`Manifold.encode <afm_rl.manifold.Manifold.encode>`).
+
+    The prediction is the mean over members of their means (``propagation="mean"``), or of one
+    sample each (``"sample"``, as published). With ``"member"`` candidate i, counted along the last
+    batch dimension, goes through member i
     modulo E alone, at every step of its plan (Chua et al.'s TS-infinity), for 1/E of the
     work; where that dimension is shorter than E, or is that of the missions, it is the mean.
 
     Only :meth:`forward` knows ``propagation`` and ``precision``: losses, errors and Jacobians
-    are always those of the whole ensemble in the parameters' own precision.
+    are always those of the whole ensemble in the parameters' own precision. States and actions
+    may have another one: networks run in their own, states stay in that of the given state.
 
     Parameters are stacked, ``(*L, E, in, out)``: no loop over members. :meth:`expand_`
     gives every mission a copy of its own to learn with.
@@ -64,6 +68,7 @@ class Ensemble(DynamicsModel):
         precision: of the hidden layers in :meth:`forward`: ``"float32"``, or ``"bfloat16"``
             wherever no gradients are recorded, as in planning. First and last layer and the
             state stay as they are.
+        encode: show the networks cosines, sines and rotation matrices; False: raw coordinates.
 
     >>> model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], hidden=[16])
     >>> model(torch.zeros(7, 3), torch.zeros(7, 2)).shape
@@ -89,6 +94,7 @@ class Ensemble(DynamicsModel):
         layer_norm: bool = False,
         running_count: int | None = None,
         precision: str = "float32",
+        encode: bool = True,
     ) -> None:
         super().__init__(manifold, action_size)
         self.features = list(features)
@@ -107,7 +113,9 @@ class Ensemble(DynamicsModel):
         self.precision, self._copies = precision, Copies(torch.bfloat16)
         self.layer_norm = check_flag("dynamics.layer_norm", layer_norm)
         self._generator = torch.Generator().manual_seed(check_count("dynamics.seed", seed, low=0))
-        inputs, targets = len(self.features) + action_size, manifold.tangent_size
+        self.encode = check_flag("dynamics.encode", encode)
+        self._encoded_size = self._encoded(torch.zeros(manifold.size)).shape[-1]
+        inputs, targets = self._encoded_size + action_size, manifold.tangent_size
         sizes = [inputs, *self.hidden, 2 * targets]
         draw = INITS[check_choice("dynamics.init", init, INITS)]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
@@ -150,7 +158,13 @@ class Ensemble(DynamicsModel):
 
     def inputs(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the raw network inputs ``(*B, in)``."""
-        return torch.cat([state[..., self.features], action], -1)
+        return torch.cat([self._encoded(state), action], -1)
+
+    def _encoded(self, state: Tensor) -> Tensor:
+        """Return what the networks read of states."""
+        if self.encode:
+            return self.manifold.encode(state, self.features)
+        return state[..., self.features]
 
     def standardise(self, change: Tensor) -> Tensor:
         """Express a state change in standard deviations of the training data."""
@@ -176,12 +190,11 @@ class Ensemble(DynamicsModel):
         parameters = self.weights, self.biases
         return self._moments(self._run(state, action, 2 * self.manifold.tangent_size, parameters))
 
-    def member_moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return each member's moments on inputs of its own: ``(E, N, S)`` in, ``(E, N, D)`` out.
+    def member_moments(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return each member's moments on rows of its own: ``(E, N, in)`` in, ``(E, N, D)`` out.
 
-        For training the members of a shared ensemble on different samples.
+        For training the members of a shared ensemble on different :meth:`network_rows`.
         """
-        rows = self._standardised(self.inputs(state, action))
         weights, biases = list(self.weights), list(self.biases)
         return self._moments(stacked_mlp(rows, weights, biases, self.layer_norm))
 
@@ -201,23 +214,25 @@ class Ensemble(DynamicsModel):
         mean, log_variance = self.moments(state, action)
         variance = log_variance.exp().mean(-2) + mean.var(-2, correction=0)
         change = mean.mean(-2) * self.target_std + self.target_mean
-        return self.manifold.add(state, change), variance.sqrt() * self.target_std
+        ahead = self.manifold.add(state, change)
+        return ahead, (variance.sqrt() * self.target_std).to(ahead)
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the mean Jacobian of the members ``(*L, *N, D, A)``, in closed form."""
         rows, shape = self._rows(state, action)
         axes = torch.eye(rows.shape[-1], device=rows.device, dtype=rows.dtype)
-        axes = axes[len(self.features) :]
+        axes = axes[self._encoded_size :]
         size = self.manifold.tangent_size
 
         def tangents(wide: Tensor, weights: Stack, biases: Stack) -> Tensor:
             return stacked_mlp_tangent(wide, axes, weights, biases, self.layer_norm)
 
         std = self.input_std if self.running is None else self.running.std
-        std = std[..., len(self.features) :].reshape(-1, 1, self.action_size, 1)
+        std = std[..., self._encoded_size :].reshape(-1, 1, self.action_size, 1)
         rows, parameters = self._per_member(rows), (self.weights, self.biases)
         moved = self._chunked(tangents, rows, size, parameters).mean(2) / std  # (l, n, A, D)
-        return (moved * self.target_std).mT.reshape(*shape, size, self.action_size)
+        moved = (moved * self.target_std).mT.reshape(*shape, size, self.action_size)
+        return moved.to(torch.promote_types(state.dtype, action.dtype))
 
     def expand_(self, missions: int) -> Ensemble:
         """Give each of ``missions`` parameters of its own, in place."""
@@ -249,15 +264,15 @@ class Ensemble(DynamicsModel):
                 f"{tuple(state.shape)}; expected ({', '.join(map(str, lead))}, ..., "
                 f"{self.state_size})"
             )
-        raw = self.inputs(state, action)
-        rows = self._standardised(raw)
-        return rows.reshape(max(1, math.prod(lead)), -1, rows.shape[-1]), raw.shape[:-1]
+        rows = self.network_rows(state, action)
+        return rows.reshape(max(1, math.prod(lead)), -1, rows.shape[-1]), rows.shape[:-1]
 
-    def _standardised(self, raw: Tensor) -> Tensor:
-        """Standardise raw inputs ``(*L, *N, in)``."""
-        if self.running is None:
-            return (raw - self.input_mean) / self.input_std
-        return self.running(raw)
+    def network_rows(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return standardised inputs ``(*L, *N, in)`` in the precision of the networks."""
+        raw = self.inputs(state, action)
+        known = self.running is not None
+        rows = self.running(raw) if known else (raw - self.input_mean) / self.input_std
+        return rows.to(self.weights[0])
 
     def _per_member(self, rows: Tensor) -> Tensor:
         """Show ``(l, n, in)`` to every member: ``(l, E, n, in)``."""

@@ -1,7 +1,7 @@
 """Learning: losses, updaters, optimisers, pre-training."""
 
 from afm_rl.learning.collect import collect
-from afm_rl.learning.fitting import fit_ensemble
+from afm_rl.learning.fitting import FitReport, fit_ensemble
 from afm_rl.learning.fresh_adam import FreshAdam
 from afm_rl.learning.hook import UpdaterHook
 from afm_rl.learning.knode_updater import KNODEUpdater
@@ -17,6 +17,7 @@ from afm_rl.learning.unmatched_updater import UnmatchedUpdater
 from afm_rl.learning.updater import OnlineUpdater, OracleUpdater, Updater
 
 __all__ = [
+    "FitReport",
     "FreshAdam",
     "GaussianNLLLoss",
     "InPlaceLoss",

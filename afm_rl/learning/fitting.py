@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -12,7 +16,33 @@ from afm_rl.errors import NonFiniteError, check_count, check_number
 from afm_rl.keys import as_keys
 from afm_rl.learning.nll import gaussian_nll
 
-CONSTANT = 1e-8  # a coordinate that varies less never changes
+CONSTANT = 1e-8  # standard deviation below which a coordinate counts as one that never changes
+TOLERATED = 1 / 3  # unexplained share of the variance above which there is a warning
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What a fitted model misses on held-out transitions, one step ahead."""
+
+    error: float
+    """Root mean square over coordinates, in standard deviations of the data."""
+    rms: tuple[float, ...]
+    """Root mean square of each coordinate of the state change, in its own unit."""
+    unexplained: tuple[float, ...]
+    """Share of each coordinate's variance that is left: 0 is perfect, 1 is as good as the mean."""
+
+    def warn(self, names: Sequence[str] | None = None) -> None:
+        """Warn of coordinates of which more than a third of the variance is left."""
+        names = names or [f"coordinate {k}" for k in range(len(self.rms))]
+        rows = zip(names, self.rms, self.unexplained, strict=True)
+        bad = [f"{n} ({100 * u:.0f} %, error {e:.3g})" for n, e, u in rows if not u <= TOLERATED]
+        if bad:
+            warnings.warn(
+                f"the model leaves more than a third of the variance of {', '.join(bad)} "
+                "unexplained: give it more or wider data, name the angles of the manifold, or add "
+                "the coordinates it depends on to features",
+                stacklevel=4,
+            )
 
 
 def fit_ensemble(
@@ -28,30 +58,33 @@ def fit_ensemble(
         "action",
         ("next", "observation"),
     ),
+    names: Sequence[str] | None = None,
     seed: int = 0,
     progress: bool = False,
-) -> float:
-    """Fit an ensemble to observed transitions by Gaussian NLL; return its held-out error.
+) -> FitReport:
+    """Fit an ensemble to observed transitions by Gaussian NLL; return its held-out errors.
 
     Each member sees the batches in an order of its own. Adam with a one-cycle step size, best
     epoch kept.
 
     Args:
         model: ensemble to fit, in place; its normaliser is set from the data.
-        transitions: any batch shape, N in all; see :func:`~afm_rl.learning.collect`.
+        transitions: any batch shape and precision, N in all; see :func:`~afm_rl.learning.collect`.
         epochs: passes over the data.
-        batch_size: transitions per step and member, at most.
+        batch_size: transitions per step and member, at most; fewer where a pass would otherwise
+            have fewer than eight steps.
         lr: largest step size.
         held_out: share of the transitions, picked at random, that only judges.
         keys: where state, action and next state are.
+        names: of the coordinates of the tangent space, for the warning.
         seed: seed of the order.
         progress: show a progress bar.
 
-    Returns:
-        Root mean square of the held-out one-step error in standard deviations of the data.
-
     Raises:
         NonFiniteError: if an entry is not finite.
+
+    Warns:
+        UserWarning: if more than a third of the variance of a coordinate is left unexplained.
 
     >>> from tensordict import TensorDict
     >>> from afm_rl.manifold import Manifold
@@ -59,7 +92,7 @@ def fit_ensemble(
     >>> cart = TensorDict(entries, [400])
     >>> cart["next", "observation"] = cart["observation"] + 0.1 * cart["action"]
     >>> model = Ensemble(Manifold(1), 1, features=[0], members=2, hidden=[8])
-    >>> fit_ensemble(model, cart, lr=2e-2, batch_size=32) < 0.2
+    >>> fit_ensemble(model, cart, lr=2e-2, batch_size=32).error < 0.2
     True
     """
     check_number("held_out", held_out, low=0.0, high=0.5, open_low=True)
@@ -79,10 +112,11 @@ def fit_ensemble(
         change,
         samples=samples,
         epochs=check_count("epochs", epochs),
-        batch_size=min(check_count("batch_size", batch_size), samples),
+        batch_size=min(check_count("batch_size", batch_size), max(16, samples // 8), samples),
         lr=check_number("lr", lr, low=0.0, open_low=True),
         generator=generator,
         title="fitting the ensemble",
+        names=names,
         progress=progress,
     )
 
@@ -99,47 +133,50 @@ def fit_changes(
     lr: float,
     generator: torch.Generator,
     title: str,
+    names: Sequence[str] | None,
     progress: bool,
-) -> float:
+) -> FitReport:
     """Fit to state changes ``(N, D)``, of which all but the first ``samples`` are held out."""
     model.normalise_(model.inputs(state, action)[:samples], change[:samples])
-    # What never changes would else be predicted to within rounding, and any error surprise.
+    # A coordinate that never changes would be predicted to within rounding errors, and any
+    # later error would count as a huge one.
     model.target_std.masked_fill_(model.target_std <= CONSTANT, 1.0)
-    target = model.standardise(change)
+    inputs = model.network_rows(state, action)
+    target = model.standardise(change).to(inputs)
     optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=True)
     steps = samples // batch_size
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=steps * epochs)
-    best, kept = float("inf"), None
+    best, best_error = model.state_dict(), torch.full_like(target[0], torch.inf)
     bar = tqdm(total=steps * epochs, desc=title, disable=None if progress else True)
     with bar, torch.enable_grad():
         for _ in range(epochs):
             order = torch.rand(model.members, samples, generator=generator).argsort(-1)
             for rows in order[:, : steps * batch_size].split(batch_size, -1):
-                loss = _member_nll(model, state, action, target, rows)
+                mean, log_variance = model.member_moments(inputs[rows])
+                loss = gaussian_nll(mean, log_variance, target[rows]).mean((-2, -1)).sum()
                 optimizer.zero_grad(set_to_none=True)
                 loss.backward()
                 optimizer.step()
                 cycle.step()
                 bar.update()
-            error = held_out_error(model, state[samples:], action[samples:], target[samples:])
-            bar.set_postfix(held_out=f"{error:.4f}")
-            if error < best:
-                best, kept = error, {k: v.clone() for k, v in model.state_dict().items()}
-    if kept is not None:
-        model.load_state_dict(kept)
-    return best
-
-
-def _member_nll(
-    model: Ensemble, state: Tensor, action: Tensor, target: Tensor, rows: Tensor
-) -> Tensor:
-    """Return the loss, each member ``e`` on its own samples ``rows[e]``."""
-    mean, log_variance = model.member_moments(state[rows], action[rows])
-    return gaussian_nll(mean, log_variance, target[rows]).mean((-2, -1)).sum()
+            error = held_out_error(model, inputs[samples:], target[samples:])
+            bar.set_postfix(held_out=f"{error.mean().sqrt():.4f}")
+            if error.mean() < best_error.mean():
+                best = {name: value.clone() for name, value in model.state_dict().items()}
+                best_error = error
+    model.load_state_dict(best)
+    variance = target[samples:].var(0, correction=0)
+    report = FitReport(
+        float(best_error.mean().sqrt()),
+        tuple((best_error.sqrt() * model.target_std).tolist()),
+        tuple(torch.where(variance > 0, best_error / variance, 0.0).tolist()),
+    )
+    report.warn(names)
+    return report
 
 
 @torch.no_grad()
-def held_out_error(model: Ensemble, state: Tensor, action: Tensor, target: Tensor) -> float:
-    """Return the RMSE of the members' mean in standardised units."""
-    mean, _ = model.moments(state, action)
-    return float((mean.mean(-2) - target).square().mean().sqrt())
+def held_out_error(model: Ensemble, inputs: Tensor, target: Tensor) -> Tensor:
+    """Return the mean squared error ``(D,)`` of the members' mean, in standardised units."""
+    mean, _ = model.member_moments(inputs.expand(model.members, *inputs.shape))
+    return (mean.mean(0) - target).square().mean(0)

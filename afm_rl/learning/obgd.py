@@ -45,7 +45,7 @@ class ObGD(Optimizer):
 
     Stacked parameters hold independent learners: with ``lead_dims=k`` the first k dimensions
     of every parameter, L, count learners, each bounded by the norm of its own traces. Groups
-    of parameters are bounded apart.
+    of parameters are bounded apart. Where an episode ends, call :meth:`reset`.
 
     Args:
         params: parameters, or groups of them with settings of their own.
@@ -97,7 +97,8 @@ class ObGD(Optimizer):
         r"""Take one step.
 
         Args:
-            delta: error :math:`\delta`, a number or one per learner: broadcasts to L.
+            delta: error :math:`\delta`: one number of any shape, or one per learner, which
+                broadcasts to L.
                 Learners with an error of 0 stay where they are.
             closure: computes the gradients first; returns the loss.
 
@@ -175,7 +176,7 @@ def _errors(delta: Tensor | float, size: Tensor) -> Tensor:
     """Return one error per learner."""
     error = torch.as_tensor(delta, dtype=size.dtype, device=size.device)
     try:
-        return error.expand_as(size)
+        return (error.reshape(()) if error.numel() == 1 else error).expand_as(size)
     except RuntimeError:
         raise ConfigurationError(
             f"delta of shape {tuple(error.shape)}: expected one number, or {tuple(size.shape)}"

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel, Ensemble
 from afm_rl.errors import check_count, check_number
-from afm_rl.learning.fitting import fit_changes
+from afm_rl.learning.fitting import FitReport, fit_changes
 from afm_rl.sampling import uniform
 
 
@@ -23,9 +25,10 @@ def pretrain_ensemble(
     lr: float = 2e-3,
     action_noise: float = 0.0,
     seed: int = 0,
+    names: Sequence[str] | None = None,
     progress: bool = False,
-) -> float:
-    """Fit an ensemble to a teacher by Gaussian NLL; return its held-out error.
+) -> FitReport:
+    """Fit an ensemble to a teacher by Gaussian NLL; return its held-out errors.
 
     States and actions are drawn uniformly from their boxes; each member sees the batches in
     an order of its own. Adam with a one-cycle step size, best epoch kept.
@@ -42,10 +45,11 @@ def pretrain_ensemble(
         action_noise: relative perturbation of the teacher's action, 0.1 for +-10 %
             (domain randomisation).
         seed: seed of data and order.
+        names: of the coordinates of the tangent space, for the warning.
         progress: show a progress bar.
 
-    Returns:
-        Root mean square of the held-out one-step error in standard deviations of the data.
+    Warns:
+        UserWarning: if more than a third of the variance of a coordinate is left unexplained.
     """
     check_count("dynamics.pretrain.batch_size", batch_size)
     check_count("dynamics.pretrain.samples", samples, low=batch_size)
@@ -70,5 +74,6 @@ def pretrain_ensemble(
         lr=lr,
         generator=generator,
         title="pre-training the ensemble",
+        names=names,
         progress=progress,
     )

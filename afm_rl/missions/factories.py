@@ -79,7 +79,9 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
 
     def train(progress: bool) -> float:
         boxes = robot.state_box, robot.action_box
-        return pretrain_ensemble(model, nominal, *boxes, progress=progress, **pretrain)
+        names = robot.state_names if model.manifold.tangent_size == model.state_size else None
+        given = {"names": names, "progress": progress, **pretrain}
+        return pretrain_ensemble(model, nominal, *boxes, **given).error
 
     return Part(model, Training("ensemble", model, train, "standard deviations of the data"))
 

@@ -83,7 +83,8 @@ class SamplingPlanner(RecedingHorizonPlanner):
         """Return the return ``(*B, N)`` of each plan ``(*B, N, H, A)``."""
         if self.backend == "fast":
             task = [td.get(key) for key in self.env.cost.in_keys]
-            return self.env.returns(td.get(self.env.observation_key), plans, *task)
+            returns = self.env.returns(td.get(self.env.observation_key), plans, *task)
+            return returns.to(plans)  # states may be in double precision, plans in single
         batch = plans.shape[:-2]
         start = td.select(*self.env.observation_spec.keys(True, True), strict=False)
         start = start.unsqueeze(-1).expand(batch).clone()
@@ -101,7 +102,7 @@ class SamplingPlanner(RecedingHorizonPlanner):
             reward_key=("next", self.env.reward_key),
             done_key=_planning_done_keys(self.env),
         )
-        return rewards.sum((-2, -1))
+        return rewards.sum((-2, -1)).to(plans)
 
     def _discard(self, finite: Tensor) -> None:
         """Count the returns ``(*B, N)`` that are not finite; warn where none is."""

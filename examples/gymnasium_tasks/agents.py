@@ -83,7 +83,7 @@ def learn(task: Task, seed: int, iterations: int = 2000) -> Learned:
         data = torch.cat(parts)
         settings = {"hidden": task.hidden, "propagation": "member", "seed": seed}
         model = Ensemble(states, len(space.low), range(size), **settings)
-        error = fit_ensemble(model, data, seed=seed, **task.fit)
+        error = fit_ensemble(model, data, seed=seed, **task.fit).error
         reward = parts[-1]["next", "reward"].mean()
         print(
             f"{len(data)} transitions, the latest with a reward of {reward:.2f} per step: "

@@ -15,7 +15,9 @@ from afm_rl.manifold import Manifold
 
 def member_by_member(model, state, action):
     """Mean and raw log-variance of every member, with ordinary layers."""
-    inputs = (torch.cat([state[..., [2]], action], -1) - model.input_mean) / model.input_std
+    turn = state[..., [2]]
+    inputs = torch.cat([turn.cos(), turn.sin(), action], -1)
+    inputs = (inputs - model.input_mean) / model.input_std
     outputs = []
     for e in range(model.members):
         rows = inputs
@@ -100,7 +102,7 @@ def test_sampling_follows_its_seed_and_no_other(make_ensemble, transitions):
 def test_training_members_see_samples_of_their_own(make_ensemble, transitions):
     model = make_ensemble().double()
     state, action = transitions(3, 8, dtype=torch.float64)
-    mean, log_variance = model.member_moments(state, action)
+    mean, log_variance = model.member_moments(model.network_rows(state, action))
     for e in range(3):
         whole = model.moments(state[e], action[e])
         torch.testing.assert_close(mean[e], whole[0][:, e])
@@ -109,7 +111,7 @@ def test_training_members_see_samples_of_their_own(make_ensemble, transitions):
 
 def test_statistics_are_those_of_the_data(make_ensemble):
     model = make_ensemble()
-    inputs, targets = 3 + 2 * torch.randn(50, 3), torch.randn(50, 3)
+    inputs, targets = 3 + 2 * torch.randn(50, 4), torch.randn(50, 3)
     targets[:, 1] = 7.0  # constant: must not divide by zero
     model.normalise_(inputs, targets)
     torch.testing.assert_close(model.input_mean, inputs.mean(0))
@@ -141,7 +143,7 @@ def test_initial_weights_follow_the_seed_and_the_bounds_of_linear_layers(make_en
 
 def test_its_state_makes_a_twin(make_ensemble, transitions):
     model, twin = make_ensemble(seed=1), make_ensemble(seed=2)
-    twin.normalise_(torch.randn(9, 3), torch.randn(9, 3))
+    twin.normalise_(torch.randn(9, 4), torch.randn(9, 3))
     state, action = transitions(5)
     twin.load_state_dict(model.state_dict())
     assert torch.equal(twin(state, action), model(state, action))

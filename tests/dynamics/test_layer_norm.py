@@ -18,7 +18,7 @@ HIDDEN = [[], [16], [8, 8, 8]]
 def make(make_ensemble):
     def build(**settings):
         model = make_ensemble(layer_norm=True, init="sparse", running_count=100, **settings)
-        model.normalise_(2 * torch.randn(200, 3) + 1, torch.randn(200, 3))
+        model.normalise_(2 * torch.randn(200, 4) + 1, torch.randn(200, 3))
         return model.double()
 
     return build
@@ -30,7 +30,7 @@ def apart(model, missions):
     for parameter in model.parameters():
         parameter.data += 0.2 * torch.randn_like(parameter)
     scale = 1 + torch.arange(missions).reshape(-1, 1, 1)
-    model.running.update_(scale * torch.randn(missions, 60, 3, dtype=torch.float64))
+    model.running.update_(scale * torch.randn(missions, 60, 4, dtype=torch.float64))
     return model
 
 
@@ -98,7 +98,7 @@ def test_missions_have_statistics_of_their_own(make, transitions):
 
 def test_running_statistics_go_on_from_pre_training(make_ensemble, transitions):
     model = make_ensemble(running_count=100)
-    data = 2 * torch.randn(400, 3) + 1
+    data = 2 * torch.randn(400, 4) + 1
     model.normalise_(data, torch.randn(400, 3))
     assert model.running.count == 100  # at most so many
     torch.testing.assert_close(model.running.mean, data.mean(0))

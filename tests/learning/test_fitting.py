@@ -1,13 +1,25 @@
 """Fitting an ensemble to transitions that were observed."""
 
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
 
-from afm_rl.dynamics import Dubins, Ensemble
+from afm_rl.dynamics import Calibrated, Dubins, Ensemble
 from afm_rl.errors import ConfigurationError, NonFiniteError
-from afm_rl.learning import fit_ensemble
+from afm_rl.learning import (
+    FreshAdam,
+    GaussianNLLLoss,
+    OnlineUpdater,
+    RLSUpdater,
+    StreamXUpdater,
+    UnmatchedUpdater,
+    fit_ensemble,
+)
 from afm_rl.manifold import Manifold
+from afm_rl.planning import ICEM, MPPI, KnownReward, PlanningEnv
+from afm_rl.rotations import RigidBodySpace
 
 SHORT = {"epochs": 2, "batch_size": 64}
 
@@ -27,13 +39,83 @@ def same(left, right):
 
 def test_it_learns_what_was_observed(make_ensemble, observed, transitions):
     model = make_ensemble(hidden=[32, 32])
-    error = fit_ensemble(model, observed, epochs=60, lr=1e-2, batch_size=100)
-    assert error < 0.3
+    assert fit_ensemble(model, observed, epochs=60, lr=1e-2, batch_size=100).error < 0.3
     state, action = transitions(200, seed=9)
     truth = Dubins()(state, action)
     miss = model.manifold.difference(model(state, action), truth).square().mean().sqrt()
     change = Dubins().manifold.difference(truth, state).square().mean().sqrt()
     assert miss < 0.4 * change
+
+
+@pytest.mark.parametrize("heading", ["wrapped", "unwrapped"])
+def test_headings_are_read_as_cosine_and_sine(heading):
+    draw = torch.Generator().manual_seed(0)
+    state = 40 * (torch.rand(4000, 3, generator=draw, dtype=torch.float64) - 0.5)  # m, m, rad
+    action = 2 * torch.rand(4000, 2, generator=draw, dtype=torch.float64) - 1
+    after = Dubins().double()(state, action)
+    if heading == "wrapped":
+        state[:, 2] = torch.remainder(state[:, 2] + torch.pi, 2 * torch.pi) - torch.pi
+    boat = TensorDict({"observation": state, "action": action}, [4000])
+    boat = boat.set(("next", "observation"), after)
+    settings = {"epochs": 12, "lr": 1e-2}
+
+    def fitted(**more):
+        torch.manual_seed(0)
+        model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], members=2, hidden=[32], **more)
+        return fit_ensemble(model, boat, names=["x", "y", "theta"], **settings)
+
+    report = fitted()
+    assert max(report.unexplained) < 0.1
+    assert max(report.rms[:2]) < 0.03  # m; the boat moves by up to 0.2 m
+    if heading == "unwrapped":
+        told = r"third of the variance of x \(\d+ %, error 0\.\d+\), y"
+        with pytest.warns(UserWarning, match=told):
+            report = fitted(encode=False)
+        assert min(report.unexplained[:2]) > 0.33
+
+
+def test_rotations_are_read_without_their_sign():
+    space, draw = RigidBodySpace(), torch.Generator().manual_seed(0)
+    state = space.project(torch.randn(50, 13, generator=draw))
+    same = torch.cat([state[:, :6], -state[:, 6:10], state[:, 10:]], -1)
+    read = space.encode(state)
+    assert read.shape == (50, 18)
+    torch.testing.assert_close(space.encode(same), read)
+    axes = read[:, 9:].unflatten(-1, (3, 3))
+    torch.testing.assert_close(axes @ axes.mT, torch.eye(3).expand(50, 3, 3), atol=1e-5, rtol=0)
+    assert torch.equal(space.encode(state, [3, 12]), state[:, [3, 12]])
+    assert space.encode(state, [3, 6, 7, 8, 9]).shape == (50, 10)
+
+
+def test_double_observations_and_single_actions(trained_ensemble, transitions):
+    state, action = transitions(3, 40)
+    after = Dubins()(state, action)
+    model = trained_ensemble
+    ahead, noise = model.forecast(state.double(), action)
+    assert ahead.dtype is noise.dtype is model.jacobian(state.double(), action).dtype
+    assert ahead.dtype is torch.float64
+    torch.testing.assert_close(ahead.float(), model(state, action))
+    mixed = TensorDict({"observation": state.double(), "action": action}, [3, 40])
+    mixed = mixed.set(("next", "observation"), after.double())
+    fit_ensemble(model, mixed, **SHORT)
+    assert {p.dtype for p in model.parameters()} == {torch.float32}
+    learner = partial(OnlineUpdater, optimizer=FreshAdam)
+    for updater in (
+        OnlineUpdater(GaussianNLLLoss(model), FreshAdam),
+        StreamXUpdater(GaussianNLLLoss(model)),
+        UnmatchedUpdater(GaussianNLLLoss(model), learner, [1, 1]),
+        RLSUpdater(GaussianNLLLoss(Calibrated(model, torch.ones(2)))),
+    ):
+        assert updater(mixed)["loss"].isfinite().all()
+    cost = KnownReward(lambda state, action, after: -after[..., 0])
+    sizes = {"horizon": 3, "population": 20}
+    for planner in (
+        MPPI(PlanningEnv(model, cost, -torch.ones(2), torch.ones(2)), **sizes),
+        ICEM(PlanningEnv(model, cost, -torch.ones(2), torch.ones(2)), **sizes),
+    ):
+        start = planner.make_tensordict_primer().primers.zero((3,))
+        start.set("observation", mixed["observation"][:, 0])
+        assert planner(start)["action"].shape == (3, 2)
 
 
 def test_the_seed_decides_everything_and_the_global_generator_nothing(make_ensemble, observed):
@@ -46,10 +128,15 @@ def test_the_seed_decides_everything_and_the_global_generator_nothing(make_ensem
     assert same(models[0], models[1]) and not same(models[0], models[2])
 
 
-def test_fewer_transitions_than_a_batch_are_one_batch(make_ensemble, observed):
-    model = make_ensemble()
-    fit_ensemble(model, observed[:1, :10], epochs=1, batch_size=64)
-    assert not same(model, make_ensemble())
+@pytest.mark.filterwarnings("ignore:the model leaves")
+@pytest.mark.parametrize(("count", "passes"), [(10, 1), (500, 8)])
+def test_few_transitions_are_several_batches_all_the_same(
+    make_ensemble, observed, monkeypatch, count, passes
+):
+    steps = []
+    monkeypatch.setattr(torch.optim.Adam, "step", lambda *_: steps.append(1))
+    fit_ensemble(make_ensemble(), observed.reshape(-1)[:count], epochs=1, batch_size=256)
+    assert len(steps) == passes
 
 
 def test_a_coordinate_that_never_changes_causes_no_surprise():

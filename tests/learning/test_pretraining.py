@@ -17,10 +17,10 @@ SHORT = {"samples": 512, "epochs": 2, "batch_size": 64}
 def fit(make_ensemble, states, box):
     def run(teacher=None, seed=0, **settings):
         model = make_ensemble()
-        error = pretrain_ensemble(
+        report = pretrain_ensemble(
             model, teacher or Dubins(), states, box, seed=seed, **{**SHORT, **settings}
         )
-        return model, error
+        return model, report.error
 
     return run
 
@@ -41,28 +41,29 @@ def test_a_small_budget_already_teaches(trained_ensemble, trained_error, transit
 
 
 def test_the_best_epoch_is_kept_and_its_error_returned(fit, monkeypatch):
-    errors, seen = iter([0.5, 0.2, 0.9, 0.3]), []
+    errors, seen = iter([0.5, 0.2, 0.9, 0.3]), []  # root mean squares
 
     def judge(model, *held_out):
         seen.append(copy.deepcopy(model))
-        return next(errors)
+        return torch.full((3,), next(errors)).square()
 
     monkeypatch.setattr(fitting, "held_out_error", judge)
     model, best = fit(epochs=4)
-    assert best == 0.2 and [same(model, other) for other in seen] == [False, True, False, False]
+    assert best == pytest.approx(0.2)
+    assert [same(model, other) for other in seen] == [False, True, False, False]
 
 
 def test_training_that_breaks_down_is_reported_as_such(fit, monkeypatch):
-    monkeypatch.setattr(fitting, "held_out_error", lambda *_: math.nan)
+    monkeypatch.setattr(fitting, "held_out_error", lambda *_: torch.full((3,), math.nan))
     assert fit()[1] == math.inf
 
 
 def test_normalisation_comes_from_the_training_data(fit, states, box):
     model, _ = fit(samples=4096)
-    low, high = states[0][2], states[1][2]
-    assert float(model.input_mean[0]) == pytest.approx(float(low + high) / 2, abs=0.1)
-    assert float(model.input_std[0]) == pytest.approx(float(high - low) / 12**0.5, rel=0.05)
-    torch.testing.assert_close(model.input_std[1:], (box[1] - box[0]) / 12**0.5, rtol=0.05, atol=0)
+    # Headings are uniform: cosine and sine have mean 0 and standard deviation 1 / sqrt(2).
+    expected = torch.cat([torch.full((2,), 0.5**0.5), (box[1] - box[0]) / 12**0.5])
+    torch.testing.assert_close(model.input_std, expected, rtol=0.05, atol=0)
+    torch.testing.assert_close(model.input_mean, torch.zeros(4), rtol=0, atol=0.1)
 
 
 def test_the_seed_decides_everything_and_the_global_generator_nothing(fit):

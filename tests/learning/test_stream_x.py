@@ -39,7 +39,8 @@ def make(make_ensemble):
         model = make_ensemble(**{**SETTINGS, **settings}).double()
         generator = torch.Generator().manual_seed(0)
         inputs = torch.randn(50, 3, generator=generator, dtype=torch.float64)
-        model.normalise_(inputs, 0.1 * inputs + 0.01)
+        inputs = torch.cat([inputs[:, :1].cos(), inputs[:, :1].sin(), inputs[:, 1:]], -1)
+        model.normalise_(inputs, 0.1 * inputs[:, :3] + 0.01)
         return model
 
     return build
