@@ -100,10 +100,10 @@ def fit_gain_offset(
     (tensor([0.5000]), tensor([0.1000]))
     """
     ones = torch.ones_like(executed)
-    terms = torch.stack([executed * executed, executed, ones, executed * effective, effective], -4)
+    terms = torch.stack([executed * executed, executed, ones, executed * effective, effective], -3)
     robust = weight
     for turn in range(rounds + 1):
-        square, mean, mass, cross, shift = (terms * robust.unsqueeze(-4)).sum(-2).unbind(-3)
+        square, mean, mass, cross, shift = (terms * robust.unsqueeze(-3)).sum(-2).unbind(-2)
         square, mass, cross = square + PRIOR, mass + 10 * PRIOR, cross + PRIOR
         determinant = (square * mass - mean.square()).clamp_min(PRIOR**2)
         gain = (mass * cross - mean * shift) / determinant
@@ -124,9 +124,9 @@ def fit_friction(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[T
         Gains, none smaller than 0.02 in size, and offsets, ``(*B, A)`` each.
     """
     size, sign = executed.abs(), executed.sign()
-    terms = torch.stack([size * size, size, sign.abs(), executed * effective, sign * effective], -4)
+    terms = torch.stack([size * size, size, sign.abs(), executed * effective, sign * effective], -3)
     moved = weight * (effective.abs() > STUCK)
-    square, mixed, signs, cross, signed = (moved.unsqueeze(-4) * terms).sum(-2).unbind(-3)
+    square, mixed, signs, cross, signed = (moved.unsqueeze(-3) * terms).sum(-2).unbind(-2)
     square, cross, signs = square + PRIOR, cross + PRIOR, signs + 10 * PRIOR
     determinant = (square * signs - mixed.square()).clamp_min(PRIOR**2)
     gain = (signs * cross - mixed * signed) / determinant
