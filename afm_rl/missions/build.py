@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from afm_rl.dynamics import Calibrated, DynamicsModel, Oracle
-from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.errors import ConfigurationError, check_choice, check_count
 from afm_rl.learning import GaussianNLLLoss, MassEstimator, OracleUpdater, RLSUpdater, Updater
 from afm_rl.missions.checks import blaming, check_cost, check_keys
 from afm_rl.missions.factories import Training
@@ -27,7 +27,7 @@ from afm_rl.missions.selection import (
     select_tracks,
 )
 from afm_rl.planning import MPC, GeometricController, PlanningEnv
-from afm_rl.transforms import ActionFlowTransform
+from afm_rl.transforms import ActionFlowTransform, Guard
 
 ROBOT_SHAPES = (
     *("action_low", "action_high", "state_low", "state_high"),
@@ -60,6 +60,8 @@ class Agent:
     transform: ActionFlowTransform | None
     executed_key: NestedKey
     trainings: Sequence[Training]
+    faults: str
+    """What a mission does at a fault: ``hold``, ``skip`` or ``raise``."""
     settings: Mapping[str, Any]
     """The resolved configuration."""
 
@@ -88,6 +90,7 @@ def build(cfg: DictConfig) -> Agent:
         regimes = select_regimes(settings["regimes"], robot)
     seeds = select_seeds(settings["seeds"])
     budget = check_count("budget", settings["budget"])
+    faults = check_choice("faults", settings["faults"], ("hold", "skip", "raise"))
     with blaming("robot.env"):
         env = robot.env(
             tracks=tracks,
@@ -118,7 +121,8 @@ def build(cfg: DictConfig) -> Agent:
     with blaming("cost"):
         cost = instantiate(cfg.cost, _convert_="all")
     planner = make("planner", PlanningEnv(model, cost, *robot.action_box))
-    executed_key = "action" if transform is None else ("next", transform.key("executed_action"))
+    guard = Guard()
+    executed_key = ("next", guard.key("executed_action"))
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=executed_key)
     updater = make("updater", loss)
@@ -132,7 +136,7 @@ def build(cfg: DictConfig) -> Agent:
             f"dynamics: a calibrated model stays as it is but for its calibration, and "
             f"{type(updater).__name__} does not teach that; choose updater=rls or updater=frozen"
         )
-    chain = [] if transform is None else [transform]
+    chain = [guard] if transform is None else [guard, transform]
     if hasattr(planner, "make_tensordict_primer"):
         chain.append(planner.make_tensordict_primer())
     whole = TransformedEnv(env, Compose(*chain))
@@ -152,6 +156,7 @@ def build(cfg: DictConfig) -> Agent:
         transform=transform,
         executed_key=executed_key,
         trainings=trainings,
+        faults=faults,
         settings=settings,
     )
 
