@@ -159,7 +159,7 @@ def _errors(agent: Agent, td: TensorDictBase) -> tuple[Sequence[Tensor], Tensor]
     """
     actions = [td.get(agent.executed_key)]
     if agent.transform is not None:
-        actions += [td["action"], td["next", agent.transform.key("expected_action")]]
+        actions += [td["action"], td["next", agent.transform.key("predicted_effect")]]
     state, reached = (part["observation"].unsqueeze(1) for part in (td, td["next"]))
     expected, noise = agent.model.forecast(
         state.expand(-1, len(actions), -1), torch.stack(actions, 1)

@@ -1,0 +1,344 @@
+"""Least-squares experts: what simple maps make of a set of pairs (executed, effective action)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from afm_rl.flow.saturation import LIMIT, saturate
+
+STUCK = 5e-3  # half ranges: an action with less effect is held by friction
+PRIOR = 1e-4  # weight of the nominal map in every fit
+LEAST_GAIN = 0.02  # smallest gain that is divided by
+NOISE = 0.1  # half ranges: a pair with this standard deviation counts half
+LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
+NEAR = 0.15  # half ranges: a pair so far from the question counts half as much
+SHORT, LONG = 0.5, 0.9  # forgetting per row
+OUTLIER = 0.1  # half ranges: a residual of this size halves a pair's weight in the robust fit
+EXPERTS = 6
+ANSWERS = EXPERTS + 1  # the experts' answers, and the effect or nearness of the nearest pairs
+MISSES = EXPERTS - 1  # the nearest pairs have no residual of their own
+
+
+class Rows(NamedTuple):
+    """Pairs that describe a regime, oldest first, in half ranges."""
+
+    executed: Tensor
+    """Executed actions u, ``(*B, K, A)``."""
+    effective: Tensor
+    """Their effective actions, ``(*B, K, A)``."""
+    std: Tensor
+    """Standard deviation of the effective actions, ``(*B, K, A)``."""
+    valid: Tensor
+    """Which rows count, ``(*B, K, 1)``, 0 or 1."""
+
+
+def weigh(valid: Tensor, forgetting: float) -> Tensor:
+    r"""Return the weight of each row ``(*B, K, 1)``: :math:`\lambda^k` at age k, if it counts.
+
+    >>> weigh(torch.ones(3, 1), 0.5).squeeze(-1)
+    tensor([0.2500, 0.5000, 1.0000])
+    """
+    age = torch.arange(valid.shape[-2] - 1, -1, -1, device=valid.device, dtype=valid.dtype)
+    return valid * (forgetting**age).unsqueeze(-1)
+
+
+def confidence(std: Tensor) -> Tensor:
+    r"""Return the weight of effective actions by their noise, :math:`1 / (1 + (s / 0.1)^2)`.
+
+    >>> confidence(torch.tensor([0.0, 0.1, 4.0]))
+    tensor([1.0000e+00, 5.0000e-01, 6.2461e-04])
+    """
+    return (1 + (std / NOISE).square()).reciprocal()
+
+
+def fit_gain(executed: Tensor, effective: Tensor, weight: Tensor) -> Tensor:
+    r"""Fit :math:`u_\mathrm{eff} = g \odot u`, each axis for itself, with a weak prior g = 1.
+
+    .. math:: g = \frac{\sum_k w_k u_k u_{\mathrm{eff},k} + \rho}{\sum_k w_k u_k^2 + \rho}
+
+    Args:
+        executed: u, ``(*B, K, A)``.
+        effective: its effective action, ``(*B, K, A)``.
+        weight: of pairs, ``(*B, K, 1)``, or of pairs and axes, ``(*B, K, A)``.
+
+    Returns:
+        Gains ``(*B, A)``, none smaller than 0.02 in size.
+
+    >>> u = torch.tensor([[0.5], [-1.0]])
+    >>> fit_gain(u, -2 * u, weigh(torch.ones(2, 1), 0.8)).round(decimals=2)
+    tensor([-2.])
+    """
+    pull = weight * executed
+    cross = (pull * effective).sum(-2) + PRIOR
+    return _not_zero(cross / ((pull * executed).sum(-2) + PRIOR))
+
+
+def fit_gain_offset(
+    executed: Tensor, effective: Tensor, weight: Tensor, rounds: int = 2
+) -> tuple[Tensor, Tensor]:
+    r"""Fit :math:`u_\mathrm{eff} = g \odot u + b` robustly, each axis for itself.
+
+    Iteratively reweighted least squares with Cauchy weights
+    :math:`1 / (1 + (r / 0.1)^2)` of the residuals r, and a weak prior g = 1, b = 0.
+
+    Args:
+        executed: u, ``(*B, K, A)``.
+        effective: its effective action, ``(*B, K, A)``.
+        weight: of pairs and axes, ``(*B, K, A)``.
+        rounds: times that the weights are renewed.
+
+    Returns:
+        Gains, none smaller than 0.02 in size, and offsets, ``(*B, A)`` each.
+
+    >>> u = torch.tensor([[0.5], [-1.0], [0.2]])
+    >>> gain, offset = fit_gain_offset(u, 0.5 * u + 0.1, torch.ones(3, 1))
+    >>> gain.round(decimals=2), offset.round(decimals=2)
+    (tensor([0.5000]), tensor([0.1000]))
+    """
+    ones = torch.ones_like(executed)
+    terms = torch.stack([executed * executed, executed, ones, executed * effective, effective], -3)
+    robust = weight
+    for turn in range(rounds + 1):
+        square, mean, mass, cross, shift = (terms * robust.unsqueeze(-3)).sum(-2).unbind(-2)
+        square, mass, cross = square + PRIOR, mass + 10 * PRIOR, cross + PRIOR
+        determinant = (square * mass - mean.square()).clamp_min(PRIOR**2)
+        gain = (mass * cross - mean * shift) / determinant
+        offset = (square * shift - mean * cross) / determinant
+        if turn < rounds:
+            miss = effective - (gain.unsqueeze(-2) * executed + offset.unsqueeze(-2))
+            robust = weight / (1 + (miss / OUTLIER).square())
+    return _not_zero(gain), offset
+
+
+def fit_friction(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Fit :math:`u_\mathrm{eff} = g \odot u + h \odot \mathrm{sign}(u)`, each axis for itself.
+
+    Dry friction, or a dead zone: pairs without any effect are left out, see
+    :func:`apply_friction`. Weak prior g = 1, h = 0. Args as for :func:`fit_gain`.
+
+    Returns:
+        Gains, none smaller than 0.02 in size, and offsets, ``(*B, A)`` each.
+    """
+    size, sign = executed.abs(), executed.sign()
+    terms = torch.stack([size * size, size, sign.abs(), executed * effective, sign * effective], -3)
+    moved = weight * (effective.abs() > STUCK)
+    square, mixed, signs, cross, signed = (moved.unsqueeze(-3) * terms).sum(-2).unbind(-2)
+    square, cross, signs = square + PRIOR, cross + PRIOR, signs + 10 * PRIOR
+    determinant = (square * signs - mixed.square()).clamp_min(PRIOR**2)
+    gain = (signs * cross - mixed * signed) / determinant
+    return _not_zero(gain), (square * signed - mixed * cross) / determinant
+
+
+def apply_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
+    """Return the effect of ``unit`` ``(*B, A)`` under :func:`fit_friction`: zero if it is held.
+
+    >>> apply_friction(torch.tensor(1.0), torch.tensor(-0.5), torch.tensor([-0.75, 0.25])).tolist()
+    [-0.25, 0.0]
+    """
+    pull = gain * unit
+    effect = pull + offset * unit.sign()
+    return torch.where(effect * pull < 0, 0.0, effect)
+
+
+def invert_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
+    """Return the action ``(*B, A)`` that has the effect ``unit`` under :func:`fit_friction`."""
+    ratio = unit / gain
+    return ratio - offset / gain * ratio.sign()
+
+
+def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Fit :math:`u_\mathrm{eff} = D u + b` with a weak prior D = 1, b = 0.
+
+    Args as for :func:`fit_gain`; with weights per axis every row of D has its own.
+
+    Returns:
+        D ``(*B, A, A)`` and b ``(*B, A)``.
+    """
+    size = executed.shape[-1]
+    inputs = torch.nn.functional.pad(executed, (0, 1), value=1.0)
+    nominal = torch.eye(size + 1, device=inputs.device, dtype=inputs.dtype)
+    if weight.shape[-1] == 1:
+        moments = (weight * inputs).mT @ torch.cat([inputs, effective], -1)
+        moments = moments + PRIOR * torch.cat([nominal, nominal[:, :-1]], -1)
+        solution = torch.linalg.solve(moments[..., : size + 1], moments[..., size + 1 :]).mT
+        return solution[..., :-1], solution[..., -1]
+    outer = (inputs.unsqueeze(-1) * inputs.unsqueeze(-2)).flatten(-2)  # (*B, K, (A + 1)^2)
+    square = (weight.mT @ outer).unflatten(-1, (size + 1, size + 1)) + PRIOR * nominal
+    cross = (weight * effective).mT @ inputs + PRIOR * nominal[:-1]
+    solution = torch.linalg.solve(square, cross)
+    return solution[..., :-1], solution[..., -1]
+
+
+def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:
+    """Return the action ``(*B, A)`` whose effect under :func:`fit_affine` is nearest to ``unit``.
+
+    A small ridge keeps it finite where the matrix is all but singular.
+    """
+    ridge = LEAST_GAIN**2 * torch.eye(unit.shape[-1], device=unit.device, dtype=unit.dtype)
+    target = (matrix * (unit - bias).unsqueeze(-1)).sum(-2, keepdim=True).mT
+    return torch.linalg.solve(matrix.mT @ matrix + ridge, target).squeeze(-1)
+
+
+def _not_zero(gain: Tensor) -> Tensor:
+    return gain.abs().clamp_min(LEAST_GAIN).copysign(gain)
+
+
+class Experts(NamedTuple):
+    """Five least-squares fits of N sets of rows, and the rows themselves, axis by axis.
+
+    Gains with short and with long memory; robust gain and offset; gain and friction; an affine
+    map; and, for what none of them expresses, a kernel average of the nearest pairs.
+
+    >>> u = torch.tensor([[[0.5], [-1.0]]])
+    >>> experts = fit_experts(Rows(u, -2 * u, torch.zeros(1, 2, 1), torch.ones(1, 2, 1)))
+    >>> experts.execute(torch.tensor([[[0.4]]]), "clip")[..., :4].round(decimals=2)
+    tensor([[[[-0.2000, -0.2000, -0.2000, -0.2000]]]])
+    >>> experts.effect(torch.tensor([[[0.4]]]))[..., :2].round(decimals=2)
+    tensor([[[[-0.8000, -0.8000]]]])
+    """
+
+    gain: Tensor
+    """Gains of the first four fits, ``(N, A, 1, 4)``."""
+    offset: Tensor
+    """Their offsets; the last one's is against the motion, ``(N, A, 1, 4)``."""
+    matrix: Tensor
+    """Of the affine map, ``(N, A, A)``."""
+    inverse: Tensor
+    """Its regularised inverse, ``(N, A, A)``."""
+    bias: Tensor
+    """Of the affine map, ``(N, A, 1)``."""
+    residuals: Tensor
+    """What each fit leaves of each row, ``(N, A, K, 5)``."""
+    misses: Tensor
+    """Logarithm of their root mean squares, ``(N, A, 1, 5)``."""
+    executed: Tensor
+    """The rows' executed actions, ``(N, A, 1, K)``."""
+    effective: Tensor
+    """Their effective actions, ``(N, A, 1, K)``."""
+    trust: Tensor
+    """Logarithm of their weights, ``(N, A, 1, K)``."""
+
+    def execute(self, planned: Tensor, mode: str) -> Tensor:
+        """Return answers ``(N, A, C, 7)`` to plans ``(N, C, A)``.
+
+        The action that each of the five fits would execute, saturated; the kernel average of the
+        actions whose effects came nearest to the plan, and that effect.
+        """
+        plan = planned.mT.to(self.bias)
+        unit = plan.unsqueeze(-1)
+        linear = (unit - self.offset[..., :3]) / self.gain[..., :3]
+        rubbed = invert_friction(self.gain[..., 3:], self.offset[..., 3:], unit)
+        affine = (self.inverse @ (plan - self.bias)).unsqueeze(-1)
+        exact = saturate(torch.cat([linear, rubbed, affine], -1), mode, dim=-3)
+        share = self._likeness(self.effective, unit).softmax(-1)
+        pairs = torch.cat([self.executed, self.effective], -2).mT
+        return torch.cat([exact, share @ pairs], -1).to(planned)
+
+    def effect(self, executed: Tensor) -> Tensor:
+        """Return answers ``(N, A, C, 7)`` about actions ``(N, C, A)``.
+
+        The effect that each of the five fits predicts, the kernel average of the effects of the
+        nearest actions, and how near those are.
+        """
+        actions = executed.mT.to(self.bias)
+        unit = actions.unsqueeze(-1)
+        likeness = self._likeness(self.executed, unit)
+        nearest = likeness.softmax(-1) @ self.effective.mT
+        nearness = likeness.exp().sum(-1, keepdim=True).clamp_max(1.0)
+        answers = torch.cat([*self.predict(actions), nearest, nearness], -1)
+        return answers.clamp(-LIMIT, LIMIT).to(executed)
+
+    def predict(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what the fits predict of actions ``(N, A, C)``: ``(N, A, C, 5)`` in parts."""
+        unit = actions.unsqueeze(-1)
+        linear = self.gain[..., :3] * unit + self.offset[..., :3]
+        rubbed = apply_friction(self.gain[..., 3:], self.offset[..., 3:], unit)
+        return linear, rubbed, (self.matrix @ actions + self.bias).unsqueeze(-1)
+
+    def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
+        """Return the log-weight of each row for ``unit`` ``(N, A, C, 1)``, ``(N, A, C, K)``."""
+        return self.trust - ((among - unit) / NEAR).square()
+
+
+def fit_experts(rows: Rows) -> Experts:
+    """Fit all experts to N sets of rows ``(N, K, A)``.
+
+    In double precision: where all actions are alike, gain and friction can hardly be told apart.
+    The fits per axis share one product of weights and terms; they are those of :func:`fit_gain`,
+    :func:`fit_gain_offset` with one round, :func:`fit_friction` and :func:`fit_affine`.
+    """
+    inputs, valid = rows.executed.double(), rows.valid.double().mT
+    u, e = inputs.mT, rows.effective.double().mT  # (N, A, K)
+    size, (count, axes, length) = u.shape[-2], u.shape
+    ages, prior, nominal = _constants(length, size)
+    weights = ages * (valid * confidence(rows.std.double().mT)).unsqueeze(-2)  # (N, A, 2, K)
+    long = weights[..., 1, :]
+    moved = (long * (e.abs() > STUCK)).unsqueeze(-2)
+    sign = u.sign()
+    terms = [u * u, u, sign * sign, u * e, e, sign * u, sign * e, torch.ones_like(u)]
+    terms = torch.stack(terms, -1).flatten(0, 1)  # (N A, K, 8)
+    flat = torch.cat([weights, moved], -2).flatten(0, 1)  # (N A, 3, K)
+    moments = torch.baddbmm(prior, flat, terms)
+    gains = moments[:, :2, 3] / moments[:, :2, 0]
+    slopes, offsets = _solve_line(moments[:, PLACES[0], PLACES[1]])  # with offset, with friction
+    miss = e.flatten(0, 1) - torch.addcmul(offsets[:, :1], slopes[:, :1], u.flatten(0, 1))
+    robust = flat[:, 1] / (1 + (miss / OUTLIER).square())
+    robust = torch.baddbmm(prior[1:2], robust.unsqueeze(1), terms)[:, 0, PLACES[1][0]]
+    slope, offset = _solve_line(robust.unsqueeze(1))
+    gain = _not_zero(torch.cat([gains, slope, slopes[:, 1:]], -1))
+    offset = torch.cat([torch.zeros_like(gains), offset, offsets[:, 1:]], -1)
+    outer = torch.nn.functional.pad(inputs, (0, 1), value=1.0)  # (N, K, A + 1)
+    square = (outer.unsqueeze(-1) * outer.unsqueeze(-2)).flatten(-2)
+    square = torch.baddbmm(nominal.flatten(), long, square).unflatten(-1, (size + 1, size + 1))
+    cross = torch.baddbmm(nominal[:-1], long * e, outer)
+    solution = torch.linalg.solve_ex(square, cross).result  # (N, A, A + 1)
+    matrix, bias = solution[..., :-1], solution[..., -1:]
+    ridge = torch.baddbmm(LEAST_GAIN**2 / PRIOR * nominal[:-1, :-1], matrix.mT, matrix)
+    inverse = torch.linalg.solve_ex(ridge, matrix.mT).result
+    wide = (count, axes, 1)
+    experts = Experts(
+        gain.unflatten(0, wide[:2]).unsqueeze(-2),
+        offset.unflatten(0, wide[:2]).unsqueeze(-2),
+        matrix,
+        inverse,
+        bias,
+        bias,  # until the residuals are known
+        bias,
+        u.unsqueeze(-2),
+        e.unsqueeze(-2),
+        long.clamp_min(LEAST_MISS**2).log().unsqueeze(-2),
+    )
+    residuals = e.unsqueeze(-1) - torch.cat(experts.predict(u), -1)  # (N, A, K, 5)
+    mass = weights.sum(-1, keepdim=True).clamp_min(LEAST_MISS)
+    left = weights @ residuals.square() / mass
+    left = torch.cat([left[..., :1, :1], left[..., 1:, 1:]], -1)
+    return experts._replace(residuals=residuals, misses=(left.sqrt() + LEAST_MISS).log())
+
+
+PLACES = torch.tensor([[1], [2]]), torch.tensor([[0, 1, 7, 3, 4], [0, 5, 2, 3, 6]])
+"""Rows and columns of the moments of the two lines that are fitted with an offset."""
+
+
+def _solve_line(moments: Tensor) -> tuple[Tensor, Tensor]:
+    """Return slope and offset ``(*B)`` of weighted least squares, given its moments ``(*B, 5)``."""
+    square, mean, mass, cross, shift = moments.unbind(-1)
+    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
+    slope = (mass * cross - mean * shift) / determinant
+    return slope, (square * shift - mean * cross) / determinant
+
+
+@lru_cache(maxsize=16)
+def _constants(rows: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the weights by age ``(2, K)`` and the moments of the priors.
+
+    Those of the lines are ``(3, 8)``, those of the affine map ``(A + 1, A + 1)``.
+    """
+    age = torch.arange(rows - 1, -1, -1, dtype=torch.float64)
+    prior = torch.zeros(3, 8, dtype=torch.float64)
+    prior[:, [0, 3]], prior[:, [2, 7]] = PRIOR, 10 * PRIOR
+    nominal = PRIOR * torch.eye(size + 1, dtype=torch.float64)
+    return torch.stack([SHORT**age, LONG**age]), prior, nominal
