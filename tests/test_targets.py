@@ -57,9 +57,7 @@ def test_every_dangerous_target_is_refused_wherever_it_stands(tmp_path):
     assert not canary.exists()
 
 
-@pytest.mark.parametrize(
-    "target", [None, 3, "", ".", ["os.system"], "afm_rl..x", {}], ids=str
-)
+@pytest.mark.parametrize("target", [None, 3, "", ".", ["os.system"], "afm_rl..x", {}], ids=str)
 def test_what_is_no_name_is_refused(target):
     with pytest.raises(ConfigurationError, match="_target_="):
         check_targets({"planner": {"_target_": target}})
