@@ -10,6 +10,7 @@ from torch import Tensor
 from afm_rl.dynamics.base import DynamicsModel
 
 UNSEEN = 4.0  # half ranges: standard deviation of an axis of which a transition shows nothing
+ASSUMED = 0.1  # half ranges: standard deviation where nothing needs an explanation
 ENOUGH = 0.1  # squared standard deviations: what less a round promises is not worth the next one
 
 
@@ -31,6 +32,7 @@ def effective_action(
     next_state: Tensor,
     half_range: Tensor,
     rounds: int = 3,
+    quiet: float = 0.0,
 ) -> EffectiveAction:
     r"""Express a prediction error in action space, for any model and robot.
 
@@ -59,6 +61,8 @@ def effective_action(
         next_state: the realised next state, ``(*B, S)``.
         half_range: h, half ranges of the action box, ``(A,)``.
         rounds: Gauss-Newton steps at most.
+        quiet: innovations up to this size need no explanation: if there is no larger one, the
+            executed actions are returned at once, with a standard deviation of a tenth.
 
     >>> from afm_rl.dynamics import Dubins
     >>> s, a = torch.zeros(3), torch.tensor([0.5, 0.2])
@@ -74,6 +78,9 @@ def effective_action(
     expected, noise = model.forecast(state, action)
     error = model.manifold.difference(next_state, expected) / noise
     innovation = error.abs().amax(-1)
+    if bool((innovation <= quiet).all()):  # false for NaN
+        std = (ASSUMED * half_range).expand_as(action)
+        return EffectiveAction(action.to(dtype), std.to(dtype), innovation.to(dtype))
     effective, limit = action, 1.0
     for last in (False,) * (rounds - 1) + (True,):
         jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()

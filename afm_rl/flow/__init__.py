@@ -1,27 +1,20 @@
-"""Flows: from the planned action to the action that has its effect."""
+"""The flow: experts, network, prior and training."""
 
-from afm_rl.flow.base import Context, Correction, Corrector, Examples, Flow, Window
-from afm_rl.flow.cfm import CFMLoss, train_flow
-from afm_rl.flow.context_flow import ContextFlow
-from afm_rl.flow.effective import effective_action
-from afm_rl.flow.l1 import L1Augmentation
-from afm_rl.flow.least_squares import LeastSquares
-from afm_rl.flow.paper_flow import PaperFlow
+from afm_rl.flow.experts import Experts, Rows, fit_experts
+from afm_rl.flow.network import AxisNetwork
+from afm_rl.flow.prior import draw_examples
 from afm_rl.flow.solver import midpoint
+from afm_rl.flow.training import CFMLoss, train_flow
+from afm_rl.flow.weights import load_universal
 
 __all__ = [
+    "AxisNetwork",
     "CFMLoss",
-    "Context",
-    "ContextFlow",
-    "Correction",
-    "Corrector",
-    "Examples",
-    "Flow",
-    "L1Augmentation",
-    "LeastSquares",
-    "PaperFlow",
-    "Window",
-    "effective_action",
+    "Experts",
+    "Rows",
+    "draw_examples",
+    "fit_experts",
+    "load_universal",
     "midpoint",
     "train_flow",
 ]

@@ -1,18 +1,26 @@
-"""Small networks."""
+"""The network of the action flow: one for robots with any number of actions."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-SHARP = 5.0  # of logits: shares that are all or nothing are soon learnt
+from afm_rl.flow.experts import ANSWERS, EXPERTS, LEAST_MISS, MISSES, Experts, Rows
+from afm_rl.flow.saturation import LIMIT, MODES
+
+SHARPNESS = 5.0  # of the logits of a mixture: shares of all or nothing are soon learnt
+LEAST_TIME = 0.1  # of the path that is left, in the velocity towards an expert's answer
+CELL = 5 + MISSES  # features of a cell
 
 
-def mlp(sizes: Sequence[int], generator: torch.Generator) -> nn.Sequential:
-    """Return a perceptron with ELU between its layers.
+def mlp(
+    sizes: Sequence[int], generator: torch.Generator, activation: type[nn.Module] = nn.ReLU
+) -> nn.Sequential:
+    """Return a perceptron with an activation between its layers.
 
     The initial weights are those of ``nn.Linear``, but drawn from ``generator``.
 
@@ -25,26 +33,159 @@ def mlp(sizes: Sequence[int], generator: torch.Generator) -> nn.Sequential:
         for parameter in linear.parameters():
             bound = 1 / math.sqrt(fan_in)
             nn.init.uniform_(parameter, -bound, bound, generator=generator)
-        layers += [linear, nn.ELU()]
+        layers += [linear, activation()]
     return nn.Sequential(*layers[:-1])
 
 
-def blend(output: Tensor, guesses: Tensor) -> Tensor:
-    r"""Return a network's own answer and G guesses of others in the shares it gives them.
+class Encoded(NamedTuple):
+    """What the network reads in a set of rows, to be asked about actions."""
 
-    .. math:: s_0\,y + \sum_g s_g\,y_g,\qquad s = \mathrm{softmax}(5 \ell)
+    experts: Experts
+    """The experts' fits."""
+    plan: Tensor
+    """The code's part in the first layer of the velocity, ``(*B, 1, A, W)``."""
+    effect: Tensor
+    """The code's part in the first layer of the effect, ``(*B, 1, A, W)``."""
 
-    each component for itself: a mixture of experts (Jacobs et al. 1991) that comes as near as need
-    be to a guess that is exact, which no network of this size does by computing it.
+    def pick(self, which: Tensor) -> Encoded:
+        """Return one of several sets of rows ``(*B, H, ...)`` for each mission, ``(*B)``."""
+        dim = which.dim()
+        if which.numel() == 1:  # a view, where gathering would copy
+            at = int(which)
+            parts = [part.select(dim, at) for part in (*self.experts, *self[1:])]
+        else:
+            flat = which.flatten()
+            rows = torch.arange(len(flat), device=which.device)
+            parts = [
+                part.flatten(0, dim - 1)[rows, flat].unflatten(0, which.shape)
+                for part in (*self.experts, *self[1:])
+            ]
+        return Encoded(Experts(*parts[:-2]), *parts[-2:])
+
+
+class Asked(NamedTuple):
+    """Plans, as the velocity reads them."""
+
+    hidden: Tensor
+    """Their part in the first layer, ``(*B, C, A, W)``."""
+    answers: Tensor
+    """The experts' answers, ``(*B, C, A, 6)``."""
+
+
+class AxisNetwork(nn.Module):
+    r"""Velocity and effect of actions under a regime that a set of pairs describes.
+
+    The same weights serve every axis, so any number of axes A will do, in any order: a cell for
+    every (row, axis) is embedded; attention over the rows pools an axis's cells into its code; the
+    codes of the other axes join it once (mean and maximum). Two heads answer per axis, each with a
+    mixture of experts (Jacobs et al. 1991) and of an answer of its own:
+
+    .. math:: y = s_0\,y_\mathrm{own} + \sum_e s_e\,y_e,\qquad s = \mathrm{softmax}(5 \ell)
+
+    which is exact where an expert is, as no network of this size is by itself. All actions are in
+    half ranges.
 
     Args:
-        output: y and the logits, ``(*B, (G + 2) A)``.
-        guesses: ``(*B, G, A)``.
+        width: units of the heads' hidden layers.
+        latent: size of an axis's code.
+        across: False lets no axis see the others' codes (a lesion for ablations).
+        experts: False lets the heads answer by themselves alone (a lesion).
+        noise: False hides the standard deviations of the pairs (a lesion).
+        seed: of the initial weights.
 
-    >>> blend(torch.tensor([1.0, 0.0, 9.0]), torch.tensor([[2.0]])).round(decimals=2)
-    tensor([2.])
+    >>> from afm_rl.flow.experts import fit_experts
+    >>> u = torch.rand(12, 3)
+    >>> rows = Rows(u, -u, torch.zeros(12, 3), torch.ones(12, 1))
+    >>> network = AxisNetwork()
+    >>> encoded = network.encode(rows, fit_experts(rows))
+    >>> network.effect(encoded, torch.rand(5, 3)).shape  # of five actions
+    torch.Size([5, 3])
     """
-    count, size = guesses.shape[-2:]
-    own, logits = output.split([size, (count + 1) * size], -1)
-    shares = (SHARP * logits).unflatten(-1, (count + 1, size)).softmax(-2)
-    return (shares * torch.cat([own.unsqueeze(-2), guesses], -2)).sum(-2)
+
+    modes: Tensor
+
+    def __init__(
+        self,
+        width: int = 128,
+        latent: int = 64,
+        across: bool = True,
+        experts: bool = True,
+        noise: bool = True,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.across, self.experts, self.noise = across, experts, noise
+        generator = torch.Generator().manual_seed(seed)
+        self.cell = mlp([CELL, latent // 2, latent], generator)
+        self.query = mlp([latent, 1], generator)
+        self.pooled = mlp([2 * latent, latent], generator)
+        self.mixed = mlp([3 * latent, latent, latent], generator)
+        self.plan_code = mlp([latent, width], generator)
+        self.plan_query = mlp([ANSWERS + MISSES + len(MODES) + 1, width], generator)
+        self.point_weight = nn.Parameter(torch.randn(width, generator=generator))
+        self.time_weight = nn.Parameter(torch.randn(width, generator=generator))
+        self.plan_head = mlp([width, width, EXPERTS + 2], generator)
+        self.effect_code = mlp([latent, width], generator)
+        self.effect_query = mlp([ANSWERS + MISSES + 1, width], generator)
+        self.effect_head = mlp([width, width, EXPERTS + 2], generator)
+        self.register_buffer("modes", torch.eye(len(MODES)), persistent=False)
+
+    def encode(self, rows: Rows, experts: Experts) -> Encoded:
+        """Read rows ``(*B, K, A)`` and the experts' fits of them."""
+        valid = rows.valid.to(self.modes.dtype).unsqueeze(-1)
+        cells = self.cell(self._cells(rows, experts)).relu() * valid
+        logits = self.query(cells) + (valid - 1) * 1e4
+        pool = torch.cat([logits.softmax(-3), valid.expand_as(logits)], -1)  # (*B, K, A, 2)
+        mass = valid.sum(-3).clamp_min(1.0)
+        attended, mean = (pool.movedim(-3, -1) @ cells.transpose(-2, -3)).unbind(-2)
+        code = self.pooled(torch.cat([attended, mean / mass], -1)).relu()
+        if self.across:
+            others = torch.cat([code.mean(-2, keepdim=True), code.amax(-2, keepdim=True)], -1)
+            code = code + self.mixed(torch.cat([code, others.expand(*code.shape[:-1], -1)], -1))
+        code = code.unsqueeze(-3)
+        return Encoded(experts, self.plan_code(code), self.effect_code(code))
+
+    def ask(self, encoded: Encoded, planned: Tensor, mode: str) -> Asked:
+        """Read plans ``(*B, C, A)``; ``mode`` says how those that cannot be had are saturated."""
+        answers = encoded.experts.execute(planned, mode)
+        misses = encoded.experts.misses.to(planned).unsqueeze(-3).expand(*planned.shape, -1)
+        which = self.modes[MODES.index(mode)].expand(*planned.shape, -1)
+        asked = torch.cat([planned.unsqueeze(-1), answers, misses, which], -1)
+        return Asked(encoded.plan + self.plan_query(asked), answers[..., :EXPERTS])
+
+    def velocity(self, asked: Asked, tau: Tensor | float, point: Tensor) -> Tensor:
+        """Return the velocity at points ``(*B, C, A)`` of the path at the time tau."""
+        point = point.unsqueeze(-1)
+        if isinstance(tau, Tensor):
+            tau = tau.unsqueeze(-1)
+            left = (1 - tau).clamp_min(LEAST_TIME)
+        else:
+            left = max(1 - tau, LEAST_TIME)
+        hidden = asked.hidden + point * self.point_weight + tau * self.time_weight
+        return self._blend(self.plan_head(hidden.relu()), (asked.answers - point) / left)
+
+    def effect(self, encoded: Encoded, executed: Tensor) -> Tensor:
+        """Return the effects ``(*B, C, A)`` that actions ``(*B, C, A)`` are predicted to have."""
+        answers = encoded.experts.effect(executed)
+        misses = encoded.experts.misses.to(executed).unsqueeze(-3).expand(*executed.shape, -1)
+        asked = torch.cat([executed.unsqueeze(-1), answers, misses], -1)
+        hidden = (encoded.effect + self.effect_query(asked)).relu()
+        return self._blend(self.effect_head(hidden), answers[..., :EXPERTS])
+
+    def _blend(self, output: Tensor, answers: Tensor) -> Tensor:
+        """Return the mixture of the own answer and the experts', ``(*B, C, A)``."""
+        own, logits = output.split([1, EXPERTS + 1], -1)
+        if not self.experts:
+            return own.squeeze(-1)
+        shares = (SHARPNESS * logits).softmax(-1)
+        return (shares * torch.cat([own, answers], -1)).sum(-1)
+
+    def _cells(self, rows: Rows, experts: Experts) -> Tensor:
+        """Return the features of every row and axis, ``(*B, K, A, F)``."""
+        executed, effective, std, valid = rows
+        loud = (std + LEAST_MISS).log() if self.noise else torch.zeros_like(std)
+        age = torch.linspace(1.0, 0.0, executed.shape[-2]).to(executed).view(-1, 1)
+        own = [executed, effective, loud, age.expand_as(executed), valid.expand_as(executed)]
+        left = experts.residuals.clamp(-LIMIT, LIMIT)
+        features = torch.cat([torch.stack(own, -1), left.to(executed)], -1) * valid.unsqueeze(-1)
+        return features.to(self.modes.dtype)

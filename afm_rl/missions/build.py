@@ -31,7 +31,7 @@ from afm_rl.transforms import ActionFlowTransform
 
 ROBOT_SHAPES = (
     *("action_low", "action_high", "state_low", "state_high"),
-    *("features", "model", "regime", "flow_low", "flow_high", "flow_reuse"),
+    *("features", "model", "regime", "flow_low", "flow_high"),
 )
 NOMINAL = {"_target_": "afm_rl.missions.factories.physics", "_partial_": True}
 AFTER_TRAINING = (

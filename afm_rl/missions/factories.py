@@ -14,17 +14,10 @@ import torch
 from torch import nn
 
 from afm_rl.artefacts import load_artefact
+from afm_rl.correction import ActionFlow, Corrector, L1Augmentation, LeastSquares, PaperFlow
 from afm_rl.dynamics import KNODE, Calibrated, Ensemble, Oracle, Quadrotor
 from afm_rl.errors import AFMError, ConfigurationError, check_flag
-from afm_rl.flow import (
-    ContextFlow,
-    Corrector,
-    Flow,
-    L1Augmentation,
-    LeastSquares,
-    PaperFlow,
-    train_flow,
-)
+from afm_rl.flow import train_flow
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
 from afm_rl.missions.robot import Robot
@@ -140,16 +133,18 @@ def no_correction(robot: Robot, dynamics: Part) -> Part:
 def afm(
     robot: Robot,
     dynamics: Part,
-    train: Mapping[str, Any],
+    train: Mapping[str, Any] | None = None,
     checkpoint: str | None = None,
     enabled: bool = True,
     extend_action_box: bool = True,
     **settings: Any,
 ) -> Part:
-    """Return the transform with a context flow, to be trained over the dynamics model."""
+    """Return the transform with the universal action flow; ``train`` refines it on the robot."""
     place, scale = list(robot.place), robot.place_scale
-    flow = ContextFlow(*robot.flow_box, place=place, place_scale=scale, **settings)
-    training = _training(flow, robot, dynamics, train, checkpoint, "half ranges")
+    flow = ActionFlow(*robot.flow_box, place=place, place_scale=scale, **settings)
+    if train is None and checkpoint is None:
+        return Part(_transform(dynamics, flow, enabled, extend_action_box))
+    training = _training(flow, robot, dynamics, train or {}, checkpoint, "half ranges")
     return Part(_transform(dynamics, flow, enabled, extend_action_box), training)
 
 
@@ -211,7 +206,7 @@ def _transform(
 
 
 def _training(
-    flow: Flow,
+    flow: ActionFlow | PaperFlow,
     robot: Robot,
     dynamics: Part,
     settings: Mapping[str, Any],
@@ -220,8 +215,6 @@ def _training(
 ) -> Training | None:
     """Return how a flow is trained; None if it comes from a file."""
     model = robot.model if dynamics.nominal else dynamics.module
-    if settings.get("reuse") is None:
-        settings = {**settings, "reuse": robot.flow_reuse}
     check_training("corrector.train", train_flow, settings, batch_size=2)
     if checkpoint is not None:
         if not isinstance(checkpoint, str):

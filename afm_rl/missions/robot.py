@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.missions.laps import LapScore
 from afm_rl.missions.score import Score
 from afm_rl.regimes import Regime, Schedule
@@ -44,11 +44,8 @@ class Robot:
         flow_low: lowest corner of the box in which flows correct actions; the actions' if None.
             Where planned actions keep to a small part of their box, a smaller one helps.
         flow_high: its highest corner.
-        flow_views: views that flows read the memory in, and
-        flow_iterations: length of their training, unless ``flow.views`` and
-            ``flow.train.iterations`` say otherwise; the configuration of flows looks here.
-        flow_reuse: how often the training of a flow uses an example, where its settings leave
-            that open; None leaves it to the training. More saves time where models are slow.
+        hypotheses: those of :data:`~afm_rl.correction.hypotheses.HYPOTHESES` that make sense for
+            the robot; all if None.
         place: indices of the state coordinates in which the ground may differ, if any.
         place_scale: distance at which ground counts as other ground, in their unit.
     """
@@ -72,9 +69,7 @@ class Robot:
     score: Score | None = None
     flow_low: Sequence[float] | None = None
     flow_high: Sequence[float] | None = None
-    flow_views: Sequence[str] | None = None
-    flow_iterations: int | None = None
-    flow_reuse: int | None = None
+    hypotheses: Sequence[str] | None = None
     place: Sequence[int] = ()
     place_scale: float = 1.0
 
@@ -101,9 +96,6 @@ class Robot:
 
         if self.flow_low is not None or self.flow_high is not None:
             self._check_box("flow", self.model.action_size)
-        for name in ("flow_iterations", "flow_reuse"):
-            if getattr(self, name) is not None:
-                check_count(f"robot.{name}", getattr(self, name))
         if self.score is not None and not isinstance(self.score, Score):
             raise ConfigurationError(f"robot.score={self.score!r}: expected a Score, or null")
 

@@ -122,7 +122,7 @@ def _advance(agent: Agent, loop: Loop) -> None:
     error, surprise = _error(agent, td)
     miss = unforeseen = error
     if agent.transform is not None:
-        expected = td["next", agent.transform.key("expected_action")]
+        expected = td["next", agent.transform.key("predicted_effect")]
         miss, unforeseen = (_distance(agent, td, action) for action in (td["action"], expected))
     loss = agent.updater(td)["loss"]
     loop.log.add(ids, loop.step, _row(agent, td, (error, miss, unforeseen), surprise, loss))

@@ -3,126 +3,159 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.data import Composite
 from torchrl.envs import FrameSkipTransform, Transform
 
+from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError
-from afm_rl.flow import Corrector
-from afm_rl.keys import as_key
-from afm_rl.transforms.memory import begin, check_parts, correct, memory_spec, observe
+from afm_rl.errors import ConfigurationError, check_flag, check_instance
+from afm_rl.keys import as_key, as_keys
+from afm_rl.transforms.memory import begin, correct, corrector_for, entries_spec
 
 
 class ActionFlowTransform(Transform):
     r"""Action Flow Matching: the planned action goes in, the action that does it comes out.
 
-    On the way to the environment the transform looks at its window of past transitions,
-    asks the dynamics model what each executed action was worth (of a model that learns, the
-    *present* one about the latest transitions again), and, while the model is misaligned,
-    replaces the planned action by the flow's answer (paper, section IV-D). On the way back it
-    adds the transition to the window. It never learns and never changes the model, which it
-    shares with planner and updater.
+    On the way to the environment the transform asks the dynamics model what the last executed
+    actions did (of a model that learns, the *present* one about the newest transitions again)
+    and, while the model is misaligned, replaces the planned action by the corrector's answer
+    (paper, section IV-D). On the way back it adds the transition to its memory. It never learns
+    and never changes the model, which it shares with planner and updater.
 
-    The whole memory lives in the tensordict, under ``prefix``: every mission of a batch has
-    its own, and resets, branches and resumed rollouts are exact. Of use to others are
+    All that it keeps lives in the tensordict, under ``prefix``: every mission of a batch has its
+    own, and resets, branches and resumed rollouts are exact. Of use to others are
 
-    * ``(prefix, "planned_action")`` and ``(prefix, "executed_action")``: the root action
-      stays the planned one, so losses should read the executed one,
-    * ``(prefix, "expected_action")``: what the executed action is expected to be worth; where
-      nothing is corrected, itself,
-    * ``(prefix, "misaligned")``: was the action corrected?
-    * ``(prefix, "surprise")``: the misalignment, in the unit of the flow's gate,
-    * ``(prefix, "spread")``: standard deviation of the flow's samples, per action,
-    * ``(prefix, "reach")``: lowest and highest effect that an action can have, ``(*B, 2, A)``, at
-      least the action box: for planners that can plan beyond it.
+    * ``(prefix, "planned_action")`` and ``(prefix, "executed_action")`` ``(*B, A)``: the root
+      action stays the planned one, so losses should read the executed one,
+    * ``(prefix, "predicted_effect")`` ``(*B, A)``: the effect that the executed action is
+      predicted to have; where nothing is corrected, itself,
+    * ``(prefix, "misaligned")`` ``(*B)``: was the action corrected?
+    * ``(prefix, "innovation")`` ``(*B)``: the misalignment, in the unit of the gate,
+    * ``(prefix, "spread")`` ``(*B, A)``: standard deviation of the flow's samples,
+    * ``(prefix, "effect_bounds")`` ``(*B, 2, A)``: lowest and highest effect that an action can
+      have, at least the action box: for planners that can plan beyond it.
+
+    ``(prefix, "memory")`` ``(*B, P)`` is the corrector's own; logs can drop it:
+    ``data.exclude(("afm", "memory"), ("next", "afm", "memory"))``.
 
     Put it first in a ``Compose``: what follows may rescale the observation under another key
-    and the action. It needs the state as the model knows it in ``observation_key``.
+    and the action. It needs the state as the model knows it.
 
     Args:
         model: dynamics model, shared (it does not become part of the state dict).
-        flow: the correction; owned.
-        observation_key: the state.
-        action_key: the action.
-        prefix: where the memory is kept.
-        enabled: switch the correction off to watch only (see :attr:`enabled`).
+        corrector: the correction, owned; None: the universal
+            :class:`~afm_rl.correction.ActionFlow` for the environment's action box.
+        in_keys: the state; ``["observation"]`` if None.
+        in_keys_inv: the action; ``["action"]`` if None.
+        prefix: where the entries are kept.
+        enabled: False to watch only.
         extend_action_box: let planners know of effects beyond the action box, if the model can
-            foresee them.
+            predict them.
+
+    Raises:
+        ConfigurationError: for parts that do not fit each other, also when it is put around an
+            environment.
 
     >>> import torch
     >>> from torchrl.envs import TransformedEnv
     >>> from afm_rl.dynamics import Dubins
-    >>> from afm_rl.flow import ContextFlow
     >>> from afm_rl.planning import GoalDistance, PlanningEnv
     >>> low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
     >>> world = PlanningEnv(Dubins(), GoalDistance(), low, high)  # any TorchRL env will do
-    >>> env = TransformedEnv(world, ActionFlowTransform(Dubins(), ContextFlow(low, high)))
+    >>> env = TransformedEnv(world, ActionFlowTransform(Dubins()))
     >>> env.rollout(5)["next", "afm", "executed_action"].shape
     torch.Size([5, 2])
     """
 
-    flow: Corrector
-
     def __init__(
         self,
         model: DynamicsModel,
-        flow: Corrector,
-        observation_key: NestedKey = "observation",
-        action_key: NestedKey = "action",
+        corrector: Corrector | None = None,
+        in_keys: Sequence[NestedKey] | None = None,
+        in_keys_inv: Sequence[NestedKey] | None = None,
         prefix: NestedKey = "afm",
         enabled: bool = True,
         extend_action_box: bool = True,
     ) -> None:
-        check_parts("transform", model, flow, enabled, extend_action_box)
-        observation_key, action_key = as_key(observation_key), as_key(action_key)
-        super().__init__(in_keys=[observation_key], in_keys_inv=[action_key])
-        self.__dict__["model"] = model  # shared with planner and updater, so not registered
-        self.flow = flow
-        self.observation_key = observation_key
-        self.action_key = action_key
+        states = _one_key("in_keys", ["observation"] if in_keys is None else in_keys)
+        actions = _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv)
+        super().__init__(in_keys=states, in_keys_inv=actions)
+        self.__dict__["model"] = check_instance("transform.model", model, DynamicsModel)
+        if corrector is not None:
+            corrector = corrector_for("transform", model, corrector, None)
+        self._corrector = corrector
         self.prefix = as_key(prefix)
-        self.enabled, self.extend_action_box = enabled, extend_action_box
+        self.enabled = check_flag("transform.enabled", enabled)
+        self.extend_action_box = check_flag("transform.extend_action_box", extend_action_box)
+
+    @property
+    def observation_key(self) -> NestedKey:
+        """Key of the state."""
+        return self.in_keys[0]
+
+    @property
+    def action_key(self) -> NestedKey:
+        """Key of the action."""
+        return self.in_keys_inv[0]
+
+    @property
+    def corrector(self) -> Corrector:
+        """The correction; the universal one is made for the environment's action box."""
+        if self._corrector is None:
+            if self.parent is None:
+                raise ConfigurationError(
+                    "ActionFlowTransform.corrector: the action box is not known yet; put the "
+                    "transform around an environment first, or give a corrector"
+                )
+            self._corrector = corrector_for("transform", self.model, None, self._action_spec)
+        return self._corrector
 
     def key(self, *names: str) -> NestedKey:
-        """Return the key of an entry of the memory."""
+        """Return the key of an entry."""
         return unravel_key((self.prefix, *names))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the tensordict as it is: a replay buffer or a policy has no step to watch."""
         return tensordict
 
+    @property
+    def _action_spec(self):
+        return self.parent.full_action_spec[self.action_key]
+
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.parent is None:  # inside a replay buffer: nothing to execute
             return tensordict
-        memory = correct(
+        planned = tensordict.get(self.action_key)
+        entries = correct(
             self._recall(tensordict),
-            tensordict.get(self.action_key),
+            planned,
             self.model,
-            self.flow,
-            self.parent.full_action_spec[self.action_key],
+            self.corrector,
+            self._action_spec,
             self.enabled,
             self.extend_action_box,
         )
-        tensordict.set(self.action_key, memory.get("executed_action"))
-        return tensordict.set(self.prefix, memory)
+        tensordict.set(self.action_key, entries.get("executed_action").to(planned.dtype))
+        return tensordict.set(self.prefix, entries)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        memory = observe(tensordict.get(self.prefix), next_tensordict.get(self.observation_key))
-        return next_tensordict.set(self.prefix, memory)
+        entries = tensordict.get(self.prefix).clone(recurse=False)
+        state = next_tensordict.get(self.observation_key).to(entries.get("memory").dtype)
+        entries.set("memory", self.corrector.observe(entries.get("memory"), state))
+        return next_tensordict.set(self.prefix, entries)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         self._check_process()
         state = tensordict_reset.get(self.observation_key)
-        action_spec = self.parent.full_action_spec[self.action_key]
-        memory = begin(self.model, self.flow, state, action_spec)
-        return tensordict_reset.set(self.prefix, memory)
+        return tensordict_reset.set(self.prefix, begin(self.corrector, state, self._action_spec))
 
-    def _recall(self, tensordict: TensorDictBase) -> TensorDictBase:
-        memory = tensordict.get(self.prefix, None)
+    def _recall(self, tensordict: TensorDictBase):
+        memory = tensordict.get(self.key("memory"), None)
         if memory is None:
             raise KeyError(
                 f"ActionFlowTransform: no {self.prefix!r} in the tensordict; start from "
@@ -155,22 +188,33 @@ class ActionFlowTransform(Transform):
 
     def _with_memory(self, spec: Composite) -> Composite:
         self._check_order()
-        found = self.parent.full_observation_spec
-        dtype = found[self.observation_key].dtype
-        if found[self.observation_key].shape[-1] != self.model.state_size:
+        found = self.parent.full_observation_spec.get(self.observation_key, None)
+        if found is None:
             raise ConfigurationError(
-                f"observation_key={self.observation_key!r}: holds "
-                f"{found[self.observation_key].shape[-1]} numbers, but the dynamics model's "
-                f"state has {self.model.state_size}"
+                f"ActionFlowTransform: in_keys={self.in_keys}: the environment has no such "
+                f"entry, but {list(self.parent.full_observation_spec.keys(True, True))}"
             )
-        memory = memory_spec(self.model, self.flow, spec.shape, dtype)
-        spec[self.prefix] = memory.to(spec.device)
+        if not found.shape or found.shape[-1] != self.model.state_size:
+            raise ConfigurationError(
+                f"ActionFlowTransform: in_keys={self.in_keys}: of the shape "
+                f"{tuple(found.shape)}, but the dynamics model's state has "
+                f"{self.model.state_size} numbers"
+            )
+        entries = entries_spec(self.corrector, self.model.state_size, spec.shape, found.dtype)
+        spec[self.prefix] = entries.to(spec.device)
         return spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the memory."""
+        """Add the entries."""
         return self._with_memory(observation_spec)
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
-        """Add the memory: it is an input of the next step."""
+        """Add the entries: they are an input of the next step."""
         return self._with_memory(state_spec)
+
+
+def _one_key(name: str, keys: Sequence[NestedKey]) -> list[NestedKey]:
+    found = as_keys([keys] if isinstance(keys, str) else keys)
+    if len(found) != 1:
+        raise ConfigurationError(f"ActionFlowTransform: {name}={keys!r}: expected one key")
+    return found

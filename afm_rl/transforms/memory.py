@@ -1,175 +1,143 @@
-"""What action flow matching remembers of a mission, and what it does with it."""
+"""The entries that action flow matching keeps in a tensordict, and the tick that renews them."""
 
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
+from afm_rl.correction import ActionFlow, Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
-from afm_rl.flow import Context, Correction, Corrector, Window
-from afm_rl.flow.base import rows_of
+from afm_rl.faults import safe_action
 
 
-def check_parts(
-    owner: str, model: DynamicsModel, flow: Corrector, enabled: bool, extend_action_box: bool
-) -> None:
-    """Check what corrects actions, for an ``owner`` such as ``transform``.
+def corrector_for(
+    owner: str,
+    model: DynamicsModel,
+    corrector: Corrector | None,
+    action_spec: TensorSpec,
+) -> Corrector:
+    """Return the corrector of an ``owner`` such as ``transform``: the universal one if None.
 
     Raises:
-        ConfigurationError: if a part is not what it should be, or flow and model are of
-            different actions.
+        ConfigurationError: if a part is not what it should be, or they are of different actions.
     """
     check_instance(f"{owner}.model", model, DynamicsModel)
-    check_instance(f"{owner}.flow", flow, Corrector)
-    check_flag(f"{owner}.enabled", enabled)
-    check_flag(f"{owner}.extend_action_box", extend_action_box)
-    if flow.action_size != model.action_size:
+    if corrector is None:
+        low, high = bounds_of(action_spec)
+        size = model.action_size
+        if low.shape[-1] != size or not bool((high - low).isfinite().all()):
+            raise ConfigurationError(
+                f"{owner}: actions between {low.tolist()} and {high.tolist()}: expected the "
+                f"{size} finite bounds of the dynamics model's actions; limit the action spec, or "
+                "give a corrector with bounds of its own"
+            )
+        corrector = ActionFlow(low.reshape(-1, size)[0], high.reshape(-1, size)[0])
+    check_instance(f"{owner}.corrector", corrector, Corrector)
+    if corrector.action_size != model.action_size:
         raise ConfigurationError(
-            f"flow: made for {flow.action_size} actions, but the dynamics model has "
-            f"{model.action_size}"
+            f"{owner}.corrector: made for {corrector.action_size} actions, but the dynamics model "
+            f"has {model.action_size}"
         )
+    return corrector
 
 
-def memory_spec(
-    model: DynamicsModel, flow: Corrector, batch: torch.Size, dtype: torch.dtype
+def entries_spec(
+    corrector: Corrector, states: int, batch: torch.Size, dtype: torch.dtype
 ) -> Composite:
-    """Return the specs of the memory for a batch shape."""
-    states, actions, window = model.state_size, model.action_size, flow.window
+    """Return the specs of the entries for a state size and a batch shape."""
+    actions = corrector.action_size
 
     def real(*shape: int) -> Unbounded:
         return Unbounded((*batch, *shape), dtype=dtype)
 
-    def flag(*shape: int) -> Binary:
-        return Binary(shape=(*batch, *shape), dtype=torch.bool)
-
-    rows = Composite(
-        state=real(window, states),
-        planned=real(window, actions),
-        executed=real(window, actions),
-        next_state=real(window, states),
-        valid=flag(window),
-        shape=batch,
-    )
     return Composite(
-        state=real(states),
-        window=rows,
-        pairs=real(window, flow.pair_size),
-        evidence=real(flow.evidence_size),
-        features=real(flow.context_size),
-        surprise=real(),
-        misaligned=flag(),
         planned_action=real(actions),
         executed_action=real(actions),
-        expected_action=real(actions),
+        predicted_effect=real(actions),
+        effect_bounds=real(2, actions),
         spread=real(actions),
-        reach=real(2, actions),
+        innovation=real(),
+        misaligned=Binary(shape=batch, dtype=torch.bool),
+        memory=real(corrector.memory_size(states)),
         shape=batch,
     )
 
 
-def begin(
-    model: DynamicsModel, flow: Corrector, state: Tensor, action_spec: TensorSpec
-) -> TensorDictBase:
-    """Return the memory of a mission that begins in ``state`` ``(*B, S)``."""
-    spec = memory_spec(model, flow, state.shape[:-1], state.dtype)
-    memory = spec.to(state.device).zero()
-    memory.set("reach", box_of(action_spec, memory.get("planned_action")))
-    return memory.set("state", state.clone())
+def begin(corrector: Corrector, state: Tensor, action_spec: TensorSpec) -> TensorDictBase:
+    """Return the entries of missions that begin in ``state`` ``(*B, S)``."""
+    spec = entries_spec(corrector, state.shape[-1], state.shape[:-1], state.dtype)
+    entries = spec.to(state.device).zero()
+    entries.set("effect_bounds", box_of(action_spec, entries.get("planned_action")))
+    return entries.set("memory", corrector.begin(state))
 
 
 def correct(
-    memory: TensorDictBase,
+    memory: Tensor,
     planned: Tensor,
     model: DynamicsModel,
-    flow: Corrector,
+    corrector: Corrector,
     action_spec: TensorSpec,
     enabled: bool = True,
     extend_action_box: bool = True,
 ) -> TensorDictBase:
-    """Return the memory with what was planned ``(*B, A)`` and what should be executed.
+    """Return the entries with what was planned ``(*B, A)`` and what should be executed.
 
     Args:
         memory: up to the present state.
         planned: the planner's action.
         model: the dynamics model as it is now.
-        flow: the correction.
+        corrector: the correction.
         action_spec: actions that can be executed.
         enabled: False to watch only.
-        extend_action_box: note effects beyond the action box, if the model can foresee them.
+        extend_action_box: note effects beyond the action box, if the model can predict them.
     """
-    window = Window(*(memory.get(("window", name)) for name in Window._fields))
-    last = Context(*(memory.get(name) for name in Context._fields))
+    planned = planned.to(memory.dtype)
     box = box_of(action_spec, planned)
-    with torch.no_grad():
-        context = flow.context(window, model, last)
-        use = context.misaligned & enabled
-        expected = planned.clone()
-        found = Correction(planned.clone(), torch.zeros_like(planned), box, expected)
-        if bool(use.any()):
-            state = memory.get("state")
-            found = _corrected(found, expected, use, context, state, model, flow, extend_action_box)
-    executed = found.action.clamp(*box.unbind(-2))
-    expected = torch.where(use.unsqueeze(-1), expected, executed)
-    memory = memory.clone(recurse=False)
-    memory.update(context._asdict())
-    memory.set("planned_action", planned)
-    memory.set("executed_action", executed)
-    memory.set("expected_action", expected)
-    memory.set("spread", found.spread)
-    return memory.set("reach", found.reach)
+    state, last, _ = corrector.latest(memory)
+    memory, found = corrector.correct(memory, planned, model, box)
+    wanted = found.executed if enabled else planned
+    # The last clamp depends on nothing but the spec, whatever the corrector answers.
+    executed, _ = safe_action(wanted, *bounds_of(action_spec), last)
+    predicted, misaligned = found.predicted, found.misaligned
+    if executed is not found.executed and not torch.equal(executed, found.executed):
+        memory = corrector.executing(memory, planned, executed)
+        touched = (executed != found.executed).any(-1, keepdim=True)
+        predicted = torch.where(touched & ~misaligned.unsqueeze(-1), executed, predicted)
+    if not enabled:
+        predicted, misaligned = executed, torch.zeros_like(misaligned)
+    wide = extend_action_box and enabled and model.extrapolates
+    entries = {
+        "planned_action": planned,
+        "executed_action": executed,
+        "predicted_effect": predicted,
+        "effect_bounds": found.bounds if wide else box,
+        "spread": found.spread,
+        "innovation": found.innovation,
+        "misaligned": misaligned,
+        "memory": memory,
+    }
+    return TensorDict(entries, planned.shape[:-1], device=planned.device)
 
 
-def observe(memory: TensorDictBase, next_state: Tensor) -> TensorDictBase:
-    """Return the memory with the transition to ``next_state`` ``(*B, S)`` in its window."""
-    memory, state = memory.clone(recurse=False), memory.get("state")
-    planned, executed = memory.get("planned_action"), memory.get("executed_action")
-    valid = next_state.isfinite().all(-1) & state.isfinite().all(-1)
-    newest = Window(state, planned, executed, next_state, valid)
-    window, at = memory.get("window").clone(recurse=False), valid.dim()
-    for name, value in newest._asdict().items():
-        rows = window.get(name)
-        kept = rows.narrow(at, 1, rows.shape[at] - 1)
-        window.set(name, torch.cat([kept, value.unsqueeze(at)], at))
-    memory.set("window", window)
-    return memory.set("state", next_state.clone())
+def bounds_of(action_spec: TensorSpec) -> tuple[Tensor, Tensor]:
+    """Return the lowest and the highest action of a spec.
+
+    Raises:
+        ConfigurationError: if its actions are no real numbers between bounds.
+    """
+    space = getattr(action_spec, "space", None)
+    if not hasattr(space, "low") or not action_spec.dtype.is_floating_point:
+        raise ConfigurationError(
+            f"action_spec={action_spec}: expected a Bounded spec of real numbers; limit the "
+            "environment's actions first"
+        )
+    return space.low, space.high
 
 
 def box_of(action_spec: TensorSpec, like: Tensor) -> Tensor:
     """Return the action box for actions ``(*B, A)``: ``(*B, 2, A)``."""
-    space = action_spec.space
-    return torch.stack([space.low.expand_as(like), space.high.expand_as(like)], -2).to(like)
-
-
-def _corrected(
-    found: Correction,
-    expected: Tensor,
-    use: Tensor,
-    context: Context,
-    state: Tensor,
-    model: DynamicsModel,
-    flow: Corrector,
-    extend_action_box: bool,
-) -> Correction:
-    """Put the flow's answers where ``use`` ``(*B)`` says so, in place."""
-    executed, spread, reach, _ = found
-    use = rows_of(use)
-    planned = executed[use].clone()
-    shown = Context(*(part[use] for part in context))
-    answer = flow.correct(shown, state[use], planned)
-    sound = answer.action.isfinite().all(-1, keepdim=True)
-    executed[use] = torch.where(sound, answer.action, planned)
-    spread[use] = torch.where(sound, answer.spread, 0.0)
-    if answer.expected is not None:
-        known = sound & answer.expected.isfinite().all(-1, keepdim=True)
-        expected[use] = torch.where(known, answer.expected, planned)
-    if answer.reach is not None and reach is not None and extend_action_box and model.extrapolates:
-        # Never a smaller box: what cannot be had the flow cuts, and it knows better.
-        told = sound.unsqueeze(-1) & answer.reach.isfinite()
-        low, high = torch.where(told, answer.reach, reach[use]).unbind(-2)
-        least, most = reach[use].unbind(-2)
-        widened = [torch.minimum(least, low), torch.maximum(most, high)]
-        reach[use] = torch.stack(widened, -2)
-    return found
+    low, high = bounds_of(action_spec)
+    return torch.stack([low.expand_as(like), high.expand_as(like)], -2).to(like)

@@ -1,4 +1,4 @@
-"""What a context flow asks about, and how it chooses among its samples."""
+"""Which of the flow's samples is executed."""
 
 from __future__ import annotations
 

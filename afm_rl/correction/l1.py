@@ -7,10 +7,9 @@ import math
 import torch
 from torch import Tensor
 
+from afm_rl.correction.pairs import ClassicalCorrector
 from afm_rl.errors import check_choice, check_number
-from afm_rl.flow.base import Context, Correction
-from afm_rl.flow.least_squares import weigh
-from afm_rl.flow.pairs import PairCorrector
+from afm_rl.flow.experts import Rows, weigh
 from afm_rl.flow.saturation import MODES, saturate
 
 
@@ -37,7 +36,7 @@ def low_pass(signal: Tensor, valid: Tensor, bandwidth: float, dt: float) -> Tens
     return (1.0 - keep) * (weigh(valid, keep) * signal).sum(-2)
 
 
-class L1Augmentation(PairCorrector):
+class L1Augmentation(ClassicalCorrector):
     r"""L1 adaptive augmentation: what the model cannot explain is an additive disturbance.
 
     .. math:: u = u_0 - C(s)\,\hat\sigma,\qquad
@@ -47,7 +46,7 @@ class L1Augmentation(PairCorrector):
     state predictor with error dynamics :math:`A_s` answers with :math:`e^{A_s \Delta t}` times
     the mean disturbance of the last tick. Here the predictor starts from the measured state at
     each tick, the limit :math:`A_s \to 0`, and that disturbance is read from the model's
-    one-tick error (:func:`~afm_rl.flow.effective.effective_action`): any model and robot will
+    one-tick error (:func:`~afm_rl.dynamics.inverse.effective_action`): any model and robot will
     do, and what no action can do (the unmatched part) is left out. Unlike in the literature
     there is a gate, and the filter remembers K ticks only: :math:`e^{-K \omega \Delta t}` of a
     lasting disturbance is missed.
@@ -70,8 +69,8 @@ class L1Augmentation(PairCorrector):
     Raises:
         ConfigurationError: for a setting that cannot be used.
 
-    >>> L1Augmentation(torch.tensor([-1.0]), torch.tensor([1.0]), dt=0.2).feature_size
-    72
+    >>> L1Augmentation(torch.tensor([-1.0]), torch.tensor([1.0]), dt=0.2).memory
+    24
     """
 
     def __init__(
@@ -84,15 +83,13 @@ class L1Augmentation(PairCorrector):
         gate: float = 5.0,
         saturation: str = "clip",
     ) -> None:
-        super().__init__(action_low, action_high, window, gate)
-        self.dt = check_number("flow.dt", dt, low=0.0, open_low=True)
+        super().__init__(action_low, action_high, gate, window)
+        self.dt = check_number("corrector.dt", dt, low=0.0, open_low=True)
         self.bandwidth = check_number("corrector.bandwidth", bandwidth, low=0.0, open_low=True)
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
 
-    def correct(self, context: Context, state: Tensor, planned: Tensor) -> Correction:
-        """Take the disturbance off; the spread is zero."""
-        executed, effective, valid = self.pairs(context.features)
-        disturbance = low_pass(effective - executed, valid, self.bandwidth, self.dt)
-        wanted = self.normalise(planned) - disturbance
-        executed = self.denormalise(saturate(wanted, self.saturation))
-        return Correction(executed, torch.zeros_like(executed))
+    def answer(self, rows: Rows, planned: Tensor) -> tuple[Tensor, Tensor]:
+        """Take the disturbance off."""
+        found = low_pass(rows.effective - rows.executed, rows.valid, self.bandwidth, self.dt)
+        executed = saturate(planned - found, self.saturation)
+        return executed, executed + found

@@ -1,0 +1,195 @@
+"""The contract between the transform and what corrects its actions."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.faults import count_repeats, trusted
+
+Fields = dict[str, Tensor]
+"""The parts of a memory, by name."""
+
+
+class Correction(NamedTuple):
+    """What to execute instead of a planned action."""
+
+    executed: Tensor
+    """The action, ``(*B, A)``."""
+    predicted: Tensor
+    """The effect that it is predicted to have, ``(*B, A)``."""
+    spread: Tensor
+    """Standard deviation over the flow's samples, ``(*B, A)``."""
+    bounds: Tensor
+    """Lowest and highest effect that an action can have, ``(*B, 2, A)``."""
+    innovation: Tensor
+    """Largest normalised innovation of the newest transitions, ``(*B)``."""
+    misaligned: Tensor
+    """Is the action corrected? ``(*B)``."""
+
+
+def rows_of(mask: Tensor) -> Any:
+    """Return an index of the missions of a mask ``(*B)``: of all of them one that copies nothing.
+
+    >>> rows_of(torch.tensor([True, True])), rows_of(torch.tensor([True, False]))
+    (Ellipsis, tensor([ True, False]))
+    """
+    return ... if bool(mask.all()) else mask
+
+
+class Corrector(nn.Module, ABC):
+    """Turns planned actions into executed ones, given the transitions that it has seen.
+
+    A corrector is a pure function on a memory, one flat tensor ``(*B, P)`` per mission:
+    :meth:`begin` makes it, :meth:`correct` turns a planned action into the one to execute, and
+    :meth:`observe` adds the state that this led to. Inside, actions are in half ranges around the
+    centre of their box, u in [-1, 1]^A.
+
+    Args:
+        action_low: lowest action, ``(A,)``.
+        action_high: highest action, ``(A,)``.
+        gate: misalignment above which actions are corrected.
+        recent: transitions that are kept as they were observed, R.
+
+    Raises:
+        ConfigurationError: for bounds or numbers that cannot be used.
+    """
+
+    centre: Tensor
+    half_range: Tensor
+
+    def __init__(self, action_low: Tensor, action_high: Tensor, gate: float, recent: int) -> None:
+        super().__init__()
+        low, high = torch.as_tensor(action_low), torch.as_tensor(action_high)
+        fits = low.shape == high.shape and low.dim() == 1 and len(low)
+        if not fits or not bool(((low < high) & (high - low).isfinite()).all()):
+            raise ConfigurationError(
+                f"corrector: action bounds {low.tolist()}, {high.tolist()}: expected two lists of "
+                "one size, finite, low < high"
+            )
+        self.gate = check_number("corrector.gate", gate, low=0.0)
+        self.recent = check_count("corrector.recent", recent)
+        self.register_buffer("centre", (low + high) / 2, persistent=False)
+        self.register_buffer("half_range", (high - low) / 2, persistent=False)
+
+    @property
+    def action_size(self) -> int:
+        """Number of action components, A."""
+        return len(self.centre)
+
+    def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
+        """Return names and shapes of the parts of a memory; subclasses add theirs."""
+        size = self.action_size
+        return {
+            "state": (state_size,),
+            "planned": (size,),
+            "executed": (size,),
+            "repeats": (1,),
+            "transitions": (self.recent, 2 * state_size + 2 * size + 1),
+        }
+
+    def memory_size(self, state_size: int) -> int:
+        """Return how many numbers a memory has, P."""
+        return sum(math.prod(shape) for shape in self.shapes(state_size).values())
+
+    def begin(self, state: Tensor) -> Tensor:
+        """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
+        size = self.memory_size(state.shape[-1]) - state.shape[-1]
+        return torch.cat([state, state.new_zeros(*state.shape[:-1], size)], -1)
+
+    def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
+        """Return the memory with the transition to ``next_state`` ``(*B, S)``.
+
+        A transition with a faulty or stale reading at either end does not count.
+        """
+        parts = self.unpack(memory, next_state.shape[-1])
+        state, count = parts["state"], parts["repeats"].squeeze(-1)
+        after = count_repeats(next_state, state, count)
+        valid = trusted(state, count) & trusted(next_state, after)
+        ends = [state, parts["planned"], parts["executed"], next_state, valid.unsqueeze(-1)]
+        row = torch.cat(ends, -1).unsqueeze(-2)
+        parts["repeats"] = after.unsqueeze(-1)
+        parts["transitions"] = torch.cat([parts["transitions"][..., 1:, :], row], -2)
+        parts["state"] = next_state
+        return self.pack(parts)
+
+    @abstractmethod
+    def correct(
+        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
+    ) -> tuple[Tensor, Correction]:
+        """Return the next memory, and what to execute for a planned action ``(*B, A)``.
+
+        Args:
+            memory: up to the present state, ``(*B, P)``.
+            planned: the planner's action.
+            model: the dynamics model as it is now.
+            box: lowest and highest action, ``(*B, 2, A)``.
+        """
+
+    def latest(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the present state, and the actions planned and executed last."""
+        size = self.action_size
+        first = (memory.shape[-1] - self.memory_size(0)) // (2 * self.recent + 1)
+        state, planned, executed, _ = memory.tensor_split(
+            [first, first + size, first + 2 * size], -1
+        )
+        return state, planned, executed
+
+    def executing(self, memory: Tensor, planned: Tensor, executed: Tensor) -> Tensor:
+        """Return the memory with the actions that are planned and executed now, ``(*B, A)``.
+
+        For whoever executes another action than :meth:`correct` returned.
+        """
+        state, _, _ = self.latest(memory)
+        rest = memory[..., state.shape[-1] + 2 * self.action_size :]
+        return torch.cat([state, planned, executed, rest], -1)
+
+    def unpack(self, memory: Tensor, state_size: int) -> Fields:
+        """Return the parts of a memory."""
+        names, sizes, shapes = _layout(self, state_size)
+        parts = memory.split(sizes, -1)
+        return {
+            name: part if len(shape) == 1 else part.unflatten(-1, shape)
+            for name, part, shape in zip(names, parts, shapes, strict=True)
+        }
+
+    def pack(self, parts: Fields) -> Tensor:
+        """Return the memory that consists of parts, in the order of :meth:`shapes`."""
+        lead = parts["state"].dim() - 1
+        flat = [part if part.dim() == lead + 1 else part.flatten(lead) for part in parts.values()]
+        return torch.cat(flat, -1)
+
+    def split_transitions(self, rows: Tensor, state_size: int) -> tuple[Tensor, ...]:
+        """Return state, planned, executed, next state and validity of rows of transitions."""
+        size = self.action_size
+        return rows.split([state_size, size, size, state_size, 1], -1)
+
+    def unchanged(self, planned: Tensor, innovation: Tensor, box: Tensor) -> Correction:
+        """Return the correction that executes what was planned."""
+        still = torch.zeros_like(planned)
+        return Correction(planned, planned, still, box, innovation, innovation > torch.inf)
+
+    def normalise(self, action: Tensor) -> Tensor:
+        """Return u for an action in its own units."""
+        return (action - self.centre) / self.half_range
+
+    def denormalise(self, unit: Tensor) -> Tensor:
+        """Return the action for u."""
+        return self.centre + self.half_range * unit
+
+
+@lru_cache(maxsize=64)
+def _sizes(shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> tuple[list, list, list]:
+    names, forms = zip(*shapes, strict=True)
+    return list(names), [math.prod(form) for form in forms], list(forms)
+
+
+def _layout(corrector: Corrector, state_size: int) -> tuple[list, list, list]:
+    return _sizes(tuple(corrector.shapes(state_size).items()))

@@ -1,0 +1,93 @@
+"""Windows that a robot would have seen under imagined regimes, to refine a flow on that robot."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from afm_rl.correction.base import Corrector
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics.inverse import effective_action
+from afm_rl.flow.experts import LIMIT, Rows
+from afm_rl.flow.prior import Draw, Drawn, draw_actions, draw_masks
+from afm_rl.flow.saturation import intend
+from afm_rl.regimes import Regime
+from afm_rl.sampling import draw_states
+
+
+def draw_counterfactuals(
+    corrector: Corrector,
+    model: DynamicsModel,
+    regime: Regime,
+    states: tuple[Tensor, Tensor] | Tensor,
+    size: tuple[int, int, int],
+    mode: str,
+    generator: torch.Generator,
+) -> Drawn:
+    """Draw regimes from a prior and show the model's world to a corrector through them.
+
+    The newest rows of each window come from the regime to correct, the older ones from the regime
+    before; some windows are not full. Half of the plans are in the action box, the others are
+    effects that can be had.
+
+    Args:
+        corrector: whose actions they are.
+        model: the world, before anything happens to it.
+        regime: the prior.
+        states: lowest and highest state, or a pool of them, ``(P, S)``.
+        size: windows, their rows and plans for each, (N, K, C).
+        mode: of plans that cannot be had, see :func:`~afm_rl.flow.saturation.saturate`.
+        generator: of all that is drawn.
+    """
+    count, rows, plans = size
+    draw, axes = Draw(generator), corrector.action_size
+    now, before = regime.sample((2, count), generator)
+    fresh, valid = draw_masks(count, rows, draw)
+    parameters = torch.where(fresh == 1.0, now.unsqueeze(1), before.unsqueeze(1))
+    state = draw_states(states, count * rows, generator).view(count, rows, -1)
+    state = model.manifold.project(state)
+    executed = corrector.denormalise(draw_actions(count, rows, axes, draw))
+    low, high = (corrector.denormalise(torch.full((axes,), end)) for end in (-1.0, 1.0))
+    effect = regime.apply(executed, parameters, state)
+    reached = imagine(model, state, effect, low, high, generator)
+    seen = effective_action(model, state, executed, reached, corrector.half_range)
+    pairs = Rows(
+        corrector.normalise(executed),
+        corrector.normalise(seen.action).clamp(-LIMIT, LIMIT),
+        (seen.std / corrector.half_range).clamp_max(LIMIT),
+        valid,
+    )
+    many = (count, plans, axes)
+    here, ruled = state[:, -1:].expand(-1, plans, -1), now.unsqueeze(1).expand(-1, plans, -1)
+    anywhere, other, probe = (
+        corrector.denormalise(draw.uniform(-1.0, 1.0, *many)) for _ in range(3)
+    )
+    inside = draw.chance(0.5, count, plans, 1)
+    planned = torch.where(inside, anywhere, regime.apply(other, ruled, here))
+    intended = intend(regime, planned, ruled, here, low, high, mode)
+    answers = planned, intended, probe, regime.apply(probe, ruled, here)
+    return Drawn(
+        Rows(*(part * valid for part in pairs)),
+        *(corrector.normalise(part).clamp(-LIMIT, LIMIT) for part in answers),
+    )
+
+
+def imagine(
+    model: DynamicsModel,
+    state: Tensor,
+    effect: Tensor,
+    low: Tensor,
+    high: Tensor,
+    generator: torch.Generator,
+) -> Tensor:
+    """Return noisy next states ``(*B, S)`` under effective actions, also beyond the box.
+
+    A learned model knows nothing outside the box, so it is continued linearly from its edge.
+    """
+    inside = torch.minimum(torch.maximum(effect, low), high)
+    expected, noise = model.forecast(state, inside)
+    change = noise * torch.randn(noise.shape, generator=generator)
+    out = (effect != inside).any(-1)  # derivatives are dear, and few effects are beyond the box
+    slope = model.jacobian(state[out], inside[out])
+    change[out] += (slope @ (effect - inside)[out].unsqueeze(-1)).squeeze(-1)
+    return model.manifold.add(expected, change)

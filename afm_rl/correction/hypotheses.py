@@ -1,0 +1,144 @@
+"""Hypotheses: which remembered pairs tell what an action does now.
+
+The newest pairs tell it, unless commands act late or the ground changes from place to place. Each
+hypothesis reads the memory in its own way; what it would have predicted decides whether it is
+believed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from afm_rl.errors import ConfigurationError, check_choice
+from afm_rl.flow.experts import Rows
+
+IDENTITY = "identity"  # actions have the effect that the model predicts
+AGE = 20.0  # steps that separate two pairs as much as one unit of place does
+
+
+class Hypothesis(NamedTuple):
+    """One way of reading the memory."""
+
+    share: float = 0.5
+    """Part of the K rows that is filled."""
+    delay: int = 0
+    """Steps from a command to its effect."""
+    near: bool = False
+    """Read the pairs nearest in place instead of in time?"""
+    penalty: float = 0.0
+    """How much worse than the first it must be expected to predict."""
+
+
+HYPOTHESES = {
+    IDENTITY: Hypothesis(penalty=0.02),  # reads nothing
+    "recent": Hypothesis(),
+    "newest": Hypothesis(share=1 / 6, penalty=0.02),  # right after a change
+    "long": Hypothesis(share=1.0),
+    **{f"delay_{k}": Hypothesis(delay=k, penalty=0.05) for k in range(1, 9)},
+    "near": Hypothesis(near=True, penalty=0.03),
+    "nearest": Hypothesis(share=1 / 6, near=True),
+    "here": Hypothesis(share=1 / 12, near=True, penalty=0.01),  # at the edge of two grounds
+}
+
+
+class Layout(NamedTuple):
+    """How H hypotheses fill K rows, those by place last; ages count from the newest pair, 0."""
+
+    command: Tensor
+    """Ages of the commands of the hypotheses by time, ``(T K,)``."""
+    effect: Tensor
+    """Ages of their effects, ``(T K,)``."""
+    filled: Tensor
+    """Which rows are filled, ``(H, K, 1)``, 0 or 1."""
+    delay: Tensor
+    """Steps from command to effect, ``(H,)``."""
+
+
+def lay_out(hypotheses: Sequence[Hypothesis], rows: int) -> Layout:
+    """Return the layout of K ``rows``.
+
+    >>> lay_out([Hypothesis(share=1.0, delay=1)], rows=3).command
+    tensor([3, 2, 1])
+    """
+    age = torch.arange(rows - 1, -1, -1)
+    timed = [h for h in hypotheses if not h.near]
+    delay = torch.tensor([h.delay for h in hypotheses])
+    count = torch.tensor([max(1, round(h.share * rows)) for h in hypotheses])
+    effect = age.repeat(len(timed))
+    late = delay[: len(timed)].repeat_interleave(rows)
+    filled = (age < count.unsqueeze(-1)).unsqueeze(-1).float()
+    return Layout(effect + late, effect, filled, delay)
+
+
+def memory_of(hypotheses: Sequence[Hypothesis], rows: int) -> int:
+    """Return how many pairs the hypotheses of K ``rows`` read at most."""
+    return rows + max(h.delay for h in hypotheses)
+
+
+def check_hypotheses(names: Sequence[str], by_place: bool) -> list[str]:
+    """Return the names without the identity, those by place last, or dropped without a place.
+
+    Raises:
+        ConfigurationError: if it is no list of hypotheses, or none is left.
+
+    >>> check_hypotheses(["identity", "near", "recent"], by_place=True)
+    ['recent', 'near']
+    """
+    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
+        raise ConfigurationError(
+            f"corrector.hypotheses={names!r}: expected a list of {', '.join(HYPOTHESES)}"
+        )
+    for name in names:
+        check_choice("corrector.hypotheses", name, HYPOTHESES)
+    timed = [name for name in names if name != IDENTITY and not HYPOTHESES[name].near]
+    if not timed:
+        raise ConfigurationError(
+            f"corrector.hypotheses={list(names)!r}: expected one by time, such as recent"
+        )
+    return timed + [name for name in names if HYPOTHESES[name].near and by_place]
+
+
+def read_rows(pairs: Tensor, layout: Layout, size: int, away: Tensor | None) -> Rows:
+    """Return the rows that each hypothesis reads, ``(*B, H, K, A)``.
+
+    Args:
+        pairs: the memory, oldest first: executed, effective, standard deviation, valid, and what
+            else there is, ``(*B, M, D)``.
+        layout: of the hypotheses.
+        size: number of actions, A.
+        away: squared distance in place of each pair from here, ``(*B, M)``; None without
+            hypotheses by place.
+
+    >>> u = torch.tensor([[0.1], [0.2], [0.3]])
+    >>> pairs = torch.cat([u, 10 * u, 0 * u, torch.ones(3, 1)], -1)
+    >>> late = lay_out([Hypothesis(share=1.0, delay=1)], rows=2)
+    >>> rows = read_rows(pairs, late, 1, None)
+    >>> rows.executed.flatten(), rows.effective.flatten()
+    (tensor([0.1000, 0.2000]), tensor([2., 3.]))
+    """
+    newest, rows = pairs.shape[-2] - 1, layout.filled.shape[-2]
+    effects = pairs.index_select(-2, newest - layout.effect)
+    commands = pairs.index_select(-2, newest - layout.command)
+    executed, valid = commands[..., :size], commands[..., 3 * size : 3 * size + 1]
+    effective, std, came = effects[..., size : 3 * size + 1].split([size, size, 1], -1)
+    parts = [part.unflatten(-2, (-1, rows)) for part in (executed, effective, std, valid * came)]
+    if away is not None:
+        near = _nearest(pairs, away, rows)
+        count = len(layout.filled) - parts[0].shape[-3]
+        shape = (*near.shape[:-2], count, *near.shape[-2:])
+        sizes = [size, size, size, 1, near.shape[-1] - 3 * size - 1]
+        there = near.unsqueeze(-3).expand(shape).split(sizes, -1)
+        parts = [torch.cat([part, more], -3) for part, more in zip(parts, there, strict=False)]
+    filled = parts[3] * layout.filled
+    return Rows(*(part * filled for part in parts[:3]), filled)
+
+
+def _nearest(pairs: Tensor, away: Tensor, rows: int) -> Tensor:
+    """Return the K pairs ``(*B, K, D)`` nearest to here, the nearest last."""
+    age = torch.arange(away.shape[-1] - 1, -1, -1, device=away.device) / AGE
+    nearest = (away + age.square()).topk(rows, -1, largest=False).indices.flip(-1)
+    return pairs.take_along_dim(nearest.unsqueeze(-1), -2)

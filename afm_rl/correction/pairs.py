@@ -1,0 +1,131 @@
+"""Transitions as pairs of executed and effective action."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import torch
+from torch import Tensor
+
+from afm_rl.correction.base import Correction, Corrector, Fields, rows_of
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics.inverse import effective_action
+from afm_rl.errors import check_count
+from afm_rl.flow.experts import LIMIT, Rows
+
+
+class PairCorrector(Corrector):
+    """A corrector that remembers M pairs (executed, effective action) in half ranges.
+
+    The model counts as misaligned while the largest normalised innovation of the newest
+    transitions exceeds ``gate`` standard deviations of the model's own noise. While it is
+    aligned, an executed action counts as its own effect, and nothing more is computed.
+
+    Args:
+        action_low: lowest action, ``(A,)``.
+        action_high: highest action, ``(A,)``.
+        gate: in standard deviations of the model.
+        recent: newest transitions, R: the gate looks at these, and a model that learns is asked
+            about them again at every step.
+        memory: pairs that are remembered, M.
+        place: number of state coordinates that are remembered with a pair.
+    """
+
+    def __init__(
+        self,
+        action_low: Tensor,
+        action_high: Tensor,
+        gate: float,
+        recent: int,
+        memory: int,
+        place: int = 0,
+    ) -> None:
+        super().__init__(action_low, action_high, gate, recent)
+        self.memory = max(check_count("corrector.memory", memory), recent)
+        self.pair_size = 3 * self.action_size + 2 + place
+
+    def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
+        """Return names and shapes, with the pairs: u, its effect, std, valid, innovation, place."""
+        return {
+            **super().shapes(state_size),
+            "pairs": (self.memory, self.pair_size),
+            "misaligned": (1,),
+        }
+
+    def place_of(self, state: Tensor) -> Tensor:
+        """Return the coordinates of states that are remembered with pairs; none by default."""
+        return state[..., :0]
+
+    def watch(self, parts: Fields, model: DynamicsModel) -> Tensor:
+        """Add the newest transitions to the pairs, in place; return the innovation ``(*B)``.
+
+        A model that stays as it is needs to be asked about the newest transition only, one that
+        learns about all R.
+        """
+        count = 1 if model.taught_in is None else self.recent
+        rows = parts["transitions"][..., -count:, :]
+        state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
+        unit = self.normalise(executed)
+        awake = bool(parts["misaligned"].any())
+        seen = effective_action(
+            model, state, executed, reached, self.half_range, quiet=0.0 if awake else self.gate
+        )
+        std = (seen.std / self.half_range).clamp_max(LIMIT)
+        rows = torch.cat(
+            [
+                unit,
+                self.normalise(seen.action).clamp(-LIMIT, LIMIT),
+                std,
+                valid,
+                seen.innovation.unsqueeze(-1),
+                self.place_of(state),
+            ],
+            -1,
+        )
+        sound = (valid == 1.0) & rows.isfinite().all(-1, keepdim=True)
+        rows = torch.where(sound, rows, 0.0)
+        parts["pairs"] = torch.cat([parts["pairs"][..., 1 : self.memory - count + 1, :], rows], -2)
+        return parts["pairs"][..., -self.recent :, 3 * self.action_size + 1].amax(-1)
+
+
+class ClassicalCorrector(PairCorrector):
+    """A corrector that answers a plan from all pairs that it remembers, at once.
+
+    Args:
+        action_low: lowest action, ``(A,)``.
+        action_high: highest action, ``(A,)``.
+        gate: in standard deviations of the model.
+        window: transitions that are remembered, K.
+    """
+
+    def __init__(self, action_low: Tensor, action_high: Tensor, gate: float, window: int) -> None:
+        super().__init__(action_low, action_high, gate, window, window)
+
+    def rows(self, pairs: Tensor) -> Rows:
+        """Return pairs as rows."""
+        size = self.action_size
+        parts = pairs.split([size, size, size, 1, self.pair_size - 3 * size - 1], -1)
+        return Rows(*parts[:4])
+
+    def correct(
+        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
+    ) -> tuple[Tensor, Correction]:
+        """Answer where the model is misaligned."""
+        parts = self.unpack(memory, model.state_size)
+        innovation = self.watch(parts, model)
+        found = self.unchanged(planned, innovation, box)
+        misaligned = innovation > self.gate
+        if bool(misaligned.any()):
+            use = rows_of(misaligned)
+            executed, predicted = planned.clone(), planned.clone()
+            unit = self.normalise(planned[use])
+            action, effect = self.answer(self.rows(parts["pairs"][use]), unit)
+            executed[use], predicted[use] = self.denormalise(action), self.denormalise(effect)
+            found = found._replace(executed=executed, predicted=predicted, misaligned=misaligned)
+        parts |= {"planned": planned, "executed": found.executed}
+        parts["misaligned"] = misaligned.unsqueeze(-1).to(planned.dtype)
+        return self.pack(parts), found
+
+    @abstractmethod
+    def answer(self, rows: Rows, planned: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the action to execute for a plan ``(*B, A)`` in u, and its predicted effect."""

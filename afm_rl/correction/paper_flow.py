@@ -1,0 +1,186 @@
+"""Action flow matching as published."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from afm_rl.correction.base import Correction, Corrector
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import (
+    ConfigurationError,
+    check_choice,
+    check_count,
+    check_counts,
+    check_flag,
+)
+from afm_rl.flow.network import mlp
+from afm_rl.flow.solver import midpoint
+from afm_rl.regimes import Regime
+from afm_rl.sampling import draw_states, uniform
+
+
+class PaperFlow(Corrector):
+    r"""The published flow: one transition, from the planned action to the one that explains it.
+
+    Trained on :math:`e = f(s, a^1) \ominus f(s, a^0)` with the velocity
+    :math:`a^1 - a^0` along :math:`a^\tau = (1-\tau) a^0 + \tau a^1` (paper, section IV-C).
+    It is kept for comparison: see the documentation for why it brings little. Its quirks
+    have switches, set as in the published runs.
+
+    Args:
+        action_low: lowest action, ``(A,)``.
+        action_high: highest action, ``(A,)``.
+        features: indices of the state coordinates that the network sees.
+        state_size: number of state coordinates, D of the error.
+        gate: the threshold delta_M on the error's norm, in mixed units (m, rad).
+        steps: midpoint steps.
+        width: units of every layer, 64 in the paper.
+        error_action: the action whose prediction the error is taken against: ``"planned"``
+            as published, or ``"executed"``.
+        wrap: take differences on the manifold; the published runs subtracted angles.
+        latch: keep the transition that opened the gate until it closes (as published)
+            instead of using the latest.
+        seed: seed of the initial weights.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+    """
+
+    def __init__(
+        self,
+        action_low: Tensor,
+        action_high: Tensor,
+        features: Sequence[int],
+        state_size: int,
+        gate: float = 1.0,
+        steps: int = 10,
+        width: int = 64,
+        error_action: str = "planned",
+        wrap: bool = False,
+        latch: bool = True,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(action_low, action_high, gate, recent=1)
+        self.state_size = check_count("corrector.state_size", state_size)
+        self.state_features = check_counts("corrector.features", features, low=0)
+        if max(self.state_features, default=0) >= state_size:
+            raise ConfigurationError(
+                f"corrector.features={self.state_features}: expected indices of the {state_size} "
+                f"state coordinates, 0 to {state_size - 1}"
+            )
+        self.steps = check_count("corrector.steps", steps)
+        self.error_action = check_choice(
+            "corrector.error_action", error_action, ("planned", "executed")
+        )
+        self.wrap = check_flag("corrector.wrap", wrap)
+        self.latch = check_flag("corrector.latch", latch)
+        check_count("corrector.width", width)
+        size = self.action_size
+        generator = torch.Generator().manual_seed(check_count("corrector.seed", seed, low=0))
+        self.regime_encoder = mlp([self.feature_size, width, width], generator, nn.ELU)
+        self.action_encoder = mlp([1 + size, width, width], generator, nn.ELU)
+        self.head = mlp([2 * width, width, width, size], generator, nn.ELU)
+
+    @property
+    def feature_size(self) -> int:
+        """State features, action, error."""
+        return len(self.state_features) + self.action_size + self.state_size
+
+    @property
+    def signature(self) -> dict[str, object]:
+        """What stored weights must agree in to be loaded."""
+        return {
+            "kind": "PaperFlow",
+            "action_size": self.action_size,
+            "feature_size": self.feature_size,
+        }
+
+    def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
+        """Return names and shapes, with what is kept while the gate is open."""
+        return {**super().shapes(state_size), "features": (self.feature_size,), "open": (1,)}
+
+    def training_loss(
+        self,
+        model: DynamicsModel,
+        regime: Regime,
+        states: tuple[Tensor, Tensor] | Tensor,
+        count: int,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """Return the loss of ``count`` transitions of one action registered as another's."""
+        features, start, end = self._examples(model, states, count, generator)
+        tau = torch.rand(count, 1, generator=generator)
+        velocity = self(features, tau, torch.lerp(start, end, tau))
+        return (velocity - (end - start)).square().mean()
+
+    @torch.no_grad()
+    def held_out_error(
+        self,
+        model: DynamicsModel,
+        regime: Regime,
+        states: tuple[Tensor, Tensor] | Tensor,
+        count: int,
+        generator: torch.Generator,
+    ) -> float:
+        """Return the root mean square error of the action, in its own units."""
+        features, start, end = self._examples(model, states, count, generator)
+        return float((self._integrate(features, start) - end).square().mean().sqrt())
+
+    def forward(self, features: Tensor, tau: Tensor, point: Tensor) -> Tensor:
+        """Return the velocity ``(*B, A)`` at ``point`` and time ``tau`` ``(*B, 1)``."""
+        return self._velocity(self.regime_encoder(features), tau, point)
+
+    def _velocity(self, regime: Tensor, tau: Tensor, point: Tensor) -> Tensor:
+        action = self.action_encoder(torch.cat([tau, point], -1))
+        return self.head(nn.functional.elu(torch.cat([regime, action], -1)))
+
+    @torch.no_grad()
+    def _examples(self, model, states, count, generator) -> tuple[Tensor, Tensor, Tensor]:
+        """Return features ``(N, C)``, planned and explaining actions ``(N, A)``."""
+        state = model.manifold.project(draw_states(states, count, generator))
+        box = (self.centre - self.half_range, self.centre + self.half_range)
+        planned, other = (uniform(*box, count, generator) for _ in range(2))
+        error = model.manifold.difference(model(state, other), model(state, planned))
+        return self._features(state, planned, error), planned, other
+
+    @torch.no_grad()
+    def correct(
+        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
+    ) -> tuple[Tensor, Correction]:
+        """Compare the last transition with the prediction; integrate from the planned action."""
+        parts = self.unpack(memory, model.state_size)
+        newest = parts["transitions"].squeeze(-2)
+        state, plan, executed, reached, valid = self.split_transitions(newest, model.state_size)
+        expected = model(state, plan if self.error_action == "planned" else executed)
+        error = reached - expected
+        if self.wrap:
+            error = model.manifold.difference(reached, expected)
+        valid = valid.squeeze(-1) == 1.0
+        size = torch.where(valid, error.norm(dim=-1), 0.0)
+        misaligned = size >= self.gate
+        features = torch.where(valid.unsqueeze(-1), self._features(state, plan, error), 0.0)
+        if self.latch:
+            held = (parts["open"] == 1.0) & misaligned.unsqueeze(-1)
+            features = torch.where(held, parts["features"], features)
+        found = self.unchanged(planned, size, box)
+        if bool(misaligned.any()):
+            action = self._integrate(features.to(self.centre), planned.to(self.centre))
+            action = torch.where(misaligned.unsqueeze(-1), action.to(planned), planned)
+            found = found._replace(executed=action, misaligned=misaligned)
+        parts |= {"planned": planned, "executed": found.executed, "features": features}
+        parts["open"] = misaligned.unsqueeze(-1).to(planned)
+        return self.pack(parts), found
+
+    def _integrate(self, features: Tensor, planned: Tensor) -> Tensor:
+        regime = self.regime_encoder(features)
+
+        def velocity(tau: float, point: Tensor) -> Tensor:
+            return self._velocity(regime, torch.full_like(point[..., :1], tau), point)
+
+        return midpoint(velocity, planned, self.steps)
+
+    def _features(self, state: Tensor, planned: Tensor, error: Tensor) -> Tensor:
+        return torch.cat([state[..., self.state_features], planned, error], -1)
