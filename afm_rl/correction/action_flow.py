@@ -24,7 +24,7 @@ from afm_rl.correction.hypotheses import (
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
-from afm_rl.flow.experts import Experts, fit_experts
+from afm_rl.flow.experts import Rows, fit_experts
 from afm_rl.flow.network import AxisNetwork, Encoded
 from afm_rl.flow.prior import Drawn
 from afm_rl.flow.saturation import MODES, attainable
@@ -149,6 +149,7 @@ class ActionFlow(PairCorrector):
                 f"corrector.memory={memory!r}: expected at least {memory_of(chosen, rows)} for "
                 f"{rows} rows and the hypotheses {', '.join(self.hypotheses)}"
             )
+        self._rest = self.pair_size - 3 * size - 1
         self.by_place = any(h.near for h in chosen)
         self.forgetting = check_number("corrector.forgetting", forgetting, low=0.0, high=1.0)
         self.source_std = check_number("corrector.source_std", source_std, low=0.0)
@@ -196,31 +197,34 @@ class ActionFlow(PairCorrector):
     @torch.inference_mode()
     def tick(self, parts: Fields, planned: Tensor) -> Answer:
         """Return the answer to plans ``(*B, A)`` of missions whose model is misaligned."""
-        parts = {name: part.to(self.penalty.dtype) for name, part in parts.items()}
-        unit = self.normalise(planned).to(self.penalty.dtype)
+        batch = planned.shape[:-1]
+        kind = self.penalty.dtype
+        names = ("state", "pairs", "losses", "predicted", "misaligned")
+        parts = {name: _flat(parts[name], len(batch)).to(kind) for name in names}
+        unit = self.normalise(_flat(planned, len(batch))).to(kind)
         losses = self.judge(parts)
         belief = (losses + self.penalty).argmin(-1)
         encoded = self.encode(parts)
-        action, effect, spread, bounds = self.propose(encoded, belief, unit)
+        action, effect, spread, bounds = self.propose(self.pick(encoded, belief), unit)
         aligned = (belief == len(self.hypotheses)).unsqueeze(-1)
         action, effect = torch.where(aligned, unit, action), torch.where(aligned, unit, effect)
         predicted = self.predict(encoded, parts, action)
-        return Answer(losses, predicted, aligned, action, effect, spread, bounds)
+        answer = Answer(losses, predicted, aligned, action, effect, spread, bounds)
+        return Answer(*(part.view(*batch, *part.shape[1:]) for part in answer))
 
     def judge(self, parts: Fields) -> Tensor:
-        """Return the hypotheses' losses ``(*B, H + 1)`` after the newest pair."""
+        """Return the hypotheses' losses ``(B, H + 1)`` after the newest pair."""
         size = self.action_size
-        newest = parts["pairs"][..., -1:, :]
-        effective, sure = newest[..., size : 2 * size], newest[..., 3 * size : 3 * size + 1]
-        std = newest[..., 2 * size : 3 * size]
-        miss = (parts["predicted"] - effective).square()
+        newest = parts["pairs"][:, -1:]
+        effective, std, valid, _ = newest[..., size:].split([size, size, 1, self._rest], -1)
         tolerance = TOLERANCE**2
-        share = (tolerance / (tolerance + std.square())) * miss / (miss + tolerance)
-        counts = sure.squeeze(-1) * parts["misaligned"]  # was anything predicted?
+        miss = (parts["predicted"] - effective).square()
+        share = miss / ((miss + tolerance) * (1 + std.square() / tolerance))
+        counts = valid.squeeze(-1) * parts["misaligned"]  # was anything predicted?
         return self.forgetting * parts["losses"] + counts * share.mean(-1)
 
     def encode(self, parts: Fields) -> Encoded:
-        """Return what the network reads under every hypothesis, ``(*B, H, ...)``."""
+        """Return what the network reads under every hypothesis, B H sets of rows."""
         away = None
         if self.by_place:
             first = 3 * self.action_size + 2
@@ -229,19 +233,25 @@ class ActionFlow(PairCorrector):
             away = torch.where(parts["pairs"][..., first - 2] == 1.0, away, torch.inf)
         layout = Layout(*(getattr(self, f"rows_{name}") for name in Layout._fields))
         rows = read_rows(parts["pairs"], layout, self.action_size, away)
+        rows = Rows(*(part.flatten(0, 1) for part in rows))
         return self.network.encode(rows, fit_experts(rows))
 
-    def propose(
-        self, encoded: Encoded, belief: Tensor, planned: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return action, predicted effect and spread ``(*B, A)``, and bounds ``(*B, 2, A)``.
+    def pick(self, encoded: Encoded, belief: Tensor) -> Encoded:
+        """Return what is read under one hypothesis for each mission, ``(B,)``.
+
+        The first stands in for the identity, which reads nothing.
+        """
+        count = len(self.hypotheses)
+        first = torch.arange(belief.shape[0], device=belief.device) * count
+        return encoded.pick(first + belief.where(belief < count, 0))
+
+    def propose(self, known: Encoded, planned: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return action, predicted effect and spread ``(B, A)``, and bounds ``(B, 2, A)``.
 
         Args:
-            encoded: the hypotheses.
-            belief: the one that is believed, ``(*B)``; the identity is answered for by the first.
-            planned: ``(*B, A)``, in half ranges.
+            known: what is read under the hypothesis that is believed.
+            planned: ``(B, A)``, in half ranges.
         """
-        known = encoded.pick(belief.where(belief < len(self.hypotheses), 0))
         plans = planned.unsqueeze(-2)
         velocity = partial(self.network.velocity, self.network.ask(known, plans, self.saturation))
         start = plans + self.source_std * self.source_points
@@ -249,23 +259,23 @@ class ActionFlow(PairCorrector):
         mean, spread = ends.mean(-2, keepdim=True), ends.std(-2, correction=0)
         proposals = mean if self.choose == "mean" else torch.cat([mean, ends], -2)
         proposals = proposals.clamp(-1.0, 1.0)
-        probes = self.probes.expand(*planned.shape[:-1], -1, -1)
+        count = proposals.shape[-2]
+        probes = self.probes.expand(planned.shape[0], -1, -1)
         foreseen = self.network.effect(known, torch.cat([proposals, probes], -2))
-        effects, found = foreseen.tensor_split([proposals.shape[-2]], -2)
+        effects, found = foreseen[:, :count], foreseen[:, count:]
         low, high = found.amin(-2), found.amax(-2)
         wanted = attainable(planned, low, high, self.saturation)
         best = nearest_of(effects, wanted, 0.5 * (high - low))
-        action, effect = (
-            part.take_along_dim(best, -2).squeeze(-2) for part in (proposals, effects)
-        )
+        chosen = torch.stack([proposals, effects], -1).take_along_dim(best.unsqueeze(-1), -3)
+        action, effect = chosen.squeeze(-3).unbind(-1)
         return action, effect, spread, torch.stack([low, high], -2)
 
     def predict(self, encoded: Encoded, parts: Fields, executed: Tensor) -> Tensor:
-        """Return the effects ``(*B, H + 1, A)`` that the hypotheses predict of what acts now."""
+        """Return the effects ``(B, H + 1, A)`` that the hypotheses predict of what acts now."""
         size = self.action_size
         sent = torch.cat([parts["pairs"][..., :size], executed.unsqueeze(-2)], -2)
-        acted = sent.index_select(-2, self.memory - self.rows_delay).unsqueeze(-2)
-        effects = self.network.effect(encoded, acted).squeeze(-2)
+        acted = sent.index_select(-2, self.memory - self.rows_delay)  # (B, H, A)
+        effects = self.network.effect(encoded, acted.reshape(-1, 1, size)).view_as(acted)
         return torch.cat([effects, executed.unsqueeze(-2)], -2)
 
     def place_of(self, state: Tensor) -> Tensor:
@@ -301,12 +311,8 @@ class ActionFlow(PairCorrector):
     ) -> float:
         """Return the root mean square error of the action on new windows, in half ranges."""
         drawn = self._draw(model, regime, states, count, generator)
-        encoded = self.network.encode(drawn.rows, fit_experts(drawn.rows))
-        here = Encoded(Experts(*(part.unsqueeze(1) for part in encoded.experts)), *encoded[1:])
-        here = here._replace(plan=here.plan.unsqueeze(1), effect=here.effect.unsqueeze(1))
-        belief = torch.zeros(count, dtype=torch.long)
-        plans = drawn.planned.unbind(1)
-        found = [self.propose(here, belief, plan)[0] for plan in plans]
+        known = self.network.encode(drawn.rows, fit_experts(drawn.rows))
+        found = [self.propose(known, plan)[0] for plan in drawn.planned.unbind(1)]
         return float((torch.stack(found, 1) - drawn.intended).square().mean().sqrt())
 
     def _draw(self, model, regime, states, count, generator) -> Drawn:
@@ -335,6 +341,11 @@ class ActionFlow(PairCorrector):
             found.innovation,
             _put(found.misaligned, use, ~answer.aligned.squeeze(-1)),
         )
+
+
+def _flat(part: Tensor, lead: int) -> Tensor:
+    """Return a part with its ``lead`` batch dimensions as one."""
+    return part.unsqueeze(0) if lead == 0 else part.flatten(0, lead - 1) if lead > 1 else part
 
 
 def _put(part: Tensor, use: Any, value: Tensor) -> Tensor:

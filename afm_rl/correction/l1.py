@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-import torch
+import torch  # noqa: F401, for the examples
 from torch import Tensor
 
 from afm_rl.correction.pairs import ClassicalCorrector

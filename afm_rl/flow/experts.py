@@ -100,10 +100,10 @@ def fit_gain_offset(
     (tensor([0.5000]), tensor([0.1000]))
     """
     ones = torch.ones_like(executed)
-    terms = torch.stack([executed * executed, executed, ones, executed * effective, effective], -4)
+    terms = torch.stack([executed * executed, executed, ones, executed * effective, effective], -3)
     robust = weight
     for turn in range(rounds + 1):
-        square, mean, mass, cross, shift = (terms * robust.unsqueeze(-4)).sum(-2).unbind(-3)
+        square, mean, mass, cross, shift = (terms * robust.unsqueeze(-3)).sum(-2).unbind(-2)
         square, mass, cross = square + PRIOR, mass + 10 * PRIOR, cross + PRIOR
         determinant = (square * mass - mean.square()).clamp_min(PRIOR**2)
         gain = (mass * cross - mean * shift) / determinant
@@ -124,9 +124,9 @@ def fit_friction(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[T
         Gains, none smaller than 0.02 in size, and offsets, ``(*B, A)`` each.
     """
     size, sign = executed.abs(), executed.sign()
-    terms = torch.stack([size * size, size, sign.abs(), executed * effective, sign * effective], -4)
+    terms = torch.stack([size * size, size, sign.abs(), executed * effective, sign * effective], -3)
     moved = weight * (effective.abs() > STUCK)
-    square, mixed, signs, cross, signed = (moved.unsqueeze(-4) * terms).sum(-2).unbind(-3)
+    square, mixed, signs, cross, signed = (moved.unsqueeze(-3) * terms).sum(-2).unbind(-2)
     square, cross, signs = square + PRIOR, cross + PRIOR, signs + 10 * PRIOR
     determinant = (square * signs - mixed.square()).clamp_min(PRIOR**2)
     gain = (signs * cross - mixed * signed) / determinant
@@ -188,137 +188,134 @@ def _not_zero(gain: Tensor) -> Tensor:
 
 
 class Experts(NamedTuple):
-    """Five least-squares fits of a set of rows, and the rows themselves.
+    """Five least-squares fits of N sets of rows, and the rows themselves, axis by axis.
 
     Gains with short and with long memory; robust gain and offset; gain and friction; an affine
     map; and, for what none of them expresses, a kernel average of the nearest pairs.
 
-    >>> u = torch.tensor([[0.5], [-1.0]])
-    >>> experts = fit_experts(Rows(u, -2 * u, torch.zeros(2, 1), torch.ones(2, 1)))
-    >>> experts.execute(torch.tensor([0.4]), 1)[..., :4].round(decimals=2)
-    tensor([[-0.2000, -0.2000, -0.2000, -0.2000]])
-    >>> experts.effect(torch.tensor([0.4]))[..., :2].round(decimals=2)
-    tensor([[-0.8000, -0.8000]])
+    >>> u = torch.tensor([[[0.5], [-1.0]]])
+    >>> experts = fit_experts(Rows(u, -2 * u, torch.zeros(1, 2, 1), torch.ones(1, 2, 1)))
+    >>> experts.execute(torch.tensor([[[0.4]]]), "clip")[..., :4].round(decimals=2)
+    tensor([[[[-0.2000, -0.2000, -0.2000, -0.2000]]]])
+    >>> experts.effect(torch.tensor([[[0.4]]]))[..., :2].round(decimals=2)
+    tensor([[[[-0.8000, -0.8000]]]])
     """
 
     gain: Tensor
-    """Gains of the first three experts, ``(*B, 3, A)``."""
+    """Gains of the first four fits, ``(N, A, 1, 4)``."""
     offset: Tensor
-    """Their offsets, ``(*B, 3, A)``."""
-    friction: Tensor
-    """Gain and offset against the motion, ``(*B, 2, A)``."""
+    """Their offsets; the last one's is against the motion, ``(N, A, 1, 4)``."""
     matrix: Tensor
-    """Of the affine map, ``(*B, A, A)``."""
+    """Of the affine map, ``(N, A, A)``."""
     inverse: Tensor
-    """Its regularised inverse, ``(*B, A, A)``."""
+    """Its regularised inverse, ``(N, A, A)``."""
     bias: Tensor
-    """Of the affine map, ``(*B, A)``."""
+    """Of the affine map, ``(N, A, 1)``."""
     residuals: Tensor
-    """What each fit leaves of each row, ``(*B, K, A, 5)``."""
+    """What each fit leaves of each row, ``(N, A, K, 5)``."""
     misses: Tensor
-    """Logarithm of their root mean squares, ``(*B, A, 5)``."""
+    """Logarithm of their root mean squares, ``(N, A, 1, 5)``."""
     executed: Tensor
-    """The rows' executed actions, ``(*B, K, A)``."""
+    """The rows' executed actions, ``(N, A, 1, K)``."""
     effective: Tensor
-    """Their effective actions, ``(*B, K, A)``."""
+    """Their effective actions, ``(N, A, 1, K)``."""
     trust: Tensor
-    """Logarithm of their weights, ``(*B, K, A)``."""
+    """Logarithm of their weights, ``(N, A, 1, K)``."""
 
     def execute(self, planned: Tensor, mode: str) -> Tensor:
-        """Return answers ``(*B, C, A, 7)`` to plans ``(*B, C, A)``.
+        """Return answers ``(N, A, C, 7)`` to plans ``(N, C, A)``.
 
         The action that each of the five fits would execute, saturated; the kernel average of the
         actions whose effects came nearest to the plan, and that effect.
         """
-        kind, planned = planned.dtype, planned.to(self.bias.dtype)
-        unit = planned.unsqueeze(-2)
-        linear = (unit - self.offset.unsqueeze(-3)) / self.gain.unsqueeze(-3)
-        gain, offset = self.friction.unsqueeze(-3).split(1, -2)
-        rubbed = invert_friction(gain, offset, unit)
-        affine = (planned - self.bias.unsqueeze(-2)) @ self.inverse.mT
-        exact = saturate(torch.cat([linear, rubbed, affine.unsqueeze(-2)], -2), mode)
-        share = self._likeness(self.effective, unit).softmax(-2).unsqueeze(-3)
-        pairs = torch.stack([self.executed, self.effective], -3).unsqueeze(-4)
-        return torch.cat([exact, (share * pairs).sum(-2)], -2).mT.to(kind)
+        plan = planned.mT.to(self.bias)
+        unit = plan.unsqueeze(-1)
+        linear = (unit - self.offset[..., :3]) / self.gain[..., :3]
+        rubbed = invert_friction(self.gain[..., 3:], self.offset[..., 3:], unit)
+        affine = (self.inverse @ (plan - self.bias)).unsqueeze(-1)
+        exact = saturate(torch.cat([linear, rubbed, affine], -1), mode, dim=-3)
+        share = self._likeness(self.effective, unit).softmax(-1)
+        pairs = torch.cat([self.executed, self.effective], -2).mT
+        return torch.cat([exact, share @ pairs], -1).to(planned)
 
     def effect(self, executed: Tensor) -> Tensor:
-        """Return answers ``(*B, C, A, 7)`` about actions ``(*B, C, A)``.
+        """Return answers ``(N, A, C, 7)`` about actions ``(N, C, A)``.
 
-        The effect that each of the five fits expects, the kernel average of the effects of the
+        The effect that each of the five fits predicts, the kernel average of the effects of the
         nearest actions, and how near those are.
         """
-        kind, executed = executed.dtype, executed.to(self.bias.dtype)
-        unit = executed.unsqueeze(-2)
+        actions = executed.mT.to(self.bias)
+        unit = actions.unsqueeze(-1)
         likeness = self._likeness(self.executed, unit)
-        nearest = (likeness.softmax(-2) * self.effective.unsqueeze(-3)).sum(-2, keepdim=True)
-        nearness = likeness.exp().sum(-2, keepdim=True).clamp_max(1.0)
-        answers = [*self._expected(executed), nearest, nearness]
-        return torch.cat(answers, -2).clamp(-LIMIT, LIMIT).mT.to(kind)
+        nearest = likeness.softmax(-1) @ self.effective.mT
+        nearness = likeness.exp().sum(-1, keepdim=True).clamp_max(1.0)
+        answers = torch.cat([*self.predict(actions), nearest, nearness], -1)
+        return answers.clamp(-LIMIT, LIMIT).to(executed)
 
-    def _expected(self, executed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what the fits expect of actions ``(*B, C, A)``, ``(*B, C, 5, A)`` in parts."""
-        unit = executed.unsqueeze(-2)
-        linear = self.gain.unsqueeze(-3) * unit + self.offset.unsqueeze(-3)
-        gain, offset = self.friction.unsqueeze(-3).split(1, -2)
-        rubbed = apply_friction(gain, offset, unit)
-        affine = executed @ self.matrix.mT + self.bias.unsqueeze(-2)
-        return linear, rubbed, affine.unsqueeze(-2)
+    def predict(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what the fits predict of actions ``(N, A, C)``: ``(N, A, C, 5)`` in parts."""
+        unit = actions.unsqueeze(-1)
+        linear = self.gain[..., :3] * unit + self.offset[..., :3]
+        rubbed = apply_friction(self.gain[..., 3:], self.offset[..., 3:], unit)
+        return linear, rubbed, (self.matrix @ actions + self.bias).unsqueeze(-1)
 
     def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
-        """Return the log-weight of each row for ``unit`` ``(*B, C, 1, A)``, ``(*B, C, K, A)``."""
-        return self.trust.unsqueeze(-3) - ((among.unsqueeze(-3) - unit) / NEAR).square()
+        """Return the log-weight of each row for ``unit`` ``(N, A, C, 1)``, ``(N, A, C, K)``."""
+        return self.trust - ((among - unit) / NEAR).square()
 
 
 def fit_experts(rows: Rows) -> Experts:
-    """Fit all experts to rows ``(*B, K, A)``.
+    """Fit all experts to N sets of rows ``(N, K, A)``.
 
     In double precision: where all actions are alike, gain and friction can hardly be told apart.
     The fits per axis share one product of weights and terms; they are those of :func:`fit_gain`,
     :func:`fit_gain_offset` with one round, :func:`fit_friction` and :func:`fit_affine`.
     """
-    executed, effective, std, valid = (part.double() for part in rows)
-    ages, prior = _constants(executed.shape[-2])
-    weights = ages * (valid * confidence(std)).unsqueeze(-3)  # short and long, (*B, 2, K, A)
-    long = weights[..., 1, :, :]
-    moved = long * (effective.abs() > STUCK)
-    squares, crosses = executed * executed, executed * effective
-    sign = executed.sign()
-    terms = [squares, executed, sign * sign, crosses, effective, sign * executed, sign * effective]
-    terms = torch.stack([*terms, torch.ones_like(sign)], -1).transpose(-2, -3)  # (*B, A, K, 8)
-    weights = torch.cat([weights, moved.unsqueeze(-3)], -3).movedim(-1, -3)  # (*B, A, 3, K)
-    moments = weights @ terms + prior
-    gains = moments[..., :2, 3] / moments[..., :2, 0]  # (*B, A, 2)
-    both = moments[..., PLACES[0], PLACES[1]]  # long with offset, moved with friction
-    slopes, offsets = _solve_line(both)
-    miss = effective - (slopes[..., 0].unsqueeze(-2) * executed + offsets[..., 0].unsqueeze(-2))
-    robust = (long / (1 + (miss / OUTLIER).square())).mT.unsqueeze(-2)  # (*B, A, 1, K)
-    robust = (robust @ terms + prior[1])[..., PLACES[1][0]]
-    slope, offset = _solve_line(robust)
-    matrix, bias = fit_affine(executed, effective, long)
-    eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-    inverse = torch.linalg.solve(matrix.mT @ matrix + LEAST_GAIN**2 * eye, matrix.mT)
-    gain = _not_zero(torch.cat([gains, slope, slopes[..., 1:]], -1)).mT
-    offset = torch.cat([torch.zeros_like(gains), offset], -1).mT
-    friction = torch.stack([gain[..., 3, :], offsets[..., 1]], -2)
+    inputs, valid = rows.executed.double(), rows.valid.double().mT
+    u, e = inputs.mT, rows.effective.double().mT  # (N, A, K)
+    size, (count, axes, length) = u.shape[-2], u.shape
+    ages, prior, nominal = _constants(length, size)
+    weights = ages * (valid * confidence(rows.std.double().mT)).unsqueeze(-2)  # (N, A, 2, K)
+    long = weights[..., 1, :]
+    moved = (long * (e.abs() > STUCK)).unsqueeze(-2)
+    sign = u.sign()
+    terms = [u * u, u, sign * sign, u * e, e, sign * u, sign * e, torch.ones_like(u)]
+    terms = torch.stack(terms, -1).flatten(0, 1)  # (N A, K, 8)
+    flat = torch.cat([weights, moved], -2).flatten(0, 1)  # (N A, 3, K)
+    moments = torch.baddbmm(prior, flat, terms)
+    gains = moments[:, :2, 3] / moments[:, :2, 0]
+    slopes, offsets = _solve_line(moments[:, PLACES[0], PLACES[1]])  # with offset, with friction
+    miss = e.flatten(0, 1) - torch.addcmul(offsets[:, :1], slopes[:, :1], u.flatten(0, 1))
+    robust = flat[:, 1] / (1 + (miss / OUTLIER).square())
+    robust = torch.baddbmm(prior[1:2], robust.unsqueeze(1), terms)[:, 0, PLACES[1][0]]
+    slope, offset = _solve_line(robust.unsqueeze(1))
+    gain = _not_zero(torch.cat([gains, slope, slopes[:, 1:]], -1))
+    offset = torch.cat([torch.zeros_like(gains), offset, offsets[:, 1:]], -1)
+    outer = torch.nn.functional.pad(inputs, (0, 1), value=1.0)  # (N, K, A + 1)
+    square = (outer.unsqueeze(-1) * outer.unsqueeze(-2)).flatten(-2)
+    square = torch.baddbmm(nominal.flatten(), long, square).unflatten(-1, (size + 1, size + 1))
+    cross = torch.baddbmm(nominal[:-1], long * e, outer)
+    solution = torch.linalg.solve_ex(square, cross).result  # (N, A, A + 1)
+    matrix, bias = solution[..., :-1], solution[..., -1:]
+    ridge = torch.baddbmm(LEAST_GAIN**2 / PRIOR * nominal[:-1, :-1], matrix.mT, matrix)
+    inverse = torch.linalg.solve_ex(ridge, matrix.mT).result
+    wide = (count, axes, 1)
     experts = Experts(
-        gain[..., :3, :],
-        offset,
-        friction,
+        gain.unflatten(0, wide[:2]).unsqueeze(-2),
+        offset.unflatten(0, wide[:2]).unsqueeze(-2),
         matrix,
         inverse,
         bias,
         bias,  # until the residuals are known
         bias,
-        executed,
-        effective,
-        long.clamp_min(LEAST_MISS**2).log(),
+        u.unsqueeze(-2),
+        e.unsqueeze(-2),
+        long.clamp_min(LEAST_MISS**2).log().unsqueeze(-2),
     )
-    expected = torch.cat(experts._expected(executed), -2)
-    residuals = (effective.unsqueeze(-2) - expected).mT  # (*B, K, A, 5)
-    weights = weights[..., :2, :]
+    residuals = e.unsqueeze(-1) - torch.cat(experts.predict(u), -1)  # (N, A, K, 5)
     mass = weights.sum(-1, keepdim=True).clamp_min(LEAST_MISS)
-    left = weights @ residuals.square().transpose(-2, -3) / mass
-    left = torch.cat([left[..., 0, :1], left[..., 1, 1:]], -1)
+    left = weights @ residuals.square() / mass
+    left = torch.cat([left[..., :1, :1], left[..., 1:, 1:]], -1)
     return experts._replace(residuals=residuals, misses=(left.sqrt() + LEAST_MISS).log())
 
 
@@ -335,10 +332,13 @@ def _solve_line(moments: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @lru_cache(maxsize=16)
-def _constants(rows: int) -> tuple[Tensor, Tensor]:
-    """Return the weights by age ``(2, K, 1)`` and the prior's moments ``(3, 8)``."""
+def _constants(rows: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the weights by age ``(2, K)`` and the moments of the priors.
+
+    Those of the lines are ``(3, 8)``, those of the affine map ``(A + 1, A + 1)``.
+    """
     age = torch.arange(rows - 1, -1, -1, dtype=torch.float64)
-    ages = torch.stack([SHORT**age, LONG**age]).unsqueeze(-1)
     prior = torch.zeros(3, 8, dtype=torch.float64)
     prior[:, [0, 3]], prior[:, [2, 7]] = PRIOR, 10 * PRIOR
-    return ages, prior
+    nominal = PRIOR * torch.eye(size + 1, dtype=torch.float64)
+    return torch.stack([SHORT**age, LONG**age]), prior, nominal

@@ -38,28 +38,22 @@ def mlp(
 
 
 class Encoded(NamedTuple):
-    """What the network reads in a set of rows, to be asked about actions."""
+    """What the network reads in N sets of rows, to be asked about actions."""
 
     experts: Experts
     """The experts' fits."""
     plan: Tensor
-    """The code's part in the first layer of the velocity, ``(*B, 1, A, W)``."""
+    """The code's part in the first layer of the velocity, ``(N, A, 1, W)``."""
     effect: Tensor
-    """The code's part in the first layer of the effect, ``(*B, 1, A, W)``."""
+    """The code's part in the first layer of the effect, ``(N, A, 1, W)``."""
 
     def pick(self, which: Tensor) -> Encoded:
-        """Return one of several sets of rows ``(*B, H, ...)`` for each mission, ``(*B)``."""
-        dim = which.dim()
-        if which.numel() == 1:  # a view, where gathering would copy
-            at = int(which)
-            parts = [part.select(dim, at) for part in (*self.experts, *self[1:])]
+        """Return the sets of rows with the indices ``which`` ``(M,)``."""
+        if not torch.compiler.is_compiling() and len(which) == 1:
+            at = int(which)  # a view, where gathering would copy
+            parts = [part[at : at + 1] for part in (*self.experts, *self[1:])]
         else:
-            flat = which.flatten()
-            rows = torch.arange(len(flat), device=which.device)
-            parts = [
-                part.flatten(0, dim - 1)[rows, flat].unflatten(0, which.shape)
-                for part in (*self.experts, *self[1:])
-            ]
+            parts = [part.index_select(0, which) for part in (*self.experts, *self[1:])]
         return Encoded(Experts(*parts[:-2]), *parts[-2:])
 
 
@@ -67,9 +61,9 @@ class Asked(NamedTuple):
     """Plans, as the velocity reads them."""
 
     hidden: Tensor
-    """Their part in the first layer, ``(*B, C, A, W)``."""
+    """Their part in the first layer, ``(N, A, C, W)``."""
     answers: Tensor
-    """The experts' answers, ``(*B, C, A, 6)``."""
+    """The experts' answers, ``(N, A, C, 6)``."""
 
 
 class AxisNetwork(nn.Module):
@@ -94,12 +88,12 @@ class AxisNetwork(nn.Module):
         seed: of the initial weights.
 
     >>> from afm_rl.flow.experts import fit_experts
-    >>> u = torch.rand(12, 3)
-    >>> rows = Rows(u, -u, torch.zeros(12, 3), torch.ones(12, 1))
+    >>> u = torch.rand(1, 12, 3)
+    >>> rows = Rows(u, -u, torch.zeros(1, 12, 3), torch.ones(1, 12, 1))
     >>> network = AxisNetwork()
     >>> encoded = network.encode(rows, fit_experts(rows))
-    >>> network.effect(encoded, torch.rand(5, 3)).shape  # of five actions
-    torch.Size([5, 3])
+    >>> network.effect(encoded, torch.rand(1, 5, 3)).shape  # of five actions
+    torch.Size([1, 5, 3])
     """
 
     modes: Tensor
@@ -131,61 +125,67 @@ class AxisNetwork(nn.Module):
         self.register_buffer("modes", torch.eye(len(MODES)), persistent=False)
 
     def encode(self, rows: Rows, experts: Experts) -> Encoded:
-        """Read rows ``(*B, K, A)`` and the experts' fits of them."""
-        valid = rows.valid.to(self.modes.dtype).unsqueeze(-1)
-        cells = self.cell(self._cells(rows, experts)).relu() * valid
+        """Read N sets of rows ``(N, K, A)`` and the experts' fits of them."""
+        valid = rows.valid.to(self.modes.dtype).unsqueeze(1)  # (N, 1, K, 1)
+        cells = self.cell(self._cells(rows, experts)).relu()
         logits = self.query(cells) + (valid - 1) * 1e4
-        pool = torch.cat([logits.softmax(-3), valid.expand_as(logits)], -1)  # (*B, K, A, 2)
-        mass = valid.sum(-3).clamp_min(1.0)
-        attended, mean = (pool.movedim(-3, -1) @ cells.transpose(-2, -3)).unbind(-2)
-        code = self.pooled(torch.cat([attended, mean / mass], -1)).relu()
+        mean = valid / valid.sum(-2, keepdim=True).clamp_min(1.0)
+        pool = torch.cat([logits.softmax(-2), mean.expand_as(logits)], -1)
+        code = self.pooled((pool.mT @ cells).flatten(-2)).relu()  # (N, A, L)
         if self.across:
             others = torch.cat([code.mean(-2, keepdim=True), code.amax(-2, keepdim=True)], -1)
             code = code + self.mixed(torch.cat([code, others.expand(*code.shape[:-1], -1)], -1))
-        code = code.unsqueeze(-3)
+        code = code.unsqueeze(-2)
         return Encoded(experts, self.plan_code(code), self.effect_code(code))
 
     def ask(self, encoded: Encoded, planned: Tensor, mode: str) -> Asked:
-        """Read plans ``(*B, C, A)``; ``mode`` says how those that cannot be had are saturated."""
+        """Read plans ``(N, C, A)``; ``mode`` says how those that cannot be had are saturated."""
         answers = encoded.experts.execute(planned, mode)
-        misses = encoded.experts.misses.to(planned).unsqueeze(-3).expand(*planned.shape, -1)
-        which = self.modes[MODES.index(mode)].expand(*planned.shape, -1)
-        asked = torch.cat([planned.unsqueeze(-1), answers, misses, which], -1)
+        which = self.modes[MODES.index(mode)]
+        given = [planned.mT.unsqueeze(-1), answers, encoded.experts.misses.to(planned), which]
+        shape = (*answers.shape[:-1], -1)
+        asked = torch.cat([part.expand(shape) for part in given], -1)
         return Asked(encoded.plan + self.plan_query(asked), answers[..., :EXPERTS])
 
     def velocity(self, asked: Asked, tau: Tensor | float, point: Tensor) -> Tensor:
-        """Return the velocity at points ``(*B, C, A)`` of the path at the time tau."""
-        point = point.unsqueeze(-1)
+        """Return the velocity at points ``(N, C, A)`` of the path, the same shape.
+
+        Args:
+            asked: the plans, C of them, or one for all points.
+            tau: time on the path, one number or ``(N, C, 1)``.
+            point: x at that time.
+        """
+        at = point.mT.unsqueeze(-1)
         if isinstance(tau, Tensor):
-            tau = tau.unsqueeze(-1)
+            tau = tau.mT.unsqueeze(-1)
             left = (1 - tau).clamp_min(LEAST_TIME)
         else:
             left = max(1 - tau, LEAST_TIME)
-        hidden = asked.hidden + point * self.point_weight + tau * self.time_weight
-        return self._blend(self.plan_head(hidden.relu()), (asked.answers - point) / left)
+        hidden = asked.hidden + at * self.point_weight + tau * self.time_weight
+        return self._blend(self.plan_head(hidden.relu()), (asked.answers - at) / left)
 
     def effect(self, encoded: Encoded, executed: Tensor) -> Tensor:
-        """Return the effects ``(*B, C, A)`` that actions ``(*B, C, A)`` are predicted to have."""
+        """Return the effects ``(N, C, A)`` that actions ``(N, C, A)`` are predicted to have."""
         answers = encoded.experts.effect(executed)
-        misses = encoded.experts.misses.to(executed).unsqueeze(-3).expand(*executed.shape, -1)
-        asked = torch.cat([executed.unsqueeze(-1), answers, misses], -1)
+        misses = encoded.experts.misses.to(executed).expand(*answers.shape[:-1], -1)
+        asked = torch.cat([executed.mT.unsqueeze(-1), answers, misses], -1)
         hidden = (encoded.effect + self.effect_query(asked)).relu()
         return self._blend(self.effect_head(hidden), answers[..., :EXPERTS])
 
     def _blend(self, output: Tensor, answers: Tensor) -> Tensor:
-        """Return the mixture of the own answer and the experts', ``(*B, C, A)``."""
+        """Return the mixture of the own answer and the experts', ``(N, C, A)``."""
         own, logits = output.split([1, EXPERTS + 1], -1)
         if not self.experts:
-            return own.squeeze(-1)
+            return own.squeeze(-1).mT
         shares = (SHARPNESS * logits).softmax(-1)
-        return (shares * torch.cat([own, answers], -1)).sum(-1)
+        return (shares * torch.cat([own, answers], -1)).sum(-1).mT
 
     def _cells(self, rows: Rows, experts: Experts) -> Tensor:
-        """Return the features of every row and axis, ``(*B, K, A, F)``."""
-        executed, effective, std, valid = rows
+        """Return the features of every axis and row, ``(N, A, K, F)``."""
+        executed, effective, std, valid = (part.mT for part in rows)
         loud = (std + LEAST_MISS).log() if self.noise else torch.zeros_like(std)
-        age = torch.linspace(1.0, 0.0, executed.shape[-2]).to(executed).view(-1, 1)
-        own = [executed, effective, loud, age.expand_as(executed), valid.expand_as(executed)]
-        left = experts.residuals.clamp(-LIMIT, LIMIT)
-        features = torch.cat([torch.stack(own, -1), left.to(executed)], -1) * valid.unsqueeze(-1)
+        age = torch.linspace(1.0, 0.0, executed.shape[-1], device=std.device, dtype=std.dtype)
+        own = [executed, effective, loud, age.expand_as(std), valid.expand_as(std)]
+        left = experts.residuals.clamp(-LIMIT, LIMIT).to(std)
+        features = torch.cat([torch.stack(own, -1), left], -1) * valid.unsqueeze(-1)
         return features.to(self.modes.dtype)

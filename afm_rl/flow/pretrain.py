@@ -1,22 +1,33 @@
-"""Training of the universal flow: ``python -m afm_rl.flow.pretrain``."""
+"""Training of the universal flow: ``python -m afm_rl.flow.pretrain --out universal.safetensors``.
+
+``--evaluate`` prints the held-out errors of the weights of the package, by kind of regime and
+number of actions, as they stand in the model card.
+"""
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import time
 from pathlib import Path
 
 import torch
+from safetensors.torch import save
 from torch import Tensor
 
+from afm_rl.artefacts import write_whole
+from afm_rl.flow.experts import Rows, fit_experts
 from afm_rl.flow.network import AxisNetwork
-from afm_rl.flow.prior import Drawn, draw_examples
+from afm_rl.flow.prior import KINDS, MIXES, Drawn, draw_examples
 from afm_rl.flow.saturation import MODES
+from afm_rl.flow.solver import midpoint
 from afm_rl.flow.training import EFFECT_WEIGHT, flow_losses
+from afm_rl.flow.weights import load_universal
 
 SIZES = {1: 0.12, 2: 0.45, 3: 0.15, 4: 0.08, 6: 0.15, 9: 0.05}  # share of numbers of actions
 SHARES = {"mixed": 0.5, "clip": 0.3, "direction": 0.2}  # share of saturation modes
 PLANS = 4  # per window
+POOL = 8  # batches that are drawn at once
 
 
 def pretrain(
@@ -29,7 +40,7 @@ def pretrain(
     seed: int = 0,
     log: int = 500,
 ) -> None:
-    """Train a network in place, with Adam and a one-cycle step size.
+    """Train a network in place on regimes without a robot: Adam, a one-cycle step size.
 
     Args:
         network: the universal network.
@@ -44,8 +55,7 @@ def pretrain(
     generator = torch.Generator().manual_seed(seed)
     optimizer = torch.optim.Adam(network.parameters(), lr=lr, fused=True)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=iterations)
-    sizes = torch.tensor(list(SIZES.values()))
-    shares = torch.tensor([SHARES[mode] for mode in MODES])
+    sizes, shares = torch.tensor(list(SIZES.values())), torch.tensor([SHARES[m] for m in MODES])
     pools: dict[tuple[int, str], list[Drawn]] = {}
     totals, clock = torch.zeros(2), time.perf_counter()
     for step in range(iterations):
@@ -53,13 +63,11 @@ def pretrain(
         mode = MODES[int(torch.multinomial(shares, 1, generator=generator))]
         pool = pools.setdefault((size, mode), [])
         if not pool:
-            many = draw_examples(8 * batch_size, size, rows, PLANS, mode, generator)
+            many = draw_examples(POOL * batch_size, size, rows, PLANS, mode, generator)
             for _ in range(reuse):
-                order = torch.randperm(8 * batch_size, generator=generator).split(batch_size)
-                pool.extend(_take(many, index) for index in order)
-        velocity, effect = (
-            part.mean() for part in flow_losses(network, pool.pop(), mode, generator)
-        )
+                order = torch.randperm(POOL * batch_size, generator=generator)
+                pool.extend(_take(many, index) for index in order.split(batch_size))
+        velocity, effect = (x.mean() for x in flow_losses(network, pool.pop(), mode, generator))
         optimizer.zero_grad(set_to_none=True)
         (velocity + EFFECT_WEIGHT * effect).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -67,43 +75,62 @@ def pretrain(
         cycle.step()
         totals += torch.stack([velocity.detach(), effect.detach()])
         if step % log == log - 1:
+            velocity, effect = (totals / log).tolist()
             spent = time.perf_counter() - clock
-            print(
-                f"{step + 1:6d}  velocity {totals[0] / log:.4f}  effect {totals[1] / log:.4f}  "
-                f"{spent:.0f} s",
-                flush=True,
-            )
+            line = f"{step + 1:6d}  velocity {velocity:.4f}  effect {effect:.4f}  {spent:.0f} s"
+            print(line, flush=True)
             totals.zero_()
 
 
 def _take(drawn: Drawn, index: Tensor) -> Drawn:
-    rows = type(drawn.rows)(*(part[index] for part in drawn.rows))
+    rows = Rows(*(part[index] for part in drawn.rows))
     return Drawn(rows, *(part[index] for part in drawn[1:]))
 
 
-def main() -> None:
-    """Train and write the weights."""
-    from safetensors.torch import save_file
+@torch.no_grad()
+def evaluate(network: AxisNetwork, count: int = 512, seed: int = 1) -> dict[str, list[float]]:
+    """Return the median error of the action, in half ranges, by kind and number of actions.
 
-    parser = argparse.ArgumentParser(description=__doc__)
+    The columns are 1, 2, 6 and 17 actions. Windows are those of the training: some are nearly
+    empty, some change regime half-way, so no error can be zero.
+    """
+    kinds = {name: ({name: 1.0}, {"none": 1.0}) for name in KINDS}
+    kinds |= {name: ({"linear": 1.0}, {name: 1.0}) for name in MIXES if name != "none"}
+    table = {}
+    for name, shares in kinds.items():
+        generator = torch.Generator().manual_seed(seed)
+        table[name] = [_error(network, count, size, shares, generator) for size in (1, 2, 6, 17)]
+    return table
+
+
+def _error(network, count, size, shares, generator) -> float:
+    drawn = draw_examples(count, size, max(12, size + 4), 1, "mixed", generator, *shares)
+    known = network.encode(drawn.rows, fit_experts(drawn.rows))
+    asked = network.ask(known, drawn.planned, "mixed")
+    end = midpoint(lambda tau, x: network.velocity(asked, tau, x), drawn.planned, 1)
+    return float((end.clamp(-1, 1) - drawn.intended).abs().amax(-1).median())
+
+
+def main() -> None:
+    """Train, or evaluate."""
+    parser = argparse.ArgumentParser(prog="python -m afm_rl.flow.pretrain", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("universal.safetensors"))
-    parser.add_argument("--iterations", type=int, default=40_000)
-    parser.add_argument("--batch-size", type=int, default=160)
-    parser.add_argument("--width", type=int, default=128)
-    parser.add_argument("--latent", type=int, default=64)
-    parser.add_argument("--lr", type=float, default=3e-3)
+    parser.add_argument("--iterations", type=int, default=36_000)
     parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
+    parser.add_argument("--evaluate", action="store_true", help="print errors, train nothing")
+    given = parser.parse_args()
     torch.set_num_threads(1)
-    network = AxisNetwork(width=arguments.width, latent=arguments.latent, seed=arguments.seed)
-    pretrain(
-        network,
-        arguments.iterations,
-        arguments.batch_size,
-        lr=arguments.lr,
-        seed=arguments.seed + 1,
-    )
-    save_file({k: v.contiguous() for k, v in network.state_dict().items()}, arguments.out)
+    if given.evaluate:
+        print(f"{'':14}" + "".join(f"{size:>8}" for size in (1, 2, 6, 17)))
+        for name, errors in evaluate(load_universal()).items():
+            print(f"{name:14}" + "".join(f"{error:8.3f}" for error in errors))
+        return
+    network = AxisNetwork(seed=given.seed)
+    pretrain(network, given.iterations, seed=given.seed + 1)
+    data = save({name: part.contiguous() for name, part in network.state_dict().items()})
+    write_whole(given.out, data)
+    checksum = f"{hashlib.sha256(data).hexdigest()}  {given.out.name}\n"
+    write_whole(given.out.with_name(given.out.name + ".sha256"), checksum.encode())
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Regimes without a robot: what the universal flow is trained on.
+r"""Regimes without a robot: what the universal flow is trained on.
 
 An action u in half ranges has the effect
 
-.. math:: T(u) = M\\,\\phi(u) + b
+.. math:: T(u) = M\,\phi(u) + b
 
-with a scalar map :math:`\\phi_a` per axis (gains, dead zone, saturation, slip, asymmetry, smooth
+with a scalar map :math:`\phi_a` per axis (gains, dead zone, saturation, slip, asymmetry, smooth
 distortion, quantisation; tabulated), a mixing matrix M (rotation, permutation, coupling) and a
 bias b.
 """
@@ -12,6 +12,7 @@ bias b.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import torch
@@ -104,7 +105,11 @@ def _invert(table: Tensor, wanted: Tensor) -> Tensor:
 
 
 class Draw:
-    """Random numbers of one generator, in the shapes that are needed here."""
+    """Random numbers of one generator, in the shapes that are needed here.
+
+    Args:
+        generator: of the numbers.
+    """
 
     def __init__(self, generator: torch.Generator) -> None:
         self.generator = generator
@@ -121,19 +126,25 @@ class Draw:
     def chance(self, share: float, *shape: int) -> Tensor:
         return torch.rand(shape, generator=self.generator) < share
 
-    def choice(self, shares: dict[str, float], count: int) -> Tensor:
-        weights = torch.tensor(list(shares.values()))
+    def choice(self, shares: Mapping[str, float], names: Iterable[str], count: int) -> Tensor:
+        weights = torch.tensor([shares.get(name, 0.0) for name in names])
         return torch.multinomial(weights, count, replacement=True, generator=self.generator)
 
 
-def draw_maps(count: int, axes: int, draw: Draw) -> Maps:
+def draw_maps(
+    count: int,
+    axes: int,
+    draw: Draw,
+    kinds: Mapping[str, float] = KINDS,
+    mixes: Mapping[str, float] = MIXES,
+) -> Maps:
     """Draw N regimes of A axes; one in twelve is nominal."""
-    table = _draw_tables(count, axes, draw)
+    table = _draw_tables(count, axes, draw, kinds)
     gain = draw.log_uniform(0.03, 3.0, count, axes) * torch.where(
         draw.chance(0.5, count, axes), 1.0, -1.0
     )
     gain = torch.where(draw.chance(0.25, count, axes) | draw.chance(0.1, count, 1), 1.0, gain)
-    matrix = _draw_matrices(count, axes, draw)
+    matrix = _draw_matrices(count, axes, draw, mixes)
     bias = draw.uniform(-0.5, 0.5, count, axes) * draw.chance(0.15, count, 1)
     # A fault of a few axes only is as frequent as one of all.
     touched = draw.chance(0.6, count, 1) | draw.chance(1.5 / (axes + 0.5), count, axes)
@@ -146,7 +157,7 @@ def draw_maps(count: int, axes: int, draw: Draw) -> Maps:
     return Maps(table, gain.unsqueeze(-1) * matrix, bias)
 
 
-def _draw_tables(count: int, axes: int, draw: Draw) -> Tensor:
+def _draw_tables(count: int, axes: int, draw: Draw, kinds: Mapping[str, float]) -> Tensor:
     """Draw scalar maps ``(N, A, G)``; the parameters are the same on all axes in half of them."""
     grid = torch.linspace(-1.0, 1.0, GRID)
 
@@ -154,7 +165,7 @@ def _draw_tables(count: int, axes: int, draw: Draw) -> Tensor:
         own = draw.uniform(low, high, count, axes)
         return torch.where(draw.chance(0.5, count, 1), own[:, :1], own).unsqueeze(-1)
 
-    kind = draw.choice(KINDS, count).view(-1, 1, 1)
+    kind = draw.choice(kinds, KINDS, count).view(-1, 1, 1)
     at, size = parameter(0.2, 0.8), grid.abs()
     forward, backward = parameter(-1.2, 0.4).exp(), parameter(-1.2, 0.4).exp()
     waves = sum(
@@ -174,12 +185,12 @@ def _draw_tables(count: int, axes: int, draw: Draw) -> Tensor:
     return torch.stack(tables).gather(0, kind.expand(count, axes, GRID).unsqueeze(0)).squeeze(0)
 
 
-def _draw_matrices(count: int, axes: int, draw: Draw) -> Tensor:
+def _draw_matrices(count: int, axes: int, draw: Draw, mixes: Mapping[str, float]) -> Tensor:
     """Draw mixing matrices ``(N, A, A)``."""
     eye = torch.eye(axes).expand(count, axes, axes)
     if axes == 1:
         return eye
-    kind = draw.choice(MIXES, count).view(-1, 1, 1)
+    kind = draw.choice(mixes, MIXES, count).view(-1, 1, 1)
     order = torch.rand(count, axes, generator=draw.generator).argsort(-1)
     swapped = torch.where(  # two axes only, or any order
         draw.chance(0.5, count, 1), order, _swap_two(order)
@@ -221,16 +232,33 @@ class Drawn(NamedTuple):
 
 
 def draw_examples(
-    count: int, axes: int, rows: int, plans: int, mode: str, generator: torch.Generator
+    count: int,
+    axes: int,
+    rows: int,
+    plans: int,
+    mode: str,
+    generator: torch.Generator,
+    kinds: Mapping[str, float] = KINDS,
+    mixes: Mapping[str, float] = MIXES,
 ) -> Drawn:
     """Draw regimes, the windows that a robot would have seen under them, plans and answers.
 
     Half of the windows hold an older regime as well. Actions fill the box, keep near one action,
     or follow a plan, as a corrected robot's do. Effects are noisy by a known amount, some are
     outliers, and some axes of some rows tell nothing.
+
+    Args:
+        count: windows, N.
+        axes: number of actions, A.
+        rows: of a window, K.
+        plans: for each window, C.
+        mode: how plans that cannot be had are saturated.
+        generator: of all that is drawn.
+        kinds: shares of the kinds of scalar maps of the present regimes.
+        mixes: shares of their kinds of mixing matrices.
     """
     draw = Draw(generator)
-    now, before = draw_maps(count, axes, draw), draw_maps(count, axes, draw)
+    now, before = draw_maps(count, axes, draw, kinds, mixes), draw_maps(count, axes, draw)
     executed = draw_actions(count, rows, axes, draw)
     fresh, valid = draw_masks(count, rows, draw)
     effective = torch.where(fresh == 1.0, now.effect(executed), before.effect(executed))

@@ -13,8 +13,10 @@ LEAST = 0.3  # share of an action that must be had for "mixed" to clip it
 ROUNDS, TOLERANCE = 8, 0.01  # bisection of the scale; miss in half ranges that still counts
 
 
-def saturate(unit: Tensor, mode: str) -> Tensor:
+def saturate(unit: Tensor, mode: str, dim: int = -1) -> Tensor:
     """Bring an action in half ranges, ``(*B, A)``, into the box [-1, 1]^A.
+
+    The axes are in the dimension ``dim``.
 
     ``"clip"`` cuts each component for itself; ``"direction"`` shrinks all alike, so that the
     robot does the same thing slower: the ratio of turning to driving is kept. ``"mixed"``
@@ -25,7 +27,7 @@ def saturate(unit: Tensor, mode: str) -> Tensor:
     """
     if mode == "clip":
         return unit.clamp(-1.0, 1.0)
-    excess = unit.abs().amax(-1, keepdim=True).clamp_min(1.0)
+    excess = unit.abs().amax(dim, keepdim=True).clamp_min(1.0)
     if mode == "direction":
         return unit / excess
     return torch.where(excess * LEAST > 1.0, unit / excess, unit.clamp(-1.0, 1.0))

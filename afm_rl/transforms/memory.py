@@ -9,7 +9,7 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
 from afm_rl.correction import ActionFlow, Corrector
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_flag, check_instance
+from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.faults import safe_action
 
 
