@@ -27,6 +27,7 @@ from afm_rl.missions.selection import (
     select_tracks,
 )
 from afm_rl.planning import MPC, GeometricController, PlanningEnv
+from afm_rl.targets import check_targets
 from afm_rl.transforms import ActionFlowTransform, Guard
 
 ROBOT_SHAPES = (
@@ -71,21 +72,23 @@ class Agent:
         return self.env.base_env
 
 
-def build(cfg: DictConfig) -> Agent:
+def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     """Compose an agent and check every setting; nothing is trained yet.
 
     Args:
         cfg: a configuration composed from ``afm_rl.conf``.
+        trust: packages whose code it may name, beside the parts of this library.
 
     Raises:
         ConfigurationError: for settings that cannot be used, naming the key.
     """
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    check_targets(settings, trust)
     label = cfg.label
     if label is not None and not isinstance(label, str):
         raise ConfigurationError(f"label={label!r}: expected a text")
     with blaming("robot"):
-        robot: Robot = instantiate(cfg.robot, _convert_="all")
+        robot: Robot = instantiate(settings["robot"], _convert_="all")
         tracks = select_tracks(settings["tracks"], robot)
         regimes = select_regimes(settings["regimes"], robot)
     seeds = select_seeds(settings["seeds"])
@@ -105,7 +108,7 @@ def build(cfg: DictConfig) -> Agent:
 
     def make(group: str, *args: Any) -> Any:
         with blaming(group):
-            return instantiate(cfg[group], _convert_="all")(*args)
+            return instantiate(settings[group], _convert_="all")(*args)
 
     dynamics = make("dynamics", robot)
     corrector = make("corrector", robot, dynamics)
@@ -119,7 +122,7 @@ def build(cfg: DictConfig) -> Agent:
     ]
     model, transform = dynamics.module, corrector.module
     with blaming("cost"):
-        cost = instantiate(cfg.cost, _convert_="all")
+        cost = instantiate(settings["cost"], _convert_="all")
     planner = make("planner", PlanningEnv(model, cost, *robot.action_box))
     guard = Guard()
     executed_key = ("next", guard.key("executed_action"))
