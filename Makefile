@@ -19,8 +19,12 @@ PYTHON ?= $(shell for p in $(CANDIDATES); do \
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
 
-demo: $(VENV)/.with-base ## Run a UGV mission, print its table, draw its figure (a few minutes)
-	@$(BIN)/afm-rl hydra.run.dir=outputs/demo overwrite=true
+demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and film them (3 minutes)
+	@echo "A robot drives along a track. After the second target its motors drive it backwards."
+	@echo "Four methods meet that: the old physics alone (physics), an ensemble that learns from every"
+	@echo "step (online_pe), the old physics behind AFM (afm_physics), and an oracle that knows it."
+	@$(BIN)/afm-rl hydra.run.dir=outputs/demo overwrite=true budget=1000 video=gif
+	@echo "Look at outputs/demo/figures/trajectory.png and at the film outputs/demo/video/afm_physics.gif"
 
 test: $(VENV)/.with-test ## Run all tests with coverage (at least 95 %)
 	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 \

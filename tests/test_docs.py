@@ -10,6 +10,7 @@ import pytest
 import yaml
 from hydra import compose, initialize_config_module
 
+from afm_rl.cli.overrides import trusted_packages
 from afm_rl.missions import build
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -89,7 +90,7 @@ def test_commands_can_be_run(page, asked, desk):
         folder = desk / asked[at + 1]
         asked = [*asked[:at], *asked[at + 2 :], f"hydra.searchpath=[file://{folder}]"]
     with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        agent = build(compose("config", asked))
+        agent = build(compose("config", asked), trusted_packages(asked))
     assert len(agent.missions)
 
 

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
-from afm_rl.cli.mistakes import explain, one_line
+from afm_rl.cli.error_messages import explain, one_line
 
 NAME = "afm-rl-report"
 ABOUT = """\

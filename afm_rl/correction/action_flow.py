@@ -266,8 +266,9 @@ class ActionFlow(PairCorrector):
         low, high = found.amin(-2), found.amax(-2)
         wanted = attainable(planned, low, high, self.saturation)
         best = nearest_of(effects, wanted, 0.5 * (high - low))
-        chosen = torch.stack([proposals, effects], -1).take_along_dim(best.unsqueeze(-1), -3)
-        action, effect = chosen.squeeze(-3).unbind(-1)
+        chosen = torch.cat([proposals, effects], -1)
+        chosen = chosen.gather(-2, best.expand(best.shape[0], 1, chosen.shape[-1])).squeeze(-2)
+        action, effect = chosen.tensor_split(2, -1)
         return action, effect, spread, torch.stack([low, high], -2)
 
     def predict(self, encoded: Encoded, parts: Fields, executed: Tensor) -> Tensor:

@@ -36,7 +36,7 @@ def effective_action(
 ) -> EffectiveAction:
     r"""Express a prediction error in action space, for any model and robot.
 
-    .. math:: v = \arg\min_v \; \| \Sigma^{-1/2} (s_{t+1} \ominus f(s_t, a + h v)) \|^2
+    .. math:: v = \operatorname{argmin}_v \; \| \Sigma^{-1/2} (s_{t+1} \ominus f(s_t, a + h v)) \|^2
 
     by Gauss-Newton: with J the derivative of the normalised forecast by v, and e the error,
 

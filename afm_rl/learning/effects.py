@@ -39,7 +39,7 @@ def take_apart(
 ) -> Effect:
     r"""Find the action that explains a transition best, and what it leaves over.
 
-    .. math:: v = \arg\min_v \| e(v) \|,\qquad
+    .. math:: v = \operatorname{argmin}_v \| e(v) \|,\qquad
               e(v) = N^{-1}\,(s_{t+1} \ominus (\mathrm{model}(s, h \odot v) \oplus c))
 
     by Gauss-Newton steps from a guess; N holds the model's standard deviations.

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from afm_rl.dynamics import Calibrated, DynamicsModel, Oracle
-from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.errors import ConfigurationError, check_choice, check_count
 from afm_rl.learning import GaussianNLLLoss, MassEstimator, OracleUpdater, RLSUpdater, Updater
 from afm_rl.missions.checks import blaming, check_cost, check_keys
 from afm_rl.missions.factories import Training
@@ -27,7 +27,8 @@ from afm_rl.missions.selection import (
     select_tracks,
 )
 from afm_rl.planning import MPC, GeometricController, PlanningEnv
-from afm_rl.transforms import ActionFlowTransform
+from afm_rl.targets import check_targets
+from afm_rl.transforms import ActionFlowTransform, Guard
 
 ROBOT_SHAPES = (
     *("action_low", "action_high", "state_low", "state_high"),
@@ -60,6 +61,8 @@ class Agent:
     transform: ActionFlowTransform | None
     executed_key: NestedKey
     trainings: Sequence[Training]
+    faults: str
+    """What a mission does at a fault: ``hold``, ``skip`` or ``raise``."""
     settings: Mapping[str, Any]
     """The resolved configuration."""
 
@@ -69,25 +72,28 @@ class Agent:
         return self.env.base_env
 
 
-def build(cfg: DictConfig) -> Agent:
+def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     """Compose an agent and check every setting; nothing is trained yet.
 
     Args:
         cfg: a configuration composed from ``afm_rl.conf``.
+        trust: packages whose code it may name, beside the parts of this library.
 
     Raises:
         ConfigurationError: for settings that cannot be used, naming the key.
     """
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    check_targets(settings, trust)
     label = cfg.label
     if label is not None and not isinstance(label, str):
         raise ConfigurationError(f"label={label!r}: expected a text")
     with blaming("robot"):
-        robot: Robot = instantiate(cfg.robot, _convert_="all")
+        robot: Robot = instantiate(settings["robot"], _convert_="all")
         tracks = select_tracks(settings["tracks"], robot)
         regimes = select_regimes(settings["regimes"], robot)
     seeds = select_seeds(settings["seeds"])
     budget = check_count("budget", settings["budget"])
+    faults = check_choice("faults", settings["faults"], ("hold", "skip", "raise"))
     with blaming("robot.env"):
         env = robot.env(
             tracks=tracks,
@@ -102,7 +108,7 @@ def build(cfg: DictConfig) -> Agent:
 
     def make(group: str, *args: Any) -> Any:
         with blaming(group):
-            return instantiate(cfg[group], _convert_="all")(*args)
+            return instantiate(settings[group], _convert_="all")(*args)
 
     dynamics = make("dynamics", robot)
     corrector = make("corrector", robot, dynamics)
@@ -116,9 +122,10 @@ def build(cfg: DictConfig) -> Agent:
     ]
     model, transform = dynamics.module, corrector.module
     with blaming("cost"):
-        cost = instantiate(cfg.cost, _convert_="all")
+        cost = instantiate(settings["cost"], _convert_="all")
     planner = make("planner", PlanningEnv(model, cost, *robot.action_box))
-    executed_key = "action" if transform is None else ("next", transform.key("executed_action"))
+    guard = Guard()
+    executed_key = ("next", guard.key("executed_action"))
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=executed_key)
     updater = make("updater", loss)
@@ -132,7 +139,7 @@ def build(cfg: DictConfig) -> Agent:
             f"dynamics: a calibrated model stays as it is but for its calibration, and "
             f"{type(updater).__name__} does not teach that; choose updater=rls or updater=frozen"
         )
-    chain = [] if transform is None else [transform]
+    chain = [guard] if transform is None else [guard, transform]
     if hasattr(planner, "make_tensordict_primer"):
         chain.append(planner.make_tensordict_primer())
     whole = TransformedEnv(env, Compose(*chain))
@@ -152,6 +159,7 @@ def build(cfg: DictConfig) -> Agent:
         transform=transform,
         executed_key=executed_key,
         trainings=trainings,
+        faults=faults,
         settings=settings,
     )
 

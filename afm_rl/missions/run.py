@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,8 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 from tqdm.auto import tqdm
 
+from afm_rl.errors import NonFiniteError
+from afm_rl.faults import blanked
 from afm_rl.measures import Measures
 from afm_rl.missions.build import Agent
 from afm_rl.missions.checkpoint import Checkpoint, Stopped
@@ -22,6 +24,7 @@ from afm_rl.missions.log import StepLog
 from afm_rl.missions.state import Loop
 
 SILENT = 5.0  # surprise, in standard deviations, up to which a model counts as aligned
+STILL = 0.1  # surprise up to which a repeated reading shows a robot that stands still, as foreseen
 
 
 @dataclass
@@ -50,6 +53,10 @@ def run(
     order is the same for one mission and for hundreds, and so are the results: to the bit, but
     for networks, whose batched products may round the last bit another way.
 
+    A fault is a reading that is missing, not finite or stale, or a plan that is not finite.
+    Nothing is learned from it. The mission goes on with its last safe action (``faults=hold``),
+    ends (``skip``), or the run does (``raise``).
+
     With a ``checkpoint`` a run that was killed goes on where it was, and its results are the
     same to the bit. The file stays: delete it once the results are safe.
 
@@ -63,6 +70,7 @@ def run(
     Raises:
         ArtefactError: if the checkpoint is damaged, or was made by other missions.
         ConfigurationError: for a time that cannot be used, or a file that cannot be written.
+        NonFiniteError: at a fault, with ``faults=raise``.
         Stopped: if ``watch`` said so; a checkpoint was written.
     """
     with torch.random.fork_rng(devices=[]):  # TorchRL's own planners draw from the global one
@@ -109,9 +117,9 @@ def _start(agent: Agent) -> Loop:
         agent.model.expand_(total)
     td = agent.env.reset(agent.missions, set_state=False)
     agent.updater.start(td)
-    ends = {name: torch.zeros(total) for name in ("steps", "seconds")}
+    ends = {name: torch.zeros(total) for name in ("steps", "seconds", "faults")}
     ends |= agent.robot.metrics.start(agent.missions)
-    whole = ["misaligned", "regime_active", *agent.robot.metrics.whole]
+    whole = ["misaligned", "regime_active", "fault", *agent.robot.metrics.whole]
     log = StepLog(_columns(agent), whole)
     return Loop(td, torch.arange(total), ends, log)
 
@@ -119,17 +127,23 @@ def _start(agent: Agent) -> Loop:
 def _advance(agent: Agent, loop: Loop) -> None:
     """Take one step with every mission that runs, in place."""
     td, ids = agent.env.step(agent.planner(loop.td)), loop.ids
-    error, surprise = _error(agent, td)
-    miss = unforeseen = error
-    if agent.transform is not None:
-        expected = td["next", agent.transform.key("predicted_effect")]
-        miss, unforeseen = (_distance(agent, td, action) for action in (td["action"], expected))
-    loss = agent.updater(td)["loss"]
-    loop.log.add(ids, loop.step, _row(agent, td, (error, miss, unforeseen), surprise, loss))
+    errors, surprise = _errors(agent, td)
+    guard = td["next", "guard"]
+    fault = guard["held"] | ~(guard["sound"] | (surprise < STILL))
+    loss = agent.updater(blanked(td, guard["sound"]))["loss"]
+    loop.log.add(ids, loop.step, _row(agent, td, errors, surprise, loss, fault))
+    if agent.faults == "raise" and bool(fault.any()):
+        raise NonFiniteError(
+            f"step {loop.step}: missions {ids[fault].tolist()}: a reading or a plan is missing, "
+            "not finite or stale; faults=hold goes on with the last safe action"
+        )
     done = td["next", "done"].squeeze(-1)
     loop.ends["steps"][ids] = loop.step
+    loop.ends["faults"][ids] += fault
     agent.robot.metrics.add(loop.ends, ids, td)
     loop.td = step_mdp(td)
+    if agent.faults == "skip":
+        done = done | fault
     if bool(done.any()):
         keep = (~done).nonzero().squeeze(-1)
         loop.ids, loop.td = ids[keep], loop.td[keep]
@@ -137,18 +151,23 @@ def _advance(agent: Agent, loop: Loop) -> None:
     loop.step += 1
 
 
-def _error(agent: Agent, td: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """Return norm ``(B,)`` and surprise ``(B,)`` of the one-step prediction error."""
-    state = td["observation"]
-    expected, noise = agent.model.forecast(state, td.get(agent.executed_key))
-    error = agent.model.manifold.difference(td["next", "observation"], expected)
-    return error.norm(dim=-1), (error.abs() / noise).amax(-1)
+def _errors(agent: Agent, td: TensorDictBase) -> tuple[Sequence[Tensor], Tensor]:
+    """Return how far the robot is from three predictions, and the surprise of the first, ``(B,)``.
 
-
-def _distance(agent: Agent, td: TensorDictBase, action: Tensor) -> Tensor:
-    """Return how far the robot is from where the model would have it after ``action``, ``(B,)``."""
-    there, _ = agent.model.forecast(td["observation"], action)
-    return agent.model.manifold.difference(td["next", "observation"], there).norm(dim=-1)
+    The predictions are the model's for what was executed, for what was planned, and for the
+    effect that the transform predicted. Without a transform all are the first.
+    """
+    actions = [td.get(agent.executed_key)]
+    if agent.transform is not None:
+        actions += [td["action"], td["next", agent.transform.key("predicted_effect")]]
+    state, reached = (part["observation"].unsqueeze(1) for part in (td, td["next"]))
+    expected, noise = agent.model.forecast(
+        state.expand(-1, len(actions), -1), torch.stack(actions, 1)
+    )
+    error = agent.model.manifold.difference(reached, expected)
+    norms = list(error.norm(dim=-1).unbind(1))
+    surprise = (error.abs() / noise)[:, 0].amax(-1)
+    return norms if len(norms) > 1 else norms * 3, surprise
 
 
 def _columns(agent: Agent) -> list[str]:
@@ -164,15 +183,16 @@ def _columns(agent: Agent) -> list[str]:
         "misaligned",
         "loss",
         "regime_active",
+        "fault",
         *agent.robot.metrics.columns,
     ]
 
 
-def _row(agent: Agent, td: TensorDictBase, errors, surprise, loss) -> Tensor:
+def _row(agent: Agent, td: TensorDictBase, errors, surprise, loss, fault) -> Tensor:
     """Return one step's values ``(B, C)``, in the order of :func:`_columns`."""
     transform = agent.transform
     flag = surprise > SILENT if transform is None else td["next", transform.key("misaligned")]
-    figures = (*errors, flag, loss, td["regime_active"])
+    figures = (*errors, flag, loss, td["regime_active"], fault)
     scalars = torch.stack([x.float() for x in figures], -1)
     score, executed = agent.robot.metrics, td.get(agent.executed_key)
     parts = [td["observation"], score.goal(td), td["action"], executed, scalars, score.row(td)]
@@ -192,7 +212,9 @@ def _missions(agent: Agent, ends: dict[str, Tensor]) -> pd.DataFrame:
     frame.update({name: changed[:, k] for k, name in enumerate(agent.robot.regime.names)})
     frame.update(seed=mission["seed"])
     frame.update(agent.robot.metrics.table(base, agent.missions, ends))
-    frame.update(seconds=ends["seconds"], regime=agent.regime_names)
+    if agent.faults == "skip":
+        frame["finished"] = frame["finished"] & (ends["faults"] == 0)
+    frame.update(faults=ends["faults"].int(), seconds=ends["seconds"], regime=agent.regime_names)
     return pd.DataFrame({name: _plain(value) for name, value in frame.items()})
 
 

@@ -1,8 +1,11 @@
 """Regimes: what changes under the robot, and when."""
 
+from afm_rl.regimes.asymmetric import AsymmetricGain
+from afm_rl.regimes.backlash import Backlash
 from afm_rl.regimes.base import Regime
 from afm_rl.regimes.bias import Bias
 from afm_rl.regimes.compose import Compose
+from afm_rl.regimes.dead import DeadActuator
 from afm_rl.regimes.dead_zone import DeadZone
 from afm_rl.regimes.delay import Delay
 from afm_rl.regimes.flight import (
@@ -16,13 +19,22 @@ from afm_rl.regimes.flight import (
 )
 from afm_rl.regimes.gain import ActionGain
 from afm_rl.regimes.gain_noise import GainNoise
+from afm_rl.regimes.lag import Lag
 from afm_rl.regimes.patches import Patches
+from afm_rl.regimes.permutation import Permutation
+from afm_rl.regimes.quantisation import Quantisation
 from afm_rl.regimes.rotation import Rotation
 from afm_rl.regimes.saturation import Saturation
 from afm_rl.regimes.schedule import Schedule, blend_phases, phase_parameters
 from afm_rl.regimes.slip import WheelSlip
 
 __all__ = [
+    "Quantisation",
+    "Permutation",
+    "Lag",
+    "DeadActuator",
+    "Backlash",
+    "AsymmetricGain",
     "ActionGain",
     "Bias",
     "Compose",

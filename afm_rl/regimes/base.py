@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 
 import torch
@@ -66,7 +66,7 @@ class Regime(ABC):
     ) -> Tensor:
         r"""Return the action in the box whose effect is nearest to ``action``, ``(*B, A)``.
 
-        :math:`\arg\min_{u \in [l, h]} \|(\mathrm{apply}(u) - a) / (h - l)\|`, by a search that
+        :math:`\operatorname{argmin}_{u \in [l, h]} \|(\mathrm{apply}(u) - a) / (h - l)\|`, by a search that
         narrows around the best of a grid of points; families with a closed form override it.
         """
         grid = torch.quasirandom.SobolEngine(len(low)).draw(SEARCH_POINTS).to(low)
@@ -107,6 +107,19 @@ class Regime(ABC):
             row[self.names.index(name)] = float(value)
         return torch.tensor(row)
 
+    @staticmethod
+    def distinct(names: Sequence[str], axes: int | None = None) -> tuple[str, ...]:
+        """Return ``names`` as a tuple, one per action axis.
+
+        Raises:
+            ConfigurationError: unless they are distinct, and as many as there are ``axes``.
+        """
+        found = tuple(names)
+        if not found or len(set(found)) < len(found) or len(found) != (axes or len(found)):
+            count = "" if axes is None else f"{axes} "
+            raise ConfigurationError(f"names={found}: expected {count}distinct names, one per axis")
+        return found
+
     def check_names(self, names: Iterable[str]) -> None:
         """Check that all ``names`` are parameters.
 
@@ -117,6 +130,21 @@ class Regime(ABC):
             if name not in self.names:
                 raise ConfigurationError(
                     f"regimes: unknown parameter {name!r}; allowed: {', '.join(self.names)}"
+                )
+
+    def check_limits(self, parameters: Tensor) -> None:
+        """Check that parameters ``(*B, F)`` are within their limits.
+
+        Raises:
+            ConfigurationError: naming the first that is not.
+        """
+        for name, (low, high) in self.limits.items():
+            values = parameters[..., self.names.index(name)]
+            wrong = values[~((values >= low) & (values <= high))]
+            if wrong.numel():
+                raise ConfigurationError(
+                    f"missions: parameters: {name}={wrong[0].item():g}: expected a number in "
+                    f"[{low:g}, {high:g}]"
                 )
 
     def describe(self, row: Tensor) -> str:

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError
 from afm_rl.regimes.base import Regime
-from afm_rl.regimes.settings import HalfRange, check_span, draw_between
+from afm_rl.regimes.settings import MOST, HalfRange, check_span, draw_between
 
 
 class Bias(Regime):
@@ -34,13 +33,9 @@ class Bias(Regime):
         half_range: Sequence[float],
         span: Sequence[float] = (-0.4, 0.4),
     ) -> None:
-        self.names = tuple(names)
         self.half_range = HalfRange(half_range)
-        axes = len(self.half_range.values)
-        if not len(set(self.names)) == len(self.names) == axes:
-            raise ConfigurationError(
-                f"names={self.names}: expected {axes} distinct names, one per axis"
-            )
+        self.names = self.distinct(names, len(self.half_range.values))
+        self.limits = dict.fromkeys(self.names, (-MOST, MOST))
         self.identity = (0.0,) * len(self.names)
         self.span = check_span("span", span)
 

@@ -20,8 +20,8 @@ class Compose(Regime):
     any, is the same for all noisy families.
 
     Args:
-        regimes: the families, by name; or a list, whose names are the indices. Only the first may
-            depend on previous actions, because these are commands.
+        regimes: the families, by name; or a list, whose names are the indices. Those that depend
+            on previous actions come first.
         prior: lists of family names: each draw picks one list at random and draws the families in
             it, the others stay nominal. None: all families are drawn.
 
@@ -54,12 +54,13 @@ class Compose(Regime):
                 f"regimes: expected families with distinct parameter names, got {self.names}"
             )
         late = [name for name, regime in self.regimes.items() if regime.history]
-        if set(late) - {next(iter(self.regimes))}:
+        if late != list(self.regimes)[: len(late)]:
             raise ConfigurationError(
-                f"regimes: {', '.join(late)} depend on previous actions: expected one such "
-                "family, at the beginning"
+                f"regimes: {', '.join(late)} depend on previous actions: expected such families "
+                "at the beginning"
             )
-        self.history = families[0].history
+        self.limits = {name: limit for each in families for name, limit in each.limits.items()}
+        self.history = sum(regime.history for regime in families)
         self.noisy = any(regime.noisy for regime in families)
         ends = itertools.accumulate(len(regime.names) for regime in families)
         self._nominal = Constant(self.identity)
@@ -83,24 +84,36 @@ class Compose(Regime):
     ) -> Tensor:
         """Apply every family in turn."""
         action = _spread(action, parameters)
-        for regime, part in self._active(parameters):
-            action = regime.apply(action, part, state, past, noise)
+        active = self._active(parameters)
+        late = sum(regime.history > 0 for regime, _ in active)
+        for place, (regime, part) in enumerate(active):
+            before = None if past is None else past[..., : regime.history, :]
+            action = regime.apply(action, part, state, before, noise)
+            if past is not None and place + 1 < late:
+                past = _effects(regime, past, part, state)
         return action
 
     def inverse(
         self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
     ) -> Tensor:
-        """Undo the last family first and clamp at the end, if every family has a closed form.
+        """Undo the last family first and clamp at the end.
 
-        Where the box is left on the way, the result is in it, but need not be the nearest.
+        Where the box is left on the way, the result is in it, but need not be the nearest. Only
+        rows in which a family without a closed form is not nominal are searched.
         """
-        if not self.closed_form:
-            return super().inverse(action, parameters, state, low, high)
         free = torch.full_like(high, torch.inf)
-        action = _spread(action, parameters)
-        for regime, part in reversed(self._active(parameters)):
-            action = regime.inverse(action, part, state, -free, free)
-        return action.clamp(low, high)
+        action, active = _spread(action, parameters), self._active(parameters)
+        found = action
+        for regime, part in reversed([pair for pair in active if pair[0].closed_form]):
+            found = regime.inverse(found, part, state, -free, free)
+        found = found.clamp(low, high)
+        slow = [~regime.is_identity(part) for regime, part in active if not regime.closed_form]
+        if slow:
+            rows = torch.stack(slow).any(0).expand(action.shape[:-1])
+            a, p, s = (part.expand(*rows.shape, -1)[rows] for part in (action, parameters, state))
+            found = found.clone()
+            found[rows] = super().inverse(a, p, s, low, high)
+        return found
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw parameters ``(*shape, F)``: one list of the prior each, or every family."""
@@ -162,3 +175,13 @@ def _spread(action: Tensor, parameters: Tensor) -> Tensor:
         return action
     batch = torch.broadcast_shapes(action.shape[:-1], parameters.shape[:-1])
     return action.expand(*batch, action.shape[-1])
+
+
+def _effects(regime: Regime, past: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
+    """Return what past commands ``(*B, H, A)`` were worth under a regime with a history of D.
+
+    Newest first, ``(*B, H - D, A)``: of the oldest D the commands before are not known.
+    """
+    before = past.unfold(-2, regime.history + 1, 1).mT  # (*B, H - D, D + 1, A), each newest first
+    rows = parameters.unsqueeze(-2), state.unsqueeze(-2)
+    return regime.apply(before[..., 0, :], *rows, before[..., 1:, :])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -31,11 +30,11 @@ class DeadZone(Regime):
 
     names = ("dead_zone",)
     identity = (0.0,)
-    limits = {"dead_zone": (0.0, math.inf)}
+    limits = {"dead_zone": (0.0, 1.0)}
 
     def __init__(self, half_range: Sequence[float], span: Sequence[float] = (0.1, 0.6)) -> None:
         self.half_range = HalfRange(half_range)
-        self.span = check_span("span", span, 0.0)
+        self.span = check_span("span", span, 0.0, 1.0)
 
     def apply(
         self,

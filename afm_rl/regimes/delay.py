@@ -2,34 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, check_counts
 from afm_rl.regimes.base import Regime
 
-STEPS = 2  # longest delay
+MOST_STEPS = 8
 
 
 class Delay(Regime):
-    r"""The command of 0, 1 or 2 steps ago: :math:`a_\mathrm{eff} = a_{t - d}`.
+    r"""The command of d steps ago: :math:`a_\mathrm{eff} = a_{t - d}`, with d up to 8.
 
     Between whole steps, as in a ramp, the neighbouring commands are mixed linearly. Whoever does
     not know the previous commands sees no delay, and so the inverse is the action itself. The
-    prior draws 1 or 2.
+    prior draws whole steps.
+
+    Args:
+        span: lowest and highest delay in the prior (steps).
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
 
     >>> late = Delay()
-    >>> past = torch.tensor([[0.2, 0.0], [0.1, 0.0]])  # newest first
+    >>> past = torch.tensor([[0.2, 0.0], [0.1, 0.0]] + 6 * [[0.0, 0.0]])  # newest first
     >>> late.apply(torch.ones(2), late.encode({"delay": 2}), torch.zeros(3), past)
     tensor([0.1000, 0.0000])
     """
 
     names = ("delay",)
     identity = (0.0,)
-    limits = {"delay": (0.0, STEPS)}
-    history = STEPS
+    limits = {"delay": (0.0, MOST_STEPS)}
+    history = MOST_STEPS
+
+    def __init__(self, span: Sequence[int] = (1, 2)) -> None:
+        self.span = check_counts("span", span)
+        if len(self.span) != 2 or not self.span[0] <= self.span[1] <= MOST_STEPS:
+            raise ConfigurationError(
+                f"span={list(span)}: expected two numbers of steps, 1 <= lowest <= highest <= "
+                f"{MOST_STEPS}"
+            )
 
     def apply(
         self,
@@ -42,7 +56,7 @@ class Delay(Regime):
         """Pick the command out of the past; the state plays no part."""
         if past is None:
             return action
-        kept = past[..., :STEPS, :].unbind(-2)
+        kept = past[..., :MOST_STEPS, :].unbind(-2)
         effect = action * (1 - parameters).clamp(min=0.0)
         for steps, command in enumerate(kept, 1):
             effect = effect + command * (1 - (parameters - steps).abs()).clamp(min=0.0)
@@ -63,9 +77,10 @@ class Delay(Regime):
         row = super().encode(values)
         if float(row) % 1:
             given = values["delay"]
-            raise ConfigurationError(f"regimes: delay={given!r}: expected 0, 1 or 2 steps")
+            raise ConfigurationError(f"regimes: delay={given!r}: expected whole steps")
         return row
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw steps ``(*shape, 1)``."""
-        return torch.randint(1, STEPS + 1, (*shape, 1), generator=generator).float()
+        low, high = self.span
+        return torch.randint(low, high + 1, (*shape, 1), generator=generator).float()

@@ -11,6 +11,8 @@ from torch import Tensor
 from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.regimes.base import Regime
 
+MOST_GAIN = 100.0  # gains beyond are typing errors
+
 
 class ActionGain(Regime):
     r"""Per-axis gains: :math:`a_\mathrm{eff} = g \odot a` (paper, section V-B).
@@ -37,10 +39,9 @@ class ActionGain(Regime):
         high: float = 3.0,
         nominal: float = 0.25,
     ) -> None:
-        self.names = tuple(names)
-        if not self.names or len(set(self.names)) < len(self.names):
-            raise ConfigurationError(f"names={self.names}: expected distinct names, one per axis")
+        self.names = self.distinct(names)
         self.identity = (1.0,) * len(self.names)
+        self.limits = dict.fromkeys(self.names, (-MOST_GAIN, MOST_GAIN))
         self.low = check_number("low", low, low=0.0, open_low=True)
         self.high = check_number("high", high, low=0.0, open_low=True)
         if self.low > self.high:

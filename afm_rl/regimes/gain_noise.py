@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from afm_rl.regimes.base import Regime
-from afm_rl.regimes.settings import check_span, draw_between
+from afm_rl.regimes.settings import MOST, check_span, draw_between
 
 
 class GainNoise(Regime):
@@ -32,11 +31,11 @@ class GainNoise(Regime):
 
     names = ("gain_noise",)
     identity = (0.0,)
-    limits = {"gain_noise": (0.0, math.inf)}
+    limits = {"gain_noise": (0.0, MOST)}
     noisy = True
 
     def __init__(self, span: Sequence[float] = (0.1, 0.5)) -> None:
-        self.span = check_span("span", span, 0.0)
+        self.span = check_span("span", span, 0.0, MOST)
 
     def apply(
         self,

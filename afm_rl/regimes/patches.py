@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_counts, check_number
+from afm_rl.errors import check_counts, check_number
 from afm_rl.regimes.base import Regime
-from afm_rl.regimes.gain import divide
+from afm_rl.regimes.gain import MOST_GAIN, divide
 from afm_rl.regimes.settings import check_span, draw_between
 
 
@@ -47,9 +47,8 @@ class Patches(Regime):
     ) -> None:
         self.size = check_number("size", size, low=0.0, open_low=True)
         self.where = check_counts("where", where, low=0)
-        self.names = tuple(names)
-        if not self.names or len(set(self.names)) < len(self.names):
-            raise ConfigurationError(f"names={self.names}: expected distinct names, one per axis")
+        self.names = self.distinct(names)
+        self.limits = dict.fromkeys(self.names, (-MOST_GAIN, MOST_GAIN))
         self.identity = (1.0,) * len(self.names)
         least = check_number("span", check_span("span", span)[0], low=0.0, open_low=True)
         self.span = math.log(least), math.log(span[1])

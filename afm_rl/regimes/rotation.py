@@ -31,6 +31,7 @@ class Rotation(Regime):
 
     names = ("rotation",)
     identity = (0.0,)
+    limits = {"rotation": (-2 * math.pi, 2 * math.pi)}
 
     def __init__(
         self, half_range: Sequence[float], span: Sequence[float] = (-math.pi, math.pi)

@@ -30,11 +30,11 @@ class Saturation(Regime):
 
     names = ("saturation",)
     identity = (1.0,)
-    limits = {"saturation": (0.0, 1.0)}
+    limits = {"saturation": (0.01, 1.0)}  # 0 would leave nothing to command
 
     def __init__(self, half_range: Sequence[float], span: Sequence[float] = (0.2, 0.6)) -> None:
         self.half_range = HalfRange(half_range)
-        self.span = check_span("span", span, 0.0, 1.0)
+        self.span = check_span("span", span, *self.limits["saturation"])
 
     def apply(
         self,

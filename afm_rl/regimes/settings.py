@@ -10,6 +10,8 @@ from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_number
 
+MOST = 10.0  # half ranges: more are typing errors
+
 
 class Constant:
     """A row of numbers as a tensor of any type and on any device, made once for each.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.regimes.base import Regime
-from afm_rl.regimes.settings import HalfRange, check_span, draw_between
+from afm_rl.regimes.settings import MOST, HalfRange, check_span, draw_between
 
 END = (2 * math.sqrt(2) / 3 - 1) / 2  # makes the starting point of `rising_load` exact at r = 0
 NEAR = 0.05  # so near to the peak the starting point is better than a step, which divides by zero
@@ -38,7 +38,7 @@ class WheelSlip(Regime):
 
     names = ("slip_at", "slip_peak")
     identity = (0.0, 1.0)
-    limits = {"slip_at": (0.0, math.inf), "slip_peak": (0.0, math.inf)}
+    limits = {"slip_at": (0.0, MOST), "slip_peak": (0.0, MOST)}
 
     def __init__(
         self,
@@ -47,8 +47,8 @@ class WheelSlip(Regime):
         peak: Sequence[float] = (0.3, 0.9),
     ) -> None:
         self.half_range = HalfRange(half_range)
-        self.at = check_span("at", at, 0.0)
-        self.peak = check_span("peak", peak, 0.0)
+        self.at = check_span("at", at, 0.0, MOST)
+        self.peak = check_span("peak", peak, 0.0, MOST)
 
     def apply(
         self,

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import layers  # beside this file
 from latex2mathml.converter import convert
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 from nbconvert import MarkdownExporter
 
@@ -57,7 +58,10 @@ def on_page_content(content, page, **kwargs):
     """Render formulas, so that a browser needs no script and no network for them."""
 
     def render(found):
-        kind, formula = found.groups()
-        return convert(html.unescape(formula), display="block" if kind == "div" else "inline")
+        kind, formula = found[1], html.unescape(found[2])
+        result = convert(formula, display="block" if kind == "div" else "inline")
+        if re.search(r"<m[ion]>(&|\\\w+)<", result):
+            raise PluginError(f"{page.file.src_uri}: a formula that is not understood: {formula}")
+        return result
 
     return FORMULA.sub(render, content)

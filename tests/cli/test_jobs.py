@@ -47,7 +47,7 @@ def test_jobs_that_fail_or_die_take_no_other_with_them(
 ):
     (tmp_path / "sabotage.py").write_text(SABOTAGE)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    command = ["method=physics", "budget=3", *quick]
+    command = ["method=physics", "budget=3", "trust=[sabotage]", *quick]
     done = process(program, "-m", *command, f"cost._target_={','.join(COSTS)}")
     (sweep,) = (tmp_path / "multirun").iterdir()
     *lines, last = done.stderr.splitlines()

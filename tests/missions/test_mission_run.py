@@ -34,9 +34,19 @@ def test_the_columns(drive, ring, tables):
     columns = {
         "steps": ["mission", "t", *states, "goal_x", "goal_y"]
         + [f"{kind}_{name}" for kind in ("planned", "executed") for name in actions]
-        + ["error", "miss", "unforeseen", "misaligned", "loss", "regime_active", "reached"],
+        + ["error", "miss", "unforeseen", "misaligned", "loss", "regime_active", "fault"]
+        + ["reached"],
         "missions": ["mission", "method", "track", *run.agent.robot.regime.names, "seed"]
-        + ["success_rate", "steps", "reached", "targets", "finished", "seconds", "regime"],
+        + [
+            "success_rate",
+            "steps",
+            "reached",
+            "targets",
+            "finished",
+            "faults",
+            "seconds",
+            "regime",
+        ],
     }
     assert list(getattr(run, tables)) == columns[tables]
 

@@ -4,7 +4,17 @@ import pytest
 import torch
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes import ActionGain, Bias, Compose, DeadZone, Delay, GainNoise, Rotation
+from afm_rl.regimes import (
+    ActionGain,
+    Backlash,
+    Bias,
+    Compose,
+    DeadZone,
+    Delay,
+    GainNoise,
+    Lag,
+    Rotation,
+)
 from afm_rl.regimes.base import Regime
 
 LOW, HIGH = torch.full((2,), -1.0), torch.ones(2)
@@ -90,10 +100,10 @@ def robot(gains):
 
 
 def test_history_and_noise_are_those_of_the_families(robot, both):
-    assert (robot.history, robot.noisy) == (2, True)
+    assert (robot.history, robot.noisy) == (8, True)
     assert (both.history, both.noisy) == (0, False)
     row = robot.encode({"delay": 1.0, "gain_noise": 0.5})
-    past = torch.tensor([[0.4, -0.2], [0.0, 0.0]])
+    past = torch.tensor([[0.4, -0.2], *[[0.0, 0.0]] * 7])
     effect = robot.apply(torch.ones(2), row, torch.zeros(3), past, torch.tensor([1.0, -1.0]))
     torch.testing.assert_close(effect, torch.tensor([0.6, -0.1]))
 
@@ -140,6 +150,54 @@ def test_a_family_without_a_closed_form_makes_the_inverse_a_search(both, robot):
     assert not Compose({"robot": robot, "shift": Shift()}).closed_form
 
 
+def test_only_rows_with_a_family_without_a_closed_form_are_searched(gains, monkeypatch):
+    family, searched = Compose([gains, Shift()]), []
+    search = Regime.inverse
+
+    def watch(self, action, *others):
+        searched.append(len(action))
+        return search(self, action, *others)
+
+    monkeypatch.setattr(Regime, "inverse", watch)
+    rows = torch.tensor([[2.0, 1.0, 0.0], [2.0, 1.0, 0.3], [-1.0, 0.5, 0.0]])
+    wanted = torch.tensor([[0.6, -0.2]])
+    found = family.inverse(wanted, rows, torch.zeros(3), LOW, HIGH)
+    assert searched == [1]
+    torch.testing.assert_close(found[[0, 2]], torch.tensor([[0.3, -0.2], [-0.6, -0.4]]))
+    torch.testing.assert_close(found[1], torch.tensor([0.15, -0.5]), rtol=0, atol=2e-3)
+    searched.clear()
+    family.inverse(wanted, rows[[0, 2]], torch.zeros(3), LOW, HIGH)
+    assert not searched
+
+
+def test_families_that_depend_on_previous_actions_follow_each_other():
+    both = Compose({"delay": Delay(), "lag": Lag(history=4), "backlash": Backlash(HALF, history=2)})
+    assert both.history == 14
+    commands = torch.randn(30, 2, generator=torch.Generator().manual_seed(0))
+    row = both.encode({"delay": 2, "lag": 1.5, "backlash": 0.1})
+    t, newest_first = 29, commands.flip(0)
+
+    def late(step):
+        return commands[step - 2]
+
+    def slow(step):
+        past = torch.stack([late(step - k) for k in range(1, 5)])
+        return Lag(history=4).apply(late(step), torch.tensor([1.5]), torch.zeros(3), past)
+
+    past = torch.stack([slow(t - 1), slow(t - 2)])
+    loose = Backlash(HALF, history=2)
+    expected = loose.apply(slow(t), torch.tensor([0.1]), torch.zeros(3), past)
+    found = both.apply(commands[t], row, torch.zeros(3), newest_first[1:15])
+    torch.testing.assert_close(found, expected)
+    batch = both.apply(
+        commands[t].expand(3, 2),
+        row.expand(3, -1),
+        torch.zeros(3, 3),
+        newest_first[1:15].expand(3, 14, 2),
+    )
+    torch.testing.assert_close(batch, expected.expand(3, 2))
+
+
 def test_nominal_families_cost_no_bit_and_change_no_shape(robot, gains):
     rows = gains.sample((50,), torch.Generator().manual_seed(0))
     action = torch.rand(50, 2, generator=torch.Generator().manual_seed(1))
@@ -155,7 +213,7 @@ def test_nominal_families_cost_no_bit_and_change_no_shape(robot, gains):
 def test_families_check_their_own_values(robot):
     assert robot.encode({"delay": 2, "v_gain": -1.0}).tolist() == [2, 0, 0, -1, 1, 0, 0, 0]
     assert robot.describe(robot.encode({"v_bias": 0.1, "delay": 1})) == "delay = 1, v_bias = 0.1"
-    with pytest.raises(ConfigurationError, match="delay=1.5: expected 0, 1 or 2"):
+    with pytest.raises(ConfigurationError, match="delay=1.5: expected whole steps"):
         robot.encode({"delay": 1.5})
     with pytest.raises(ConfigurationError, match="unknown parameter 'dealy'; allowed: delay"):
         robot.encode({"dealy": 1.0})

@@ -10,11 +10,17 @@ from hypothesis import strategies as st
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import (
     ActionGain,
+    AsymmetricGain,
+    Backlash,
     Bias,
+    DeadActuator,
     DeadZone,
     Delay,
     GainNoise,
+    Lag,
     Patches,
+    Permutation,
+    Quantisation,
     Rotation,
     Saturation,
     WheelSlip,
@@ -35,6 +41,12 @@ FAMILIES = {
     "delay": Delay(),
     "patches": Patches(),
     "gain_noise": GainNoise(),
+    "permutation": Permutation(["v_from", "omega_from"], HALF),
+    "dead": DeadActuator(["v_loss", "omega_loss"]),
+    "asymmetric": AsymmetricGain(["v", "omega"]),
+    "quantisation": Quantisation(HALF),
+    "backlash": Backlash(HALF),
+    "lag": Lag(),
 }
 every_family = pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
 
@@ -77,7 +89,7 @@ def test_the_inverse_stays_in_the_box(family):
 @every_family
 def test_a_batch_is_what_its_rows_are_alone(family):
     action, rows, state = drawn(family, 20)
-    past, noise = torch.rand(20, 2, 2).double(), torch.randn(20, 2).double()
+    past, noise = torch.rand(20, 8, 2).double(), torch.randn(20, 2).double()
     whole = family.apply(action, rows, state, past, noise)
     back = family.inverse(action, rows, state, LOW, HIGH)
     for k in (0, 7, 19):
@@ -109,6 +121,12 @@ def test_the_generator_decides_the_draw(family, shape):
         ("delay", [1.0], [2.0]),
         ("patches", [-1.5, 1.0], [-0.5, 1.0]),
         ("gain_noise", [0.1], [0.5]),
+        ("permutation", [0.0, 0.0], [1.0, 1.0]),
+        ("dead", [0.0, 0.0], [1.0, 1.0]),
+        ("asymmetric", [0.3] * 4, [1.5] * 4),
+        ("quantisation", [0.1], [0.5]),
+        ("backlash", [0.05], [0.3]),
+        ("lag", [0.5], [3.0]),
     ],
 )
 def test_the_prior_covers_its_range(family, least, most):
@@ -156,12 +174,18 @@ def test_more_traction_than_there_is_takes_the_command_of_the_peak():
     assert family.inverse(torch.zeros(2), nothing, STATE, LOW, HIGH).tolist() == [0, 0]
 
 
-PAST = torch.tensor([[0.2, 0.3], [-0.6, 0.5]])
+PAST = torch.tensor([[0.2, 0.3], [-0.6, 0.5], *[[0.0, 0.0]] * 5, [0.7, 0.1]])
 
 
 @pytest.mark.parametrize(
     ("steps", "effect"),
-    [(0.0, [1.0, 1.0]), (1.0, [0.2, 0.3]), (2.0, [-0.6, 0.5]), (0.5, [0.6, 0.65])],
+    [
+        (0.0, [1.0, 1.0]),
+        (1.0, [0.2, 0.3]),
+        (2.0, [-0.6, 0.5]),
+        (8.0, [0.7, 0.1]),
+        (0.5, [0.6, 0.65]),
+    ],
 )
 def test_a_delay_picks_the_command_of_that_many_steps_ago(steps, effect):
     found = FAMILIES["delay"].apply(torch.ones(2), torch.tensor([steps]), STATE, PAST)
@@ -172,6 +196,60 @@ def test_without_a_past_nothing_is_delayed():
     family = FAMILIES["delay"]
     row = family.encode({"delay": 2})
     assert family.apply(torch.ones(2), row, STATE).tolist() == [1, 1]
+
+
+def test_a_permutation_swaps_shares_of_the_half_ranges():
+    family = FAMILIES["permutation"]
+    row = family.encode({"v_from": 1, "omega_from": 0})
+    effect = family.apply(torch.tensor([0.5, 0.3]), row, STATE)
+    torch.testing.assert_close(effect, torch.tensor([0.2, 0.75]))
+    three = Permutation(["a", "b", "c"], [1.0] * 3)
+    row = three.encode({"a": 1, "b": 2, "c": 0})
+    assert three.apply(torch.arange(3.0), row, STATE).tolist() == [1, 2, 0]
+    box = torch.full((3,), 9.0)
+    assert three.inverse(torch.tensor([1.0, 2.0, 0.0]), row, STATE, -box, box).tolist() == [0, 1, 2]
+
+
+def test_a_dead_actuator_does_nothing_and_is_given_nothing():
+    family = FAMILIES["dead"]
+    row = family.encode({"v_loss": 1.0, "omega_loss": 0.5})
+    assert family.apply(torch.ones(2), row, STATE).tolist() == [0, 0.5]
+    assert family.inverse(torch.ones(2), row, STATE, LOW, HIGH).tolist() == [0, 1.5]
+    assert (FAMILIES["dead"].sample((50,)).sum(-1) == 1).all()
+
+
+def test_gains_differ_by_direction():
+    row = FAMILIES["asymmetric"].encode({"v_up": 2.0, "v_down": 0.5, "omega_down": 0.0})
+    action = torch.tensor([[1.0, 1.0], [-1.0, -1.0]])
+    effect = FAMILIES["asymmetric"].apply(action, row, STATE)
+    assert effect.tolist() == [[2.0, 1.0], [-0.5, 0.0]]
+
+
+def test_quantised_commands_are_multiples_of_a_step():
+    family = FAMILIES["quantisation"]
+    row = family.encode({"quantum": 0.4})
+    effect = family.apply(torch.tensor([[0.5, 1.5], [-0.7, 0.29]]), row, STATE)
+    torch.testing.assert_close(effect, torch.tensor([[0.4, 1.2], [-0.8, 0.0]]))
+
+
+def test_a_gear_with_play_follows_a_command_that_turns_back_late():
+    family = Backlash([1.0, 1.0])
+    row, commands = family.encode({"backlash": 0.2}), [0.0, 0.5, 0.9, 0.8, 0.6, 0.4, 0.0]
+    effects, past = [], torch.zeros(8, 2)
+    for command in commands:
+        now = torch.full((2,), command)
+        effects.append(float(family.apply(now, row, STATE, past)[0]))
+        past = torch.cat([now.unsqueeze(0), past[:-1]])
+    assert effects == pytest.approx([0.0, 0.3, 0.7, 0.7, 0.7, 0.6, 0.2])
+
+
+def test_a_lag_is_a_filter_of_first_order():
+    family = FAMILIES["lag"]
+    row, past, effects = family.encode({"lag": 2.0}), torch.zeros(8, 2), []
+    for _ in range(8):
+        effects.append(float(family.apply(torch.ones(2), row, STATE, past)[0]))
+        past = torch.cat([torch.ones(1, 2), past[:-1]])
+    assert effects == pytest.approx([1 - math.exp(-k / 2) for k in range(1, 9)])
 
 
 def test_patches_depend_on_the_place():
@@ -205,15 +283,19 @@ def test_a_row_is_described_by_what_is_not_nominal(gains):
         (
             "saturation",
             {"saturation": 1.5},
-            r"saturation=1.5: expected a finite number in \[0, 1\]",
+            r"saturation=1.5: expected a finite number in \[0.01, 1\]",
         ),
-        ("dead_zone", {"dead_zone": -0.1}, r"dead_zone=-0.1: .* in \[0, inf\]"),
-        ("slip", {"slip_at": -1}, r"slip_at=-1: .* in \[0, inf\]"),
+        ("saturation", {"saturation": 0}, r"saturation=0: .* in \[0.01, 1\]"),
+        ("gain", {"v_gain": 1e30}, r"v_gain=1e\+30: .* in \[-100, 100\]"),
+        ("permutation", {"v_from": 1}, r".*expected each of 0..1 once"),
+        ("lag", {"lag": 9}, r"lag=9: .* in \[0, 8\]"),
+        ("dead_zone", {"dead_zone": -0.1}, r"dead_zone=-0.1: .* in \[0, 1\]"),
+        ("slip", {"slip_at": -1}, r"slip_at=-1: .* in \[0, 10\]"),
         ("slip", {"slip_peak": "much"}, "slip_peak='much': expected a finite number"),
-        ("delay", {"delay": 3}, r"delay=3: expected a finite number in \[0, 2\]"),
-        ("delay", {"delay": 0.5}, "delay=0.5: expected 0, 1 or 2 steps"),
-        ("gain_noise", {"gain_noise": -0.1}, r"gain_noise=-0.1: .* in \[0, inf\]"),
-        ("bias", {"v_bias": math.nan}, "v_bias=nan: expected a finite number$"),
+        ("delay", {"delay": 9}, r"delay=9: expected a finite number in \[0, 8\]"),
+        ("delay", {"delay": 0.5}, "delay=0.5: expected whole steps"),
+        ("gain_noise", {"gain_noise": -0.1}, r"gain_noise=-0.1: .* in \[0, 10\]"),
+        ("bias", {"v_bias": math.nan}, r"v_bias=nan: expected a finite number in \[-10, 10\]"),
     ],
 )
 def test_values_beyond_their_limits_are_refused(family, values, complaint):
@@ -237,7 +319,7 @@ def test_values_beyond_their_limits_are_refused(family, values, complaint):
         ),
         (lambda: Rotation(1.0), "half_range=1.0: expected a finite number"),
         (lambda: Saturation([]), r"half_range=\[\]: expected"),
-        (lambda: Saturation(HALF, span=[0.2, 2.0]), r"span=2.0: .* in \[0, 1\]"),
+        (lambda: Saturation(HALF, span=[0.2, 2.0]), r"span=2.0: .* in \[0.01, 1\]"),
         (lambda: DeadZone([1.0, math.inf]), r"half_range=\[1.0, inf\]: .*action_high"),
         (lambda: DeadZone(HALF, span=[-1, 1]), "span=-1: expected"),
         (lambda: WheelSlip(HALF, at=[-1, 1]), "at=-1: expected"),
@@ -246,6 +328,10 @@ def test_values_beyond_their_limits_are_refused(family, values, complaint):
         (lambda: Patches(where=[-1]), "where=-1: expected"),
         (lambda: Patches(names=[]), r"names=\(\): expected distinct names"),
         (lambda: Patches(span=[0.0, 1.0]), "span=0.0: expected"),
+        (lambda: Delay([3, 2]), r"span=\[3, 2\]: expected two numbers of steps"),
+        (lambda: Delay([1, 9]), "highest <= 8"),
+        (lambda: AsymmetricGain(["v"], span=[0.0, 1.0]), "span=0.0: expected"),
+        (lambda: Permutation(["a"], HALF), r"names=\('a',\): expected 2 distinct names"),
         (lambda: GainNoise(span=[-0.1, 1.0]), "span=-0.1: expected"),
     ],
 )

@@ -87,13 +87,13 @@ def test_any_answer_becomes_a_safe_action(make, data):
     chain = [watch, Guard(), Answers(iter([answer.reshape(size) for answer in answers]))]
     rows = drive(base, chain, len(answers))
     last = spec.zero().clamp(spec.space.low, spec.space.high)
-    for given, answer, row in zip(watch.given, answers, rows, strict=True):
-        assert spec.is_in(given) and given.isfinite().all()
+    for passed, answer, row in zip(watch.given, answers, rows, strict=True):
+        assert spec.is_in(passed) and passed.isfinite().all()
         held = ~answer.reshape(size).isfinite().all(-1)
         assert torch.equal(row["guard", "held"], held)
-        assert torch.equal(given[held], last[held])
-        assert torch.equal(row["guard", "executed_action"], given)
-        last = given
+        assert torch.equal(passed[held], last[held])
+        assert torch.equal(row["guard", "executed_action"], passed)
+        last = passed
 
 
 def test_one_frozen_sensor_among_others():

@@ -10,8 +10,8 @@ import traceback
 from pathlib import Path
 
 from afm_rl import cli
+from afm_rl.cli.error_messages import explain, one_line
 from afm_rl.cli.launchers.job import FINISHED, SAYS
-from afm_rl.cli.mistakes import explain, one_line
 
 
 def main() -> None:

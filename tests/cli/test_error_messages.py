@@ -1,12 +1,13 @@
 """Settings that cannot be used: one line that names them, before anything is trained."""
 
+import os
 import re
 
 import pytest
 import torch
 
 from afm_rl.artefacts import save_artefact
-from afm_rl.cli.mistakes import explain, one_line
+from afm_rl.cli.error_messages import explain, one_line
 from afm_rl.errors import ConfigurationError
 from afm_rl.flow import ContextFlow
 
@@ -162,18 +163,50 @@ def test_a_checkpoint_that_is_no_checkpoint(refuse, tmp_path):
     assert "corrector.checkpoint: " in line and "damaged" in line
 
 
-@pytest.mark.parametrize("target", ["os.system", "subprocess.run", "builtins.eval"])
-@pytest.mark.parametrize("place", ["planner", "robot.env", "updater.optimizer"])
-def test_a_loaded_configuration_runs_no_command(refuse, tmp_path, target, place):
+def test_a_configuration_from_a_file_runs_no_command(refuse, tmp_path):
     canary = tmp_path / "canary"
-    line = refuse(
-        "method=online_pe",
-        f"{place}._target_={target}",
-        f"+{place}._args_=['touch {canary}']",
-        f"{place}._partial_=false",
-    )
-    assert f"{place}: Target '{target}' is blocklisted" in line
-    assert not canary.exists()
+    evil = f"{{_target_: os.system, command: touch {canary}}}"
+    wishes = {
+        "planner": evil,
+        "label": evil,
+        "updater": f"{{optimizer: {evil}}}",
+        "hydra": f"{{callbacks: {{x: {evil}}}}}",
+        "hydra ": f"{{launcher: {{x: {evil}}}}}",
+        "hydra  ": "{job_logging: {handlers: {x: {class: subprocess.Popen, args: touch}}}}",
+        "hydra   ": "{job_logging: {formatters: {x: {(): os.system}}}}",
+        "trust": "[os]\nplanner: " + evil,
+    }
+    for number, (key, wish) in enumerate(wishes.items()):
+        (tmp_path / "conf").mkdir(exist_ok=True)
+        text = f"defaults: [config, _self_]\n{key.strip()}: {wish}\n"
+        (tmp_path / "conf" / f"evil{number}.yaml").write_text(text)
+        line = refuse(f"--config-dir={tmp_path}/conf", f"--config-name=evil{number}")
+        assert "trust=[PACKAGE]" in line or "expected one of logging.StreamHandler" in line
+        assert not canary.exists()
+
+
+def test_a_package_is_trusted_on_the_command_line_alone(refuse, monkeypatch, tmp_path):
+    (tmp_path / "mine.py").write_text("from os import system\ndef made(): ...\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    target = "planner._target_=mine.made"
+    assert "planner._target_='mine.made': only parts of afm_rl" in refuse(target)
+    assert "planner: made() got an unexpected" in refuse(target, "trust=[mine]")
+    line = refuse("trust=[mine]", "planner._target_=mine.system")
+    assert "is code of posix" in line  # trusted is what the package defines
+    assert refuse("trust=mine").startswith("afm-rl: trust='mine': expected a list of names")
+    assert "AFM_RL_TRUST" not in os.environ
+
+
+def test_a_misspelt_setting_suggests_the_nearest_one(refuse):
+    table = {
+        "planner.horizn=3": "did you mean planner.horizon?",
+        "planer=cem": "did you mean planner?",
+        "method=afm_physics corrector.gat=3": "did you mean corrector.gate?",
+        "method=physics horizon=3": "did you mean planner.horizon?",
+        "xyzxyz=3": "afm-rl --cfg job shows all settings",
+    }
+    for overrides, advice in table.items():
+        assert refuse(*overrides.split()).endswith(f": there is no such setting; {advice}\n")
 
 
 def test_yaml_tags_are_not_followed(refuse, tmp_path):

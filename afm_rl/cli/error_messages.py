@@ -1,0 +1,116 @@
+"""Errors in one line, for people."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from afm_rl.errors import AFMError
+
+NOISE = ("Config search path:", "Set the env", "See https://")  # of no help here
+UNKNOWN = re.compile(r"Could not override '([^']+)'")  # Hydra's words for a misspelt setting
+MEMORY = ("not enough memory", "can't allocate memory", "out of memory")  # torch's words
+
+
+def explain(error: BaseException) -> str | None:
+    """Return one line that says what is wrong with the settings, or None for other errors.
+
+    >>> explain(FileNotFoundError(2, "No such file or directory", "track.csv"))
+    'track.csv: No such file or directory'
+    >>> explain(RuntimeError("a bug")) is None
+    True
+    """
+    chain = list(_causes(error))
+    for cause in chain:
+        if isinstance(cause, AFMError):
+            return one_line(str(cause))
+    for cause in chain:
+        if isinstance(cause, HydraException | OmegaConfBaseException | YAMLError):
+            unknown = UNKNOWN.search(str(cause))
+            if unknown:
+                return _unknown(unknown[1], sys.argv[1:])
+            merging = str(cause).startswith("Error merging")  # Hydra keeps the reason to itself
+            return one_line(f"{cause}: {cause.__cause__}" if merging else str(cause))
+        if isinstance(cause, OSError) and cause.strerror:
+            return one_line(f"{cause.filename or 'files'}: {cause.strerror}")
+        if isinstance(cause, MemoryError) or any(words in str(cause) for words in MEMORY):
+            return (
+                "not enough memory: choose fewer tracks, regimes or seeds at a time, a smaller "
+                "planner.population or a shorter planner.horizon"
+            )
+    return None
+
+
+def _unknown(key: str, overrides: Sequence[str]) -> str:
+    """Return the complaint about a setting that does not exist, with the nearest one."""
+    near = nearest(key, _known(overrides))
+    advice = f"did you mean {near}?" if near else "afm-rl --cfg job shows all settings"
+    return f"{key}: there is no such setting; {advice}"
+
+
+def nearest(key: str, known: Sequence[str]) -> str | None:
+    """Return the known setting that a misspelt one is most like.
+
+    >>> nearest("planner.horizn", ["planner.horizon", "planner.sigma", "budget"])
+    'planner.horizon'
+    >>> nearest("xyz", ["planner.horizon", "budget"]) is None
+    True
+    """
+    found = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+    if not found:  # the right name in the wrong place
+        last = [name for name in known if name.rpartition(".")[2] == key.rpartition(".")[2]]
+        found = difflib.get_close_matches(key, last, n=1, cutoff=0.0)
+    return found[0] if found else None
+
+
+def _known(overrides: Sequence[str]) -> list[str]:
+    """Return all settings of the choices among the overrides, as far as these can be composed."""
+    choices = [text for text in overrides if re.fullmatch(r"\w+=\w+", text)]
+    for chosen in (choices, []):
+        GlobalHydra.instance().clear()
+        try:
+            with initialize_config_module("afm_rl.conf", version_base="1.3"):
+                cfg = compose("config", chosen)
+            return list(_paths(OmegaConf.to_container(cfg, resolve=False), ""))
+        except (HydraException, OmegaConfBaseException):
+            continue
+    return []
+
+
+def _paths(settings: Any, place: str) -> Iterator[str]:
+    if place:
+        yield place
+    if isinstance(settings, Mapping):
+        for key, value in settings.items():
+            yield from _paths(value, f"{place}.{key}" if place else str(key))
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def one_line(text: str) -> str:
+    r"""Put a message of several lines into one; indented lines are the items of a list.
+
+    >>> one_line("Choose one of:\n\tcem\n\tmppi\nConfig search path:\n\tsomewhere")
+    'Choose one of: cem, mppi'
+    """
+    for noise in NOISE:
+        text = text.partition(noise)[0]
+    joined = ""
+    for line in filter(str.strip, text.splitlines()):
+        item = line[0].isspace() and bool(joined) and not joined.endswith(":")
+        joined += (", " if item else " ") + " ".join(line.split())
+    return joined.strip()

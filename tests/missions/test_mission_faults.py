@@ -1,0 +1,167 @@
+"""One mission's bad readings and plans: the others do not notice, and nothing is learned."""
+
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Transform
+
+from afm_rl.errors import ConfigurationError, NonFiniteError
+from afm_rl.missions import run
+
+FLIGHT = ("robot=quadrotor", "dynamics=physics")
+PLANNERS = {
+    "mppi": (),
+    "icem": ("planner=icem",),
+    "cem": ("planner=cem",),
+    "torchrl_mppi": ("planner=torchrl_mppi",),
+    "geometric": (*FLIGHT, "planner=geometric"),
+    "mpc": FLIGHT,
+}
+NAN = float("nan")
+
+
+class Sensor(Transform):
+    """Mission 0's readings are replaced, or kept back, at some steps."""
+
+    def __init__(self, steps, value=None):
+        super().__init__(in_keys=["observation"])
+        self.steps, self.value, self.kept = steps, value, None
+
+    def _step(self, tensordict, next_tensordict):
+        seen = next_tensordict["observation"].clone()
+        if int(next_tensordict["step"][0]) - 1 in self.steps:
+            seen[0] = self.kept if self.value is None else self.value
+        self.kept = seen[0].clone()
+        return next_tensordict.set("observation", seen)
+
+    def _reset(self, tensordict, tensordict_reset):
+        return tensordict_reset
+
+
+class Breaks(TensorDictModuleBase):
+    """A policy of somebody else's, that plans NaN for mission 0 at step 2."""
+
+    def __init__(self, planner):
+        super().__init__()
+        self.planner, self.in_keys, self.out_keys = planner, planner.in_keys, planner.out_keys
+
+    def forward(self, tensordict):
+        tensordict = self.planner(tensordict)
+        if int(tensordict["step"][0]) == 2:
+            tensordict["action"][0] = NAN
+        return tensordict
+
+
+def drive(agent, sensor=None):
+    if sensor is not None:
+        agent.env.insert_transform(0, sensor)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # plans without a finite return are announced
+        return run(agent)
+
+
+def of(table, mission):
+    return table[table["mission"] == mission].drop(columns="seconds", errors="ignore")
+
+
+def same(left, right):
+    pd.testing.assert_frame_equal(
+        left.reset_index(drop=True), right.reset_index(drop=True), check_exact=True
+    )
+
+
+@pytest.fixture
+def three(make_agent, ring):
+    def make(*overrides, **settings):
+        track = {} if "robot=quadrotor" in overrides else {"tracks": ring}
+        return make_agent(*overrides, **{**track, "seeds": 3, "budget": 8, **settings})
+
+    return make
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_reading_that_is_nan_is_survived_and_the_others_do_not_notice(three, planner):
+    healthy = drive(three(*PLANNERS[planner]))
+    faulty = drive(three(*PLANNERS[planner]), Sensor([2], NAN))
+    for mission in (1, 2):
+        same(of(faulty.steps, mission), of(healthy.steps, mission))
+        same(of(faulty.missions, mission), of(healthy.missions, mission))
+    assert faulty.missions["faults"].tolist() == [2, 0, 0]  # into the reading, and out of it
+    first = of(faulty.steps, 0)
+    assert len(first) == 8
+    assert first["fault"].tolist() == [0, 0, 1, 1, 0, 0, 0, 0]
+    executed = first.filter(like="executed_").to_numpy()
+    assert np.isfinite(executed).all()
+    if planner == "geometric":  # it plans NaN from NaN
+        assert (executed[3] == executed[2]).all()
+
+
+def test_a_policy_that_plans_nan(three):
+    agent = three()
+    agent.planner = Breaks(agent.planner)
+    results = drive(agent)
+    assert results.missions["faults"].tolist() == [1, 0, 0]
+    first = of(results.steps, 0)
+    assert first["planned_v"].isna().tolist() == [False, False, True] + [False] * 5
+    assert first["executed_v"].iloc[2] == first["executed_v"].iloc[1]
+
+
+def test_a_mission_with_a_fault_can_be_ended(three):
+    results = drive(three("faults=skip"), Sensor([2], NAN))
+    assert results.missions["steps"].tolist() == [2, 7, 7]
+    assert results.missions["faults"].tolist() == [1, 0, 0]
+    flight = drive(three(*FLIGHT, "planner=geometric", "faults=skip"), Sensor([2], NAN))
+    assert flight.missions["finished"].tolist() == [False, True, True]
+
+
+def test_or_the_run_can_be_ended(three):
+    with pytest.raises(NonFiniteError, match=r"step 2: missions \[0\]: .* faults=hold goes on"):
+        drive(three("faults=raise"), Sensor([2], NAN))
+    with pytest.raises(ConfigurationError, match="faults='ignore': expected one of hold, skip, r"):
+        three(faults="ignore")
+
+
+LEARNERS = ["online_pe", "stream_x_pe", "rls", "afm_physics"]
+
+
+@pytest.mark.parametrize("method", LEARNERS)
+def test_a_frozen_sensor_teaches_nothing(three, method):
+    changed = {"regimes": [{"v_gain": -1.0}], "robot.schedule.at": []}
+    agent = three(f"method={method}", budget=9, **changed)
+    seen, learn = [], agent.updater.forward
+
+    def watch(td):
+        before = [value[0].clone() if value.dim() else value.clone() for value in state(agent)]
+        out = learn(td)
+        after = [value[0] if value.dim() else value for value in state(agent)]
+        seen.append(all(map(torch.equal, before, after)))
+        return out
+
+    agent.updater.forward = watch
+    results = drive(agent, Sensor([3, 4, 5]))
+    first = of(results.steps, 0)
+    assert seen[3:7] == [True] * 4
+    if method != "afm_physics":  # its model does not learn
+        assert not any(seen[1:3] + seen[7:])
+        assert first["loss"].isna().tolist() == [False] * 3 + [True] * 4 + [False] * 2
+    if not method.endswith("pe"):  # hardly trained networks foresee no movement
+        assert first["fault"].tolist() == [0, 0, 0, 1, 1, 1, 1, 0, 0]
+        assert results.missions["faults"].tolist() == [4, 0, 0]
+
+
+def state(agent):
+    names = ("weights", "biases", "matrix", "bias", "shape")
+    model = agent.model
+    return [v for k, v in model.state_dict().items() if any(name in k for name in names)]
+
+
+def test_a_robot_without_power_is_not_taken_for_a_frozen_sensor_forever(three):
+    settings = {"regimes": [{"v_gain": 0.0, "omega_gain": 0.0}], "robot.schedule.at": []}
+    quiet = {"robot.env.process_noise": 0.0, "robot.env.start_noise": 0.0}
+    steps = drive(three("method=rls", budget=26, **settings, **quiet)).steps
+    assert steps[steps["fault"] == 1]["t"].unique().tolist() == list(range(21))
+    assert steps[steps["t"] > 20]["loss"].notna().all()  # learned from
