@@ -7,8 +7,6 @@ from afm_rl.flow import AxisNetwork, Rows, fit_experts
 from afm_rl.flow.experts import EXPERTS
 from afm_rl.flow.saturation import MODES
 
-SIZES = [1, 2, 3, 6, 17]
-
 
 def drawn(*shape, seed=0):
     return 2 * torch.rand(*shape, generator=torch.Generator().manual_seed(seed)) - 1
@@ -98,20 +96,6 @@ def test_sets_of_rows_can_be_picked(network):
         which = torch.tensor(which)
         found = network.effect(encoded.pick(which), points[which])
         torch.testing.assert_close(found, expected[which], rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("axes", SIZES)
-def test_rows_that_are_not_valid_do_not_matter(network, axes):
-    rows, plans, points = example(3, axes)
-    junk = [
-        torch.where(p_valid == 1.0, part, 7.0 * drawn(*part.shape, seed=8))
-        for part, p_valid in ((part, rows.valid) for part in rows[:3])
-    ]
-    other = Rows(junk[0], junk[1], junk[2].abs(), rows.valid)
-    for found, expected in zip(
-        answers(network, other, plans, points), answers(network, rows, plans, points), strict=True
-    ):
-        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
 
 
 def test_without_any_row_the_answers_are_finite(network):
