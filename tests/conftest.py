@@ -9,8 +9,9 @@ from hypothesis import settings
 
 import afm_rl.flow
 import afm_rl.learning
+from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, Ensemble
-from afm_rl.flow import ContextFlow, train_flow
+from afm_rl.flow import AxisNetwork
 from afm_rl.learning import pretrain_ensemble
 from afm_rl.manifold import Manifold
 from afm_rl.regimes import ActionGain
@@ -97,24 +98,34 @@ def trained_error(_trained_ensemble):
     return _trained_ensemble[1]
 
 
-@pytest.fixture(scope="session")
-def _trained_flow():
-    flow = ContextFlow(LOW, HIGH, window=4, hidden=[48, 48], latent=24)
-    prior = ActionGain(["v_gain", "omega_gain"], low=0.5, high=2.0)
-    error = train_flow(flow, Dubins(), prior, STATES, iterations=300, batch_size=256, lr=5e-3)
-    return flow, error
+@pytest.fixture
+def universal_flow():
+    """The action flow of the ground robot, as it comes with the package."""
+    return ActionFlow(LOW, HIGH)
 
 
 @pytest.fixture
-def trained_flow(_trained_flow):
-    """A small flow for the nominal ground robot under gains; a copy for each test."""
-    return copy.deepcopy(_trained_flow[0])
+def small_flow():
+    """Make an action flow of the ground robot with a small network that knows nothing."""
+
+    def make(seed=0, **settings):
+        network = AxisNetwork(width=16, latent=8, seed=seed)
+        return ActionFlow(LOW, HIGH, network=network, **settings)
+
+    return make
 
 
 @pytest.fixture
-def trained_flow_error(_trained_flow):
-    """Its held-out error."""
-    return _trained_flow[1]
+def remembered():
+    """Read the newest transitions in the entries of a transform, by name."""
+
+    def read(corrector, entries, states=3):
+        rows = corrector.unpack(entries["memory"], states)["transitions"]
+        names = "state", "planned", "executed", "next_state", "valid"
+        parts = dict(zip(names, corrector.split_transitions(rows, states), strict=True))
+        return {**parts, "valid": parts["valid"].squeeze(-1) == 1.0}
+
+    return read
 
 
 @pytest.fixture

@@ -141,4 +141,4 @@ def _nearest(pairs: Tensor, away: Tensor, rows: int) -> Tensor:
     """Return the K pairs ``(*B, K, D)`` nearest to here, the nearest last."""
     age = torch.arange(away.shape[-1] - 1, -1, -1, device=away.device) / AGE
     nearest = (away + age.square()).topk(rows, -1, largest=False).indices.flip(-1)
-    return pairs.take_along_dim(nearest.unsqueeze(-1), -2)
+    return pairs.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, pairs.shape[-1]))

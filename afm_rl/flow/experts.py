@@ -274,7 +274,7 @@ def fit_experts(rows: Rows) -> Experts:
     inputs, valid = rows.executed.double(), rows.valid.double().mT
     u, e = inputs.mT, rows.effective.double().mT  # (N, A, K)
     size, (count, axes, length) = u.shape[-2], u.shape
-    ages, prior, nominal = _constants(length, size)
+    ages, prior, nominal = _constants(length, size, u.device)
     weights = ages * (valid * confidence(rows.std.double().mT)).unsqueeze(-2)  # (N, A, 2, K)
     long = weights[..., 1, :]
     moved = (long * (e.abs() > STUCK)).unsqueeze(-2)
@@ -332,13 +332,14 @@ def _solve_line(moments: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @lru_cache(maxsize=16)
-def _constants(rows: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
+def _constants(rows: int, size: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Return the weights by age ``(2, K)`` and the moments of the priors.
 
     Those of the lines are ``(3, 8)``, those of the affine map ``(A + 1, A + 1)``.
     """
-    age = torch.arange(rows - 1, -1, -1, dtype=torch.float64)
-    prior = torch.zeros(3, 8, dtype=torch.float64)
+    kind = {"dtype": torch.float64, "device": device}
+    age = torch.arange(rows - 1, -1, -1, **kind)
+    prior = torch.zeros(3, 8, **kind)
     prior[:, [0, 3]], prior[:, [2, 7]] = PRIOR, 10 * PRIOR
-    nominal = PRIOR * torch.eye(size + 1, dtype=torch.float64)
+    nominal = PRIOR * torch.eye(size + 1, **kind)
     return torch.stack([SHORT**age, LONG**age]), prior, nominal

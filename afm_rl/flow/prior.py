@@ -264,7 +264,7 @@ def draw_examples(
     effective = torch.where(fresh == 1.0, now.effect(executed), before.effect(executed))
     flicker = draw.uniform(0.1, 0.5, count, 1, 1) * draw.chance(0.06, count, 1, 1)
     effective = effective * (1 + flicker * draw.normal(count, rows, axes))
-    std = draw.log_uniform(1e-4, 0.1, count, 1, 1) * draw.log_uniform(0.3, 3.0, count, 1, axes)
+    std = draw.log_uniform(1e-5, 0.1, count, 1, 1) * draw.log_uniform(0.3, 3.0, count, 1, axes)
     mute = draw.chance(0.2, count, 1, 1) & draw.chance(0.3, count, rows, axes)
     std = torch.where(mute, draw.log_uniform(0.3, LIMIT, count, rows, axes), std)
     noise = std * draw.normal(count, rows, axes)
@@ -292,7 +292,7 @@ def draw_actions(count: int, rows: int, axes: int, draw: Draw) -> Tensor:
     """Draw executed actions ``(N, K, A)``: half of the windows keep near one action."""
     wide = draw.uniform(-1.0, 1.0, count, rows, axes)
     around = EDGE * draw.uniform(-1.0, 1.0, count, 1, axes)
-    spread = 0.4 * draw.uniform(0.0, 1.0, count, 1, axes)
+    spread = draw.log_uniform(0.01, 0.6, count, 1, axes)
     return torch.where(draw.chance(0.5, count, 1, 1), wide, (around + spread * wide).clamp(-1, 1))
 
 
@@ -317,7 +317,7 @@ def _draw_plans(now: Maps, last: Tensor, plans: int, draw: Draw) -> Tensor:
     kind = torch.rand(*size, 1, generator=draw.generator)
     anywhere = draw.uniform(-1.0, 1.0, *size, axes)
     achievable = now.effect(draw.uniform(-1.0, 1.0, *size, axes))
-    near = now.effect(last) + 0.1 * draw.normal(*size, axes)
-    near = torch.where(draw.chance(0.3, *size, 1), -near, near)
-    plan = torch.where(kind < 0.45, anywhere, torch.where(kind < 0.8, achievable, near))
+    near = now.effect(last) + draw.log_uniform(0.01, 0.3, *size, 1) * draw.normal(*size, axes)
+    near = torch.where(draw.chance(0.25, *size, 1), -near, near)
+    plan = torch.where(kind < 0.4, anywhere, torch.where(kind < 0.65, achievable, near))
     return plan.clamp(-2.0, 2.0)

@@ -22,8 +22,8 @@ from afm_rl.learning import InPlaceLoss
 from afm_rl.regimes import Regime
 
 SOURCE_STD = 0.3  # of the path's start around the plan, in half ranges
-EFFECT_WEIGHT, SIZE_WEIGHT = 0.4, 0.2  # of the loss of effects, and of the size of all errors
-PRECISION = 0.02  # half ranges: smaller errors count less
+EFFECT_WEIGHT, SIZE_WEIGHT = 0.6, 0.5  # of the loss of effects, and of the size of all errors
+PRECISION = 0.01  # half ranges: smaller errors count less
 States = tuple[Tensor, Tensor] | Tensor
 
 
@@ -32,7 +32,7 @@ def flow_losses(
 ) -> tuple[Tensor, Tensor]:
     r"""Return the losses ``(N,)`` of velocity and effect.
 
-    .. math:: \|r\|^2 + 0.2\,|r|_\epsilon,\ r = v(c, u_0, \tau, x_\tau) - (x_1 - x_0),\qquad
+    .. math:: \|r\|^2 + 0.5\,|r|_\epsilon,\ r = v(c, u_0, \tau, x_\tau) - (x_1 - x_0),\qquad
               |r|_\epsilon,\ r = \hat T(u) - T(u),\qquad
               |r|_\epsilon = \sqrt{r^2 + \epsilon^2} - \epsilon
 

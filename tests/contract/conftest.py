@@ -8,6 +8,7 @@ import torch
 from pushing import push
 from tensordict import TensorDict
 
+from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
 from afm_rl.dynamics import (
     KNODE,
     Calibrated,
@@ -17,7 +18,7 @@ from afm_rl.dynamics import (
     Oracle,
     Quadrotor,
 )
-from afm_rl.flow import CFMLoss, Context, ContextFlow, LeastSquares, PaperFlow, Window
+from afm_rl.flow import AxisNetwork, CFMLoss
 from afm_rl.learning import (
     FreshAdam,
     GaussianNLLLoss,
@@ -76,15 +77,14 @@ def predict(model, batch, **kind):
     return model(state, action), expected, noise, model.jacobian(state, action)
 
 
-def correct(flow, batch, **kind):
-    rows = [draw(batch, flow.window, n, seed=n, **kind) for n in (3, 2, 2, 3)]
-    window = Window(*rows, draw(batch, flow.window, **kind) >= 0)
-    sizes = (flow.window, flow.pair_size), (flow.evidence_size,), (flow.context_size,)
-    silent = torch.zeros(batch, **kind)
-    last = Context(*(draw(batch, *size, **kind) for size in sizes), silent, silent.bool())
-    context = flow.context(window, Dubins().to(**kind), last)
-    found = flow.correct(context, rows[0][..., -1, :], rows[1][..., -1, :])
-    return *context[:4], *(part for part in found if part is not None)
+def correct(corrector, batch, **kind):
+    model, box = Dubins().to(**kind), torch.stack(BOX).to(**kind).expand(*batch, 2, 2)
+    memory, said = corrector.begin(draw(batch, 3, **kind)), []
+    for seed in range(3):
+        memory, found = corrector.correct(memory, draw(batch, 2, seed=seed, **kind), model, box)
+        memory = corrector.observe(memory, draw(batch, 3, seed=seed + 3, **kind))
+        said += found[:-1]
+    return (*said, memory)
 
 
 def plan(planner, batch, **kind):
@@ -113,9 +113,11 @@ def measure(loss, batch, **kind):
 
 
 def match(loss, batch, **kind):
-    data = {"features": draw(batch, loss.flow.feature_size, **kind)}
-    for seed, name in enumerate(loss.in_keys[1:]):
-        data[name] = draw(batch, 2, seed=seed, **kind)
+    sizes = {"std": (6, 2), "executed": (6, 2), "effective": (6, 2), "valid": (6, 1)}
+    data = {
+        name: draw(batch, *sizes.get(name, (4, 2)), seed=seed, **kind)
+        for seed, name in enumerate(loss.in_keys)
+    }
     return (loss(TensorDict(data, batch))["loss_cfm"],)
 
 
@@ -138,13 +140,13 @@ def updater(kind, *more, seed=0, dtype=torch.float32, **settings):
     return kind(GaussianNLLLoss(model), *more)
 
 
-SMALL_FLOW = {"window": 3, "memory": 7, "hidden": [8], "latent": 4}
+def network(seed=0):
+    return AxisNetwork(width=16, latent=8, seed=seed)
 
 
 def policy(seed=0, dtype=torch.float32):
-    model = Dubins().to(dtype)
-    flow = ContextFlow(*BOX, window=3, hidden=[8], latent=4, seed=seed).to(dtype)
-    return ActionFlowPolicy(model, flow, world(dtype=dtype).action_spec)
+    flow = ActionFlow(*BOX, network=network(seed)).to(dtype)
+    return ActionFlowPolicy(Dubins().to(dtype), world(dtype=dtype).action_spec, flow)
 
 
 FEW = {"population": 12, "iterations": 2}
@@ -162,12 +164,11 @@ MODULES = {
     "Oracle": Case(lambda seed: Oracle(Dubins(), ActionGain(["v", "omega"])), predict),
     "Quadrotor": Case(lambda seed: Quadrotor(), predict),
     "KNODE": Case(lambda seed: KNODE(Quadrotor()), predict),
-    "ContextFlow": Case(
-        lambda seed: ContextFlow(*BOX, **SMALL_FLOW, place=[0, 1], seed=seed), correct
-    ),
-    "PaperFlow": Case(lambda seed: PaperFlow(*BOX, [2], 3, width=8, seed=seed), correct),
+    "ActionFlow": Case(lambda seed: ActionFlow(*BOX, place=[0, 1], network=network(seed)), correct),
+    "PaperFlow": Case(lambda seed: PaperFlow(*BOX, [2], 3, gate=0.1, width=8, seed=seed), correct),
     "LeastSquares gain": Case(lambda seed: LeastSquares(*BOX), correct),
     "LeastSquares affine": Case(lambda seed: LeastSquares(*BOX, form="affine"), correct),
+    "L1Augmentation": Case(lambda seed: L1Augmentation(*BOX, dt=0.2), correct),
     "MPPI": Case(partial(planner, MPPI, **FEW), plan),
     "ICEM": Case(partial(planner, ICEM, **FEW, elites=3), plan),
     "MPC": Case(partial(planner, MPC, cost=TRACKING), plan),
@@ -175,12 +176,7 @@ MODULES = {
     "TorchRLMPPI": Case(partial(planner, TorchRLMPPI, **FEW, elites=3), plan),
     "ActionFlowPolicy": Case(policy, execute),
     "GaussianNLLLoss": Case(lambda seed: GaussianNLLLoss(small(seed), reduction="none"), measure),
-    "CFMLoss": Case(
-        lambda seed: CFMLoss(PaperFlow(*BOX, [2], 3, width=8, seed=seed), reduction="none"), match
-    ),
-    "CFMLoss with effects": Case(
-        lambda seed: CFMLoss(ContextFlow(*BOX, **SMALL_FLOW, seed=seed), reduction="none"), match
-    ),
+    "CFMLoss": Case(lambda seed: CFMLoss(network(seed), reduction="none"), match),
     "Updater": Case(partial(updater, Updater), learn),
     "OnlineUpdater": Case(partial(updater, OnlineUpdater, ADAM), learn),
     "RLSUpdater": Case(
@@ -195,7 +191,9 @@ BOUND_TO_VALUES = (
     *("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI"),
     *("OnlineUpdater", "RLSUpdater", "StreamXUpdater", "UnmatchedUpdater"),
 )
-LOOKS_AT_VALUES = ("ContextFlow",)  # only what is surprising is looked at closely
+LOOKS_AT_VALUES = (  # only where there is an innovation is anything corrected
+    *("ActionFlow", "PaperFlow", "LeastSquares gain", "LeastSquares affine", "L1Augmentation"),
+)
 BUILT_IN_PRECISION = ("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI")
 
 

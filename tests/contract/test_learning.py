@@ -14,7 +14,7 @@ from torchrl.trainers import ReplayBufferTrainer, Trainer
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import CFMLoss, PaperFlow
+from afm_rl.flow import AxisNetwork, CFMLoss, draw_examples
 from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater, Updater, UpdaterHook
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 
@@ -134,14 +134,14 @@ def test_a_trainer_descends_the_likelihood(make_ensemble):
     assert not torch.equal(weights(model), before) and len(buffer) == 24
 
 
-def test_a_trainer_descends_the_flow_matching_loss(box):
-    flow = PaperFlow(*box, features=[2], state_size=3, width=8)
-    before = weights(flow)
-    batch = {"features": torch.randn(8, flow.feature_size)}
-    batch |= {name: torch.randn(8, 2) for name in ("planned", "intended")}
-    trainer = trainer_of(CFMLoss(flow), _Examples(TensorDict(batch, [8])))
+def test_a_trainer_descends_the_flow_matching_loss():
+    network = AxisNetwork(width=16, latent=8)
+    before = weights(network)
+    drawn = draw_examples(8, 2, 6, 4, "mixed", torch.Generator().manual_seed(0))
+    batch = TensorDict({**drawn.rows._asdict(), **drawn._asdict()}, [8]).exclude("rows")
+    trainer = trainer_of(CFMLoss(network), _Examples(batch))
     trainer.train()
-    assert not torch.equal(weights(flow), before)
+    assert not torch.equal(weights(network), before)
 
 
 class _Examples:

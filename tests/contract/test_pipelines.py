@@ -12,10 +12,10 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, GymWrapper, ParallelEnv, TransformedEnv, VecGymEnvTransform
 from torchrl.envs.utils import step_mdp
 
+from afm_rl.correction import LeastSquares
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import ContextFlow, LeastSquares
 from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater, Updater
 from afm_rl.planning import ICEM, MPPI, GoalDistance, PlanningEnv
 from afm_rl.regimes import Schedule
@@ -34,7 +34,7 @@ def car(box, *more, batch=(), model=None, **settings):
 
 
 @pytest.mark.parametrize("kind", [MPPI, ICEM])
-def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind):
+def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind, remembered):
     planner = kind(PlanningEnv(Dubins(), GoalDistance(), *box), horizon=3, population=20)
     env = car(box, planner.make_tensordict_primer(), batch=(2,), max_steps=5)
     collector = Collector(env, planner, frames_per_batch=12, total_frames=12)
@@ -47,21 +47,22 @@ def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind):
     assert torch.equal(memory["planned_action"], sample["action"])
     apart = (memory["executed_action"] != sample["action"]).any(-1)
     assert torch.equal(apart, memory["misaligned"]) and apart.any()
-    assert (data["afm", "window", "valid"][:, 5] == 0).all()  # a new episode, a new memory
+    past = remembered(env.transform[0].corrector, data["afm"])
+    assert not past["valid"][:, 5].any()  # a new episode, a new memory
 
 
-def test_terminal_states_reach_the_window_and_resets_do_not(box):
+def test_terminal_states_reach_the_memory_and_resets_do_not(box, remembered):
     env = car(box, batch=(2,), max_steps=3)
-    td = env.reset()
+    td, corrector = env.reset(), env.transform[0].corrector
     for step in range(7):
         td = env.rand_action(td)
         whole, td = env.step_and_maybe_reset(td)
-        after = whole["next", "afm", "window"]
+        after = remembered(corrector, whole["next", "afm"])
         torch.testing.assert_close(after["next_state"][:, -1], whole["next", "pose"])
         torch.testing.assert_close(after["state"][:, -1], whole["pose"])
         fresh = whole["next", "done"].squeeze(-1)
         assert fresh.all() == (step % 3 == 2)
-        assert (td["afm", "window", "valid"].any(-1) != fresh).all()
+        assert (remembered(corrector, td["afm"])["valid"].any(-1) != fresh).all()
 
 
 @pytest.mark.parametrize("mode", ["SAME_STEP", "DISABLED"])
@@ -73,7 +74,7 @@ def test_vectorised_gymnasium_environments_keep_terminal_states(mode):
     env = TransformedEnv(GymWrapper(envs), Compose(*chain, afm(box)))
     data = env.rollout(9, break_when_any_done=False)
     assert data["next", "done"].sum() >= 4
-    assert float(data["next", "afm", "surprise"].max()) < 0.1
+    assert float(data["next", "afm", "innovation"].max()) < 0.1
 
 
 class Short(gymnasium.Env):
@@ -92,10 +93,9 @@ class Short(gymnasium.Env):
         return self.state.numpy(), 0.0, self.count == 4, False, {}
 
 
-def test_a_compiled_environment_steps_alike(box):
-    env = car(box, batch=(3,))
-    flow = ContextFlow(*box, window=3, hidden=[8], latent=4)
-    env.transform[0].flow = flow
+def test_a_compiled_environment_steps_alike(small_flow):
+    base = UGVTrack(batch_size=(3,), process_noise=0.0, **REVERSED)
+    env = TransformedEnv(base, Compose(ActionFlowTransform(Dubins(), small_flow())))
     start = env.rollout(3)[:, -1]
     td = step_mdp(start).set("action", torch.full((3, 2), 0.4))
     expected = env.step(td.clone())

@@ -5,9 +5,9 @@ import re
 import pytest
 import torch
 
+from afm_rl.correction import LeastSquares
 from afm_rl.dynamics import Dubins, Ensemble, KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import ContextFlow, LeastSquares
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, Updater, UpdaterHook
 from afm_rl.manifold import Manifold
 from afm_rl.planning import CEM, ICEM, MPC, MPPI, GoalDistance, PlanningEnv
@@ -50,12 +50,14 @@ REFUSED = {
     "transform.model: expected a DynamicsModel, got None": lambda: ActionFlowTransform(
         None, LeastSquares(*BOX)
     ),
-    "transform.flow: expected a Corrector, got None": lambda: ActionFlowTransform(Dubins(), None),
-    "key ('afm', 1): expected a text": lambda: ActionFlowTransform(
-        Dubins(), ContextFlow(*BOX), prefix=("afm", 1)
+    "transform.corrector: expected a Corrector, got 3": lambda: ActionFlowTransform(Dubins(), 3),
+    "made for 1 actions, but the dynamics model has 2": lambda: ActionFlowTransform(
+        Dubins(), LeastSquares([-1.0], [1.0])
     ),
-    "key []: expected a text": lambda: ActionFlowTransform(
-        Dubins(), ContextFlow(*BOX), observation_key=[]
+    "key ('afm', 1): expected a text": lambda: ActionFlowTransform(Dubins(), prefix=("afm", 1)),
+    "in_keys=[]: expected one key": lambda: ActionFlowTransform(Dubins(), in_keys=[]),
+    "in_keys_inv=['a', 'b']: expected one key": lambda: ActionFlowTransform(
+        Dubins(), in_keys_inv=["a", "b"]
     ),
 }
 

@@ -1,0 +1,195 @@
+"""The contract of correctors: one memory, three pure functions."""
+
+import math
+
+import pytest
+import torch
+
+from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
+from afm_rl.correction.base import Correction, Corrector
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
+from afm_rl.faults import PATIENCE
+from afm_rl.flow import AxisNetwork
+
+LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+
+
+class Watching(Corrector):
+    """Keeps three transitions, and corrects nothing."""
+
+    def __init__(self, low=LOW, high=HIGH):
+        super().__init__(low, high, gate=1.0, recent=3)
+
+    def correct(self, memory, planned, model, box):
+        return self.executing(memory, planned, planned), self.unchanged(
+            planned, planned[..., 0], box
+        )
+
+
+def correctors():
+    """One of each kind."""
+    network = AxisNetwork(width=16, latent=8)
+    return {
+        "flow": ActionFlow(LOW, HIGH, network=network),
+        "flow by place": ActionFlow(LOW, HIGH, place=[0, 1], network=network),
+        "gain": LeastSquares(LOW, HIGH),
+        "gain and offset": LeastSquares(LOW, HIGH, form="gain_offset"),
+        "affine": LeastSquares(LOW, HIGH, form="affine"),
+        "l1": L1Augmentation(LOW, HIGH, dt=0.2),
+        "paper": PaperFlow(LOW, HIGH, [2], 3, width=8, gate=0.05),
+    }
+
+
+KINDS = list(correctors())
+
+
+@pytest.fixture(params=KINDS)
+def corrector(request):
+    return correctors()[request.param]
+
+
+def test_actions_are_handled_in_half_ranges():
+    corrector = Watching(torch.tensor([0.0, -1.0]), torch.tensor([4.0, 3.0]))
+    corners = torch.tensor([[0.0, -1.0], [2.0, 1.0], [4.0, 3.0]])
+    unit = corrector.normalise(corners)
+    assert unit.tolist() == [[-1.0, -1.0], [0.0, 0.0], [1.0, 1.0]]
+    assert torch.equal(corrector.denormalise(unit), corners)
+    assert corrector.action_size == 2
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        ([-1.0], [1.0, 1.0]),
+        ([1.0], [-1.0]),
+        ([1.0], [1.0]),
+        ([math.nan], [1.0]),
+        ([-math.inf], [1.0]),
+        ([[-1.0]], [[1.0]]),
+        ([], []),
+    ],
+    ids=str,
+)
+def test_impossible_boxes_are_refused(low, high):
+    for kind in (Watching, LeastSquares, ActionFlow):
+        with pytest.raises(ConfigurationError, match="corrector: action bounds"):
+            kind(torch.tensor(low), torch.tensor(high))
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
+def test_a_memory_comes_apart_and_together(corrector, batch):
+    memory = torch.rand(*batch, corrector.memory_size(3))
+    parts = corrector.unpack(memory, 3)
+    assert {name: part.shape[len(batch) :] for name, part in parts.items()} == corrector.shapes(3)
+    assert torch.equal(corrector.pack(parts), memory)
+    state, planned, executed = corrector.latest(memory)
+    for name, part in (("state", state), ("planned", planned), ("executed", executed)):
+        assert torch.equal(part, parts[name])
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
+def test_a_mission_begins_with_its_state_and_nothing_else(corrector, batch):
+    state = torch.rand(*batch, 3)
+    memory = corrector.begin(state)
+    assert memory.shape == (*batch, corrector.memory_size(3))
+    assert torch.equal(memory[..., :3], state) and not memory[..., 3:].any()
+
+
+def test_another_action_can_be_noted(corrector):
+    memory = torch.rand(4, corrector.memory_size(3))
+    planned, executed = torch.rand(2, 4, 2)
+    parts = corrector.unpack(memory, 3) | {"planned": planned, "executed": executed}
+    found = corrector.executing(memory, planned, executed)
+    assert torch.equal(found, corrector.pack(parts))
+
+
+def test_transitions_are_kept_oldest_first():
+    corrector, states = Watching(), torch.rand(6, 4, 3)
+    actions = torch.rand(5, 4, 2)
+    memory = corrector.begin(states[0])
+    for k in range(5):
+        memory = corrector.executing(memory, actions[k], -actions[k])
+        memory = corrector.observe(memory, states[k + 1])
+    rows = corrector.unpack(memory, 3)["transitions"]
+    state, planned, executed, reached, valid = corrector.split_transitions(rows, 3)
+    for k in range(3):
+        assert torch.equal(state[:, k], states[2 + k])
+        assert torch.equal(reached[:, k], states[3 + k])
+        assert torch.equal(planned[:, k], actions[2 + k])
+        assert torch.equal(executed[:, k], -actions[2 + k])
+    assert (valid == 1.0).all() and torch.equal(corrector.latest(memory)[0], states[5])
+
+
+@pytest.mark.parametrize("fault", [math.nan, math.inf, -math.inf, 1e30])
+def test_a_faulty_reading_spoils_two_transitions(fault):
+    corrector, states = Watching(), torch.rand(5, 2, 3)
+    states[2, 0, 1] = fault
+    memory, valid = corrector.begin(states[0]), []
+    for state in states[1:]:
+        memory = corrector.observe(memory, state)
+        rows = corrector.unpack(memory, 3)["transitions"]
+        valid.append(corrector.split_transitions(rows, 3)[-1][:, -1, 0])
+    assert torch.stack(valid, 1).tolist() == [[1, 0, 0, 1], [1, 1, 1, 1]]
+
+
+def test_a_stale_reading_does_not_count_until_it_is_believed():
+    corrector, memory = Watching(), Watching().begin(torch.zeros(3))
+    valid = []
+    for _ in range(PATIENCE + 3):
+        memory = corrector.observe(memory, torch.zeros(3))
+        rows = corrector.unpack(memory, 3)["transitions"]
+        valid.append(bool(corrector.split_transitions(rows, 3)[-1][-1]))
+    assert valid == [False] * (PATIENCE + 1) + [True] * 2
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_corrections_have_the_shapes_that_are_promised(corrector, batch, dtype):
+    model, box = Dubins(), torch.stack([LOW, HIGH]).to(dtype).expand(*batch, 2, 2)
+    state = torch.zeros(*batch, 3, dtype=dtype)
+    memory = corrector.begin(state)
+    shapes = Correction(*[(2,)] * 3, (2, 2), (), ())
+    for _ in range(3):
+        plan = 0.5 * torch.ones(*batch, 2, dtype=dtype)
+        memory, found = corrector.correct(memory, plan, model, box)
+        for part, shape in zip(found, shapes, strict=True):
+            assert part.shape == (*batch, *shape)
+            assert part.dtype is (torch.bool if part is found.misaligned else dtype)
+        state = model(state, -found.executed)
+        memory = corrector.observe(memory, state)
+        assert memory.shape == (*batch, corrector.memory_size(3)) and memory.dtype is dtype
+    assert found.misaligned.all()
+
+
+def test_corrections_are_pure_functions(corrector):
+    model, box = Dubins(), torch.stack([LOW, HIGH]).expand(2, 2, 2)
+    memory = corrector.begin(torch.zeros(2, 3))
+    for _ in range(3):
+        plan = torch.tensor([[0.5, 0.2], [0.3, -0.4]])
+        given = memory.clone(), plan.clone(), box.clone()
+        after, found = corrector.correct(memory, plan, model, box)
+        again, same = corrector.correct(memory, plan, model, box)
+        assert torch.equal(after, again)
+        assert all(torch.equal(left, right) for left, right in zip(found, same, strict=True))
+        for before, now in zip(given, (memory, plan, box), strict=True):
+            assert torch.equal(before, now)
+        reached = model(corrector.latest(after)[0], -found.executed)
+        memory = corrector.observe(after, reached)
+
+
+def test_no_reading_makes_an_action_that_is_not_finite(corrector):
+    """Many missions at once, each with faults of its own."""
+    faults = torch.tensor([0.3, -2.0, math.nan, math.inf, -math.inf, 1e30])
+    generator = torch.Generator().manual_seed(0)
+    drawn = faults[torch.randint(6, (4, 64, 3), generator=generator)]
+    sound = torch.rand(4, 64, 3, generator=generator)
+    faulty = torch.where(torch.rand(4, 64, 1, generator=generator) < 0.5, drawn, sound)
+    model, box = Dubins(), torch.stack([LOW, HIGH]).expand(64, 2, 2)
+    memory, plan = corrector.begin(faulty[0]), torch.tensor([0.5, 0.2]).expand(64, 2)
+    for state in (*faulty[1:], *sound[:2]):
+        memory, found = corrector.correct(memory, plan, model, box)
+        assert found.executed.isfinite().all() and found.innovation.isfinite().all()
+        memory = corrector.observe(memory, state)
+    _, found = corrector.correct(memory, plan, model, box)
+    assert all(part.isfinite().all() for part in found)
