@@ -25,7 +25,7 @@ FLOORS = [
     {"foundations": 2},
 ]
 
-WIDTH, HEIGHT, STEP, GAP, TRUNK = 112, 36, 64, 24, 320
+WIDTH, HEIGHT, STEP, GAP, TRUNK = 112, 34, 66, 20, 320
 STYLE = (
     "<style>rect{fill:#e8eaf6;stroke:#3f51b5}.arrow{fill:none;stroke:#607d8b;stroke-width:1.4}"
     "text{font:15px sans-serif;text-anchor:middle;fill:#1a237e}</style>"
