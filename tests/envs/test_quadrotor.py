@@ -274,8 +274,9 @@ def test_a_lost_flight_terminates_and_stays_finite(action):
     assert not record["lost"][:first].any()
 
 
-def test_numbers_without_end_terminate():
+def test_numbers_without_end_terminate(monkeypatch):
     env = CrazyflieTrack(Hover(), regime=ActionGain(["a", "b", "c", "d"]), schedule=[])
+    monkeypatch.setattr(env.regime, "limits", {})
     missions = [env.mission(regime={"b": value}) for value in (1.0, 1e30)]
     record = fly(env, env.reset(torch.stack(missions), set_state=False), 3, [0.3, 1e-3, 0, 0])
     assert record["terminated"][..., 0].tolist() == [[False, True]] * 3
