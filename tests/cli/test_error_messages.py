@@ -9,7 +9,7 @@ import torch
 from afm_rl.artefacts import save_artefact
 from afm_rl.cli.error_messages import explain, one_line
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import ContextFlow
+from afm_rl.correction import PaperFlow
 
 # method, overrides, what the line must name
 CASES = """
@@ -145,16 +145,16 @@ def test_a_cache_that_cannot_be_written(afm_rl, tmp_path, quick, monkeypatch):
     monkeypatch.setattr("afm_rl.missions.factories.train_flow", lambda *args, **settings: 1 / 0)
     monkeypatch.setattr("afm_rl.missions.factories.check_training", lambda *args, **settings: None)
     folder = f"hydra.run.dir={tmp_path}/run"
-    done = afm_rl("method=afm_physics", f"cache={tmp_path}/file/parts", folder, *quick)
+    done = afm_rl("method=afm_physics", "corrector.train={iterations: 1}", f"cache={tmp_path}/file/parts", folder, *quick)
     assert done.status == 2
     assert done.err.startswith(f"afm-rl: cache={tmp_path}/file/parts: cannot be written: Not a ")
 
 
 def test_a_checkpoint_for_another_robot(refuse, tmp_path):
-    flow = ContextFlow(torch.tensor([-1.0]), torch.tensor([1.0]))
+    flow = PaperFlow(torch.tensor([-1.0]), torch.tensor([1.0]), [2], 3)
     save_artefact(tmp_path / "flow", flow, flow.signature)
     line = refuse("method=afm_physics", f"corrector.checkpoint={tmp_path}/flow")
-    assert "corrector.checkpoint: " in line and "action_size=1, expected action_size=2" in line
+    assert "corrector.checkpoint: " in line and "kind=PaperFlow, expected kind=ActionFlow" in line
 
 
 def test_a_checkpoint_that_is_no_checkpoint(refuse, tmp_path):

@@ -12,7 +12,7 @@ from torch import nn
 import afm_rl.conf
 from afm_rl.artefacts import save_artefact
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.flow import ContextFlow, PaperFlow
+from afm_rl.correction import ActionFlow, PaperFlow
 from afm_rl.missions import build, prepare
 from afm_rl.missions.checks import blaming, check_training
 
@@ -205,31 +205,24 @@ def _checkpoint(path, flow):
 
 
 def test_a_good_checkpoint_is_used(configure, no_training, tmp_path, cache):
-    stored = _checkpoint(tmp_path / "flow", ContextFlow(LOW, HIGH, **SHAPE))
-    changes = {f"corrector.{name}": value for name, value in SHAPE.items()}
-    changes["corrector.checkpoint"] = str(tmp_path / "flow")
-    cfg = configure("method=afm_physics", **changes)
+    stored = _checkpoint(tmp_path / "flow", ActionFlow(LOW, HIGH))
+    cfg = configure("method=afm_physics", **{"corrector.checkpoint": str(tmp_path / "flow")})
     agent = build(cfg)
     assert agent.trainings == []
     prepare(agent, cache)
     for name, value in stored.state_dict().items():
-        assert torch.equal(agent.transform.flow.state_dict()[name], value)
+        assert torch.equal(agent.transform.corrector.state_dict()[name], value)
 
 
 @pytest.mark.parametrize(
     ("flow", "complaint"),
     [
-        (ContextFlow(LOW[:1], HIGH[:1], **SHAPE), "action_size=1, expected action_size=2"),
-        (ContextFlow(LOW, HIGH, **{**SHAPE, "window": 5}), "feature_size=25, expected feature"),
-        (ContextFlow(LOW, HIGH, **{**SHAPE, "hidden": [9]}), r"has shape \(9,\), expected \(8,\)"),
-        (PaperFlow(LOW, HIGH, [2], 3), "kind=PaperFlow, expected kind=ContextFlow"),
+        (PaperFlow(LOW, HIGH, [2], 3), "kind=PaperFlow, expected kind=ActionFlow"),
     ],
 )
 def test_a_checkpoint_of_another_flow_is_refused(configure, no_training, tmp_path, flow, complaint):
     _checkpoint(tmp_path / "flow", flow)
-    changes = {f"corrector.{name}": value for name, value in SHAPE.items()}
-    changes["corrector.checkpoint"] = str(tmp_path / "flow")
-    cfg = configure("method=afm_physics", **changes)
+    cfg = configure("method=afm_physics", **{"corrector.checkpoint": str(tmp_path / "flow")})
     with pytest.raises(ConfigurationError, match=f"^corrector.checkpoint: {tmp_path}.*{complaint}"):
         build(cfg)
 
