@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
@@ -72,6 +74,17 @@ def begin(corrector: Corrector, state: Tensor, action_spec: TensorSpec) -> Tenso
     entries = spec.to(state.device).zero()
     entries.set("effect_bounds", box_of(action_spec, entries.get("planned_action")))
     return entries.set("memory", corrector.begin(state))
+
+
+def warn_of_old(tensordict: TensorDictBase, prefix: NestedKey) -> None:
+    """Warn if a tensordict holds the entries of the next step already: it is an old one."""
+    later = tensordict.get("next", None)
+    if later is not None and later.get(prefix, None) is not None:
+        warnings.warn(
+            f"this step was made before: ('next', {prefix!r}) is in the tensordict, so its memory "
+            "is an old one; go on with step_mdp(tensordict)",
+            stacklevel=3,
+        )
 
 
 def correct(
