@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from afm_rl.correction.base import Correction, Fields, rows_of
 from afm_rl.correction.choice import nearest_of, probes_of, source_points_of
+from afm_rl.correction.compiled import compile_tick
 from afm_rl.correction.counterfactuals import draw_counterfactuals
 from afm_rl.correction.hypotheses import (
     HYPOTHESES,
@@ -23,7 +25,7 @@ from afm_rl.correction.hypotheses import (
 )
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_choice, check_count, check_flag, check_number
 from afm_rl.flow.experts import Rows, fit_experts
 from afm_rl.flow.network import AxisNetwork, Encoded
 from afm_rl.flow.prior import Drawn
@@ -95,6 +97,10 @@ class ActionFlow(PairCorrector):
         choose: the ``"best"`` sample by its predicted effect, or always their ``"mean"``.
         saturation: what gives way when a plan cannot be had in full, see
             :func:`~afm_rl.flow.saturation.saturate`.
+        compile: run the tick as machine code, which is some five times as fast for a single
+            mission; it is compiled once and kept in the cache. Where there is no compiler, the
+            tick runs as it is. Results agree to rounding.
+        cache: folder of compiled ticks.
         network: the network; None: the universal one that comes with the package.
 
     Raises:
@@ -132,6 +138,8 @@ class ActionFlow(PairCorrector):
         steps: int = 1,
         choose: str = "best",
         saturation: str = "mixed",
+        compile: bool = False,
+        cache: str | Path = "~/.cache/afm_rl",
         network: AxisNetwork | None = None,
     ) -> None:
         size = len(torch.as_tensor(action_low))
@@ -156,6 +164,8 @@ class ActionFlow(PairCorrector):
         self.steps = check_count("corrector.steps", steps)
         self.choose = check_choice("corrector.choose", choose, ("best", "mean"))
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
+        self.compile, self.cache = check_flag("corrector.compile", compile), Path(cache)
+        self.__dict__["_machine_code"] = None
         self.network = load_universal() if network is None else network
         never = 0.0 if IDENTITY in hypotheses else torch.inf
         penalty = [h.penalty for h in chosen] + [HYPOTHESES[IDENTITY].penalty + never]
@@ -188,51 +198,78 @@ class ActionFlow(PairCorrector):
             found = self.unchanged(planned, innovation, box)
             if bool(surprised.any()):
                 use = rows_of(surprised)
-                answer = self.tick({name: part[use] for name, part in parts.items()}, planned[use])
+                answer = self.answer(
+                    {name: part[use] for name, part in parts.items()}, planned[use]
+                )
                 found = self._merge(found, parts, use, answer)
             parts |= {"planned": planned, "executed": found.executed}
             parts["misaligned"] = surprised.unsqueeze(-1).to(planned.dtype)
             return self.pack(parts), found
 
     @torch.inference_mode()
-    def tick(self, parts: Fields, planned: Tensor) -> Answer:
+    def answer(self, parts: Fields, planned: Tensor) -> Answer:
         """Return the answer to plans ``(*B, A)`` of missions whose model is misaligned."""
-        batch = planned.shape[:-1]
-        kind = self.penalty.dtype
-        names = ("state", "pairs", "losses", "predicted", "misaligned")
-        parts = {name: _flat(parts[name], len(batch)).to(kind) for name in names}
-        unit = self.normalise(_flat(planned, len(batch))).to(kind)
-        losses = self.judge(parts)
-        belief = (losses + self.penalty).argmin(-1)
-        encoded = self.encode(parts)
-        action, effect, spread, bounds = self.propose(self.pick(encoded, belief), unit)
-        aligned = (belief == len(self.hypotheses)).unsqueeze(-1)
-        action, effect = torch.where(aligned, unit, action), torch.where(aligned, unit, effect)
-        predicted = self.predict(encoded, parts, action)
-        answer = Answer(losses, predicted, aligned, action, effect, spread, bounds)
+        batch, kind = planned.shape[:-1], self.penalty.dtype
+        given = [parts["pairs"], parts["losses"], parts["predicted"], parts["misaligned"]]
+        given += [self.place_of(parts["state"]), self.normalise(planned)]
+        given = [_flat(part, len(batch)).to(kind) for part in given]
+        answer = self._compiled_tick(given)(*given) if self.compile else self.tick(*given)
         return Answer(*(part.view(*batch, *part.shape[1:]) for part in answer))
 
-    def judge(self, parts: Fields) -> Tensor:
+    def tick(
+        self,
+        pairs: Tensor,
+        losses: Tensor,
+        predicted: Tensor,
+        misaligned: Tensor,
+        place: Tensor,
+        planned: Tensor,
+    ) -> Answer:
+        """Return the answer for B missions whose model is misaligned, in half ranges.
+
+        Args:
+            pairs: what is remembered, the newest last, ``(B, M, D)``.
+            losses: of the hypotheses before the newest pair, ``(B, H + 1)``.
+            predicted: effects that they predicted of it, ``(B, H + 1, A)``.
+            misaligned: was anything predicted? ``(B, 1)``.
+            place: where the missions are, ``(B, P)``.
+            planned: u, ``(B, A)``.
+        """
+        losses = self.judge(pairs, losses, predicted, misaligned)
+        belief = (losses + self.penalty).argmin(-1)
+        encoded = self.encode(pairs, place)
+        action, effect, spread, bounds = self.propose(self.pick(encoded, belief), planned)
+        aligned = (belief == len(self.hypotheses)).unsqueeze(-1)
+        action, effect = (torch.where(aligned, planned, part) for part in (action, effect))
+        predicted = self.predict(encoded, pairs, action)
+        return Answer(losses, predicted, aligned, action, effect, spread, bounds)
+
+    def _compiled_tick(self, given: list[Tensor]) -> Callable[..., Sequence[Tensor]]:
+        """Return :meth:`tick` as machine code, or as it is where that cannot be had."""
+        if self._machine_code is None:
+            two = [part[:1].repeat(2, *[1] * (part.dim() - 1)) for part in given]
+            found = compile_tick(self.tick, self, two, self.cache)
+            self.__dict__["_machine_code"] = self.tick if found is None else found
+        return self._machine_code
+
+    def judge(self, pairs: Tensor, losses: Tensor, predicted: Tensor, misaligned: Tensor) -> Tensor:
         """Return the hypotheses' losses ``(B, H + 1)`` after the newest pair."""
         size = self.action_size
-        newest = parts["pairs"][:, -1:]
-        effective, std, valid, _ = newest[..., size:].split([size, size, 1, self._rest], -1)
+        effective, std, valid, _ = pairs[:, -1:, size:].split([size, size, 1, self._rest], -1)
         tolerance = TOLERANCE**2
-        miss = (parts["predicted"] - effective).square()
+        miss = (predicted - effective).square()
         share = miss / ((miss + tolerance) * (1 + std.square() / tolerance))
-        counts = valid.squeeze(-1) * parts["misaligned"]  # was anything predicted?
-        return self.forgetting * parts["losses"] + counts * share.mean(-1)
+        return self.forgetting * losses + valid.squeeze(-1) * misaligned * share.mean(-1)
 
-    def encode(self, parts: Fields) -> Encoded:
+    def encode(self, pairs: Tensor, place: Tensor) -> Encoded:
         """Return what the network reads under every hypothesis, B H sets of rows."""
         away = None
         if self.by_place:
             first = 3 * self.action_size + 2
-            there = parts["pairs"][..., first:] - self.place_of(parts["state"]).unsqueeze(-2)
-            away = there.square().sum(-1)
-            away = torch.where(parts["pairs"][..., first - 2] == 1.0, away, torch.inf)
+            away = (pairs[..., first:] - place.unsqueeze(-2)).square().sum(-1)
+            away = torch.where(pairs[..., first - 2] == 1.0, away, torch.inf)
         layout = Layout(*(getattr(self, f"rows_{name}") for name in Layout._fields))
-        rows = read_rows(parts["pairs"], layout, self.action_size, away)
+        rows = read_rows(pairs, layout, self.action_size, away)
         rows = Rows(*(part.flatten(0, 1) for part in rows))
         return self.network.encode(rows, fit_experts(rows))
 
@@ -271,10 +308,10 @@ class ActionFlow(PairCorrector):
         action, effect = chosen.tensor_split(2, -1)
         return action, effect, spread, torch.stack([low, high], -2)
 
-    def predict(self, encoded: Encoded, parts: Fields, executed: Tensor) -> Tensor:
+    def predict(self, encoded: Encoded, pairs: Tensor, executed: Tensor) -> Tensor:
         """Return the effects ``(B, H + 1, A)`` that the hypotheses predict of what acts now."""
         size = self.action_size
-        sent = torch.cat([parts["pairs"][..., :size], executed.unsqueeze(-2)], -2)
+        sent = torch.cat([pairs[..., :size], executed.unsqueeze(-2)], -2)
         acted = sent.index_select(-2, self.memory - self.rows_delay)  # (B, H, A)
         effects = self.network.effect(encoded, acted.reshape(-1, 1, size)).view_as(acted)
         return torch.cat([effects, executed.unsqueeze(-2)], -2)
