@@ -37,6 +37,7 @@ def room(module: str) -> str:
     """Return the room of a module, given by its full name."""
     rooms = [name for floor in FLOORS for name in floor]
     name = module.split(".")[1] if "." in module else ""
+    name = {"__main__": "cli"}.get(name, name)
     return name if name in rooms else "foundations"
 
 
