@@ -109,7 +109,7 @@ def correct(
     """
     planned = planned.to(memory.dtype)
     box = box_of(action_spec, planned)
-    state, last, _ = corrector.latest(memory)
+    _, _, last = corrector.latest(memory)
     memory, found = corrector.correct(memory, planned, model, box)
     wanted = found.executed if enabled else planned
     # The last clamp depends on nothing but the spec, whatever the corrector answers.
