@@ -1,12 +1,10 @@
 """Environments: robots whose dynamics change under way."""
 
 from afm_rl.envs.course import Course
-from afm_rl.envs.flights import find_reference, make_flights
 from afm_rl.envs.mission_noise import MissionNoise
 from afm_rl.envs.missions import MissionFormat
 from afm_rl.envs.quadrotor import CrazyflieTrack
 from afm_rl.envs.quadrotor_gym import CrazyflieTrackGym
-from afm_rl.envs.quadrotor_settings import schedule_in_seconds
 from afm_rl.envs.references import (
     Circle,
     FigureEight,
@@ -14,9 +12,11 @@ from afm_rl.envs.references import (
     Reference,
     Table,
     Waypoints,
+    find_reference,
     load_reference,
 )
 from afm_rl.envs.rendering import TrackCanvas
+from afm_rl.envs.settings import schedule_in_seconds
 from afm_rl.envs.track import Track
 from afm_rl.envs.tracks import load_track
 from afm_rl.envs.ugv import UGVTrack
@@ -43,6 +43,5 @@ __all__ = [
     "find_reference",
     "load_reference",
     "load_track",
-    "make_flights",
     "schedule_in_seconds",
 ]

@@ -1,24 +1,70 @@
-"""What the gymnasium adapters of the ground robot share."""
+"""What the gymnasium adapters share."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from tensordict import TensorDictBase
+from torch import Tensor
 
+from afm_rl.envs.mission_env import MissionEnv
 from afm_rl.envs.track import Track
 from afm_rl.envs.ugv import UGVTrack
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import Regime, Schedule
 
+UGV_BOUND = (np.inf, np.inf, np.pi, np.inf, np.inf)  # x, y, theta, goal x, goal y
 
-def build_native(
+
+class MissionGym(gymnasium.Env):
+    """One mission of a native environment.
+
+    Args:
+        native: the environment.
+        bound: largest size of each number of the observation.
+    """
+
+    def __init__(self, native: MissionEnv, bound: Sequence[float]) -> None:
+        self.native = native
+        self.observation_space, self.action_space = spaces(native, bound)
+        self._data: TensorDictBase | None = None
+
+    @abstractmethod
+    def _seen(self, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the observation and the info."""
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Begin an episode; ``seed`` restarts the noise, no seed continues it."""
+        super().reset(seed=seed)
+        reseed(self.native, self.np_random, seed, self._data)
+        self._data = self.native.reset()
+        return self._described(self._data)
+
+    def step(self, action: np.ndarray):
+        """Apply the action for one time step."""
+        data = require_reset(self._data)
+        data["action"] = torch.as_tensor(np.asarray(action), device=self.native.device)
+        following = self.native.step(data)["next"]
+        self._data = self.native.step_mdp(data)
+        ends = (bool(following[name]) for name in ("terminated", "truncated"))
+        observation, info = self._described(following)
+        return observation, float(following["reward"]), *ends, info
+
+    def _described(self, data: TensorDictBase) -> tuple[np.ndarray, dict[str, Any]]:
+        seen, info = self._seen(data)
+        plain = {k: v.cpu().numpy() if v.dim() else v.item() for k, v in info.items()}
+        return seen.cpu().numpy().astype(np.float32), plain
+
+
+def build_ugv(
     track: str | Path | Track,
     regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None,
     gains: Mapping[str, float | None],
@@ -28,7 +74,7 @@ def build_native(
     batch_size: tuple[int, ...],
     settings: Mapping[str, Any],
 ) -> UGVTrack:
-    """Return the native environment, with the same regime for every mission.
+    """Return the ground robot, with the same regime for every mission.
 
     Args:
         track: name, CSV path or track.
@@ -50,24 +96,25 @@ def build_native(
         if regime is not None and not isinstance(regime, Mapping):
             raise ConfigurationError(f"regime={regime!r}: per phase, so {given} belongs inside it")
         regime = {**(regime or {}), **given}
+    missions = {"regime": regime, "ramp": ramp}
     return UGVTrack(
-        tracks=(track,),
-        regime=family,
-        schedule=schedule,
-        batch_size=batch_size,
-        missions={"regime": regime, "ramp": ramp},
-        **settings,
+        (track,), family, schedule, batch_size=batch_size, missions=missions, **settings
     )
 
 
-def spaces(env: UGVTrack) -> tuple[Box, Box]:
-    """Return the observation space (x, y, theta, goal x, goal y) and the action space."""
-    bounds = np.array([np.inf, np.inf, np.pi, np.inf, np.inf], dtype=np.float32)
-    low, high = (
-        bound.cpu().numpy().astype(np.float32)
-        for bound in (env.simulation.low, env.simulation.high)
-    )
-    return Box(-bounds, bounds, dtype=np.float32), Box(low, high, dtype=np.float32)
+def spaces(env: MissionEnv, bound: Sequence[float]) -> tuple[Box, Box]:
+    """Return the observation space and the action space of one mission."""
+    box = env.full_action_spec_unbatched["action"].space
+    low, high = (side.cpu().numpy().astype(np.float32) for side in (box.low, box.high))
+    most = np.array(bound, dtype=np.float32)
+    return Box(-most, most, dtype=np.float32), Box(low, high, dtype=np.float32)
+
+
+def reseed(env: MissionEnv, random, seed: int | None, data: TensorDictBase | None) -> None:
+    """Restart the noise where a ``seed`` is given, and before the first reset."""
+    if seed is not None or data is None:
+        chosen = int(random.integers(2**31)) if seed is None else seed
+        env.set_seed(chosen, static_seed=True)
 
 
 def require_reset(data: TensorDictBase | None) -> TensorDictBase:
@@ -81,16 +128,13 @@ def require_reset(data: TensorDictBase | None) -> TensorDictBase:
     return data
 
 
-def observe(env: UGVTrack, data: TensorDictBase) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def observe_ugv(env: UGVTrack, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
     """Return the observation ``(*B, 5)`` and the info of each mission.
 
     The info holds the number of targets ``reached``, the ``progress`` in [0, 1], and, as a
     truth hidden from the observation, ``regime_active``.
     """
-    seen = torch.cat([data["observation"], data["goal"]], -1)
-    info = {
-        "reached": data["reached"],
-        "progress": env.course.progress(data["mission", "track"], data["reached"]),
-        "regime_active": data["regime_active"],
-    }
-    return seen.cpu().numpy().astype(np.float32), {k: v.cpu().numpy() for k, v in info.items()}
+    reached = data["reached"]
+    progress = env.course.progress(data["mission", "track"], reached)
+    info = {"reached": reached, "progress": progress, "regime_active": data["regime_active"]}
+    return torch.cat([data["observation"], data["goal"]], -1), info

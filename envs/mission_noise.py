@@ -11,15 +11,15 @@ from afm_rl.streams import Streams
 
 
 class MissionNoise:
-    """Start, process and actuator noise that depend on a mission's seed alone.
+    """Start, process, sensor and actuator noise that depend on a mission's seed alone.
 
     Each kind draws from streams of its own, so a reset does not shift the noise of the steps, and
     rows that are left out of a call draw nothing. Rows with equal seeds share their numbers call
     by call: step them together, and they are paired.
 
-    Attributes:
-        salts: tell the streams of each kind apart from all others; other robots have their own.
-        sizes: how many numbers each kind draws, N.
+    Args:
+        kinds: a salt, which tells the streams of a kind from all others, and how many numbers it
+            draws, N, by name; those of the ground robot if None.
 
     >>> noise = MissionNoise()
     >>> seeds = torch.tensor([3, 4, 3])
@@ -28,11 +28,10 @@ class MissionNoise:
     (True, tensor([0., 0., 0.]))
     """
 
-    salts: Mapping[str, int] = {"start": 0x55475653, "process": 0x55475650, "actuator": 0x55475641}
-    sizes: Mapping[str, int] = {"start": 3, "process": 3, "actuator": 2}  # poses, actions
-
-    def __init__(self) -> None:
-        self.streams = {name: Streams(salt=salt) for name, salt in self.salts.items()}
+    def __init__(self, kinds: Mapping[str, tuple[int, int]] | None = None) -> None:
+        kinds = UGV_NOISE if kinds is None else kinds
+        self.sizes = {name: size for name, (_, size) in kinds.items()}
+        self.streams = {name: Streams(salt=salt) for name, (salt, _) in kinds.items()}
 
     def normal(
         self,
@@ -71,3 +70,12 @@ class MissionNoise:
         """Restore what :meth:`state_dict` returned."""
         for name, stream in self.streams.items():
             stream.load_state_dict(state[name])
+
+
+UGV_NOISE = {"start": (0x55475653, 3), "process": (0x55475650, 3), "actuator": (0x55475641, 2)}
+
+
+def flight_noise(between: int) -> MissionNoise:
+    """Return the noise of a quadrotor, with readings of its sensor ``between`` two ticks."""
+    kinds = {"start": (0x464C5953, 3), "sensor": (0x464C594E, 12), "actuator": (0x464C5941, 4)}
+    return MissionNoise({**kinds, "between": (0x464C5942, 12 * between)})

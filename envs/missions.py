@@ -174,6 +174,7 @@ class MissionFormat:
             raise ConfigurationError(f"missions: track: expected indices 0..{last}")
         if not mission["parameters"].isfinite().all():
             raise ConfigurationError("missions: parameters: expected finite numbers")
+        self.regime.check_limits(mission["parameters"])
         if (mission["ramp"] < 0).any():
             raise ConfigurationError("missions: ramp: expected whole numbers of at least 0")
         if mission["at"].isnan().any():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +12,22 @@ from torch import Tensor
 
 from afm_rl.airframe import QuadrotorBody
 from afm_rl.dynamics.quadrotor import check_body
-from afm_rl.envs import quadrotor_settings as settings
-from afm_rl.envs import quadrotor_specs as specs
-from afm_rl.envs.flight_noise import FlightNoise
-from afm_rl.envs.mission_env import MissionEnv, check_action
-from afm_rl.envs.missions import MissionFormat
+from afm_rl.envs.mission_env import MissionEnv
+from afm_rl.envs.mission_noise import flight_noise
 from afm_rl.envs.quadrotor_simulation import QuadrotorSimulation
-from afm_rl.envs.references import Reference
-from afm_rl.envs.ugv_settings import check_batch, check_dtype, check_missions
-from afm_rl.envs.ugv_specs import done_spec, reward_spec
+from afm_rl.envs.references import Reference, check_reference, find_reference
+from afm_rl.envs.settings import (
+    check_bounds,
+    check_names,
+    check_regime,
+    schedule_in_seconds,
+    steps_at,
+)
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_flag, check_number
-from afm_rl.regimes import Regime, Schedule
+from afm_rl.regimes import Regime, Schedule, flight_regimes
+
+ACTIONS = ("thrust (N)", "moment_x (N m)", "moment_y (N m)", "moment_z (N m)")
+UNIT = 1e-3  # how far a quaternion's length may be from 1
 
 
 class CrazyflieTrack(MissionEnv):
@@ -66,16 +71,17 @@ class CrazyflieTrack(MissionEnv):
     published study, but a bare Crazyflie cannot lose it; 133 % is a payload of 10 g.
 
     Args:
-        references: references or CSV paths (see :func:`~afm_rl.envs.references.load_reference`);
-            a circle of 2 m at 0.8 m/s if None.
+        tracks: references, or their names (see :func:`~afm_rl.envs.find_reference`), such as
+            ``circle_2m_0.8mps`` (radius, speed) or the path of a CSV file.
         regime: regime family; all of :func:`~afm_rl.regimes.flight_regimes` if None.
         schedule: when regimes change: a schedule, or times in s; at 2 s and 5 s if None.
         body: the quadrotor, a Crazyflie if None.
         duration: length of a flight (s).
+        max_steps: control ticks after which a flight is over, if that is earlier.
         horizon: ticks N by which ``reference`` looks ahead.
         preview: whether it holds the future; otherwise it repeats the present set-point.
         start: ``"moving"``, with the velocity of the reference, or ``"rest"``. Either starts at
-            the reference, level.
+            the reference, level. None: moving with a preview, and at rest without, as published.
         limit: distance from the reference at which a flight is lost (m).
         sensor_noise: standard deviation in ``observation``: one number, or four for position
             (m), velocity (m/s), attitude (rad) and body rate (rad/s).
@@ -105,22 +111,25 @@ class CrazyflieTrack(MissionEnv):
     torch.Size([5, 21, 6])
     """
 
+    simulation: QuadrotorSimulation
+
     def __init__(
         self,
-        references: Sequence[Reference | str | Path] | Reference | str | Path | None = None,
+        tracks: Sequence[Reference | str | Path] | Reference | str | Path = "circle_2m_0.8mps",
         regime: Regime | None = None,
         schedule: Schedule | Sequence[float] | None = None,
         body: QuadrotorBody | None = None,
         duration: float = 8.0,
         horizon: int = 20,
         preview: bool = True,
-        start: str = "moving",
+        start: str | None = None,
         limit: float = 50.0,
         sensor_noise: float | Sequence[float] = 0.0,
         start_noise: float = 0.0,
         dt: float = 0.05,
         substeps: int = 25,
         trace: bool = False,
+        max_steps: int = 5000,
         batch_size: Sequence[int] = (),
         seed: int = 0,
         device: torch.device | str | None = None,
@@ -130,55 +139,42 @@ class CrazyflieTrack(MissionEnv):
         action_high: Sequence[float] | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
-        batch = check_batch(batch_size)
-        super().__init__(device=device, batch_size=batch)
-        self._batch_locked = bool(batch)
-        self.dtype = check_dtype(dtype)
-        self.references = settings.check_references(references)
+        super().__init__(batch_size, seed, start_noise, device, dtype)
+        if isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable):
+            tracks = (tracks,)
+        self.references = tuple(
+            find_reference(str(one)) if isinstance(one, (str, Path)) else check_reference(one)
+            for one in tracks
+        )
+        names = [reference.name for reference in self.references]
+        check_names("tracks", names)
         self.body = check_body(body)
-        self.regime = settings.check_flight_regime(regime, self.body)
-        self.start_noise = check_number("start_noise", start_noise, low=0.0)
-        self.seed = check_count("seed", seed, low=0)
         substeps = check_count("substeps", substeps)
-        self.noise = FlightNoise(between=substeps - 1)
+        self.noise = flight_noise(between=substeps - 1)
         dt = check_number("dt", dt, low=0.0, open_low=True)
-        self.schedule = settings.check_flight_schedule(schedule, dt)
+        if not isinstance(schedule, Schedule):
+            schedule = schedule_in_seconds((2.0, 5.0) if schedule is None else schedule, dt)
+        preview = check_flag("preview", preview)
+        if start is None:
+            start = "moving" if preview else "rest"
         self.simulation = QuadrotorSimulation(
             references=self.references,
-            regime=self.regime,
-            schedule=self.schedule,
+            regime=check_regime(regime, lambda: flight_regimes(self.body), 13, 4),
+            schedule=schedule,
             body=self.body,
             dt=dt,
             substeps=substeps,
-            steps=settings.check_steps(duration, dt),
+            steps=min(_ticks(duration, dt), check_count("max_steps", max_steps)),
             horizon=check_count("horizon", horizon),
-            preview=check_flag("preview", preview),
+            preview=preview,
             start=check_choice("start", start, ("rest", "moving")),
             limit=check_number("limit", limit, low=0.0, open_low=True),
-            sensor_noise=settings.check_sensor_noise(sensor_noise),
+            sensor_noise=_sensor_noise(sensor_noise),
             trace=check_flag("trace", trace),
         )
-
-        names = [reference.name for reference in self.references]
-        self.mission_format = MissionFormat(names, self.regime, self.schedule, self.dtype)
-        if isinstance(missions, Mapping) and not isinstance(missions, TensorDictBase):
-            for key in missions:
-                known = ("track", "seed", "regime", "at", "ramp", "times")
-                check_choice("missions", key, known)
-            missions = self.mission(**missions)
-        self._default = check_missions(missions, batch)
-        self._missions_of(None, batch)  # a wrong default fails here, not at the first reset
-
-        mission = self.mission_format.spec(batch, self.device)
-        state = specs.state_spec(mission, self.dtype, self.regime.history)
-        self.state_spec = state
-        self.observation_spec = specs.observation_spec(
-            state, self.simulation.horizon, len(self.regime.names), substeps + 1 if trace else None
-        )
-        bounds = settings.check_action_box(action_low, action_high, self.body)
-        self.full_action_spec = specs.action_spec(bounds, state)
-        self.full_reward_spec = reward_spec(state)
-        self.full_done_spec = done_spec(state)
+        pairs = zip((action_low, action_high), self.body.bounds, strict=True)
+        low, high = (most if given is None else given for given, most in pairs)
+        self._complete(names, missions, check_bounds(low, high, ACTIONS))
 
     def mission(
         self,
@@ -206,41 +202,31 @@ class CrazyflieTrack(MissionEnv):
             if at is not None:
                 raise ConfigurationError(f"missions: at={at!r}, times={times!r}: expected one")
             whole = self.simulation.steps if self.schedule.by == "progress" else 1
-            at = [tick / whole for tick in settings.ticks(times, self.simulation.dt)]
+            at = [tick / whole for tick in steps_at(times, self.simulation.dt)]
         return self.mission_format.build(track, seed, regime, at, ramp).to(self.device)
 
-    def _missions_of(self, given: TensorDictBase | None, batch: torch.Size) -> TensorDict:
-        mission = super()._missions_of(given, batch)
-        settings.check_parameters(self.regime, mission["parameters"])
-        return mission
+    def _check_pose(self, pose: Tensor) -> None:
+        if pose.shape[-1] != 13 or not pose.isfinite().all():
+            raise ConfigurationError(
+                f"pose {tuple(pose.shape)}: expected 13 finite numbers per flight: position, "
+                "velocity, quaternion (scalar-last), body rate"
+            )
+        length = pose[..., 6:10].norm(dim=-1).reshape(-1)
+        rows = (length - 1).abs().gt(UNIT).nonzero().flatten().tolist()
+        if rows:
+            raise ConfigurationError(
+                f"pose: quaternions of flights {rows}: length {length[rows[0]].item():g}, "
+                "expected 1"
+            )
 
-    def _reset(
-        self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs
+    def _described(
+        self, mission: TensorDictBase, state: dict[str, Tensor], rows: Tensor | None
     ) -> TensorDictBase:
-        batch = self.batch_size if tensordict is None else tensordict.batch_size
-        given = TensorDict({}, batch) if tensordict is None else tensordict
-        mission = self._missions_of(given, batch)
-        rows = given.get("_reset", None)
-        rows = None if rows is None else rows.reshape(batch)
-        state = self.simulation.begin(mission, self.dtype)
-        if set_state and "pose" in given.keys():
-            settings.check_pose(given["pose"])
-            state = {
-                name: given.get(name, value).to(value.dtype, copy=True)
-                for name, value in state.items()
-            }
-        elif self.start_noise:
-            moved = self.noise.normal("start", mission["seed"], rows, self.dtype)
-            state["pose"][..., :3] += self.start_noise * moved
-        sensor = self._sensor(mission["seed"], rows)
-        return self._remembered(self.simulation.describe(mission, state, sensor))
+        return self.simulation.describe(mission, state, self._sensor(mission["seed"], rows))
 
     def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:
-        check_action(tensordict["action"])
         seeds = tensordict["mission", "seed"]
-        actuator = None
-        if self.regime.noisy:
-            actuator = self.noise.normal("actuator", seeds, dtype=self.dtype)
+        actuator = self._actuator_noise(seeds)
         between = self._sensor(seeds, event="between") if self.simulation.trace else None
         return self.simulation.advance(tensordict, self._sensor(seeds), between, actuator)
 
@@ -250,3 +236,21 @@ class CrazyflieTrack(MissionEnv):
         if not self.simulation.sensor_noise.any():
             return None
         return self.noise.normal(event, seeds, rows, self.dtype)
+
+
+def _ticks(duration: float, dt: float) -> int:
+    """Return the number of control ticks in a flight, whose duration (s) must be a multiple."""
+    duration = check_number("duration", duration, low=0.0, open_low=True)
+    steps = round(duration / dt)
+    if steps < 1 or abs(steps * dt - duration) > 1e-6 * duration:
+        raise ConfigurationError(f"duration={duration!r}: expected a multiple of dt={dt!r} s")
+    return steps
+
+
+def _sensor_noise(std: float | Sequence[float]) -> Tensor:
+    """Return standard deviations ``(12,)`` from one number, or four: position, velocity, ..."""
+    given = list(std) if isinstance(std, Sequence) and not isinstance(std, str) else [std] * 4
+    if len(given) != 4:
+        raise ConfigurationError(f"sensor_noise={std!r}: expected one number, or four")
+    checked = [check_number("sensor_noise", value, low=0.0) for value in given]
+    return torch.tensor(checked, dtype=torch.float64).repeat_interleave(3)

@@ -6,19 +6,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box
 from tensordict import TensorDictBase
+from torch import Tensor
 
-from afm_rl.envs.gym_adapter import require_reset
+from afm_rl.envs.gym_adapter import MissionGym
 from afm_rl.envs.quadrotor import CrazyflieTrack
 from afm_rl.envs.references import Reference
 from afm_rl.errors import ConfigurationError
 
 
-class CrazyflieTrackGym(gymnasium.Env):
+class CrazyflieTrackGym(MissionGym):
     """One mission of :class:`~afm_rl.envs.CrazyflieTrack`.
 
     The observation holds the state (position in m, velocity in m/s, quaternion, body rate in rad/s)
@@ -38,7 +37,7 @@ class CrazyflieTrackGym(gymnasium.Env):
         ConfigurationError: for a setting that cannot be used.
         NonFiniteError: at a step whose action is NaN or infinite.
 
-    >>> import afm_rl  # registers the name
+    >>> import gymnasium, afm_rl  # registers the name
     >>> env = gymnasium.make("afm_rl/CrazyflieTrack-v0", regime={"mass": 0.5}, times=[2.0])
     >>> observation, info = env.reset(seed=0)
     >>> observation.shape, info["time"]
@@ -59,37 +58,15 @@ class CrazyflieTrackGym(gymnasium.Env):
         if render_mode is not None:
             raise ConfigurationError(f"render_mode={render_mode!r}: expected none")
         missions = {"regime": regime, "ramp": ramp}
-        self.native = CrazyflieTrack(reference, schedule=times, missions=missions, **settings)
-        box = self.native.action_spec.space
-        low, high = (bound.cpu().numpy().astype(np.float32) for bound in (box.low, box.high))
-        self.action_space = Box(low, high, dtype=np.float32)
-        self.observation_space = Box(-np.inf, np.inf, (19,), dtype=np.float32)
-        self._data: TensorDictBase | None = None
+        tracks = "circle_2m_0.8mps" if reference is None else reference
+        settings.setdefault("start", "moving")
+        native = CrazyflieTrack(tracks, schedule=times, missions=missions, **settings)
+        super().__init__(native, [np.inf] * 19)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Begin a flight; ``seed`` restarts the noise, no seed continues it."""
-        super().reset(seed=seed)
-        if seed is not None or self._data is None:
-            chosen = int(self.np_random.integers(2**31)) if seed is None else seed
-            self.native.set_seed(chosen, static_seed=True)
-        self._data = self.native.reset()
-        return self._described(self._data)
-
-    def step(self, action: np.ndarray):
-        """Hold thrust and moments for one control tick."""
-        data = require_reset(self._data)
-        data["action"] = torch.as_tensor(np.asarray(action), device=self.native.device)
-        following = self.native.step(data)["next"]
-        self._data = self.native.step_mdp(data)
-        observation, info = self._described(following)
-        ends = (bool(following[name]) for name in ("terminated", "truncated"))
-        return observation, float(following["reward"]), *ends, info
-
-    def _described(self, data: TensorDictBase) -> tuple[np.ndarray, dict[str, Any]]:
-        seen = torch.cat([data["observation"], data["reference"][..., 0, :]], -1)
+    def _seen(self, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         info = {
-            "time": data["step"].item() * self.native.simulation.dt,
-            "square_error": data["square_error"].cpu().numpy(),
-            "regime_active": data["regime_active"].item(),
+            "time": data["step"].double() * self.native.simulation.dt,
+            "square_error": data["square_error"],
+            "regime_active": data["regime_active"],
         }
-        return seen.cpu().numpy().astype(np.float32), info
+        return torch.cat([data["observation"], data["reference"][..., 0, :]], -1), info

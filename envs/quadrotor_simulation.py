@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,13 +12,14 @@ from torch import Tensor
 
 from afm_rl.airframe import QuadrotorBody, saturate
 from afm_rl.dynamics.quadrotor_equations import quadrotor_path
+from afm_rl.envs.phases import PhasedSimulation
 from afm_rl.envs.references import Reference, references_at
-from afm_rl.regimes import Regime, Schedule, blend_phases, wind_of
+from afm_rl.regimes import Regime, Schedule, wind_of
 from afm_rl.rotations import RigidBodySpace
 
 
 @dataclass(frozen=True)
-class QuadrotorSimulation:
+class QuadrotorSimulation(PhasedSimulation):
     r"""Quadrotors under regimes, without any state or random numbers of its own.
 
     The plant takes ``substeps`` Runge-Kutta steps per tick, while the effective action
@@ -51,16 +53,15 @@ class QuadrotorSimulation:
         turning[..., 3] = 1.0
         if self.start == "rest":
             wanted = torch.cat([wanted[..., :3], torch.zeros_like(wanted[..., 3:])], -1)
-        state = {
-            "pose": torch.cat([wanted, turning], -1),
-            "step": none,
-            "since": none.clone(),
-            "lost": none.bool(),
-        }
-        if self.regime.history:
-            size = (*none.shape, self.regime.history, 4)
-            state["past"] = torch.zeros(size, dtype=dtype, device=none.device)
-        return state
+        return self.started(torch.cat([wanted, turning], -1), mission, 4, lost=none.bool())
+
+    def displaced(self, pose: Tensor, noise: Tensor) -> Tensor:
+        """Return poses whose positions are moved by noise (m), ``(*B, 3)``."""
+        return torch.cat([pose[..., :3] + noise, pose[..., 3:]], -1)
+
+    def progress(self, mission: TensorDictBase, state: Any) -> Tensor:
+        """Return the share of the flight's time."""
+        return state["step"].to(mission["at"].dtype) / self.steps
 
     def advance(
         self,
@@ -82,7 +83,7 @@ class QuadrotorSimulation:
         mission, pose, step = data["mission"], data["pose"], data["step"]
         past = data["past"] if self.regime.history else None
         action = saturate(data["action"].to(pose.dtype), self.body)
-        parameters = self.regime_now(mission, step, data["since"])
+        parameters = self.regime_now(mission, data)
         effective = self.regime.apply(action, parameters, pose, past, actuator)
         wind = wind_of(self.regime, parameters)
         path = quadrotor_path(pose, effective, self.dt, self.substeps, self.body, wind)
@@ -96,18 +97,8 @@ class QuadrotorSimulation:
         frozen = lost.unsqueeze(-1)
         miss = torch.where(frozen.unsqueeze(-1), wanted - pose[..., None, :3], miss)
 
-        state = {
-            "pose": torch.where(frozen, pose, path[-1]),
-            "step": step + 1,
-            "since": torch.where(
-                self._phase(mission, step) == self._phase(mission, step + 1),
-                data["since"],
-                step + 1,
-            ),
-            "lost": lost,
-        }
-        if past is not None:
-            state["past"] = torch.cat([action.unsqueeze(-2), past[..., :-1, :]], -2)
+        state = {"pose": torch.where(frozen, pose, path[-1]), "step": step + 1, "lost": lost}
+        state = self.followed(mission, data, state, action)
         out = self.describe(mission, state, sensor)
         if self.trace:
             passed = torch.where(frozen.unsqueeze(-1), pose.unsqueeze(-2), path.movedim(0, -2))
@@ -122,28 +113,23 @@ class QuadrotorSimulation:
         return out
 
     def describe(
-        self, mission: TensorDictBase, state: dict[str, Tensor], sensor: Tensor | None
+        self, mission: TensorDictBase, state: dict[str, Tensor], sensor: Tensor | None = None
     ) -> TensorDict:
         """Return the state and what is seen of it; no error is known yet."""
         pose, step = state["pose"], state["step"]
-        parameters = self.regime_now(mission, step, state["since"])
-        seen = self._sense(pose, sensor)
         ticks = torch.arange(self.horizon + 1, device=pose.device) * self.preview
         times = ((step.unsqueeze(-1) + ticks) * self.dt).to(pose.dtype)
         times = times + self.dt / self.substeps  # as far ahead as the metric's
-        entries = {
-            **state,
-            "mission": mission.clone(),
-            "observation": seen,
+        seen = {
+            "observation": self._sense(pose, sensor),
             "reference": self._wanted(mission, times),
             "square_error": torch.zeros_like(pose[..., :3]),
-            "phase": self._phase(mission, step),
-            "regime": parameters,
-            "regime_active": ~self.regime.is_identity(parameters),
+            "phase": self.phase(mission, state),
         }
         if self.trace:  # nothing has happened yet
-            entries["trace"] = seen.unsqueeze(-2).repeat_interleave(self.substeps + 1, -2)
-        return TensorDict(entries, mission.batch_size, device=mission.device)
+            rows = seen["observation"].unsqueeze(-2)
+            seen["trace"] = rows.repeat_interleave(self.substeps + 1, -2)
+        return self.described(mission, state, **seen)
 
     def _sense(self, pose: Tensor, numbers: Tensor | None) -> Tensor:
         """Return states ``(*B, 13)`` as the sensors see them."""
@@ -151,21 +137,6 @@ class QuadrotorSimulation:
             return pose.clone()
         numbers = numbers.reshape(*pose.shape[:-1], 12)
         return RigidBodySpace().add(pose, numbers * self.sensor_noise.to(pose))
-
-    def regime_now(self, mission: TensorDictBase, step: Tensor, since: Tensor) -> Tensor:
-        """Return the parameters ``(*B, F)`` that act on the next action.
-
-        Args:
-            mission: parameters, breakpoints and ramp.
-            step: number of ticks flown, ``(*B)``.
-            since: tick at which the present phase began, ``(*B)``.
-        """
-        phase = self._phase(mission, step)
-        return blend_phases(mission["parameters"], phase, step - since, mission["ramp"])
-
-    def _phase(self, mission: TensorDictBase, step: Tensor) -> Tensor:
-        progress = step.to(mission["at"].dtype) / self.steps
-        return self.schedule.phase(progress, step, mission["at"])
 
     def _wanted(self, mission: TensorDictBase, time: Tensor) -> Tensor:
         return references_at(self.references, mission["track"], time)

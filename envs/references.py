@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 import math
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from afm_rl.envs.track import check_near, local_origin
 from afm_rl.envs.track_files import read_columns
-from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_number
+from afm_rl.errors import (
+    ConfigurationError,
+    check_choice,
+    check_flag,
+    check_instance,
+    check_number,
+)
 
 
 class Reference(ABC):
     """Position and velocity over time.
+
+    References made of points that are far from zero are moved by whole kilometres, so that single
+    precision does: see :func:`~afm_rl.envs.track.local_origin`.
 
     Attributes:
         name: how missions call it.
@@ -193,7 +204,9 @@ class Table(Reference):
             )
         if not times.diff().gt(0).all():
             raise ConfigurationError(f"references: {name}: expected times that increase")
-        self.times, self.rows = times, torch.cat([positions, velocities], -1)
+        check_near(positions, f"{name}: position")
+        local = positions - local_origin(positions)
+        self.times, self.rows = times, torch.cat([local, velocities], -1)
 
     def at(self, time: Tensor) -> Tensor:
         """Return the rows, mixed linearly."""
@@ -235,6 +248,54 @@ def load_reference(path: str | Path, velocity: str = "columns") -> Table:
     return Table(times, positions, velocities, path.stem)
 
 
+NUMBER = r"(\d+(?:\.\d+)?)"
+NAMED: dict[str, Callable[..., Reference]] = {
+    "hover": Hover,
+    f"circle_{NUMBER}m_{NUMBER}mps": Circle,
+    f"figure_8_{NUMBER}s": lambda period: FigureEight(period=period),
+}
+
+
+def find_reference(name: str) -> Reference:
+    """Return a reference by its name, or from a CSV file.
+
+    Args:
+        name: ``hover``, ``circle_2m_0.8mps`` (radius, speed), ``figure_8_8s`` (period), or the path
+            of a CSV file; see :func:`load_reference`.
+
+    Raises:
+        ConfigurationError: if there is no such reference, or the file cannot be used.
+
+    >>> find_reference("circle_3m_1.2mps").speed
+    1.2
+    """
+    for pattern, make in NAMED.items():
+        found = re.fullmatch(pattern, name)
+        if found:
+            return make(*map(float, found.groups()))
+    if not name.lower().endswith(".csv"):
+        raise ConfigurationError(
+            f"tracks={name!r}: expected hover, a circle such as circle_2m_0.8mps (radius, speed), "
+            "a figure of eight such as figure_8_8s (period), or the path of a CSV file"
+        )
+    return load_reference(name)
+
+
+def check_reference(reference: Reference) -> Reference:
+    """Return a reference if it gives positions and velocities.
+
+    Raises:
+        ConfigurationError: otherwise.
+    """
+    size = tuple(check_instance("tracks", reference, Reference).at(torch.zeros(2)).shape)
+    if size != (2, 6):
+        raise ConfigurationError(
+            f"tracks: {reference.name}: at() gives {size} for 2 times, expected (2, 6): position "
+            "and velocity"
+        )
+    return reference
+
+
 def references_at(references: Sequence[Reference], index: Tensor, time: Tensor) -> Tensor:
     """Return positions and velocities ``(*B, K, 6)`` of flights that follow several references.
 
@@ -263,4 +324,5 @@ def _points(name: str, points: Sequence[Sequence[float]]) -> Tensor:
         rows = torch.zeros(0)
     if rows.dim() != 2 or rows.shape[-1] != 3 or not rows.isfinite().all():
         raise ConfigurationError(f"{name}={points!r}: expected finite numbers x, y, z (m)")
-    return rows
+    check_near(rows, name)
+    return rows - local_origin(rows)

@@ -2,17 +2,50 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_number
 
+GRID = 1e3  # m: origins are multiples of it
+FARTHEST = 1e8  # m from zero: there is no such place on Earth
+LONGEST = 1e5  # m: a longer course is a typing error, and its centre line would fill the memory
+
+
+def local_origin(points: Tensor) -> Tensor:
+    """Return the corner of a grid of kilometres that is nearest to the middle of points ``(N, D)``.
+
+    Single precision has 7 digits: in UTM coordinates, of 5e6 m, steps of half a metre. Relative to
+    this origin, they are below 0.1 mm. It is zero for points around zero.
+
+    >>> local_origin(torch.tensor([[500_123.4, 5_400_007.8]]))
+    tensor([ 500000., 5400000.])
+    """
+    return (points.mean(0) / GRID).round() * GRID
+
+
+def check_near(points: Tensor, name: str) -> None:
+    """Refuse ``points`` ``(N, D)`` that are nowhere on Earth.
+
+    Raises:
+        ConfigurationError: naming the first.
+    """
+    far = points.abs().amax(-1) > FARTHEST
+    if far.any():
+        first = int(far.nonzero()[0])
+        raise ConfigurationError(
+            f"tracks: {name} {first + 1} at {points[first].tolist()}: expected coordinates of at "
+            f"most {FARTHEST:g} m"
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Track:
     """A closed course.
+
+    Points far from zero are moved by whole kilometres when the track is made, all in the same way.
 
     Attributes:
         name: what logs and tables call it.
@@ -20,10 +53,11 @@ class Track:
         start: pose of the robot before the start noise: x, y (m), heading (rad), ``(3,)``.
         centerline: dense line to draw (m), ``(M, 2)``.
         width: width of the road, for drawing only (m).
+        origin: what was subtracted from all points (m), ``(2,)``; see :func:`local_origin`.
 
     Raises:
-        ConfigurationError: for fewer than two waypoints, neighbours that coincide, a wrong
-            shape or a number that is not finite.
+        ConfigurationError: for points too far from zero or from each other, fewer than two
+            waypoints, neighbours that coincide, a wrong shape or a number that is not finite.
 
     >>> corners = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0]])
     >>> Track("triangle", corners, torch.zeros(3), corners).targets.shape
@@ -35,19 +69,27 @@ class Track:
     start: Tensor
     centerline: Tensor
     width: float = 2.0
+    origin: Tensor = field(default_factory=lambda: torch.zeros(2, dtype=torch.float64))
 
     def __post_init__(self) -> None:
         check_number(f"tracks: {self.name}: width", self.width, low=0.0, open_low=True)
         check_closed(self.waypoints, self.name, "waypoint")
-        for field, value, dims, columns in (
+        for name, value, dims, columns in (
             ("start", self.start, 1, 3),
             ("centerline", self.centerline, 2, 2),
         ):
             if value.dim() != dims or value.shape[-1] != columns or not value.isfinite().all():
                 raise ConfigurationError(
-                    f"tracks: {self.name}: {field} {tuple(value.shape)}: expected finite numbers "
+                    f"tracks: {self.name}: {name} {tuple(value.shape)}: expected finite numbers "
                     f"of shape {'(3,)' if dims == 1 else '(M, 2)'}"
                 )
+        shift = local_origin(self.waypoints)
+        if shift.any():
+            move = torch.cat([shift, shift.new_zeros(1)])
+            object.__setattr__(self, "origin", self.origin + shift)
+            object.__setattr__(self, "waypoints", self.waypoints - shift)
+            object.__setattr__(self, "centerline", self.centerline - shift)
+            object.__setattr__(self, "start", self.start - move)
 
     @property
     def targets(self) -> Tensor:
@@ -56,10 +98,10 @@ class Track:
 
 
 def check_closed(points: Tensor, name: str, what: str) -> None:
-    """Refuse ``points`` that are no closed course: at least two, neighbours distinct.
+    """Refuse ``points`` that are no closed course: at least two, neighbours distinct, not absurd.
 
     Raises:
-        ConfigurationError: naming the track and the first offending pair.
+        ConfigurationError: naming the track and the first offending point or pair.
     """
     if points.dim() != 2 or points.shape[-1] != 2 or not points.isfinite().all():
         raise ConfigurationError(
@@ -67,6 +109,13 @@ def check_closed(points: Tensor, name: str, what: str) -> None:
         )
     if len(points) < 2:
         raise ConfigurationError(f"tracks: {name}: {what} count {len(points)}: expected at least 2")
+    check_near(points, f"{name}: {what}")
+    length = float((points.roll(-1, 0) - points).norm(dim=-1).sum())
+    if length > LONGEST:
+        raise ConfigurationError(
+            f"tracks: {name}: a course of {length / 1e3:.4g} km: expected at most "
+            f"{LONGEST / 1e3:g} km; coordinates are metres"
+        )
     same = (points.roll(-1, 0) == points).all(-1)
     if same.any():
         first = int(same.nonzero()[0]) + 1

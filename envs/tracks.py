@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.envs.geometry import Pieces, poses_at, round_corners, station_of
-from afm_rl.envs.track import Track, check_closed
+from afm_rl.envs.track import Track, check_closed, local_origin
 from afm_rl.envs.track_files import read_columns
 from afm_rl.errors import ConfigurationError
 
@@ -26,7 +26,8 @@ def load_track(source: str | Path) -> Track:
     A file with the columns ``x,y`` lists waypoints: the robot starts at the first and faces
     the second. With ``x,y,radius`` it lists the corners of a closed polygon and their fillet
     radii (m): waypoints then stand about 3.5 m apart, the first one where the first corner's
-    arc ends. Either closes by itself: the first row is not repeated.
+    arc ends. Either closes by itself: the first row is not repeated. Coordinates may be those of a
+    map (UTM, m): the track's are relative to its ``origin``.
 
     Args:
         source: ``ethz_1``, ``ethz_2``, or the path of a CSV file.
@@ -66,17 +67,21 @@ def _from_corners(name: str, corners: Tensor) -> Track:
     if (corners[:, 2] < 0).any():
         low = float(corners[:, 2].min())
         raise ConfigurationError(f"tracks: {name}: radius {low:g}: expected at least 0 m")
-    pieces = round_corners(corners[:, :2], corners[:, 2], name)
+    origin = local_origin(corners[:, :2])  # first, so that nothing is rounded far from zero
+    pieces = round_corners(corners[:, :2] - origin, corners[:, 2], name)
     length = float(pieces.length.sum())
     count = max(2, round(length / SPACING))
-    return _along(name, pieces, torch.arange(count, dtype=corners.dtype) * (length / count))
+    stations = torch.arange(count, dtype=corners.dtype) * (length / count)
+    return replace(_along(name, pieces, stations), origin=origin)
 
 
 def _from_points(name: str, points: Tensor) -> Track:
     check_closed(points, name, "waypoint")
+    origin = local_origin(points)
+    points = points - origin
     pieces = round_corners(points, points.new_zeros(len(points)), name)
     corners = (pieces.length.cumsum(0) - pieces.length)[::2]
-    return replace(_along(name, pieces, corners), waypoints=points)
+    return replace(_along(name, pieces, corners), waypoints=points, origin=origin)
 
 
 def _along(name: str, pieces: Pieces, stations: Tensor) -> Track:

@@ -3,30 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 
-from afm_rl.envs import ugv_settings as settings
-from afm_rl.envs import ugv_specs as specs
 from afm_rl.envs.course import Course
-from afm_rl.envs.mission_env import MissionEnv, check_action
+from afm_rl.envs.mission_env import MissionEnv
 from afm_rl.envs.mission_noise import MissionNoise
-from afm_rl.envs.missions import MissionFormat
 from afm_rl.envs.rendering import canvas_of
+from afm_rl.envs.settings import check_bounds, check_names, check_regime
 from afm_rl.envs.track import Track
+from afm_rl.envs.tracks import load_track
 from afm_rl.envs.ugv_simulation import UGVSimulation
-from afm_rl.errors import (
-    AFMError,
-    check_choice,
-    check_count,
-    check_number,
-)
-from afm_rl.regimes import Regime, Schedule
+from afm_rl.errors import AFMError, check_choice, check_count, check_instance, check_number
+from afm_rl.regimes import ActionGain, Regime, Schedule
+
+ACTIONS = ("v (m/s)", "omega (rad/s)")
 
 
 class UGVTrack(MissionEnv):
@@ -56,6 +52,9 @@ class UGVTrack(MissionEnv):
                                      for oracles and logs only
     ``regime_active`` ``(*B)``       whether they differ from nominal; hidden truth as well
     ================= ============== ====================================================
+
+    Positions are relative to the ``origin`` of the track, whole kilometres: zero for tracks near
+    zero, and in single precision a track in UTM coordinates is then as good as any.
 
     The state travels in the tensordict. With ``batch_size=()`` the environment accepts
     tensordicts of any batch shape, also one that loses rows from step to step. ``reset`` keeps
@@ -95,6 +94,8 @@ class UGVTrack(MissionEnv):
     tensor([1, 1, 1, 1, 1])
     """
 
+    simulation: UGVSimulation
+
     def __init__(
         self,
         tracks: Sequence[str | Path | Track] = ("ethz_2",),
@@ -114,98 +115,36 @@ class UGVTrack(MissionEnv):
         *,
         dtype: torch.dtype | None = None,
     ) -> None:
-        batch = settings.check_batch(batch_size)
-        super().__init__(device=device, batch_size=batch)
-        self._batch_locked = bool(batch)
-        self.dtype = settings.check_dtype(dtype)
-        self.tracks = settings.load_tracks(tracks)
-        self.regime = settings.check_regime(regime)
-        self.schedule = settings.check_schedule(schedule)
+        super().__init__(batch_size, seed, start_noise, device, dtype)
+        if isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable):
+            tracks = (tracks,)
+        self.tracks = tuple(one if isinstance(one, Track) else load_track(one) for one in tracks)
+        names = [track.name for track in self.tracks]
+        check_names("tracks", names)
         self.process_noise = check_number("process_noise", process_noise, low=0.0)
-        self.start_noise = check_number("start_noise", start_noise, low=0.0)
-        self.seed = check_count("seed", seed, low=0)
         self.noise = MissionNoise()
-        low, high = settings.action_box(action_low, action_high)
+        bounds = check_bounds(action_low, action_high, ACTIONS)
+        schedule = Schedule() if schedule is None else schedule
         self.simulation = UGVSimulation(
             Course(self.tracks, self.dtype),
-            regime=self.regime,
-            schedule=self.schedule,
-            low=low.to(self.dtype),
-            high=high.to(self.dtype),
+            check_regime(regime, lambda: ActionGain(["v_gain", "omega_gain"]), 3, 2),
+            check_instance("schedule", schedule, Schedule),
+            *(bound.to(self.dtype) for bound in bounds),
             dt=check_number("dt", dt, low=0.0, open_low=True),
             reach=check_number("reach", reach, low=0.0, open_low=True),
             max_steps=check_count("max_steps", max_steps),
         ).to(self.device)
-
-        names = [track.name for track in self.tracks]
-        self.mission_format = MissionFormat(names, self.regime, self.schedule, self.dtype)
-        if isinstance(missions, Mapping) and not isinstance(missions, TensorDictBase):
-            for key in missions:
-                check_choice("missions", key, ("track", "seed", "regime", "at", "ramp"))
-            missions = self.mission(**missions)
-        self._default = settings.check_missions(missions, batch)
-        self._missions_of(None, batch)  # a wrong default fails here, not at the first reset
-
-        mission = self.mission_format.spec(batch, self.device)
-        state = specs.state_spec(mission, self.dtype, self.regime.history)
-        self.state_spec = state
-        self.observation_spec = specs.observation_spec(state, len(self.regime.names))
-        self.full_action_spec = specs.action_spec(
-            self.simulation.low, self.simulation.high, batch, self.device
-        )
-        self.full_reward_spec = specs.reward_spec(state)
-        self.full_done_spec = specs.done_spec(state)
+        self._complete(names, missions, bounds)
 
     @property
     def course(self) -> Course:
         """The targets of all tracks."""
         return self.simulation.course
 
-    def mission(
-        self,
-        track: int | str = 0,
-        seed: int | None = None,
-        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
-        at: Sequence[float] | None = None,
-        ramp: int = 0,
-    ) -> TensorDict:
-        """Describe one mission; see :meth:`~afm_rl.envs.missions.MissionFormat.build`."""
-        return self.mission_format.build(track, seed, regime, at, ramp).to(self.device)
-
-    def _reset(
-        self, tensordict: TensorDictBase | None = None, *, set_state: bool = False, **kwargs
-    ) -> TensorDictBase:
-        batch = self.batch_size if tensordict is None else tensordict.batch_size
-        given = TensorDict({}, batch) if tensordict is None else tensordict
-        mission = self._missions_of(given, batch)
-        nothing = torch.zeros_like(mission["track"])
-        state = {"reached": nothing, "step": nothing, "since": nothing}
-        if self.regime.history:
-            size = (*batch, self.regime.history, 2)
-            state["past"] = torch.zeros(size, dtype=self.dtype, device=self.device)
-        if set_state and "pose" in given.keys():
-            pose = given["pose"].to(self.dtype, copy=True)
-            state = {name: given.get(name, value) for name, value in state.items()}
-        else:
-            rows = given.get("_reset", None)
-            rows = None if rows is None else rows.reshape(batch)
-            noise = self.noise.normal("start", mission["seed"], rows, self.dtype)
-            pose = self.simulation.start(mission, self.start_noise * noise)
-        state = {name: value.clone() for name, value in state.items()}
-        return self._remembered(self.simulation.describe(mission, pose, **state))
-
     def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:
-        check_action(tensordict["action"])
         seeds = tensordict["mission", "seed"]
-        noise = self.noise.normal("process", seeds, dtype=self.dtype)
-        actuator = None
-        if self.regime.noisy:
-            actuator = self.noise.normal("actuator", seeds, dtype=self.dtype)
-        return self.simulation.advance(tensordict, self.process_noise * noise, actuator)
-
-    def _remembered(self, out: TensorDictBase) -> TensorDictBase:
-        self._last = out.select("pose", "goal", "mission")
-        return out
+        noise = self.process_noise * self.noise.normal("process", seeds, dtype=self.dtype)
+        return self.simulation.advance(tensordict, noise, self._actuator_noise(seeds))
 
     def render(
         self, tensordict: TensorDictBase | None = None, mode: str = "rgb_array"

@@ -10,8 +10,15 @@ import gymnasium
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
-from afm_rl.envs.gym_adapter import build_native, observe, require_reset, spaces
+from afm_rl.envs.gym_adapter import (
+    UGV_BOUND,
+    MissionGym,
+    build_ugv,
+    observe_ugv,
+    require_reset,
+)
 from afm_rl.envs.rendering import canvas_of
 from afm_rl.envs.track import Track
 from afm_rl.envs.ugv_vector import UGVTrackVectorEnv
@@ -21,7 +28,7 @@ from afm_rl.regimes import Regime, Schedule
 __all__ = ["UGVTrackGym", "UGVTrackVectorEnv"]
 
 
-class UGVTrackGym(gymnasium.Env):
+class UGVTrackGym(MissionGym):
     """One mission of :class:`~afm_rl.envs.UGVTrack`.
 
     The observation is (x, y, theta, goal x, goal y) in m and rad, the action (v, omega) in m/s
@@ -68,32 +75,14 @@ class UGVTrackGym(gymnasium.Env):
         self.render_mode = render_mode
         gains = {"v_gain": v_gain, "omega_gain": omega_gain}
         settings.setdefault("max_steps", 2**62)  # gymnasium limits time by a wrapper
-        self.native = build_native(track, regime, gains, schedule, ramp, family, (), settings)
-        self.observation_space, self.action_space = spaces(self.native)
-        self._data: TensorDictBase | None = None
-        self._trail: list[torch.Tensor] = []
+        native = build_ugv(track, regime, gains, schedule, ramp, family, (), settings)
+        super().__init__(native, UGV_BOUND)
+        self._trail: list[Tensor] = []
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Begin an episode; ``seed`` restarts the noise, no seed continues it."""
-        super().reset(seed=seed)
-        if seed is not None or self._data is None:
-            chosen = int(self.np_random.integers(2**31)) if seed is None else seed
-            self.native.set_seed(chosen, static_seed=True)
-        self._data = self.native.reset()
-        self._trail = [self._data["pose"]]
-        return self._described(self._data)
-
-    def step(self, action: np.ndarray):
-        """Apply (v, omega) for one time step."""
-        data = require_reset(self._data)
-        data["action"] = torch.as_tensor(np.asarray(action), device=self.native.device)
-        following = self.native.step(data)["next"]
-        self._data = self.native.step_mdp(data)
-        if self.render_mode is not None:
-            self._trail.append(following["pose"])
-        observation, info = self._described(following)
-        ends = (bool(following[name]) for name in ("terminated", "truncated"))
-        return observation, float(following["reward"]), *ends, info
+        self._trail = []
+        return super().reset(seed=seed, options=options)
 
     def render(self) -> np.ndarray | None:
         """Draw the robot, its goal and its trail, ``(H, W, 3)`` bytes."""
@@ -104,6 +93,7 @@ class UGVTrackGym(gymnasium.Env):
         canvas = canvas_of(self.native.tracks[0])
         return canvas.draw(trail[-1], goal, trail, self.native.simulation.reach)
 
-    def _described(self, data: TensorDictBase) -> tuple[np.ndarray, dict[str, Any]]:
-        observation, info = observe(self.native, data)
-        return observation, {name: value.item() for name, value in info.items()}
+    def _seen(self, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        if self.render_mode is not None:
+            self._trail.append(data["pose"])
+        return observe_ugv(self.native, data)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from afm_rl.dynamics import dubins_step
 from afm_rl.envs.course import Course
+from afm_rl.envs.phases import PhasedSimulation
 from afm_rl.manifold import wrap_angle
-from afm_rl.regimes import Regime, Schedule, blend_phases
+from afm_rl.regimes import Regime, Schedule
 
 
-class UGVSimulation(nn.Module):
+class UGVSimulation(nn.Module, PhasedSimulation):
     r"""Dubins robots under regimes, without any state or random numbers of its own.
 
     .. math:: s_{t+1} = f(s_t, g(\mathrm{clamp}(a_t); \rho_t)) + \epsilon_t
@@ -46,9 +49,18 @@ class UGVSimulation(nn.Module):
         self.reach = reach
         self.max_steps = max_steps
 
-    def start(self, mission: TensorDictBase, noise: Tensor) -> Tensor:
-        """Return start poses ``(*B, 3)``, displaced by ``noise`` ``(*B, 3)``."""
-        return _wrapped(self.course.starts[mission["track"]] + noise)
+    def begin(self, mission: TensorDictBase, dtype: torch.dtype) -> dict[str, Tensor]:
+        """Return the state at the beginning of missions: at the start, nothing reached."""
+        pose = _wrapped(self.course.starts[mission["track"]].to(dtype))
+        return self.started(pose, mission, 2, reached=torch.zeros_like(mission["track"]))
+
+    def displaced(self, pose: Tensor, noise: Tensor) -> Tensor:
+        """Return poses moved by noise (m, m, rad), ``(*B, 3)``."""
+        return _wrapped(pose + noise)
+
+    def progress(self, mission: TensorDictBase, state: Any) -> Tensor:
+        """Return the share of targets reached."""
+        return self.course.progress(mission["track"], state["reached"])
 
     def advance(
         self, data: TensorDictBase, noise: Tensor, actuator: Tensor | None = None
@@ -64,7 +76,7 @@ class UGVSimulation(nn.Module):
         mission, pose, before = data["mission"], data["pose"], data["reached"]
         action = data["action"].to(pose.dtype).clamp(self.low, self.high)
         past = data["past"] if self.regime.history else None
-        parameters = self.regime_now(mission, before, data["step"], data["since"])
+        parameters = self.regime_now(mission, data)
         effective = self.regime.apply(action, parameters, pose, past, actuator)
         moved = _wrapped(dubins_step(pose, effective, self.dt) + noise)
 
@@ -72,64 +84,19 @@ class UGVSimulation(nn.Module):
         goal = self.course.goal(track, before)
         gap = (moved[..., :2] - goal).norm(dim=-1)
         hit = (gap < self.reach) & ~self.course.finished(track, before)
-        reached, step = before + hit, data["step"] + 1
         gained = (pose[..., :2] - goal).norm(dim=-1) - gap
-        terminated = self.course.finished(track, reached)
-        truncated = step >= self.max_steps
-        same = self._phase(mission, before, data["step"]) == self._phase(mission, reached, step)
-        since = torch.where(same, data["since"], step)
-        if past is not None:
-            past = torch.cat([action.unsqueeze(-2), past[..., :-1, :]], -2)
-        out = self.describe(mission, moved, reached, step, since, past)
+        state = {"pose": moved, "reached": before + hit, "step": data["step"] + 1}
+        out = self.describe(mission, self.followed(mission, data, state, action))
         out["reward"] = (gained + hit).unsqueeze(-1)
-        out["terminated"] = terminated.unsqueeze(-1)
-        out["truncated"] = truncated.unsqueeze(-1)
-        out["done"] = (terminated | truncated).unsqueeze(-1)
+        out["terminated"] = self.course.finished(track, state["reached"]).unsqueeze(-1)
+        out["truncated"] = (state["step"] >= self.max_steps).unsqueeze(-1)
+        out["done"] = out["terminated"] | out["truncated"]
         return out
 
-    def describe(
-        self,
-        mission: TensorDictBase,
-        pose: Tensor,
-        reached: Tensor,
-        step: Tensor,
-        since: Tensor,
-        past: Tensor | None = None,
-    ) -> TensorDict:
+    def describe(self, mission: TensorDictBase, state: dict[str, Tensor]) -> TensorDict:
         """Return the state and what is seen of it."""
-        parameters = self.regime_now(mission, reached, step, since)
-        entries = {
-            "pose": pose,
-            "reached": reached,
-            "step": step,
-            "since": since,
-            "mission": mission.clone(),
-            "observation": pose.clone(),
-            "goal": self.course.goal(mission["track"], reached),
-            "regime": parameters,
-            "regime_active": ~self.regime.is_identity(parameters),
-        }
-        if past is not None:
-            entries["past"] = past
-        return TensorDict(entries, mission.batch_size, device=mission.device)
-
-    def regime_now(
-        self, mission: TensorDictBase, reached: Tensor, step: Tensor, since: Tensor
-    ) -> Tensor:
-        """Return the parameters ``(*B, F)`` that act on the next action.
-
-        Args:
-            mission: parameters, breakpoints and ramp.
-            reached: number of targets reached, ``(*B)``.
-            step: number of steps taken, ``(*B)``.
-            since: step at which the present phase began, ``(*B)``.
-        """
-        phase = self._phase(mission, reached, step)
-        return blend_phases(mission["parameters"], phase, step - since, mission["ramp"])
-
-    def _phase(self, mission: TensorDictBase, reached: Tensor, step: Tensor) -> Tensor:
-        progress = self.course.progress(mission["track"], reached)
-        return self.schedule.phase(progress, step, mission["at"])
+        goal = self.course.goal(mission["track"], state["reached"])
+        return self.described(mission, state, observation=state["pose"].clone(), goal=goal)
 
 
 def _wrapped(pose: Tensor) -> Tensor:

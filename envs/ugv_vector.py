@@ -12,7 +12,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from tensordict import TensorDictBase
 
-from afm_rl.envs.gym_adapter import build_native, observe, require_reset, spaces
+from afm_rl.envs.gym_adapter import (
+    UGV_BOUND,
+    build_ugv,
+    observe_ugv,
+    require_reset,
+    reseed,
+    spaces,
+)
 from afm_rl.envs.rendering import canvas_of
 from afm_rl.envs.track import Track
 from afm_rl.errors import ConfigurationError, check_choice, check_count
@@ -83,10 +90,9 @@ class UGVTrackVectorEnv(VectorEnv):
         self.num_envs = check_count("num_envs", num_envs)
         settings.setdefault("max_steps", max_episode_steps)
         gains = {"v_gain": v_gain, "omega_gain": omega_gain}
-        self.native = build_native(
-            track, regime, gains, schedule, ramp, family, (num_envs,), settings
-        )
-        self.single_observation_space, self.single_action_space = spaces(self.native)
+        size = (self.num_envs,)
+        self.native = build_ugv(track, regime, gains, schedule, ramp, family, size, settings)
+        self.single_observation_space, self.single_action_space = spaces(self.native, UGV_BOUND)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._data: TensorDictBase | None = None
@@ -94,9 +100,7 @@ class UGVTrackVectorEnv(VectorEnv):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Reset all missions, or those in ``options["reset_mask"]`` (booleans ``(N,)``)."""
         super().reset(seed=seed)
-        if seed is not None or self._data is None:
-            chosen = int(self.np_random.integers(2**31)) if seed is None else seed
-            self.native.set_seed(chosen, static_seed=True)
+        reseed(self.native, self.np_random, seed, self._data)
         mask = (options or {}).get("reset_mask")
         if mask is None or self._data is None:
             self._data = self.native.reset()
@@ -146,6 +150,8 @@ class UGVTrackVectorEnv(VectorEnv):
 
     def _described(self, data: TensorDictBase) -> tuple[np.ndarray, dict[str, Any]]:
         """Return observation and info, with gymnasium's mask for each entry of the info."""
-        observation, info = observe(self.native, data)
+        seen, truth = observe_ugv(self.native, data)
+        observation = seen.cpu().numpy().astype(np.float32)
+        info = {name: value.cpu().numpy() for name, value in truth.items()}
         everyone = {f"_{name}": np.ones(self.num_envs, dtype=np.bool_) for name in info}
         return observation, info | everyone

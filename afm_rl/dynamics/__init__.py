@@ -7,6 +7,7 @@ from afm_rl.dynamics.ensemble import Ensemble
 from afm_rl.dynamics.inverse import EffectiveAction, effective_action
 from afm_rl.dynamics.knode import KNODE
 from afm_rl.dynamics.known import KnownDynamics
+from afm_rl.dynamics.mujoco import MuJoCoDynamics
 from afm_rl.dynamics.oracle import Oracle
 from afm_rl.dynamics.quadrotor import Quadrotor
 
@@ -18,6 +19,7 @@ __all__ = [
     "EffectiveAction",
     "Ensemble",
     "KnownDynamics",
+    "MuJoCoDynamics",
     "Oracle",
     "Quadrotor",
     "dubins_step",

@@ -77,6 +77,21 @@ class DynamicsModel(nn.Module, ABC):
         """Return expected next state and noise scale together, in one pass if possible."""
         return self(state, action), self.noise_scale(state, action)
 
+    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+        """Return the states ``(*B, N, H, S)`` that whole plans lead to.
+
+        Step by step; models that simulate a plan at once override it.
+
+        Args:
+            state: the first state of all plans, ``(*B, S)``.
+            actions: plans of H steps, ``(*B, N, H, A)``.
+        """
+        now, states = state.unsqueeze(-2).expand(*actions.shape[:-2], -1), []
+        for action in actions.unbind(-2):
+            now = self(now, action)
+            states.append(now)
+        return torch.stack(states, -2)
+
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         r"""Return :math:`\partial f / \partial a` ``(*L, *N, D, A)`` on the tangent space.
 

@@ -54,6 +54,19 @@ class Dubins(KnownDynamics):
         super().__init__(partial(dubins_step, dt=dt), Manifold(3, angles=[2]), 2, noise_std)
         self.dt = dt
 
+    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+        """Return the states ``(*B, N, H, 3)`` of whole plans, by cumulative sums."""
+        x, y, theta = state[..., None, None, :].unbind(-1)
+        stride, turn = (actions * self.dt).unbind(-1)
+        heading = theta + turn.cumsum(-1)
+        before = torch.cat([theta.expand_as(heading[..., :1]), heading[..., :-1]], -1)
+        moved = (
+            x + (stride * before.cos()).cumsum(-1),
+            y + (stride * before.sin()).cumsum(-1),
+            wrap_angle(heading),
+        )
+        return torch.stack(moved, -1)
+
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the closed form ``(*B, 3, 2)``."""
         theta = state[..., 2]

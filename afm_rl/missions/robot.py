@@ -83,8 +83,15 @@ class Robot:
         for kind, size in (("action", self.model.action_size), ("state", self.model.state_size)):
             self._check_box(kind, size)
             names = list(getattr(self, f"{kind}_names"))
-            if len(names) != size:
-                raise ConfigurationError(f"robot.{kind}_names={names}: expected {size} names")
+            if len(set(names)) < len(names) or len(names) != size:
+                raise ConfigurationError(
+                    f"robot.{kind}_names={names}: expected {size} names, each once"
+                )
+        goals = list(self.goal_names)
+        if len(set(goals)) < len(goals) or not set(goals) <= set(self.state_names):
+            raise ConfigurationError(
+                f"robot.goal_names={goals}: expected some of {', '.join(self.state_names)}"
+            )
         size = self.model.state_size
         for name in ("features", "place"):
             indices = list(getattr(self, name))

@@ -103,11 +103,8 @@ class PlanningEnv(ModelBasedEnvBase):
             actions: ``(*B, N, H, A)``.
             task: the cost's task entries, each ``(*B, size)``.
         """
-        state = state.unsqueeze(-2).expand(*actions.shape[:-2], -1)
-        wide = [entry.unsqueeze(-2) for entry in task]
-        total: Tensor | float = 0.0
-        for action in actions.unbind(-2):
-            next_state = self.dynamics(state, action)
-            total = total + self.cost(state, action, next_state, *wide)
-            state = next_state
-        return -torch.as_tensor(total)
+        states = self.dynamics.rollout(state, actions)
+        first = state[..., None, None, :].expand_as(states[..., :1, :])
+        before = torch.cat([first, states[..., :-1, :]], -2)
+        wide = [entry[..., None, None, :] for entry in task]
+        return -self.cost(before, actions, states, *wide).sum(-1)

@@ -66,8 +66,8 @@ class Regime(ABC):
     ) -> Tensor:
         r"""Return the action in the box whose effect is nearest to ``action``, ``(*B, A)``.
 
-        :math:`\operatorname{argmin}_{u \in [l, h]} \|(\mathrm{apply}(u) - a) / (h - l)\|`, by a search that
-        narrows around the best of a grid of points; families with a closed form override it.
+        :math:`\operatorname{argmin}_{u \in [l, h]} \|(\mathrm{apply}(u) - a) / (h - l)\|`, by a
+        search that narrows around the best of a grid of points; families with a closed form override it.
         """
         grid = torch.quasirandom.SobolEngine(len(low)).draw(SEARCH_POINTS).to(low)
         centre, span = ((low + high) / 2).expand_as(action), high - low

@@ -2,13 +2,13 @@
 
 import pytest
 
-from afm_rl.envs import FigureEight, Hover, find_reference, make_flights
+from afm_rl.envs import CrazyflieTrack, FigureEight, Hover, find_reference
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import MassFactor, Schedule
 
 
 def flights(tracks=("hover",), **settings):
-    return make_flights(tracks, MassFactor(), Schedule([], by="step"), **settings)
+    return CrazyflieTrack(tracks, MassFactor(), Schedule([], by="step"), **settings)
 
 
 @pytest.mark.parametrize("name", ["hover", "circle_2m_0.3mps", "circle_10.5m_0mps", "figure_8_6s"])

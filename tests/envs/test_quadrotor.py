@@ -84,7 +84,7 @@ def test_flights_start_on_the_reference():
 def test_the_reference_is_previewed_or_held():
     circle = Circle(1.0, 0.7)
     for preview in (True, False):
-        env = CrazyflieTrack(circle, preview=preview, horizon=4)
+        env = CrazyflieTrack(circle, preview=preview, start="moving", horizon=4)
         seen = fly(env, env.reset(), 3)["reference"][-1]
         ticks = torch.arange(3, 8) if preview else torch.full((5,), 3)
         torch.testing.assert_close(seen, circle.at(ticks * 0.05 + 0.002))  # the metric's
@@ -274,8 +274,9 @@ def test_a_lost_flight_terminates_and_stays_finite(action):
     assert not record["lost"][:first].any()
 
 
-def test_numbers_without_end_terminate():
+def test_numbers_without_end_terminate(monkeypatch):
     env = CrazyflieTrack(Hover(), regime=ActionGain(["a", "b", "c", "d"]), schedule=[])
+    monkeypatch.setattr(env.regime, "limits", {})
     missions = [env.mission(regime={"b": value}) for value in (1.0, 1e30)]
     record = fly(env, env.reset(torch.stack(missions), set_state=False), 3, [0.3, 1e-3, 0, 0])
     assert record["terminated"][..., 0].tolist() == [[False, True]] * 3
@@ -363,16 +364,16 @@ class Halfway(Reference):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"references": []}, "expected at least one"),
-        ({"references": [Circle(), Circle()]}, "distinct names"),
-        ({"references": 3}, "references: 3: expected a Reference or a CSV path"),
-        ({"references": "nowhere.csv"}, "cannot read nowhere.csv"),
-        ({"action_low": [0.0]}, r"action_low=\[0.0\]: expected four numbers"),
-        ({"action_high": "far"}, "action_high='far': expected four numbers"),
+        ({"tracks": []}, "expected at least one"),
+        ({"tracks": [Circle(), Circle()]}, "distinct names"),
+        ({"tracks": 3}, "tracks: expected a Reference, got 3"),
+        ({"tracks": "nowhere.csv"}, "cannot read nowhere.csv"),
+        ({"action_low": [0.0]}, r"action_low=\[0.0\]: expected numbers for .*thrust"),
+        ({"action_high": "far"}, "action_high='far': expected numbers for"),
         ({"action_low": [0.6, -1, -1, -1]}, "expected less than action_high"),
-        ({"references": Halfway()}, r"halfway: at\(\) gives \(2, 3\).*position and velocity"),
-        ({"regime": "heavy"}, "regime='heavy': expected a Regime"),
-        ({"regime": ActionGain(["a", "b"])}, "does not fit actions"),
+        ({"tracks": Halfway()}, r"halfway: at\(\) gives \(2, 3\).*position and velocity"),
+        ({"regime": "heavy"}, "regime: expected a Regime, got 'heavy'"),
+        ({"regime": ActionGain(["a", "b"])}, "does not fit 4 actions"),
         ({"regime": Delay(), "missions": {"regime": {"delay": 0.5}}}, "delay=0.5"),
         ({"schedule": [5.0, 2.0]}, r"times=\[5.0, 2.0\]: expected increasing"),
         ({"schedule": [0.0]}, "times=0.0: expected a finite number in"),

@@ -142,3 +142,38 @@ def test_a_track_checks_itself(field, value):
     fields = {"waypoints": points, "start": torch.zeros(3), "centerline": points}
     with pytest.raises(ConfigurationError, match=rf"tracks: mine: {field[:5]}"):
         Track("mine", **{**fields, field: value})
+
+
+SQUARE = [(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)]
+
+
+def square(folder, x=0.0, y=0.0, side=1.0, name="square"):
+    path = folder / f"{name}.csv"
+    rows = "".join(f"{x + side * a!r},{y + side * b!r}\n" for a, b in SQUARE)
+    path.write_text("x,y\n" + rows)
+    return path
+
+
+@pytest.mark.parametrize(("x", "y"), [(1e7, -1e7), (500_000.0, 5_400_000.0)])
+def test_far_from_zero_is_as_near(tmp_path, x, y):
+    near = load_track(square(tmp_path, name="near"))
+    far = load_track(square(tmp_path, x, y, name="far"))
+    assert (near.origin.tolist(), far.origin.tolist()) == ([0, 0], [x, y])
+    for part in ("waypoints", "start", "centerline"):
+        assert torch.equal(getattr(near, part), getattr(far, part))
+    points = near.waypoints + far.origin
+    whole = Track("far", points, torch.cat([points[0], torch.zeros(1)]), points)
+    assert torch.equal(whole.waypoints, near.waypoints) and whole.origin.tolist() == [x, y]
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"side": 5e4}, "tracks: square: a course of 800 km: expected at most 100 km"),
+        ({"side": 1e30}, r"square: waypoint 2 at \[4e\+30, 0.0\]: expected coordinates of at most"),
+        ({"x": 1e30}, r"square: waypoint 1 at \[1e\+30, 0.0\]"),
+    ],
+)
+def test_tracks_that_nobody_can_mean_are_refused(tmp_path, settings, complaint):
+    with pytest.raises(ConfigurationError, match=complaint):
+        load_track(square(tmp_path, **settings))

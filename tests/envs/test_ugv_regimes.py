@@ -47,7 +47,7 @@ def steer(data):
 def test_specs_hold(batch, dtype):
     env = quiet(batch_size=batch, max_steps=3, dtype=dtype, missions={"ramp": 2})
     check_env_specs(env, break_when_any_done="both")
-    assert env.reset()["past"].shape == (*batch, 2, 2)
+    assert env.reset()["past"].shape == (*batch, 8, 2)
     assert "past" not in UGVTrack(batch_size=batch).reset()
 
 
@@ -67,9 +67,9 @@ def test_a_delayed_command_acts_that_many_steps_later(steps):
 def test_the_past_holds_the_clamped_actions_newest_first():
     env = quiet()
     results = drive(env, env.reset(), [[3.0, 0.1], [-0.3, 0.2], [0.5, -9.0]])
-    expected = torch.tensor([[0.5, -torch.pi / 2], [-0.3, 0.2]])
-    torch.testing.assert_close(results[-1]["past"], expected)
-    torch.testing.assert_close(results[0]["past"], torch.tensor([[1.0, 0.1], [0.0, 0.0]]))
+    expected = torch.tensor([[0.5, -torch.pi / 2], [-0.3, 0.2], [1.0, 0.1], [0.0, 0.0]])
+    torch.testing.assert_close(results[-1]["past"][:4], expected)
+    torch.testing.assert_close(results[0]["past"][:2], expected[2:])
 
 
 def test_the_robot_may_drive_backwards_on_patches():

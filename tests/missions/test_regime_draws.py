@@ -116,9 +116,9 @@ def test_without_a_draw_a_family_is_what_is_set(robot):
     [
         (3, "families.mine=3: expected a mapping of draw, set, ramp, changes"),
         ({"draws": ["gain"]}, "families.mine: setting='draws': expected one of draw, set"),
-        ({"draw": "gain"}, "families.mine.draw='gain': expected names among delay, sat"),
+        ({"draw": "gain"}, "families.mine.draw='gain': expected names among delay, lag"),
         ({"draw": [["gain"], 3]}, r"families.mine.draw=\[\['gain'\], 3\]: expected names"),
-        ({"draw": ["gains"]}, "families.mine.draw='gains': expected one of delay, saturation"),
+        ({"draw": ["gains"]}, "families.mine.draw='gains': expected one of delay, lag"),
         ({"set": ["v_gain"]}, r"families.mine.set=\['v_gain'\]: expected a mapping of delay"),
         ({"set": {"gain": 1.0}}, "regimes: unknown parameter 'gain'"),
         ({"draw": ["gain"], "ramp": -1}, "families.mine.ramp=-1: expected a whole number"),

@@ -145,7 +145,9 @@ def test_double_precision_is_kept():
 
 
 def circle(speed=0.8, preview=True, ticks=100):
-    env = CrazyflieTrack([Circle(2.0, speed)], horizon=1, preview=preview, batch_size=(1,))
+    env = CrazyflieTrack(
+        [Circle(2.0, speed)], horizon=1, preview=preview, start="moving", batch_size=(1,)
+    )
     start = env.reset(set_state=False)
     with torch.no_grad():
         rolled = env.rollout(ticks, controller(), tensordict=start, auto_reset=False)

@@ -1,0 +1,218 @@
+"""MuJoCo as a dynamics model."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from afm_rl.dynamics.known import KnownDynamics
+from afm_rl.dynamics.mujoco_space import MuJoCoSpace
+from afm_rl.errors import ConfigurationError, check_count
+
+try:
+    import mujoco
+    from mujoco import rollout as mujoco_rollout
+except ImportError:  # an extra
+    mujoco = None
+
+STEP = 1e-4  # of finite differences, in half ranges and units of the state: far above the
+# tolerance of the contact solver, far below what bends a trajectory
+HUGE = 1e9  # MuJoCo resets a simulation that holds larger numbers
+
+
+def read_model(source: Any) -> tuple[Any, int]:
+    """Return a copy of the ``MjModel`` in a source, and the simulation steps per action.
+
+    Args:
+        source: see :class:`MuJoCoDynamics`.
+
+    Raises:
+        ConfigurationError: if there is no model in it, or none with actuators.
+    """
+    if mujoco is None:
+        raise ConfigurationError(
+            "dynamics=mujoco: the package mujoco is missing; install afm-rl[mujoco]"
+        )
+    skip, inner = 1, getattr(source, "unwrapped", source)
+    if isinstance(source, str | Path):
+        found = _parse(source)
+    elif isinstance(getattr(inner, "model", inner), mujoco.MjModel):  # gymnasium, or plain
+        found, skip = getattr(inner, "model", inner), getattr(inner, "frame_skip", 1)
+    elif hasattr(source, "physics"):  # dm_control
+        found = source.physics.model.ptr
+        skip = round(source.control_timestep() / source.physics.timestep())
+    else:
+        raise ConfigurationError(
+            f"dynamics.model={source!r}: expected an MJCF file or string, an mjModel, or a MuJoCo "
+            "environment of gymnasium or dm_control"
+        )
+    if found.nu == 0:
+        raise ConfigurationError(f"dynamics.model={source!r}: expected actuators, found none")
+    return copy.copy(found), skip
+
+
+def _parse(source: str | Path) -> Any:
+    text = str(source)
+    try:
+        if text.lstrip().startswith("<"):
+            return mujoco.MjModel.from_xml_string(text)
+        if not Path(text).is_file():
+            raise ConfigurationError(f"dynamics.model={text}: no such file")
+        return mujoco.MjModel.from_xml_path(text)
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise ConfigurationError(f"dynamics.model={text[:80]!r}: {reason}") from error
+
+
+def space_of(model: Any) -> MuJoCoSpace:
+    """Return the state space of an ``MjModel``."""
+    angles, quaternions = [], []
+    for kind, first, limited in zip(
+        model.jnt_type, model.jnt_qposadr, model.jnt_limited, strict=True
+    ):
+        if kind == mujoco.mjtJoint.mjJNT_HINGE and not limited:
+            angles.append(int(first))
+        elif kind == mujoco.mjtJoint.mjJNT_BALL:
+            quaternions.append(int(first))
+        elif kind == mujoco.mjtJoint.mjJNT_FREE:
+            quaternions.append(int(first) + 3)
+    return MuJoCoSpace(model.nq + model.nv + model.na, angles, quaternions)
+
+
+class Simulator:
+    """Simulates many copies of a MuJoCo model from given states, on some threads.
+
+    Args:
+        model: an ``MjModel``; not copied.
+        frame_skip: simulation steps per action.
+        threads: 0 for the calling thread.
+    """
+
+    def __init__(self, model: Any, frame_skip: int, threads: int) -> None:
+        self.settings = model, frame_skip, threads
+        self.data = [mujoco.MjData(model) for _ in range(max(1, threads))]
+        self.pool = mujoco_rollout.Rollout(nthread=threads)
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        self.rest = np.empty(mujoco.mj_stateSize(model, kind))
+        mujoco.mj_getState(model, self.data[0], self.rest, kind)
+        self.state = slice(1, 1 + model.nq + model.nv + model.na)  # the time stands before it
+
+    def __reduce__(self):  # threads can neither be copied nor sent to another process
+        return type(self), self.settings
+
+    def __deepcopy__(self, memo: dict) -> Simulator:
+        return type(self)(*self.settings)
+
+    def __call__(self, states: np.ndarray, controls: np.ndarray) -> np.ndarray:
+        """Return the states ``(N, H, S)`` that controls ``(N, H, A)`` lead to from ``(N, S)``.
+
+        A row with numbers that are not finite, or huge, leads to NaN.
+        """
+        model, skip, _ = self.settings
+        bad = ~((np.abs(states).max(-1) < HUGE) & (np.abs(controls).max((-2, -1)) < HUGE))
+        full = np.repeat(self.rest[None], len(states), 0)
+        full[:, self.state] = states
+        if bad.any():
+            full[bad], controls = self.rest, np.where(bad[:, None, None], 0.0, controls)
+        controls = np.repeat(controls, skip, 1)
+        after, _ = self.pool.rollout(model, self.data, full, controls)
+        after = after[:, skip - 1 :: skip, self.state]
+        if bad.any():
+            after[bad] = np.nan
+        return after
+
+
+class MuJoCoDynamics(KnownDynamics):
+    r"""Any MuJoCo model: its own simulation, as robot or as the nominal model of one.
+
+    States are :math:`(q, \dot q, w)`: positions, velocities and the actuators' activations;
+    actions are the controls. Whole plans are simulated in one call, on some threads, in double
+    precision; derivatives are finite differences of such simulations. Nothing can be
+    differentiated through.
+
+    Controls beyond their range are simulated as they are: an effective action may lie there.
+
+    Args:
+        model: MJCF file or string, ``MjModel``, or environment of gymnasium or dm_control; copied,
+            so that later changes of the environment's physics do not reach it.
+        frame_skip: simulation steps per action; None takes the environment's, or 1.
+        noise_std: standard deviation of the model's own error per step: one number; two, for
+            positions and activations, and for velocities; or one per tangent coordinate.
+        threads: that simulate beside the calling one; 0 for none.
+
+    Raises:
+        ConfigurationError: if there is no MuJoCo, or no such model.
+
+    >>> cart = '''<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="1"/></body>
+    ... </worldbody><actuator><motor joint="x"/></actuator></mujoco>'''
+    >>> model = MuJoCoDynamics(cart, frame_skip=5)
+    >>> model(torch.zeros(3, 2), torch.ones(3, 1)).shape
+    torch.Size([3, 2])
+    >>> model.rollout(torch.zeros(2), torch.ones(64, 20, 1)).shape
+    torch.Size([64, 20, 2])
+    """
+
+    extrapolates = True
+    stiff = True
+
+    def __init__(
+        self,
+        model: Any,
+        frame_skip: int | None = None,
+        noise_std: float | Sequence[float] = (0.01, 0.1),
+        threads: int = 0,
+    ) -> None:
+        found, skip = read_model(model)
+        found.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+        skip = skip if frame_skip is None else check_count("dynamics.frame_skip", frame_skip)
+        simulator = Simulator(found, skip, check_count("dynamics.threads", threads, low=0))
+        if not isinstance(noise_std, int | float) and len(noise_std) == 2:
+            position, velocity = noise_std
+            noise_std = [position] * found.nv + [velocity] * found.nv + [position] * found.na
+        super().__init__(simulator, space_of(found), found.nu, noise_std)
+        low, high = torch.as_tensor(found.actuator_ctrlrange).unbind(-1)
+        limited = torch.as_tensor(found.actuator_ctrllimited).bool()
+        self.action_low = torch.where(limited, low, -torch.inf)
+        self.action_high = torch.where(limited, high, torch.inf)
+        half = torch.where(limited, (high - low) / 2, 1.0)
+        self.action_steps = STEP * torch.cat([torch.zeros(1, found.nu), half.diag()])
+
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the next state ``(*B, S)``."""
+        return self._simulate(state, action.unsqueeze(-2)).squeeze(-2)
+
+    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+        """Return the states ``(*B, N, H, S)`` of whole plans, simulated in one call."""
+        return self._simulate(state.unsqueeze(-2), actions)
+
+    def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return finite differences ``(*B, D, A)``."""
+        steps = self.action_steps.to(action)
+        after = self.forward(state.unsqueeze(-2), action.unsqueeze(-2) + steps)
+        change = self.manifold.difference(after[..., 1:, :], after[..., :1, :])
+        return change.mT / steps[1:].diagonal()
+
+    def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the next state and finite differences by state and action."""
+        size = self.state_size
+        steps = STEP * torch.eye(size).to(state)
+        steps = torch.cat([state.new_zeros(self.action_size + 1, size), steps])
+        act = torch.nn.functional.pad(self.action_steps.to(action), (0, 0, 0, size))
+        after = self.forward(state.unsqueeze(-2) + steps, action.unsqueeze(-2) + act)
+        change = (after[..., 1:, :] - after[..., :1, :]).mT
+        by_action, by_state = change.split([self.action_size, size], -1)
+        return after[..., 0, :], by_state / STEP, by_action / act.amax(0)
+
+    def _simulate(self, state: Tensor, actions: Tensor) -> Tensor:
+        """Return the states ``(*B, H, S)`` after actions ``(*B, H, A)`` from ``(*B, S)``."""
+        batch = torch.broadcast_shapes(state.shape[:-1], actions.shape[:-2])
+        rows = state.expand(*batch, -1).reshape(-1, state.shape[-1])
+        plans = actions.expand(*batch, -1, -1).reshape(-1, *actions.shape[-2:])
+        after = self.step(*(x.detach().cpu().double().numpy() for x in (rows, plans)))
+        return torch.from_numpy(after).to(state).reshape(*batch, *after.shape[1:])

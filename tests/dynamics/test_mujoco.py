@@ -1,0 +1,152 @@
+"""MuJoCo's own simulation as a dynamics model."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from afm_rl.dynamics import Dubins, DynamicsModel, MuJoCoDynamics, effective_action
+from afm_rl.errors import ConfigurationError
+
+mujoco = pytest.importorskip("mujoco")
+
+JOINTED = """<mujoco><option timestep="0.005"/><worldbody>
+<geom type="plane" size="5 5 .1"/>
+<body pos="0 0 .5"><freejoint/><geom size=".1"/>
+  <body pos=".2 0 0"><joint type="ball"/><geom size=".05"/>
+    <body pos=".2 0 0"><joint name="turns" type="hinge"/><geom size=".05" pos=".1 0 0"/>
+      <body pos=".2 0 0"><joint name="limited" type="hinge" limited="true" range="-1 1"/>
+        <geom size=".05" pos=".1 0 0"/>
+</body></body></body></body></worldbody>
+<actuator><motor joint="turns" ctrlrange="-2 2"/>
+<general joint="limited" dyntype="filter" dynprm=".05" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def model():
+    return MuJoCoDynamics(JOINTED, frame_skip=4)
+
+
+@pytest.fixture(scope="module")
+def states(model):
+    """States ``(6, S)`` on the way of a moving body, in double precision."""
+    plan = torch.randn(60, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    still = torch.from_numpy(model.step.rest[model.step.state])
+    return model.rollout(still, plan.unsqueeze(0))[0, ::10]
+
+
+def test_it_is_the_simulation_itself(model, states):
+    data = mujoco.MjData(model.step.settings[0])
+    mujoco.mj_resetData(model.step.settings[0], data)
+    data.qpos, data.qvel, data.act = np.split(states[3].numpy(), [model_size := data.qpos.size, -1])
+    data.ctrl = [0.5, -0.3]
+    for _ in range(4):
+        mujoco.mj_step(model.step.settings[0], data)
+    reached = torch.from_numpy(np.concatenate([data.qpos, data.qvel, data.act]))
+    found = model(states[3], torch.tensor([0.5, -0.3]).double())
+    torch.testing.assert_close(found, reached, rtol=0, atol=1e-7)
+    assert model_size == 13 and model.state_size == 13 + 11 + 1
+
+
+def test_its_space_is_that_of_mujoco(model, states):
+    space = model.manifold
+    assert space.is_angle.nonzero().flatten().tolist() == [11]
+    assert space.tangent_size == 2 * 11 + 1
+    tangent = 0.3 * torch.randn(5, 23, generator=torch.Generator().manual_seed(1)).double()
+    moved = space.add(states[:5], tangent)
+    torch.testing.assert_close(space.difference(moved, states[:5]), tangent)
+    found = np.zeros(11)
+    for k in range(5):
+        pair = (states[k, :13].numpy(), moved[k, :13].numpy())
+        mujoco.mj_differentiatePos(model.step.settings[0], found, 1.0, *pair)
+        found[9] = math.remainder(found[9], 2 * math.pi)  # MuJoCo counts the turns
+        torch.testing.assert_close(tangent[k, :11], torch.from_numpy(found))
+    torch.testing.assert_close(space.project(3 * moved)[..., 3:7], moved[..., 3:7])
+
+
+@pytest.mark.parametrize("threads", [0, 2])
+def test_whole_plans_are_single_steps_in_a_row(states, threads):
+    model = MuJoCoDynamics(JOINTED, frame_skip=4, threads=threads)
+    plans = torch.randn(6, 3, 5, 2, generator=torch.Generator().manual_seed(0)).double()
+    whole = model.rollout(states, plans)
+    assert whole.shape == (6, 3, 5, 25)
+    torch.testing.assert_close(
+        whole, DynamicsModel.rollout(model, states, plans), atol=1e-8, rtol=0
+    )
+
+
+def test_a_kinematic_plan_is_a_sum():
+    state, plans = torch.randn(2, 3, dtype=torch.float64), torch.randn(2, 4, 9, 2).double()
+    whole = Dubins().rollout(state, plans)
+    torch.testing.assert_close(whole, DynamicsModel.rollout(Dubins(), state, plans))
+
+
+def test_derivatives_are_those_of_mujoco(states):
+    model = MuJoCoDynamics(JOINTED)
+    action = torch.tensor([0.5, -0.3]).double()
+    native = model.step.settings[0]
+    data = mujoco.MjData(native)
+    by_state, by_action = np.zeros((23, 23)), np.zeros((23, 2))
+    data.qpos, data.qvel, data.act = np.split(states[2].numpy(), [13, -1])
+    data.ctrl = action.numpy()
+    mujoco.mj_forward(native, data)
+    mujoco.mjd_transitionFD(native, data, 1e-6, True, by_state, by_action, None, None)
+    jacobian = model.jacobian(states[2], action)
+    torch.testing.assert_close(jacobian, torch.from_numpy(by_action), rtol=1e-3, atol=1e-5)
+    ahead, slope, drive = model.linearise(states[2], action)
+    torch.testing.assert_close(ahead, model(states[2], action))
+    plain = [10, *range(13, 24)]  # of the raw coordinates after the quaternions, velocities
+    velocities = torch.from_numpy(by_state)[11:22, 11:22]
+    torch.testing.assert_close(slope[13:24, 13:24], velocities, rtol=1e-2, atol=1e-3)
+    torch.testing.assert_close(drive[13:], torch.from_numpy(by_action)[11:], rtol=1e-3, atol=1e-5)
+    assert slope[plain].isfinite().all()
+
+
+def test_actions_beyond_their_range_still_count(model, states):
+    far, half = torch.tensor([6.0, -3.0]).double(), model.action_high
+    found = effective_action(model, states[1], 0 * far, model(states[1], far), half)
+    torch.testing.assert_close(found.action[0], far[0], rtol=1e-2, atol=0)
+
+
+def test_rows_that_are_not_finite_stay_alone(model, states):
+    given = states.clone()
+    given[1, 0], given[4, 20] = torch.nan, 1e12
+    after = model(given, torch.zeros(6, 2).double())
+    assert after.isnan().all(-1).tolist() == [False, True, False, False, True, False]
+
+
+def test_a_copy_simulates_alike(model, states):
+    action = torch.ones(2).double()
+    torch.testing.assert_close(copy.deepcopy(model)(states, action), model(states, action))
+
+
+def test_environments_bring_model_and_frame_skip():
+    gymnasium = pytest.importorskip("gymnasium")
+    env = gymnasium.make("InvertedPendulum-v5")
+    env.reset(seed=0)
+    model, inner = MuJoCoDynamics(env), env.unwrapped
+    state = torch.from_numpy(np.concatenate([inner.data.qpos, inner.data.qvel]))
+    inner.model.opt.gravity[2] = -1.0  # the world changes, the model does not
+    before = model(state, torch.ones(1).double())
+    env.step(np.ones(1))
+    reached = np.concatenate([inner.data.qpos, inner.data.qvel])
+    assert not np.allclose(before.numpy(), reached)
+    again = MuJoCoDynamics(env)(state, torch.ones(1).double())
+    np.testing.assert_allclose(again.numpy(), reached, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("source", "word"),
+    [
+        ("<mujoco><worldbody>", "XML"),
+        ("missing.xml", "no such file"),
+        ("<mujoco/>", "actuators"),
+        (3.0, "expected an MJCF"),
+    ],
+)
+def test_bad_models_are_named(source, word):
+    with pytest.raises(ConfigurationError, match=word) as caught:
+        MuJoCoDynamics(source)
+    assert "\n" not in str(caught.value)
