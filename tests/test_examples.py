@@ -13,7 +13,7 @@ LESS = {
     "plan": "--steps 20",
     "learn": "--batches 2 --samples 512",
     "compare": "--methods physics oracle --budget 10",
-    "deploy": "--iterations 5 --steps 20",
+    "deploy": "--steps 20",
 }
 FILES = [path for verb in LESS for path in sorted((ROOT / "examples" / verb).glob("*.py"))]
 

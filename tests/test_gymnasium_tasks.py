@@ -102,7 +102,7 @@ def test_every_method_runs_and_the_table_is_made_once(example, monkeypatch, caps
     name, run = "pendulum", example("run")
     tasks, agents = example("tasks").TASKS, example("agents")
     monkeypatch.setitem(tasks, name, replace(tasks[name], **SMALL))
-    command = ["--task", name, "--iterations", "2", "--out", "here"]
+    command = ["--task", name, "--out", "here"]
     run.main(command)
     table = capsys.readouterr().out.split("| change |")[1]
     assert all(f"| {method} |" in table for method in agents.METHODS)

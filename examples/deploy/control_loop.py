@@ -16,13 +16,11 @@ from torchrl.envs import Compose
 from torchrl.envs.utils import step_mdp
 
 from afm_rl.dynamics import Dubins
-from afm_rl.flow import ContextFlow, train_flow
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 from afm_rl.regimes import ActionGain
 from afm_rl.transforms import ActionFlowPolicy
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-parser.add_argument("--iterations", type=int, default=1000, help="training steps of the flow")
 parser.add_argument("--steps", type=int, default=200)
 asked = parser.parse_args()
 
@@ -30,12 +28,8 @@ torch.set_num_threads(1)
 torch.manual_seed(0)
 model, gains = Dubins(), ActionGain(["v", "omega"])
 low, high = torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57])
-flow = ContextFlow(low, high)
-states = torch.tensor([0.0, 0.0, -3.14]), torch.tensor([0.0, 0.0, 3.14])
-train_flow(flow, model, gains, states, iterations=asked.iterations)
-
 planner = MPPI(PlanningEnv(model, GoalDistance(), low, high))
-policy = TensorDictSequential(planner, ActionFlowPolicy(model, flow, planner.action_spec))
+policy = TensorDictSequential(planner, ActionFlowPolicy(model, planner.action_spec))
 
 pose, seconds = torch.zeros(3), []  # the robot
 td = Compose(*(part.make_tensordict_primer() for part in policy))(TensorDict({}))

@@ -9,8 +9,8 @@ from tasks import Task
 from tensordict import TensorDict
 from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, SerialEnv, TransformedEnv
 
+from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Ensemble, Oracle
-from afm_rl.flow import ContextFlow, train_flow
 from afm_rl.learning import (
     FreshAdam,
     GaussianNLLLoss,
@@ -29,7 +29,7 @@ from afm_rl.transforms import ActionFlowTransform, RegimeTransform
 
 METHODS = ("frozen", "online", "afm", "afm_online", "oracle")
 EXECUTED = ("next", "afm", "executed_action")
-GATE = 0.99  # quantile of the surprise under nominal dynamics that is still no surprise
+GATE = 0.99  # quantile of the innovation under nominal dynamics that is still let pass
 
 
 def make(task: Task, count: int, *transforms) -> TransformedEnv:
@@ -63,12 +63,12 @@ class Learned:
     """What is learned before the change is met."""
 
     model: Ensemble
-    flow: ContextFlow
+    flow: ActionFlow
     regime: Regime
 
 
-def learn(task: Task, seed: int, iterations: int = 2000) -> Learned:
-    """Learn a model from random and planned transitions, then a flow over it."""
+def learn(task: Task, seed: int) -> Learned:
+    """Learn a model from random and planned transitions; the universal flow needs no training."""
     env = make(task, 4)
     space = env.action_spec_unbatched.space
     size = env.observation_spec_unbatched["observation"].shape[-1]
@@ -90,13 +90,8 @@ def learn(task: Task, seed: int, iterations: int = 2000) -> Learned:
             f"held-out error {error:.3f}",
             flush=True,
         )
-    flow = ContextFlow(space.low, space.high, seed=seed, saturation="clip")
-    regime = regimes_of(env)
-    error = train_flow(
-        flow, model, regime, data["observation"], iterations=iterations, batch_size=256, seed=seed
-    )
-    print(f"flow: held-out error {error:.3f} half ranges", flush=True)
-    learned = Learned(model, flow, regime)
+    flow = ActionFlow(space.low, space.high, saturation="clip")
+    learned = Learned(model, flow, regimes_of(env))
     calibrate(task, learned, seed)
     return learned
 
@@ -109,7 +104,7 @@ def calibrate(task: Task, learned: Learned, seed: int) -> None:
     env = make(task, 2, watch, planner.make_tensordict_primer())
     env.set_seed(1000 + seed)
     data = env.rollout(task.steps, planner, break_when_any_done=False)
-    learned.flow.gate = float(data["next", "afm", "surprise"].quantile(GATE))
+    learned.flow.gate = float(data["next", "afm", "innovation"].quantile(GATE))
     print(f"gate: {learned.flow.gate:.1f} standard deviations", flush=True)
 
 

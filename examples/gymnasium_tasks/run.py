@@ -35,9 +35,9 @@ def spans(data: TensorDictBase, steps: int) -> dict[str, torch.Tensor]:
     return {name: reward[:, at].mean(1) for name, at in zip(SPANS, windows, strict=True)}
 
 
-def measure(task: Task, seed: int, iterations: int, lr: float) -> pd.DataFrame:
+def measure(task: Task, seed: int, lr: float) -> pd.DataFrame:
     """Return one row per method and change."""
-    learned, tables = learn(task, seed, iterations), []
+    learned, tables = learn(task, seed), []
     for method in METHODS:
         data = compose(task, method, learned, seed, lr).run(task.steps, seed)
         found = {name: value.tolist() for name, value in spans(data, task.steps).items()}
@@ -62,7 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--task", choices=TASKS, default="pendulum")
     parser.add_argument("--seeds", type=int, default=1, help="how many")
-    parser.add_argument("--iterations", type=int, default=2000, help="training steps of the flow")
     parser.add_argument("--lr", type=float, default=1e-3, help="of the online learner")
     parser.add_argument("--out", type=Path, default=Path("outputs/gymnasium"), help="folder")
     chosen = parser.parse_args(arguments)
@@ -71,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for seed in range(chosen.seeds):
         path = chosen.out / f"{chosen.task}_{seed}.csv"
         if not path.exists():
-            frame = measure(TASKS[chosen.task], seed, chosen.iterations, chosen.lr)
+            frame = measure(TASKS[chosen.task], seed, chosen.lr)
             write_whole(path, frame.to_csv(index=False).encode())
         frames.append(pd.read_csv(io.BytesIO(path.read_bytes())))
     print(table(pd.concat(frames)))
