@@ -16,16 +16,16 @@ from tensordict import TensorDict, TensorDictBase
 from timing import timed
 from torchrl.envs import EnvBase, TransformedEnv
 
+from afm_rl.correction import ActionFlow
+from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY
 from afm_rl.dynamics import Dubins, DynamicsModel, Ensemble
-from afm_rl.flow import ContextFlow
-from afm_rl.flow.views import SILENT, VIEWS
 from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater
 from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 from afm_rl.transforms import ActionFlowTransform
 
 POPULATION, HORIZON, HIDDEN, ROUNDS = 1000, 5, (200, 200, 200), 40
-CORRECTING = [name for name in VIEWS if name != SILENT]  # where there is a surprise
+CORRECTING = [name for name in HYPOTHESES if name != IDENTITY]
 
 
 def ensemble(seed: int) -> Ensemble:
@@ -51,13 +51,13 @@ def main() -> None:
     env = TransformedEnv(world, planner.make_tensordict_primer())
     td = env.reset().set("goal", torch.ones(2))
     cases = {  # model, robot, and what the flow may believe
-        "silent, over physics": (Dubins(), Dubins(), list(VIEWS)),
+        "silent, over physics": (Dubins(), Dubins(), list(HYPOTHESES)),
         "correcting, over the ensemble": (model, ensemble(1), CORRECTING),
         "correcting, over physics": (Dubins(), model, CORRECTING),
     }
 
-    def with_afm(model: DynamicsModel, robot: DynamicsModel, views: list[str]):
-        flow = ContextFlow(low, high, views=views, place=[0, 1], gate=1e-6)
+    def with_afm(model: DynamicsModel, robot: DynamicsModel, hypotheses: list[str]):
+        flow = ActionFlow(low, high, hypotheses, place=[0, 1], gate=1e-6)
         plain = PlanningEnv(robot, GoalDistance(), low, high)
         env = TransformedEnv(plain, ActionFlowTransform(model, flow))
         start = warm(env)

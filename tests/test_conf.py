@@ -31,8 +31,6 @@ SMALL = {  # settings that are there are made small
     "dynamics.base.hidden": [8, 8],
     "dynamics.base.pretrain.samples": 256,
     "dynamics.base.pretrain.epochs": 1,
-    "corrector.hidden": [8, 8],
-    "corrector.latent": 8,
     "corrector.width": 8,
     "corrector.train.iterations": 5,
     "budget": 5,

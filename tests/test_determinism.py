@@ -62,8 +62,8 @@ class Run:
 
 
 @pytest.fixture
-def parts(trained_flow, trained_ensemble, gains, box):
-    return trained_flow, trained_ensemble, gains, box
+def parts(universal_flow, trained_ensemble, gains, box):
+    return universal_flow, trained_ensemble, gains, box
 
 
 def differences(left, right, tolerance=0.0):

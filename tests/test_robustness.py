@@ -47,14 +47,14 @@ def flat(model, mission):
     return torch.cat([parameter.data[mission].flatten() for parameter in model.parameters()])
 
 
-def test_a_faulty_observation_is_survived_and_not_learned(trained_flow, trained_ensemble, box):
+def test_a_faulty_observation_is_survived_and_not_learned(universal_flow, trained_ensemble, box):
     cases = [(fault, where) for fault in FAULTS for where in COORDINATES]
     model = trained_ensemble.expand_(len(cases))
     planner = MPPI(PlanningEnv(model, GoalDistance(), *box), horizon=4, population=24)
     base = UGVTrack(
         batch_size=(len(cases),), schedule=Schedule([]), missions={"regime": {"v_gain": -1.0}}
     )
-    chain = [FaultySensor(cases), ActionFlowTransform(model, trained_flow)]
+    chain = [FaultySensor(cases), ActionFlowTransform(model, universal_flow)]
     env = TransformedEnv(base, Compose(*chain, planner.make_tensordict_primer()))
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=("next", "afm", "executed_action"))
@@ -104,8 +104,8 @@ def test_outliers_do_little_harm(trained_ensemble, transitions):
     assert error[0.01] < 1.5 * error[0.0]
 
 
-def test_turning_through_the_seam_is_no_misalignment(trained_flow):
-    env = TransformedEnv(UGVTrack(batch_size=(40,)), ActionFlowTransform(Dubins(), trained_flow))
+def test_turning_through_the_seam_is_no_misalignment(universal_flow):
+    env = TransformedEnv(UGVTrack(batch_size=(40,)), ActionFlowTransform(Dubins(), universal_flow))
     td, crossings = env.reset(), 0
     for _ in range(60):
         td["action"] = torch.tensor([0.1, 1.5]).expand(40, 2)

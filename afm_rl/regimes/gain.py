@@ -56,7 +56,16 @@ class ActionGain(Regime):
         past: Tensor | None = None,
         noise: Tensor | None = None,
     ) -> Tensor:
-        """Multiply; the state plays no part."""
+        """Multiply; the state plays no part.
+
+        Raises:
+            ConfigurationError: for another number of actions than of names.
+        """
+        if action.shape[-1] != len(self.names):
+            raise ConfigurationError(
+                f"ActionGain({list(self.names)}): the robot has {action.shape[-1]} actions; give "
+                "one name for each"
+            )
         return action * parameters
 
     def inverse(

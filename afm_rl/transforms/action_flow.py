@@ -6,14 +6,14 @@ import os
 from collections.abc import Sequence
 
 from tensordict import NestedKey, TensorDictBase, unravel_key
-from torchrl.data import Composite
+from torchrl.data import Composite, TensorSpec
 from torchrl.envs import FrameSkipTransform, Transform
 
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.keys import as_key, as_keys
-from afm_rl.transforms.memory import begin, correct, corrector_for, entries_spec
+from afm_rl.transforms.memory import begin, correct, corrector_for, entries_spec, warn_of_old
 
 
 class ActionFlowTransform(Transform):
@@ -123,7 +123,18 @@ class ActionFlowTransform(Transform):
 
     @property
     def _action_spec(self):
-        return self.parent.full_action_spec[self.action_key]
+        return self._entry("in_keys_inv", self.parent.full_action_spec)
+
+    def _entry(self, name: str, specs: Composite) -> TensorSpec:
+        """Return the environment's spec of ``in_keys`` or ``in_keys_inv``."""
+        (key,) = getattr(self, name)
+        found = specs.get(key, None)
+        if found is None:
+            raise ConfigurationError(
+                f"ActionFlowTransform: {name}=[{key!r}]: the environment has no such entry, but "
+                f"{list(specs.keys(True, True))}"
+            )
+        return found
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.parent is None:  # inside a replay buffer: nothing to execute
@@ -161,6 +172,7 @@ class ActionFlowTransform(Transform):
                 f"ActionFlowTransform: no {self.prefix!r} in the tensordict; start from "
                 "env.reset(), and carry its entries on"
             )
+        warn_of_old(tensordict, self.prefix)
         return memory
 
     def _check_process(self) -> None:
@@ -188,12 +200,7 @@ class ActionFlowTransform(Transform):
 
     def _with_memory(self, spec: Composite) -> Composite:
         self._check_order()
-        found = self.parent.full_observation_spec.get(self.observation_key, None)
-        if found is None:
-            raise ConfigurationError(
-                f"ActionFlowTransform: in_keys={self.in_keys}: the environment has no such "
-                f"entry, but {list(self.parent.full_observation_spec.keys(True, True))}"
-            )
+        found = self._entry("in_keys", self.parent.full_observation_spec)
         if not found.shape or found.shape[-1] != self.model.state_size:
             raise ConfigurationError(
                 f"ActionFlowTransform: in_keys={self.in_keys}: of the shape "

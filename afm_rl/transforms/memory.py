@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import warnings
+
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
@@ -74,6 +76,17 @@ def begin(corrector: Corrector, state: Tensor, action_spec: TensorSpec) -> Tenso
     return entries.set("memory", corrector.begin(state))
 
 
+def warn_of_old(tensordict: TensorDictBase, prefix: NestedKey) -> None:
+    """Warn if a tensordict holds the entries of the next step already: it is an old one."""
+    later = tensordict.get("next", None)
+    if later is not None and later.get(prefix, None) is not None:
+        warnings.warn(
+            f"this step was made before: ('next', {prefix!r}) is in the tensordict, so its memory "
+            "is an old one; go on with step_mdp(tensordict)",
+            stacklevel=3,
+        )
+
+
 def correct(
     memory: Tensor,
     planned: Tensor,
@@ -96,7 +109,7 @@ def correct(
     """
     planned = planned.to(memory.dtype)
     box = box_of(action_spec, planned)
-    state, last, _ = corrector.latest(memory)
+    _, _, last = corrector.latest(memory)
     memory, found = corrector.correct(memory, planned, model, box)
     wanted = found.executed if enabled else planned
     # The last clamp depends on nothing but the spec, whatever the corrector answers.

@@ -12,7 +12,7 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.keys import as_key
 from afm_rl.planning.primer import ZeroPrimer
-from afm_rl.transforms.memory import begin, correct, corrector_for, entries_spec
+from afm_rl.transforms.memory import begin, correct, corrector_for, entries_spec, warn_of_old
 
 
 class ActionFlowPolicy(TensorDictModuleBase):
@@ -107,6 +107,7 @@ class ActionFlowPolicy(TensorDictModuleBase):
                 f"ActionFlowPolicy: no {self.prefix!r} in the tensordict; apply "
                 "make_tensordict_primer() to the first one, and carry the entries of 'next' on"
             )
+        warn_of_old(tensordict, self.prefix)
         planned = tensordict.get(self.action_key)
         state = tensordict.get(self.observation_key).to(memory.dtype)
         entries = correct(

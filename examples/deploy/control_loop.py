@@ -25,9 +25,9 @@ parser.add_argument("--steps", type=int, default=200)
 asked = parser.parse_args()
 
 torch.set_num_threads(1)
+torch.manual_seed(0)
 model, gains = Dubins(), ActionGain(["v", "omega"])
 low, high = torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57])
-
 planner = MPPI(PlanningEnv(model, GoalDistance(), low, high))
 policy = TensorDictSequential(planner, ActionFlowPolicy(model, planner.action_spec))
 

@@ -1,7 +1,7 @@
 """Draw the figures of docs/afm.md.
 
 Run ``python examples/explain_afm/figures.py --out docs/images``.
-The first run trains two flows (some minutes); they are kept in the cache of ``afm-rl``.
+The first run trains the published flow (some minutes); it is kept in the cache of ``afm-rl``.
 """
 
 from __future__ import annotations
@@ -29,14 +29,10 @@ TRAPS = {
     "patches of ground on which driving is reversed": "regimes=[{patch_v_gain: -1}]",
 }
 NAMES = {
-    "silent": "as they are",
+    "identity": "no correction",
     "recent": "recent",
     "newest": "newest",
-    "long": "long",
-    "mean": "averaged",
-    "late_1": "one step late",
-    "late_2": "two steps late",
-    "near": "near in place",
+    "delay_2": "two steps late",
     "nearest": "nearest in place",
     "here": "the one nearest",
 }
@@ -67,25 +63,25 @@ def draw_progress(axes: Axes, budget: int) -> None:
 
 
 @torch.no_grad()
-def draw_evidence(axes: Axes, regimes: str, budget: int) -> None:
-    """Draw how badly each view of the memory predicted of late, and which one is believed."""
+def draw_losses(axes: Axes, regimes: str, budget: int) -> None:
+    """Draw the discounted loss of hypotheses, and which one is believed."""
     agent = agent_of("method=afm_physics", regimes, f"budget={budget}")
     start = agent.env.reset(agent.missions, set_state=False)
     rollout = agent.env.rollout(budget, agent.planner, auto_reset=False, tensordict=start)
-    flow = agent.transform.flow
-    memory = rollout["next", "afm"][0]
-    evidence, active = memory["evidence"], memory["misaligned"]
-    believed = (evidence + flow.doubt).argmin(-1)
+    flow, entries = agent.transform.corrector, rollout["next", "afm"][0]
+    losses = flow.unpack(entries["memory"], agent.model.state_size)["losses"]
+    believed, active = (losses + flow.penalty).argmin(-1), entries["innovation"] > flow.gate
     first = int(active.int().argmax()) - 5
-    shown = [name for name in flow.views if name in NAMES]
-    styles = method_styles(shown)
-    for k, name in enumerate(shown):
-        times = first + torch.arange(len(evidence[first : first + 80]))
+    styles = method_styles(NAMES)
+    for k, name in enumerate([*flow.hypotheses, "identity"]):
+        if name not in NAMES:
+            continue
+        times = first + torch.arange(len(losses[first : first + 80]))
         lines = {"color": styles[name].color, "linestyle": styles[name].linestyle}
-        axes.plot(times, evidence[first : first + 80, k], label=NAMES[name], lw=1.2, **lines)
+        axes.plot(times, losses[first : first + 80, k], label=NAMES[name], lw=1.2, **lines)
         rows = [int(t) for t in times if active[t] and believed[t] == k]
         axes.plot(rows, [-0.25] * len(rows), "s", ms=3, color=styles[name].color)
-    axes.set(xlabel="step", ylabel="recent misses $E_v$", ylim=(-0.5, None))
+    axes.set(xlabel="step", ylabel="discounted loss $L$", ylim=(-0.5, None))
 
 
 def main() -> None:
@@ -106,7 +102,7 @@ def main() -> None:
     pair = figure.subplots(1, 2)
     for axes, (title, regimes) in zip(pair, TRAPS.items(), strict=True):
         dress(axes)
-        draw_evidence(axes, regimes, asked.budget)
+        draw_losses(axes, regimes, asked.budget)
         axes.set_title(title, fontsize=9)
     figure.legend(
         *pair[1].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=7

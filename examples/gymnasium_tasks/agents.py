@@ -29,7 +29,7 @@ from afm_rl.transforms import ActionFlowTransform, RegimeTransform
 
 METHODS = ("frozen", "online", "afm", "afm_online", "oracle")
 EXECUTED = ("next", "afm", "executed_action")
-GATE = 0.99  # share of the innovations under nominal dynamics that opens no gate
+GATE = 0.99  # quantile of the innovation under nominal dynamics that is still let pass
 
 
 def make(task: Task, count: int, *transforms) -> TransformedEnv:
@@ -63,12 +63,12 @@ class Learned:
     """What is learned before the change is met."""
 
     model: Ensemble
-    corrector: ActionFlow
+    flow: ActionFlow
     regime: Regime
 
 
 def learn(task: Task, seed: int) -> Learned:
-    """Learn a model from random and planned transitions."""
+    """Learn a model from random and planned transitions; the universal flow needs no training."""
     env = make(task, 4)
     space = env.action_spec_unbatched.space
     size = env.observation_spec_unbatched["observation"].shape[-1]
@@ -90,22 +90,22 @@ def learn(task: Task, seed: int) -> Learned:
             f"held-out error {error:.3f}",
             flush=True,
         )
-    corrector = ActionFlow(space.low, space.high, saturation="clip")
-    learned = Learned(model, corrector, regimes_of(env))
+    flow = ActionFlow(space.low, space.high, saturation="clip")
+    learned = Learned(model, flow, regimes_of(env))
     calibrate(task, learned, seed)
     return learned
 
 
 def calibrate(task: Task, learned: Learned, seed: int) -> None:
     """Set the gate to what the model meets in an episode without any change."""
-    watch = ActionFlowTransform(learned.model, learned.corrector, enabled=False)
+    watch = ActionFlowTransform(learned.model, learned.flow, enabled=False)
     env = make(task, 2)
     planner = plan(task, learned.model, env, seed)
     env = make(task, 2, watch, planner.make_tensordict_primer())
     env.set_seed(1000 + seed)
     data = env.rollout(task.steps, planner, break_when_any_done=False)
-    learned.corrector.gate = float(data["next", "afm", "innovation"].quantile(GATE))
-    print(f"gate: {learned.corrector.gate:.1f} standard deviations", flush=True)
+    learned.flow.gate = float(data["next", "afm", "innovation"].quantile(GATE))
+    print(f"gate: {learned.flow.gate:.1f} standard deviations", flush=True)
 
 
 @dataclass
@@ -132,8 +132,7 @@ class Agent:
 
 def compose(task: Task, method: str, learned: Learned, seed: int, lr: float = 1e-3) -> Agent:
     """Put an agent together; its environments change half-way, one for each change."""
-    model, corrector = deepcopy(learned.model), learned.corrector
-    regime = learned.regime
+    model, flow, regime = deepcopy(learned.model), learned.flow, learned.regime
     rows = torch.stack([regime.encode(change) for change in task.changes.values()])
     phases = torch.stack([torch.tensor(regime.identity).expand_as(rows), rows], 1)
     change = RegimeTransform(regime, phases, at=[task.steps // 2])
@@ -145,13 +144,13 @@ def compose(task: Task, method: str, learned: Learned, seed: int, lr: float = 1e
     transforms = [change, planner.make_tensordict_primer()]
     loss = GaussianNLLLoss(model)
     if "afm" in method:
-        transforms.insert(1, ActionFlowTransform(model, corrector))
+        transforms.insert(1, ActionFlowTransform(model, flow))
         loss.set_keys(action=EXECUTED)
     learner = partial(OnlineUpdater, optimizer=partial(FreshAdam, lr=lr))
     if method == "online":
         updater = learner(loss)
-    elif method == "afm_online":  # the transform corrects what actions can: learn the rest
-        updater = UnmatchedUpdater(loss, learner, corrector.half_range, corrector.gate)
+    elif method == "afm_online":  # the transform undoes what actions can: learn the rest
+        updater = UnmatchedUpdater(loss, learner, flow.half_range, flow.gate)
     elif method == "oracle":
         updater = OracleUpdater(loss, regime_key=("regime", "parameters"))
     else:

@@ -2,7 +2,7 @@
 
     python examples/gymnasium_tasks/run.py --task pendulum --seeds 5
 
-Each seed learns a model from scratch, then every method drives the same episodes,
+Each seed learns a model and a flow from scratch, then every method drives the same episodes,
 whose actuators change half-way. A file per seed goes to `--out`; seeds that are there are not
 run again: give other settings another folder. The table of all seeds is printed at the end.
 """

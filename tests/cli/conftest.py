@@ -16,19 +16,12 @@ from afm_rl import cli
 from afm_rl.missions import factories
 
 QUICK = ["progress=false", "figures=false", "tensorboard=false"]
-SMALL_FLOW = ["corrector.train.iterations=20", "corrector.hidden=[16,16]", "corrector.latent=8"]
 
 
 @pytest.fixture
 def quick():
     """Settings of a run that only writes its tables."""
     return [*QUICK, "planner.population=16"]
-
-
-@pytest.fixture
-def small_flow():
-    """Settings of a flow that is trained in no time."""
-    return SMALL_FLOW
 
 
 @pytest.fixture

@@ -15,8 +15,8 @@ COLUMNS = (  # the last ones, after the parameters
 ).split()
 
 
-def test_the_paper_s_study_is_one_line(process, program, afm_rl, tmp_path, quick, small_flow):
-    small = [*quick, *small_flow, "budget=20"]
+def test_the_paper_s_study_is_one_line(process, program, afm_rl, tmp_path, quick):
+    small = [*quick, "budget=20"]
     done = process(program, *STUDY.split(), f"hydra.run.dir={tmp_path}/one", *small)
     assert (done.returncode, done.stderr) == (0, "")
     missions = pd.read_csv(tmp_path / "one" / "missions.csv")

@@ -96,10 +96,11 @@ def assert_same_results(left, right):
         pd.testing.assert_frame_equal(one, other, check_exact=True)
 
 
-def test_the_stored_configuration_makes_the_same_run(afm_rl, tmp_path, quick, small_flow, cache):
+def test_the_stored_configuration_makes_the_same_run(afm_rl, tmp_path, quick, cache):
     first, again = tmp_path / "first", tmp_path / "again"
-    chosen = ["method=afm_physics", "corrector.window=3", "budget=20", "seeds=[4]", "label=mine"]
-    assert afm_rl(*chosen, *small_flow, *quick, f"hydra.run.dir={first}").status == 0
+    train = "corrector.train={iterations: 5, batch_size: 16}"
+    chosen = ["method=afm_physics", train, "budget=20", "seeds=[4]", "label=mine"]
+    assert afm_rl(*chosen, *quick, f"hydra.run.dir={first}").status == 0
     replay = [f"--config-path={first}", "--config-name=config", f"hydra.run.dir={again}"]
     done = afm_rl(*replay)
     assert done.status == 0

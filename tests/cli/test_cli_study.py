@@ -104,8 +104,8 @@ def test_a_comparison_takes_settings_of_some_methods_too(afm_rl, tmp_path, quick
     chosen = ["compare=[physics, adaptive_gain]", "corrector.window=7", "budget=2"]
     done = afm_rl(*chosen, *quick, f"hydra.run.dir={tmp_path}")
     assert done.status == 0, done.err
-    assert "physics: has no flow.window, so it stays as it is" in done.out
-    assert OmegaConf.load(tmp_path / "config" / "adaptive_gain.yaml").flow.window == 7
+    assert "physics: has no corrector.window, so it stays as it is" in done.out
+    assert OmegaConf.load(tmp_path / "config" / "adaptive_gain.yaml").corrector.window == 7
 
 
 @pytest.mark.parametrize(

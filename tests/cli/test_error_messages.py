@@ -8,8 +8,8 @@ import torch
 
 from afm_rl.artefacts import save_artefact
 from afm_rl.cli.error_messages import explain, one_line
+from afm_rl.correction import PaperFlow
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import ContextFlow
 
 # method, overrides, what the line must name
 CASES = """
@@ -67,10 +67,11 @@ online_pe       dynamics.pretrain.samples=10             dynamics.pretrain.sampl
 online_pe       +dynamics.pretrain.step=1                dynamics.pretrain 'step' samples
 online_pe       updater.optimizer.lr=0                   updater lr=0
 afm_physics     corrector.gate=-1                             corrector.gate=-1
-afm_physics     corrector.window=0                            corrector.window=0
-afm_physics     corrector.hidden=[0]                          corrector
-afm_physics     corrector.train.iterations=0                  corrector.train.iterations=0
-afm_physics     +corrector.train.step=1                       corrector.train 'step' iterations
+afm_physics     corrector.memory=10                           corrector.memory=10
+afm_physics     corrector.hypotheses=[late]                   corrector.hypotheses='late' recent
+afm_physics     corrector.train={iterations:0}                corrector.train.iterations=0
+afm_physics     corrector.train={step:1}                      corrector.train 'step' iterations
+adaptive_gain   corrector.window=0                            corrector.window=0
 afm_physics     corrector.checkpoint=missing                  corrector.checkpoint missing
 """
 
@@ -145,16 +146,16 @@ def test_a_cache_that_cannot_be_written(afm_rl, tmp_path, quick, monkeypatch):
     monkeypatch.setattr("afm_rl.missions.factories.train_flow", lambda *args, **settings: 1 / 0)
     monkeypatch.setattr("afm_rl.missions.factories.check_training", lambda *args, **settings: None)
     folder = f"hydra.run.dir={tmp_path}/run"
-    done = afm_rl("method=afm_physics", f"cache={tmp_path}/file/parts", folder, *quick)
+    done = afm_rl("method=afm_paper", f"cache={tmp_path}/file/parts", folder, *quick)
     assert done.status == 2
     assert done.err.startswith(f"afm-rl: cache={tmp_path}/file/parts: cannot be written: Not a ")
 
 
 def test_a_checkpoint_for_another_robot(refuse, tmp_path):
-    flow = ContextFlow(torch.tensor([-1.0]), torch.tensor([1.0]))
+    flow = PaperFlow(torch.tensor([-1.0]), torch.tensor([1.0]), [2], 3)
     save_artefact(tmp_path / "flow", flow, flow.signature)
     line = refuse("method=afm_physics", f"corrector.checkpoint={tmp_path}/flow")
-    assert "corrector.checkpoint: " in line and "action_size=1, expected action_size=2" in line
+    assert "corrector.checkpoint: " in line and "kind=PaperFlow, expected kind=ActionFlow" in line
 
 
 def test_a_checkpoint_that_is_no_checkpoint(refuse, tmp_path):

@@ -1,12 +1,13 @@
-"""The windows that a context flow is trained on."""
+"""The windows on which a flow is refined for one robot."""
 
 import pytest
 import torch
 
-from afm_rl.dynamics import Dubins
-from afm_rl.flow.counterfactuals import excite, imagine, rows_filled, rows_of_now
-
-MANY = 4000
+from afm_rl.correction import ActionFlow, PaperFlow
+from afm_rl.correction.counterfactuals import draw_counterfactuals, imagine
+from afm_rl.dynamics import Dubins, Quadrotor
+from afm_rl.flow import AxisNetwork
+from afm_rl.regimes import ActionGain, MassFactor
 
 
 @pytest.fixture
@@ -14,33 +15,22 @@ def generator():
     return torch.Generator().manual_seed(0)
 
 
-@pytest.mark.parametrize("window", [1, 4, 12])
-def test_windows_are_filled_as_views_fill_them_or_by_any_number(window, generator):
-    filled = rows_filled(MANY, window, generator)
-    assert filled.shape == (MANY, 1) and filled.min() >= 1 and filled.max() <= window
-    share = torch.bincount(filled.flatten(), minlength=window + 1) / MANY
-    expected = torch.zeros(window + 1)
-    expected[1:] += 0.25 / window
-    for usual in (max(1, round(window / 6)), max(1, window // 2), window):
-        expected[usual] += 0.25
-    torch.testing.assert_close(share, expected, rtol=0, atol=0.03)
-
-
-def test_half_of_the_windows_are_from_one_regime(generator):
-    now = rows_of_now(MANY, 6, generator)
-    assert now.min() == 1 and now.max() == 6
-    assert float((now == 6).float().mean()) == pytest.approx(0.5 + 0.5 / 6, abs=0.03)
-
-
-def test_actions_move_about_everywhere_or_about_one_and_saturate(generator):
-    executed = excite(MANY, 12, 2, generator)
-    assert executed.shape == (MANY, 12, 2) and executed.abs().max() == 1
-    narrow = (executed.amax(1) - executed.amin(1) < 0.81).all(-1)
-    assert float(narrow.float().mean()) == pytest.approx(0.5, abs=0.03)
-    stuck = (executed.abs() == 1).float()
-    assert 0.25 < float(stuck[narrow].mean()) < 0.5 and not stuck[~narrow].mean() > 0.02
-    held = (executed.abs() == 1).all(1)  # the same command all the time: what full drive looks like
-    assert float(held[narrow].float().mean()) > 0.2
+def test_windows_show_the_regime_its_inverse_and_its_effects(small_flow, states, generator):
+    twice = ActionGain(["v_gain", "omega_gain"], low=2.0, high=2.0, nominal=0.0)
+    flow, size = small_flow(), (500, 12, 3)
+    made = draw_counterfactuals(flow, Dubins(), twice, states, size, "clip", generator)
+    executed, effective, std, valid = made.rows
+    assert executed.abs().max() <= 1 and valid[:, -1].all() and (std >= 0).all()
+    assert (valid.diff(dim=1) >= 0).all()  # what is missing is the oldest
+    moving = executed[:, -1].abs() > 0.1
+    gain = torch.where(moving, effective[:, -1] / executed[:, -1], 2.0)
+    torch.testing.assert_close(gain.abs(), torch.full_like(gain, 2.0), rtol=0, atol=0.3)
+    known, sign = moving.all(-1), 2.0 * gain.sign().unsqueeze(1)
+    inverse, effect = (made.planned / sign).clamp(-1, 1), made.probe * sign
+    torch.testing.assert_close(made.intended[known], inverse[known])
+    torch.testing.assert_close(made.effect[known], effect[known])
+    inside = (made.planned.abs() <= 1).all(-1).float().mean()
+    assert 0.5 < float(inside) < 0.7  # the others ask for what can be had
 
 
 def test_beyond_the_box_effects_go_on_straight(box, generator, make_ensemble):
@@ -59,3 +49,45 @@ def test_beyond_the_box_effects_go_on_straight(box, generator, make_ensemble):
     )
     edge = model(state, high.expand(50, 2))
     torch.testing.assert_close(twice - edge, 2 * (once - edge), rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["physics", "base class", "ensemble"])
+def test_in_the_box_no_derivative_is_needed(kind, make_ensemble, generator, monkeypatch):
+    model = {"physics": Dubins, "base class": Quadrotor, "ensemble": make_ensemble}[kind]()
+    size = model.action_size
+    state, effect = model.manifold.project(torch.rand(5, model.state_size)), torch.zeros(5, size)
+    asked = []
+    whole = type(model).jacobian
+    monkeypatch.setattr(
+        type(model), "jacobian", lambda m, s, a: asked.append(len(s)) or whole(m, s, a)
+    )
+    with torch.no_grad():
+        expected, noise = model.forecast(state, effect)
+        seen = imagine(model, state, effect, -torch.ones(size), torch.ones(size), generator)
+    assert sum(asked) == 0
+    assert (model.manifold.difference(seen, expected).abs() < 5 * noise).all()
+
+
+def test_training_states_lie_on_the_manifold(monkeypatch, generator):
+    seen = []
+    forecast = Quadrotor.forecast
+
+    def spy(model, state, action):
+        seen.append(state)
+        return forecast(model, state, action)
+
+    monkeypatch.setattr(Quadrotor, "forecast", spy)
+    low, high = torch.tensor([0.0, -1.0, -1.0, -1.0]), torch.ones(4)
+    states = torch.zeros(13), torch.ones(13)
+    flow = ActionFlow(low, high, network=AxisNetwork(width=16, latent=8))
+    flow.training_loss(Quadrotor(), MassFactor(), states, 8, generator)
+    assert seen
+    for state in seen:
+        torch.testing.assert_close(state[..., 6:10].norm(dim=-1), torch.ones(state.shape[:-1]))
+    paper = PaperFlow(low, high, [3, 4], 13)
+    monkeypatch.setattr(
+        Quadrotor, "forward", lambda model, state, action: seen.append(state) or state
+    )
+    monkeypatch.setattr("afm_rl.manifold.Manifold.difference", lambda m, a, b: a - b)
+    paper._examples(Quadrotor(), states, 8, generator)
+    torch.testing.assert_close(seen[-1][..., 6:10].norm(dim=-1), torch.ones(8))

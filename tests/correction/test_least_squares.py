@@ -1,13 +1,20 @@
+"""The classical baselines on the universal pairs."""
+
 import pytest
 import torch
 
-from afm_rl.dynamics import Dubins
+from afm_rl.correction import LeastSquares
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import LeastSquares, Window
-from afm_rl.flow.least_squares import fit_affine, fit_gain, weigh
+from afm_rl.flow.experts import fit_affine, fit_gain, weigh
 from afm_rl.flow.saturation import MODES
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+TURN = torch.tensor([[0.6, -0.8], [0.8, 0.6]])
+REGIMES = {
+    "gain": lambda sent: torch.tensor([-0.8, 0.9]) * sent[-1],
+    "gain_offset": lambda sent: torch.tensor([-0.8, 0.9]) * sent[-1] + 0.2,
+    "affine": lambda sent: sent[-1] @ TURN.mT + 0.1,
+}
 
 
 def actions(*shape):
@@ -19,14 +26,6 @@ def test_gains_are_found_per_mission():
     u = actions(2, 24)
     fitted = fit_gain(u, gains.unsqueeze(-2) * u, weigh(torch.ones(2, 24, 1), 0.8))
     assert torch.allclose(fitted, gains, atol=5e-3)
-
-
-def test_an_affine_map_is_found():
-    matrix, bias = torch.tensor([[0.6, -0.8], [0.8, 0.6]]), torch.tensor([0.2, -0.1])
-    u = actions(24)
-    fitted = fit_affine(u, u @ matrix.mT + bias, weigh(torch.ones(24, 1), 0.95))
-    assert torch.allclose(fitted[0], matrix, atol=5e-3)
-    assert torch.allclose(fitted[1], bias, atol=5e-3)
 
 
 def test_weights_equal_plain_weighted_least_squares():
@@ -50,35 +49,32 @@ def test_recent_pairs_outweigh_old_ones():
     assert (fit_gain(u, seen, weigh(torch.ones(24, 1), 0.5)) < -0.9).all()
 
 
-@pytest.mark.parametrize("form", ["gain", "affine"])
-def test_the_corrected_action_has_the_planned_effect(unknown, form):
-    gains, model = torch.tensor([-0.8, 0.9]), Dubins()
-    state, executed = torch.zeros(5, 24, 3), actions(5, 24) * HIGH
-    seen = Window(
-        state, executed, executed, model(state, gains * executed), torch.ones(5, 24).bool()
-    )
+@pytest.mark.parametrize("form", REGIMES)
+def test_the_corrected_action_has_the_planned_effect(line, drive, plans, form):
     corrector = LeastSquares(LOW, HIGH, form=form, forgetting=0.95)
-    context = corrector.context(seen, model)
-    again = corrector.context(seen, model, context._replace(pairs=context.pairs.roll(1, -2)))
-    torch.testing.assert_close(again, context)  # asked about the newest pair only
-    begun = corrector.context(seen, model, unknown(corrector, 5))
-    assert torch.equal(begun.pairs[:, -1], context.pairs[:, -1]) and not begun.pairs[:, :-1].any()
-    assert context.misaligned.all()
-    planned = 0.5 * actions(5) * HIGH
-    corrected = corrector.correct(context, state[:, 0], planned)
-    assert torch.allclose(gains * corrected.action, planned, atol=0.02)
-    assert not corrected.spread.any() and corrected.reach is None
-    far = corrector.correct(context, state[:, 0], HIGH.expand(5, 2))  # cannot be had
-    torch.testing.assert_close(far.expected, gains * far.action, rtol=0, atol=0.02)
+    planned = plans(10, 5, 2, size=0.5)
+    (executed, predicted, spread, *_, misaligned), effects = drive(
+        corrector, line(2), REGIMES[form], planned
+    )
+    assert misaligned[1:].all() and not spread.any()
+    torch.testing.assert_close(effects[5:], planned[5:], rtol=0, atol=0.02)
+    torch.testing.assert_close(predicted[5:], effects[5:], rtol=0, atol=0.02)
 
 
-@pytest.mark.parametrize("form", ["gain", "affine"])
+def test_what_cannot_be_had_is_predicted_as_it_comes(line, drive, plans):
+    corrector = LeastSquares(LOW, HIGH)
+    planned = torch.cat([plans(6, 3, 2), HIGH.expand(1, 3, 2)])
+    (executed, predicted, *_), effects = drive(corrector, line(2), REGIMES["gain"], planned)
+    assert ((executed >= LOW) & (executed <= HIGH)).all()
+    torch.testing.assert_close(predicted[-1], effects[-1], rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("form", REGIMES)
 @pytest.mark.parametrize("saturation", MODES)
-def test_actions_stay_in_the_box(shown, form, saturation):
+def test_actions_stay_in_the_box(line, drive, plans, form, saturation):
     corrector = LeastSquares(LOW, HIGH, form=form, saturation=saturation)
-    context = shown(corrector, actions(7, 24), 0.01 * actions(7, 24))
-    corrected = corrector.correct(context, torch.zeros(7, 3), HIGH.expand(7, 2)).action
-    assert ((corrected >= LOW - 1e-6) & (corrected <= HIGH + 1e-6)).all()
+    (executed, *_), _ = drive(corrector, line(2), lambda sent: 0.01 * sent[-1], plans(5, 7, 2))
+    assert ((executed >= LOW - 1e-6) & (executed <= HIGH + 1e-6)).all()
 
 
 @pytest.mark.parametrize(
@@ -87,7 +83,8 @@ def test_actions_stay_in_the_box(shown, form, saturation):
         ({"form": "cubic"}, "corrector.form"),
         ({"forgetting": 0.0}, "corrector.forgetting"),
         ({"forgetting": 1.5}, "corrector.forgetting"),
-        ({"window": 0}, "corrector.window"),
+        ({"window": 0}, "corrector.recent"),
+        ({"gate": -1.0}, "corrector.gate"),
         ({"saturation": "none"}, "corrector.saturation"),
     ],
 )

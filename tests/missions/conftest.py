@@ -21,8 +21,6 @@ SMALL = {  # settings that are there are made small
     "dynamics.pretrain.samples": 512,
     "dynamics.pretrain.epochs": 1,
     "dynamics.pretrain.flights": 4,
-    "corrector.hidden": [16, 16],
-    "corrector.latent": 8,
     "corrector.width": 8,
     "corrector.train.iterations": 20,
 }

@@ -124,8 +124,8 @@ def test_a_lost_flight_leaves_the_batch(fly):
 
 
 def test_flows_correct_in_a_box_of_their_own(fly):
-    flown = fly("method=afm_physics", "corrector.views=[recent]")
-    flow, robot = flown.agent.transform.flow, flown.agent.robot
+    flown = fly("method=afm_physics", "corrector.hypotheses=[recent]")
+    flow, robot = flown.agent.transform.corrector, flown.agent.robot
     torch.testing.assert_close(flow.half_range, torch.tensor([0.575, 3e-4, 3e-4, 1e-4]))
     steps = flown.steps
     assert steps["misaligned"].sum() > 0
@@ -149,8 +149,6 @@ def test_flows_correct_in_a_box_of_their_own(fly):
         (["robot.score=null"], "robot.score=LapScore: reads goal, .* gives no goal, reached"),
         (["robot.score=3"], "robot.score=3: expected a Score, or null"),
         (["robot.score.band=0"], "score.band=0: expected a finite number"),
-        (["robot.flow_reuse=0"], "robot.flow_reuse=0"),
-        (["robot.flow_iterations=0"], "robot.flow_iterations=0"),
         (["robot.flow_low=null"], r"robot.flow_low=\[\], .* expected 4 numbers each"),
         (["robot.flow_low=[0, 1, 1, 1]"], "robot.flow_low=.* expected 4 numbers each, low <= high"),
         (["robot.env.start=up"], "start='up': expected one of rest, moving"),
@@ -190,29 +188,19 @@ def test_a_network_may_be_trained_before_the_flight(make_agent, randomised):
     assert np.isfinite(run(agent).steps.to_numpy(dtype=float)).all()
 
 
-def test_flows_use_examples_as_often_as_the_robot_says(make_agent, monkeypatch):
-    used = []
-    monkeypatch.setattr(
-        "afm_rl.missions.factories.train_flow",
-        lambda *args, reuse, **rest: used.append(reuse) or 0.0,
-    )
-    monkeypatch.setattr("afm_rl.missions.factories.check_training", lambda *args, **least: None)
-    for k, given in enumerate((None, 3)):
-        settings = {"corrector.train.reuse": given, "corrector.train.seed": 77 + k, **QUICK}
-        make_agent("robot=quadrotor", "method=afm_physics", **settings)
-    assert used == [32, 3]
-
-
-@pytest.mark.parametrize(("robot", "views", "steps"), [("quadrotor", 4, 4000), ("ugv", 10, 12000)])
-def test_robots_say_how_flows_are_made_for_them(composed, robot, views, steps):
-    flow = composed(f"robot={robot}", "method=afm_physics").flow
-    assert len(flow.views) == views and flow.train.iterations == steps
-    own = composed(f"robot={robot}", "method=afm_physics", "corrector.views=[recent]").corrector
-    assert list(own.views) == ["recent"]
+def test_robots_say_which_hypotheses_make_sense(composed):
+    chosen = composed("robot=quadrotor", "method=afm_physics").corrector
+    assert list(chosen.hypotheses) == ["identity", "recent", "newest", "long"]
+    assert composed("robot=ugv", "method=afm_physics").corrector.hypotheses is None
+    own = composed("robot=quadrotor", "method=afm_physics", "corrector.hypotheses=[recent]")
+    assert list(own.corrector.hypotheses) == ["recent"]
 
 
 def test_before_it_learns_a_model_shares_the_flow_of_the_physics(configure):
     methods = ("afm_physics", "afm_online_knode", "afm_rls", "afm_offline_knode")
-    agents = [build(configure("robot=quadrotor", f"method={method}")) for method in methods]
+    train = {"corrector.train": {"iterations": 5}}
+    agents = [
+        build(configure("robot=quadrotor", f"method={method}", **train)) for method in methods
+    ]
     first, *others, offline = [agent.trainings[-1].settings for agent in agents]
     assert others == [first, first] and offline != first

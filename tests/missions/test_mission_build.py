@@ -11,15 +11,15 @@ from torch import nn
 
 import afm_rl.conf
 from afm_rl.artefacts import save_artefact
+from afm_rl.correction import ActionFlow, PaperFlow
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.flow import ContextFlow, PaperFlow
+from afm_rl.flow import AxisNetwork
 from afm_rl.missions import build, prepare
 from afm_rl.missions.checks import blaming, check_training
 
 FLIERS = ("geometric", "mass_estimator")  # need a quadrotor
 METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
-SHAPE = {"window": 4, "hidden": [8], "latent": 4}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -148,12 +148,13 @@ NAN = float("nan")
         ("afm_physics", "corrector.samples", 0, "corrector.samples=0: expected a whole number"),
         ("afm_physics", "corrector.steps", 0, "corrector.steps=0: expected a whole number"),
         ("afm_physics", "corrector.source_std", -1, "corrector.source_std=-1: expected a finite"),
-        ("afm_physics", "corrector.latent", -1, "corrector.latent=-1: "),
-        ("afm_physics", "corrector.hidden", 3, "corrector.hidden=3: expected a list"),
+        ("afm_physics", "corrector.memory", 10, "corrector.memory=10: expected at least"),
+        ("afm_physics", "corrector.hypotheses", ["late"], "corrector.hypotheses='late': expected"),
+        ("afm_physics", "corrector.hypotheses", ["identity"], "corrector.hypotheses=.* by time"),
         ("afm_physics", "corrector.train", 3, "corrector: 'int' object"),
-        ("afm_physics", "corrector.train.batch_size", 1, "corrector.train.batch_size=1: expected"),
-        ("afm_physics", "corrector.train.reuse", 0, "corrector.train.reuse=0: expected"),
-        ("afm_physics", "corrector.train.seed", "abc", "corrector.train.seed='abc': expected"),
+        ("afm_physics", "corrector.train", {"batch_size": 1}, "corrector.train.batch_size=1: exp"),
+        ("afm_physics", "corrector.train", {"seed": "abc"}, "corrector.train.seed='abc': expected"),
+        ("afm_paper", "corrector.train.batch_size", 1, "corrector.train.batch_size=1: expected"),
         ("afm_paper", "corrector.width", 0, "corrector.width=0: "),
         ("afm_paper", "corrector.error_action", "foo", "corrector.error_action='foo': expected"),
     ],
@@ -205,31 +206,37 @@ def _checkpoint(path, flow):
 
 
 def test_a_good_checkpoint_is_used(configure, no_training, tmp_path, cache):
-    stored = _checkpoint(tmp_path / "flow", ContextFlow(LOW, HIGH, **SHAPE))
-    changes = {f"corrector.{name}": value for name, value in SHAPE.items()}
-    changes["corrector.checkpoint"] = str(tmp_path / "flow")
-    cfg = configure("method=afm_physics", **changes)
+    stored = _checkpoint(tmp_path / "flow", ActionFlow(LOW, HIGH))
+    cfg = configure("method=afm_physics", **{"corrector.checkpoint": str(tmp_path / "flow")})
     agent = build(cfg)
     assert agent.trainings == []
     prepare(agent, cache)
     for name, value in stored.state_dict().items():
-        assert torch.equal(agent.transform.flow.state_dict()[name], value)
+        assert torch.equal(agent.transform.corrector.state_dict()[name], value)
+
+
+def test_the_universal_flow_is_not_trained(configure, no_training):
+    agent = build(configure("method=afm_physics"))
+    assert agent.trainings == []
+    expected = ActionFlow(LOW, HIGH).state_dict()
+    for name, value in agent.transform.corrector.state_dict().items():
+        assert torch.equal(value, expected[name])
 
 
 @pytest.mark.parametrize(
     ("flow", "complaint"),
     [
-        (ContextFlow(LOW[:1], HIGH[:1], **SHAPE), "action_size=1, expected action_size=2"),
-        (ContextFlow(LOW, HIGH, **{**SHAPE, "window": 5}), "feature_size=25, expected feature"),
-        (ContextFlow(LOW, HIGH, **{**SHAPE, "hidden": [9]}), r"has shape \(9,\), expected \(8,\)"),
-        (PaperFlow(LOW, HIGH, [2], 3), "kind=PaperFlow, expected kind=ContextFlow"),
+        (PaperFlow(LOW, HIGH, [2], 3), "kind=PaperFlow, expected kind=ActionFlow"),
+        (
+            ActionFlow(LOW, HIGH, network=AxisNetwork(width=8)),
+            r"has shape \(8,\), expected \(128,\)",
+        ),
     ],
+    ids=["kind", "width"],
 )
 def test_a_checkpoint_of_another_flow_is_refused(configure, no_training, tmp_path, flow, complaint):
     _checkpoint(tmp_path / "flow", flow)
-    changes = {f"corrector.{name}": value for name, value in SHAPE.items()}
-    changes["corrector.checkpoint"] = str(tmp_path / "flow")
-    cfg = configure("method=afm_physics", **changes)
+    cfg = configure("method=afm_physics", **{"corrector.checkpoint": str(tmp_path / "flow")})
     with pytest.raises(ConfigurationError, match=f"^corrector.checkpoint: {tmp_path}.*{complaint}"):
         build(cfg)
 

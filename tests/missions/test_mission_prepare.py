@@ -6,7 +6,8 @@ import torch
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.missions import build, prepare
 
-METHOD = "method=afm_frozen_pe"  # trains an ensemble, then a flow over it
+METHOD = "method=afm_frozen_pe"  # trains an ensemble
+REFINED = {"iterations": 20, "batch_size": 16, "seed": 0}  # and refines the flow over it
 
 
 @pytest.fixture
@@ -14,6 +15,7 @@ def prepared(configure):
     """Build and prepare; return the agent and what was said."""
 
     def make(cache, *overrides, **settings):
+        settings = {"corrector.train": REFINED, **settings}
         agent, lines = build(configure(METHOD, *overrides, **settings)), []
         prepare(agent, cache, echo=lines.append)
         return agent, lines
@@ -22,7 +24,7 @@ def prepared(configure):
 
 
 def parameters(agent):
-    return [*agent.model.state_dict().values(), *agent.transform.flow.state_dict().values()]
+    return [*agent.model.state_dict().values(), *agent.transform.corrector.state_dict().values()]
 
 
 def test_trained_once_then_from_the_cache(prepared, tmp_path):
@@ -47,7 +49,7 @@ def test_only_what_the_result_depends_on_is_part_of_the_key(prepared, cache):
     after["dynamics.propagation"] = "sample"
     _, lines = prepared(cache, **after)
     assert all("from the cache" in line for line in lines)
-    _, lines = prepared(cache, **{"corrector.train.iterations": 21})
+    _, lines = prepared(cache, **{"corrector.train": {**REFINED, "iterations": 21}})
     assert ["from the cache" in line for line in lines] == [True, False]
     _, lines = prepared(cache, **{"dynamics.seed": 1})
     assert not any("from the cache" in line for line in lines)
@@ -81,7 +83,7 @@ def test_nothing_to_train_needs_no_cache(configure, no_training):
 
 def test_progress_is_shown_if_asked_for(configure, tmp_path):
     seen = []
-    agent = build(configure("method=afm_physics"))
+    agent = build(configure("method=afm_physics", **{"corrector.train": REFINED}))
     agent.trainings = [
         part._replace(train=lambda progress: seen.append(progress) or 0.5)
         for part in agent.trainings

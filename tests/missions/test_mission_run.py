@@ -126,7 +126,7 @@ def test_seconds_are_shared_out_among_the_missions(drive, ring):
 FLIERS = {"geometric", "mass_estimator"}  # need a quadrotor, as all with a KNODE do
 METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
 METHODS = [name for name in METHODS if name not in FLIERS and "knode" not in name]
-NAIVE = {"corrector.views": ["recent"]}  # untrained networks foresee nothing: silence would win
+NAIVE = {"corrector.hypotheses": ["recent"]}  # whatever is believed, it is corrected
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -279,11 +279,11 @@ def test_a_box_per_mission_replaces_that_of_the_actions(world, box):
     td["observation"] = torch.zeros(3, 4, 3)
     wide, narrow = torch.stack([low, 2.5 * high]), torch.stack([0.2 * low, 0.1 * high])
     boxes = torch.stack([wide, narrow, narrow]).unsqueeze(1)
-    td["afm", "reach"] = boxes.expand(3, 4, 2, 2).clone()
-    planner = MPPI(world, horizon=4, population=256, box_key=["afm", "reach"])
-    assert ("afm", "reach") in planner.in_keys
+    td["afm", "effect_bounds"] = boxes.expand(3, 4, 2, 2).clone()
+    planner = MPPI(world, horizon=4, population=256, box_key=["afm", "effect_bounds"])
+    assert ("afm", "effect_bounds") in planner.in_keys
     out = planner(td.clone())
-    least, most = td["afm", "reach"].unsqueeze(-3).unbind(-2)
+    least, most = td["afm", "effect_bounds"].unsqueeze(-3).unbind(-2)
     for planned in (out["next", "mppi", "mean"], out["action"].unsqueeze(-2)):
         assert (planned >= least - 1e-6).all() and (planned <= most + 1e-6).all()
     assert (out["action"][0] > high).any() and (out["action"][0] >= low).all()
@@ -291,7 +291,7 @@ def test_a_box_per_mission_replaces_that_of_the_actions(world, box):
     assert (plain >= low).all() and (plain <= high).all()
 
 
-@pytest.mark.parametrize("key", [None, "box", ("afm", "reach")])
+@pytest.mark.parametrize("key", [None, "box", ("afm", "effect_bounds")])
 def test_without_a_box_or_with_that_of_the_actions_plans_are_the_same(world, box, key):
     td = situation(3)
     expected = plan(MPPI(world, **SMALL), td)

@@ -123,3 +123,10 @@ def test_an_unknown_parameter_lists_the_known_ones(gains):
 def test_impossible_priors_are_refused(settings):
     with pytest.raises(ConfigurationError, match=next(iter(settings))):
         ActionGain(**{"names": ["a"], **settings})
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_each_action_has_a_name(count):
+    with pytest.raises(ConfigurationError, match="the robot has 2 actions; give one name for each"):
+        names = [f"gain_{k}" for k in range(count)]
+        ActionGain(names).apply(torch.ones(4, 2), torch.ones(4, count), torch.zeros(4, 3))

@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, Unbounded
 from torchrl.envs import (
     Compose,
     ObservationNorm,
@@ -19,19 +19,18 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
+from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import ContextFlow, PaperFlow
+from afm_rl.flow import AxisNetwork
 from afm_rl.planning import GoalDistance, PlanningEnv
 from afm_rl.transforms import ActionFlowTransform
-
-ROWS = 7
 
 
 def transform(**settings):
     low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
-    flow = ContextFlow(low, high, window=3, memory=ROWS, hidden=[8], latent=4)
+    flow = ActionFlow(low, high, network=AxisNetwork(width=16, latent=8))
     return ActionFlowTransform(Dubins(), flow, **settings)
 
 
@@ -54,7 +53,7 @@ def test_either_precision(dtype):
     whole.transform.to(dtype)  # the flow computes in the precision of its weights
     check_env_specs(whole)
     data = whole.rollout(2)["next", "afm"]
-    assert data["state"].dtype is data["window", "planned"].dtype is dtype
+    assert data["memory"].dtype is data["planned_action"].dtype is dtype
 
 
 def test_planning_environment(box):
@@ -128,8 +127,8 @@ def test_a_later_normaliser_does_not_disturb_it():
     norm = ObservationNorm(loc=3.0, scale=0.1, in_keys=["observation"])
     data = env(norm, batch_size=(4,), process_noise=0.0).rollout(3)
     assert not torch.allclose(data["next", "observation"], data["next", "pose"])
-    torch.testing.assert_close(data["next", "afm", "state"], data["next", "pose"])
-    assert float(data["next", "afm", "surprise"].max()) < 0.1
+    torch.testing.assert_close(data["next", "afm", "memory"][..., :3], data["next", "pose"])
+    assert float(data["next", "afm", "innovation"].max()) < 0.1
 
 
 def test_random_rollouts_stay_within_the_specs():
@@ -148,20 +147,20 @@ def test_two_prefixes_live_together():
     check_env_specs(both, break_when_any_done="both")
     data = both.rollout(3)
     assert data["next", "agent", "second", "executed_action"].shape == (2, 3, 2)
-    assert data["next", "first", "window", "valid"].shape == (2, 3, ROWS)
-    assert data["next", "first", "pairs"].shape == (2, 3, ROWS, 6)
+    size = chain[0].corrector.memory_size(3)
+    assert data["next", "first", "memory"].shape == (2, 3, size)
 
 
 def test_keys_may_be_nested_and_come_from_yaml(box):
     cost = GoalDistance(in_keys=[["task", "goal"]])
     world = PlanningEnv(Dubins(), cost, *box, ["robot", "pose"], ["robot", "action"])
     chain = transform(
-        observation_key=["robot", "pose"], action_key=["robot", "action"], prefix=["robot", "afm"]
+        in_keys=[["robot", "pose"]], in_keys_inv=[["robot", "action"]], prefix=["robot", "afm"]
     )
     nested = TransformedEnv(world, chain)
     check_env_specs(nested)
     assert nested.rollout(3)["next", "robot", "afm", "executed_action"].shape == (3, 2)
-    assert chain.key("window", "valid") == ("robot", "afm", "window", "valid")
+    assert chain.key("memory") == ("robot", "afm", "memory")
 
 
 @pytest.mark.parametrize("double", [copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))])
@@ -173,7 +172,7 @@ def test_copies_behave_alike(double):
         torch.manual_seed(0)
         results.append(TransformedEnv(track(batch_size=(2,)), chain).rollout(3))
     torch.testing.assert_close(results[0], results[1])
-    assert twin.flow is not original.flow and twin.model is not original.model
+    assert twin.corrector is not original.corrector and twin.model is not original.model
 
 
 def test_a_copied_environment_keeps_its_own_model():
@@ -188,29 +187,56 @@ def test_an_appended_environment_copy_shares_the_specs():
     check_env_specs(whole)
 
 
-def test_the_flow_is_owned_and_the_model_is_shared(box, make_ensemble):
-    model = make_ensemble().train()
-    flow = ContextFlow(*box, window=3, hidden=[8], latent=4)
+def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble, small_flow):
+    model, flow = make_ensemble().train(), small_flow()
     chain = ActionFlowTransform(model, flow)
     whole = TransformedEnv(track(), Compose(chain))
     assert chain.model is model and model.training  # composing switches what is owned to eval
     stored = set(whole.state_dict())
     assert len(stored) == len(flow.state_dict()) > 0
-    assert all("flow." in name for name in stored)
+    assert all("corrector." in name for name in stored)
     assert {id(p) for p in chain.parameters()} == {id(p) for p in flow.parameters()}
 
 
 def test_the_state_of_one_environment_loads_into_another():
     one, other = env(), env()
-    for parameter in one.transform[0].flow.parameters():
+    for parameter in one.transform[0].corrector.parameters():
         parameter.data += 1.0
     other.load_state_dict(one.state_dict())
     pairs = zip(one.parameters(), other.parameters(), strict=True)
     assert all(torch.equal(left, right) for left, right in pairs)
 
 
-def test_sizes_that_contradict_each_other_are_refused(box):
+def test_nothing_but_a_model_is_needed(box):
+    world = PlanningEnv(Dubins(), GoalDistance(), *box)
+    env = TransformedEnv(world, ActionFlowTransform(Dubins()))
+    check_env_specs(env)
+    flow = env.transform.corrector
+    assert isinstance(flow, ActionFlow) and torch.equal(flow.half_range, box[1])
+    assert env.rollout(3)["next", "afm", "executed_action"].shape == (3, 2)
+
+
+def test_before_it_is_around_an_environment_the_box_is_not_known():
+    with pytest.raises(ConfigurationError, match="put the transform around an environment first"):
+        ActionFlowTransform(Dubins()).corrector  # noqa: B018
+
+
+def test_the_universal_flow_needs_a_box(box):
+    unbounded = PlanningEnv(Dubins(), GoalDistance(), *box)
+    unbounded.action_spec = Unbounded((2,))
+    with pytest.raises(ConfigurationError, match="expected a Bounded spec of real numbers"):
+        TransformedEnv(unbounded, ActionFlowTransform(Dubins())).reset()
+
+
+def test_sizes_that_contradict_each_other_are_refused():
     with pytest.raises(ConfigurationError, match="1 actions, but the dynamics model has 2"):
-        ActionFlowTransform(Dubins(), ContextFlow([-1.0], [1.0]))
-    with pytest.raises(ConfigurationError, match="'goal': holds 2 numbers, .* state has 3"):
-        TransformedEnv(track(), transform(observation_key="goal")).reset()
+        ActionFlowTransform(Dubins(), LeastSquares([-1.0], [1.0]))
+    with pytest.raises(ConfigurationError, match=r"\['goal'\]: of the shape \(2,\), .* has 3 num"):
+        TransformedEnv(track(), transform(in_keys=["goal"])).reset()
+
+
+def test_a_missing_key_is_named_with_what_there_is():
+    with pytest.raises(ConfigurationError, match=r"\['pos'\]: the environment has no .*'pose'"):
+        TransformedEnv(track(), transform(in_keys=["pos"])).reset()
+    with pytest.raises(ConfigurationError, match=r"\['act'\]: the environment has no .*'action'"):
+        TransformedEnv(track(), transform(in_keys_inv=["act"])).reset()

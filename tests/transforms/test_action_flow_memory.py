@@ -1,5 +1,7 @@
 """The memory of the action flow transform lives in the tensordict."""
 
+import warnings
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -8,22 +10,19 @@ from torchrl.envs.utils import step_mdp
 
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
-from afm_rl.flow import ContextFlow
 from afm_rl.regimes import Schedule
-from afm_rl.transforms import ActionFlowTransform
+from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
 
-ROWS = 5
-VIEWS = ["recent", "newest", "late_1"]  # and never silent
+HYPOTHESES = ["recent", "newest", "delay_1"]  # and never the identity
 
 
 @pytest.fixture
-def make(box):
+def make(small_flow):
     """Make an environment with a reversed drive, which the flow does correct somehow."""
 
     def build(batch=(4,), max_steps=100):
         # From one point: among samples that are as good, rounding would decide.
-        small = {"window": 3, "memory": ROWS, "hidden": [8], "latent": 4, "source_std": 0.0}
-        flow = ContextFlow(*box, views=VIEWS, **small)
+        flow = small_flow(hypotheses=HYPOTHESES, source_std=0.0)
         base = UGVTrack(
             batch_size=batch,
             max_steps=max_steps,
@@ -54,26 +53,29 @@ def same(left, right):
 def test_it_is_empty_at_the_start_but_for_state_and_box(make):
     env = make()
     td = env.reset()
-    memory = td["afm"].clone()
-    torch.testing.assert_close(memory.pop("state"), td["observation"])
+    entries = td["afm"].clone()
+    memory = entries.pop("memory")
+    torch.testing.assert_close(memory[:, :3], td["observation"])
     space = env.full_action_spec["action"].space
-    torch.testing.assert_close(memory.pop("reach"), torch.stack([space.low, space.high], -2))
-    assert all((value == 0).all() for value in memory.values(True, True))
+    bounds = torch.stack([space.low, space.high], -2)
+    torch.testing.assert_close(entries.pop("effect_bounds"), bounds)
+    assert not memory[:, 3:].any() and not any(part.any() for part in entries.values())
 
 
-def test_the_window_holds_the_latest_transitions_oldest_first(make):
-    data = make().rollout(6)
-    for step in range(6):
-        window = data["next", "afm", "window"][:, step]
-        first = max(0, step + 1 - ROWS)
-        held = step + 1 - first
-        assert (window["valid"].sum(-1) == held).all() and window["valid"][:, -held:].all()
-        past = data[:, first : step + 1]
-        torch.testing.assert_close(window["state"][:, -held:], past["observation"])
-        torch.testing.assert_close(window["next_state"][:, -held:], past["next", "observation"])
-        torch.testing.assert_close(window["planned"][:, -held:], past["action"])
+def test_it_holds_the_latest_transitions_oldest_first(make, remembered):
+    env, steps = make(), 15
+    data, corrector = env.rollout(steps), env.transform.corrector
+    found = remembered(corrector, data["next", "afm"])
+    for step in (0, 4, steps - 1):
+        held = min(step + 1, corrector.recent)
+        now = {name: part[:, step] for name, part in found.items()}
+        assert (now["valid"].sum(-1) == held).all() and now["valid"][:, -held:].all()
+        past = data[:, step + 1 - held : step + 1]
+        torch.testing.assert_close(now["state"][:, -held:], past["observation"])
+        torch.testing.assert_close(now["next_state"][:, -held:], past["next", "observation"])
+        torch.testing.assert_close(now["planned"][:, -held:], past["action"])
         executed = past["next", "afm", "executed_action"]
-        torch.testing.assert_close(window["executed"][:, -held:], executed)
+        torch.testing.assert_close(now["executed"][:, -held:], executed)
 
 
 def test_the_gate_opens_after_the_first_surprise(make):
@@ -84,11 +86,12 @@ def test_the_gate_opens_after_the_first_surprise(make):
     assert td["afm", "misaligned"].all() and (executed[0] != action).any(-1).all()
 
 
-def test_an_automatic_reset_clears_it(make):
-    data = make(max_steps=4).rollout(9, break_when_any_done=False)
-    valid = data["afm", "window", "valid"].sum(-1)
+def test_an_automatic_reset_clears_it(make, remembered):
+    env = make(max_steps=4)
+    data = env.rollout(9, break_when_any_done=False)
+    valid = remembered(env.transform.corrector, data["afm"])["valid"].sum(-1)
     assert valid.tolist() == [[0, 1, 2, 3, 0, 1, 2, 3, 0]] * 4
-    torch.testing.assert_close(data["afm", "state"], data["observation"])
+    torch.testing.assert_close(data["afm", "memory"][..., :3], data["observation"])
     assert not data["next", "afm", "misaligned"][:, [0, 4, 8]].any()
 
 
@@ -101,11 +104,11 @@ def test_a_partial_reset_clears_its_own_rows_only(make):
     after = env.reset(td, set_state=False)
     assert same(after["afm"][~rows], before[~rows])
     fresh = after["afm"][rows]
-    torch.testing.assert_close(fresh["state"], after["observation"][rows])
-    assert (fresh["window", "valid"] == 0).all() and (fresh["surprise"] == 0).all()
+    torch.testing.assert_close(fresh["memory"][:, :3], after["observation"][rows])
+    assert not fresh["memory"][:, 3:].any() and not fresh["innovation"].any()
 
 
-def test_missions_end_at_times_of_their_own(make):
+def test_missions_end_at_times_of_their_own(make, remembered):
     env = make()
     td = env.reset()
     td["step"] = torch.tensor([99, 98, 97, 0])  # of 100
@@ -113,7 +116,8 @@ def test_missions_end_at_times_of_their_own(make):
     for _ in range(4):
         td["action"] = torch.full((4, 2), 0.1)
         _, td = env.step_and_maybe_reset(td)
-        counts.append(td["afm", "window", "valid"].sum(-1).tolist())
+        found = remembered(env.transform.corrector, td["afm"])
+        counts.append(found["valid"].sum(-1).tolist())
     assert counts == [[0, 1, 1, 1], [1, 0, 2, 2], [2, 1, 0, 3], [3, 2, 1, 4]]
 
 
@@ -159,10 +163,28 @@ def test_a_batch_equals_single_missions(make):
 
 
 @pytest.mark.parametrize("more", [[], [StepCounter()]], ids=["alone", "in company"])
-def test_a_tensordict_without_memory_is_refused_clearly(make, box, more):
-    flow = ContextFlow(*box, window=3, hidden=[8], latent=4)
-    chain = Compose(ActionFlowTransform(Dubins(), flow, prefix=["my", "afm"]), *more)
+def test_a_tensordict_without_memory_is_refused_clearly(small_flow, more):
+    chain = Compose(ActionFlowTransform(Dubins(), small_flow(), prefix=["my", "afm"]), *more)
     env = TransformedEnv(UGVTrack(), chain)
     td = env.reset().exclude("my")
     with pytest.raises(KeyError, match=r"no \('my', 'afm'\) in the tensordict; start from env.r"):
         env.step(td.set("action", torch.zeros(2)))
+
+
+@pytest.mark.parametrize("end", ["transform", "policy"])
+def test_whoever_forgets_to_go_on_is_warned(make, small_flow, end):
+    if end == "transform":
+        env = make()
+        td, step = env.reset().set("action", torch.full((4, 2), 0.5)), env.step
+    else:
+        spec = make().action_spec_unbatched
+        step = ActionFlowPolicy(Dubins(), spec, small_flow())
+        td = step.make_tensordict_primer()(TensorDict())
+        td.update({"observation": torch.zeros(3), "action": torch.zeros(2)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        td = step(td)
+        going = step(step_mdp(td.clone(), exclude_action=False))
+    assert "afm" in going["next"].keys()
+    with pytest.warns(UserWarning, match="go on with step_mdp"):
+        step(td)

@@ -9,10 +9,10 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
+from afm_rl.correction import ActionFlow, LeastSquares
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import ContextFlow, LeastSquares
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 from afm_rl.regimes import Schedule
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
@@ -38,19 +38,19 @@ def track(box):
 def planner(box):
     """Make a planner that knows how far actions reach."""
     world = PlanningEnv(Dubins(), GoalDistance(), *box)
-    return MPPI(world, horizon=3, population=20, box_key=["afm", "reach"])
+    return MPPI(world, horizon=3, population=20, box_key=["afm", "effect_bounds"])
 
 
 @pytest.fixture
-def flow(box):
-    """A flow that answers something, and knows how far actions reach."""
-    return ContextFlow(*box, hidden=[8], latent=4)
+def flow(small_flow):
+    """A flow that answers something."""
+    return small_flow()
 
 
 @pytest.fixture
 def agent(planner, flow):
     """Planner and correction as one policy."""
-    return TensorDictSequential(planner, ActionFlowPolicy(Dubins(), flow, planner.action_spec))
+    return TensorDictSequential(planner, ActionFlowPolicy(Dubins(), planner.action_spec, flow))
 
 
 def primers(agent):
@@ -64,7 +64,7 @@ def test_actions_are_those_of_the_transform(track, agent, flow):
     found = TransformedEnv(track(), primers(agent)).rollout(STEPS, agent)
     assert expected["next", "afm", "misaligned"].any()
     assert torch.equal(found["action"], expected["next", "afm", "executed_action"])
-    for name in ("planned_action", "surprise", "spread", "reach"):
+    for name in ("planned_action", "innovation", "spread", "effect_bounds"):
         assert torch.equal(found["next", "afm", name], expected["next", "afm", name])
 
 
@@ -84,7 +84,8 @@ def test_a_loop_without_an_environment_takes_the_same_actions(track, agent):
 
 def test_the_first_state_is_no_transition(track, agent):
     data = TransformedEnv(track(), primers(agent)).rollout(3)
-    assert data["afm", "state"].isnan().all() and not data["afm", "window", "valid"].any()
+    memory = data["afm", "memory"][:, 0]
+    assert memory[:, :3].isnan().all() and not memory[:, 3:].any()
 
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
@@ -97,8 +98,8 @@ def test_any_batch(track, agent, batch):
 def test_keys_are_declared_and_may_be_nested(planner, flow):
     policy = ActionFlowPolicy(
         Dubins(),
-        flow,
         planner.action_spec,
+        flow,
         ["robot", "pose"],
         ["robot", "action"],
         ["robot", "afm"],
@@ -111,16 +112,16 @@ def test_keys_are_declared_and_may_be_nested(planner, flow):
 
 
 def test_it_may_only_watch(track, planner, flow):
-    policy = ActionFlowPolicy(Dubins(), flow, planner.action_spec, enabled=False)
+    policy = ActionFlowPolicy(Dubins(), planner.action_spec, flow, enabled=False)
     agent = TensorDictSequential(planner, policy)
     data = TransformedEnv(track(), primers(agent)).rollout(4, agent)
-    assert data["next", "afm", "misaligned"].any()
+    assert (data["next", "afm", "innovation"] > 5).any()
     assert torch.equal(data["action"], data["next", "afm", "planned_action"])
 
 
-def test_the_flow_is_owned_and_the_model_is_shared(planner, flow):
-    policy = ActionFlowPolicy(Dubins(), flow, planner.action_spec)
-    assert {name.partition(".")[0] for name in policy.state_dict()} == {"flow"}
+def test_the_corrector_is_owned_and_the_model_is_shared(planner, flow):
+    policy = ActionFlowPolicy(Dubins(), planner.action_spec, flow)
+    assert {name.partition(".")[0] for name in policy.state_dict()} == {"corrector"}
 
 
 def test_without_its_memory_it_says_what_is_missing(agent):
@@ -131,13 +132,23 @@ def test_without_its_memory_it_says_what_is_missing(agent):
 
 def test_sizes_that_contradict_each_other_are_refused(planner, flow):
     with pytest.raises(ConfigurationError, match="made for 1 actions, but .* has 2"):
-        ActionFlowPolicy(Dubins(), LeastSquares([-1.0], [1.0]), planner.action_spec)
+        ActionFlowPolicy(Dubins(), planner.action_spec, LeastSquares([-1.0], [1.0]))
     with pytest.raises(ConfigurationError, match=r"policy.action_spec: of the shape \(3, 2\)"):
-        ActionFlowPolicy(Dubins(), flow, planner.action_spec.expand(3, 2))
+        ActionFlowPolicy(Dubins(), planner.action_spec.expand(3, 2), flow)
 
 
-@pytest.mark.parametrize("part", ["model", "flow", "action_spec", "enabled", "extend_action_box"])
+def test_nothing_but_a_model_and_a_spec_is_needed(planner):
+    policy = ActionFlowPolicy(Dubins(), planner.action_spec)
+    assert isinstance(policy.corrector, ActionFlow)
+    td = policy.make_tensordict_primer()(TensorDict())
+    td.update({"observation": torch.zeros(3), "action": torch.tensor([0.3, 0.4])})
+    assert torch.equal(policy(td)["action"], torch.tensor([0.3, 0.4]))
+
+
+@pytest.mark.parametrize(
+    "part", ["model", "corrector", "action_spec", "enabled", "extend_action_box"]
+)
 def test_parts_of_the_wrong_kind_are_refused(planner, flow, part):
-    parts = {"model": Dubins(), "flow": flow, "action_spec": planner.action_spec, part: None}
+    parts = {"model": Dubins(), "corrector": flow, "action_spec": planner.action_spec, part: 3}
     with pytest.raises(ConfigurationError, match=f"policy.{part}"):
         ActionFlowPolicy(**parts)

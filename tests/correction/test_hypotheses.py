@@ -1,0 +1,171 @@
+"""What each hypothesis reads in the memory."""
+
+import pytest
+import torch
+
+from afm_rl.correction import ActionFlow
+from afm_rl.correction.hypotheses import (
+    HYPOTHESES,
+    IDENTITY,
+    Hypothesis,
+    check_hypotheses,
+    lay_out,
+    memory_of,
+    read_rows,
+)
+from afm_rl.errors import ConfigurationError
+from afm_rl.flow import AxisNetwork
+
+MANY = 20
+AGES = torch.arange(float(MANY)).unsqueeze(-1)
+PLACE = torch.zeros(MANY, 2)
+DELAYS = range(1, 9)
+
+
+def pairs_of(valid=None):
+    """Return a memory of one action: 0, 1, ... with the effects 100, 101, ..."""
+    valid = torch.ones(MANY, 1) if valid is None else valid
+    return torch.cat([AGES, 100 + AGES, 0.01 * AGES, valid, 0 * AGES, PLACE], -1)
+
+
+def read(hypothesis, rows=4, pairs=None, away=None):
+    """Return executed, effective, std and valid of what one hypothesis reads, ``(K,)`` each."""
+    timed = [] if not hypothesis.near else [HYPOTHESES["recent"]]
+    layout = lay_out([*timed, hypothesis], rows)
+    found = read_rows(pairs_of() if pairs is None else pairs, layout, 1, away)
+    return [part[-1, :, 0] for part in found]
+
+
+def without(*rows):
+    valid = torch.ones(MANY, 1)
+    valid[list(rows)] = 0.0
+    return pairs_of(valid)
+
+
+def test_recent_pairs_are_the_newest_and_fill_half():
+    executed, effective, std, valid = read(HYPOTHESES["recent"])
+    assert executed.tolist() == [0, 0, 18, 19] and effective.tolist() == [0, 0, 118, 119]
+    torch.testing.assert_close(std, 0.01 * executed)
+    assert valid.tolist() == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("name", "filled"),
+    [("newest", 2), ("recent", 6), ("long", 12), ("here", 1), ("nearest", 2), ("near", 6)],
+)
+def test_each_fills_its_share_and_one_row_at_least(name, filled):
+    away = torch.zeros(MANY)
+    assert read(HYPOTHESES[name], 12, away=away)[3].sum() == filled
+    assert read(HYPOTHESES[name], 1, away=away)[3].sum() == 1
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+def test_late_pairs_join_a_command_with_the_effect_that_came_later(delay):
+    hypothesis = HYPOTHESES[f"delay_{delay}"]._replace(share=1.0)
+    executed, effective, std, valid = read(hypothesis)
+    assert effective.tolist() == [116, 117, 118, 119] and valid.all()
+    assert torch.equal(executed, effective - 100 - delay)
+    torch.testing.assert_close(std, 0.01 * (effective - 100))  # of the effect
+    found = read(hypothesis, pairs=without(17))[3]
+    assert found.tolist() == [float(k not in (17, 17 + delay)) for k in range(16, 20)]
+
+
+def test_near_pairs_come_in_the_order_of_place_then_of_age():
+    hypothesis = HYPOTHESES["near"]._replace(share=1.0)
+    away = torch.tensor([0.0, 4.0]).repeat(MANY // 2)  # every second pair is from elsewhere
+    assert read(hypothesis, away=away)[0].tolist() == [12, 14, 16, 18]
+    away[18] = 9.0
+    assert read(hypothesis, away=away)[0].tolist() == [10, 12, 14, 16]
+    away[16] = torch.inf  # as pairs that do not count have it
+    assert read(hypothesis, away=away)[0].tolist() == [8, 10, 12, 14]
+    assert read(HYPOTHESES["nearest"], away=away)[0].tolist() == [0, 0, 0, 14]
+
+
+def test_what_does_not_count_fills_a_row_with_nothing():
+    few = pairs_of((AGES > MANY - 2).float())
+    for name in ("long", "near"):
+        hypothesis = HYPOTHESES[name]._replace(share=1.0)
+        executed, effective, _, valid = read(hypothesis, pairs=few, away=torch.zeros(MANY))
+        assert valid.tolist() == [0, 0, 0, 1] == (executed > 0).tolist() == (effective > 0).tolist()
+
+
+@pytest.mark.parametrize("delay", [0, 3, 8])
+def test_the_memory_is_as_long_as_they_look_back_and_no_longer(delay):
+    hypothesis = Hypothesis(share=1.0, delay=delay)
+    count = memory_of([hypothesis], 3)
+    assert read(hypothesis, 3, pairs_of()[-count:])[3].all()
+    with pytest.raises((RuntimeError, IndexError)):
+        read(hypothesis, 3, pairs_of()[-count + 1 :])
+
+
+@pytest.mark.parametrize("axes", [1, 2, 6])
+def test_batches_are_read_one_by_one(axes):
+    generator = torch.Generator().manual_seed(0)
+    pairs = torch.rand(5, MANY, 3 * axes + 4, generator=generator)
+    away = torch.rand(5, MANY, generator=generator)
+    chosen = [HYPOTHESES[name] for name in check_hypotheses(list(HYPOTHESES), by_place=True)]
+    layout = lay_out(chosen, 4)
+    together = read_rows(pairs, layout, axes, away)
+    assert together.executed.shape == (5, len(chosen), 4, axes)
+    for k in range(5):
+        single = read_rows(pairs[k], layout, axes, away[k])
+        assert all(torch.equal(one, many[k]) for one, many in zip(single, together, strict=True))
+
+
+def test_the_identity_reads_nothing_and_those_by_place_are_last():
+    names = check_hypotheses(["near", IDENTITY, "recent", "here", "delay_3"], by_place=True)
+    assert names == ["recent", "delay_3", "near", "here"]
+    assert check_hypotheses(["near", "recent"], by_place=False) == ["recent"]
+
+
+@pytest.mark.parametrize(
+    ("names", "complaint"),
+    [
+        ("recent", "expected a list of"),
+        ([], "expected a list of"),
+        (["late"], "'late': expected one of identity, recent"),
+        ([IDENTITY], "expected one by time, such as recent"),
+        (["near"], "expected one by time"),
+    ],
+    ids=str,
+)
+def test_a_list_that_cannot_be_used_is_refused(names, complaint):
+    with pytest.raises(ConfigurationError, match=f"corrector.hypotheses=.*{complaint}"):
+        check_hypotheses(names, by_place=True)
+
+
+def late(delay):
+    def effect(sent):
+        return sent[-1 - delay] if len(sent) > delay else torch.zeros_like(sent[-1])
+
+    return effect
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2, 3, 5, 8])
+def test_the_hypothesis_that_a_delay_needs_is_believed(line, drive, plans, delay):
+    """With experts alone, an untrained network would not know whom to trust."""
+    flow = ActionFlow(-torch.ones(2), torch.ones(2), network=Experienced())
+    memory, model, box = flow.begin(torch.zeros(3, 2)), line(2), torch.ones(3, 2, 2)
+    box[:, 0] = -1.0
+    sent, state = [], torch.zeros(3, 2)
+    for plan in plans(40, 3, 2, size=1.0):
+        memory, found = flow.correct(memory, plan, model, box)
+        sent.append(plan)  # others act: the choice alone is looked at
+        memory = flow.executing(memory, plan, plan)
+        state = model(state, -late(delay)(sent))
+        memory = flow.observe(memory, state)
+    losses = flow.unpack(memory, 2)["losses"] + flow.penalty
+    names = [*flow.hypotheses, IDENTITY]
+    believed = {names[int(k)] for k in losses.argmin(-1)}
+    assert believed <= ({f"delay_{delay}"} if delay else {"recent", "newest", "long"})
+
+
+class Experienced(AxisNetwork):
+    """Trusts the gain with long memory, whatever it is asked."""
+
+    def __init__(self):
+        super().__init__(width=16, latent=8)
+        for head in (self.plan_head, self.effect_head):
+            for part in (head[-1].weight, head[-1].bias):
+                torch.nn.init.zeros_(part)
+            head[-1].bias.data[3] = 9.0  # own answer, its logit, those of the experts
