@@ -95,7 +95,8 @@ def on_page_content(content, page, **kwargs):
 
     def render(found):
         kind, formula = found[1], html.unescape(found[2])
-        result = convert(formula, display="block" if kind == "div" else "inline")
+        known = formula.replace(r"\arg\min", r"\operatorname{argmin}")  # the converter lacks it
+        result = convert(known, display="block" if kind == "div" else "inline")
         if re.search(r"<m[ion]>(&|\\\w+)<", result):
             raise PluginError(f"{page.file.src_uri}: a formula that is not understood: {formula}")
         return result

@@ -6,7 +6,6 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torchrl.envs import Compose, TransformedEnv
 
-from afm_rl.correction import LeastSquares
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.manifold import Manifold
 from afm_rl.planning import PlanningEnv
