@@ -162,7 +162,9 @@ class ActionFlowTransform(Transform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         self._check_process()
-        state = tensordict_reset.get(self.observation_key)
+        state = tensordict_reset.get(self.observation_key, None)
+        if state is None:
+            self._entry("in_keys", self.parent.full_observation_spec)
         return tensordict_reset.set(self.prefix, begin(self.corrector, state, self._action_spec))
 
     def _recall(self, tensordict: TensorDictBase):

@@ -34,7 +34,7 @@ def test_planner_transform_and_updater_share_one_model(configure, no_training, m
     assert (agent.transform is None) == cfg.corrector._target_.endswith("no_correction")
     if agent.transform is not None:
         assert agent.transform.model is agent.model
-        assert unravel_key(agent.executed_key) == ("next", "afm", "executed_action")
+    assert unravel_key(agent.executed_key) == ("next", "guard", "executed_action")
     models = [part.module for part in agent.trainings if part.title in ("ensemble", "KNODE")]
     calibrated = "base" in cfg.dynamics
     trained, settings = (

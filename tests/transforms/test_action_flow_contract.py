@@ -224,7 +224,7 @@ def test_before_it_is_around_an_environment_the_box_is_not_known():
 def test_the_universal_flow_needs_a_box(box):
     unbounded = PlanningEnv(Dubins(), GoalDistance(), *box)
     unbounded.action_spec = Unbounded((2,))
-    with pytest.raises(ConfigurationError, match="expected a Bounded spec of real numbers"):
+    with pytest.raises(ConfigurationError, match="expected the 2 finite bounds"):
         TransformedEnv(unbounded, ActionFlowTransform(Dubins())).reset()
 
 
