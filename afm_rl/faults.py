@@ -9,7 +9,7 @@ repetitions beside the state and asks for both ends of a transition::
 
 Both ends count: the first fresh reading after a stale one seems to be a jump.
 
-How a stale sensor and a robot that stands still are told apart:
+How a stale sensor and a robot that stands still differ:
 
 * With a time stamp: the reading is stale if and only if the stamp stands still.
 * Without one: real sensors and noisy simulators never send the same bits twice, so a reading

@@ -18,8 +18,8 @@ class MissionNoise:
     by call: step them together, and they are paired.
 
     Args:
-        kinds: a salt, which tells the streams of a kind from all others, and how many numbers it
-            draws, N, by name; those of the ground robot if None.
+        kinds: by name, a salt, which separates the streams of a kind from all others, and how many
+            numbers it draws, N; those of the ground robot if None.
 
     >>> noise = MissionNoise()
     >>> seeds = torch.tensor([3, 4, 3])

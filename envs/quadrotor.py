@@ -1,4 +1,4 @@
-"""The quadrotor that follows references, under regimes it is not told of."""
+"""The quadrotor that follows references, under regimes that are hidden from it."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class CrazyflieTrack(MissionEnv):
         batch_size: number of flights, or ``()`` for any.
         seed: missions without a seed of their own get ``seed, seed + 1, ...``.
         device: where the tensors live.
-        missions: what missions are unless ``reset`` is told otherwise: a tensordict that
+        missions: what missions are unless ``reset`` is given others: a tensordict that
             broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
         action_low: lowest action, ``(4,)``; what the motors can do if None.
         action_high: highest action.

@@ -1,4 +1,4 @@
-"""The ground robot on a track, under regimes it is not told of."""
+"""The ground robot on a track, under regimes that are hidden from it."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class UGVTrack(MissionEnv):
         batch_size: number of missions, or ``()`` for any.
         seed: missions without a seed of their own get ``seed, seed + 1, ...``.
         device: where the tensors live.
-        missions: what missions are unless ``reset`` is told otherwise: a tensordict that
+        missions: what missions are unless ``reset`` is given others: a tensordict that
             broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
         dtype: floating-point type, torch's default if None.
 

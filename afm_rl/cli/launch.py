@@ -60,10 +60,10 @@ def launch(cfg: DictConfig) -> None:
     roads = [getattr(agent.base_env, "tracks", ()) for agent in agents]  # flights have none
     tracks = {track.name: track for some in roads for track in some}
     shown = {"figures": cfg.figures, "tensorboard": cfg.tensorboard}
-    write_run(folder, missions, steps, list(tracks.values()), **shown)
+    write_run(folder, missions, steps, results[0].measures, list(tracks.values()), **shown)
     if film is not None:
         write_films(folder / "video", missions, steps, list(tracks.values()), film)
-    print_summary(missions)
+    print_summary(missions, results[0].measures)
     print(f"Results: {folder}")
 
 

@@ -21,8 +21,8 @@ Join the results of runs, sweeps and studies; write tables (CSV, LaTeX), figures
   afm-rl-report study --no-figures                 tables only, in seconds
   afm-rl-report outputs/demo --video gif           films only, one per method, in report/video
 
-A folder is what `afm-rl` or a study has written: missions.csv, and steps.parquet for curves, maps
-and recovery times. A study may still be running: the report takes what is finished, and says
+A folder is what `afm-rl` has written: missions.csv and measures.json, and steps.parquet for curves,
+maps and recovery times. A study may still be running: the report takes what is finished, and says
 which methods, cells and seeds are missing (missing.csv). Of a mission that stands in several
 folders, the last one counts.
 """
@@ -47,12 +47,11 @@ def main() -> None:
         "--baselines",
         metavar="METHOD",
         nargs="+",
-        default=["online_pe", "adaptive_affine"],
-        help="methods that the others are compared with (online_pe adaptive_affine)",
+        help="methods that the others are compared with (online_pe and adaptive_affine, if there)",
     )
     add("--oracle", metavar="METHOD", default="oracle", help="who knows the regime (oracle)")
     add("--no-figures", dest="figures", action="store_false", help="write tables only")
-    films = "write films only, of each method's first mission: gif, or mp4, which needs an extra"
+    films = "write films only, of each method's first mission and of all at once (mp4: an extra)"
     add("--video", choices=("gif", "mp4"), help=films)
     options = parser.parse_args()
 

@@ -43,7 +43,7 @@ def launch_study(
         )
         sys.exit(130)
     if len(outcome.missions):
-        print_summary(outcome.missions)
+        print_summary(outcome.missions, outcome.measures)
         write_report([folder], folder / "report", figures=figures, load_track=load_track)
     print(f"Results: {folder}")
     for shard, reason in outcome.failures.items():

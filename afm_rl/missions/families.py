@@ -48,7 +48,7 @@ class Family:
     changes: int = 0
 
     def mission(self, seed: int) -> dict[str, Any]:
-        """Return what ``env.mission`` is to be told: ``regime``, ``at`` and ``ramp``."""
+        """Return the arguments of ``env.mission``: ``regime``, ``at`` and ``ramp``."""
         generator = torch.Generator().manual_seed(_stable(self.name, seed))
         if not self.changes:
             return {"regime": self._values(generator), "ramp": self.ramp}

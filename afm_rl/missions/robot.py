@@ -17,26 +17,26 @@ from afm_rl.missions.score import Score
 from afm_rl.regimes import Regime, Schedule
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Robot:
     """A robot: its environment, nominal physics, regimes and boxes.
 
     Args:
         name: short name.
         state_names: names of the state coordinates, for tables.
-        goal_names: names of the goal's coordinates.
+        goal_names: names of the goal's coordinates, among those of the state; none without a goal.
         action_names: names of the action components.
         action_low: lowest action.
         action_high: highest action.
         state_low: lowest corner of the box from which training states are drawn.
         state_high: its highest corner.
-        features: indices of the state coordinates that the dynamics depend on.
+        features: indices of the state coordinates that the dynamics depend on; all if none is given.
         env: makes the environment from ``tracks``, ``regime``, ``schedule``, ``max_steps``
             and the action bounds.
         model: nominal physics.
         regime: family of regimes.
         schedule: when regimes start and end.
-        tracks: all tracks.
+        tracks: names of all tracks, or of whatever else missions differ in.
         paper_regimes: the regimes of the published study.
         families: regimes of which every seed gets a draw of its own, by name; see
             :class:`~afm_rl.missions.families.Family`.
@@ -52,19 +52,19 @@ class Robot:
 
     name: str
     state_names: Sequence[str]
-    goal_names: Sequence[str]
     action_names: Sequence[str]
     action_low: Sequence[float]
     action_high: Sequence[float]
     state_low: Sequence[float]
     state_high: Sequence[float]
-    features: Sequence[int]
     env: Callable[..., EnvBase]
     model: DynamicsModel
     regime: Regime
-    schedule: Schedule
-    tracks: Sequence[str]
-    paper_regimes: Sequence[Mapping[str, float]]
+    goal_names: Sequence[str] = ()
+    features: Sequence[int] = ()
+    schedule: Schedule = field(default_factory=Schedule)
+    tracks: Sequence[str] = ("default",)
+    paper_regimes: Sequence[Mapping[str, float]] = ()
     families: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     score: Score | None = None
     flow_low: Sequence[float] | None = None
@@ -93,6 +93,8 @@ class Robot:
                 f"robot.goal_names={goals}: expected some of {', '.join(self.state_names)}"
             )
         size = self.model.state_size
+        if not self.features:
+            object.__setattr__(self, "features", tuple(range(size)))
         for name in ("features", "place"):
             indices = list(getattr(self, name))
             if not all(type(index) is int and 0 <= index < size for index in indices):

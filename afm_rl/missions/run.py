@@ -23,8 +23,9 @@ from afm_rl.missions.checkpoint import Checkpoint, Stopped
 from afm_rl.missions.log import StepLog
 from afm_rl.missions.state import Loop
 
-SILENT = 5.0  # surprise, in standard deviations, up to which a model counts as aligned
-STILL = 0.1  # surprise up to which a repeated reading shows a robot that stands still, as foreseen
+ALIGNED = 5.0  # innovation, in standard deviations, up to which a model counts as aligned
+STILL = 0.1  # innovation up to which a repeated reading shows a robot at rest, as foreseen
+
 
 
 @dataclass
@@ -127,11 +128,11 @@ def _start(agent: Agent) -> Loop:
 def _advance(agent: Agent, loop: Loop) -> None:
     """Take one step with every mission that runs, in place."""
     td, ids = agent.env.step(agent.planner(loop.td)), loop.ids
-    errors, surprise = _errors(agent, td)
+    errors, innovation = _errors(agent, td)
     guard = td["next", "guard"]
-    fault = guard["held"] | ~(guard["sound"] | (surprise < STILL))
+    fault = guard["held"] | ~(guard["sound"] | (innovation < STILL))
     loss = agent.updater(blanked(td, guard["sound"]))["loss"]
-    loop.log.add(ids, loop.step, _row(agent, td, errors, surprise, loss, fault))
+    loop.log.add(ids, loop.step, _row(agent, td, errors, innovation, loss, fault))
     if agent.faults == "raise" and bool(fault.any()):
         raise NonFiniteError(
             f"step {loop.step}: missions {ids[fault].tolist()}: a reading or a plan is missing, "
@@ -152,10 +153,11 @@ def _advance(agent: Agent, loop: Loop) -> None:
 
 
 def _errors(agent: Agent, td: TensorDictBase) -> tuple[Sequence[Tensor], Tensor]:
-    """Return how far the robot is from three predictions, and the surprise of the first, ``(B,)``.
+    """Return the distances to three predictions, and the normalised innovation, ``(B,)`` each.
 
     The predictions are the model's for what was executed, for what was planned, and for the
-    effect that the transform predicted. Without a transform all are the first.
+    effect that the transform predicted; without a transform all are the first. The innovation is
+    that of the first.
     """
     actions = [td.get(agent.executed_key)]
     if agent.transform is not None:
@@ -166,8 +168,8 @@ def _errors(agent: Agent, td: TensorDictBase) -> tuple[Sequence[Tensor], Tensor]
     )
     error = agent.model.manifold.difference(reached, expected)
     norms = list(error.norm(dim=-1).unbind(1))
-    surprise = (error.abs() / noise)[:, 0].amax(-1)
-    return norms if len(norms) > 1 else norms * 3, surprise
+    innovation = (error.abs() / noise)[:, 0].amax(-1)
+    return norms if len(norms) > 1 else norms * 3, innovation
 
 
 def _columns(agent: Agent) -> list[str]:
@@ -188,10 +190,10 @@ def _columns(agent: Agent) -> list[str]:
     ]
 
 
-def _row(agent: Agent, td: TensorDictBase, errors, surprise, loss, fault) -> Tensor:
+def _row(agent: Agent, td: TensorDictBase, errors, innovation, loss, fault) -> Tensor:
     """Return one step's values ``(B, C)``, in the order of :func:`_columns`."""
     transform = agent.transform
-    flag = surprise > SILENT if transform is None else td["next", transform.key("misaligned")]
+    flag = innovation > ALIGNED if transform is None else td["next", transform.key("misaligned")]
     figures = (*errors, flag, loss, td["regime_active"], fault)
     scalars = torch.stack([x.float() for x in figures], -1)
     score, executed = agent.robot.metrics, td.get(agent.executed_key)

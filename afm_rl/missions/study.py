@@ -11,6 +11,7 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 
 from afm_rl.errors import check_count, check_number
+from afm_rl.measures import Measures
 from afm_rl.missions.build import Agent, build
 from afm_rl.missions.lock import locked
 from afm_rl.missions.prepare import prepare
@@ -32,6 +33,8 @@ class Outcome:
     """All missions so far, one per row, with their times."""
     failures: dict[Shard, str]
     """Why shards have no results."""
+    measures: Measures
+    """What the missions are compared by."""
 
 
 def run_study(
@@ -97,7 +100,8 @@ def run_study(
         texts = {cfg.label: OmegaConf.to_yaml(cfg, resolve=True) for cfg in methods}
         with Board(now, finished, cells, progress, echo) as board:
             Crew(folder, texts, size, every, listen).work(waiting)
-        return Outcome(write_tables(folder, whole), failures)
+        measures = next(iter(agents.values())).robot.metrics.measures
+        return Outcome(write_tables(folder, whole), failures, measures)
 
 
 def _train(

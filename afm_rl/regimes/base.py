@@ -46,7 +46,7 @@ class Regime(ABC):
         past: Tensor | None = None,
         noise: Tensor | None = None,
     ) -> Tensor:
-        """Return what an action is worth, ``(*B, A)``.
+        """Return the effect of an action, ``(*B, A)``.
 
         Args:
             action: commanded action, ``(*B, A)``.
@@ -67,7 +67,8 @@ class Regime(ABC):
         r"""Return the action in the box whose effect is nearest to ``action``, ``(*B, A)``.
 
         :math:`\operatorname{argmin}_{u \in [l, h]} \|(\mathrm{apply}(u) - a) / (h - l)\|`, by a
-        search that narrows around the best of a grid of points; families with a closed form override it.
+        search that narrows around the best of a grid of points; families with a closed form
+        override it.
         """
         grid = torch.quasirandom.SobolEngine(len(low)).draw(SEARCH_POINTS).to(low)
         centre, span = ((low + high) / 2).expand_as(action), high - low

@@ -178,7 +178,7 @@ def _spread(action: Tensor, parameters: Tensor) -> Tensor:
 
 
 def _effects(regime: Regime, past: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
-    """Return what past commands ``(*B, H, A)`` were worth under a regime with a history of D.
+    """Return the effects of past commands ``(*B, H, A)`` under a regime with a history of D.
 
     Newest first, ``(*B, H - D, A)``: of the oldest D the commands before are not known.
     """

@@ -51,7 +51,7 @@ class DeadZone(Regime):
     def inverse(
         self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
     ) -> Tensor:
-        """Add the loss and clamp; zero is had by doing nothing."""
+        """Add the loss and clamp; the command for no effect is zero."""
         loss = parameters * self.half_range.like(action)
         return (action + action.sign() * loss).clamp(low, high)
 

@@ -25,12 +25,12 @@ class FlightRegime(Regime):
     """A regime in which neither the state, nor earlier actions, nor chance play a part."""
 
     @abstractmethod
-    def worth(self, action: Tensor, parameters: Tensor) -> Tensor:
-        """Return what actions are worth, ``(*B, 4)``."""
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
+        """Return the effects of actions, ``(*B, 4)``."""
 
     @abstractmethod
-    def needed(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Return the actions that are worth ``effect``, in the box or not, ``(*B, 4)``."""
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Return the actions with an ``effect``, in the box or not, ``(*B, 4)``."""
 
     def apply(
         self,
@@ -40,14 +40,14 @@ class FlightRegime(Regime):
         past: Tensor | None = None,
         noise: Tensor | None = None,
     ) -> Tensor:
-        """Return :meth:`worth`."""
-        return self.worth(action, parameters)
+        """Return :meth:`effect_of`."""
+        return self.effect_of(action, parameters)
 
     def inverse(
         self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
     ) -> Tensor:
-        """Return :meth:`needed`, clamped."""
-        return self.needed(action, parameters).clamp(low, high)
+        """Return :meth:`command_for`, clamped."""
+        return self.command_for(action, parameters).clamp(low, high)
 
 
 class _Divisor(FlightRegime):
@@ -58,11 +58,11 @@ class _Divisor(FlightRegime):
     def __init__(self, span: Sequence[float]) -> None:
         self.span = check_span("span", span, LEAST, MOST)
 
-    def worth(self, action: Tensor, parameters: Tensor) -> Tensor:
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         """Divide."""
         return action / self._divisors(parameters)
 
-    def needed(self, effect: Tensor, parameters: Tensor) -> Tensor:
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
         """Multiply."""
         return effect * self._divisors(parameters)
 
@@ -152,11 +152,11 @@ class MotorEfficiency(FlightRegime):
         self.body = QuadrotorBody() if body is None else body
         self.span = check_span("span", span, 0.0, 1.0)
 
-    def worth(self, action: Tensor, parameters: Tensor) -> Tensor:
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         """Take away what is lost."""
         return action + mix(unmix(action, self.body) * (parameters - 1), self.body)
 
-    def needed(self, effect: Tensor, parameters: Tensor) -> Tensor:
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
         """Ask each motor for more; nothing is asked of one that stands still."""
         forces = unmix(effect, self.body)
         return effect + mix(divide(forces, parameters) - forces, self.body)
@@ -199,12 +199,12 @@ class Payload(FlightRegime):
         self.share = check_span("share", share, 0.0, MOST)
         self.offset = check_span("offset", offset)
 
-    def worth(self, action: Tensor, parameters: Tensor) -> Tensor:
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         """Share the thrust and tilt."""
         thrust = action[..., :1]
         return action / self._weight(parameters) + thrust * self._levers(parameters)
 
-    def needed(self, effect: Tensor, parameters: Tensor) -> Tensor:
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
         """Push more, and lean against the tilt."""
         needed = effect * self._weight(parameters)
         return needed - needed[..., :1] * self._levers(parameters)
@@ -248,11 +248,11 @@ class Wind(FlightRegime):
     def __init__(self, span: Sequence[float] = (-1.0, 1.0)) -> None:
         self.span = check_span("span", span)
 
-    def worth(self, action: Tensor, parameters: Tensor) -> Tensor:
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         """Return the action."""
         return action
 
-    def needed(self, effect: Tensor, parameters: Tensor) -> Tensor:
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
         """Return the effect."""
         return effect
 

@@ -69,7 +69,7 @@ class WheelSlip(Regime):
     def inverse(
         self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
     ) -> Tensor:
-        """Return the command on the rising side, |u| <= c; at most the peak can be had."""
+        """Return the command on the rising side, |u| <= c; at most the peak is achievable."""
         at, peak = parameters[..., :1], parameters[..., 1:]
         half = self.half_range.like(action)
         most = (peak * half).clamp_min(torch.finfo(action.dtype).tiny)

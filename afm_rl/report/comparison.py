@@ -1,4 +1,4 @@
-"""Methods side by side, by what counts."""
+"""Methods side by side, by what they are compared by."""
 
 from __future__ import annotations
 
@@ -10,36 +10,44 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from afm_rl.measures import Measure, Measures
 from afm_rl.report import style
-from afm_rl.report.kinds import Measure, kind_of
-from afm_rl.report.summary import summarise
+from afm_rl.report.summary import count_budgets, summarise
 
+PANELS = 3
 SPREAD = 0.26  # of a row: how far single missions lie off its middle
+CAPTION = (
+    "Large markers are means over all missions of a method, small dots single missions. Lines are "
+    "95 % intervals of the stratified bootstrap, seeds drawn anew within cells; a mean without one "
+    "has no spread."
+)
 
 
-def draw_comparison(missions: pd.DataFrame) -> Figure:
-    """Return a figure of mean success and mean number of steps of each method, or of mean errors.
+def draw_comparison(missions: pd.DataFrame, measures: Measures) -> Figure:
+    """Return a figure of the means of each method, one panel for each of the first measures.
 
     Large markers are means, with 95 % bootstrap intervals where there are any; small dots
-    are single missions.
+    are single missions. More methods than there are colours are all drawn in one.
 
     Args:
         missions: one row per mission.
+        measures: what methods are compared by; the first three are shown.
     """
-    means = summarise(missions)
-    styles = style.method_styles(means["method"])
-    figure = style.new_figure(7.0, 1.1 + 0.42 * len(means))
-    panels = figure.subplots(1, 2, sharey=True)
-    for axes, measure in zip(panels, kind_of(missions).measures, strict=True):
-        for place, row in means.iterrows():
-            single = missions.loc[missions["method"] == row["method"], measure.column]
-            _draw_row(axes, int(place), row, measure, single, styles[row["method"]])
-        axes.set_xlim(measure.limits or (0, 1.04 * measure.scale * missions[measure.column].max()))
-        axes.xaxis.set_major_locator(MaxNLocator(6))
-        axes.set_xlabel(measure.label, fontsize=style.NORMAL)
+    means, counted = summarise(missions, measures), count_budgets(missions, measures)
+    styles, shown = style.method_styles(means["method"]), measures.each[:PANELS]
+    if len(means) > style.FEW:
+        styles = dict.fromkeys(styles, style.Style(style.NOMINAL, "-", "o"))
+    figure = style.new_figure(1.6 + 2.9 * len(shown), 1.1 + 0.42 * len(means))
+    panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for axes, measure in zip(panels, shown, strict=True):
+        for place, row in enumerate(means.to_dict("records")):
+            single = counted.loc[counted["method"] == row["method"], measure.column]
+            _draw_row(axes, place, row, measure, single, styles[row["method"]])
+        axes.set_xlim(*_limits(measure, counted[measure.column]))
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        axes.set_xlabel(f"{measure.label}\n{measure.better} is better", fontsize=style.NORMAL)
         style.dress(axes)
-        axes.grid(axis="x", color="#eeeeee", linewidth=0.6)
-        axes.set_axisbelow(True)
+        style.grid(axes, "x")
     names = [style.literal(f"{row.method} (n = {row.missions})") for row in means.itertuples()]
     panels[0].set_yticks(range(len(means)), names, fontsize=style.NORMAL)
     panels[0].set_ylim(len(means) - 0.5, -0.5)
@@ -47,31 +55,27 @@ def draw_comparison(missions: pd.DataFrame) -> Figure:
     return figure
 
 
+def _limits(measure: Measure, values: pd.Series) -> tuple[float, float]:
+    """Return the ends of an axis: those of the measure, or from 0 to a little beyond all values."""
+    if measure.limits is not None:
+        low, high = (measure.scale * limit for limit in measure.limits)
+        return low - 0.04 * (high - low), high + 0.04 * (high - low)
+    low, high = min(0.0, measure.scale * values.min()), max(0.0, measure.scale * values.max())
+    margin = 0.04 * (high - low) if high > low else 1.0
+    return (low - margin if low < 0 else 0.0), (high + margin if high > 0 else 0.0)
+
+
 def _draw_row(
-    axes: Axes,
-    place: int,
-    means: pd.Series,
-    measure: Measure,
-    single: pd.Series,
-    look: style.Style,
+    axes: Axes, place: int, means: dict, measure: Measure, single: pd.Series, look: style.Style
 ) -> None:
-    name, scale = measure.name, measure.scale
+    name, scale, color = measure.column, measure.scale, look.color
     offset = SPREAD * np.linspace(-1, 1, len(single)) if len(single) > 1 else 0.0
     axes.plot(
-        scale * single, place + offset, ".", color=look.color, alpha=0.3, markersize=4, gid="single"
+        scale * single, place + offset, ".", color=color, alpha=0.3, markersize=4, gid="single"
     )
     low, mean, high = (scale * means[key] for key in (f"{name}_low", name, f"{name}_high"))
     if math.isfinite(low):
-        (bar,) = axes.plot([low, high], [place, place], "-|", color=look.color, gid="interval")
+        (bar,) = axes.plot([low, high], [place, place], "-|", color=color, gid="interval")
         bar.set(linewidth=1.8, markersize=11, markeredgewidth=1.8)
-    axes.plot(
-        mean,
-        place,
-        marker=look.marker,
-        color=look.color,
-        markeredgecolor="white",
-        markersize=6.5,
-        zorder=3,
-        clip_on=False,
-        gid="mean",
-    )
+    (dot,) = axes.plot(mean, place, look.marker, color=color, markersize=6.5, gid="mean")
+    dot.set(markeredgecolor="white", zorder=3, clip_on=False)

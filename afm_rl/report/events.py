@@ -9,51 +9,54 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pandas as pd
-from tensorboard.compat.proto.summary_pb2 import Summary
-from torch.utils.tensorboard import FileWriter
+from torch.utils.tensorboard import SummaryWriter
 
 from afm_rl.artefacts import write_whole
+from afm_rl.measures import Measures
 from afm_rl.report.frames import cell_names, steps_of
-from afm_rl.report.kinds import kind_of
 
-POINTS = 1000  # per curve
+POINTS = 500  # per curve
 SINGLE = 8  # missions of each method with curves of their own
-CURVES = ["error", "loss", "misaligned", "regime_active"]
+# TensorBoard orders groups by name: whether plans came true stands first.
+GROUPS = {"miss": "came_true", "unforeseen": "came_true", "error": "model", "loss": "model"}
 FILE = "events.out.tfevents.0.afm_rl"  # TensorBoard looks for "tfevents" in the name
 
 
-def write_events(folder: Path, missions: pd.DataFrame, steps: pd.DataFrame) -> list[Path]:
+def write_events(
+    folder: Path, missions: pd.DataFrame, steps: pd.DataFrame, measures: Measures
+) -> list[Path]:
     """Write a sub-folder per method, and in it one for each of its first eight missions.
 
-    A method's curves (``step/error``, ``step/loss``, ``step/misaligned``,
-    ``step/regime_active``, ``step/reached``) are means over the missions that are still
-    running; ``final/success_rate`` and ``final/steps`` are means over all of them. Flights have
-    squared errors instead. The only mission of a method has no folder of its own: its curves
-    are the means.
+    A method's curves are means over the missions that are still running: ``came_true/miss``, the
+    distance from the plan, ``came_true/unforeseen``, that from the prediction of model and
+    correction; ``model/error`` and ``model/loss``; ``step/misaligned``, ``step/regime_active`` and
+    what the robot's score logs. ``final/COLUMN`` is the mean of a measure over all missions. The
+    only mission of a method has no folder of its own: its curves are the means.
 
     Args:
         folder: where to.
         missions: one row per mission.
         steps: one row per mission and step.
+        measures: what methods are compared by.
 
     Returns:
         The files written.
     """
     stride = math.ceil((int(steps["t"].max()) + 1) / POINTS)
     titles = cell_names(missions) + ", seed " + missions["seed"].astype(str)
-    named, kind = missions.assign(title=titles), kind_of(missions)
-    shown, final = [*CURVES, *kind.steps], list(kind.final)
+    named, final = missions.assign(title=titles), [measure.column for measure in measures]
+    last = list(steps)[list(steps).index("regime_active") :]  # and what the score logs
+    logged = [*(name for name in GROUPS if name in steps), "misaligned", *last]
     groups = named.groupby("method", sort=False)
     written = []
     for name, (_, group) in zip(folder_names(groups.groups), groups, strict=True):
         own, place = steps[steps["mission"].isin(group["mission"])], Path(folder) / name
-        written.append(
-            _write(place / FILE, curves(own[["t", *shown]], stride), group[final].mean())
-        )
+        curve = curves(own[["t", *logged]], stride)
+        written.append(_write(place / FILE, curve, group[final].mean()))
         single = group[: SINGLE if len(group) > 1 else 0]
         rows = steps_of(own, single["mission"])
         for title, (_, row) in zip(folder_names(single["title"]), single.iterrows(), strict=True):
-            curve = curves(rows[row["mission"]][["t", *shown]], stride)
+            curve = curves(rows[row["mission"]][["t", *logged]], stride)
             written.append(_write(place / title / FILE, curve, row[final]))
     return written
 
@@ -77,7 +80,7 @@ def folder_names(names: Iterable[str]) -> list[str]:
     folders: list[str] = []
     taken = set()
     for name in names:
-        folder = re.sub(r"[^\w.=+-]+", "_", str(name).replace(" = ", "=")).lstrip(".")
+        folder = re.sub(r"[^\w.=+-]+", "_", str(name).replace(" = ", "=")).lstrip(".")[:100]
         while not folder or folder.lower() in taken:  # some disks take A and a for the same
             folder += "_"
         taken.add(folder.lower())
@@ -87,17 +90,13 @@ def folder_names(names: Iterable[str]) -> list[str]:
 
 def _write(path: Path, curve: pd.DataFrame, final: pd.Series) -> Path:
     with TemporaryDirectory() as scratch:
-        writer = FileWriter(scratch)
-        writer.add_summary(_summary([f"final/{name}" for name in final.index], final), 0)
-        tags = [f"step/{name}" for name in curve.columns]
-        for step, values in zip(curve.index, curve.to_numpy(), strict=True):
-            writer.add_summary(_summary(tags, values), int(step))
-        writer.close()
+        with SummaryWriter(scratch) as writer:
+            for name, value in final.items():
+                writer.add_scalar(f"final/{name}", float(value), 0)
+            for name, values in curve.items():
+                tag = f"{GROUPS.get(str(name), 'step')}/{name}"
+                for step, value in values.items():
+                    writer.add_scalar(tag, value, step)
         (file,) = Path(scratch).iterdir()
         write_whole(path, file.read_bytes())
     return path
-
-
-def _summary(tags: Iterable[str], values: Iterable[float]) -> Summary:
-    pairs = zip(tags, values, strict=True)
-    return Summary(value=[Summary.Value(tag=tag, simple_value=value) for tag, value in pairs])

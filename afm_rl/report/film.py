@@ -6,7 +6,7 @@ import importlib.util
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -16,23 +16,17 @@ from PIL import Image
 from afm_rl.artefacts import write_whole
 from afm_rl.errors import ConfigurationError
 from afm_rl.report.collect import collect
-from afm_rl.report.drawings import LoadTrack, load_tracks
 from afm_rl.report.events import folder_names
-from afm_rl.report.frames import cell_names, steps_of
-from afm_rl.report.kinds import FLIGHTS, kind_of
+from afm_rl.report.frames import first_missions, steps_of
 from afm_rl.report.results_files import read_steps
-from afm_rl.report.road import DrawableTrack
-from afm_rl.report.scenes import (
-    DRIVE_COLUMNS,
-    FLIGHT_COLUMNS,
-    Scene,
-    drive_scene,
-    flight_scene,
-)
+from afm_rl.report.scenes import COLUMNS, Scene, map_scene, space_scene
+from afm_rl.report.style import FEW
+from afm_rl.report.track_plot import DrawableTrack, LoadTrack, load_tracks
 
 FRAMES, RATE = 150, 15  # at most; per second
 DPI, COLOURS = 100, 128
 LAST = 1500  # ms, how long the last frame of a GIF stays
+TOGETHER = "all_methods"  # file name
 
 
 def check_video(video: bool | str) -> str | None:
@@ -67,14 +61,14 @@ def write_films(
 ) -> list[Path]:
     """Write a film of each method's first mission, ``METHOD.gif`` or ``METHOD.mp4``.
 
-    A film has at most 150 frames, 15 a second, whatever the length of the mission. Files of the
-    same name are replaced; each is written whole or not at all.
+    Of several methods on a map, one more film shows all of them at once (``all_methods.gif``),
+    six at most. A film has at most 150 frames, 15 a second, whatever the length of the mission.
+    Files of the same name are replaced; each is written whole or not at all.
 
     Args:
         folder: where to; made if it is not there.
         missions: one row per mission.
-        steps: one row per mission and step; see :data:`~.scenes.DRIVE_COLUMNS` and
-            :data:`~.scenes.FLIGHT_COLUMNS`.
+        steps: one row per mission and step; see :data:`~.scenes.COLUMNS`.
         tracks: tracks to draw, found by name.
         form: ``"gif"`` or ``"mp4"``.
         echo: receives one line per film.
@@ -85,22 +79,31 @@ def write_films(
     Raises:
         ConfigurationError: if a column is missing, or the folder cannot be written.
     """
-    encode, roads = ENCODERS[form], {track.name: track for track in tracks}
-    flights = kind_of(missions) is FLIGHTS
-    first = missions.assign(cell=cell_names(missions)).drop_duplicates("method")
+    roads = {track.name: track for track in tracks}
+    first = first_missions(missions).drop_duplicates("method")
     rows = steps_of(steps, first["mission"])
-    written = []
-    for mission, name in zip(first.itertuples(), folder_names(first["method"]), strict=True):
-        told = rows.get(mission.mission, steps.iloc[:0])
-        _check_columns(told, FLIGHT_COLUMNS if flights else DRIVE_COLUMNS)
-        title = f"{mission.method}: {mission.cell}"
-        if flights:
-            scene = flight_scene(title, told)
-        else:
-            scene = drive_scene(title, told, roads.get(mission.track))
-        write_whole(folder / f"{name}.{form}", encode(frames(scene, len(told))))
+    space = {"z", "goal_z"} <= set(steps.dropna(axis=1, how="all"))
+    written: list[Path] = []
+
+    def write(name: str, scene: Scene, count: int) -> None:
         written.append(folder / f"{name}.{form}")
+        write_whole(written[-1], ENCODERS[form](frames(scene, count)))
         echo(f"wrote {written[-1]}")
+
+    cell = first["cell"].iloc[0]
+    together = first[first["cell"] == cell][:FEW]
+    if len(together) > 1 and not space:
+        runs = {m.method: _checked(rows, m.mission, steps) for m in together.itertuples()}
+        scene = map_scene(cell, runs, roads.get(together["track"].iloc[0]))
+        write(TOGETHER, scene, max(map(len, runs.values())))
+    names = folder_names([TOGETHER, *first["method"]])[1:]
+    for mission, name in zip(first.itertuples(), names, strict=True):
+        own, title = _checked(rows, mission.mission, steps), f"{mission.method}: {mission.cell}"
+        if space:
+            scene = space_scene(title, own)
+        else:
+            scene = map_scene(title, {mission.method: own}, roads.get(mission.track))
+        write(name, scene, len(own))
     return written
 
 
@@ -114,7 +117,7 @@ def film_results(
     """Write films of results on disk, see :func:`write_films`.
 
     Args:
-        folders: of runs or studies.
+        folders: of runs, comparisons, sweeps or studies.
         out: where to.
         form: ``"gif"`` or ``"mp4"``.
         load_track: returns a track by name, to draw roads; may raise a ConfigurationError.
@@ -130,9 +133,8 @@ def film_results(
             f"{', '.join(map(str, folders))}: no steps.parquet; films are drawn from it"
         )
     first = known.drop_duplicates("method")
-    columns = FLIGHT_COLUMNS if kind_of(first) is FLIGHTS else (*DRIVE_COLUMNS, "miss")
     tracks = load_tracks(first["track"].unique(), load_track)
-    return write_films(out, first, read_steps(collection.files, first, columns), tracks, form, echo)
+    return write_films(out, first, read_steps(collection.files, first), tracks, form, echo)
 
 
 def frames(scene: Scene, count: int) -> Iterator[np.ndarray]:
@@ -157,12 +159,15 @@ def frames(scene: Scene, count: int) -> Iterator[np.ndarray]:
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _check_columns(steps: pd.DataFrame, columns: Sequence[str]) -> None:
-    missing = [name for name in columns if name not in steps or steps[name].isna().all()]
+def _checked(rows: dict[int, pd.DataFrame], mission: int, steps: pd.DataFrame) -> pd.DataFrame:
+    """Return the steps of a mission, if they can be filmed."""
+    own = rows.get(mission, steps.iloc[:0])
+    missing = [name for name in COLUMNS if name not in own or own[name].isna().all()]
     if missing:
         raise ConfigurationError(
-            f"video: the steps lack {', '.join(missing)}; films know drives and flights only"
+            f"video: the steps lack {', '.join(missing)}; films are drawn of robots with positions"
         )
+    return own
 
 
 def _gif(pictures: Iterable[np.ndarray]) -> bytes:
@@ -178,14 +183,13 @@ def _gif(pictures: Iterable[np.ndarray]) -> bytes:
 
 
 def _palette(picture: np.ndarray) -> Image.Image:
-    """Return the most common colours, no two all but alike, so that areas keep theirs exactly."""
-    image = Image.fromarray(picture)
-    counted: Any = image.getcolors(image.width * image.height)
-    common: dict[tuple[int, ...], tuple[int, ...]] = {}
-    for _, colour in sorted(counted, reverse=True):
-        common.setdefault(tuple(value // 8 for value in colour), colour)
+    """Return the most common colours, no two almost alike, so that areas keep theirs exactly."""
+    packed = picture.astype(np.int64) @ [65536, 256, 1]  # far faster than unique rows
+    values, counts = np.unique(packed, return_counts=True)
+    common = values[np.argsort(-counts, kind="stable"), None] // [65536, 256, 1] % 256
+    _, first = np.unique(common // 8, axis=0, return_index=True)
     palette = Image.new("P", (1, 1))
-    palette.putpalette([value for colour in [*common.values()][:COLOURS] for value in colour])
+    palette.putpalette(common[np.sort(first)[:COLOURS]].ravel().tolist())
     return palette
 
 

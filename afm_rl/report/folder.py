@@ -10,14 +10,15 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from afm_rl.artefacts import write_whole
+from afm_rl.csv_text import csv_text
+from afm_rl.measures import FILE, Measures
 from afm_rl.report.comparison import draw_comparison
 from afm_rl.report.events import write_events
-from afm_rl.report.flight import draw_flight
-from afm_rl.report.frames import check_frames, order_columns
-from afm_rl.report.kinds import FLIGHTS, kind_of
+from afm_rl.report.frames import check_frames
 from afm_rl.report.learning import draw_learning
-from afm_rl.report.road import DrawableTrack
+from afm_rl.report.space_plot import COLUMNS, draw_space
 from afm_rl.report.style import png_bytes
+from afm_rl.report.track_plot import DrawableTrack
 from afm_rl.report.trajectory import draw_trajectories
 
 
@@ -25,27 +26,31 @@ def write_run(
     folder: str | Path,
     missions: pd.DataFrame,
     steps: pd.DataFrame,
+    measures: Measures,
     tracks: Sequence[DrawableTrack] = (),
     *,
     figures: bool = True,
     tensorboard: bool = True,
+    tables: bool = True,
     echo: Callable[[str], object] = print,
 ) -> list[Path]:
     """Write tables, figures and TensorBoard events of one method or several.
 
-    Files: ``missions.csv``, ``steps.parquet``, ``figures/trajectory.png`` (if the steps have
-    ``x`` and ``y``) or, of flights, ``figures/flight.png``, ``figures/learning.png``,
-    ``figures/summary.png`` (if a method has more than one mission), and event files under
-    ``tensorboard/``. Each is written whole or not at all; files of the same name are replaced,
-    others left alone.
+    Files: ``missions.csv``, ``measures.json``, ``steps.parquet``, ``figures/trajectory.png`` (if
+    the steps have ``x`` and ``y``) or, of robots in space, ``figures/space.png``,
+    ``figures/learning.png``, ``figures/summary.png`` (if a method has more than one mission), and
+    event files under ``tensorboard/``. Each is written whole or not at all; files of the same name
+    are replaced, others left alone.
 
     Args:
         folder: where to; made if it is not there.
         missions: one row per mission; mission numbers must differ over the whole frame.
         steps: one row per mission and step.
+        measures: what methods are compared by.
         tracks: tracks to draw, found by name.
         figures: draw figures.
         tensorboard: write events.
+        tables: write the tables; the folder of a run has them already.
         echo: receives one line per thing written.
 
     Returns:
@@ -55,7 +60,7 @@ def write_run(
         ConfigurationError: if the frames do not fit each other, or the folder cannot be
             written.
     """
-    check_frames(missions, steps)
+    check_frames(missions, steps, measures)
     folder = Path(folder)
     written = []
 
@@ -65,30 +70,34 @@ def write_run(
         echo(f"wrote {folder / name}")
 
     # The numbers come first: whatever happens to a figure, they are safe.
-    table = order_columns(missions).to_csv(index=False, lineterminator="\n")
-    keep("missions.csv", table.encode())
-    buffer = io.BytesIO()
-    steps.to_parquet(buffer, index=False, compression="zstd")
-    keep("steps.parquet", buffer.getvalue())
+    if tables:
+        keep("missions.csv", csv_text(missions).encode())
+        keep(FILE, measures.to_json().encode())
+        buffer = io.BytesIO()
+        steps.to_parquet(buffer, index=False, compression="zstd")
+        keep("steps.parquet", buffer.getvalue())
     if tensorboard:
-        written += write_events(folder / "tensorboard", missions, steps)
+        written += write_events(folder / "tensorboard", missions, steps, measures)
         echo(f"wrote {folder / 'tensorboard'} (tensorboard --logdir {folder / 'tensorboard'})")
     if figures:
-        for name, draw in _drawings(missions, steps, tracks).items():
+        for name, draw in _drawings(missions, steps, measures, tracks).items():
             keep(f"figures/{name}.png", png_bytes(draw()))
     return written
 
 
 def _drawings(
-    missions: pd.DataFrame, steps: pd.DataFrame, tracks: Sequence[DrawableTrack]
+    missions: pd.DataFrame,
+    steps: pd.DataFrame,
+    measures: Measures,
+    tracks: Sequence[DrawableTrack],
 ) -> dict[str, Callable[[], Figure]]:
     """Return what there is to draw, by name."""
     drawings: dict[str, Callable[[], Figure]] = {}
-    if kind_of(missions) is FLIGHTS:
-        drawings["flight"] = lambda: draw_flight(missions, steps)
-    elif {"x", "y"} <= set(steps.columns):
-        drawings["trajectory"] = lambda: draw_trajectories(missions, steps, tracks)
-    drawings["learning"] = lambda: draw_learning(missions, steps)
+    if set(COLUMNS) <= set(steps):
+        drawings["space"] = lambda: draw_space(missions, steps)
+    elif {"x", "y"} <= set(steps):
+        drawings["trajectory"] = lambda: draw_trajectories(missions, steps, measures, tracks)
+    drawings["learning"] = lambda: draw_learning(missions, steps, measures.error_unit)
     if missions["method"].duplicated().any():
-        drawings["summary"] = lambda: draw_comparison(missions)
+        drawings["summary"] = lambda: draw_comparison(missions, measures)
     return drawings

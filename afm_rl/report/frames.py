@@ -7,26 +7,22 @@ from collections.abc import Iterable
 import pandas as pd
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.report.kinds import kind_of
+from afm_rl.measures import Measures
 
-FRONT = ["method", "track"]
 STEPS = ["mission", "t", "error", "misaligned", "loss", "regime_active"]
 
 
-def check_frames(missions: pd.DataFrame, steps: pd.DataFrame) -> None:
+def check_frames(missions: pd.DataFrame, steps: pd.DataFrame, measures: Measures) -> None:
     """Check what reports rely on.
 
     Raises:
         ConfigurationError: if there is no mission, a column is missing, a mission's number
             occurs twice, or a mission has no steps.
     """
-    kind = kind_of(missions)
-    wanted_of_missions, wanted_of_steps = [*FRONT, *kind.missions], [*STEPS, *kind.steps]
-    for name, frame, wanted in (
-        ("missions", missions, wanted_of_missions),
-        ("steps", steps, wanted_of_steps),
-    ):
-        missing = [column for column in wanted if column not in frame]
+    first = ["method", "track", "seed"]
+    wanted = list(dict.fromkeys([*first, *measures.columns, "steps", "finished", "mission"]))
+    for name, frame, columns in (("missions", missions, wanted), ("steps", steps, STEPS)):
+        missing = [column for column in columns if column not in frame]
         if missing:
             raise ConfigurationError(f"{name}: columns {', '.join(missing)} are missing")
     number = missions["mission"]
@@ -52,51 +48,32 @@ def regime_names(missions: pd.DataFrame) -> list[str]:
     return names[names.index("track") + 1 : names.index("seed")]
 
 
-def order_columns(missions: pd.DataFrame) -> pd.DataFrame:
-    """Return the missions with their columns in the order of the files; others come last."""
-    known = [*FRONT, *regime_names(missions), *kind_of(missions).missions]
-    return missions[[*known, *(name for name in missions if name not in known)]]
-
-
 def cell_names(missions: pd.DataFrame) -> pd.Series:
     """Return each mission's cell: its track and regime, in words.
 
-    The regime is what the column ``regime`` calls it; without one, its parameters.
+    The regime is what the column ``regime`` calls it; without one, its parameters, but for gains
+    of 1.
 
-    >>> row = {"method": "physics", "track": "oval", "v_gain": -1.0, "seed": 0}
-    >>> cell_names(pd.DataFrame([row])).tolist()
-    ['oval, v_gain = -1']
+    >>> row = {"method": "physics", "track": "oval", "v_gain": 1.0, "seed": 0}
+    >>> cell_names(pd.DataFrame([row, row | {"v_gain": -1.0}])).tolist()
+    ['oval, nominal', 'oval, v_gain = -1']
     >>> cell_names(pd.DataFrame([row | {"regime": "slip"}])).tolist()
     ['oval, slip']
     """
-    cells = missions["track"].astype(str)
+    tracks = missions["track"].astype(str)
     if "regime" in missions:
         # A family draws its parameters anew for each seed: only its name is the same.
-        return (cells + ", " + missions["regime"].astype(str)).rename("cell")
+        return (tracks + ", " + missions["regime"].astype(str)).rename("cell")
+    regimes = pd.Series("", index=missions.index)
     for name in regime_names(missions):
-        cells = cells + missions[name].map(f", {name} = {{:g}}".format)
-    return cells.rename("cell")
-
-
-def short_cell_names(missions: pd.DataFrame) -> pd.Series:
-    """Return each mission's cell, gains of 1 not named, as the column ``regime`` has it.
-
-    So results with that column and results without it can be joined.
-
-    >>> row = {"method": "physics", "track": "oval", "v_gain": 1.0, "seed": 0}
-    >>> short_cell_names(pd.DataFrame([row, row | {"v_gain": -1.0}])).tolist()
-    ['oval, nominal', 'oval, v_gain = -1']
-    """
-    names = cell_names(missions)
-    if "regime" in missions:
-        return names
-    short = names.str.replace(r", \w*gain = 1(?=,|$)", "", regex=True)
-    return short.where(short != missions["track"].astype(str), short + ", nominal")
+        regimes += missions[name].map(f", {name} = {{:g}}".format)
+    regimes = regimes.str.replace(r", \w*gain = 1(?=,|$)", "", regex=True)
+    return (tracks + regimes.where(regimes != "", ", nominal")).rename("cell")
 
 
 def first_missions(missions: pd.DataFrame) -> pd.DataFrame:
     """Return one mission per method and cell, the first, with a column ``cell``."""
-    named = missions.assign(cell=cell_names(missions))
+    named = missions if "cell" in missions else missions.assign(cell=cell_names(missions))
     return named.drop_duplicates(["method", "cell"])
 
 
@@ -115,3 +92,12 @@ def steps_of(steps: pd.DataFrame, missions: Iterable[int]) -> dict[int, pd.DataF
     """
     chosen = steps[steps["mission"].isin(list(missions))]
     return dict(iter(chosen.groupby("mission", sort=False)))
+
+
+def action_names(steps: pd.DataFrame) -> list[str]:
+    """Return the names of the action's components.
+
+    >>> action_names(pd.DataFrame(columns=["x", "planned_v", "executed_v"]))
+    ['v']
+    """
+    return [name.removeprefix("planned_") for name in steps if name.startswith("planned_")]

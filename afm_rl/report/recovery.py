@@ -12,18 +12,22 @@ from afm_rl.report.table import Table, number
 STAY = 20  # steps that the error must stay low
 QUANTILE, FACTOR = 0.95, 1.5  # of the errors before the first change: the nominal level
 FLOOR = 1e-4  # m, rad: below this every robot counts as well predicted
-MEASURES = {"miss": "motion", "unforeseen": "agent", "error": "model"}  # columns, judged
+MEASURES = {
+    "miss": "motion",
+    "unforeseen": "agent",
+    "error": "model",
+}  # columns, by what they measure
 NOTE = (
     "Steps from a change of the regime until the one-step error is back under the nominal level "
     f"for the first time, and until it stays there for {STAY} steps. The nominal level of a "
     f"mission is {FACTOR} times the {100 * QUANTILE:.0f}th percentile of its errors before the "
     f"first change, at least "
     f"{FLOOR:g}. Medians are over all changes, those never recovered from included as ∞; "
-    f"changes with fewer than {STAY} steps to the next one or to the end cannot tell and are left "
-    "out. Three errors are judged: that of the motion, against what the plan intended, had or not; "
-    "that of the agent, against what it foresaw, model and correction together; and that of the "
+    f"changes with fewer than {STAY} steps to the next one or to the end are left "
+    "out. Three errors: that of the motion, against the plan; "
+    "that of the agent, against the prediction of model and correction together; and that of the "
     "model alone, against what it predicts of the action that was executed. A method that corrects "
-    "actions over a frozen model foresees its motion again, and its model never does."
+    "actions over a frozen model recovers in the first two, and its model never does."
 )
 
 
@@ -36,7 +40,7 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
     shows no nominal level.
 
     Args:
-        steps: one mission's steps, in order; what has no column is not judged.
+        steps: one mission's steps, in order; a column that is missing is left out.
 
     >>> active, error = [0] * 30 + [1] * 50, [1e-3] * 30 + [1] * 7 + [1e-3] * 43
     >>> steps = pd.DataFrame({"regime_active": active, "error": error})
@@ -79,35 +83,25 @@ def recovery_table(times: pd.DataFrame) -> Table:
     Args:
         times: rows of :func:`recovery_times` with a column ``method``; at least one.
     """
-    rows = []
-    for (method, of, change), group in times.groupby(["method", "of", "change"], sort=False):
-        quartiles = group["time"].quantile([0.25, 0.5, 0.75], interpolation="lower")
-        rows.append(
-            {
-                "method": method,
-                "of": of,
-                "change": change,
-                "changes": len(group),
-                "first": float(group["first"].quantile(0.5, interpolation="lower")),
-                "never": float(np.isinf(group["time"]).mean()),
-                "median": float(quartiles[0.5]),
-                "lower_quartile": float(quartiles[0.25]),
-                "upper_quartile": float(quartiles[0.75]),
-            }
-        )
-    numbers = pd.DataFrame(rows)
-    shown = pd.DataFrame(
-        {
-            "method": numbers["method"],
-            "of the": numbers["of"],
-            "change": numbers["change"].astype(str),
-            "changes seen": numbers["changes"].astype(str),
-            "first, median steps": numbers["first"].map(number),
-            "to stay, median steps": numbers["median"].map(number),
-            "quartiles": numbers["lower_quartile"].map(number)
-            + " to "
-            + numbers["upper_quartile"].map(number),
-            "never %": [number(100 * share) for share in numbers["never"]],
-        }
-    )
-    return Table("recovery", "Recovery after each change of the regime", NOTE, numbers, shown)
+    by = times.groupby(["method", "of", "change"], sort=False)
+    numbers = by.agg(
+        changes=("time", "size"),
+        first=("first", lambda steps: steps.quantile(0.5, interpolation="lower")),
+        median=("time", lambda steps: steps.quantile(0.5, interpolation="lower")),
+        lower_quartile=("time", lambda steps: steps.quantile(0.25, interpolation="lower")),
+        upper_quartile=("time", lambda steps: steps.quantile(0.75, interpolation="lower")),
+        never=("time", lambda steps: float(np.isinf(steps).mean())),
+    ).reset_index()
+    low, high = (numbers[f"{end}_quartile"].map(number) for end in ("lower", "upper"))
+    heads = {
+        "method": numbers["method"],
+        "of the": numbers["of"],
+        "change": numbers["change"].astype(str),
+        "changes seen": numbers["changes"].astype(str),
+        "first, median steps": numbers["first"].map(number),
+        "to stay, median steps": numbers["median"].map(number),
+        "quartiles": low + " to " + high,
+        "never %": (100 * numbers["never"]).map(number),
+    }
+    title = "Recovery after each change of the regime"
+    return Table("recovery", title, NOTE, numbers, pd.DataFrame(heads))

@@ -1,8 +1,8 @@
-"""What a film of one mission shows: a figure, and how it looks at a step."""
+"""What a film shows: a figure, and how it looks at a step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,26 +14,20 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch, Polygon
 
 from afm_rl.report import style
-from afm_rl.report.flight import REFERENCE, dress_space, mark_regimes
-from afm_rl.report.path import CHANGED, NOMINAL, START, changed_stretch, positions
-from afm_rl.report.road import DrawableTrack, draw_road, view
+from afm_rl.report.frames import action_names
+from afm_rl.report.space_plot import GOAL, POSITION, REFERENCE, dress_space, mark_regimes
+from afm_rl.report.track_plot import DrawableTrack, draw_road, view
+from afm_rl.report.trajectory import CHANGED, NOMINAL, START, changed_stretch, positions
 
-DRIVE_COLUMNS = (
-    *("x", "y", "theta", "goal_x", "goal_y", "planned_v", "planned_omega", "executed_v"),
-    *("executed_omega", "error", "misaligned", "regime_active"),
-)
-FLIGHT_COLUMNS = (
-    *("x", "y", "z", "goal_x", "goal_y", "goal_z", "planned_thrust", "executed_thrust"),
-    *("misaligned", "regime_active", "phase"),
-)
-PLANNED: dict[str, Any] = {"color": "#0072b2"}
-EXECUTED: dict[str, Any] = {"color": "#cc79a7"}
-GOAL: dict[str, Any] = {"marker": "*", "color": "#009e73", "markersize": 13, "linestyle": ""}
+COLUMNS = ("x", "y", "goal_x", "goal_y", "error", "misaligned", "regime_active")  # at least
+PLANNED: dict[str, Any] = {"color": "#0072b2", "linewidth": 6.0}
+EXECUTED: dict[str, Any] = {"color": "#cc79a7", "linewidth": 2.5}
+TARGET: dict[str, Any] = {"marker": "*", "color": "#009e73", "markersize": 13, "linestyle": ""}
 BODY = np.array([[1.0, 0.0], [-0.8, 0.65], [-0.4, 0.0], [-0.8, -0.65]])  # seen from above
-SIZE, REACH = 0.022, 0.13  # robot and longest arrow, as parts of the map
+SIZE, ARROW = 0.022, 0.13  # robot and longest arrow, as parts of the map
 GRID = 0.16  # inches: sides of pictures are multiples of 16 pixels, as video codecs want them
 AHEAD = 0.5  # s, how long arrows turn
-LEAST = 1e-6  # smallest error that is told apart from none
+LEAST = 1e-6  # smallest distance that is told apart from none
 
 
 class Scene(NamedTuple):
@@ -43,23 +37,26 @@ class Scene(NamedTuple):
     moving: Sequence[Artist]
     """All that differs from frame to frame."""
     show: Callable[[int], None]
-    """Sets the moving parts to a row of the table of steps."""
+    """Sets the moving parts to a row of the table of steps, or of the longest of several."""
 
 
-def drive_scene(title: str, steps: pd.DataFrame, track: DrawableTrack | None = None) -> Scene:
-    """Return the scene of a drive: a map, and the error over time under it.
+def map_scene(
+    title: str, runs: Mapping[str, pd.DataFrame], track: DrawableTrack | None = None
+) -> Scene:
+    """Return the scene of robots on a map, and their distance from the plan over time under it.
 
-    Arrows show the planned action (wide) and the executed one (slim): as long as the robot is
-    to be fast, and turned by how far it is to turn in half a second.
+    A robot alone has its target, and arrows for the planned action (wide) and the executed one
+    (slim), if its actions are called ``v`` and ``omega``: as long as the robot is to be fast, and
+    turned by how far it is to turn in half a second. Several robots move at the same time.
 
     Args:
         title: what is shown.
-        steps: one mission's steps, with :data:`DRIVE_COLUMNS`. If there is a ``miss``, it is
-            drawn in place of ``error``.
+        runs: each method's steps, with :data:`COLUMNS`; ``miss`` is drawn if all have it, and
+            ``error`` otherwise.
         track: the road.
     """
-    path = positions(steps)
-    box = view(track, [path])
+    paths = {method: positions(steps) for method, steps in runs.items()}
+    box = view(track, list(paths.values()))
     tall = 5.6 * np.clip((box.top - box.bottom) / (box.right - box.left), 0.4, 1.2)
     figure = style.new_figure(6.4, GRID * round((tall + 2.3) / GRID))
     upper, lower = figure.subplots(2, 1, height_ratios=[tall, 1.1])
@@ -68,87 +65,134 @@ def drive_scene(title: str, steps: pd.DataFrame, track: DrawableTrack | None = N
     style.dress(upper)
     if track is not None:
         draw_road(upper, track)
-    upper.plot(*path[:1].T, **START, zorder=3)
-
-    name, label = ("error", "error of the\nmodel (m, rad)")
-    if "miss" in steps and steps["miss"].notna().all():
-        name, label = ("miss", "distance from\nthe plan (m)")
-    lower.plot(steps["t"], steps[name].clip(lower=LEAST), color=style.NOMINAL, linewidth=0.9)
-    lower.set(yscale="log", ylabel=label)
-    cursors = _timeline([lower], steps)
-
-    (before,) = upper.plot([], [], **NOMINAL, zorder=4)
-    (under,) = upper.plot([], [], **CHANGED, zorder=4)
-    (goal,) = upper.plot([], [], **GOAL, zorder=5)
-    arrows = [_arrow(upper, PLANNED, 6.0), _arrow(upper, EXECUTED, 2.5)]
-    robot = Polygon(BODY, facecolor=style.NOMINAL, edgecolor="white", linewidth=0.8, zorder=7)
-    upper.add_patch(robot)
-    said = _speech(upper)
-    handles = [before, under, goal, Line2D([], [], linewidth=6.0, **PLANNED)]
-    handles.append(Line2D([], [], linewidth=2.5, **EXECUTED))
-    labels = ["nominal", "changed regime", "target", "planned action", "executed action"]
-    style.legend_above(figure, handles, labels, style.literal(title))
-
-    changed = np.where(changed_stretch(steps["regime_active"].to_numpy())[:, None], path, np.nan)
+    column, label = _distance(runs)
+    styles, alone = style.method_styles(runs), len(runs) == 1
     span = max(box.right - box.left, box.top - box.bottom)
-    goals, heading = steps[["goal_x", "goal_y"]].to_numpy(), steps["theta"].to_numpy(dtype=float)
-    courses = _courses(steps, heading) * REACH * span
+    timeline = _timeline([lower], max(runs.values(), key=len), alone)
+    lower.set(yscale="log", ylabel=label)
+    moving, shows, handles, labels = [*timeline], [], [], []
+    for method, steps in runs.items():
+        look = style.Style(style.NOMINAL, "-", "o") if alone else styles[method]
+        upper.plot(*paths[method][:1].T, **START, zorder=3)
+        width = 0.9 if alone else 2.2 - 0.25 * look.place
+        (line,) = lower.plot(steps["t"], steps[column].clip(lower=LEAST), linewidth=width)
+        line.set(color=look.color, linestyle=look.linestyle)
+        robot = _Robot(upper, steps, look.color, span, alone)
+        moving += robot.moving
+        shows.append(robot.show)
+        handles += robot.handles if alone else [look.handle()]
+        labels += robot.labels if alone else [method]
+    style.legend_above(figure, handles, labels, style.literal(title))
+    words = _words(upper)
+    longest = max(runs.values(), key=len)
 
     def show(row: int) -> None:
-        here = path[row]
-        before.set_data(*path[: row + 1].T)
-        under.set_data(*changed[: row + 1].T)
-        goal.set_data(*goals[row : row + 1].T)
-        for arrow, course in zip(arrows, courses, strict=True):
+        for each in shows:
+            each(row)
+        _tell(longest.iloc[row], timeline, words, alone)
+
+    return Scene(figure, [*moving, words], show)
+
+
+def _distance(runs: Mapping[str, pd.DataFrame]) -> tuple[str, str]:
+    """Return which distance to draw over time, and what it is."""
+    if all("miss" in steps and steps["miss"].notna().all() for steps in runs.values()):
+        return "miss", "distance from\nthe plan"
+    return "error", "error of\nthe model"
+
+
+class _Robot:
+    """One robot on a map: its line so far, its body, and alone its target and actions."""
+
+    def __init__(
+        self, axes: Axes, steps: pd.DataFrame, color: str, span: float, alone: bool
+    ) -> None:
+        self.path, self.span = positions(steps), span
+        moved = np.diff(self.path, axis=0, prepend=self.path[:1])
+        self.heading = (
+            steps["theta"].to_numpy(dtype=float)
+            if "theta" in steps
+            else np.arctan2(moved[:, 1], moved[:, 0])
+        )
+        self.changed = np.where(
+            changed_stretch(steps["regime_active"].to_numpy())[:, None], self.path, np.nan
+        )
+        (self.before,) = axes.plot([], [], **NOMINAL | {"color": color}, zorder=4)
+        after = CHANGED if alone else {"color": color, "linewidth": 2.4}
+        (self.under,) = axes.plot([], [], **after, zorder=4)
+        self.body = Polygon(BODY, facecolor=color, edgecolor="white", linewidth=0.8, zorder=7)
+        axes.add_patch(self.body)
+        self.moving: list[Artist] = [self.before, self.under, self.body]
+        self.handles, self.labels = [self.before, self.under], ["nominal", "changed regime"]
+        self.arrows: list[FancyArrowPatch] = []
+        self.target = None
+        if alone:
+            self.goals = steps[["goal_x", "goal_y"]].to_numpy()
+            (self.target,) = axes.plot([], [], **TARGET, zorder=5)
+            self.handles, self.labels = [*self.handles, self.target], [*self.labels, "target"]
+            self.moving.append(self.target)
+        if alone and {"v", "omega"} <= set(action_names(steps)):
+            self.courses = _courses(steps, self.heading) * ARROW * span
+            self.arrows = [_arrow(axes, PLANNED), _arrow(axes, EXECUTED)]
+            self.handles += [Line2D([], [], **PLANNED), Line2D([], [], **EXECUTED)]
+            self.labels += ["planned action", "executed action"]
+            self.moving += self.arrows
+
+    def show(self, row: int) -> None:
+        """Go to a row; a robot that has ended stays where it is."""
+        row = min(row, len(self.path) - 1)
+        here = self.path[row]
+        self.before.set_data(*self.path[: row + 1].T)
+        self.under.set_data(*self.changed[: row + 1].T)
+        if self.target is not None:
+            self.target.set_data(*self.goals[row : row + 1].T)
+        for arrow, course in zip(self.arrows, self.courses if self.arrows else (), strict=True):
             arrow.set_positions(here, here + course[row])
-        cos, sin = np.cos(heading[row]), np.sin(heading[row])
-        robot.set_xy(here + SIZE * span * BODY @ np.array([[cos, sin], [-sin, cos]]))
-        _tell(steps.iloc[row], cursors, said)
-
-    return Scene(figure, [before, under, goal, *arrows, robot, *cursors, said], show)
+        cos, sin = np.cos(self.heading[row]), np.sin(self.heading[row])
+        self.body.set_xy(here + SIZE * self.span * BODY @ np.array([[cos, sin], [-sin, cos]]))
 
 
-def flight_scene(title: str, steps: pd.DataFrame) -> Scene:
-    """Return the scene of a flight: the path so far, and height and thrust over time.
+def space_scene(title: str, steps: pd.DataFrame) -> Scene:
+    """Return the scene of a path in space, with the height and the first action over time.
 
     Args:
         title: what is shown.
-        steps: one mission's steps, with :data:`FLIGHT_COLUMNS`.
+        steps: one mission's steps, with :data:`COLUMNS`, ``z``, ``goal_z`` and actions.
     """
-    figure = style.new_figure(9.6, 28 * GRID)
+    figure, action = style.new_figure(9.6, 28 * GRID), action_names(steps)[0]
     grid = figure.add_gridspec(2, 2, width_ratios=[1.2, 1])
     space: Any = figure.add_subplot(grid[:, 0], projection="3d")
-    height, thrust = (figure.add_subplot(grid[row, 1]) for row in (0, 1))
-    flown = steps[["x", "y", "z"]].to_numpy(dtype=float)
-    space.plot(*steps[["goal_x", "goal_y", "goal_z"]].to_numpy().T, **REFERENCE)
-    space.plot(*flown.T, alpha=0.0)  # so that the axes have room for all of it
+    height, effort = (figure.add_subplot(grid[row, 1]) for row in (0, 1))
+    path, wanted = (steps[names].to_numpy(dtype=float) for names in (POSITION, GOAL))
+    space.plot(*wanted.T, **REFERENCE)
+    space.plot(*path.T, alpha=0.0)  # so that the axes have room for all of it
     dress_space(space)
 
     height.plot(steps["t"], steps["goal_z"], **REFERENCE)
     height.plot(steps["t"], steps["z"], color=style.NOMINAL, linewidth=1.2)
     height.set(ylabel="height (m)")
-    thrust.plot(steps["t"], steps["planned_thrust"], linewidth=3.0, **PLANNED)
-    thrust.plot(steps["t"], steps["executed_thrust"], linewidth=1.2, **EXECUTED)
-    thrust.set(ylabel="thrust (N)")
-    cursors = _timeline([height, thrust], steps)
+    looks = (PLANNED | {"linewidth": 3.0}, EXECUTED | {"linewidth": 1.2})
+    for kind, look in zip(("planned", "executed"), looks, strict=True):
+        effort.plot(steps["t"], steps[f"{kind}_{action}"], **look)
+    effort.set(ylabel=style.literal(action))
+    cursors = _timeline([height, effort], steps, True)
 
-    (path,) = space.plot([], [], [], color=style.NOMINAL, linewidth=1.4)
+    (line,) = space.plot([], [], [], color=style.NOMINAL, linewidth=1.4)
     (robot,) = space.plot([], [], [], "o", color=style.REGIME, markersize=7)
-    (goal,) = space.plot([], [], [], **GOAL)
-    said = _speech(space)
-    wanted = steps[["goal_x", "goal_y", "goal_z"]].to_numpy(dtype=float)
-    handles = [Line2D([], [], **REFERENCE), path, robot, goal]
-    handles += [Line2D([], [], linewidth=3.0, **PLANNED), Line2D([], [], linewidth=1.2, **EXECUTED)]
-    labels = ["reference", "flown", "now", "set-point", "planned thrust", "executed thrust"]
+    (goal,) = space.plot([], [], [], **TARGET)
+    words = _words(space)
+    handles = [Line2D([], [], **REFERENCE), line, robot, goal]
+    handles += [Line2D([], [], **look) for look in looks]
+    labels = ["reference", "path", "now", "set-point", f"planned {action}", f"executed {action}"]
     style.legend_above(figure, handles, labels, style.literal(title))
 
     def show(row: int) -> None:
-        path.set_data_3d(*flown[: row + 1].T)
-        robot.set_data_3d(*flown[row : row + 1].T)
+        line.set_data_3d(*path[: row + 1].T)
+        robot.set_data_3d(*path[row : row + 1].T)
         goal.set_data_3d(*wanted[row : row + 1].T)
-        _tell(steps.iloc[row], cursors, said)
+        _tell(steps.iloc[row], cursors, words, True)
 
-    return Scene(figure, [path, goal, robot, *cursors, said], show)
+    return Scene(figure, [line, goal, robot, *cursors, words], show)
 
 
 def _courses(steps: pd.DataFrame, heading: np.ndarray) -> np.ndarray:
@@ -163,17 +207,17 @@ def _courses(steps: pd.DataFrame, heading: np.ndarray) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], -1) * (fast / longest)[..., None]
 
 
-def _arrow(axes: Axes, look: dict[str, Any], width: float) -> FancyArrowPatch:
-    whole: dict[str, Any] = {"shrinkA": 0, "shrinkB": 0, "linewidth": width, "zorder": 6}
-    head: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 9 + width}
-    arrow = FancyArrowPatch((0, 0), (0, 0), **whole, **head, **look)
+def _arrow(axes: Axes, look: dict[str, Any]) -> FancyArrowPatch:
+    head: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 9 + look["linewidth"]}
+    arrow = FancyArrowPatch((0, 0), (0, 0), shrinkA=0, shrinkB=0, zorder=6, **head, **look)
     axes.add_patch(arrow)
     return arrow
 
 
-def _timeline(panels: Sequence[Axes], steps: pd.DataFrame) -> list[Line2D]:
-    """Dress axes over time, shade the changed regime; return the lines that mark now."""
-    mark_regimes(panels, steps)
+def _timeline(panels: Sequence[Axes], steps: pd.DataFrame, alone: bool) -> list[Line2D]:
+    """Dress axes over time; return the lines that mark now. Methods change at different steps."""
+    if alone:
+        mark_regimes(panels, steps)
     for axes in panels:
         style.dress(axes)
         axes.set_xlim(0, max(int(steps["t"].iloc[-1]), 1))
@@ -181,16 +225,18 @@ def _timeline(panels: Sequence[Axes], steps: pd.DataFrame) -> list[Line2D]:
     return [axes.axvline(0, color=style.REGIME, linewidth=1.2) for axes in panels]
 
 
-def _speech(axes: Any) -> Any:
+def _words(axes: Any) -> Any:
     """Return an empty line above axes."""
     speak = axes.text2D if hasattr(axes, "text2D") else axes.text
     return speak(0.0, 1.01, "", transform=axes.transAxes, fontsize=style.NORMAL)
 
 
-def _tell(step: Any, cursors: Sequence[Line2D], said: Any) -> None:
-    """Move the cursors and say what is the case."""
+def _tell(step: Any, cursors: Sequence[Line2D], words: Any, alone: bool) -> None:
+    """Move the cursors, and write the step and what is known of it."""
     for cursor in cursors:
         cursor.set_xdata([step["t"], step["t"]])
-    regime = "changed regime" if step["regime_active"] else "nominal"
-    seen = ", misaligned" if step["misaligned"] else ""
-    said.set_text(f"step {int(step['t'])}: {regime}{seen}")
+    text = f"step {int(step['t'])}"
+    if alone:
+        text += ": changed regime" if step["regime_active"] else ": nominal"
+        text += ", misaligned" if step["misaligned"] else ""
+    words.set_text(text)

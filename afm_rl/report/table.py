@@ -8,8 +8,12 @@ from dataclasses import dataclass, field
 
 import pandas as pd
 
+from afm_rl.csv_text import csv_text
+from afm_rl.measures import Measure
+
 # What LaTeX writes another way; the escapes of pandas leave these alone.
 LATEX = {"±": r"$\pm$", "∞": r"$\infty$"}
+Places = frozenset[tuple[int, int]]
 ESCAPES = str.maketrans(
     {sign: f"\\{sign}" for sign in "%_#&${}"}
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -35,12 +39,12 @@ class Table:
     note: str
     numbers: pd.DataFrame
     shown: pd.DataFrame
-    bold: frozenset[tuple[int, int]] = field(default_factory=frozenset)
+    bold: Places = field(default_factory=frozenset)
     align: str = ""
 
     def to_csv(self) -> str:
         """Return the numbers as CSV."""
-        return self.numbers.to_csv(index=False, lineterminator="\n")
+        return csv_text(self.numbers)
 
     def to_latex(self) -> str:
         """Return the table as LaTeX, to be set with the package ``booktabs``."""
@@ -74,30 +78,30 @@ def number(value: float, digits: int = 0) -> str:
     return "∞" if value == math.inf else f"{value:.{digits}f}"
 
 
-def with_interval(value: float, low: float, high: float, digits: int = 0) -> str:
-    """Return a number and its interval as text.
+def interval_text(measure: Measure, row: Mapping[str, float], name: str, digits: int) -> str:
+    """Return an entry of a row as text, in the unit of a measure, with its interval.
 
-    >>> with_interval(1.0, 0.5, 2.0, 1), with_interval(1.0, math.nan, math.nan)
-    ('1.0 [0.5, 2.0]', '1')
+    >>> share = Measure("share", "share", "share", "%", scale=100)
+    >>> interval_text(share, {"a": 0.5, "a_low": 0.4, "a_high": 0.6}, "a", 1)
+    '50.0 [40.0, 60.0]'
     """
-    interval = "" if math.isnan(low) else f" [{number(low, digits)}, {number(high, digits)}]"
-    return number(value, digits) + interval
+    middle, low, high = (
+        measure.text(row[key], digits) for key in (name, f"{name}_low", f"{name}_high")
+    )
+    return middle if low == "-" else f"{middle} [{low}, {high}]"
 
 
-def best_places(
-    values: pd.DataFrame, better: Mapping[str, str], columns: Mapping[str, int]
-) -> frozenset[tuple[int, int]]:
+def best_places(values: pd.DataFrame, signs: Mapping[str, int]) -> Places:
     """Return the places of the best value of each column, unless all are alike.
 
     Args:
         values: numbers, one row per row of the table.
-        better: ``"max"`` or ``"min"`` for each column of ``values`` that has a best one.
-        columns: where that column stands in the table as it is shown.
+        signs: 1 for each column of ``values`` in which the highest is best, -1 for the lowest;
+            in this order they are the table's columns from the third on.
     """
     places = set()
-    for name, choose in better.items():
-        column = values[name].reset_index(drop=True)
+    for place, (name, sign) in enumerate(signs.items(), 2):
+        column = sign * values[name].reset_index(drop=True)
         if column.nunique() > 1:
-            best = column.agg(choose)
-            places |= {(int(row), columns[name]) for row in column.index[column == best]}
+            places |= {(int(row), place) for row in column.index[column == column.max()]}
     return frozenset(places)

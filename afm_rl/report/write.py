@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pandas as pd
+from jinja2 import Environment, StrictUndefined
 
 from afm_rl.artefacts import write_whole
+from afm_rl.csv_text import csv_text
+from afm_rl.measures import Measures
 from afm_rl.report import style
-from afm_rl.report.absent import absent_lines, absent_table, find_absent
-from afm_rl.report.aggregate import aggregate, aggregate_table
-from afm_rl.report.cells import cell_table
-from afm_rl.report.collect import collect
-from afm_rl.report.drawings import LoadTrack, all_figures
+from afm_rl.report.collect import Collection, collect
+from afm_rl.report.comparisons import (
+    aggregate,
+    cell_table,
+    compare,
+    comparison_tables,
+    rank_missions,
+    summary_table,
+)
 from afm_rl.report.events import folder_names
-from afm_rl.report.flight_report import flight_figures, flight_tables
-from afm_rl.report.gather import Gathered, gather
-from afm_rl.report.heatmaps import mapped_cells
-from afm_rl.report.kinds import FLIGHTS, kind_of
-from afm_rl.report.outcomes import add_outcomes, budget_notes
-from afm_rl.report.page import Picture, render_page
-from afm_rl.report.pairs import compare, comparison_tables
-from afm_rl.report.published import published_tables
+from afm_rl.report.figures import draw_all, excerpts, telling_cells
+from afm_rl.report.missing_runs import find_missing, missing_lines, missing_table
 from afm_rl.report.recovery import recovery_table
-from afm_rl.report.scenarios import traced_missions
+from afm_rl.report.summary import budget_notes, count_budgets
 from afm_rl.report.table import Table
+from afm_rl.report.track_plot import LoadTrack, load_tracks
 
+TEMPLATE = Path(__file__).with_name("page.html")
 BASELINES = ("online_pe", "adaptive_affine")
 
 
@@ -34,7 +38,7 @@ def write_report(
     folders: Sequence[str | Path],
     out: str | Path,
     *,
-    baselines: Sequence[str] = BASELINES,
+    baselines: Sequence[str] | None = None,
     oracle: str = "oracle",
     figures: bool = True,
     load_track: LoadTrack | None = None,
@@ -44,14 +48,15 @@ def write_report(
 
     Files in ``out``: ``index.html``, which holds everything; ``tables/NAME.csv`` and
     ``tables/NAME.tex`` (for LaTeX with ``booktabs``); ``figures/NAME.png``; ``missing.csv``.
-    Each is written whole or not at all; files of the same name are replaced. Partial results
-    are welcome: what is missing is said. Flights have tables and figures of their own.
+    Each is written whole or not at all; files of the same name are replaced. Results may be
+    incomplete: the report names what is missing.
 
     Args:
-        folders: of runs (``missions.csv``, ``steps.parquet``) or studies; of a mission that
-            stands in several, the last one counts.
+        folders: of runs, comparisons, sweeps or studies; of a mission that stands in several, the
+            last one counts.
         out: where to; made if it is not there.
-        baselines: methods that the others are compared with.
+        baselines: methods that the others are compared with. None: those of
+            :data:`BASELINES` that there are, or else the first method.
         oracle: the method that knows the regime.
         figures: draw figures.
         load_track: returns a track by name, to draw roads; may raise a ConfigurationError.
@@ -63,70 +68,70 @@ def write_report(
     Raises:
         ConfigurationError: if a folder or a file in it cannot be used, or ``out`` cannot be
             written.
+        ArtefactError: if a file is damaged.
     """
     collection, out = collect(folders), Path(out)
-    flights = kind_of(collection.missions) is FLIGHTS
-    missions, notes = collection.missions, list(collection.notes)
-    if not flights:
-        missions = add_outcomes(missions)
-        notes += budget_notes(missions)
-        notes += [
-            f"There are no missions of {name}: comparisons with it are left out."
-            for name in dict.fromkeys([*baselines, oracle])
-            if name not in collection.methods
-        ]
-    absent = find_absent(missions, collection.asked)
-    cells = pd.concat([missions["cell"], collection.asked["cell"]]).nunique()
+    measures = collection.measures
+    missions = count_budgets(collection.missions, measures)
+    notes = [*collection.notes, *budget_notes(collection.missions, measures)]
+    if baselines is None:
+        baselines = [name for name in BASELINES if name in collection.methods]
+        baselines = baselines or collection.methods[:1]
+    notes += [
+        f"There are no missions of {name}: comparisons with it are left out."
+        for name in baselines
+        if name not in collection.methods
+    ]
+    missing = find_missing(missions, collection.plan)
+    cells = pd.concat([missions["cell"], collection.plan["cell"]]).nunique()
     summary = (
         f"{len(missions)} missions of {len(collection.methods)} methods in "
         f"{missions['cell'].nunique()} cells, from {', '.join(map(str, folders))}; "
-        f"{len(absent)} missions are missing."
+        f"{len(missing)} missions are missing."
     )
-    for line in (summary, *notes, *absent_lines(absent, collection.methods, cells)):
+    lost = [missing_table(missing, cells)] if len(missing) else []
+    for line in (summary, *notes, *(line for table in lost for line in missing_lines(table))):
         echo(line)
 
-    if flights:
-        tables, drawn = list(flight_tables(missions)), flight_figures(collection)
-    else:
-        traced = traced_missions(missions[missions["file"] >= 0])
-        mapped = mapped_cells(missions) if figures else []
-        gathered = gather(collection, traced["mission"] if figures else [], mapped)
-        means = aggregate(missions, collection.compute, oracle)
-        tables = list(_tables(missions, means, gathered, baselines, oracle))
-        drawn = all_figures(missions, means, traced, gathered, load_track)
-    if len(absent):
-        tables.insert(0, absent_table(absent, cells))
+    found = excerpts(collection, telling_cells(missions, measures) if figures else [])
+    tables = [*_tables(missions, collection, found.recovery, baselines, oracle), *lost]
     for table in tables:
         (name,) = folder_names([table.name])
         write_whole(out / "tables" / f"{name}.csv", table.to_csv().encode())
         write_whole(out / "tables" / f"{name}.tex", table.to_latex().encode())
-    write_whole(out / "missing.csv", absent.to_csv(index=False, lineterminator="\n").encode())
+    write_whole(out / "missing.csv", csv_text(missing).encode())
     echo(f"wrote {len(tables)} tables: {out / 'tables'}")
     pictures = []
     if figures:
-        for name, title, caption, figure in drawn:
+        tracks = load_tracks(missions["track"].unique(), load_track)
+        for name, title, caption, figure in draw_all(missions, collection, found, tracks):
             png = style.png_bytes(figure)
             write_whole(out / "figures" / f"{folder_names([name])[0]}.png", png)
-            pictures.append(Picture(name, title, caption, png))
+            data = base64.b64encode(png).decode()
+            pictures.append({"name": name, "title": title, "caption": caption, "data": data})
         echo(f"wrote {len(pictures)} figures: {out / 'figures'}")
     title = f"Results: {len(collection.methods)} methods, {missions['cell'].nunique()} cells"
-    page = render_page(title, summary, notes, tables, pictures)
-    write_whole(out / "index.html", page.encode())
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    page = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
+    content = {"title": title, "summary": summary, "notes": notes, "tables": tables}
+    write_whole(out / "index.html", page.render(**content, figures=pictures).encode())
     echo(f"Report: {out / 'index.html'}")
     return out / "index.html"
 
 
 def _tables(
     missions: pd.DataFrame,
-    means: pd.DataFrame,
-    gathered: Gathered,
+    collection: Collection,
+    recovery: Sequence[pd.DataFrame],
     baselines: Sequence[str],
     oracle: str,
 ) -> Iterator[Table]:
     """Yield the tables in the order of the page."""
-    yield aggregate_table(means, oracle)
-    yield from comparison_tables(compare(missions, baselines))
-    if gathered.recovery and sum(map(len, gathered.recovery)):
-        yield recovery_table(pd.concat(gathered.recovery))
-    yield cell_table(missions)
-    yield from published_tables(missions)
+    measures: Measures = collection.measures
+    means = aggregate(missions, measures, collection.compute, oracle)
+    yield summary_table(means, measures, oracle)
+    ranked = rank_missions(missions, measures)
+    yield from comparison_tables(compare(ranked, measures, baselines), measures)
+    if sum(map(len, recovery)):
+        yield recovery_table(pd.concat(recovery))
+    yield cell_table(missions, measures)

@@ -17,7 +17,7 @@ from afm_rl.streams import Streams
 
 
 class RegimeTransform(Transform):
-    r"""Change the dynamics of any environment: what reaches it is what actions are worth.
+    r"""Change the dynamics of any environment: it receives the effects of actions.
 
     .. math:: a_\mathrm{eff} = \mathrm{clip}(g(a_t;\, \rho_k,\, s_t))
 

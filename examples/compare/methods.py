@@ -25,5 +25,6 @@ for method in asked.methods:
     cfg.budget = asked.budget
     agent = build(cfg)  # everything is checked here
     prepare(agent, cfg.cache, progress=True)  # trains what is not in the cache; nothing, here
-    tables.append(run(agent).missions)
-print_summary(pd.concat(tables))
+    results = run(agent)
+    tables.append(results.missions)
+print_summary(pd.concat(tables), results.measures)

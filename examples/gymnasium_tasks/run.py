@@ -19,7 +19,7 @@ from tasks import TASKS, Task
 from tensordict import TensorDictBase
 
 from afm_rl.artefacts import write_whole
-from afm_rl.report.interval import mean_interval
+from afm_rl.report.statistics import stratified_interval
 
 SOON = 20  # steps that count as "at" the change
 SPANS = ("before", "at", "after")
@@ -51,7 +51,7 @@ def table(frame: pd.DataFrame) -> str:
     for (change, method), rows in frame.groupby(["change", "method"], sort=False):
         cells = []
         for name in SPANS:
-            low, high = mean_interval(rows[name])
+            low, high = stratified_interval(rows[name], rows["change"])
             spread = "" if low != low else f" [{low:.2f}, {high:.2f}]"
             cells.append(f"{rows[name].mean():.2f}{spread}")
         lines.append(f"| {change} | {method} | " + " | ".join(cells) + " |")

@@ -9,6 +9,8 @@ import pandas as pd
 import pytest
 
 from afm_rl.cli import report
+from afm_rl.measures import FILE
+from afm_rl.missions import LapScore
 
 
 @pytest.fixture
@@ -47,6 +49,7 @@ def run_folder(tmp_path):
         for number in range(4)
         for t in range(10)
     ]
+    (tmp_path / FILE).write_text(LapScore.measures.to_json())
     pd.DataFrame(table).to_csv(tmp_path / "missions.csv", index=False)
     pd.DataFrame(steps).to_parquet(tmp_path / "steps.parquet")
     return tmp_path
@@ -75,7 +78,6 @@ def test_a_report_of_a_run(call, run_folder):
     assert done.out.splitlines()[0].startswith("4 missions of 2 methods in 1 cells")
     assert done.out.splitlines()[-1] == f"Report: {run_folder}/report/index.html"
     assert (run_folder / "report" / "figures" / "heat_ethz_2.png").exists()
-    assert (run_folder / "report" / "tables" / "paper_ethz_2_steps.tex").exists()
 
 
 def test_films_in_place_of_a_report(call, afm_rl, tmp_path):

@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 from afm_rl.missions import build, prepare, run
 
 COLUMNS = (
-    "seed success_rate steps reached targets finished seconds mission regime"  # after parameters
+    "seed success_rate steps reached targets finished faults seconds regime"  # after parameters
 ).split()
 
 
@@ -21,11 +21,11 @@ def test_one_method(afm_rl, tmp_path, quick):
     )
     assert (done.status, done.err) == (0, "")
     folder = tmp_path / "new" / "run"
-    assert files(folder) == ["config.yaml", "missions.csv", "steps.parquet"]
+    assert files(folder) == ["config.yaml", "measures.json", "missions.csv", "steps.parquet"]
     missions = pd.read_csv(folder / "missions.csv")
     columns = list(missions)
-    assert columns[:2] == ["method", "track"] and columns[-len(COLUMNS) :] == COLUMNS
-    assert {"v_gain", "omega_gain", "slip_at"} <= set(columns[2 : -len(COLUMNS)])
+    assert columns[:3] == ["mission", "method", "track"] and columns[-len(COLUMNS) :] == COLUMNS
+    assert {"v_gain", "omega_gain", "slip_at"} <= set(columns[3 : -len(COLUMNS)])
     assert missions["method"].tolist() == ["physics"] * 2
     assert missions["v_gain"].eq(-1).all() and missions["steps"].eq(3).all()
     assert len(pd.read_parquet(folder / "steps.parquet")) == 8

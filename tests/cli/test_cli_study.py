@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from afm_rl.cli.overrides import relaxed
 from afm_rl.errors import ArtefactError
+from afm_rl.missions import LapScore
 from afm_rl.missions.shard import Shard
 from afm_rl.missions.study import Outcome
 
@@ -163,8 +164,10 @@ def ended(monkeypatch, outcome):
 
 def test_shards_that_failed_are_listed(afm_rl, tmp_path, monkeypatch):
     row = {"method": "physics", "track": "oval", "seed": 0, "seconds": 2.0, "steps": 3}
-    missions = pd.DataFrame([row | {"success_rate": 1.0, "finished": True}])
-    reported = ended(monkeypatch, Outcome(missions, {Shard("oracle", 3): "out of luck"}))
+    missions = pd.DataFrame([row | {"success_rate": 1.0, "finished": True, "targets": 1}])
+    reported = ended(
+        monkeypatch, Outcome(missions, {Shard("oracle", 3): "out of luck"}, LapScore.measures)
+    )
     done = afm_rl(*TINY, f"hydra.run.dir={tmp_path}")
     assert done.status == 1
     assert reported == [tmp_path]

@@ -33,14 +33,14 @@ def test_the_columns(fly):
     assert list(flown.missions) == [
         *("mission", "method", "track", *names, "seed", "mse", "mse_z"),
         *("mse_phase_0", "mse_phase_1", "mse_phase_2", "peak_z", "settle_1", "settle_2"),
-        *("steps", "finished", "seconds", "regime"),
+        *("steps", "finished", "faults", "seconds", "regime"),
     ]
     actions = ["thrust", "moment_x", "moment_y", "moment_z"]
     assert list(flown.steps) == [
         *("mission", "t", *flown.agent.robot.state_names, "goal_x", "goal_y", "goal_z"),
         *(f"planned_{name}" for name in actions),
         *(f"executed_{name}" for name in actions),
-        *("error", "miss", "unforeseen", "misaligned", "loss", "regime_active"),
+        *("error", "miss", "unforeseen", "misaligned", "loss", "regime_active", "fault"),
         *("square_error_x", "square_error_y", "square_error_z", "phase"),
     ]
     assert flown.missions["track"].tolist() == list(flown.agent.robot.tracks)

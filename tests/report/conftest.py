@@ -7,6 +7,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from afm_rl.manifest import write_manifest
+from afm_rl.measures import Measure, Measures
+
+LAPS = Measures(
+    (
+        Measure(
+            *("success_rate", "success", "targets reached", "%", "higher"),
+            **{"scale": 100.0, "digits": 1, "limits": (0.0, 1.0), "headline": True},
+        ),
+        Measure("steps", "steps", "steps", better="lower", headline=True, budget=True),
+    ),
+    progress=("reached", "targets"),
+    error_unit="m, rad",
+)
 RADIUS, TARGETS, BUDGET = 4.0, 8, 400
 STEPS = {"physics": BUDGET, "adaptive": 120, "oracle": 100}  # physics is given up
 
@@ -45,6 +59,8 @@ def drive(method: str, number: int, seed: int) -> pd.DataFrame:
         "executed_v": np.ones(length),
         "executed_omega": np.zeros(length),
         "error": error,
+        "miss": error,
+        "unforeseen": error / 2,
         "misaligned": wrong.astype("int32"),
         "loss": np.where(wrong, 5e4, -3.0) * rng.uniform(0.8, 1.2, length),
         "regime_active": active.astype("int32"),
@@ -84,6 +100,27 @@ def results(methods=tuple(STEPS), v_gains=(-1.0,), seeds=1, tracks=("ring",)):
 @pytest.fixture
 def make_results():
     return results
+
+
+@pytest.fixture
+def laps():
+    return LAPS
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    """Write the folder of a run: tables, measures and manifest."""
+
+    def write(name="run", change=lambda missions: missions, measures=LAPS, **chosen):
+        from afm_rl.report import write_run
+
+        missions, steps = results(**chosen)
+        quiet = {"figures": False, "tensorboard": False, "echo": lambda line: None}
+        write_run(tmp_path / name, change(missions), steps, measures, **quiet)
+        write_manifest(tmp_path / name)
+        return tmp_path / name
+
+    return write
 
 
 @pytest.fixture

@@ -9,9 +9,13 @@ import pytest
 from PIL import Image
 
 from afm_rl.errors import ConfigurationError
+from afm_rl.manifest import write_manifest
+from afm_rl.measures import Measure, Measures
 from afm_rl.report import check_video, film_results, write_films, write_run
 from afm_rl.report.film import ENCODERS, FRAMES, LAST, frames
-from afm_rl.report.scenes import drive_scene, flight_scene
+from afm_rl.report.scenes import map_scene, space_scene
+
+MSE = Measures((Measure("mse", "MSE", "mean squared error", "m²", "lower", digits=5),))
 
 
 def quiet(line):
@@ -55,9 +59,9 @@ def artists(scene, kind):
 
 
 def test_a_drive_is_shown_up_to_the_step(drive, ring):
-    scene = drive_scene("title", drive, ring)
+    scene = map_scene("title", {"oracle": drive}, ring)
     scene.show(50)
-    before, changed, goal, cursor = artists(scene, "Line2D")
+    cursor, before, changed, goal = artists(scene, "Line2D")
     assert len(before.get_xdata()) == len(changed.get_xdata()) == 51
     np.testing.assert_allclose(before.get_xydata()[-1], drive.loc[50, ["x", "y"]].astype(float))
     np.testing.assert_allclose(goal.get_xydata()[0], drive.loc[50, ["goal_x", "goal_y"]].to_list())
@@ -68,7 +72,7 @@ def test_a_drive_is_shown_up_to_the_step(drive, ring):
 
 
 def test_the_robot_points_where_it_heads(drive):
-    scene = drive_scene("title", drive)
+    scene = map_scene("title", {"oracle": drive})
     scene.show(25)
     (robot,) = artists(scene, "Polygon")
     nose, tail = robot.get_xy()[0], robot.get_xy()[2]
@@ -79,7 +83,7 @@ def test_the_robot_points_where_it_heads(drive):
 
 def test_arrows_show_what_is_planned_and_what_is_executed(drive):
     drive = drive.assign(theta=0.0, planned_v=0.5, executed_v=-1.0, executed_omega=np.pi)
-    scene = drive_scene("title", drive)
+    scene = map_scene("title", {"oracle": drive})
     scene.show(0)
     planned, executed = (
         np.subtract(*arrow._posA_posB[::-1]) for arrow in artists(scene, "FancyArrowPatch")
@@ -90,14 +94,35 @@ def test_arrows_show_what_is_planned_and_what_is_executed(drive):
 
 @pytest.mark.parametrize("column", ["error", "miss"])
 def test_the_miss_is_drawn_where_it_is_known(drive, column):
-    steps = drive.assign(miss=0.01) if column == "miss" else drive
-    curve = drive_scene("title", steps).figure.axes[1].lines[0]
+    steps = drive.assign(miss=0.01) if column == "miss" else drive.drop(columns="miss")
+    curve = map_scene("title", {"oracle": steps}).figure.axes[1].lines[-1]
     np.testing.assert_allclose(curve.get_ydata(), steps[column])
+
+
+def test_robots_in_one_film_move_together(make_results, ring):
+    missions, steps = make_results()
+    runs = {name: steps[steps["mission"] == k] for k, name in enumerate(missions["method"])}
+    scene = map_scene("title", runs, ring)
+    scene.show(150)
+    bodies = [polygon.get_xy().mean(0) for polygon in artists(scene, "Polygon")]
+    lengths = [len(line.get_xdata()) for line in artists(scene, "Line2D")[1::2]]
+    assert len(bodies) == 3 and lengths == [151, 120, 100]  # who has ended stays where it is
+    assert artists(scene, "Text")[0].get_text() == "step 150"
+    legend = [text.get_text() for text in scene.figure.legends[0].get_texts()]
+    assert legend == ["physics", "adaptive", "oracle"]
+    assert len({polygon.get_facecolor() for polygon in artists(scene, "Polygon")}) == 3
+
+
+def test_robots_with_other_actions_have_no_arrows(drive):
+    steps = drive.drop(columns=["theta", "planned_omega", "executed_omega"])
+    scene = map_scene("title", {"oracle": steps})
+    scene.show(3)
+    assert artists(scene, "FancyArrowPatch") == []
 
 
 def test_a_flight_is_shown_up_to_the_step():
     steps = fly()[1]
-    scene = flight_scene("title", steps)
+    scene = space_scene("title", steps)
     scene.show(12)
     path, goal, robot = artists(scene, "Line3D")
     assert np.shape(path.get_data_3d()) == (3, 13)
@@ -108,15 +133,16 @@ def test_a_flight_is_shown_up_to_the_step():
 
 
 def test_changed_regimes_are_shaded(drive):
-    for axes in drive_scene("title", drive).figure.axes[1:]:
+    for axes in map_scene("title", {"oracle": drive}).figure.axes[1:]:
         assert len(axes.collections) == 1
-    for axes in flight_scene("title", fly()[1]).figure.axes[1:]:
+    for axes in space_scene("title", fly()[1]).figure.axes[1:]:
         assert len(axes.collections) == 1
 
 
 def test_a_film_moves_and_its_background_does_not(drive, ring):
     steps = drive[::10].reset_index(drop=True)
-    shown, durations = pictures(ENCODERS["gif"](frames(drive_scene("a", steps, ring), len(steps))))
+    scene = map_scene("a", {"oracle": steps}, ring)
+    shown, durations = pictures(ENCODERS["gif"](frames(scene, len(steps))))
     assert len(shown) == len(steps) and durations[-1] == LAST
     assert shown.shape[1] % 16 == shown.shape[2] % 16 == 0  # as video codecs want it
     assert (np.diff(shown.astype(int), axis=0) != 0).any((1, 2, 3)).all()
@@ -129,7 +155,7 @@ def test_a_film_moves_and_its_background_does_not(drive, ring):
 
 @pytest.mark.parametrize(("length", "expected"), [(1, 1), (2, 2), (FRAMES + 70, FRAMES)])
 def test_long_missions_are_shown_in_strides(length, expected):
-    scene = flight_scene("title", fly(length)[1])
+    scene = space_scene("title", fly(length)[1])
     rows = []
     watched = scene._replace(show=lambda row: (rows.append(row), scene.show(row)))
     assert len(list(frames(watched, length))) == expected
@@ -138,27 +164,29 @@ def test_long_missions_are_shown_in_strides(length, expected):
 
 def test_places_that_are_not_finite_are_left_out(drive):
     lost = drive.assign(x=np.where(drive["t"] > 30, np.nan, drive["x"]))
-    scene = drive_scene("title", lost.iloc[:40])
+    scene = map_scene("title", {"oracle": lost.iloc[:40]})
     assert len(list(frames(scene, 40))) == 40
 
 
-def test_one_film_per_method(tmp_path, make_results, ring):
+def test_one_film_per_method_and_one_of_all(tmp_path, make_results, ring):
     said = []
     missions, steps = make_results(methods=("oracle", "adaptive"), v_gains=(-1.0, 2.0))
     missions["method"] = missions["method"].replace("oracle", "a/b")
     steps = steps[steps["t"] % 20 == 0]
     written = write_films(tmp_path / "new", missions, steps, [ring], echo=said.append)
-    assert written == [tmp_path / "new" / "a_b.gif", tmp_path / "new" / "adaptive.gif"]
+    names = ["all_methods.gif", "a_b.gif", "adaptive.gif"]
+    assert written == [tmp_path / "new" / name for name in names]
     assert said == [f"wrote {path}" for path in written]
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["a_b.gif", "adaptive.gif"]
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == sorted(names)
     for path in written:
         assert path.stat().st_size < 500_000
 
 
-def test_films_are_made_from_a_folder_alone(tmp_path, make_results, ring):
+def test_films_are_made_from_a_folder_alone(tmp_path, make_results, laps, ring):
     missions, steps = make_results(methods=("oracle",))
     steps = steps[steps["t"] < 5]
-    write_run(tmp_path, missions, steps, figures=False, tensorboard=False, echo=quiet)
+    write_run(tmp_path, missions, steps, laps, figures=False, tensorboard=False, echo=quiet)
+    write_manifest(tmp_path)
     direct = write_films(tmp_path / "one", missions, steps, [ring], echo=quiet)
     stored = film_results([tmp_path], tmp_path / "two", load_track=lambda name: ring, echo=quiet)
     assert [path.read_bytes() for path in stored] == [path.read_bytes() for path in direct]
@@ -166,20 +194,22 @@ def test_films_are_made_from_a_folder_alone(tmp_path, make_results, ring):
 
 def test_films_of_flights_from_a_folder(tmp_path):
     missions, steps = fly(6)
-    write_run(tmp_path, missions, steps, figures=False, tensorboard=False, echo=quiet)
+    write_run(tmp_path, missions, steps, MSE, figures=False, tensorboard=False, echo=quiet)
+    write_manifest(tmp_path)
     (path,) = film_results([tmp_path], tmp_path / "films", echo=quiet)
     assert len(pictures(path.read_bytes())[0]) == 6
 
 
 def test_a_folder_without_steps_is_refused(tmp_path):
     missions, steps = fly(6)
-    write_run(tmp_path, missions, steps, figures=False, tensorboard=False, echo=quiet)
+    write_run(tmp_path, missions, steps, MSE, figures=False, tensorboard=False, echo=quiet)
     (tmp_path / "steps.parquet").unlink()
+    write_manifest(tmp_path)
     with pytest.raises(ConfigurationError, match=r"no steps\.parquet; films"):
         film_results([tmp_path], tmp_path / "films", echo=quiet)
 
 
-@pytest.mark.parametrize("lost", ["theta", "planned_v", "goal_x"])
+@pytest.mark.parametrize("lost", ["x", "regime_active", "goal_x"])
 def test_what_a_film_needs_is_asked_for(tmp_path, make_results, lost):
     missions, steps = make_results(methods=("oracle",))
     for without in (steps.drop(columns=lost), steps.assign(**{lost: np.nan})):

@@ -1,118 +1,107 @@
-"""Folders of runs and studies, read and joined."""
+"""Folders of runs, comparisons, sweeps and studies, read and joined."""
+
+import json
 
 import pandas as pd
 import pytest
+import yaml
 
-from afm_rl.errors import ConfigurationError
-from afm_rl.report import write_run
+from afm_rl.errors import AFMError, ArtefactError, ConfigurationError
+from afm_rl.manifest import write_manifest
 from afm_rl.report.collect import collect
-from afm_rl.report.results_files import read_steps, read_table
+from afm_rl.report.results_files import read_settings, read_steps, read_table
 
 
 @pytest.fixture
-def run_folder(tmp_path, make_results):
-    """Write the folder of a run."""
+def study_folder(tmp_path, run_folder):
+    """Write the folder of a study: a job per method and seed."""
 
-    def write(name="run", **chosen):
-        missions, steps = make_results(**chosen)
-        quiet = {"figures": False, "tensorboard": False, "echo": lambda line: None}
-        write_run(tmp_path / name, missions, steps, **quiet)
+    def write(name="study", methods=("physics", "oracle"), seeds=2, planned=(), regime=False):
+        def change(seed):
+            def apply(missions):
+                missions = missions.assign(seed=seed)
+                named = missions["v_gain"].map("v_gain = {:g}".format)
+                return missions.assign(regime=named) if regime else missions
+
+            return apply
+
+        jobs = []
+        for method in (*methods, *planned):
+            for seed in range(seeds):
+                jobs.append(f"{method}+seed={seed}")
+                job = f"{name}/jobs/{jobs[-1]}"
+                settings = yaml.safe_dump({"label": method, "seeds": [seed]})
+                if method in planned:
+                    (tmp_path / job / "unfinished").mkdir(parents=True)
+                    (tmp_path / job / "unfinished" / "config.yaml").write_text(settings)
+                    continue
+                gains = {"methods": [method], "v_gains": [-1.0, 2.0]}
+                folder = run_folder(job, change(seed), **gains)
+                (folder / "config.yaml").write_text(settings)
+                spent = {"method": [method], "missions": 2, "seconds": 1800.0 * (1 + seed)}
+                pd.DataFrame(spent).to_csv(folder / "compute.csv", index=False)
+                write_manifest(folder)
+        (tmp_path / name / "jobs.yaml").write_text(yaml.safe_dump({"jobs": jobs}))
         return tmp_path / name
 
     return write
 
 
-@pytest.fixture
-def study_folder(tmp_path, make_results):
-    """Write the folder of a study: shards, and the tables made of them."""
-
-    def write(name="study", methods=("physics", "oracle"), seeds=2, asked=None, regime=False):
-        folder = tmp_path / name
-        tables = []
-        for method in methods:
-            missions, steps = make_results([method], v_gains=[-1.0, 2.0], seeds=seeds)
-            if regime:
-                missions["regime"] = missions["v_gain"].map("v_gain = {:g}".format)
-            for seed, own in missions.groupby("seed"):
-                shard = folder / "shards" / method / str(seed)
-                shard.mkdir(parents=True)
-                number = {mission: place for place, mission in enumerate(own["mission"])}
-                rows = steps[steps["mission"].isin(number)]
-                own = own.assign(mission=range(len(own)))
-                own.to_csv(shard / "missions.csv", index=False)
-                rows.assign(mission=rows["mission"].map(number)).to_parquet(shard / "steps.parquet")
-                tables.append(own)
-        table = pd.concat(tables).drop(columns="seconds")
-        table.assign(mission=range(len(table))).to_csv(folder / "missions.csv", index=False)
-        names = "".join(f"  {method}: {{budget: 400}}\n" for method in asked or methods)
-        text = f"version: 0.1.0\nseeds: [{', '.join(map(str, range(seeds)))}]\nmethods:\n{names}"
-        (folder / "study.yaml").write_text(text)
-        compute = {"method": methods, "missions": 4, "seconds": [7200.0, 3600.0][: len(methods)]}
-        pd.DataFrame(compute).to_csv(folder / "compute.csv", index=False)
-        return folder
-
-    return write
-
-
-def test_a_run_is_read_with_its_steps(run_folder, make_results):
+def test_a_run_is_read_with_its_steps(run_folder, make_results, laps):
     found = collect([run_folder(seeds=2)])
-    assert found.methods == ["physics", "adaptive", "oracle"]
+    assert found.methods == ["physics", "adaptive", "oracle"] and found.measures == laps
     assert found.missions["mission"].tolist() == list(range(6))
     assert found.missions["cell"].unique().tolist() == ["ring, v_gain = -1"]
-    assert found.notes == [] and found.asked.empty and found.compute.empty
+    assert found.notes == [] and found.plan.empty and found.compute.empty
     _, steps = make_results(seeds=2)
     oracle = found.missions[found.missions["method"] == "oracle"]
     read = read_steps(found.files, oracle, ["error", "reached", "mass"])
     expected = steps[steps["mission"].isin([4, 5])].reset_index(drop=True)
     assert read["error"].tolist() == expected["error"].tolist()
     assert read["mass"].isna().all()
+    assert set(steps) == set(read_steps(found.files, oracle))
 
 
-def test_a_study_s_steps_stand_in_its_shards(study_folder, make_results):
+def test_a_study_s_missions_stand_in_its_jobs(study_folder, make_results):
     found = collect([study_folder()])
-    assert len(found.files) == 4
+    assert len(found.files) == 4 and len(found.missions) == 8
+    assert found.methods == ["physics", "oracle"]
     oracle = found.missions[found.missions["method"] == "oracle"]
     assert oracle["own"].tolist() == [0, 1, 0, 1]  # seed 0, then seed 1
     read = read_steps(found.files, oracle, ["error"])
-    _, steps = make_results(["oracle"], v_gains=[-1.0, 2.0], seeds=2)
+    _, steps = make_results(["oracle"], v_gains=[-1.0, 2.0])
     for row in oracle.itertuples():
-        place = 2 * (row.v_gain == 2.0) + row.seed
         own = read.loc[read["mission"] == row.mission, "error"]
-        assert own.tolist() == steps.loc[steps["mission"] == place, "error"].tolist()
-    assert found.compute.loc["oracle"].to_dict() == {"seconds": 3600.0, "missions": 4}
+        assert own.tolist() == steps.loc[steps["mission"] == row.own, "error"].tolist()
+    assert found.compute.loc["oracle"].to_dict() == {"seconds": 5400.0, "missions": 4}
 
 
-def test_methods_have_the_order_of_the_study_s_table(study_folder):
-    assert collect([study_folder(methods=("physics", "adaptive"))]).methods == [
-        "physics",
-        "adaptive",
-    ]
+def test_methods_have_the_order_of_the_record(study_folder):
+    folder = study_folder(methods=("physics", "adaptive"))
+    assert collect([folder]).methods == ["physics", "adaptive"]
+    (folder / "jobs.yaml").unlink()
+    assert collect([folder]).methods == ["adaptive", "physics"]
 
 
-def test_shards_count_that_the_table_does_not_have_yet(study_folder):
+def test_jobs_without_steps_are_said(study_folder):
     folder = study_folder()
-    table = pd.read_csv(folder / "missions.csv")
-    table[table["method"] == "physics"].to_csv(folder / "missions.csv", index=False)
-    assert len(collect([folder]).missions) == 8
-    (folder / "missions.csv").unlink()
-    assert len(collect([folder]).missions) == 8
-
-
-def test_a_study_without_its_shards_has_no_steps(study_folder):
-    folder = study_folder()
-    for path in folder.glob("shards/*/*/*"):
-        path.unlink()
+    for job in (folder / "jobs").iterdir():
+        (job / "steps.parquet").unlink()
+        write_manifest(job)
     found = collect([folder])
-    assert len(found.missions) == 8
     (note,) = found.notes
     assert note.startswith("8 of 8 missions have no steps.parquet")
     assert read_steps(found.files, found.missions, ["error"]).empty
 
 
 def test_the_later_folder_wins_and_says_so(run_folder, study_folder):
-    first = run_folder("first", methods=["oracle"], v_gains=[-1.0, 0.5], seeds=2)
-    table = pd.read_csv(first / "missions.csv")
-    table.assign(steps=7).to_csv(first / "missions.csv", index=False)
+    first = run_folder(
+        "first",
+        lambda missions: missions.assign(steps=7),
+        methods=["oracle"],
+        v_gains=[-1.0, 0.5],
+        seeds=2,
+    )
     found = collect([first, study_folder(regime=True)])
     oracle = found.missions[found.missions["method"] == "oracle"]
     assert len(oracle) == 6  # -1 and 2 of the study, 0.5 of the run
@@ -122,76 +111,137 @@ def test_the_later_folder_wins_and_says_so(run_folder, study_folder):
     assert note.startswith(f"oracle: 2 missions of {first} stand twice")
 
 
-def test_what_a_study_asked_for_is_known(study_folder):
-    asked = collect([study_folder(asked=["physics", "oracle", "online_pe"])]).asked
-    assert len(asked) == 3 * 2 * 2
-    assert set(asked["method"]) == {"physics", "oracle", "online_pe"}
+def test_what_was_planned_is_known(study_folder):
+    found = collect([study_folder(planned=["online_pe"])])
+    assert len(found.plan) == 3 * 2 * 2
+    assert set(found.plan["method"]) == {"physics", "oracle", "online_pe"}
+    assert [note.rpartition(" has ")[2] for note in found.notes] == ["no results yet."] * 2
 
 
-def test_seeds_may_be_a_count_and_cells_a_list(study_folder):
-    folder = study_folder()
-    text = "methods: [a]\nseeds: 3\ncells: ['ring, slip']\n"
-    (folder / "study.yaml").write_text(text)
-    asked = collect([folder]).asked
-    assert asked.to_numpy().tolist() == [["a", "ring, slip", seed] for seed in range(3)]
-
-
-def test_a_study_that_has_just_begun_joins_others(run_folder, tmp_path):
-    new = tmp_path / "new"
-    new.mkdir()
-    (new / "study.yaml").write_text("methods: {a: {}}\nseeds: [0]\n")
+def test_a_study_that_has_just_begun_joins_others(run_folder, study_folder):
+    new = study_folder("new", methods=(), planned=["a"])
     with pytest.raises(ConfigurationError, match="no mission is finished yet"):
         collect([new])
     assert len(collect([new, run_folder()]).missions) == 3
 
 
 def test_names_that_look_like_numbers_stay_text(run_folder):
-    folder = run_folder(methods=["oracle"])
-    table = pd.read_csv(folder / "missions.csv")
-    table.assign(method=10, track=1).to_csv(folder / "missions.csv", index=False)
+    folder = run_folder(
+        change=lambda missions: missions.assign(method=10, track=1), methods=["oracle"]
+    )
     found = collect([folder])
     assert found.methods == ["10"]
     assert found.missions["cell"].tolist() == ["1, v_gain = -1"]
 
 
+def rewrite(folder, name, content):
+    """Change a file as somebody would who also renews the manifest."""
+    (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    write_manifest(folder)
+
+
+BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nseeds: [*b, *b]\n"
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("missions.csv", "method,track\n", "columns seed, success_rate.* are missing"),
+        ("missions.csv", "method,track\n", "columns finished, seed, .* are missing"),
         ("missions.csv", "", "no table of values"),
-        ("missions.csv", b"\xff\xfe\x00", "no table of values"),
+        ("missions.csv", b"\xff\xfe\x00", "no UTF-8 text"),
         ("compute.csv", "method\na\n", "columns seconds, missions are missing"),
-        ("study.yaml", "seeds: 3\n", "expected the entries methods and seeds"),
-        ("study.yaml", "a: [", "cannot be read"),
+        ("compute.csv", "method,seconds,missions\na,soon,1\n", "seconds: expected a finite"),
+        ("measures.json", "{", "no declaration of measures"),
+        ("measures.json", b"\xff", "no UTF-8 text"),
+        ("config.yaml", "a: [", "damaged"),
+        ("config.yaml", "- 1\n", "damaged; expected a mapping"),
+        ("config.yaml", b"\xff\xfe", "no UTF-8 text"),
+        ("config.yaml", BOMB, r"damaged: aliases \(\*name\) are not read"),
+        ("config.yaml", "a: " + "[" * 5000, "damaged: more than 50 levels"),
+        ("config.yaml", "a: !!python/object/apply:os.getcwd []\n", "damaged"),
+        ("config.yaml", "seeds: 1000000000\n", "seeds=1000000000: expected a count or a list"),
+        ("config.yaml", "x" * (5 * 2**20), "5242880 bytes; expected 4194304 at most"),
         ("steps.parquet", "no", "damaged, or no Parquet file"),
     ],
 )
 def test_files_that_cannot_be_used_are_named(run_folder, name, content, message):
     folder = run_folder()
-    (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(ConfigurationError, match=f"{name}: {message}"):
+    rewrite(folder, name, content)
+    with pytest.raises(AFMError, match=f"{name}: {message}") as caught:
         found = collect([folder])
         read_steps(found.files, found.missions, ["error"])
+    assert "\n" not in str(caught.value)
+
+
+def test_nothing_is_interpolated(run_folder, monkeypatch):
+    monkeypatch.setenv("SECRET", "hush")
+    folder = run_folder()
+    rewrite(folder, "config.yaml", "label: ${oc.env:SECRET}\nseeds: [0]\n")
+    assert "${oc.env:SECRET}" in set(collect([folder]).plan["method"])
+    assert read_settings(folder / "config.yaml")["label"] == "${oc.env:SECRET}"
+
+
+@pytest.mark.parametrize("name", ["missions.csv", "steps.parquet", "measures.json", "config.yaml"])
+def test_a_damaged_file_is_named(run_folder, name):
+    folder = run_folder()
+    rewrite(folder, "config.yaml", "label: physics\nseeds: [0]\n")
+    whole = (folder / name).read_bytes()
+    for place in range(0, len(whole), max(1, len(whole) // 12)):
+        spoilt = bytearray(whole)
+        spoilt[place] ^= 1 << place % 8
+        (folder / name).write_bytes(spoilt)
+        with pytest.raises(ArtefactError, match=f"{name}: damaged"):
+            collect([folder])
 
 
 @pytest.mark.parametrize(
     ("column", "value", "message"),
     [
         ("steps", "many", "steps: expected a finite number"),
-        ("success_rate", "", "success_rate: expected a finite number"),
+        ("steps", "1e999", "steps: expected a finite number"),
+        ("steps", "1.5", "steps: expected a whole number"),
+        ("mission", "0", "mission: expected another number"),
         ("finished", "maybe", "finished: expected True or False"),
+        ("method", "", "method: expected a text"),
+        ("method", "m" * 501, "method: expected a text of 1 to 500 letters"),
     ],
 )
 def test_values_that_cannot_be_are_refused(run_folder, column, value, message):
     folder = run_folder()
-    table = pd.read_csv(folder / "missions.csv")
-    table.assign(**{column: value}).to_csv(folder / "missions.csv", index=False)
-    with pytest.raises(ConfigurationError, match=message):
+    table = pd.read_csv(folder / "missions.csv", dtype=str)
+    rewrite(folder, "missions.csv", table.assign(**{column: value}).to_csv(index=False))
+    with pytest.raises(ConfigurationError, match=f"missions.csv: {message}"):
+        collect([folder])
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda steps: steps.assign(error="high"),
+        lambda steps: steps.assign(t=None),
+        lambda steps: steps.drop(columns="t"),
+    ],
+)
+def test_steps_that_are_no_numbers_are_refused(run_folder, spoil):
+    folder = run_folder()
+    spoil(pd.read_parquet(folder / "steps.parquet")).to_parquet(folder / "steps.parquet")
+    write_manifest(folder)
+    found = collect([folder])
+    with pytest.raises(ConfigurationError, match=r"steps\.parquet: .*expected"):
+        read_steps(found.files, found.missions, ["error"])
+
+
+def test_measures_of_a_stranger_are_checked(run_folder):
+    folder = run_folder()
+    declared = json.loads((folder / "measures.json").read_text())
+    declared["each"][0]["better"] = "=cmd"
+    rewrite(folder, "measures.json", json.dumps(declared))
+    with pytest.raises(ArtefactError, match=r"measures\.json: no decl.* measure 'success_rate'"):
         collect([folder])
 
 
 def test_a_table_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(ConfigurationError, match="none.csv: No such file"):
+    with pytest.raises(ConfigurationError, match="none.csv: no such file"):
         read_table(tmp_path / "none.csv", ["a"])
 
 
@@ -203,6 +253,5 @@ def test_folders_without_results_are_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="holds no missions.csv"):
         collect([tmp_path])
     (tmp_path / "missions.csv").mkdir()
-    (tmp_path / "study.yaml").mkdir()
     with pytest.raises(ConfigurationError, match="holds no missions.csv"):
         collect([tmp_path])

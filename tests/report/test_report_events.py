@@ -18,14 +18,16 @@ def read(folder):
     }
 
 
-def test_a_method_has_its_curves_and_its_result(tmp_path, make_results):
+def test_a_method_has_its_curves_and_its_result(tmp_path, make_results, laps):
     missions, steps = make_results()
-    written = write_events(tmp_path, missions, steps)
+    written = write_events(tmp_path, missions, steps, laps)
     assert written == [tmp_path / name / FILE for name in ("physics", "adaptive", "oracle")]
     curves = read(tmp_path / "adaptive")
     assert set(curves) == {
-        "step/error",
-        "step/loss",
+        "came_true/miss",
+        "came_true/unforeseen",
+        "model/error",
+        "model/loss",
         "step/misaligned",
         "step/regime_active",
         "step/reached",
@@ -33,56 +35,58 @@ def test_a_method_has_its_curves_and_its_result(tmp_path, make_results):
         "final/steps",
     }
     own = steps[steps["mission"] == 1]
-    for name in ("error", "loss", "misaligned", "regime_active", "reached"):
-        np.testing.assert_allclose(curves[f"step/{name}"], own[name], rtol=1e-6)
+    for tag, curve in curves.items():
+        if not tag.startswith("final"):
+            np.testing.assert_allclose(curve, own[tag.split("/")[1]], rtol=1e-6)
+    assert min(curves) == "came_true/miss"  # TensorBoard's order
     assert curves["final/steps"].to_dict() == {0: 119}
     assert curves["final/success_rate"].to_dict() == {0: 1.0}
 
 
-def test_a_mean_is_taken_over_those_still_running(tmp_path, make_results):
+def test_a_mean_is_taken_over_those_still_running(tmp_path, make_results, laps):
     missions, steps = make_results(["oracle"], seeds=3)
     steps = steps[(steps["mission"] != 2) | (steps["t"] < 40)]
-    write_events(tmp_path, missions, steps)
-    error = read(tmp_path / "oracle")["step/error"]
+    write_events(tmp_path, missions, steps, laps)
+    error = read(tmp_path / "oracle")["model/error"]
     rows = steps.pivot(index="t", columns="mission", values="error")
     np.testing.assert_allclose(error, rows.mean(axis=1), rtol=1e-6)
     assert rows[2].isna().any()
 
 
-def test_missions_have_curves_of_their_own_up_to_eight(tmp_path, make_results):
+def test_missions_have_curves_of_their_own_up_to_eight(tmp_path, make_results, laps):
     missions, steps = make_results(["adaptive", "oracle"], v_gains=[-1.0, 2.0], seeds=5)
-    written = write_events(tmp_path, missions, steps)
+    written = write_events(tmp_path, missions, steps, laps)
     assert len(written) == len(set(written)) == 2 * (1 + 8)
-    name = "ring_v_gain=2_omega_gain=1_seed_1"
+    name = "ring_v_gain=2_seed_1"
     curves = read(tmp_path / "oracle" / name)
     own = steps[steps["mission"] == 16]
-    np.testing.assert_allclose(curves["step/error"], own["error"], rtol=1e-6)
+    np.testing.assert_allclose(curves["model/error"], own["error"], rtol=1e-6)
     assert curves["final/steps"].to_dict() == {0: 100}
 
 
-def test_long_curves_are_means_over_a_few_steps(tmp_path, make_results):
+def test_long_curves_are_means_over_a_few_steps(tmp_path, make_results, laps):
     missions, steps = make_results(["physics"])
     many = pd.concat([steps.assign(t=steps["t"] + 400 * k) for k in range(6)])
-    write_events(tmp_path, missions, many)
-    error = read(tmp_path / "physics")["step/error"]
-    assert len(error) == 800 <= POINTS
-    np.testing.assert_allclose(error.loc[3], many["error"].iloc[3:6].mean(), rtol=1e-6)
+    write_events(tmp_path, missions, many, laps)
+    error = read(tmp_path / "physics")["model/error"]
+    assert len(error) == 480 <= POINTS
+    np.testing.assert_allclose(error.loc[5], many["error"].iloc[5:10].mean(), rtol=1e-6)
 
 
-def test_writing_again_replaces(tmp_path, make_results):
+def test_writing_again_replaces(tmp_path, make_results, laps):
     frames = make_results(["oracle"], seeds=2)
-    assert write_events(tmp_path, *frames) == write_events(tmp_path, *frames)
+    assert write_events(tmp_path, *frames, laps) == write_events(tmp_path, *frames, laps)
     assert sorted(path.name for path in (tmp_path / "oracle").iterdir()) == sorted(
-        [FILE, "ring_v_gain=-1_omega_gain=1_seed_0", "ring_v_gain=-1_omega_gain=1_seed_1"]
+        [FILE, "ring_v_gain=-1_seed_0", "ring_v_gain=-1_seed_1"]
     )
 
 
-def test_the_index_of_the_frames_plays_no_part(tmp_path, make_results):
+def test_the_index_of_the_frames_plays_no_part(tmp_path, make_results, laps):
     missions, steps = make_results(["adaptive", "oracle"], seeds=2)
-    write_events(tmp_path / "a", missions, steps)
+    write_events(tmp_path / "a", missions, steps, laps)
     joined = missions.set_index(pd.Index([0, 1, 0, 1])), steps.set_index(steps["t"].rename(None))
-    write_events(tmp_path / "b", *joined)
-    for name in ("oracle", "oracle/ring_v_gain=-1_omega_gain=1_seed_1"):
+    write_events(tmp_path / "b", *joined, laps)
+    for name in ("oracle", "oracle/ring_v_gain=-1_seed_1"):
         first, second = read(tmp_path / "a" / name), read(tmp_path / "b" / name)
         for tag, curve in first.items():
             pd.testing.assert_series_equal(curve, second[tag])

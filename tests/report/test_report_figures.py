@@ -11,9 +11,10 @@ from matplotlib.colors import to_hex
 from matplotlib.image import imread
 from matplotlib.text import Text
 
+from afm_rl.measures import Measure, Measures
 from afm_rl.report import draw_comparison, draw_learning, draw_trajectories
-from afm_rl.report.road import distance_to, resample, view
-from afm_rl.report.style import COLOURS, DPI, REGIME, method_styles, png_bytes
+from afm_rl.report.style import DPI, FEW, REGIME, groups_of_methods, method_styles, png_bytes
+from afm_rl.report.track_plot import distance_to, resample, view
 
 
 def texts(figure):
@@ -28,10 +29,16 @@ def pixels(figure):
     return imread(io.BytesIO(png_bytes(figure)))
 
 
+LAPS = Measures(
+    (
+        Measure("success_rate", "success", "success", "%", "higher", 100.0, headline=True),
+        Measure("steps", "steps", "steps", better="lower", headline=True),
+    )
+)
 ALL = {
-    "trajectory": lambda missions, steps, ring: draw_trajectories(missions, steps, [ring]),
-    "learning": lambda missions, steps, ring: draw_learning(missions, steps),
-    "comparison": lambda missions, steps, ring: draw_comparison(missions),
+    "trajectory": lambda missions, steps, ring: draw_trajectories(missions, steps, LAPS, [ring]),
+    "learning": lambda missions, steps, ring: draw_learning(missions, steps, "m, rad"),
+    "comparison": lambda missions, steps, ring: draw_comparison(missions, LAPS),
 }
 
 
@@ -75,49 +82,59 @@ def test_a_picture_is_the_same_each_time(draw, make_results):
     assert png_bytes(draw(*make_results(seeds=2))) == png_bytes(draw(*make_results(seeds=2)))
 
 
-def test_methods_differ_without_colour():
-    styles = method_styles(f"m{k}" for k in range(14)).values()
-    assert len({style[1:] for style in styles}) == len(styles)
-    assert len({style.color for style in styles}) == len(COLOURS)
-    assert len({style.marker for style in styles}) == len(styles)
+def test_methods_of_a_figure_differ_in_colour_marker_and_line():
+    styles = list(method_styles(f"m{k}" for k in range(FEW)).values())
+    for attribute in ("color", "marker"):
+        assert len({getattr(look, attribute) for look in styles}) == FEW
+    assert len({(look.linestyle, look.marker) for look in styles}) == FEW
 
 
-def test_methods_of_one_colour_differ_in_line_and_marker():
-    styles = list(method_styles(f"m{k}" for k in range(13)).values())
-    for k, first in enumerate(styles):
-        for second in styles[k + 1 :]:
-            if first.color == second.color:
-                assert first.linestyle != second.linestyle
-                assert first.marker != second.marker
+@pytest.mark.parametrize(("count", "sizes"), [(1, [1]), (6, [6]), (7, [4, 3]), (15, [5, 5, 5])])
+def test_no_figure_shows_more_methods_than_there_are_colours(count, sizes):
+    names = [f"m{k}" for k in range(count)]
+    groups = groups_of_methods(names)
+    assert [len(group) for group in groups] == sizes
+    assert sum(groups, []) == names
+
+
+def test_lines_that_lie_on_each_other_are_told_apart(make_results, artists):
+    missions, steps = make_results(["physics"])
+    copies = [missions.assign(method=f"m{k}", mission=k) for k in range(3)]
+    same = pd.concat([steps.assign(mission=k) for k in range(3)])
+    axes = draw_learning(pd.concat(copies), same).axes[0]
+    lines = artists(axes, "mean")
+    widths = [line.get_linewidth() for line in lines]
+    assert widths == sorted(widths, reverse=True) and len(set(widths)) == 3
+    assert len({line.get_markevery() for line in lines}) == 3
 
 
 # Trajectories
 
 
 def test_one_map_per_method_and_cell(make_results, ring):
-    figure = draw_trajectories(*make_results(v_gains=[-1.0, 2.0], seeds=2), [ring])
+    figure = draw_trajectories(*make_results(v_gains=[-1.0, 2.0], seeds=2), LAPS, [ring])
     assert titles(figure) == ["physics", "adaptive", "oracle"] * 2
     assert "6 of 12 missions not shown" in texts(figure)
     assert any("v_gain = 2\n" in text for text in texts(figure))
 
 
 def test_twelve_maps_at_most(make_results, ring):
-    figure = draw_trajectories(*make_results(v_gains=range(1, 8)), [ring])
+    figure = draw_trajectories(*make_results(v_gains=range(1, 8)), LAPS, [ring])
     assert len(figure.axes) == 12
     assert "9 of 21 missions not shown" in texts(figure)
 
 
 def test_a_map_says_how_the_mission_fared(make_results, ring):
-    shown = texts(draw_trajectories(*make_results(), [ring]))
-    for text in ("2/8 targets, 399 steps", "8/8 targets, 119 steps", "8/8 targets, 99 steps"):
+    shown = texts(draw_trajectories(*make_results(), LAPS, [ring]))
+    for text in ("25 %, 399 steps", "100 %, 119 steps", "100 %, 99 steps"):
         assert text in shown
-    assert "ring, v_gain = -1, omega_gain = 1" in shown
+    assert "ring, v_gain = -1" in shown
     assert not any("not shown" in text for text in shown)
 
 
 def test_the_changed_stretch_is_coloured_and_shaded(make_results, ring, artists):
     missions, steps = make_results(["oracle"])
-    (axes,) = draw_trajectories(missions, steps, [ring]).axes
+    (axes,) = draw_trajectories(missions, steps, LAPS, [ring]).axes
     (changed,), (band,) = artists(axes, "changed"), artists(axes, "band")
     active = steps["regime_active"].to_numpy(dtype=bool)
     expected = active | np.roll(active, 1)  # a move has two ends
@@ -131,7 +148,7 @@ def test_the_changed_stretch_is_coloured_and_shaded(make_results, ring, artists)
 
 
 def test_the_road_is_as_wide_as_the_track_says(make_results, ring, artists):
-    (axes,) = draw_trajectories(*make_results(["oracle"]), [ring]).axes
+    (axes,) = draw_trajectories(*make_results(["oracle"]), LAPS, [ring]).axes
     (road,) = artists(axes, "road")
     np.testing.assert_allclose(road.get_widths(), ring.width)
     np.testing.assert_allclose(np.hypot(*road.get_offsets().T), 4.0, rtol=1e-3)
@@ -142,7 +159,7 @@ def test_the_road_is_as_wide_as_the_track_says(make_results, ring, artists):
 
 def test_marks_say_how_it_began_and_ended(make_results, ring, artists):
     missions, steps = make_results()
-    lost, _, done = draw_trajectories(missions, steps, [ring]).axes
+    lost, _, done = draw_trajectories(missions, steps, LAPS, [ring]).axes
     for axes in (lost, done):
         (start,) = artists(axes, "start")
         np.testing.assert_allclose(start.get_xydata(), [[4.0, 0.0]], atol=1e-9)
@@ -154,7 +171,7 @@ def test_marks_say_how_it_began_and_ended(make_results, ring, artists):
 
 def test_who_goes_astray_does_not_shrink_the_map(make_results, ring, artists):
     missions, steps = make_results()
-    axes = draw_trajectories(missions, steps, [ring]).axes[0]
+    axes = draw_trajectories(missions, steps, LAPS, [ring]).axes[0]
     last = steps[steps["mission"] == 0][["x", "y"]].iloc[-1].to_numpy()
     left, right = axes.get_xlim()
     assert last[0] < -90
@@ -166,12 +183,12 @@ def test_who_goes_astray_does_not_shrink_the_map(make_results, ring, artists):
 
 def test_an_end_within_the_map_needs_no_words(make_results, ring):
     missions, steps = make_results(["physics"])
-    figure = draw_trajectories(missions, steps[steps["t"] < 30], [ring])
+    figure = draw_trajectories(missions, steps[steps["t"] < 30], LAPS, [ring])
     assert not any("away" in text for text in texts(figure))
 
 
 def test_a_track_that_is_not_given_is_left_out(make_results, artists):
-    figure = draw_trajectories(*make_results())
+    figure = draw_trajectories(*make_results(), LAPS)
     assert not artists(figure, "road")
     assert len(artists(figure, "nominal")) == 3
     assert not any("away" in text for text in texts(figure))
@@ -182,10 +199,10 @@ def test_a_track_that_is_not_given_is_left_out(make_results, artists):
 def test_places_that_are_not_finite_are_passed_over(make_results, ring, artists, given):
     missions, steps = make_results(["oracle"])
     some = steps.assign(x=steps["x"].where(steps["t"] < 50))
-    figure = draw_trajectories(missions, some, [ring] * given)
+    figure = draw_trajectories(missions, some, LAPS, [ring] * given)
     (end,) = artists(figure, "finished")
     np.testing.assert_array_equal(end.get_xydata()[0], steps[["x", "y"]].iloc[49])
-    nowhere = draw_trajectories(missions, steps.assign(y=np.nan), [ring] * given)
+    nowhere = draw_trajectories(missions, steps.assign(y=np.nan), LAPS, [ring] * given)
     assert not artists(nowhere, "start")
     png_bytes(nowhere)
 
@@ -209,23 +226,33 @@ def test_the_line_closes_when_resampled():
 # Learning
 
 
-def test_error_and_loss_of_every_cell(make_results, artists):
+def test_whether_plans_came_true_stands_first(make_results, artists):
     missions, steps = make_results(v_gains=[-1.0, 2.0])
-    figure = draw_learning(missions, steps)
-    assert len(figure.axes) == 4
+    figure = draw_learning(missions, steps, "m, rad")
+    assert len(figure.axes) == 4 * 2
     for axes in figure.axes:
         assert len(artists(axes, "mean")) == len(artists(axes, "raw")) == 3
-    error, loss = figure.axes[0], figure.axes[2]
-    assert (error.get_yscale(), loss.get_yscale()) == ("log", "symlog")
-    assert "(m, rad)" in error.get_ylabel()
-    assert "loss" in loss.get_ylabel()
+    labels = [axes.get_ylabel().replace("\n", " ") for axes in figure.axes[::2]]
+    assert labels == [
+        "distance from the plan (m, rad)",
+        "distance from the prediction (m, rad)",
+        "model's error (m, rad)",
+        "model's loss (NLL)",
+    ]
+    assert [axes.get_yscale() for axes in figure.axes[::2]] == ["log"] * 3 + ["symlog"]
     assert {"physics", "adaptive", "oracle"} <= set(texts(figure))
+    blind = draw_learning(missions, steps.assign(unforeseen=np.nan).drop(columns="miss"))
+    assert len(blind.axes) == 2 * 2
 
 
-def test_four_cells_at_most(make_results):
+def test_six_methods_and_four_cells_at_most(make_results):
     figure = draw_learning(*make_results(v_gains=range(1, 7), seeds=2))
-    assert len(figure.axes) == 8
+    assert len(figure.axes) == 4 * 4
     assert "24 of 36 missions not shown" in texts(figure)
+    missions, steps = make_results(["oracle"])
+    many = pd.concat([missions.assign(method=f"m{k}", mission=k) for k in range(8)])
+    figure = draw_learning(many, pd.concat([steps.assign(mission=k) for k in range(8)]))
+    assert "2 of 8 missions not shown" in texts(figure)
 
 
 def test_a_curve_is_a_moving_average_over_what_was_measured(make_results, artists):
@@ -241,7 +268,7 @@ def test_a_curve_is_a_moving_average_over_what_was_measured(make_results, artist
 def test_long_curves_keep_their_extremes(make_results, artists):
     missions, steps = make_results(["physics"])
     many = pd.concat([steps.assign(t=steps["t"] + 400 * k) for k in range(10)])
-    many = many.assign(error=np.where(many["t"] == 1234, 77.0, many["error"]))
+    many = many.assign(miss=np.where(many["t"] == 1234, 77.0, many["miss"]))
     axes = draw_learning(missions.assign(steps=3999), many).axes[0]
     (raw,), (mean,) = artists(axes, "raw"), artists(axes, "mean")
     assert raw.get_ydata().max() == 77.0
@@ -252,13 +279,13 @@ def test_long_curves_keep_their_extremes(make_results, artists):
 def test_the_axis_ends_soon_after_the_last_who_finishes(make_results):
     figure = draw_learning(*make_results())
     assert figure.axes[0].get_xlim() == (0, round(1.15 * 119))
-    assert figure.axes[1].get_xlabel() == "step\nphysics goes on to step 399"
+    assert figure.axes[3].get_xlabel() == "step\nphysics goes on to step 399"
 
 
 def test_the_axis_is_whole_if_nobody_finishes(make_results):
     figure = draw_learning(*make_results(["physics"]))
     assert figure.axes[0].get_xlim() == (0, 399)
-    assert figure.axes[1].get_xlabel() == "step"
+    assert figure.axes[3].get_xlabel() == "step"
 
 
 def test_each_method_shows_where_its_regime_starts_and_ends(make_results, artists):
@@ -291,18 +318,18 @@ def test_a_lone_method_has_its_stretch_shaded(make_results, artists, method, str
 
 def test_small_losses_have_a_linear_scale(make_results):
     missions, steps = make_results(["oracle"])
-    assert draw_learning(missions, steps).axes[1].get_yscale() == "linear"
+    assert draw_learning(missions, steps).axes[3].get_yscale() == "linear"
 
 
 def test_numbers_that_cannot_be_drawn_do_no_harm(make_results):
     missions, steps = make_results(["oracle"])
     error, loss = steps["error"].copy(), steps["loss"].copy()
     error[5:8], loss[9:11] = [0.0, np.nan, np.inf], [np.inf, -np.inf]
-    figure = draw_learning(missions, steps.assign(error=error, loss=loss))
+    figure = draw_learning(missions, steps.assign(miss=error, loss=loss))
     png_bytes(figure)
     assert figure.axes[0].get_ylim()[0] > 1e-7
     with warnings.catch_warnings(action="error"):
-        png_bytes(draw_learning(missions, steps.assign(error=0.0, loss=np.nan)))
+        png_bytes(draw_learning(missions, steps.assign(miss=0.0, loss=np.nan)))
 
 
 # Comparison
@@ -311,7 +338,7 @@ def test_numbers_that_cannot_be_drawn_do_no_harm(make_results):
 def test_means_and_intervals_of_each_method(make_results, artists):
     missions, _ = make_results(["physics", "oracle"], seeds=4)
     spread = missions.assign(success_rate=[0.2, 0.4, 0.2, 0.4, 1.0, 1.0, 1.0, 1.0])
-    success, steps = draw_comparison(spread).axes
+    success, steps = draw_comparison(spread, LAPS).axes
     means = [mark.get_xdata()[0] for mark in artists(success, "mean")]
     np.testing.assert_allclose(means, [30.0, 100.0])
     (interval,) = artists(success, "interval")  # none where all are alike
@@ -322,3 +349,18 @@ def test_means_and_intervals_of_each_method(make_results, artists):
     assert [len(dots.get_xdata()) for dots in artists(steps, "single")] == [4, 4]
     labels = [label.get_text() for label in success.get_yticklabels()]
     assert labels == ["physics (n = 4)", "oracle (n = 4)"]
+
+
+def test_more_methods_than_colours_are_drawn_in_one(make_results, artists):
+    missions, _ = make_results(["oracle"])
+    many = pd.concat([missions.assign(method=f"m{k}") for k in range(8)])
+    panels = draw_comparison(many, LAPS).axes
+    assert len({mark.get_color() for mark in artists(panels[0], "mean")}) == 1
+
+
+def test_axes_say_what_is_better_and_hold_negative_values(make_results):
+    missions, _ = make_results(seeds=2)
+    reward = Measures((Measure("reward", "return", "return"),))
+    (axes,) = draw_comparison(missions.assign(reward=-3.0 - missions["seed"]), reward).axes
+    assert axes.get_xlabel() == "return\nhigher is better"
+    assert axes.get_xlim()[0] < -4 and axes.get_xlim()[1] == 0

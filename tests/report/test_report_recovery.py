@@ -55,7 +55,7 @@ def test_missions_without_times_may_come_first():
     assert recovery_table(joined).numbers["median"].tolist() == [5]
 
 
-def test_motion_and_agent_are_judged_where_they_were_logged():
+def test_motion_and_agent_are_measured_where_they_were_logged():
     steps = mission((0, LOW, 50), (1, HIGH, 50)).assign(miss=LOW)
     found = recovery_times(steps).set_index("of")["time"].to_dict()
     assert found == {"motion": 0, "model": np.inf}

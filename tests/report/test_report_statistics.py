@@ -7,13 +7,25 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from afm_rl.report.absent import absent_lines, absent_table, find_absent
-from afm_rl.report.aggregate import aggregate, aggregate_table
-from afm_rl.report.bootstrap import bounds, interquartile_mean, resample, stratified_interval
-from afm_rl.report.cells import cell_table
-from afm_rl.report.improvement import probability_of_improvement
-from afm_rl.report.outcomes import add_outcomes, budget_notes, pair
-from afm_rl.report.pairs import compare, comparison_tables
+from afm_rl.measures import Measure, Measures
+from afm_rl.report import summarise
+from afm_rl.report.comparisons import (
+    aggregate,
+    cell_table,
+    compare,
+    comparison_tables,
+    pair,
+    rank_missions,
+    summary_table,
+)
+from afm_rl.report.missing_runs import find_missing, missing_lines, missing_table
+from afm_rl.report.statistics import (
+    interquartile_mean,
+    probability_of_improvement,
+    resampled_bounds,
+    stratified_interval,
+)
+from afm_rl.report.summary import budget_notes, count_budgets
 
 NOTHING = pd.DataFrame(columns=["seconds", "missions"])
 
@@ -36,7 +48,7 @@ def rows(method, cell, outcomes):
 
 
 @pytest.fixture
-def missions():
+def missions(laps):
     table = [
         *rows("ours", "a", [(1.0, 99), (1.0, 199)]),
         *rows("ours", "b", [(0.5, 499), (1.0, 399)]),
@@ -45,36 +57,43 @@ def missions():
         *rows("oracle", "a", [(1.0, 99), (1.0, 99)]),
         *rows("oracle", "b", [(1.0, 199), (0.5, 499)]),
     ]
-    return add_outcomes(pd.DataFrame(table))
+    return rank_missions(count_budgets(pd.DataFrame(table), laps), laps)
 
 
-def test_given_up_missions_cost_the_budget_of_their_cell():
+def test_given_up_missions_cost_the_budget_of_their_cell(laps):
     table = [*rows("a", "x", [(0.5, 50), (0.5, 80), (1.0, 30)]), *rows("a", "y", [(0.5, 60)])]
-    missions = add_outcomes(pd.DataFrame(table))
-    assert missions["cost"].tolist() == [80, 80, 30, 60]
-    (note,) = budget_notes(missions)
-    assert note.startswith("x: missions were given up after 50 to 80 steps")
+    missions = count_budgets(pd.DataFrame(table), laps)
+    assert missions["steps"].tolist() == [80, 80, 30, 60]
+    first, second = budget_notes(pd.DataFrame(table), laps)
+    assert first.startswith("3 of 4 missions did not finish within their budget and count as 60 ")
+    assert "do not compare with those of results under another budget" in first
+    assert second.startswith("x: missions were given up after 50 to 80 steps")
+    assert budget_notes(pd.DataFrame(rows("a", "x", [(1.0, 30)])), laps) == []
 
 
-def test_success_comes_first_and_fewer_steps_break_ties():
+def test_the_console_and_the_report_give_the_same_interval(missions, laps):
+    short, long = summarise(missions, laps), aggregate(missions, laps, NOTHING, "oracle")
+    for column in ("success_rate_low", "success_rate_high", "steps_low", "steps_high"):
+        pd.testing.assert_series_equal(short[column], long[column])
+    plain = scipy.stats.bootstrap(
+        (missions.loc[missions["method"] == "ours", "steps"].to_numpy(),),
+        np.mean,
+        method="percentile",
+        rng=0,
+    )
+    low, high = plain.confidence_interval  # what differs between cells would count as spread
+    assert high - low > 1.2 * (short.loc[0, "steps_high"] - short.loc[0, "steps_low"])
+
+
+def test_success_comes_first_and_fewer_steps_break_ties(laps):
     table = rows("a", "x", [(0.5, 90), (1.0, 80), (1.0, 30), (0.25, 90), (1.0, 80)])
-    assert add_outcomes(pd.DataFrame(table))["score"].tolist() == [1, 2, 3, 0, 2]
+    assert rank_missions(pd.DataFrame(table), laps)["rank"].tolist() == [1, 2, 3, 0, 2]
 
 
-def test_pairs_share_cell_and_seed(missions):
+def test_pairs_share_cell_and_seed(missions, laps):
     pairs = pair(missions, "ours", "base")
     assert pairs[["cell", "seed"]].to_numpy().tolist() == [["a", 0], ["a", 1], ["b", 0]]
-    assert (pairs["cost"] - pairs["cost_other"]).tolist() == [-100, -300, 0]
-
-
-def test_draws_stay_within_their_stratum():
-    strata = np.array(["b", "a", "b", "c", "a", "b"])
-    drawn = resample(strata)
-    assert (strata[drawn] == strata).all()
-    for place in range(len(strata)):
-        alike = np.flatnonzero(strata == strata[place])
-        often = np.bincount(drawn[:, place], minlength=6)[alike] / len(drawn)
-        np.testing.assert_allclose(often, 1 / len(alike), atol=0.05)
+    assert (pairs["steps"] - pairs["steps_other"]).tolist() == [-100, -300, 0]
 
 
 def test_one_stratum_is_the_plain_bootstrap():
@@ -101,7 +120,16 @@ def test_intervals_hold_the_mean_as_often_as_they_say():
 def test_no_draw_that_differs_no_interval():
     for values, strata in (([1.0, 2.0], ["a", "b"]), ([3.0, 3.0], ["a", "a"]), ([], [])):
         assert all(map(math.isnan, stratified_interval(values, strata)))
-    assert bounds(np.arange(101.0)) == pytest.approx((2.5, 97.5))
+
+
+def test_bounds_of_a_curve_are_those_of_each_of_its_points():
+    rng = np.random.default_rng(4)
+    samples = [rng.normal(size=(size, 3)) for size in (5, 1, 8)]
+    found = resampled_bounds(samples, lambda parts: np.concatenate(parts, -1).mean(-1))
+    strata = np.repeat([0, 1, 2], [5, 1, 8])
+    points = [stratified_interval(column, strata) for column in np.concatenate(samples).T]
+    assert found.shape == (2, 3)
+    np.testing.assert_allclose(found.T, points, atol=0.06)
 
 
 def test_the_interquartile_mean_cuts_a_quarter_on_each_side():
@@ -113,12 +141,12 @@ def test_the_interquartile_mean_cuts_a_quarter_on_each_side():
 def test_improvement_is_mann_whitney_s_u_in_each_cell():
     rng = np.random.default_rng(1)
     frames = [
-        pd.DataFrame({"cell": rng.choice(["a", "b"], 30), "score": rng.integers(0, 6, 30)})
+        pd.DataFrame({"cell": rng.choice(["a", "b"], 30), "rank": rng.integers(0, 6, 30)})
         for _ in range(2)
     ]
     expected = []
     for cell in "ab":
-        x, y = (frame.loc[frame["cell"] == cell, "score"] for frame in frames)
+        x, y = (frame.loc[frame["cell"] == cell, "rank"] for frame in frames)
         expected.append(scipy.stats.mannwhitneyu(x, y).statistic / (len(x) * len(y)))
     found, (low, high) = probability_of_improvement(*frames)
     assert found == pytest.approx(np.mean(expected))
@@ -130,7 +158,7 @@ def test_improvement_is_mann_whitney_s_u_in_each_cell():
 def test_improvement_s_interval_is_that_of_draws_one_by_one():
     rng = np.random.default_rng(2)
     x, y = rng.normal(0.5, 1, 10).round(1), rng.normal(0, 1, 8).round(1)
-    mine, other = (pd.DataFrame({"cell": "a", "score": values}) for values in (x, y))
+    mine, other = (pd.DataFrame({"cell": "a", "rank": values}) for values in (x, y))
     drawn = []
     for _ in range(4000):
         pairs = rng.choice(x, len(x))[:, None] - rng.choice(y, len(y))
@@ -140,18 +168,18 @@ def test_improvement_s_interval_is_that_of_draws_one_by_one():
 
 
 def test_nothing_shared_no_probability():
-    frames = [pd.DataFrame({"cell": [cell], "score": [0]}) for cell in "ab"]
+    frames = [pd.DataFrame({"cell": [cell], "rank": [0]}) for cell in "ab"]
     found, interval = probability_of_improvement(*frames)
     assert all(map(math.isnan, (found, *interval)))
 
 
-def test_aggregates_are_those_found_by_hand(missions):
-    means = aggregate(missions, NOTHING, "oracle").set_index("method")
+def test_aggregates_are_those_found_by_hand(missions, laps):
+    means = aggregate(missions, laps, NOTHING, "oracle").set_index("method")
     ours = means.loc["ours"]
     assert (ours["missions"], ours["cells"], ours["finished"]) == (4, 2, 0.75)
-    assert ours["success"] == 0.875
+    assert ours["success_rate"] == 0.875
     assert ours["steps"] == (99 + 199 + 499 + 399) / 4
-    assert ours["success_iqm"] == 1.0
+    assert ours["success_rate_iqm"] == 1.0
     assert ours["steps_iqm"] == (199 + 399) / 2
     assert ours["per_hour"] == 360
     assert ours["ratio_pairs"] == 3 and ours["ratio_all_pairs"] == 4
@@ -160,91 +188,103 @@ def test_aggregates_are_those_found_by_hand(missions):
     assert means.loc["base", "ratio_all_pairs"] == 3
     assert means.loc["oracle", "ratio"] == 1.0
     # Two seeds in each cell: the four means of success are 0.75, 0.875 and 1.
-    assert (ours["success_low"], ours["success_high"]) == (0.75, 1.0)
+    assert (ours["success_rate_low"], ours["success_rate_high"]) == (0.75, 1.0)
 
 
-def test_the_table_of_aggregates_is_bold_for_the_best_but_the_oracle(missions):
+def test_the_table_of_aggregates_is_bold_for_the_best_but_the_oracle(missions, laps):
     last = pd.DataFrame(rows("base", "b", [(0.5, 499)])).assign(seed=1)
     spared = pd.DataFrame(rows("spared", "a", [(1.0, 9)]))
-    whole = add_outcomes(pd.concat([missions, last, spared], ignore_index=True))
-    means = aggregate(whole, NOTHING, "oracle")
-    table = aggregate_table(means, "oracle")
+    whole = count_budgets(pd.concat([missions, last, spared], ignore_index=True), laps)
+    means = aggregate(whole, laps, NOTHING, "oracle")
+    table = summary_table(means, laps, "oracle")
     assert table.shown["method"].tolist() == ["ours", "base", "oracle", "spared"]
-    assert table.shown.loc[0, "success %"] == "87.5 [75.0, 100.0]"
+    assert table.shown.loc[0, "success (%)"] == "87.5 [75.0, 100.0]"
     assert "(n = 3)" in table.shown.loc[0, "steps / oracle, where it finished"]
     assert {row for row, _ in table.bold} == {0}
     assert {column for _, column in table.bold} == {2, 3, 4, 5, 6, 7, 8}
 
 
-def test_no_oracle_no_ratio(missions):
-    table = aggregate_table(aggregate(missions, NOTHING, "nobody"), "nobody")
-    assert table.shown["steps / nobody, all"].tolist() == ["-"] * 3
+def test_no_oracle_no_ratio(missions, laps):
+    table = summary_table(aggregate(missions, laps, NOTHING, "nobody"), laps, "nobody")
+    assert not any("nobody" in head for head in table.shown)
 
 
-def test_speed_comes_from_the_study_or_from_the_missions(missions):
+def test_speed_comes_from_the_study_or_from_the_missions(missions, laps):
     study = pd.DataFrame({"seconds": [36.0], "missions": [4]}, index=["ours"])
-    means = aggregate(missions, study, "oracle").set_index("method")
+    means = aggregate(missions, laps, study, "oracle").set_index("method")
     assert means["per_hour"].to_dict() == {"ours": 400.0, "base": 360.0, "oracle": 360.0}
-    timeless = aggregate(missions.drop(columns="seconds"), NOTHING, "oracle")
+    timeless = aggregate(missions.drop(columns="seconds"), laps, NOTHING, "oracle")
     assert timeless["per_hour"].isna().all()
 
 
-def test_differences_are_paired(missions):
-    numbers = compare(missions, ["base", "nobody"])
+def test_differences_are_paired(missions, laps):
+    numbers = compare(missions, laps, ["base", "nobody"])
     assert numbers["method"].tolist() == ["ours", "oracle"]
     ours = numbers.iloc[0]
     assert ours["pairs"] == 3
-    assert ours["success"] == pytest.approx(0.5 / 3)
+    assert ours["success_rate"] == pytest.approx(0.5 / 3)
     assert ours["steps"] == pytest.approx(-400 / 3)
     # Cell a: 99 beats both, 199 ties once and wins once. Cell b: 0.5 ties, 1.0 wins.
     assert ours["better"] == pytest.approx((3.5 / 4 + 1.5 / 2) / 2)
-    (table,) = comparison_tables(numbers)
+    (table,) = comparison_tables(numbers, laps)
     assert table.name == "against_base"
     assert table.shown.loc[0, "n pairs"] == "3"
     assert table.shown.loc[0, "steps"].startswith("-133 [-")
     assert (0, 3) in table.bold  # the interval of steps lies below 0
 
 
-def test_methods_that_share_no_cell_are_not_compared(missions):
+def test_methods_that_share_no_cell_are_not_compared(missions, laps):
     apart = missions[(missions["method"] == "ours") ^ (missions["cell"] == "b")]
     apart = apart[(apart["method"] != "ours") | (apart["cell"] == "a")]
-    assert compare(apart, ["base"])["method"].tolist() == ["oracle"]
-    assert comparison_tables(compare(missions, [])) == []
+    assert compare(apart, laps, ["base"])["method"].tolist() == ["oracle"]
+    assert comparison_tables(compare(missions, laps, []), laps) == []
 
 
-def test_a_cell_shared_without_a_seed_has_no_pairs(missions):
+def test_a_cell_shared_without_a_seed_has_no_pairs(missions, laps):
     apart = missions[missions["method"] != "oracle"]
     apart = apart.assign(seed=apart["seed"].where(apart["method"] == "ours", 7))
-    (table,) = comparison_tables(compare(apart.drop_duplicates(["method", "cell"]), ["base"]))
+    (table,) = comparison_tables(
+        compare(apart.drop_duplicates(["method", "cell"]), laps, ["base"]), laps
+    )
     assert table.shown.iloc[0, 1:4].tolist() == ["0", "-", "-"]
     assert table.shown.loc[0, "P(better)"] == "0.75"
 
 
-def test_cells_times_methods(missions):
-    table = cell_table(missions)
+def test_cells_times_methods(missions, laps):
+    table = cell_table(missions, laps)
     assert table.shown.to_numpy().tolist() == [
         ["a", "100 / 149", "75 / 349", "100 / 99"],
         ["b", "75 / 449", "50 / 499", "75 / 349"],
     ]
     assert table.bold == {(0, 3), (1, 3)}
-    alone = cell_table(missions[(missions["method"] != "base") | (missions["cell"] == "a")])
+    alone = cell_table(missions[(missions["method"] != "base") | (missions["cell"] == "a")], laps)
     assert alone.shown.loc[1, "base"] == "-"
 
 
-def test_what_is_missing_is_counted(missions):
-    asked = pd.DataFrame({"method": ["online"], "cell": ["a"], "seed": [5]})
-    absent = find_absent(missions, asked)
-    assert len(absent) == 1 + 4 + 4  # base: b, seed 1; seed 5 of all four; all of online's
-    lines = absent_lines(absent, ["ours", "base", "oracle"], cells=2)
-    assert "missing: base: 2 missions in all 2 cells" in lines
-    assert "missing: ours: 1 mission in a" in lines
-    assert "missing: online (it has none): 5 missions in all 2 cells" in lines
-    table = absent_table(absent, cells=2)
-    assert table.numbers is absent
+def test_what_is_missing_is_counted(missions, laps):
+    plan = pd.DataFrame({"method": ["online"], "cell": ["a"], "seed": [5]})
+    missing = find_missing(missions, plan)
+    assert len(missing) == 1 + 4 + 4  # base: b, seed 1; seed 5 of all four; all of online's
+    table = missing_table(missing, cells=2)
+    lines = missing_lines(table)
+    assert "missing: ours: 1 missions, seeds 5, cells a" in lines
+    assert len(lines) == len(table.shown)
+    assert table.numbers is missing
     assert table.shown["missions"].astype(int).sum() == 9
 
 
 def test_many_missing_cells_are_not_all_named():
-    absent = pd.DataFrame({"method": "a", "cell": list("abcde"), "seed": 0})
-    (line,) = absent_lines(absent, ["a"], cells=9)
-    assert line == "missing: a: 5 missions in a; b; c and 2 more"
+    missing = pd.DataFrame({"method": "a", "cell": list("abcde"), "seed": 0})
+    (line,) = missing_lines(missing_table(missing.assign(cell="a long name " + missing["cell"]), 9))
+    assert line.endswith("[...]") and len(line) < 120
+
+
+def test_missions_without_a_value_are_left_out_of_its_mean():
+    late = Measures((Measure("recovery", "recovery", "recovery", "steps", "lower"),))
+    values = {"recovery": [3.0, np.nan, 5.0], "finished": True, "cell": "a", "seed": [0, 1, 2]}
+    missions = pd.DataFrame({"method": "x", "track": "a"} | values)
+    (row,) = aggregate(missions, late, NOTHING, "x").to_dict("records")
+    assert row["recovery"] == 4.0 and row["recovery_low"] == 3.0
+    empty = missions.assign(recovery=np.nan)
+    table = summary_table(aggregate(empty, late, NOTHING, "x"), late, "x")
+    assert table.shown["recovery (steps)"].tolist() == ["-"]

@@ -8,20 +8,10 @@ import pandas as pd
 import pytest
 
 from afm_rl.errors import ConfigurationError
+from afm_rl.manifest import write_manifest
+from afm_rl.measures import Measure, Measures
 from afm_rl.report import write_report, write_run
 from afm_rl.report.table import Table, best_places
-
-QUIET = {"figures": False, "tensorboard": False, "echo": lambda line: None}
-
-
-@pytest.fixture
-def run_folder(tmp_path, make_results):
-    def write(name="run", change=lambda missions: missions, **chosen):
-        missions, steps = make_results(**chosen)
-        write_run(tmp_path / name, change(missions), steps, **QUIET)
-        return tmp_path / name
-
-    return write
 
 
 @pytest.fixture
@@ -74,12 +64,12 @@ class Page(HTMLParser):
 def test_everything_is_written(run_folder, report):
     folder, said = report(run_folder(seeds=2, v_gains=[-1.0, 2.0]))
     tables = ["aggregate", "against_physics", "recovery", "cells"]
-    figures = ["aggregate", "profile", "progress", "error_ring", "loss_ring", "heat_ring"]
+    figures = ["summary", "learning_ring", "profile", "progress", "heat_ring"]
     assert files(folder) == {
         "index.html",
         "missing.csv",
         *(f"tables/{name}.{kind}" for name in tables for kind in ("csv", "tex")),
-        *(f"figures/{name}.png" for name in [*figures, "feasible"]),
+        *(f"figures/{name}.png" for name in figures),
     }
     assert said[0].startswith("12 missions of 3 methods in 2 cells")
     assert said[-1] == f"Report: {folder / 'index.html'}"
@@ -161,7 +151,7 @@ def test_what_is_missing_is_said_three_times(run_folder, report):
         run_folder("b", methods=["oracle"], v_gains=[2.0]),
         baselines=["physics", "online_pe"],
     )
-    assert "missing: physics: 1 mission in ring, v_gain = 2" in said
+    assert "missing: physics: 1 missions, seeds 0, cells ring, v_gain = 2" in said
     assert "There are no missions of online_pe: comparisons with it are left out." in said
     expected = [["physics", "ring, v_gain = 2", 0]]
     assert pd.read_csv(folder / "missing.csv").to_numpy().tolist() == expected
@@ -170,30 +160,91 @@ def test_what_is_missing_is_said_three_times(run_folder, report):
     assert "ring, v_gain = 2" in page.texts
 
 
-def test_the_paper_s_tables_come_with_its_regimes(run_folder, report):
-    folder, _ = report(run_folder(tracks=["ethz_1"], methods=["physics"]), figures=False)
-    table = pd.read_csv(folder / "tables" / "paper_ethz_1_success.csv")
-    mine = table[table["missions"] > 0]
-    assert mine[["method", "v_gain", "omega_gain"]].to_numpy().tolist() == [["physics", -1.0, 1.0]]
-    assert mine["ours_mean"].item() == 0.25 and mine["published_mean"].item() == 0.18
-    assert "tables/paper_ethz_2_steps.csv" not in files(folder)
-
-
 def test_results_without_steps_make_tables_and_bars(run_folder, report):
     source = run_folder(seeds=2)
     (source / "steps.parquet").unlink()
+    write_manifest(source)
     folder, said = report(source)
     assert any("6 of 6 missions have no steps.parquet" in line for line in said)
     written = files(folder)
     assert "tables/recovery.csv" not in written
-    assert {"figures/aggregate.png", "figures/profile.png", "figures/feasible.png"} <= written
-    assert len([name for name in written if name.endswith(".png")]) == 3
+    pictures = {name for name in written if name.endswith(".png")}
+    assert pictures == {"figures/summary.png", "figures/profile.png"}
 
 
-def test_robots_of_another_kind_have_no_picture_of_theirs(run_folder, report):
-    source = run_folder(change=lambda missions: missions.rename(columns={"v_gain": "mass"}))
-    folder, _ = report(source)
-    assert "figures/feasible.png" not in files(folder)
+@pytest.fixture
+def rewards():
+    """Measures of a third kind of robot, which has no positions either."""
+    return Measures(
+        (
+            Measure("return", "return", "return", digits=1, headline=True),
+            Measure("after", "after", "reward per step after the change", digits=3),
+            Measure("recovery_steps", "recovery", "steps to recover", better="lower"),
+        )
+    )
+
+
+def test_a_third_kind_of_robot_needs_no_change(tmp_path, make_results, rewards, report):
+    missions, steps = make_results(seeds=2)
+    new = {"return": -10.0 * missions["steps"], "after": 0.5, "recovery_steps": [3, 4, 5, 9, 9, 9]}
+    missions = missions.drop(columns=["success_rate", "reached", "targets"]).assign(**new)
+    steps = steps.drop(columns=["x", "y", "theta", "goal_x", "goal_y", "reached"])
+    write_run(tmp_path / "run", missions, steps, rewards, echo=lambda line: None)
+    write_manifest(tmp_path / "run")
+    drawn = {path.name for path in (tmp_path / "run" / "figures").iterdir()}
+    assert drawn == {"learning.png", "summary.png"}
+    folder, _ = report(tmp_path / "run")
+    assert {name for name in files(folder) if name.endswith(".png")} == {
+        "figures/summary.png",
+        "figures/learning_ring.png",
+    }
+    means = pd.read_csv(folder / "tables" / "aggregate.csv").set_index("method")
+    assert means.loc["oracle", "return"] == -995.0 and means.loc["physics", "recovery_steps"] == 3.5
+    page = Page((folder / "index.html").read_text())
+    assert "return" in page.texts and not {"steps", "success (%)"} & set(page.texts)
+
+
+def test_kinds_of_missions_do_not_mix(run_folder, make_results, report, rewards, tmp_path):
+    missions, steps = make_results(["oracle"])
+    missions = missions.assign(**{"return": 1.0, "after": 1.0, "recovery_steps": 1})
+    write_run(tmp_path / "other", missions, steps, rewards, echo=lambda line: None, figures=False)
+    write_manifest(tmp_path / "other")
+    with pytest.raises(ConfigurationError, match="hold missions of different kinds"):
+        report(run_folder(), tmp_path / "other")
+
+
+def test_figures_come_first(run_folder, report):
+    folder, _ = report(run_folder(seeds=2))
+    found = Page((folder / "index.html").read_text()).found
+    names = [attrs["id"] for _, attrs in found if "id" in attrs]
+    assert [name.split("-")[0] for name in names] == ["figure"] * 5 + ["table"] * 4
+
+
+def test_budgets_are_said(run_folder, report):
+    folder, said = report(run_folder(), figures=False)
+    (line,) = (line for line in said if "did not finish" in line)
+    assert line.startswith("1 of 3 missions did not finish within their budget and count as 399")
+    assert line in Page((folder / "index.html").read_text()).texts
+
+
+def test_many_methods_fill_several_figures(run_folder, make_results, report):
+    def many(missions):
+        return missions.assign(method=[f"m{k}" for k in range(len(missions))])
+
+    folder, _ = report(run_folder(change=many, methods=["oracle"] * 7))
+    names = {name for name in files(folder) if name.endswith(".png")}
+    for name in ("learning_ring", "profile", "progress", "heat_ring"):
+        assert {f"figures/{name}_1.png", f"figures/{name}_2.png"} <= names
+
+
+def test_names_that_are_formulas_stay_texts(run_folder, report):
+    strange = "=cmd|' /C calc'!A0"
+    source = run_folder(change=lambda missions: missions.replace("physics", strange), seeds=2)
+    folder, _ = report(source, baselines=[strange], figures=False)
+    for path in folder.rglob("*.csv"):
+        for line in path.read_text().splitlines():
+            assert not line.startswith(("=", '"=')) and ",=" not in line and ',"=' not in line
+    assert strange in Page((folder / "index.html").read_text()).texts
 
 
 @pytest.mark.parametrize("load", [None, "own"])
@@ -219,7 +270,7 @@ def test_a_folder_that_cannot_be_written(run_folder, tmp_path):
 
 def test_the_best_is_not_marked_where_all_are_alike():
     values = pd.DataFrame({"a": [1.0, 1.0], "b": [2.0, 1.0]}, index=[7, 7])
-    assert best_places(values, {"a": "max", "b": "min"}, {"a": 1, "b": 2}) == {(1, 2)}
+    assert best_places(values, {"a": 1, "b": -1}) == {(1, 3)}
 
 
 def test_signs_become_commands():

@@ -19,8 +19,8 @@ from afm_rl.artefacts import write_whole
 from afm_rl.cli.launchers.job import Job
 from afm_rl.cli.overrides import PARTS
 from afm_rl.missions.settings import influential
-from afm_rl.report.sweep import ASKED
 
+ASKED = "job.yaml"
 ELSEWHERE = ("hydra.mode=", "hydra.run", "hydra.sweep", "hydra.launcher", "hydra/")
 """Overrides of Hydra's own that are of the sweep, not of its jobs."""
 

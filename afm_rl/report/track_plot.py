@@ -1,13 +1,15 @@
-"""Tracks as figures show them."""
+"""Tracks as maps show them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
+
+from afm_rl.errors import ConfigurationError
 
 ROAD, WAYPOINT = "#e4e4e4", "#9a9a9a"
 MARGIN, STRAY = 0.04, 0.15  # of the road's extent: always shown around it; shown of who strays
@@ -41,6 +43,20 @@ class DrawableTrack(Protocol):
     @property
     def width(self) -> float:
         """Width of the road."""
+
+
+LoadTrack = Callable[[str], DrawableTrack]
+
+
+def load_tracks(names: Iterable[str], load_track: LoadTrack | None) -> list[DrawableTrack]:
+    """Return the tracks that can be loaded; a map without its road is a map."""
+    tracks = []
+    for name in names if load_track else ():
+        try:
+            tracks.append(load_track(str(name)))  # type: ignore[misc]
+        except ConfigurationError:
+            continue
+    return tracks
 
 
 def resample(points: np.ndarray, spacing: float) -> np.ndarray:
