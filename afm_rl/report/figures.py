@@ -151,7 +151,7 @@ def draw_all(
             rows = own[own["method"].isin(methods)]
             figure = learning.draw_learning(rows, traces, measures.error_unit)
             yield *page, learning.CAPTION, figure
-    if spent := measures.budget:
+    if (spent := measures.budget) and missions["finished"].any():
         ratio, caption = shares.ratios(missions, spent), shares.PROFILE_CAPTION
         for page, methods in _pages("profile", "Performance profile", missions):
             figure = shares.draw_profile(missions, ratio, spent, style.method_styles(methods))

@@ -16,10 +16,10 @@ def summarise(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
     """Return one row per method, in the order in which they first occur.
 
     Columns: ``method``; ``missions`` and ``cells``, how many; the mean of each measure under the
-    name of its column, with ``_low`` and ``_high``; ``finished``, a share; ``faults`` and ``seconds``,
-    in all, if they are known. The bounds are 95 % intervals of the stratified bootstrap, seeds drawn anew
-    within cells; they are NaN where no cell has two missions, or where all are alike. Missions
-    without a value (NaN) are left out of its mean.
+    name of its column, with ``_low`` and ``_high``; ``finished``, a share; ``faults`` and
+    ``seconds``, in all, if they are known. The bounds are 95 % intervals of the stratified
+    bootstrap, seeds drawn anew within cells; they are NaN where no cell has two missions, or where
+    all are alike. Missions without a value (NaN) are left out of its mean.
 
     Args:
         missions: one row per mission.
