@@ -138,7 +138,8 @@ def test_a_trainer_descends_the_flow_matching_loss():
     network = AxisNetwork(width=16, latent=8)
     before = weights(network)
     drawn = draw_examples(8, 2, 6, 4, "mixed", torch.Generator().manual_seed(0))
-    batch = TensorDict({**drawn.rows._asdict(), **drawn._asdict()}, [8]).exclude("rows")
+    names = [*drawn.rows._fields, *drawn._fields[1:]]
+    batch = TensorDict(dict(zip(names, [*drawn.rows, *drawn[1:]], strict=True)), [8])
     trainer = trainer_of(CFMLoss(network), _Examples(batch))
     trainer.train()
     assert not torch.equal(weights(network), before)

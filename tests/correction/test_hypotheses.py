@@ -148,10 +148,9 @@ def test_the_hypothesis_that_a_delay_needs_is_believed(line, drive, plans, delay
     memory, model, box = flow.begin(torch.zeros(3, 2)), line(2), torch.ones(3, 2, 2)
     box[:, 0] = -1.0
     sent, state = [], torch.zeros(3, 2)
-    for plan in plans(40, 3, 2, size=1.0):
+    for plan in plans(40, 3, 2):
         memory, found = flow.correct(memory, plan, model, box)
-        sent.append(plan)  # others act: the choice alone is looked at
-        memory = flow.executing(memory, plan, plan)
+        sent.append(found.executed)
         state = model(state, -late(delay)(sent))
         memory = flow.observe(memory, state)
     losses = flow.unpack(memory, 2)["losses"] + flow.penalty

@@ -33,7 +33,9 @@ def drawn():
 
 @pytest.fixture
 def examples(drawn):
-    return TensorDict({**drawn.rows._asdict(), **drawn._asdict()}, [32]).exclude("rows")
+    rows, *answers = drawn
+    names = [*rows._fields, *drawn._fields[1:]]
+    return TensorDict(dict(zip(names, [*rows, *answers], strict=True)), [32])
 
 
 class Exact(AxisNetwork):
