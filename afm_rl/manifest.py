@@ -20,7 +20,7 @@ MANIFEST = "manifest.json"
 
 
 def write_manifest(folder: str | Path, names: Iterable[str | Path] | None = None) -> None:
-    """Write the checksums of the files of a folder to its ``manifest.json``.
+    r"""Write the checksums of the files of a folder to its ``manifest.json``.
 
     Args:
         folder: where the files are.
@@ -32,7 +32,7 @@ def write_manifest(folder: str | Path, names: Iterable[str | Path] | None = None
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = Path(folder, "missions.csv").write_text("mission,steps\\n")
+    ...     _ = Path(folder, "missions.csv").write_text("mission,steps\n")
     ...     write_manifest(folder)
     ...     sorted(check_manifest(folder))
     ['missions.csv']

@@ -27,7 +27,6 @@ ALIGNED = 5.0  # innovation, in standard deviations, up to which a model counts 
 STILL = 0.1  # innovation up to which a repeated reading shows a robot at rest, as foreseen
 
 
-
 @dataclass
 class Results:
     """What a batch of missions gives."""
