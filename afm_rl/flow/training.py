@@ -108,9 +108,11 @@ class CFMLoss(InPlaceLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_cfm`` for examples ``(*B)``."""
         parts = [tensordict.get(key) for key in self.in_keys]
+        batch = parts[0].shape[:-2]
+        parts = [part.reshape(-1, *part.shape[-2:]) for part in parts]
         drawn = Drawn(Rows(*parts[:4]), *parts[4:])
         velocity, effect = flow_losses(self.network, drawn, self.saturation, self._generator)
-        return self._reduced(velocity + EFFECT_WEIGHT * effect, tensordict)
+        return self._reduced((velocity + EFFECT_WEIGHT * effect).view(batch), tensordict)
 
 
 class Trainable(Protocol):
