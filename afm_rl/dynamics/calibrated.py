@@ -38,6 +38,7 @@ class Calibrated(DynamicsModel):
     tensor([-0.2000,  0.0000,  0.0000])
     """
 
+    conditioned_on = "calibration"
     half_range: Tensor
     matrix: Tensor
     bias: Tensor

@@ -102,8 +102,8 @@ class Ensemble(DynamicsModel):
             raise ConfigurationError(
                 f"dynamics.features={self.features}: expected indices in 0..{manifold.size - 1}"
             )
-        self.members = check_count("dynamics.members", members)
-        self.hidden = check_counts("dynamics.hidden", hidden)
+        self.members = check_count("dynamics.members", members, high=1000)
+        self.hidden = check_counts("dynamics.hidden", hidden, high=10_000, least=1)
         if len(log_variance) != 2 or not log_variance[0] < log_variance[1]:
             raise ConfigurationError(f"dynamics.log_variance={log_variance}: expected low < high")
         low, high = log_variance

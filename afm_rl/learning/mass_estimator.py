@@ -72,6 +72,8 @@ class MassEstimator(Updater):
             [1.5000]])
     """
 
+    sets = "regime"
+
     def __init__(
         self,
         loss: GaussianNLLLoss,

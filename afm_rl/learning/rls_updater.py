@@ -74,7 +74,7 @@ class RLSUpdater(Updater):
             [ 0.0000,  0.5000]])
     """
 
-    learns = True
+    learns, sets = True, "calibration"
     missions: Tensor
 
     def __init__(

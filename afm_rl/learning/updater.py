@@ -39,6 +39,9 @@ class Updater(nn.Module):
     learns = False
     """Do missions need parameters of their own?"""
 
+    sets: str | None = None
+    """What it sets in models that are conditioned on it: ``regime``, ``calibration``, or None."""
+
     def __init__(self, loss: GaussianNLLLoss) -> None:
         super().__init__()
         check_instance("updater.loss", loss, GaussianNLLLoss).reduction = "none"
@@ -148,6 +151,8 @@ class OracleUpdater(Updater):
         loss: a loss over an :class:`~afm_rl.dynamics.Oracle`.
         regime_key: where the environment publishes the regime's parameters.
     """
+
+    sets = "regime"
 
     def __init__(self, loss: GaussianNLLLoss, regime_key: NestedKey = "regime") -> None:
         super().__init__(loss)

@@ -189,7 +189,7 @@ def _palette(picture: np.ndarray) -> Image.Image:
     common = values[np.argsort(-counts, kind="stable"), None] // [65536, 256, 1] % 256
     _, first = np.unique(common // 8, axis=0, return_index=True)
     palette = Image.new("P", (1, 1))
-    palette.putpalette(common[np.sort(first)[:COLOURS]].ravel().tolist())
+    palette.putpalette([int(value) for value in common[np.sort(first)[:COLOURS]].ravel()])
     return palette
 
 

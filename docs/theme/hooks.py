@@ -1,5 +1,6 @@
 """What the site needs beyond its pages: copies, notebooks, a picture of the imports, formulas."""
 
+import ast
 import html
 import re
 from pathlib import Path
@@ -13,6 +14,27 @@ from nbconvert import MarkdownExporter
 ROOT = Path(__file__).resolve().parents[2]
 LINK = re.compile(r"(?<!!)\[([^]]+)\]\(([^):]+)\)")
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+# The parts of the API page: packages with an __all__, and names of single modules.
+API = {
+    "Transforms and policies": "transforms",
+    "Correction": "correction",
+    "The flow": "flow",
+    "Planning": "planning",
+    "Dynamics": "dynamics",
+    "Learning": "learning",
+    "Regimes": "regimes",
+    "Environments": "envs",
+    "Missions": "missions",
+    "Reports": "report",
+    "Foundations": [
+        "manifold.Manifold",
+        "streams.Streams",
+        "artefacts.save_artefact",
+        "artefacts.load_artefact",
+        "manifest.write_manifest",
+        "manifest.check_manifest",
+    ],
+}
 # Pages of the site that are kept elsewhere, because people look for them there.
 COPIES = {
     "README.md": "index.md",
@@ -40,8 +62,22 @@ def with_site_links(text):
     return LINK.sub(link, text).replace("](docs/", "](")
 
 
+def api_page():
+    """Return the page that lists every public part."""
+    parts = ["# API", "Every public part, by package."]
+    for title, names in API.items():
+        if isinstance(names, str):
+            package = names
+            path = ROOT / ("" if package == "envs" else "afm_rl") / package / "__init__.py"
+            public = re.search(r"__all__ = (\[.*?\])", path.read_text(encoding="utf-8"), re.DOTALL)
+            names = [f"{package}.{name}" for name in sorted(ast.literal_eval(public[1]))]
+        parts += [f"## {title}", *(f"::: afm_rl.{name}" for name in names)]
+    return "\n\n".join(parts) + "\n"
+
+
 def on_files(files, config):
-    """Add the pages that are kept outside of docs/."""
+    """Add the pages that are made, or kept outside of docs/."""
+    files.append(File.generated(config, "api.md", content=api_page()))
     for path, uri in COPIES.items():
         text = with_site_links((ROOT / path).read_text(encoding="utf-8"))
         files.append(File.generated(config, uri, content=text))
@@ -59,7 +95,8 @@ def on_page_content(content, page, **kwargs):
 
     def render(found):
         kind, formula = found[1], html.unescape(found[2])
-        result = convert(formula, display="block" if kind == "div" else "inline")
+        known = formula.replace(r"\arg\min", r"\operatorname{argmin}")  # the converter lacks it
+        result = convert(known, display="block" if kind == "div" else "inline")
         if re.search(r"<m[ion]>(&|\\\w+)<", result):
             raise PluginError(f"{page.file.src_uri}: a formula that is not understood: {formula}")
         return result

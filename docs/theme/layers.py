@@ -14,16 +14,18 @@ ROOT = Path(__file__).resolve().parents[2]
 # from the floors below its own. The foundations are the modules of afm_rl that are in no folder.
 FLOORS = [
     {"cli": 2},
+    {"jobs": 2},
     {"missions": 2, "report": 4},
     {"envs": 0, "transforms": 2},
-    {"flow": 1, "planning": 3},
-    {"learning": 1},
+    {"correction": 2, "planning": 3},
+    {"flow": 2},
+    {"learning": 2},
     {"dynamics": 2},
     {"regimes": 2},
     {"foundations": 2},
 ]
 
-WIDTH, HEIGHT, STEP = 150, 40, 78
+WIDTH, HEIGHT, STEP, GAP, TRUNK = 112, 34, 66, 20, 320
 STYLE = (
     "<style>rect{fill:#e8eaf6;stroke:#3f51b5}.arrow{fill:none;stroke:#607d8b;stroke-width:1.4}"
     "text{font:15px sans-serif;text-anchor:middle;fill:#1a237e}</style>"
@@ -79,7 +81,7 @@ def essential(pairs: set) -> set:
 def draw() -> str:
     """Return the picture, as SVG."""
     places = {
-        name: (80 + 120 * column, 30 + STEP * floor)
+        name: (TRUNK + 120 * (column - 2), 30 + STEP * floor)
         for floor, rooms in enumerate(FLOORS)
         for name, column in rooms.items()
     }
@@ -87,8 +89,11 @@ def draw() -> str:
     for source, target in sorted(essential(set(imports()))):
         (x, y), (to_x, to_y) = places[source], places[target]
         start, end = y + HEIGHT / 2, to_y - HEIGHT / 2 - 4
-        middle = (start + end) / 2
-        curve = f"M{x},{start} C{x},{middle} {to_x},{middle} {to_x},{end}"
+        if to_x == TRUNK:  # down first, then sideways; and the other way round
+            curve = f"L{x},{end - GAP} C{x},{end} {to_x},{end - GAP} {to_x},{end}"
+        else:
+            curve = f"C{x},{start + GAP} {to_x},{start} {to_x},{start + GAP} L{to_x},{end}"
+        curve = f"M{x},{start} {curve}"
         shapes.append(f'<path d="{curve}" class="arrow" marker-end="url(#head)"/>')
     for name, (x, y) in places.items():
         box = f'x="{x - WIDTH / 2}" y="{y - HEIGHT / 2}" width="{WIDTH}" height="{HEIGHT}"'

@@ -2,9 +2,8 @@
 
     python examples/transform/your_env.py
 
-A cart on a line from gymnasium (MountainCarContinuous) whose motor is reversed half-way. Its
-nominal dynamics are written down in three lines; everything else is the library, and nothing is
-trained.
+A cart on a hill from gymnasium (MountainCarContinuous) whose motor is reversed half-way. Its
+nominal dynamics are three lines; one more line corrects the actions.
 """
 
 import torch
@@ -23,21 +22,21 @@ def hill(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
 
 
 torch.set_num_threads(1)
-torch.manual_seed(0)
 model = KnownDynamics(hill, Manifold(2), action_size=1, noise_std=1e-5)
 env = TransformedEnv(GymEnv("MountainCarContinuous-v0"), ActionFlowTransform(model))
 td = env.reset(seed=0)
 for step in range(40):
     td["action"] = torch.tensor([0.5]) if step % 4 < 2 else torch.tensor([-0.5])
-    if step >= 20:  # the motor is reversed below the transform, which is not told
+    if step >= 20:  # the transform does not know that the motor is reversed now
         env.base_env._env.unwrapped.power = -0.0015
+    before = hill(td["observation"], torch.zeros(1))[1]  # its velocity without the motor
     td = env.step(td)
     if step in (10, 19, 21, 30, 39):
-        moved = td["next", "observation"][1] - td["observation"][1]
+        change = float(td["next", "observation"][1] - before)
         print(
             f"step {step:2d}  planned {float(td['action']):+.2f}  "
             f"executed {float(td['next', 'afm', 'executed_action']):+.2f}  "
             f"misaligned {bool(td['next', 'afm', 'misaligned'])!s:5}  "
-            f"change of velocity {float(moved):+.5f}"
+            f"effect of the motor {change / 0.0015:+.2f}"
         )
     td = td["next"].exclude("reward")

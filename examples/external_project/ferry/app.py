@@ -6,7 +6,6 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torchrl.envs import Compose, TransformedEnv
 
-from afm_rl.correction import LeastSquares
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.manifold import Manifold
 from afm_rl.planning import PlanningEnv
@@ -23,7 +22,7 @@ def main(cfg: DictConfig) -> None:
     model = KnownDynamics(drift, Manifold(2), action_size=2)
     cost = instantiate(cfg.cost, _convert_="all")
     planner = instantiate(cfg.planner, _convert_="all")(PlanningEnv(model, cost, low, high))
-    transform = ActionFlowTransform(model, LeastSquares(low, high), enabled=cfg.correct)
+    transform = ActionFlowTransform(model, enabled=cfg.correct)
     whole = TransformedEnv(env, Compose(transform, planner.make_tensordict_primer()))
     path = whole.rollout(cfg.steps, planner)
     state = "landed" if path["next", "done"][-1] else "lost"
