@@ -110,7 +110,7 @@ def test_an_interrupted_run_goes_on_to_the_bit(make_agent, tmp_path):
 
     whole, path = run(agent()), tmp_path / "checkpoint"
     with pytest.raises(Stopped):
-        run(agent(), checkpoint=path, watch=lambda loop: loop.step == 5)
+        run(agent(), checkpoint=path, stopped=lambda loop: loop.step == 5)
     resumed = run(agent(), checkpoint=path)
     same(whole.missions, resumed.missions)
     same(whole.steps, resumed.steps)
