@@ -20,7 +20,7 @@ from afm_rl.measures import Measures
 from afm_rl.missions.build import Agent
 from afm_rl.missions.checkpoint import Checkpoints, Stopped
 from afm_rl.missions.log import StepLog
-from afm_rl.missions.state import Loop
+from afm_rl.missions.state import Loop, leave, unsaved
 from afm_rl.progress import Bar
 
 ALIGNED = 5.0  # innovation, in standard deviations, up to which a model counts as aligned
@@ -130,7 +130,7 @@ def _start(agent: Agent) -> Loop:
     ends |= agent.robot.metrics.start(agent.missions)
     whole = ["misaligned", "regime_active", "fault", *agent.robot.metrics.whole]
     log = StepLog(_columns(agent), whole)
-    return Loop(td, torch.arange(total), ends, log)
+    return Loop(td, torch.arange(total), ends, log, unsaved=unsaved(agent))
 
 
 def _advance(agent: Agent, loop: Loop) -> None:
@@ -155,8 +155,7 @@ def _advance(agent: Agent, loop: Loop) -> None:
         done = done | fault
     if bool(done.any()):
         keep = (~done).nonzero().squeeze(-1)
-        loop.ids, loop.td = ids[keep], loop.td[keep]
-        agent.model.select_(keep)
+        leave(agent, loop, keep)
     loop.step += 1
 
 

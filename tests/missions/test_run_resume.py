@@ -1,6 +1,7 @@
 """Runs that are interrupted and go on give what they would have given, to the bit."""
 
 import random
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -9,6 +10,8 @@ import torch
 
 from afm_rl.artefacts import read_tensors
 from afm_rl.errors import AFMError, ArtefactError, ConfigurationError
+from afm_rl.learning import Updater
+from afm_rl.mission_state import MissionState
 from afm_rl.missions import run
 from afm_rl.missions.checkpoint import Checkpoints, Stopped
 from afm_rl.missions.log import StepLog
@@ -17,7 +20,7 @@ from afm_rl.missions.tree import flatten, unflatten
 
 METHODS = [
     *("physics", "online_pe", "oracle", "afm_physics", "afm_paper", "stream_x_pe"),
-    *("adaptive_gain", "physics planner=cem", "online_pe dynamics.propagation=sample"),
+    *("adaptive_gain", "rls", "physics planner=cem", "online_pe dynamics.propagation=sample"),
     "online_pe updater.optimizer._target_=torch.optim.Adam",
 ]
 
@@ -31,8 +34,7 @@ def agent(make_agent, ring, spot):
     """Make an agent for three missions on two tracks, of which one ends early."""
 
     def make(method, **settings):
-        tracks = [ring] if "Adam" in method else [ring, spot]  # Adam's moments cannot be selected
-        settings = {"tracks": tracks, "seeds": [3, 8], "budget": 14, **settings}
+        settings = {"tracks": [ring, spot], "seeds": [3, 8], "budget": 14, **settings}
         return make_agent(*f"method={method}".split(), **settings)
 
     return make
@@ -206,3 +208,67 @@ def test_a_log_grows_on_after_it_was_taken_up():
 
 def test_stopped_is_an_error_of_the_library():
     assert issubclass(Stopped, AFMError)
+
+
+class Latest(NamedTuple):
+    """The latest rewards of missions."""
+
+    reward: torch.Tensor
+
+
+class Curious(Updater):
+    """An updater that remembers something of a new kind; the last part of each name says how."""
+
+    learns = True
+
+    def __init__(self, loss, kind):
+        super().__init__(loss)
+        self.kind, self.count, self.rows = kind, 0, []
+        self.register_buffer("rates", torch.zeros(3), persistent=False)
+        self.state = MissionState(Latest(torch.zeros(3)))
+
+    def _learn(self, found, transitions, learn):
+        if self.kind == "list":
+            self.rows.append(float(found["loss"].sum()))
+        elif self.kind == "attribute":
+            self.mean = found["loss"]
+        elif self.kind == "buffer":
+            self.rates = found["loss"]
+        else:
+            self.count += 1
+            before = self.state.parts.reward
+            before = before if before.shape == learn.shape else torch.zeros(learn.shape)
+            self.state.keep(Latest(before + found["loss"]))
+
+
+@pytest.mark.parametrize("kind", ["list", "attribute", "buffer"])
+def test_state_that_nobody_saves_or_cuts_is_an_error(agent, tmp_path, kind):
+    for settings in ({}, {"checkpoint": tmp_path / kind, "every": 0}):  # a mission ends early
+        made = agent("physics")
+        made.updater = Curious(made.updater.loss, kind)
+        with pytest.raises(ConfigurationError, match=r"updater\.(rows|mean|rates) changes during"):
+            run(made, **settings)
+
+
+def test_state_of_a_new_kind_is_saved_and_cut(agent, tmp_path):
+    totals = []
+    for stops in ([], [3, 5, 9]):
+        for stop in [*stops, None]:
+            made = agent("physics")
+            made.updater = Curious(made.updater.loss, "kept")
+            try:
+                watch = None if stop is None else lambda loop, at=stop: loop.step == at
+                run(made, checkpoint=tmp_path / str(len(stops)), watch=watch)
+            except Stopped:
+                continue
+        totals.append((made.updater.count, made.updater.state.parts.reward))
+    assert totals[0][0] == totals[1][0] > 10
+    assert torch.equal(totals[0][1], totals[1][1])
+    assert totals[0][1].shape == (2,)  # those that ran to the end
+
+
+def test_moments_of_optimisers_are_cut_with_their_missions(agent):
+    made = agent("online_pe updater.optimizer._target_=torch.optim.Adam")
+    run(made)
+    for parameter, state in made.updater.optimizer.state.items():
+        assert state["exp_avg"].shape == parameter.shape
