@@ -13,8 +13,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from afm_rl._version import __version__
-from afm_rl.artefacts import write_whole
 from afm_rl.errors import ArtefactError
+from afm_rl.files import write_whole
 
 MANIFEST = "manifest.json"
 
@@ -77,13 +77,13 @@ def check_manifest(folder: str | Path) -> dict[str, str]:
 _REMEDY = "restore it, or delete the folder and run the same command again"
 
 
-def read_manifest(folder: str | Path) -> dict[str, Any]:
+def read_manifest(folder: str | Path, name: str = MANIFEST) -> dict[str, Any]:
     """Return ``version`` and ``files`` of a manifest, without looking at the files.
 
     Raises:
         ArtefactError: if there is none, or it is damaged.
     """
-    path = Path(folder) / MANIFEST
+    path = Path(folder) / name
     try:
         text = path.read_bytes().decode()
     except FileNotFoundError:

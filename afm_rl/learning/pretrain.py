@@ -46,7 +46,7 @@ def pretrain_ensemble(
             (domain randomisation).
         seed: seed of data and order.
         names: of the coordinates of the tangent space, for the warning.
-        progress: show a progress bar.
+        progress: show progress.
 
     Warns:
         UserWarning: if more than a third of the variance of a coordinate is left unexplained.

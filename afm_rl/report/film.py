@@ -13,8 +13,8 @@ import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
-from afm_rl.artefacts import write_whole
 from afm_rl.errors import ConfigurationError
+from afm_rl.files import write_whole
 from afm_rl.report.collect import collect
 from afm_rl.report.events import folder_names
 from afm_rl.report.frames import first_missions, steps_of
