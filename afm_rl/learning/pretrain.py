@@ -20,7 +20,7 @@ def pretrain_ensemble(
     action_box: tuple[Tensor, Tensor],
     *,
     samples: int = 50_000,
-    epochs: int = 10,
+    epochs: int = 16,
     batch_size: int = 256,
     lr: float = 2e-3,
     action_noise: float = 0.0,

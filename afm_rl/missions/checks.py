@@ -50,7 +50,10 @@ def blaming(group: str) -> Iterator[None]:
             raise ConfigurationError(str(last)) from error
         found = re.search(r"full_key: (\S+)", str(error))
         text = str(last).partition("\nfull_key:")[0]
-        raise ConfigurationError(f"{found[1] if found else group}: {text}") from error
+        inside = found is not None and found[1] != group
+        raise ConfigurationError(
+            f"{group}.{found[1]}: {text}" if inside else f"{group}: {text}"
+        ) from error
     except MISTAKES as error:
         raise ConfigurationError(f"{group}: {error}") from error
 
