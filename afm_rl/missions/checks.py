@@ -50,10 +50,9 @@ def blaming(group: str) -> Iterator[None]:
             raise ConfigurationError(str(last)) from error
         found = re.search(r"full_key: (\S+)", str(error))
         text = str(last).partition("\nfull_key:")[0]
-        inside = found is not None and found[1] != group
-        raise ConfigurationError(
-            f"{group}.{found[1]}: {text}" if inside else f"{group}: {text}"
-        ) from error
+        place = found[1] if found else group
+        place = place if place.startswith(group) else f"{group}.{place}"
+        raise ConfigurationError(f"{place}: {text}") from error
     except MISTAKES as error:
         raise ConfigurationError(f"{group}: {error}") from error
 
