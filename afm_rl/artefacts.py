@@ -1,11 +1,9 @@
-"""Trained parts on disk: safetensors, written whole or not at all."""
+"""Trained parts on disk: safetensors with checksums."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import secrets
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,28 +13,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file so that readers see the old content or the new, never a part.
-
-    Raises:
-        ConfigurationError: if the folder cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{path.name}.{secrets.token_hex(6)}")
-        try:
-            with open(part, "xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, path)
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise ConfigurationError(f"cannot write {path}: {error.strerror}") from error
+from afm_rl.files import locked, remove_parts, write_whole
 
 
 def save_artefact(path: Path, module: nn.Module, description: Mapping[str, Any]) -> None:
@@ -124,13 +101,15 @@ def cached(
     text = json.dumps(description, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:16]
     path = Path(folder) / f"{description['name']}-{digest}.safetensors"
-    if path.exists():
-        load_artefact(path, module, description)
-        with safe_open(path, framework="pt") as file:
-            return float(json.loads(file.metadata()["description"])["held_out_error"]), True
-    error = train()
-    save_artefact(path, module, {**description, "held_out_error": error})
-    return error, False
+    with locked(path.parent, f".{path.name}.lock", wait=True):  # the second one need not train
+        if path.exists():
+            load_artefact(path, module, description)
+            with safe_open(path, framework="pt") as file:
+                return float(json.loads(file.metadata()["description"])["held_out_error"]), True
+        remove_parts(path.parent, path.name)
+        error = train()
+        save_artefact(path, module, {**description, "held_out_error": error})
+        return error, False
 
 
 def digest_of(tensors: Mapping[str, Tensor], text: str = "") -> str:

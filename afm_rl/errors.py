@@ -47,8 +47,8 @@ def check_number(
     return float(value)
 
 
-def check_count(name: str, value: int, *, low: int = 1) -> int:
-    """Return ``value`` if it is a whole number of at least ``low``.
+def check_count(name: str, value: int, *, low: int = 1, high: int = 2**63 - 1) -> int:
+    """Return ``value`` if it is a whole number in ``[low, high]``.
 
     Raises:
         ConfigurationError: otherwise.
@@ -58,11 +58,22 @@ def check_count(name: str, value: int, *, low: int = 1) -> int:
     """
     if isinstance(value, bool) or not isinstance(value, int) or value < low:
         raise ConfigurationError(f"{name}={value!r}: expected a whole number of at least {low}")
+    if value > high:
+        raise ConfigurationError(f"{name}={value!r}: expected a whole number of at most {high}")
     return value
 
 
-def check_counts(name: str, values: Iterable[int], *, low: int = 1) -> list[int]:
-    """Return ``values`` as a list if each is a whole number of at least ``low``.
+def check_counts(
+    name: str, values: Iterable[int], *, low: int = 1, high: int = 2**63 - 1, least: int = 0
+) -> list[int]:
+    """Return ``values`` as a list if each is a whole number in ``[low, high]``.
+
+    Args:
+        name: of the setting.
+        values: the numbers.
+        low: lowest one.
+        high: highest one.
+        least: how many there must be.
 
     Raises:
         ConfigurationError: otherwise.
@@ -72,7 +83,10 @@ def check_counts(name: str, values: Iterable[int], *, low: int = 1) -> list[int]
     """
     if isinstance(values, str) or not isinstance(values, Iterable):
         raise ConfigurationError(f"{name}={values!r}: expected a list of whole numbers")
-    return [check_count(name, value, low=low) for value in values]
+    found = [check_count(name, value, low=low, high=high) for value in values]
+    if len(found) < least:
+        raise ConfigurationError(f"{name}={found}: expected at least {least} whole numbers")
+    return found
 
 
 def check_choice(name: str, value: str, allowed: Iterable[str]) -> str:

@@ -13,14 +13,14 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from afm_rl._version import __version__
-from afm_rl.artefacts import write_whole
 from afm_rl.errors import ArtefactError
+from afm_rl.files import write_whole
 
 MANIFEST = "manifest.json"
 
 
 def write_manifest(folder: str | Path, names: Iterable[str | Path] | None = None) -> None:
-    """Write the checksums of the files of a folder to its ``manifest.json``.
+    r"""Write the checksums of the files of a folder to its ``manifest.json``.
 
     Args:
         folder: where the files are.
@@ -32,7 +32,7 @@ def write_manifest(folder: str | Path, names: Iterable[str | Path] | None = None
 
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     _ = Path(folder, "missions.csv").write_text("mission,steps\\n")
+    ...     _ = Path(folder, "missions.csv").write_text("mission,steps\n")
     ...     write_manifest(folder)
     ...     sorted(check_manifest(folder))
     ['missions.csv']
@@ -77,13 +77,13 @@ def check_manifest(folder: str | Path) -> dict[str, str]:
 _REMEDY = "restore it, or delete the folder and run the same command again"
 
 
-def read_manifest(folder: str | Path) -> dict[str, Any]:
+def read_manifest(folder: str | Path, name: str = MANIFEST) -> dict[str, Any]:
     """Return ``version`` and ``files`` of a manifest, without looking at the files.
 
     Raises:
         ArtefactError: if there is none, or it is damaged.
     """
-    path = Path(folder) / MANIFEST
+    path = Path(folder) / name
     try:
         text = path.read_bytes().decode()
     except FileNotFoundError:

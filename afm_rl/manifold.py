@@ -49,6 +49,7 @@ class Manifold(nn.Module):
         mask = torch.zeros(size, dtype=torch.bool)
         mask[list(angles)] = True
         self.register_buffer("is_angle", mask, persistent=False)
+        self._turning = frozenset(mask.nonzero().flatten().tolist())  # no look at the device
 
     def project(self, raw: Tensor) -> Tensor:
         """Return the states ``(*B, S)`` that numbers drawn from a box stand for: themselves."""
@@ -69,7 +70,7 @@ class Manifold(nn.Module):
         tensor([ 5., -1.,  0.])
         """
         chosen = range(self.size) if coordinates is None else coordinates
-        plain, angles = ([i for i in chosen if bool(self.is_angle[i]) == turns] for turns in (0, 1))
+        plain, angles = ([i for i in chosen if (i in self._turning) == turns] for turns in (0, 1))
         angle = state[..., angles]
         return torch.cat([state[..., plain], angle.cos(), angle.sin()], -1)
 

@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from afm_rl.correction import ActionFlow
 from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY
 from afm_rl.dynamics import Dubins, DynamicsModel, Ensemble
-from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 from afm_rl.transforms import ActionFlowTransform
@@ -66,7 +66,7 @@ def main() -> None:
     jobs = {f"with AFM, {name}": with_afm(*parts) for name, parts in cases.items()}
     plain_td = world.reset().set("action", torch.ones(2))
     learner = ensemble(0)
-    updater = OnlineUpdater(GaussianNLLLoss(learner), FreshAdam)
+    updater = OnlineUpdater(GaussianNLLLoss(learner), ResetAdam)
     transition = TensorDict({"observation": torch.zeros(3), "action": torch.ones(2)})
     transition["next", "observation"] = torch.ones(3)
     weights = [weight.detach() for weight in model.weights]

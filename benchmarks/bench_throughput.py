@@ -25,7 +25,7 @@ from tensordict import TensorDict
 from timing import timed
 
 from afm_rl.dynamics import Dubins, Ensemble
-from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 
@@ -47,7 +47,7 @@ class Batch:
         ).expand_(missions)
         world = PlanningEnv(model, GoalDistance(), LOW, HIGH)
         self.planner = MPPI(world, horizon=5, population=population, seed_key="seed")
-        self.updater = OnlineUpdater(GaussianNLLLoss(model), FreshAdam)
+        self.updater = OnlineUpdater(GaussianNLLLoss(model), ResetAdam)
         self.world = Dubins()
         self.td = TensorDict(
             {

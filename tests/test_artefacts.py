@@ -10,8 +10,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from afm_rl.artefacts import cached, load_artefact, save_artefact, write_whole
+from afm_rl.artefacts import cached, load_artefact, save_artefact
 from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.files import write_whole
 
 MADE_FOR = {"name": "net", "sizes": [3, 2], "rate": 0.1, "of": {"robot": "ugv"}}
 
@@ -166,7 +167,7 @@ def test_the_cache_trains_once_for_each_description(tmp_path):
 
 def test_a_damaged_cache_is_reported_not_used(tmp_path):
     cached(tmp_path, net(), MADE_FOR, lambda: 0.0)
-    (path,) = tmp_path.iterdir()
+    (path,) = tmp_path.glob("net-*")
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(ArtefactError, match=path.name):
         cached(tmp_path, net(), MADE_FOR, lambda: 0.0)

@@ -9,7 +9,7 @@ from torchrl.envs.utils import step_mdp
 
 from afm_rl.dynamics import Dubins, Oracle
 from afm_rl.envs import UGVTrack
-from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater, OracleUpdater, Updater
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, OracleUpdater, ResetAdam, Updater
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 from afm_rl.regimes import Schedule
 from afm_rl.transforms import ActionFlowTransform
@@ -42,7 +42,7 @@ class Run:
             loss.set_keys(action=("next", "afm", "executed_action"))
         if kind == "online":
             self.model.expand_(len(seeds))
-            self.updater = OnlineUpdater(loss, lambda p: FreshAdam(p, lr=1e-3))
+            self.updater = OnlineUpdater(loss, lambda p: ResetAdam(p, lr=1e-3))
         else:
             self.updater = (OracleUpdater if kind == "oracle" else Updater)(loss)
         self.env = TransformedEnv(base, Compose(*chain))

@@ -11,7 +11,7 @@ from torchrl.envs.utils import step_mdp
 
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
-from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 from afm_rl.regimes import Schedule
 from afm_rl.transforms import ActionFlowTransform
@@ -58,7 +58,7 @@ def test_a_faulty_observation_is_survived_and_not_learned(universal_flow, traine
     env = TransformedEnv(base, Compose(*chain, planner.make_tensordict_primer()))
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=("next", "afm", "executed_action"))
-    updater = OnlineUpdater(loss, lambda p: FreshAdam(p, lr=1e-3))
+    updater = OnlineUpdater(loss, lambda p: ResetAdam(p, lr=1e-3))
     td, learned = env.reset(), []
     for _ in range(14):
         before = [flat(model, mission) for mission in range(len(cases))]
@@ -86,7 +86,7 @@ def test_outliers_do_little_harm(trained_ensemble, transitions):
     error = {}
     for share in (0.0, 0.01):
         model = copy.deepcopy(trained_ensemble)
-        updater = OnlineUpdater(GaussianNLLLoss(model), lambda p: FreshAdam(p, lr=1e-4))
+        updater = OnlineUpdater(GaussianNLLLoss(model), lambda p: ResetAdam(p, lr=1e-4))
         dice = torch.Generator().manual_seed(0)
         gain = torch.tensor([0.6, 1.2])
         state, action = transitions(1000, seed=1)

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from afm_rl._version import __version__
 from afm_rl.cli.error_messages import explain, one_line
 from afm_rl.cli.launchers import register
-from afm_rl.cli.launchers.base import SweepError
+from afm_rl.cli.launchers.base import JobsFailed
 from afm_rl.cli.overrides import relaxed, trusted_packages, with_sweep_folder
 from afm_rl.targets import TRUST, check_composed, trusted
 
@@ -52,7 +52,7 @@ def _explained(sweep: bool = False) -> Iterator[None]:
         print(f"afm-rl: {message}", file=sys.stderr)
         if sweep:
             raise  # the other jobs go on; Hydra raises the first error again at the end
-        sys.exit(1 if isinstance(error, SweepError) else 2)
+        sys.exit(1 if isinstance(error, JobsFailed) else 2)
 
 
 @contextmanager

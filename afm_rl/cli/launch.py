@@ -2,21 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import shlex
+import signal
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import torch
-from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from hydra.utils import instantiate
+from omegaconf import DictConfig
 
-from afm_rl.artefacts import write_whole
-from afm_rl.cli.overrides import PARTS, has, optional
-from afm_rl.errors import ConfigurationError, check_count, check_flag
-from afm_rl.missions import build, prepare, run
-from afm_rl.report import check_video, print_summary, write_films, write_run
+from afm_rl.cli.launchers.base import JobLauncher, JobsFailed
+from afm_rl.cli.methods import jobs_of
+from afm_rl.envs import load_track
+from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag, check_number
+from afm_rl.files import locked
+from afm_rl.jobs.batch import Pool, run_batch
+from afm_rl.jobs.layout import JOBS, LOG
+from afm_rl.jobs.local import LocalPool
+from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
+from afm_rl.jobs.tables import read_measures, read_missions, read_steps
+from afm_rl.manifest import extend_manifest, read_manifest, write_manifest
+from afm_rl.missions import Agent, build
+from afm_rl.missions.checkpoint import Stopped
+from afm_rl.report import (
+    check_video,
+    film_results,
+    print_summary,
+    write_films,
+    write_report,
+    write_run,
+)
 
 SWITCHES = ("overwrite", "progress", "figures", "tensorboard")
 
@@ -26,114 +45,142 @@ def launch(cfg: DictConfig) -> None:
 
     Everything is built and checked before anything is trained.
     """
+    film = check_settings(cfg)
+    hydra = HydraConfig.get()
+    folder = Path(hydra.runtime.output_dir)
+    jobs = jobs_of(cfg, hydra)
+    agents = {job.label: build(job) for job in {job.label: job for job in jobs.values()}.values()}
+    roads = [getattr(agent.base_env, "tracks", ()) for agent in agents.values()]  # flights: none
+    tracks = list({track.name: track for some in roads for track in some}.values())
+    if cfg.get("study") is None and len(jobs) == 1:
+        _run_alone(folder, *jobs.values(), *agents.values())
+        show(folder, cfg, tracks, film)
+        return
+    chosen = instantiate(hydra.launcher)  # Hydra's own launchers only know sweeps
+    pool = chosen if isinstance(chosen, JobLauncher) else LocalPool()
+    failed = run_together(folder, jobs, pool, cfg, hydra.overrides.task)
+    if cfg.get("study") is None and not failed:
+        show(folder, cfg, tracks, film)
+    else:
+        report(folder, cfg, film)
+    if failed:
+        raise failed
+
+
+def check_settings(cfg: DictConfig) -> str | None:
+    """Check the settings that are not of the missions.
+
+    Returns:
+        The format of films; None for no films.
+
+    Raises:
+        ConfigurationError: for one that cannot be used.
+    """
     torch.set_num_threads(check_count("threads", cfg.threads))
     for name in SWITCHES:
         check_flag(name, cfg[name])
-    film = check_video(cfg.video)
     if not isinstance(cfg.cache, str):
         raise ConfigurationError(f"cache={cfg.cache!r}: expected a folder")
-    job = HydraConfig.get()
-    folder = Path(job.runtime.output_dir)
-    study = cfg.get("study")
-    if (folder / "missions.csv").exists() and not cfg.overwrite and study is None:
-        raise ConfigurationError(
-            f"hydra.run.dir={folder}: holds results; choose another folder, or overwrite=true"
-        )
-    methods = _methods(cfg, list(job.overrides.task), job.runtime.choices.get("method"))
-    if study is not None:
-        if film is not None:
-            raise ConfigurationError(
-                f"video={cfg.video}: a study makes no films; use afm-rl-report {folder} --video gif"
-            )
-        from afm_rl.cli.study import launch_study  # file locks: not on every system
+    check_number("checkpoints.every", cfg.checkpoints.every, low=0.0)
+    check_count("checkpoints.keep", cfg.checkpoints.keep)
+    return check_video(cfg.video)
 
-        launch_study(study, methods, folder, cfg.progress, cfg.figures)
-        return
-    agents = [build(method) for method in methods]
-    for method in methods:
-        name = "config.yaml" if len(methods) == 1 else f"config/{method.label}.yaml"
-        write_whole(folder / name, OmegaConf.to_yaml(method, resolve=True).encode())
-    for agent in agents:
-        prepare(agent, cfg.cache, progress=cfg.progress)
-    results = [run(agent, progress=cfg.progress) for agent in agents]
-    missions, steps = _joined(results)
-    roads = [getattr(agent.base_env, "tracks", ()) for agent in agents]  # flights have none
-    tracks = {track.name: track for some in roads for track in some}
-    shown = {"figures": cfg.figures, "tensorboard": cfg.tensorboard}
-    write_run(folder, missions, steps, results[0].measures, list(tracks.values()), **shown)
-    if film is not None:
-        write_films(folder / "video", missions, steps, list(tracks.values()), film)
-    print_summary(missions, results[0].measures)
+
+def _run_alone(folder: Path, cfg: DictConfig, agent: Agent) -> None:
+    """Run the missions of one method in this process."""
+    with _interruptible(folder), Stop().on(signal.SIGINT, signal.SIGTERM) as stop, locked(folder):
+        if needs_run(folder, cfg, cfg.overwrite):
+            begin(folder, cfg)
+            finish(folder, agent, stop, cfg.progress)
+        else:
+            print(f"{folder} has these results already")
+
+
+def run_together(
+    folder: Path,
+    jobs: Mapping[str, DictConfig],
+    pool: Pool,
+    cfg: DictConfig,
+    overrides: Sequence[str],
+    failures: Mapping[str, str] | None = None,
+) -> JobsFailed | None:
+    """Run jobs, and say which of them failed.
+
+    Args:
+        folder: of the batch.
+        jobs: settings of each, by name.
+        pool: where they run.
+        cfg: settings of the command.
+        overrides: of the command, for people.
+        failures: jobs that could not even be composed, with reasons.
+
+    Returns:
+        What to raise once the results of the others are shown.
+    """
+    command = shlex.join(["afm-rl", *overrides])
+    how = {"command": command, "overwrite": cfg.overwrite, "progress": cfg.progress}
+    with _interruptible(folder), _like_ctrl_c(signal.SIGTERM):
+        found = run_batch(folder, jobs, pool, **how)
+    failures = {**(failures or {}), **found}
+    for name, reason in failures.items():
+        print(f"afm-rl: {name}: failed: {reason}", file=sys.stderr)
+    if not failures:
+        return None
+    return JobsFailed(
+        f"{len(failures)} of {len(failures.keys() | jobs.keys())} jobs failed "
+        f"({folder / JOBS}/*/{LOG}); the same command tries them again"
+    )
+
+
+def show(folder: Path, cfg: DictConfig, tracks: Sequence[Any], film: str | None) -> None:
+    """Draw the results of a run or a comparison, and print their table."""
+    missions, steps, measures = read_missions(folder), read_steps(folder), read_measures(folder)
+    with locked(folder):
+        # What is drawn anew leaves the manifest first, so that this may be interrupted.
+        names = [*read_manifest(folder)["files"]]
+        write_manifest(folder, [name for name in names if Path(name).parts[0] not in SHOWN])
+        what = {"figures": cfg.figures, "tensorboard": cfg.tensorboard, "tables": False}
+        write_run(folder, missions, steps, measures, tracks, **what)
+        if film is not None:
+            write_films(folder / "video", missions, steps, tracks, film)
+        extend_manifest(folder, [name for name in SHOWN if (folder / name).is_dir()])
+    print_summary(missions, measures)
     print(f"Results: {folder}")
 
 
-def _methods(cfg: DictConfig, overrides: Sequence[str], method: str | None) -> list[DictConfig]:
-    """Return one configuration per method, each with its label; none compares any more."""
-    compare = cfg.compare
-    if compare is not None:
-        names = list(compare) if isinstance(compare, ListConfig) else [None]
-        if not all(isinstance(n, str) for n in names) or len(set(names)) < len(names):
-            raise ConfigurationError(f"compare={compare}: expected a list of distinct methods")
-    given = {text.split("=")[0] for text in overrides}
-    by_hand = given.isdisjoint({"compare", "study"}) and not given.isdisjoint(PARTS)
-    if method is not None or by_hand or not cfg.compare:
-        chosen = [(method, cfg)]
-    else:
-        chosen = [*_compared(list(compare), overrides)]
-    for name, each in chosen:
-        each.compare = []
-        OmegaConf.set_struct(each, False)
-        each.pop("study", None)
-        each.label = each.label if len(chosen) == 1 and each.label else _label(name, overrides)
-    return [each for _, each in chosen]
+def report(folder: Path, cfg: DictConfig, film: str | None) -> None:
+    """Write the report on a sweep or a study, as far as there are results."""
+    missions = read_missions(folder)
+    if len(missions):
+        print_summary(missions, read_measures(folder))
+        try:
+            write_report([folder], folder / "report", figures=cfg.figures, load_track=load_track)
+            if film is not None:
+                film_results([folder], folder / "report" / "video", film, load_track)
+        except AFMError as error:  # such as jobs that cannot stand in one table
+            print(f"afm-rl: no report: {error}", file=sys.stderr)
+    print(f"Results: {folder}")
 
 
-def _compared(names: Sequence[str], overrides: Sequence[str]) -> list[tuple[str, DictConfig]]:
-    """Compose each method with those settings of its parts that it has.
-
-    Raises:
-        ConfigurationError: for a setting that none of them has.
-    """
-    some = optional(overrides)
-    common = [text for text in overrides if text not in some.values()]
-    bare = {name: compose("config", [*common, f"method={name}"]) for name in names}
-    if not some:
-        return list(bare.items())
-    plain: dict[str, Any] = {
-        name: OmegaConf.to_container(cfg, resolve=False) for name, cfg in bare.items()
-    }
-    for key, text in some.items():
-        without = [name for name in names if not has(plain[name], key)]
-        if len(without) == len(names):
-            raise ConfigurationError(f"{text.lstrip('+')}: none of {', '.join(names)} has {key}")
-        for name in without:
-            print(f"{name}: has no {key}, so it stays as it is")
-    return [
-        (name, compose("config", [*common, *_fitting(some, plain[name]), f"method={name}"]))
-        for name in names
-    ]
+@contextmanager
+def _interruptible(folder: Path) -> Iterator[None]:
+    """End with one line and status 130 when interrupted."""
+    try:
+        yield
+    except (KeyboardInterrupt, Stopped):
+        print(
+            f"afm-rl: interrupted; what was done is in {folder}, and the same command goes on "
+            "there, if it names this folder (hydra.run.dir, or hydra.sweep.dir of a sweep)",
+            file=sys.stderr,
+        )
+        sys.exit(130)
 
 
-def _fitting(some: Mapping[str, str], settings: Mapping[str, Any]) -> list[str]:
-    """Return the overrides of settings that there are."""
-    return [text for key, text in some.items() if has(settings, key)]
-
-
-def _label(method: str | None, overrides: Sequence[str]) -> str:
-    """Name a method after its preset and the parts that were chosen by hand.
-
-    >>> _label("online_pe", ["seeds=2", "updater=rls", "corrector=afm"])
-    'online_pe+updater=rls+corrector=afm'
-    """
-    parts = [text for text in overrides if text.split("=")[0] in PARTS]
-    return "+".join([*([method] if method else []), *parts]) or "physics"
-
-
-def _joined(results) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Put the tables of several methods together; missions are numbered through."""
-    missions, steps, count = [], [], 0
-    for result in results:
-        missions.append(result.missions.assign(mission=result.missions["mission"] + count))
-        steps.append(result.steps.assign(mission=result.steps["mission"] + count))
-        count += len(result.missions)
-    return pd.concat(missions, ignore_index=True), pd.concat(steps, ignore_index=True)
+@contextmanager
+def _like_ctrl_c(number: signal.Signals) -> Iterator[None]:
+    """Treat a signal like Ctrl-C: batch systems send it before they kill."""
+    before = signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)

@@ -38,6 +38,9 @@ class DynamicsModel(nn.Module, ABC):
     extrapolates: bool = False
     """Can it foresee what actions beyond their box would do? Equations can, networks cannot."""
 
+    conditioned_on: str | None = None
+    """What an updater sets in it: ``regime``, ``calibration``, or nothing."""
+
     def __init__(self, manifold: Manifold, action_size: int) -> None:
         super().__init__()
         self.manifold = manifold

@@ -1,28 +1,30 @@
-"""Any dynamics model, put right by a few numbers per mission."""
+"""Any dynamics model, corrected by a few numbers per mission."""
 
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from afm_rl.dynamics.base import DynamicsModel, linearised
-from afm_rl.dynamics.hammerstein import PLAIN, shaped, shaped_slope
+from afm_rl.dynamics.per_mission import PerMissionModel
 from afm_rl.errors import ConfigurationError
 
+CALIBRATION = ("matrix", "bias", "slip", "offset")
 
-class Calibrated(DynamicsModel):
-    r"""A frozen model behind an affine map of its action and in front of an offset.
+
+class Calibrated(PerMissionModel):
+    r"""A frozen model behind a static map of its action and in front of an offset.
 
     .. math:: f(s, a) = \mathrm{model}(s,\ a') \oplus c,\qquad
-              a' = h \odot (D\,\psi(a / h) + b)
+              a' = h \odot (D\,\psi(a / h) + b),\qquad \psi(u) = u\,e^{-\kappa |u|}
 
-    with h the half ranges of the action. D, b and the static shape :math:`\psi`
-    (:func:`~afm_rl.dynamics.hammerstein.shaped`) are what other actions can undo (*matched*
-    uncertainty), c is for what no action can (*unmatched*). At the start, and for missions whose
-    calibration is the identity, predictions are those of the model to the bit.
+    with h the half ranges of the action. D, b and the slip :math:`\kappa \ge 0` (a Hammerstein
+    model: the more command, the less traction) describe what other actions can undo (*matched*
+    uncertainty), c what no action can (*unmatched*). For missions whose calibration is the
+    identity, predictions are those of the model to the bit.
 
-    The calibration is told with :meth:`tell_`, not trained by gradients. :meth:`expand_` gives
-    every mission one of its own; the model itself is shared and stays as it is.
+    The calibration is set with :meth:`calibrate_`, not trained by gradients. :meth:`expand_`
+    gives every mission one of its own; the model itself is shared and stays as it is.
 
     Args:
         model: the dynamics that hold before anything changes; its missions share parameters.
@@ -33,17 +35,17 @@ class Calibrated(DynamicsModel):
 
     >>> from afm_rl.dynamics import Dubins
     >>> model = Calibrated(Dubins(), torch.tensor([1.0, 1.5]))
-    >>> model.tell_(matrix=torch.diag(torch.tensor([-1.0, 1.0])))  # it drives backwards
+    >>> model.calibrate_(matrix=torch.diag(torch.tensor([-1.0, 1.0])))  # it drives backwards
     >>> model(torch.zeros(3), torch.tensor([1.0, 0.0]))
     tensor([-0.2000,  0.0000,  0.0000])
     """
 
+    conditioned_on = "calibration"
     half_range: Tensor
     matrix: Tensor
     bias: Tensor
-    shape: Tensor
+    slip: Tensor
     offset: Tensor
-    missions: Tensor
 
     def __init__(self, model: DynamicsModel, half_range: Tensor) -> None:
         super().__init__(model.manifold, model.action_size)
@@ -62,21 +64,15 @@ class Calibrated(DynamicsModel):
         self.register_buffer("half_range", half_range, persistent=False)
         self.register_buffer("matrix", torch.eye(size))
         self.register_buffer("bias", torch.zeros(size))
-        self.register_buffer("shape", torch.tensor(PLAIN))
+        self.register_buffer("slip", torch.zeros(()))
         self.register_buffer("offset", torch.zeros(model.manifold.tangent_size))
-        self.register_buffer("missions", torch.zeros((), dtype=torch.int64), persistent=False)
 
-    @property
-    def lead(self) -> torch.Size:
-        """Leading mission dimensions, () or (B,)."""
-        return self.bias.shape[:-1]
-
-    def tell_(self, **calibration: Tensor) -> None:
+    def calibrate_(self, **calibration: Tensor) -> None:
         """Set parts of the calibration, in place.
 
         Args:
-            calibration: any of ``matrix`` ``(*L, A, A)``, ``bias`` ``(*L, A)``, ``shape``
-                ``(*L, 3)`` and ``offset`` ``(*L, D)``.
+            calibration: any of ``matrix`` ``(*L, A, A)``, ``bias`` ``(*L, A)``, ``slip``
+                ``(*L)`` and ``offset`` ``(*L, D)``.
         """
         for name, value in calibration.items():
             now = self.get_buffer(name)
@@ -85,23 +81,22 @@ class Calibrated(DynamicsModel):
     def effective(self, action: Tensor) -> Tensor:
         """Return a', what the model is asked about, for actions ``(*L, *N, A)``."""
         unit = action / self.half_range
-        shape, matrix, bias = (
-            self._wide(part, action) for part in (self.shape, self.matrix, self.bias)
-        )
-        command = shaped(unit, shape) if _any(self.shape != self.shape.new_tensor(PLAIN)) else unit
-        moved = bias
-        for axis in range(self.action_size):  # quicker than products of very small matrices
+        matrix, moved = self._wide(self.matrix, action), self._wide(self.bias, action)
+        command = unit
+        if _any(self.slip):
+            command = unit * (-self._wide(self.slip, action).unsqueeze(-1) * unit.abs()).exp()
+        for axis in range(self.action_size):  # faster than products of very small matrices
             moved = torch.addcmul(moved, matrix[..., axis], command[..., axis, None])
-        return action + self.half_range * (moved - unit)  # plus nothing where nothing changed
+        return action + self.half_range * (moved - unit)  # plus exactly 0 for the identity
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the expected next state ``(*L, *N, S)``."""
-        return self._offset(self.model(state, self.effective(action)))
+        return self._shifted(self.model(state, self.effective(action)))
 
     def forecast(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return expected next state and noise scale, as the model has them."""
         ahead, noise = self.model.forecast(state, self.effective(action))
-        return self._offset(ahead), noise
+        return self._shifted(ahead), noise
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the model's Jacobian ``(*L, *N, D, A)`` times that of a'."""
@@ -114,9 +109,9 @@ class Calibrated(DynamicsModel):
         ahead, by_state, by_action = self.model.linearise(state, self.effective(action))
         by_action = by_action @ self._slope(action)
         if self._flat:
-            return self._offset(ahead), by_state, by_action
+            return self._shifted(ahead), by_state, by_action
         nothing = action[..., :0]
-        moved, through, _ = linearised(lambda there, _: self._offset(there), ahead, nothing)
+        moved, through, _ = linearised(lambda there, _: self._shifted(there), ahead, nothing)
         return moved, through @ by_state, through @ by_action
 
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -134,54 +129,37 @@ class Calibrated(DynamicsModel):
         """Return the model's noise scale at a'."""
         return self.model.noise_scale(state, self.effective(action))
 
-    def expand_(self, missions: int) -> Calibrated:
-        """Give each of ``missions`` a calibration of its own, in place."""
-        if self.lead:
-            raise ConfigurationError(f"dynamics: already expanded to {tuple(self.lead)} missions")
-        for name in ("matrix", "bias", "shape", "offset"):
-            part = self.get_buffer(name)
-            setattr(self, name, part.expand(missions, *part.shape).clone())
-        self.missions = torch.arange(missions, device=self.missions.device)
-        return self
-
-    def select_(self, index: Tensor) -> Calibrated:
-        """Keep the missions in ``index``, in place; a shared calibration stays as it is."""
-        if self.lead:
-            for name in ("matrix", "bias", "shape", "offset", "missions"):
-                setattr(self, name, self.get_buffer(name)[index])
-        return self
+    def _owned(self) -> list[tuple[nn.Module, str]]:
+        return [(self, name) for name in CALIBRATION]
 
     @property
     def _flat(self) -> bool:
         """Does adding c leave derivatives as they are?"""
         return self.manifold.tangent_size == self.manifold.size
 
-    def _offset(self, ahead: Tensor) -> Tensor:
+    def _shifted(self, ahead: Tensor) -> Tensor:
         """Add c; states of missions without any stay as they are, to the bit."""
-        if not _any(self.offset != 0):
-            return ahead
-        offset = self._wide(self.offset, ahead)
-        moved = self.manifold.add(ahead, offset)
-        return torch.where((offset != 0).any(-1, keepdim=True), moved, ahead)
+        if _any(self.offset):
+            offset = self._wide(self.offset, ahead)
+            moved = self.manifold.add(ahead, offset)
+            return torch.where((offset != 0).any(-1, keepdim=True), moved, ahead)
+        return ahead
 
     def _slope(self, action: Tensor) -> Tensor:
         """Return the derivative of a' ``(*L, *N, A, A)``."""
-        matrix, shape = self._wide(self.matrix, action), self._wide(self.shape, action)
-        bend = shaped_slope(action / self.half_range, shape)
+        matrix, slip = self._wide(self.matrix, action), self._wide(self.slip, action)
+        size = slip.unsqueeze(-1) * (action / self.half_range).abs()
+        bend = (-size).exp() * (1 - size)
         return self.half_range.unsqueeze(-1) * matrix * (bend / self.half_range).unsqueeze(-2)
 
     def _wide(self, part: Tensor, like: Tensor) -> Tensor:
         """Insert dimensions into ``(*L, ...)`` so that it goes with ``(*L, *N, ...)``."""
         lead = len(self.lead)
-        if like.shape[:lead] != self.lead:
-            raise ConfigurationError(
-                f"dynamics: the model holds {tuple(self.lead)} missions, got a batch of shape "
-                f"{tuple(like.shape[:-1])}; expected ({', '.join(map(str, self.lead))}, ...)"
-            )
+        self._check_lead(like.shape[:-1])
         extra = like.dim() - 1 - lead
-        return part.reshape(*part.shape[:lead], *(1,) * extra, *part.shape[lead:]).to(like)
+        return part.reshape((*part.shape[:lead], *(1,) * extra, *part.shape[lead:])).to(like)
 
 
-def _any(flags: Tensor) -> bool:
-    """Is any set? What need not be computed is not; where that cannot be known, it is."""
-    return flags.is_meta or bool(flags.any())
+def _any(part: Tensor) -> bool:
+    """Is any number not 0? Where that cannot be known, yes."""
+    return part.is_meta or bool(part.any())

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from afm_rl.dynamics.base import DynamicsModel
-from afm_rl.dynamics.copies import Copies
+from afm_rl.dynamics.cast_cache import CastCache
+from afm_rl.dynamics.per_mission import PerMissionModel
 from afm_rl.dynamics.sparse import sparse_layer, uniform_layer
 from afm_rl.dynamics.stacked import stacked_mlp, stacked_mlp_tangent
 from afm_rl.errors import (
@@ -30,7 +30,7 @@ INITS = {"uniform": uniform_layer, "sparse": sparse_layer}
 CHUNK = 2**18  # activations per layer and chunk: 1 MiB in float32, so that they stay in cache
 
 
-class Ensemble(DynamicsModel):
+class Ensemble(PerMissionModel):
     r"""Probabilistic ensemble of E networks (Chua et al. 2018; paper, section V-A).
 
     Each member maps the standardised features of state and action to mean and
@@ -102,15 +102,15 @@ class Ensemble(DynamicsModel):
             raise ConfigurationError(
                 f"dynamics.features={self.features}: expected indices in 0..{manifold.size - 1}"
             )
-        self.members = check_count("dynamics.members", members)
-        self.hidden = check_counts("dynamics.hidden", hidden)
+        self.members = check_count("dynamics.members", members, high=1000)
+        self.hidden = check_counts("dynamics.hidden", hidden, high=10_000, least=1)
         if len(log_variance) != 2 or not log_variance[0] < log_variance[1]:
             raise ConfigurationError(f"dynamics.log_variance={log_variance}: expected low < high")
         low, high = log_variance
         self.log_variance = (float(low), float(high))
         self.propagation = check_choice("dynamics.propagation", propagation, PROPAGATIONS)
         check_choice("dynamics.precision", precision, ("float32", "bfloat16"))
-        self.precision, self._copies = precision, Copies(torch.bfloat16)
+        self.precision, self._cast = precision, CastCache(torch.bfloat16)
         self.layer_norm = check_flag("dynamics.layer_norm", layer_norm)
         self._generator = torch.Generator().manual_seed(check_count("dynamics.seed", seed, low=0))
         self.encode = check_flag("dynamics.encode", encode)
@@ -131,10 +131,13 @@ class Ensemble(DynamicsModel):
             check_count("dynamics.running_count", running_count, low=2)
             self.running = RunningStats(inputs)
 
-    @property
-    def lead(self) -> torch.Size:
-        """Leading mission dimensions, () or (B,)."""
-        return self.weights[0].shape[:-3]
+    def _owned(self) -> Iterator[tuple[nn.Module, str]]:
+        for group in (self.weights, self.biases):
+            for index in range(len(group)):
+                yield group, str(index)
+        if self.running is not None:
+            for name, _ in self.running.named_buffers():
+                yield self.running, name
 
     def normalise_(self, inputs: Tensor, targets: Tensor) -> None:
         """Set the statistics of inputs ``(N, in)`` and state changes ``(N, D)``."""
@@ -234,36 +237,10 @@ class Ensemble(DynamicsModel):
         moved = (moved * self.target_std).mT.reshape(*shape, size, self.action_size)
         return moved.to(torch.promote_types(state.dtype, action.dtype))
 
-    def expand_(self, missions: int) -> Ensemble:
-        """Give each of ``missions`` parameters of its own, in place."""
-        if self.lead:
-            raise ConfigurationError(f"dynamics: already expanded to {tuple(self.lead)} missions")
-        for parameter in self.parameters():
-            parameter.data = parameter.data.expand(missions, *parameter.shape).clone()
-            parameter.grad = None
-        if self.running is not None:
-            self.running.expand_(missions)
-        return self
-
-    def select_(self, index: Tensor) -> Ensemble:
-        """Keep the missions in ``index``, in place; a shared ensemble stays as it is."""
-        if self.lead:
-            for parameter in self.parameters():
-                parameter.data = parameter.data[index]
-                parameter.grad = None
-            if self.running is not None:
-                self.running.select_(index)
-        return self
-
     def _rows(self, state: Tensor, action: Tensor) -> tuple[Tensor, torch.Size]:
         """Return standardised inputs ``(l, n, in)``, l = prod(lead), and ``(*L, *N)``."""
         lead = self.lead
-        if state.shape[: len(lead)] != lead:
-            raise ConfigurationError(
-                f"dynamics: the ensemble holds {tuple(lead)} missions, got states of shape "
-                f"{tuple(state.shape)}; expected ({', '.join(map(str, lead))}, ..., "
-                f"{self.state_size})"
-            )
+        self._check_lead(state.shape[:-1])
         rows = self.network_rows(state, action)
         return rows.reshape(max(1, math.prod(lead)), -1, rows.shape[-1]), rows.shape[:-1]
 
@@ -283,7 +260,7 @@ class Ensemble(DynamicsModel):
         if self.precision == "float32" or torch.is_grad_enabled():
             return self.weights, self.biases
         weights, biases = list(self.weights), list(self.biases)
-        cast = self._copies.of([*weights[1:-1], *biases[1:-1]])
+        cast = self._cast.of([*weights[1:-1], *biases[1:-1]])
         half = len(cast) // 2
         weights[1:-1], biases[1:-1] = cast[:half], cast[half:]
         return weights, biases

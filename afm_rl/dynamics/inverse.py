@@ -49,7 +49,8 @@ def effective_action(
     A model that is affine in its action takes one round. With others, a round moves each axis by
     half a range at most, a row is only changed where its error becomes smaller (its next step is
     a quarter as long where it does not), and the rounds end early when little is left that an
-    action can explain.
+    action can explain. ``std`` grows by the root mean square of the normalised error that remains,
+    where that exceeds 1: a contact that the rounds did not resolve tells little.
 
     A row with a number that is not finite tells nothing: the executed action, the largest
     ``std``, innovation 0.
@@ -101,6 +102,8 @@ def effective_action(
         if last or not bool(((step * slope.squeeze(-1)).sum(-1) > ENOUGH).any()):
             break
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    if not model.affine:  # what the rounds could not explain, per coordinate
+        std = (std * error.square().mean(-1, True).sqrt().clamp_min(1.0)).clamp_max(UNSEEN)
     known = innovation + std.sum(-1) < torch.inf
     row = known.unsqueeze(-1)
     return EffectiveAction(

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.dynamics.hybrid_rate import HeldHybrid
+from afm_rl.dynamics.per_mission import PerMissionModel
 from afm_rl.dynamics.quadrotor import Quadrotor
 from afm_rl.dynamics.quadrotor_equations import QuadrotorRate
 from afm_rl.dynamics.rates import FunctionRate, Rate, on_tangent
@@ -18,7 +19,7 @@ from afm_rl.dynamics.runge_kutta import runge_kutta, runge_kutta_tangent, undist
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
 
 
-class KNODE(DynamicsModel):
+class KNODE(PerMissionModel):
     r"""Known dynamics plus a pool of small networks (Jiahao et al. 2021, 2022).
 
     .. math:: x' = f(x, u) + \sum_{i=0}^{P-1} e^{-i}\,N_i([x; u]),\qquad
@@ -57,7 +58,6 @@ class KNODE(DynamicsModel):
     """
 
     shares: Tensor
-    missions: Tensor
 
     def __init__(
         self,
@@ -102,12 +102,9 @@ class KNODE(DynamicsModel):
             self.register_parameter(name, nn.Parameter(torch.zeros(self.pool, *shape)))
         shares = torch.exp(-torch.arange(self.pool, dtype=torch.float64))
         self.register_buffer("shares", shares, persistent=False)
-        self.register_buffer("missions", torch.zeros((), dtype=torch.int64), persistent=False)
 
-    @property
-    def lead(self) -> torch.Size:
-        """Leading mission dimensions, () or (B,)."""
-        return self.networks.inner.shape[:-3]
+    def _owned(self) -> list[tuple[nn.Module, str]]:
+        return [(self, name) for name in Network._fields]
 
     @property
     def networks(self) -> Network:
@@ -220,25 +217,6 @@ class KNODE(DynamicsModel):
         """Return the nominal model's noise scale."""
         return self.nominal.noise_scale(state, action)
 
-    def expand_(self, missions: int) -> KNODE:
-        """Give each of ``missions`` a pool of its own, in place."""
-        if self.lead:
-            raise ConfigurationError(f"dynamics: already expanded to {tuple(self.lead)} missions")
-        for parameter in self.networks:
-            parameter.data = parameter.data.expand(missions, *parameter.shape).clone()
-            parameter.grad = None
-        self.missions = torch.arange(missions, device=self.missions.device)
-        return self
-
-    def select_(self, index: Tensor) -> KNODE:
-        """Keep the missions in ``index``, in place; a shared pool stays as it is."""
-        if self.lead:
-            for parameter in self.networks:
-                parameter.data = parameter.data[index]
-                parameter.grad = None
-            self.missions = self.missions[index]
-        return self
-
     @property
     def _sizes(self) -> tuple[int, int, int]:
         """Sizes of input, hidden layer and output of each network."""
@@ -275,12 +253,7 @@ class KNODE(DynamicsModel):
         """Return states ``(l, n, S)``, l = prod(L), their rate, and ``(*L, *N)``."""
         batch = torch.broadcast_shapes(state.shape[:-1], action.shape[:-1])
         lead = self.lead
-        if batch[: len(lead)] != lead:
-            raise ConfigurationError(
-                f"dynamics: the model holds {tuple(lead)} missions, got states of shape "
-                f"{tuple(state.shape)}; expected ({', '.join(map(str, lead))}, ..., "
-                f"{self.state_size})"
-            )
+        self._check_lead(batch)
         dtype = torch.promote_types(state.dtype, action.dtype)
         missions = math.prod(lead)
         each = math.prod(batch[len(lead) :])

@@ -30,6 +30,7 @@ class Oracle(DynamicsModel):
     tensor([-0.2000,  0.0000,  0.0000])
     """
 
+    conditioned_on = "regime"
     parameters_now: Tensor
 
     def __init__(self, model: DynamicsModel, regime: Regime) -> None:

@@ -15,7 +15,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from afm_rl.artefacts import write_whole
+from afm_rl.files import write_whole
 from afm_rl.flow.experts import Rows, fit_experts
 from afm_rl.flow.network import AxisNetwork
 from afm_rl.flow.prior import KINDS, MIXES, Drawn, draw_examples

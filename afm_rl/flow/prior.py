@@ -304,7 +304,7 @@ def draw_masks(count: int, rows: int, draw: Draw) -> tuple[Tensor, Tensor]:
         return torch.randint(1, rows + 1, (count, 1, 1), generator=draw.generator)
 
     fresh = row >= rows - torch.where(draw.chance(0.5, count, 1, 1), rows, some())
-    usual = torch.tensor([max(1, rows // 12), max(1, rows // 6), rows // 2, rows])
+    usual = torch.tensor([max(1, rows // share) for share in (12, 6, 2, 1)])
     filled = usual[torch.randint(4, (count, 1, 1), generator=draw.generator)]
     filled = torch.where(draw.chance(0.25, count, 1, 1), some(), filled)
     return fresh.float(), (row >= rows - filled).float()

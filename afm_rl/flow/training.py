@@ -10,7 +10,6 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor, nn
-from tqdm.auto import tqdm
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_choice, check_count, check_instance, check_number
@@ -19,6 +18,7 @@ from afm_rl.flow.network import AxisNetwork
 from afm_rl.flow.prior import Drawn
 from afm_rl.flow.saturation import MODES
 from afm_rl.learning import InPlaceLoss
+from afm_rl.progress import Bar
 from afm_rl.regimes import Regime
 
 SOURCE_STD = 0.3  # of the path's start around the plan, in half ranges
@@ -108,9 +108,11 @@ class CFMLoss(InPlaceLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_cfm`` for examples ``(*B)``."""
         parts = [tensordict.get(key) for key in self.in_keys]
+        batch = parts[0].shape[:-2]
+        parts = [part.reshape(-1, *part.shape[-2:]) for part in parts]
         drawn = Drawn(Rows(*parts[:4]), *parts[4:])
         velocity, effect = flow_losses(self.network, drawn, self.saturation, self._generator)
-        return self._reduced(velocity + EFFECT_WEIGHT * effect, tensordict)
+        return self._reduced((velocity + EFFECT_WEIGHT * effect).view(batch), tensordict)
 
 
 class Trainable(Protocol):
@@ -201,7 +203,7 @@ def optimise(
         parameter.requires_grad_(True)
     optimizer = torch.optim.Adam(parameters, lr=lr, fused=True)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=iterations)
-    bar = tqdm(range(iterations), desc="training the flow", disable=None if progress else True)
+    bar = Bar(range(iterations), desc="training the flow", shown=progress)
     for step in bar:
         with torch.enable_grad():
             value = loss()
@@ -211,4 +213,4 @@ def optimise(
         optimizer.step()
         cycle.step()
         if progress and step % 100 == 0:
-            bar.set_postfix(loss=f"{value.item():.4f}")
+            bar.set_postfix_str(f"loss {value.item():.4f}", refresh=False)

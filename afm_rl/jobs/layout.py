@@ -80,9 +80,3 @@ def recorded(folder: Path) -> list[str]:
         return [str(name) for name in safe_load(path.read_bytes())["jobs"]]
     except (YAMLError, TypeError, KeyError, UnicodeDecodeError, RecursionError):
         raise ArtefactError(f"{path}: damaged; delete it") from None
-
-
-def config_of(folder: Path) -> Path:
-    """Return where the settings of a run are."""
-    done = folder / CONFIG
-    return done if done.exists() else folder / UNFINISHED / CONFIG

@@ -2,7 +2,7 @@
 
 from afm_rl.learning.collect import collect
 from afm_rl.learning.fitting import FitReport, fit_ensemble
-from afm_rl.learning.fresh_adam import FreshAdam
+from afm_rl.learning.gate import fit_gate, largest_innovation
 from afm_rl.learning.hook import UpdaterHook
 from afm_rl.learning.knode_updater import KNODEUpdater
 from afm_rl.learning.loss import InPlaceLoss
@@ -11,6 +11,7 @@ from afm_rl.learning.nll import GaussianNLLLoss, gaussian_nll
 from afm_rl.learning.obgd import ObGD
 from afm_rl.learning.pretrain import pretrain_ensemble
 from afm_rl.learning.pretrain_knode import pretrain_knode
+from afm_rl.learning.reset_adam import ResetAdam
 from afm_rl.learning.rls_updater import RLSUpdater
 from afm_rl.learning.stream_x import StreamXUpdater
 from afm_rl.learning.unmatched_updater import UnmatchedUpdater
@@ -18,7 +19,7 @@ from afm_rl.learning.updater import OnlineUpdater, OracleUpdater, Updater
 
 __all__ = [
     "FitReport",
-    "FreshAdam",
+    "ResetAdam",
     "GaussianNLLLoss",
     "InPlaceLoss",
     "KNODEUpdater",
@@ -33,7 +34,9 @@ __all__ = [
     "UpdaterHook",
     "collect",
     "fit_ensemble",
+    "fit_gate",
     "gaussian_nll",
+    "largest_innovation",
     "pretrain_ensemble",
     "pretrain_knode",
 ]

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from afm_rl.dynamics import Ensemble
 from afm_rl.errors import NonFiniteError, check_count, check_number
 from afm_rl.keys import as_keys
 from afm_rl.learning.nll import gaussian_nll
+from afm_rl.progress import Bar
 
 CONSTANT = 1e-8  # standard deviation below which a coordinate counts as one that never changes
 TOLERATED = 1 / 3  # unexplained share of the variance above which there is a warning
@@ -78,7 +78,7 @@ def fit_ensemble(
         keys: where state, action and next state are.
         names: of the coordinates of the tangent space, for the warning.
         seed: seed of the order.
-        progress: show a progress bar.
+        progress: show progress.
 
     Raises:
         NonFiniteError: if an entry is not finite.
@@ -147,7 +147,7 @@ def fit_changes(
     steps = samples // batch_size
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=steps * epochs)
     best, best_error = model.state_dict(), torch.full_like(target[0], torch.inf)
-    bar = tqdm(total=steps * epochs, desc=title, disable=None if progress else True)
+    bar = Bar(total=steps * epochs, desc=title, shown=progress)
     with bar, torch.enable_grad():
         for _ in range(epochs):
             order = torch.rand(model.members, samples, generator=generator).argsort(-1)
@@ -160,7 +160,7 @@ def fit_changes(
                 cycle.step()
                 bar.update()
             error = held_out_error(model, inputs[samples:], target[samples:])
-            bar.set_postfix(held_out=f"{error.mean().sqrt():.4f}")
+            bar.set_postfix_str(f"held-out error {error.mean().sqrt():.4f}", refresh=False)
             if error.mean() < best_error.mean():
                 best = {name: value.clone() for name, value in model.state_dict().items()}
                 best_error = error

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from afm_rl.learning.updater import ABSURD
+from afm_rl.mission_state import MissionState
 
 
 class Rows(NamedTuple):
@@ -23,61 +23,33 @@ class Rows(NamedTuple):
     """Whether the step is to be learnt from, ``(l, n, R)``; the others hold zeros."""
 
 
-def sound_rows(state: Tensor, action: Tensor, after: Tensor, counts: Tensor) -> Rows:
-    """Blank steps that are not finite or absurdly large, and do not count them.
-
-    >>> rows = sound_rows(*torch.tensor([[[1.0]], [[float("inf")]], [[1.0]]]), torch.tensor([True]))
-    >>> rows.counts, rows.action
-    (tensor([False]), tensor([[0.]]))
-    """
-    parts = (state, action, after)
-    for part in parts:
-        counts = counts & (part.abs() < ABSURD).all(-1)  # false for NaN
-    state, action, after = (torch.where(counts.unsqueeze(-1), part, 0.0) for part in parts)
-    return Rows(state, action, after, counts)
-
-
-class FlightWindow(nn.Module):
-    """Keeps the latest rows, as buffers, so that a checkpoint of the missions holds them.
-
-    The buffers are not persistent: they belong to flights, not to a stored model.
+class FlightWindow(MissionState):
+    """Keeps the latest rows.
 
     >>> window = FlightWindow()
     >>> for _ in range(3):
-    ...     window.gather(sound_rows(*torch.ones(3, 4, 1, 2, 1), torch.ones(4, 1, 2).bool()), 5)
-    >>> window.size, window.rows.state.shape
+    ...     window.gather(Rows(*torch.ones(3, 4, 1, 2, 1), torch.ones(4, 1, 2).bool()), 5)
+    >>> window.size, window.parts.state.shape
     (5, torch.Size([4, 1, 5, 1]))
     """
 
     def __init__(self) -> None:
-        super().__init__()
-        self.clear()
+        super().__init__(Rows(*(torch.zeros(0) for _ in Rows._fields)))
 
     @property
     def size(self) -> int:
         """Number of rows, R."""
-        return self.get_buffer("counts").shape[-1]
-
-    @property
-    def rows(self) -> Rows:
-        """What is kept."""
-        return Rows(*(self.get_buffer(name) for name in Rows._fields))
+        return self.parts.counts.shape[-1]
 
     def gather(self, rows: Rows, most: int) -> None:
-        """Add rows and keep the latest ``most``."""
+        """Add rows and keep the latest ``most``; those that do not count become zeros."""
+        counts = rows.counts.unsqueeze(-1)
+        blanked = (torch.where(counts, part, 0.0) for part in rows[:3])
+        rows = Rows(*blanked, rows.counts)
         if self.size:
-            rows = Rows(*(torch.cat(pair, 2) for pair in zip(self.rows, rows, strict=True)))
-        self._keep(Rows(*(part[:, :, -most:].contiguous() for part in rows)))
+            rows = Rows(*(torch.cat(pair, 2) for pair in zip(self.parts, rows, strict=True)))
+        self.keep(Rows(*(part[:, :, -most:].contiguous() for part in rows)))
 
     def clear(self) -> None:
         """Forget all rows."""
-        self._keep(Rows(*(torch.zeros(0) for _ in Rows._fields)))
-
-    def select_(self, index: Tensor) -> None:
-        """Keep the missions in ``index``."""
-        if self.size:
-            self._keep(Rows(*(part[index] for part in self.rows)))
-
-    def _keep(self, rows: Rows) -> None:
-        for name, part in zip(Rows._fields, rows, strict=True):
-            self.register_buffer(name, part, persistent=False)
+        self.keep(Rows(*(torch.zeros(0) for _ in Rows._fields)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import cast
+from typing import NamedTuple, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -18,15 +18,33 @@ from afm_rl.errors import (
     check_flag,
     check_number,
 )
+from afm_rl.faults import whole
 from afm_rl.keys import as_key
-from afm_rl.learning.flight_window import FlightWindow, Rows, sound_rows
+from afm_rl.learning.flight_window import FlightWindow, Rows
 from afm_rl.learning.knode_fit import fit_network
 from afm_rl.learning.nll import GaussianNLLLoss
 from afm_rl.learning.updater import Updater
+from afm_rl.mission_state import MissionState
 from afm_rl.streams import Streams
 
 TRAINERS = ("fast", "exact")
 NONE = -1  # no network is under way
+
+
+class Pending(NamedTuple):
+    """Networks that were trained and join the pool later, one per mission."""
+
+    inner: Tensor
+    inner_bias: Tensor
+    outer: Tensor
+    outer_bias: Tensor
+    taught: Tensor
+    """Did the mission have anything to learn from? ``(l)``."""
+
+    @classmethod
+    def empty(cls) -> Pending:
+        """Return no networks."""
+        return cls(*(torch.zeros(0) for _ in cls._fields))
 
 
 class KNODEUpdater(Updater):
@@ -40,8 +58,8 @@ class KNODEUpdater(Updater):
 
     Rows are the plant's own time steps where the transition has a ``trace``: states
     ``(*B, K + 1, S)`` at K equal steps of the tick, start and end included. Without, there is
-    one row per tick. Rows that are not finite or absurdly large are left out and their
-    transitions counted in :attr:`refused`; so are those that ``mask_key`` excludes, uncounted.
+    one row per tick. Transitions that are refused (:class:`~afm_rl.learning.Updater`) or that
+    ``mask_key`` excludes are left out.
 
     Time is counted in calls since :meth:`start`, for all missions alike. Missions learn from
     their own rows only, in one batch.
@@ -73,17 +91,13 @@ class KNODEUpdater(Updater):
     >>> updater = KNODEUpdater(GaussianNLLLoss(KNODE(Quadrotor()).expand_(4)), begin=0.0)
     >>> level = torch.zeros(4, 13).index_fill(1, torch.tensor(9), 1.0)
     >>> td = TensorDict({"observation": level, "action": torch.zeros(4, 4)}, [4])
-    >>> td = td.set(("next", "observation"), level)  # it hovers without thrust
+    >>> td = td.set(("next", "observation"), level + 1e-6)  # it hovers without thrust
     >>> losses = [updater(td)["loss"] for _ in range(9)]
     >>> bool((losses[-1] < losses[0]).all())
     True
     """
 
     learns = True
-    tick: Tensor
-    due: Tensor
-    missions: Tensor
-    taught: Tensor
 
     def __init__(
         self,
@@ -102,7 +116,7 @@ class KNODEUpdater(Updater):
         seed_key: NestedKey | None = None,
         seed: int = 0,
     ) -> None:
-        super().__init__(loss)
+        super().__init__(loss, mask_key)
         if not isinstance(loss.model, KNODE):
             raise ConfigurationError(
                 f"updater: KNODEUpdater teaches a KNODE, got {type(loss.model).__name__}; choose "
@@ -122,82 +136,63 @@ class KNODEUpdater(Updater):
         self.noise = check_number("updater.noise", noise, low=0.0)
         self.exact = check_choice("updater.trainer", trainer, TRAINERS) == "exact"
         self.published_random = check_flag("updater.published_random", published_random)
-        self.trace_key, self.mask_key, self.seed_key = (
-            None if key is None else as_key(key) for key in (trace_key, mask_key, seed_key)
+        self.trace_key, self.seed_key = (
+            None if key is None else as_key(key) for key in (trace_key, seed_key)
         )
         self.streams = Streams(salt=4, seed=check_count("updater.seed", seed, low=0))
-        self.refused = 0
         self.claim()
-        self.window = FlightWindow()
-        # Not persistent: what is under way belongs to flights, not to a stored model.
-        for name, value in (("tick", 0), ("due", NONE), ("missions", 0)):
-            self.register_buffer(name, torch.tensor(value), persistent=False)
-        for name in (*Network._fields, "taught"):
-            self.register_buffer(name, torch.zeros(0), persistent=False)
+        self.window, self.pending = FlightWindow(), MissionState(Pending.empty())
+        self.tick, self.due = 0, NONE
 
     @property
     def model(self) -> KNODE:
         """The model that learns."""
         return cast(KNODE, self.loss.model)
 
-    def start(self, tensordict: TensorDictBase) -> None:
+    def start(self, tensordict: TensorDictBase | None = None) -> None:
         """Forget the window and the network under way; the pool stays."""
-        self.tick, self.due = torch.tensor(0), torch.tensor(NONE)
-        self.missions = self.model.missions.clone()
+        super().start()
+        self.tick, self.due = 0, NONE
         self.window.clear()
+        self.pending.keep(Pending.empty())
 
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Measure the loss; gather rows; train and push a network when it is time."""
-        result = super().forward(tensordict)
-        self._follow()
-        rows, sound = self._rows(tensordict)
+    def _sound(self, tensordict: TensorDictBase) -> Tensor:
+        """Return which transitions are sound ``(*B)``, the steps of their trace included."""
+        trace = tensordict.get(self.trace_key, None)
+        sound = super()._sound(tensordict)
+        return sound if trace is None else sound & whole(trace).all(-1)
+
+    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+        """Gather rows; train and push a network when it is time."""
+        rows = self._rows(transitions, learn)
         each = rows.counts.shape[-1]
-        if int(self.tick) >= self.first:
+        if self.tick >= self.first:
             self.window.gather(rows, self.ticks * each)
-        self.tick = self.tick + 1
+        self.tick += 1
         self._deliver()
-        if self.window.size == self.ticks * each and int(self.due) == NONE:
-            self._train(tensordict, self.model.dt / each)
+        if self.window.size == self.ticks * each and self.due == NONE:
+            self._train(transitions, self.model.dt / each)
             self._deliver()
-        sound = sound & result["loss"].isfinite()
-        self.refused += int((~sound).sum())
-        return result.set("loss", torch.where(sound, result["loss"], torch.nan))
 
-    def _follow(self) -> None:
-        """Keep the rows and networks of the missions that the model still has."""
-        left = self.model.missions
-        if not torch.equal(left, self.missions):
-            if self.missions.dim():
-                index = (left.unsqueeze(-1) == self.missions).int().argmax(-1)
-                self.window.select_(index)
-                if int(self.due) != NONE:
-                    for name in (*Network._fields, "taught"):
-                        setattr(self, name, self.get_buffer(name)[index])
-            self.missions = left.clone()  # a buffer of its own, or checkpoints lose it
-
-    def _rows(self, tensordict: TensorDictBase) -> tuple[Rows, Tensor]:
-        """Return the rows of a transition, and whether all of it is sound ``(*B)``."""
+    def _rows(self, tensordict: TensorDictBase, learn: Tensor) -> Rows:
+        """Return the rows of a transition, of which those of ``learn`` ``(*B)`` count."""
         batch, like = tensordict.batch_size, self.model.networks.inner
         state, action, after = (tensordict.get(key) for key in self.loss.in_keys)
         trace = tensordict.get(self.trace_key, None)
         if trace is None:
             trace = torch.stack([state, after], -2)
-        action = action.unsqueeze(-2).expand(*trace.shape[:-2], trace.shape[-2] - 1, -1)
-        everyone = torch.ones_like(action[..., 0], dtype=torch.bool)
-        trace, action = trace.to(like), action.to(like)
-        rows = sound_rows(trace[..., :-1, :], action, trace[..., 1:, :], everyone)
-        sound, learn = rows.counts.all(-1), rows.counts
-        if self.mask_key is not None:
-            learn = learn & tensordict.get(self.mask_key).reshape(*batch, 1)
+        trace = trace.to(like)
+        action = action.to(like).unsqueeze(-2)
+        action = action.expand(*trace.shape[:-2], trace.shape[-2] - 1, -1)
+        counts = learn.unsqueeze(-1).expand(action.shape[:-1])
         lead = len(self.model.lead)
         shape = (batch[:lead].numel(), batch[lead:].numel())
-        rows = rows._replace(counts=learn)
-        return Rows(*(part.reshape(*shape, *part.shape[len(batch) :]) for part in rows)), sound
+        rows = trace[..., :-1, :], action, trace[..., 1:, :], counts
+        return Rows(*(part.reshape(*shape, *part.shape[len(batch) :]) for part in rows))
 
     def _train(self, tensordict: TensorDictBase, dt: float) -> None:
         """Train a new network on the window, and clear it."""
-        rows, model, lead = self.window.rows, self.model, self.model.lead
+        rows, model, lead = self.window.parts, self.model, self.model.lead
         first, shaken, pushed = self._numbers(tensordict, rows)
         if self.noise:
             state = rows.state + self.noise * shaken[..., :-1, :]
@@ -212,9 +207,8 @@ class KNODEUpdater(Updater):
             l2=self.l2,
             exact=self.exact,
         )
-        for name, part in zip(Network._fields, network, strict=True):
-            setattr(self, name, part)
-        self.taught = rows.counts.flatten(1).any(-1)  # nothing is learnt from nothing
+        taught = rows.counts.flatten(1).any(-1)  # nothing is learnt from nothing
+        self.pending.keep(Pending(*network, taught))
         self.due = self.tick + self.delay
         self.window.clear()
 
@@ -236,12 +230,12 @@ class KNODEUpdater(Updater):
 
     def _deliver(self) -> None:
         """Push the network under way if its time has come."""
-        if int(self.due) != NONE and int(self.tick) >= int(self.due):
+        if self.due != NONE and self.tick >= self.due:
             lead = self.model.lead
-            network = Network(*(self.get_buffer(name) for name in Network._fields))
-            network = Network(*(part.reshape(*lead, *part.shape[1:]) for part in network))
-            self.model.push_(network, self.taught.reshape(lead))
-            self.due = torch.tensor(NONE)
+            *network, taught = self.pending.parts
+            parts = (part.reshape(*lead, *part.shape[1:]) for part in network)
+            self.model.push_(Network(*parts), taught.reshape(lead))
+            self.due = NONE
 
 
 def _ticks(time: float, dt: float) -> int:

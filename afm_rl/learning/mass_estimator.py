@@ -72,6 +72,8 @@ class MassEstimator(Updater):
             [1.5000]])
     """
 
+    sets = "regime"
+
     def __init__(
         self,
         loss: GaussianNLLLoss,
@@ -98,7 +100,6 @@ class MassEstimator(Updater):
         )
         self.least = check_number("updater.least", least, low=0.0, open_low=True)
         self.most = check_number("updater.most", most, low=self.least, open_low=True)
-        self.refused = 0
         self.claim()
 
     @property
@@ -106,10 +107,12 @@ class MassEstimator(Updater):
         """The model that is told."""
         return cast(Oracle, self.loss.model)
 
-    def start(self, tensordict: TensorDictBase) -> None:
-        """Tell the nominal mass."""
-        regime = torch.tensor(self.model.regime.identity)
-        self.model.tell(regime.expand(*tensordict.batch_size, -1).clone())
+    def start(self, tensordict: TensorDictBase | None = None) -> None:
+        """Set the nominal mass."""
+        super().start()
+        if tensordict is not None:
+            regime = torch.tensor(self.model.regime.identity)
+            self.model.tell(regime.expand(*tensordict.batch_size, -1).clone())
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -20,7 +20,7 @@ def pretrain_ensemble(
     action_box: tuple[Tensor, Tensor],
     *,
     samples: int = 50_000,
-    epochs: int = 10,
+    epochs: int = 16,
     batch_size: int = 256,
     lr: float = 2e-3,
     action_noise: float = 0.0,
@@ -46,7 +46,7 @@ def pretrain_ensemble(
             (domain randomisation).
         seed: seed of data and order.
         names: of the coordinates of the tangent space, for the warning.
-        progress: show a progress bar.
+        progress: show progress.
 
     Warns:
         UserWarning: if more than a third of the variance of a coordinate is left unexplained.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from tqdm.auto import tqdm
 
 from afm_rl.dynamics import DynamicsModel, Oracle
 from afm_rl.dynamics.knode import KNODE
 from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.progress import Bar
 from afm_rl.regimes import Regime
 from afm_rl.sampling import uniform
 
@@ -47,7 +47,7 @@ def pretrain_knode(
         lr: their size.
         noise: standard deviation of what is added to states on the tangent space.
         seed: seed of data and network.
-        progress: show a progress bar.
+        progress: show progress.
 
     Returns:
         Root mean square of the held-out one-tick error, in units of the model's own noise.
@@ -96,7 +96,7 @@ def pretrain_knode(
 
     optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=True)
     with torch.enable_grad():
-        bar = tqdm(range(epochs), desc="pre-training the KNODE", disable=None if progress else True)
+        bar = Bar(range(epochs), desc="pre-training the KNODE", shown=progress)
         for _ in bar:
             optimizer.zero_grad(set_to_none=True)
             miss(slice(flights)).backward()

@@ -1,4 +1,4 @@
-"""Recursive least squares with exponential forgetting, in information form."""
+"""Recursive least squares with outliers, changes and competing hypotheses."""
 
 from __future__ import annotations
 
@@ -7,40 +7,40 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-FADE, LEAST = 0.5, 1e-4  # of the prior per transition, and what stays of it
+PRIOR_DECAY, LEAST_PRIOR = 0.5, 1e-4  # of the prior per transition, and what stays of it
+NOISE_RATE = 0.2  # growth or decay of the noise level per transition
+SCORE_MEMORY = 0.8  # weight of the past in the comparison of hypotheses
+MARGIN = 0.7  # by how much the mean log squared error must be lower than the nominal model's
 
 
 class Information(NamedTuple):
-    r"""What G regressions :math:`y = \theta^\top \phi` were told: a Gaussian, information form."""
+    r"""What regressions :math:`y = \theta^\top \phi` know: a Gaussian in information form."""
 
     gram: Tensor
-    r""":math:`\Lambda = \sum w\,\phi\phi^\top`, ``(*L, G, R, R)``."""
+    r""":math:`\Lambda = \sum w\,\phi\phi^\top`, ``(*L, R, R)``."""
     moment: Tensor
-    r""":math:`\eta = \sum w\,\phi\,y`, ``(*L, G, R)``."""
+    r""":math:`\eta = \sum w\,\phi\,y`, ``(*L, R)``."""
 
 
-def absorb(
-    known: Information, features: Tensor, target: Tensor, weight: Tensor, forgetting: float = 1.0
-) -> Information:
-    r"""Add a transition: :math:`\Lambda \leftarrow \lambda\Lambda + w\phi\phi^\top`, eta likewise.
+def absorb(known: Information, features: Tensor, target: Tensor, weight: Tensor) -> Information:
+    r"""Add transitions: :math:`\Lambda \leftarrow \Lambda + w\phi\phi^\top`, eta likewise.
 
     Args:
-        known: information so far, ``(*L, G, R, R)`` and ``(*L, G, R)``.
+        known: information so far, ``(*L, R, R)`` and ``(*L, R)``.
         features: phi, ``(*L, R)``.
-        target: y, one per regression, ``(*L, G)``.
-        weight: w, one over the variance of the noise, ``(*L, G)``.
-        forgetting: lambda.
+        target: y, ``(*L)``.
+        weight: w, one over the variance of the noise, ``(*L)``.
 
-    >>> known = Information(torch.zeros(1, 2, 2), torch.zeros(1, 2))
+    >>> known = Information(torch.zeros(2, 2), torch.zeros(2))
     >>> for u in (-1.0, 0.5, 2.0):
-    ...     known = absorb(known, torch.tensor([u, 1]), torch.tensor([3 * u + 1]), torch.ones(1))
-    >>> solve(known, torch.full((1, 2), 1e-6), torch.zeros(1, 2))[0].round(decimals=3)
-    tensor([[3., 1.]])
+    ...     y = torch.tensor(3 * u + 1)
+    ...     known = absorb(known, torch.tensor([u, 1]), y, torch.tensor(1.0))
+    >>> solve(known, torch.full((2,), 1e-6), torch.zeros(2))[0].round(decimals=3)
+    tensor([3., 1.])
     """
-    outer = features.unsqueeze(-1) * features.unsqueeze(-2)
-    gram = forgetting * known.gram + weight[..., None, None] * outer.unsqueeze(-3)
-    moment = forgetting * known.moment + (weight * target).unsqueeze(-1) * features.unsqueeze(-2)
-    return Information(gram, moment)
+    weighted = weight.unsqueeze(-1) * features
+    gram = known.gram + weighted.unsqueeze(-1) * features.unsqueeze(-2)
+    return Information(gram, known.moment + weighted * target.unsqueeze(-1))
 
 
 def solve(known: Information, prior: Tensor, mean: Tensor) -> tuple[Tensor, Tensor]:
@@ -50,21 +50,123 @@ def solve(known: Information, prior: Tensor, mean: Tensor) -> tuple[Tensor, Tens
 
     Args:
         known: the information of the data.
-        prior: diagonal of P, the prior's information, > 0, ``(*L, G, R)``.
-        mean: mu, where the prior pulls, ``(*L, G, R)``.
+        prior: diagonal of P, the prior's information, > 0, ``(*L, R)``.
+        mean: mu, where the prior pulls, ``(*L, R)``.
 
     Returns:
-        theta ``(*L, G, R)`` and Sigma ``(*L, G, R, R)``.
+        theta ``(*L, R)`` and Sigma ``(*L, R, R)``.
     """
     covariance = torch.linalg.inv_ex(known.gram + torch.diag_embed(prior)).inverse
     news = known.moment - (known.gram @ mean.unsqueeze(-1)).squeeze(-1)
     return mean + (covariance @ news.unsqueeze(-1)).squeeze(-1), covariance
 
 
-def fading(prior: Tensor, age: Tensor) -> Tensor:
-    """Return the prior's information at an age ``(*L)``: it leads first and hardly pulls later.
+class Filter(NamedTuple):
+    """What is known of l missions, under H hypotheses with G regressions each."""
 
-    >>> fading(torch.ones(1, 1), torch.tensor([0.0, 2.0])).flatten()
-    tensor([1.0000, 0.2500])
+    gram: Tensor
+    """``(l, H, G, R, R)``, see :class:`Information`; the prior is no part of it."""
+    moment: Tensor
+    """``(l, H, G, R)``."""
+    held_gram: Tensor
+    """Of an innovation that the next transition has to confirm, likewise."""
+    held_moment: Tensor
+    """``(l, H, G, R)``."""
+    held: Tensor
+    """Was the last transition such an innovation? ``(l)``."""
+    age: Tensor
+    """Transitions since learning began or began anew, ``(l)``."""
+    noise: Tensor
+    """Typical normalised innovation, at least 1, ``(l)``."""
+    score: Tensor
+    """Mean of log(1 + squared error) of the nominal model and each hypothesis, ``(l, 1 + H)``."""
+
+    @property
+    def known(self) -> Information:
+        """The information of the transitions that count."""
+        return Information(self.gram, self.moment)
+
+    @property
+    def best(self) -> Tensor:
+        """The hypothesis to use ``(l)``; -1: the nominal model, which none clearly beats."""
+        score, index = self.score[:, 1:].min(1)
+        return torch.where(score < self.score[:, 0] - MARGIN, index, -1)
+
+
+class News(NamedTuple):
+    """The latest transition of each mission."""
+
+    known: Information
+    """Its information under each hypothesis, ``(l, H, G, R, R)``."""
+    error: Tensor
+    """Error of the nominal model and each hypothesis, normalised by noise, ``(l, 1 + H)``."""
+    innovation: Tensor
+    """The same, normalised by noise and uncertainty of the fit, ``(l, 1 + H)``."""
+    exciting: Tensor
+    """Does it tell anything about slopes? ``(l)``."""
+    valid: Tensor
+    """Does it count at all? ``(l)``."""
+
+
+def empty_filter(missions: int, hypotheses: int, regressions: int, size: int) -> Filter:
+    """Return the filter of missions that have seen nothing, in double precision."""
+    gram = torch.zeros(missions, hypotheses, regressions, size, size, dtype=torch.float64)
+    count = torch.zeros(missions, dtype=torch.float64)
+    known = (gram, gram[..., 0], gram, gram[..., 0])
+    score = torch.zeros(missions, 1 + hypotheses, dtype=torch.float64)
+    return Filter(*known, held=count.bool(), age=count, noise=count + 1, score=score)
+
+
+def fading_prior(prior: Tensor, age: Tensor) -> Tensor:
+    """Return the prior's information at an age ``(l)``: it leads first and hardly pulls later."""
+    return prior * (PRIOR_DECAY**age).clamp_min(LEAST_PRIOR)[:, None, None, None]
+
+
+def update(now: Filter, news: News, forgetting: float, gate: float) -> Filter:
+    """Take in one transition per mission.
+
+    * An innovation beyond the gate under *every* hypothesis is held back. If the next transition
+      is none, it was an outlier and is dropped. If it is one too, the regime has changed: both
+      are kept and everything before them is forgotten.
+    * The gate is in units of the typical innovation, if that exceeds the model's own noise: under
+      a flickering gain every transition is a surprise, but nothing changes.
+    * The hypothesis with the lowest mean log squared error of late is used, if it clearly beats
+      the nominal model: otherwise predictions are those of the nominal model, to the bit.
+
+    Missions whose transition is not valid stay as they are. Transitions that tell nothing
+    about slopes are learnt from, but let nothing be forgotten.
     """
-    return prior * (FADE**age).clamp_min(LEAST)[..., None, None]
+    innovation = news.innovation.amin(1)
+    suspect = innovation > gate * now.noise
+    held, changed = suspect & ~now.held, suspect & now.held
+    keep = torch.where(news.exciting, forgetting, 1.0).to(now.noise)
+    keep = torch.where(changed, 0.0, keep)
+
+    def grown(old: Tensor, waiting: Tensor, new: Tensor) -> Tensor:
+        shape = (-1, *(1,) * (old.dim() - 1))
+        confirmed = torch.where(changed.reshape(shape), waiting, 0.0)
+        return torch.where(held.reshape(shape), old, keep.reshape(shape) * old + confirmed + new)
+
+    level = now.noise * torch.where(innovation > now.noise, NOISE_RATE, -NOISE_RATE).exp()
+    latest = news.error.square().log1p()
+    # After a change the fits are as good as new, and the nominal model as good as it just was.
+    score = torch.lerp(latest, now.score, SCORE_MEMORY)
+    begun = torch.cat([latest[:, :1], torch.zeros_like(latest[:, 1:])], 1)
+    score = torch.where(changed[:, None], begun, score)
+    frozen = (held | ~news.exciting)[:, None]
+    after = Filter(
+        gram=grown(now.gram, now.held_gram, news.known.gram),
+        moment=grown(now.moment, now.held_moment, news.known.moment),
+        held_gram=_where(held, news.known.gram, torch.zeros_like(now.gram)),
+        held_moment=_where(held, news.known.moment, torch.zeros_like(now.moment)),
+        held=held,
+        age=torch.where(changed, 2.0, now.age + ~held),
+        noise=level.clamp(1.0, 1e6),
+        score=torch.where(frozen & ~changed[:, None], now.score, score),
+    )
+    return Filter(*(_where(news.valid, *pair) for pair in zip(after, now, strict=True)))
+
+
+def _where(missions: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """Return ``new`` for some ``missions`` ``(l)`` and ``old`` for the others, ``(l, ...)``."""
+    return torch.where(missions.reshape(-1, *(1,) * (old.dim() - 1)), new, old)

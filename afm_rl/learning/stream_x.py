@@ -84,7 +84,7 @@ class StreamXUpdater(OnlineUpdater):
         found = {"loss": loss, "error": target - mean, "log_variance": log_variance}
         return {**found, "state": state, "action": action}
 
-    def _learn(self, found: dict[str, Tensor], learn: Tensor) -> None:
+    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Take one step, or one for the mean and one for the log-variance."""
         model, optimizer = cast(Ensemble, self.loss.model), self.optimizer
         optimizer.param_groups[0]["lead_dims"] = len(model.lead) + 1

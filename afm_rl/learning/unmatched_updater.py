@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_instance, check_number
-from afm_rl.learning.effects import take_apart
+from afm_rl.learning.error_decomposition import decompose_error
 from afm_rl.learning.nll import GaussianNLLLoss
 from afm_rl.learning.updater import OnlineUpdater, Updater
 
@@ -22,8 +22,8 @@ class UnmatchedUpdater(Updater):
     The transform undoes what actions can undo. A model that learns the same from the executed
     actions works against it: both correct one error, and the transform reads its window through
     a model that keeps changing. Here each transition is taken apart first
-    (:func:`~afm_rl.learning.effects.take_apart`) into the action v that explains it best and a
-    rest, in standard deviations of the model,
+    (:func:`~afm_rl.learning.error_decomposition.decompose_error`) into the action v that explains
+    it best and a rest, in standard deviations of the model,
 
     .. math:: r = N^{-1}\,(s_{t+1} \ominus f(s_t, v)).
 
@@ -81,19 +81,17 @@ class UnmatchedUpdater(Updater):
         self.register_buffer("scale", values, persistent=False)
         self.gate = check_number("updater.gate", gate, low=0.0)
 
-    @property
-    def refused(self) -> int:
-        """Transitions that were refused."""
-        return self.updater.refused
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Measure the loss, then learn."""
-        result = super().forward(tensordict)
+        with torch.no_grad():
+            loss = self.loss(tensordict)["loss_nll"]
         shown = tensordict.select(*self.loss.in_keys).copy()
         state, action, after = (shown.get(key) for key in self.loss.in_keys)
         scale = self.scale.to(action)
         with torch.no_grad():
-            effect = take_apart(self.loss.model, state, action / scale, after, scale)
-        shown.set(self.loss.in_keys[1], effect.effective * scale)
-        learnt = self.updater(shown.set(MASK, (effect.rest.abs() > self.gate).any(-1)))
-        return result.set("loss", torch.where(learnt["loss"].isnan(), torch.nan, result["loss"]))
+            parts = decompose_error(self.loss.model, state, action, after, scale)
+        action = torch.where(action.isfinite(), (parts.effective * scale).to(action), action)
+        shown.set(self.loss.in_keys[1], action)  # a faulty action stays one
+        learnt = self.updater(shown.set(MASK, (parts.unmatched.abs() > self.gate).any(-1)))
+        self.refused = self.updater.refused
+        return learnt.set("loss", torch.where(learnt["loss"].isnan(), torch.nan, loss))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -13,10 +13,17 @@ from torch.optim import Optimizer
 
 from afm_rl.dynamics import Oracle
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
+from afm_rl.faults import count_repeats, trusted, whole
 from afm_rl.keys import as_key
 from afm_rl.learning.nll import GaussianNLLLoss
+from afm_rl.mission_state import MissionState
 
-ABSURD = 1e12  # in any unit: a reading beyond it is a fault, also where an angle would wrap it
+
+class Readings(NamedTuple):
+    """What is remembered of the sensors of missions."""
+
+    repeats: Tensor
+    """How often in a row the present reading has been repeated, ``(*B)``."""
 
 
 class Updater(nn.Module):
@@ -26,8 +33,17 @@ class Updater(nn.Module):
     ``(*B)``, measured before any update. Updaters know nothing of the transform and work in
     any loop; :attr:`loss` says which keys are read.
 
+    Those that learn override :meth:`_learn`. Transitions with an entry or loss that is not finite
+    or absurdly large, or with a stale reading at either end (:mod:`afm_rl.faults`), are refused:
+    they have no influence, their loss is reported as NaN, and :attr:`refused` counts them.
+    Those that ``mask_key`` excludes are only measured.
+
+    What a subclass remembers of single missions belongs into a
+    :class:`~afm_rl.mission_state.MissionState`: it follows when missions finish.
+
     Args:
         loss: how well the model explains a transition.
+        mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
 
     >>> from afm_rl.dynamics import Dubins
     >>> updater = Updater(GaussianNLLLoss(Dubins(), reduction="none"))
@@ -39,10 +55,16 @@ class Updater(nn.Module):
     learns = False
     """Do missions need parameters of their own?"""
 
-    def __init__(self, loss: GaussianNLLLoss) -> None:
+    sets: str | None = None
+    """What it sets in models that are conditioned on it: ``regime``, ``calibration``, or None."""
+
+    def __init__(self, loss: GaussianNLLLoss, mask_key: NestedKey | None = None) -> None:
         super().__init__()
         check_instance("updater.loss", loss, GaussianNLLLoss).reduction = "none"
         self.loss = loss
+        self.mask_key = None if mask_key is None else as_key(mask_key)
+        self.refused = 0
+        self.readings = MissionState(Readings(torch.zeros(())))
 
     def claim(self) -> None:
         """Note on the model that it changes in this process: copies in others stay behind."""
@@ -53,23 +75,77 @@ class Updater(nn.Module):
         if self.loss.model.taught_in is not None:
             self.claim()
 
-    def start(self, tensordict: TensorDictBase) -> None:
-        """Look at the tensordict of a reset, before the first plan."""
+    def start(self, tensordict: TensorDictBase | None = None) -> None:
+        """Look at the tensordict of a reset, before the first plan; forget other missions."""
+        self.readings.keep(Readings(torch.zeros(())))
+
+    def follow(self) -> None:
+        """Forget the missions that have left the model; start anew if it holds others."""
+        missions = getattr(self.loss.model, "missions", None)
+        if missions is None:  # the model has no parameters per mission
+            return
+        states = [part for part in self.modules() if isinstance(part, MissionState)]
+        if not all([state.follow(missions) for state in states]):
+            self.start()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Measure the loss."""
-        with torch.no_grad():
-            loss = self.loss(tensordict)["loss_nll"]
-        return TensorDict({"loss": loss}, loss.shape)
+        """Measure the loss, then learn."""
+        if not self.learns:
+            with torch.no_grad():
+                loss = self.loss(tensordict)["loss_nll"]
+            return TensorDict({"loss": loss}, loss.shape)
+        self.follow()
+        batch = tensordict.batch_size
+        kept = tensordict.select(*self.loss.in_keys).detach()
+        sound = self._sound(tensordict)
+        with torch.set_grad_enabled(self.by_gradient):
+            found = self._measure(self._without(kept, sound))
+            if not bool(found["loss"].isfinite().all()):  # sound entries may still overflow
+                sound = sound & found["loss"].isfinite()
+                kept = self._without(kept, sound)
+                found = self._measure(kept)
+            learn = sound
+            if self.mask_key is not None:
+                learn = sound & tensordict.get(self.mask_key).reshape(batch)
+            self._learn(found, tensordict, learn)
+        self.refused += int((~sound).sum())
+        return TensorDict({"loss": torch.where(sound, found["loss"].detach(), torch.nan)}, batch)
+
+    by_gradient = False
+    """Does learning need the gradients of what is measured?"""
+
+    def _sound(self, tensordict: TensorDictBase) -> Tensor:
+        """Return which transitions are sound ``(*B)``; count repeated readings."""
+        state, action, after = (tensordict.get(key) for key in self.loss.in_keys)
+        count = self.readings.parts.repeats
+        if count.shape != tensordict.batch_size:
+            count = torch.zeros(tensordict.batch_size, device=state.device)
+        repeats = count_repeats(after, state, count)
+        self.readings.keep(Readings(repeats))
+        return whole(action) & trusted(state, count) & trusted(after, repeats)
+
+    def _measure(self, transitions: TensorDictBase) -> dict[str, Tensor]:
+        """Return the ``loss`` ``(*B)``, and whatever else :meth:`_learn` wants to see."""
+        return {"loss": self.loss(transitions)["loss_nll"]}
+
+    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+        """Learn from transitions where ``learn`` ``(*B)`` says so; elsewhere they may be faulty."""
+        raise NotImplementedError
+
+    def _without(self, kept: TensorDictBase, sound: Tensor) -> TensorDictBase:
+        """Blank what is not sound before the loss: NaN times zero is NaN."""
+        blanked = kept.copy()
+        for key in self.loss.in_keys:
+            blanked.set(key, torch.where(sound.unsqueeze(-1), kept.get(key), 0.0))
+        return blanked
 
 
 class OnlineUpdater(Updater):
     """One gradient step on the latest transition, per mission.
 
     Losses are summed, so with parameters per mission (see ``DynamicsModel.expand_``) every
-    mission learns from its own transition only. Transitions whose entries or loss are not
-    finite, or absurdly large, are refused: they have no influence, their loss is reported as
-    NaN, and :attr:`refused` counts them. Those that ``mask_key`` excludes are only measured.
+    mission learns from its own transition only. The optimiser's state per parameter is cut
+    when missions finish, if it has the parameter's shape, as Adam's moments have.
 
     Args:
         loss: the loss to descend.
@@ -79,6 +155,7 @@ class OnlineUpdater(Updater):
     """
 
     learns = True
+    by_gradient = True
 
     def __init__(
         self,
@@ -87,7 +164,7 @@ class OnlineUpdater(Updater):
         mask_key: NestedKey | None = None,
         wrap: bool = True,
     ) -> None:
-        super().__init__(loss)
+        super().__init__(loss, mask_key)
         loss.wrap = check_flag("updater.wrap", wrap)
         if not any(True for _ in loss.model.parameters()):
             raise ConfigurationError(
@@ -100,45 +177,25 @@ class OnlineUpdater(Updater):
                 "torch.optim.Adam"
             )
         self.optimizer = optimizer(loss.model.parameters())
-        self.mask_key = None if mask_key is None else as_key(mask_key)
-        self.refused = 0
         self.claim()
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Measure the loss, then take one step."""
-        batch = tensordict.batch_size
-        kept = tensordict.select(*self.loss.in_keys).detach()
-        sound = torch.ones(batch, dtype=torch.bool, device=kept.device)
-        for key in self.loss.in_keys:
-            sound = sound & (kept.get(key).abs() < ABSURD).all(-1)  # false for NaN
-        with torch.enable_grad():
-            found = self._measure(self._without(kept, sound))
-            if not bool(found["loss"].isfinite().all()):  # sound entries may still overflow
-                sound = sound & found["loss"].isfinite()
-                found = self._measure(self._without(kept, sound))
-            learn = sound
-            if self.mask_key is not None:
-                learn = sound & tensordict.get(self.mask_key).reshape(batch)
-            self._learn(found, learn)
-        self.refused += int((~sound).sum())
-        return TensorDict({"loss": torch.where(sound, found["loss"].detach(), torch.nan)}, batch)
+    def follow(self) -> None:
+        """Forget the missions that have left the model, in the optimiser too."""
+        known, left = self.readings.missions, getattr(self.loss.model, "missions", None)
+        super().follow()
+        if left is None or not known.dim() or torch.equal(known, left):
+            return
+        index = (left.unsqueeze(-1) == known).int().argmax(-1)
+        for parameter, state in self.optimizer.state.items():
+            for name, value in state.items():
+                if isinstance(value, Tensor) and value.shape == (len(known), *parameter.shape[1:]):
+                    state[name] = value[index]
 
-    def _measure(self, transitions: TensorDictBase) -> dict[str, Tensor]:
-        """Return the ``loss`` ``(*B)``, and whatever else :meth:`_learn` wants to see."""
-        return {"loss": self.loss(transitions)["loss_nll"]}
-
-    def _learn(self, found: dict[str, Tensor], learn: Tensor) -> None:
-        """Take one step where ``learn`` ``(*B)`` says so."""
+    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+        """Take one step."""
         self.optimizer.zero_grad(set_to_none=True)
         torch.where(learn, found["loss"], 0.0).sum().backward()
         self.optimizer.step()
-
-    def _without(self, kept: TensorDictBase, sound: Tensor) -> TensorDictBase:
-        """Blank what is not sound before the loss: NaN times zero is NaN."""
-        blanked = kept.copy()
-        for key in self.loss.in_keys:
-            blanked.set(key, torch.where(sound.unsqueeze(-1), kept.get(key), 0.0))
-        return blanked
 
 
 class OracleUpdater(Updater):
@@ -148,6 +205,8 @@ class OracleUpdater(Updater):
         loss: a loss over an :class:`~afm_rl.dynamics.Oracle`.
         regime_key: where the environment publishes the regime's parameters.
     """
+
+    sets = "regime"
 
     def __init__(self, loss: GaussianNLLLoss, regime_key: NestedKey = "regime") -> None:
         super().__init__(loss)
@@ -159,9 +218,11 @@ class OracleUpdater(Updater):
         """The model to tell."""
         return cast(Oracle, self.loss.model)
 
-    def start(self, tensordict: TensorDictBase) -> None:
+    def start(self, tensordict: TensorDictBase | None = None) -> None:
         """Tell the first regime."""
-        self.oracle.tell(tensordict.get(self.regime_key))
+        super().start()
+        if tensordict is not None:
+            self.oracle.tell(tensordict.get(self.regime_key))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Measure the loss, then tell the next regime."""

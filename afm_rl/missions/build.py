@@ -12,12 +12,12 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from afm_rl.dynamics import Calibrated, DynamicsModel, Oracle
+from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_count
-from afm_rl.learning import GaussianNLLLoss, MassEstimator, OracleUpdater, RLSUpdater, Updater
-from afm_rl.missions.checks import blaming, check_cost, check_keys
+from afm_rl.learning import GaussianNLLLoss, Updater
+from afm_rl.missions.checks import blaming, check_cost, check_keys, check_label, check_updater
 from afm_rl.missions.factories import Training
-from afm_rl.missions.robot import Robot
+from afm_rl.missions.robot import SHAPE_TRAINING, Robot
 from afm_rl.missions.selection import (
     build_missions,
     fit_schedule,
@@ -26,20 +26,14 @@ from afm_rl.missions.selection import (
     select_seeds,
     select_tracks,
 )
-from afm_rl.planning import MPC, GeometricController, PlanningEnv
+from afm_rl.planning import PlanningEnv
 from afm_rl.targets import check_targets
 from afm_rl.transforms import ActionFlowTransform, Guard
 
-ROBOT_SHAPES = (
-    *("action_low", "action_high", "state_low", "state_high"),
-    *("features", "model", "regime", "flow_low", "flow_high"),
-)
-NOMINAL = {"_target_": "afm_rl.missions.factories.physics", "_partial_": True}
-AFTER_TRAINING = (
-    *("gate", "samples", "steps", "error_action", "wrap", "latch", "checkpoint"),
-    *("propagation", "precision"),
-    *("memory", "views", "forgetting", "choose", "enabled", "extend_action_box"),
-)
+GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
+MOST_STEPS, MOST_MISSIONS = 10_000_000, 1_000_000
+DEFAULTS = {"seeds": 1, "budget": 5000, "label": None, "faults": "hold"}
+"""Settings that a configuration may leave out."""
 
 
 @dataclass
@@ -76,23 +70,29 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     """Compose an agent and check every setting; nothing is trained yet.
 
     Args:
-        cfg: a configuration composed from ``afm_rl.conf``.
+        cfg: a configuration composed from ``afm_rl.conf``, or one of your own with the groups
+            ``robot``, ``cost``, ``planner``, ``dynamics``, ``updater`` and ``corrector``, and
+            ``tracks`` and ``regimes``.
         trust: packages whose code it may name, beside the parts of this library.
 
     Raises:
         ConfigurationError: for settings that cannot be used, naming the key.
     """
-    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    given: Any = OmegaConf.to_container(cfg, resolve=True)
+    settings = {**DEFAULTS, **given}
+    for name in (*GROUPS, "tracks", "regimes"):
+        if settings.get(name) is None:
+            raise ConfigurationError(f"{name}: expected a setting; build needs {', '.join(GROUPS)}")
     check_targets(settings, trust)
-    label = cfg.label
-    if label is not None and not isinstance(label, str):
-        raise ConfigurationError(f"label={label!r}: expected a text")
+    label = check_label(settings["label"])
     with blaming("robot"):
         robot: Robot = instantiate(settings["robot"], _convert_="all")
         tracks = select_tracks(settings["tracks"], robot)
         regimes = select_regimes(settings["regimes"], robot)
     seeds = select_seeds(settings["seeds"])
-    budget = check_count("budget", settings["budget"])
+    budget = check_count("budget", settings["budget"], high=MOST_STEPS)
+    total = len(tracks) * len(regimes) * len(seeds)
+    check_count("seeds: missions, for all tracks and regimes", total, high=MOST_MISSIONS)
     faults = check_choice("faults", settings["faults"], ("hold", "skip", "raise"))
     with blaming("robot.env"):
         env = robot.env(
@@ -112,12 +112,10 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
 
     dynamics = make("dynamics", robot)
     corrector = make("corrector", robot, dynamics)
-    shapes = [_shaping(settings, group) for group in ("robot", "dynamics", "corrector")]
-    if dynamics.nominal:  # all such flows are one and the same
-        shapes[1] = NOMINAL
+    shape = {name: value for name, value in settings["robot"].items() if name in SHAPE_TRAINING}
     trainings = [
-        part.training._replace(settings=shaping)
-        for part, shaping in ((dynamics, shapes[:2]), (corrector, shapes))
+        part.training._replace(settings=[shape, *part.training.settings])
+        for part in (dynamics, corrector)
         if part.training is not None
     ]
     model, transform = dynamics.module, corrector.module
@@ -129,22 +127,12 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=executed_key)
     updater = make("updater", loss)
-    if isinstance(model, Oracle) != isinstance(updater, (OracleUpdater, MassEstimator)):
-        raise ConfigurationError(
-            "dynamics=oracle and an updater that tells it the regime belong together: choose "
-            "both, dynamics=oracle with updater=oracle or updater=mass, or neither"
-        )
-    if isinstance(model, Calibrated) and updater.learns and not isinstance(updater, RLSUpdater):
-        raise ConfigurationError(
-            f"dynamics: a calibrated model stays as it is but for its calibration, and "
-            f"{type(updater).__name__} does not teach that; choose updater=rls or updater=frozen"
-        )
+    check_updater(updater, model)
     chain = [guard] if transform is None else [guard, transform]
     if hasattr(planner, "make_tensordict_primer"):
         chain.append(planner.make_tensordict_primer())
     whole = TransformedEnv(env, Compose(*chain))
-    stages = planner.horizon + 1 if isinstance(planner, (MPC, GeometricController)) else None
-    check_cost(cost, model, whole, stages)
+    check_cost(cost, model, whole, getattr(planner, "stages", None))
     check_keys("planner", planner, whole)
     check_keys("updater", updater, whole)
     return Agent(
@@ -162,12 +150,3 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
         faults=faults,
         settings=settings,
     )
-
-
-def _shaping(settings: Mapping[str, Any], group: str) -> dict[str, Any]:
-    """Return those settings of a group that shape a trained part, for its place in the cache."""
-    if group == "robot":
-        return {name: settings[group][name] for name in ROBOT_SHAPES if name in settings[group]}
-    chosen = settings[group]
-    chosen = chosen.get("base", chosen)  # what is calibrated is trained before its calibration
-    return {name: value for name, value in chosen.items() if name not in AFTER_TRAINING}

@@ -15,9 +15,13 @@ from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_count, check_number
+from afm_rl.learning import Updater
 from afm_rl.planning import Cost
 
-MISTAKES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+MISTAKES = (
+    *(ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, RuntimeError),
+    *(TypeError, ValueError),
+)
 KEYS = ("seed_key", "mask_key", "regime_key")  # settings that name an entry of the environment
 
 
@@ -46,7 +50,9 @@ def blaming(group: str) -> Iterator[None]:
             raise ConfigurationError(str(last)) from error
         found = re.search(r"full_key: (\S+)", str(error))
         text = str(last).partition("\nfull_key:")[0]
-        raise ConfigurationError(f"{found[1] if found else group}: {text}") from error
+        place = found[1] if found else group
+        place = place if place.startswith(group) else f"{group}.{place}"
+        raise ConfigurationError(f"{place}: {text}") from error
     except MISTAKES as error:
         raise ConfigurationError(f"{group}: {error}") from error
 
@@ -56,7 +62,8 @@ def check_training(
 ) -> None:
     """Check the ``settings`` of a training function by its defaults.
 
-    Counts must be at least 1, or what ``least`` says; other numbers must not be negative.
+    Counts must be at least 1, or what ``least`` says; other numbers must not be negative, and step
+    sizes at most 1.
 
     Raises:
         ConfigurationError: for an unknown setting, or one out of range.
@@ -71,9 +78,55 @@ def check_training(
         if value is None and known[name] is None:
             continue
         if known[name] is None or isinstance(known[name], int):
-            check_count(f"{group}.{name}", value, low=0 if name == "seed" else least.get(name, 1))
+            if name == "seed":
+                check_count(f"{group}.{name}", value, low=0)
+            else:
+                check_count(f"{group}.{name}", value, low=least.get(name, 1), high=100_000_000)
         else:
-            check_number(f"{group}.{name}", value, low=0.0, open_low=name == "lr")
+            step = name == "lr"
+            check_number(
+                f"{group}.{name}", value, low=0.0, high=1.0 if step else 1e6, open_low=step
+            )
+
+
+def check_label(label: Any) -> str | None:
+    """Return the name of a method, which also becomes the name of a file.
+
+    Raises:
+        ConfigurationError: if it is no text, or leads out of the folder of results.
+
+    >>> check_label("physics+corrector=l1")
+    'physics+corrector=l1'
+    """
+    if label is None:
+        return None
+    if not isinstance(label, str) or not re.fullmatch(r"(?!\.)[^/\\\x00-\x1f]{1,200}", label):
+        raise ConfigurationError(
+            f"label={label!r:.80}: expected a text of up to 200 characters without / and \\, which "
+            "does not begin with a dot"
+        )
+    return label
+
+
+def check_updater(updater: Updater, model: DynamicsModel) -> None:
+    """Check that the updater sets what the model is conditioned on, and nothing else.
+
+    Raises:
+        ConfigurationError: otherwise.
+    """
+    wanted, given = model.conditioned_on, updater.sets
+    optional = wanted == "calibration" and not updater.learns  # without one it is the identity
+    if wanted == given or (given is None and optional):
+        return
+    if "regime" in (wanted, given):
+        raise ConfigurationError(
+            "dynamics=oracle and an updater that sets its regime belong together: choose both, "
+            "dynamics=oracle with updater=oracle or updater=mass, or neither"
+        )
+    raise ConfigurationError(
+        f"dynamics: a calibrated model stays as it is but for its calibration, and "
+        f"{type(updater).__name__} does not set that; choose updater=rls or updater=frozen"
+    )
 
 
 def check_cost(cost: Cost, model: DynamicsModel, env: EnvBase, stages: int | None = None) -> None:

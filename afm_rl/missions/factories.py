@@ -36,7 +36,7 @@ class Training(NamedTuple):
     unit: str
     """Unit of the held-out error."""
     settings: Sequence[Mapping[str, Any]] = ()
-    """Everything that the result depends on."""
+    """Everything that the result depends on, beside the robot."""
 
 
 class Part(NamedTuple):
@@ -44,18 +44,18 @@ class Part(NamedTuple):
 
     module: Any
     training: Training | None = None
-    nominal: bool = False
-    """Does it predict what the nominal physics do, as yet? Flows are then trained over these."""
+    settings: Mapping[str, Any] | None = None
+    """What its predictions before the missions depend on; None: on the nominal physics alone."""
 
 
 def physics(robot: Robot) -> Part:
     """Return the robot's nominal physics."""
-    return Part(robot.model, nominal=True)
+    return Part(robot.model)
 
 
 def oracle(robot: Robot) -> Part:
     """Return the nominal physics seen through the true regime."""
-    return Part(Oracle(robot.model, robot.regime))
+    return Part(Oracle(robot.model, robot.regime), settings={"model": "oracle"})
 
 
 def calibrated(robot: Robot, base: Callable[[Robot], Part]) -> Part:
@@ -83,7 +83,9 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
         given = {"names": names, "progress": progress, **pretrain}
         return pretrain_ensemble(model, nominal, *boxes, **given).error
 
-    return Part(model, Training("ensemble", model, train, "standard deviations of the data"))
+    shape = {"pretrain": dict(pretrain), **_without(settings, "propagation", "precision")}
+    unit = "standard deviations of the data"
+    return Part(model, Training("ensemble", model, train, unit, [shape]), shape)
 
 
 def knode(
@@ -112,7 +114,7 @@ def knode(
     model = KNODE(nominal, **settings)
     check_flag("dynamics.randomised", randomised)
     if pretrain is None:
-        return Part(model, nominal=True)
+        return Part(model)
     check_training("dynamics.pretrain", pretrain_knode, pretrain)
 
     def train(progress: bool) -> float:
@@ -122,7 +124,9 @@ def knode(
         boxes = robot.state_box, actions
         return pretrain_knode(model, nominal, *boxes, regime=regime, progress=progress, **pretrain)
 
-    return Part(model, Training("KNODE", model, train, "standard deviations of the model"))
+    shape = {"pretrain": dict(pretrain), "randomised": randomised, **settings}
+    unit = "standard deviations of the model"
+    return Part(model, Training("KNODE", model, train, unit, [shape]), shape)
 
 
 def no_correction(robot: Robot, dynamics: Part) -> Part:
@@ -144,7 +148,8 @@ def afm(
     flow = ActionFlow(*robot.flow_box, place=place, place_scale=scale, **settings)
     if train is None and checkpoint is None:
         return Part(_transform(dynamics, flow, enabled, extend_action_box))
-    training = _training(flow, robot, dynamics, train or {}, checkpoint, "half ranges")
+    own = {name: settings[name] for name in ("hypotheses", "rows") if name in settings}
+    training = _training(flow, robot, dynamics, train or {}, checkpoint, own, "half ranges")
     return Part(_transform(dynamics, flow, enabled, extend_action_box), training)
 
 
@@ -169,7 +174,8 @@ def paper_flow(
         )
     size, features = model.state_size, list(robot.features)
     flow = PaperFlow(*robot.flow_box, features=features, state_size=size, **settings)
-    training = _training(flow, robot, dynamics, train, checkpoint, "action units")
+    own = _without(settings, "gate", "steps", "error_action", "wrap", "latch")
+    training = _training(flow, robot, dynamics, train, checkpoint, own, "action units")
     return Part(_transform(dynamics, flow, enabled, extend_action_box), training)
 
 
@@ -211,10 +217,11 @@ def _training(
     dynamics: Part,
     settings: Mapping[str, Any],
     checkpoint: str | None,
+    own: Mapping[str, Any],
     unit: str,
 ) -> Training | None:
     """Return how a flow is trained; None if it comes from a file."""
-    model = robot.model if dynamics.nominal else dynamics.module
+    model = robot.model if dynamics.settings is None else dynamics.module
     check_training("corrector.train", train_flow, settings, batch_size=2)
     if checkpoint is not None:
         if not isinstance(checkpoint, str):
@@ -230,4 +237,10 @@ def _training(
     def train(progress: bool) -> float:
         return train_flow(flow, model, robot.regime, robot.state_box, progress=progress, **settings)
 
-    return Training("flow", flow, train, unit)
+    shape = {**own, "train": settings}
+    return Training("flow", flow, train, unit, [dynamics.settings or {}, shape])
+
+
+def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:
+    """Leave out the settings that have no influence on what is trained."""
+    return {name: value for name, value in settings.items() if name not in names}

@@ -13,6 +13,7 @@ from afm_rl.artefacts import cached
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions.build import Agent
 from afm_rl.missions.factories import Training
+from afm_rl.missions.gate import fit_agents_gate
 
 
 def prepare(
@@ -43,6 +44,10 @@ def prepare(
         error, found = cached(folder, part.module, description, partial(train, part))
         spent = "from the cache" if found else f"trained in {time.perf_counter() - start:.0f} s"
         echo(f"{part.title}: held-out error {error:.4f} {part.unit} ({spent})")
+    gate = fit_agents_gate(agent)
+    if gate is not None:
+        rate = 100 * agent.settings["false_alarms"]
+        echo(f"corrector: gate {gate:.1f} standard deviations, for {rate:g} % false alarms")
 
 
 def _check_writable(folder: Path) -> None:

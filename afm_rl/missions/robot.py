@@ -16,6 +16,12 @@ from afm_rl.missions.laps import LapScore
 from afm_rl.missions.score import Score
 from afm_rl.regimes import Regime, Schedule
 
+SHAPE_TRAINING = (
+    *("action_low", "action_high", "state_low", "state_high"),
+    *("features", "model", "regime", "flow_low", "flow_high"),
+)
+"""What training data depend on."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:

@@ -13,19 +13,18 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
-from tqdm.auto import tqdm
 
 from afm_rl.errors import NonFiniteError
 from afm_rl.faults import blanked
 from afm_rl.measures import Measures
 from afm_rl.missions.build import Agent
-from afm_rl.missions.checkpoint import Checkpoint, Stopped
+from afm_rl.missions.checkpoint import Checkpoints, Stopped
 from afm_rl.missions.log import StepLog
-from afm_rl.missions.state import Loop
+from afm_rl.missions.state import Loop, leave, unsaved
+from afm_rl.progress import Bar
 
 ALIGNED = 5.0  # innovation, in standard deviations, up to which a model counts as aligned
 STILL = 0.1  # innovation up to which a repeated reading shows a robot at rest, as foreseen
-
 
 
 @dataclass
@@ -46,7 +45,8 @@ def run(
     progress: bool = False,
     checkpoint: Path | None = None,
     every: float = 60.0,
-    watch: Callable[[Loop], bool] | None = None,
+    keep: int = 2,
+    stopped: Callable[[Loop], bool] | None = None,
 ) -> Results:
     """Run every mission of an agent to its end; missions that finish leave the batch.
 
@@ -58,57 +58,65 @@ def run(
     Nothing is learned from it. The mission goes on with its last safe action (``faults=hold``),
     ends (``skip``), or the run does (``raise``).
 
-    With a ``checkpoint`` a run that was killed goes on where it was, and its results are the
-    same to the bit. The file stays: delete it once the results are safe.
+    With a ``checkpoint`` folder a run that was killed goes on where it was, and its results are
+    the same to the bit. The files stay: delete them once the results are safe.
 
     Args:
         agent: from :func:`~afm_rl.missions.build.build`, prepared. Its model learns in place.
-        progress: show a progress bar.
-        checkpoint: a file that keeps the state; if it is there, the run goes on from it.
-        every: time between two writes of it (s); 0 writes after each step.
-        watch: is shown the state after each step; true stops the run.
+        progress: show progress.
+        checkpoint: folder of checkpoints; if it holds any, the run goes on from the latest.
+        every: time between two checkpoints (s); 0 writes one after each step.
+        keep: number of checkpoints to keep.
+        stopped: is shown the state after each step; true stops the run.
 
     Raises:
-        ArtefactError: if the checkpoint is damaged, or was made by other missions.
+        ArtefactError: if the checkpoint is damaged, or was made by other missions; the agent is
+            then as it was.
         ConfigurationError: for a time that cannot be used, or a file that cannot be written.
         NonFiniteError: at a fault, with ``faults=raise``.
-        Stopped: if ``watch`` said so; a checkpoint was written.
+        Stopped: if ``stopped`` said so; a checkpoint was written.
     """
     with torch.random.fork_rng(devices=[]):  # TorchRL's own planners draw from the global one
         torch.manual_seed(0)
-        kept = None if checkpoint is None else Checkpoint(checkpoint, agent, every)
-        return _run(agent, progress, kept, watch)
+        kept = None if checkpoint is None else Checkpoints(checkpoint, agent, every, keep)
+        return _run(agent, progress, kept, stopped)
 
 
 def _run(
     agent: Agent,
     progress: bool,
-    checkpoint: Checkpoint | None,
-    watch: Callable[[Loop], bool] | None,
+    checkpoints: Checkpoints | None,
+    stopped: Callable[[Loop], bool] | None,
 ) -> Results:
+    state = None if checkpoints is None else checkpoints.read()  # before the agent is changed
     loop = _start(agent)
-    if checkpoint is not None:
-        checkpoint.resume(loop)
-    total, clock = len(agent.missions), time.perf_counter()
-    with tqdm(
-        total=total, desc=agent.label, unit="mission", disable=None if progress else True
+    if checkpoints is not None and state is not None:
+        checkpoints.resume(loop, state)
+    total, budget, clock = len(agent.missions), agent.settings["budget"], time.perf_counter()
+    with Bar(
+        total=total * budget, initial=_done(loop, budget), desc=agent.label, shown=progress
     ) as bar:
         while len(loop.ids):
-            bar.update(total - len(loop.ids) - bar.n)
-            if progress and loop.step % 50 == 0:
-                bar.set_postfix(step=loop.step, running=len(loop.ids))
             ids = loop.ids
             _advance(agent, loop)
             now = time.perf_counter()
             loop.ends["seconds"][ids] += (now - clock) / len(ids)
             clock = now
-            stop = watch is not None and watch(loop)
-            if checkpoint is not None:
-                checkpoint.write(loop) if stop else checkpoint.keep(loop)
+            ended = f"{total - len(loop.ids)} of {total} missions ended, step {loop.step}"
+            bar.set_postfix_str(ended, refresh=False)
+            bar.update(_done(loop, budget) - bar.n)
+            stop = stopped is not None and stopped(loop)
+            if checkpoints is not None:
+                checkpoints.write(loop) if stop else checkpoints.write_if_due(loop)
             if stop:
                 raise Stopped(f"stopped before step {loop.step}")
-        bar.update(total - bar.n)
     return Results(_missions(agent, loop.ends), loop.log.table(), agent.robot.metrics.measures)
+
+
+def _done(loop: Loop, budget: int) -> int:
+    """Return the mission-steps that are behind: missions that have ended need no more."""
+    running = len(loop.ids)
+    return (len(loop.ends["steps"]) - running) * budget + running * loop.step
 
 
 def _start(agent: Agent) -> Loop:
@@ -122,7 +130,7 @@ def _start(agent: Agent) -> Loop:
     ends |= agent.robot.metrics.start(agent.missions)
     whole = ["misaligned", "regime_active", "fault", *agent.robot.metrics.whole]
     log = StepLog(_columns(agent), whole)
-    return Loop(td, torch.arange(total), ends, log)
+    return Loop(td, torch.arange(total), ends, log, unsaved=unsaved(agent))
 
 
 def _advance(agent: Agent, loop: Loop) -> None:
@@ -147,8 +155,7 @@ def _advance(agent: Agent, loop: Loop) -> None:
         done = done | fault
     if bool(done.any()):
         keep = (~done).nonzero().squeeze(-1)
-        loop.ids, loop.td = ids[keep], loop.td[keep]
-        agent.model.select_(keep)
+        leave(agent, loop, keep)
     loop.step += 1
 
 

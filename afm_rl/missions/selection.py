@@ -15,6 +15,7 @@ from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Schedule
 
 Entry = Family | Mapping[str, Any] | Sequence[Mapping[str, float]]
+MOST_SEEDS = 100_000
 PLAN = ("phases", "at", "ramp")
 
 
@@ -83,12 +84,13 @@ def _checked(entry: Any, robot: Robot) -> Entry:
 
 def select_seeds(seeds: Any) -> list[int]:
     """Return seeds: a count, or a list."""
-    if isinstance(seeds, int) and not isinstance(seeds, bool) and seeds >= 1:
+    if isinstance(seeds, int) and not isinstance(seeds, bool) and 1 <= seeds <= MOST_SEEDS:
         return list(range(seeds))
     whole = isinstance(seeds, list) and all(type(s) is int and 0 <= s < 2**63 for s in seeds)
     if not whole or not seeds or len(set(seeds)) < len(seeds):
         raise ConfigurationError(
-            f"seeds={seeds!r}: expected a count of at least 1, or a list of distinct whole numbers"
+            f"seeds={seeds!r}: expected a count in 1..{MOST_SEEDS}, or a list of distinct whole "
+            "numbers"
         )
     return seeds
 

@@ -8,7 +8,7 @@ from typing import Any
 
 WITHOUT_INFLUENCE = (
     *("progress", "figures", "video", "tensorboard", "overwrite", "cache", "threads"),
-    *("compare", "study", "label", "trust"),
+    *("compare", "study", "label", "trust", "checkpoints"),
 )
 """Settings that change how a run is done, shown or called, but not its results."""
 

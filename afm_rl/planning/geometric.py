@@ -158,7 +158,8 @@ class GeometricController(TensorDictModuleBase):
                 f"the dynamics model has {sizes[0]} and {sizes[1]}; choose robot=quadrotor"
             )
         self.dt = check_number("planner.dt", dt, low=0.0, open_low=True)
-        self.horizon = check_count("planner.horizon", horizon)
+        self.horizon = check_count("planner.horizon", horizon, high=10_000)
+        self.stages = horizon + 1
         self.tilt = check_number("planner.tilt", tilt, low=0.0, high=1.5, open_low=True)
         self.body = check_body(body)
         for name, values in zip(Gains._fields, (position, velocity, attitude, rate), strict=True):

@@ -136,8 +136,8 @@ class ICEM(SamplingPlanner):
             )
         self.elites, self.kept = elites, kept
         self.decay = check_number("planner.decay", decay, low=1.0)
-        self.sigma = check_number("planner.sigma", sigma, low=0.0)
-        self.beta = check_number("planner.beta", beta, low=0.0)
+        self.sigma = check_number("planner.sigma", sigma, low=0.0, high=100.0)
+        self.beta = check_number("planner.beta", beta, low=0.0, high=100.0)
         self.momentum = check_number("planner.momentum", momentum, low=0.0, high=1.0)
         space = self.action_spec.space
         self.register_buffer("scale", self.sigma * (space.high - space.low) / 2)

@@ -129,7 +129,7 @@ class MPC(RecedingHorizonPlanner):
                 f"planner: got {type(env).__name__}{cost}; MPC needs a PlanningEnv with a "
                 "quadratic cost, such as TrackingCost"
             )
-        check_count("planner.horizon", horizon)
+        check_count("planner.horizon", horizon, high=10_000)
         memory_key, size = as_key(memory_key), env.dynamics.action_size
         root = memory_key if isinstance(memory_key, tuple) else (memory_key,)
         memory = {
@@ -137,9 +137,11 @@ class MPC(RecedingHorizonPlanner):
             (*root, "actions"): (horizon, size),
         }
         super().__init__(env, memory, action_key)
-        self.horizon = horizon
-        self.iterations = check_count("planner.iterations", iterations)
-        self.first_iterations = check_count("planner.first_iterations", first_iterations)
+        self.horizon, self.stages = horizon, horizon + 1
+        self.iterations = check_count("planner.iterations", iterations, high=10_000)
+        self.first_iterations = check_count(
+            "planner.first_iterations", first_iterations, high=10_000
+        )
         self.qp = check_choice("planner.qp", qp, SOLVERS)
         if qp == "hpipm":
             load_casadi()

@@ -137,7 +137,7 @@ class MPPI(SamplingPlanner):
             seed=seed,
         )
         self.temperature = check_number("planner.temperature", temperature, low=0, open_low=True)
-        self.sigma = check_number("planner.sigma", sigma, low=0.0)
+        self.sigma = check_number("planner.sigma", sigma, low=0.0, high=100.0)
         self.beta = check_number("planner.beta", beta, low=0.0, high=1.0, open_low=True)
         self.noise = check_choice("planner.noise", noise, ("scaled", "unit"))
         self.past = check_choice("planner.past", past, ("previous", "shifted"))

@@ -49,9 +49,9 @@ class SamplingPlanner(RecedingHorizonPlanner):
         seed: int = 0,
     ) -> None:
         super().__init__(env, memory, action_key)
-        self.horizon = check_count("planner.horizon", horizon)
-        self.population = check_count("planner.population", population)
-        self.iterations = check_count("planner.iterations", iterations)
+        self.horizon = check_count("planner.horizon", horizon, high=10_000)
+        self.population = check_count("planner.population", population, high=1_000_000)
+        self.iterations = check_count("planner.iterations", iterations, high=10_000)
         if backend is None:
             backend = "fast" if hasattr(env, "returns") else "env"
         self.backend = check_choice("planner.backend", backend, ("fast", "env"))

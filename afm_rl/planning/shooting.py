@@ -52,9 +52,9 @@ class CEM(CEMPlanner):
         elites: int = 30,
     ) -> None:
         _check_action_key(env)
-        check_count("planner.horizon", horizon)
-        check_count("planner.population", population)
-        check_count("planner.iterations", iterations)
+        check_count("planner.horizon", horizon, high=10_000)
+        check_count("planner.population", population, high=1_000_000)
+        check_count("planner.iterations", iterations, high=10_000)
         super().__init__(env, horizon, iterations, population, _check_elites(elites, population))
 
     def planning(self, tensordict: TensorDictBase) -> Tensor:
@@ -86,9 +86,9 @@ class TorchRLMPPI(MPPIPlanner):
         temperature: float = 1.0,
     ) -> None:
         _check_action_key(env)
-        check_count("planner.horizon", horizon)
-        check_count("planner.population", population)
-        check_count("planner.iterations", iterations)
+        check_count("planner.horizon", horizon, high=10_000)
+        check_count("planner.population", population, high=1_000_000)
+        check_count("planner.iterations", iterations, high=10_000)
         check_number("planner.temperature", temperature, low=0.0, open_low=True)
         _check_elites(elites, population)
         keys = list(env.observation_spec.keys(True, True))

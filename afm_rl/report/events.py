@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 import pandas as pd
 from torch.utils.tensorboard import SummaryWriter
 
-from afm_rl.artefacts import write_whole
+from afm_rl.files import write_whole
 from afm_rl.measures import Measures
 from afm_rl.report.frames import cell_names, steps_of
 

@@ -13,8 +13,8 @@ import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
-from afm_rl.artefacts import write_whole
 from afm_rl.errors import ConfigurationError
+from afm_rl.files import write_whole
 from afm_rl.report.collect import collect
 from afm_rl.report.events import folder_names
 from afm_rl.report.frames import first_missions, steps_of
@@ -189,7 +189,7 @@ def _palette(picture: np.ndarray) -> Image.Image:
     common = values[np.argsort(-counts, kind="stable"), None] // [65536, 256, 1] % 256
     _, first = np.unique(common // 8, axis=0, return_index=True)
     palette = Image.new("P", (1, 1))
-    palette.putpalette(common[np.sort(first)[:COLOURS]].ravel().tolist())
+    palette.putpalette([int(value) for value in common[np.sort(first)[:COLOURS]].ravel()])
     return palette
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 
-from afm_rl.artefacts import write_whole
 from afm_rl.csv_text import csv_text
+from afm_rl.files import write_whole
 from afm_rl.measures import FILE, Measures
 from afm_rl.report.comparison import draw_comparison
 from afm_rl.report.events import write_events

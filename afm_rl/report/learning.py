@@ -186,6 +186,6 @@ def _step_label(missions: pd.DataFrame) -> str:
 
 def _legend(figure: Figure, styles: Mapping[str, style.Style]) -> None:
     handles: Sequence[Line2D] = [look.handle() for look in styles.values()]
-    faint = {"color": style.FAINT, "linestyle": "", "markersize": 6}
+    faint: dict[str, Any] = {"color": style.FAINT, "linestyle": "", "markersize": 6}
     marks = [Line2D([], [], marker=marker, **faint) for marker in (STARTS, ENDS)]
     style.legend_above(figure, [*handles, *marks], [*styles, "changed regime starts", "ends"])

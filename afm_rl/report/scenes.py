@@ -70,7 +70,8 @@ def map_scene(
     span = max(box.right - box.left, box.top - box.bottom)
     timeline = _timeline([lower], max(runs.values(), key=len), alone)
     lower.set(yscale="log", ylabel=label)
-    moving, shows, handles, labels = [*timeline], [], [], []
+    moving: list[Artist] = [*timeline]
+    shows, handles, labels = [], [], []
     for method, steps in runs.items():
         look = style.Style(style.NOMINAL, "-", "o") if alone else styles[method]
         upper.plot(*paths[method][:1].T, **START, zorder=3)

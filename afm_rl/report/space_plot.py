@@ -128,7 +128,7 @@ def mark_regimes(panels: Sequence[Axes], steps: pd.DataFrame) -> None:
     """
     active, t = steps["regime_active"].to_numpy(dtype=bool), steps["t"].to_numpy()
     for axes in panels:
-        look = {"color": style.BAND, "alpha": 0.15, "linewidth": 0}
+        look: dict[str, Any] = {"color": style.BAND, "alpha": 0.15, "linewidth": 0}
         axes.fill_between(t, 0, 1, where=active, **look, transform=axes.get_xaxis_transform())
         for step in changes(steps):
             line = axes.axvline(step, color=style.FAINT, linewidth=0.8, linestyle="--")

@@ -9,8 +9,8 @@ from pathlib import Path
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
 
-from afm_rl.artefacts import write_whole
 from afm_rl.csv_text import csv_text
+from afm_rl.files import write_whole
 from afm_rl.measures import Measures
 from afm_rl.report import style
 from afm_rl.report.collect import Collection, collect

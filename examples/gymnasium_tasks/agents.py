@@ -12,10 +12,10 @@ from torchrl.envs import Compose, DoubleToFloat, EnvBase, GymEnv, SerialEnv, Tra
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Ensemble, Oracle
 from afm_rl.learning import (
-    FreshAdam,
     GaussianNLLLoss,
     OnlineUpdater,
     OracleUpdater,
+    ResetAdam,
     UnmatchedUpdater,
     Updater,
     collect,
@@ -146,7 +146,7 @@ def compose(task: Task, method: str, learned: Learned, seed: int, lr: float = 1e
     if "afm" in method:
         transforms.insert(1, ActionFlowTransform(model, flow))
         loss.set_keys(action=EXECUTED)
-    learner = partial(OnlineUpdater, optimizer=partial(FreshAdam, lr=lr))
+    learner = partial(OnlineUpdater, optimizer=partial(ResetAdam, lr=lr))
     if method == "online":
         updater = learner(loss)
     elif method == "afm_online":  # the transform undoes what actions can: learn the rest

@@ -18,7 +18,7 @@ from agents import METHODS, compose, learn
 from tasks import TASKS, Task
 from tensordict import TensorDictBase
 
-from afm_rl.artefacts import write_whole
+from afm_rl.files import write_whole
 from afm_rl.report.statistics import stratified_interval
 
 SOON = 20  # steps that count as "at" the change

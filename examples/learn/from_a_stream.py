@@ -15,9 +15,9 @@ from torchrl.envs import TransformedEnv
 from afm_rl.dynamics import Dubins, Ensemble
 from afm_rl.envs import UGVTrack
 from afm_rl.learning import (
-    FreshAdam,
     GaussianNLLLoss,
     OnlineUpdater,
+    ResetAdam,
     UpdaterHook,
     pretrain_ensemble,
 )
@@ -43,7 +43,7 @@ pretrain_ensemble(model, Dubins(), states, (low, high), samples=asked.samples)
 
 planner = MPPI(PlanningEnv(model, GoalDistance(), low, high), population=100)
 env = TransformedEnv(env, planner.make_tensordict_primer())
-updater = OnlineUpdater(GaussianNLLLoss(model), lambda parameters: FreshAdam(parameters, lr=1e-3))
+updater = OnlineUpdater(GaussianNLLLoss(model), lambda parameters: ResetAdam(parameters, lr=1e-3))
 frames = ROBOTS * STEPS
 collector = Collector(
     env,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from afm_rl.artefacts import write_whole
+from afm_rl.files import write_whole
 from afm_rl.report.collect import collect
 from afm_rl.report.frames import cell_names
 from afm_rl.report.table import Table

@@ -13,6 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.singleton import Singleton
 
 from afm_rl import cli
+from afm_rl.jobs import process as jobs_process
 from afm_rl.missions import factories
 
 QUICK = ["progress=false", "figures=false", "tensorboard=false"]
@@ -51,6 +52,7 @@ def afm_rl(monkeypatch, capsys, cache):
     monkeypatch.setenv("AFM_RL_CACHE", str(cache))
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(jobs_process, "START", "fork")  # saves jobs the imports
     root, states = logging.getLogger(), Singleton.get_state()
     handlers, level, threads = root.handlers[:], root.level, torch.get_num_threads()
 

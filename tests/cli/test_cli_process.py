@@ -11,7 +11,7 @@ import afm_rl.conf
 CONF = Path(afm_rl.conf.__file__).parent
 STUDY = "method=afm_physics tracks=all regimes=paper seeds=5 planner=mppi_paper cost=goal_pose"
 COLUMNS = (  # the last ones, after the parameters
-    "seed success_rate steps reached targets finished faults seconds regime"
+    "seed success_rate steps reached targets finished faults regime"
 ).split()
 
 

@@ -4,10 +4,11 @@ import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
+from afm_rl.jobs.tables import read_steps
 from afm_rl.missions import build, prepare, run
 
 COLUMNS = (
-    "seed success_rate steps reached targets finished faults seconds regime"  # after parameters
+    "seed success_rate steps reached targets finished faults regime"  # after parameters
 ).split()
 
 
@@ -21,10 +22,12 @@ def test_one_method(afm_rl, tmp_path, quick):
     )
     assert (done.status, done.err) == (0, "")
     folder = tmp_path / "new" / "run"
-    assert files(folder) == ["config.yaml", "measures.json", "missions.csv", "steps.parquet"]
+    tables = ["compute.csv", "config.yaml", "manifest.json", "measures.json", "missions.csv"]
+    assert files(folder) == [".lock", *tables, "steps.parquet"]
     missions = pd.read_csv(folder / "missions.csv")
     columns = list(missions)
-    assert columns[:3] == ["mission", "method", "track"] and columns[-len(COLUMNS) :] == COLUMNS
+    assert columns[:3] == ["mission", "method", "track"]
+    assert columns[-len(COLUMNS) :] == COLUMNS
     assert {"v_gain", "omega_gain", "slip_at"} <= set(columns[3 : -len(COLUMNS)])
     assert missions["method"].tolist() == ["physics"] * 2
     assert missions["v_gain"].eq(-1).all() and missions["steps"].eq(3).all()
@@ -42,12 +45,12 @@ def test_bare_compares_four_methods(afm_rl, tmp_path, small_training):
     assert missions["method"].tolist() == methods
     assert missions["mission"].tolist() == [0, 1, 2, 3]
     assert missions["track"].eq("ethz_2").all()
-    steps = pd.read_parquet(tmp_path / "steps.parquet")
-    assert steps["mission"].tolist() == [k for k in range(4) for _ in range(6)]
-    assert sorted(path.stem for path in (tmp_path / "config").iterdir()) == sorted(methods)
+    assert read_steps(tmp_path)["mission"].tolist() == [k for k in range(4) for _ in range(6)]
+    assert sorted(path.name for path in (tmp_path / "jobs").iterdir()) == sorted(methods)
     assert (tmp_path / "figures" / "trajectory.png").stat().st_size > 1000
     assert sorted(path.name for path in (tmp_path / "tensorboard").iterdir()) == sorted(methods)
-    assert "ensemble: held-out error" in done.out and "flow: held-out error" in done.out
+    said = "".join(path.read_text() for path in tmp_path.glob("jobs/*/log.txt"))
+    assert "ensemble: held-out error" in said and "flow: held-out error" in said
     assert all(method in done.out for method in methods)
 
 
@@ -78,17 +81,17 @@ def test_results_are_not_overwritten_unless_told(afm_rl, tmp_path, quick):
     refused = afm_rl(*command, "seeds=2")
     assert refused.status == 2
     assert refused.err == (
-        f"afm-rl: hydra.run.dir={tmp_path}: holds results; choose another folder, or "
-        "overwrite=true\n"
+        f"afm-rl: {tmp_path}/config.yaml: belongs to other settings (seeds: 1 -> 2); choose "
+        "another folder, or overwrite=true\n"
     )
     assert {name: (tmp_path / name).read_bytes() for name in files(tmp_path)} == before
+    assert "has these results already" in afm_rl(*command).out
     assert afm_rl(*command, "seeds=2", "overwrite=true").status == 0
     assert len(pd.read_csv(tmp_path / "missions.csv")) == 2
 
 
 def stored(folder):
-    missions = pd.read_csv(folder / "missions.csv").drop(columns="seconds")
-    return missions, pd.read_parquet(folder / "steps.parquet")
+    return pd.read_csv(folder / "missions.csv"), read_steps(folder)
 
 
 def assert_same_results(left, right):
@@ -115,7 +118,11 @@ def test_each_stored_method_of_a_comparison_makes_its_own_run(afm_rl, tmp_path, 
     first, again = tmp_path / "first", tmp_path / "again"
     chosen = ["compare=[physics, oracle]", "budget=8", *quick]
     assert afm_rl(*chosen, f"hydra.run.dir={first}").status == 0
-    replay = [f"--config-path={first}/config", "--config-name=oracle", f"hydra.run.dir={again}"]
+    replay = [
+        f"--config-path={first}/jobs/oracle",
+        "--config-name=config",
+        f"hydra.run.dir={again}",
+    ]
     assert afm_rl(*replay).status == 0
     missions, steps = stored(first)
     assert missions["method"].tolist() == ["physics", "oracle"]
@@ -146,6 +153,6 @@ def test_a_bug_is_not_dressed_up_as_a_mistake(afm_rl, tmp_path, quick, monkeypat
     def bug(*args, **kwargs):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("afm_rl.cli.launch.run", bug)
+    monkeypatch.setattr("afm_rl.jobs.run.run", bug)
     with pytest.raises(RuntimeError, match="a bug"):
         afm_rl("method=physics", f"hydra.run.dir={tmp_path}", *quick)

@@ -15,14 +15,11 @@ from afm_rl.errors import ConfigurationError
 CASES = """
 -               method=nope                              method/nope afm_physics
 -               planner=nope                             planner/nope mppi_paper
--               plannr=mppi                              plannr
-physics         planner.horizn=3                         planner.horizn
 physics         +planner.horizn=3                        planner: horizn
 physics         +robot.env.horizn=3                      robot.env: horizn
 physics         seeds                                    seeds
 physics         seeds=[1                                 [1
 physics         seeds=0                                  seeds=0
-physics         seeds=[1,1]                              seeds=[1,
 physics         seeds=many                               seeds='many'
 physics         seeds=[99999999999999999999]             seeds=
 physics         budget=0                                 budget=0
@@ -40,38 +37,19 @@ physics         cache=null                               cache=None
 physics         regimes=[]                               regimes=[] paper none v_gain
 physics         regimes=papper                           regimes='papper' paper
 physics         regimes=[{v_gain:nan}]                   regimes v_gain=nan
-physics         regimes=[{gain:1.0}]                     regimes 'gain' omega_gain
 physics         regimes={v_gain:-1.0}                    regimes
 physics         tracks=nope                              tracks='nope' ethz_1 ethz_2
 physics         tracks=missing.csv                       tracks missing.csv
-physics         planner.horizon=-1                       planner.horizon=-1
-physics         planner.horizon=0                        planner.horizon=0
 physics         planner.horizon=abc                      planner.horizon='abc'
-physics         planner.population=0                     planner.population=0
-physics         planner.beta=2                           planner.beta=2
-physics         planner.temperature=0                    planner.temperature=0
 physics         planner=cem,planner.elites=500           planner.elites=500
 physics         planner=torchrl_mppi,planner.elites=0    planner.elites=0
-physics         +cost.weights=[1,-1]                     cost.weights=-1
-physics         robot.schedule.at=[0.8,0.15]             schedule.at=[0.8,
-physics         robot.schedule.by=foo                    schedule.by='foo' progress step
-physics         robot.action_low=[1.0,9.0]               robot.action_low=[1.0, low
 physics         robot.action_high=[inf,inf]              half_range=[inf, action_high
-physics         robot.env.reach=nan                      reach=nan
 physics         robot.paper_regimes=[],regimes=paper     regimes=[]
-physics         dynamics=oracle                          dynamics=oracle updater=oracle
-online_pe       dynamics.members=0                       dynamics.members=0
-online_pe       dynamics.hidden=[0]                      dynamics.hidden=0
-online_pe       dynamics.log_variance=[1,-1]             dynamics.log_variance=[1,
 online_pe       dynamics.pretrain.samples=10             dynamics.pretrain.samples=10 256
-online_pe       +dynamics.pretrain.step=1                dynamics.pretrain 'step' samples
 online_pe       updater.optimizer.lr=0                   updater lr=0
-afm_physics     corrector.gate=-1                             corrector.gate=-1
 afm_physics     corrector.memory=10                           corrector.memory=10
 afm_physics     corrector.hypotheses=[late]                   corrector.hypotheses='late' recent
-afm_physics     corrector.train={iterations:0}                corrector.train.iterations=0
 afm_physics     corrector.train={step:1}                      corrector.train 'step' iterations
-adaptive_gain   corrector.window=0                            corrector.window=0
 afm_physics     corrector.checkpoint=missing                  corrector.checkpoint missing
 """
 

@@ -1,15 +1,15 @@
-"""Jobs of sweeps, each in a process of its own."""
+"""Jobs, each in a process of its own, from the command line."""
 
 import os
 import signal
+import subprocess
 import sys
-from itertools import pairwise
+import time
 
 import pandas as pd
 import pytest
 
-from afm_rl.cli.launchers import child
-from afm_rl.cli.launchers.job import Job, run
+from afm_rl.manifest import check_manifest
 
 SABOTAGE = """
 import os, signal
@@ -49,47 +49,45 @@ def test_jobs_that_fail_or_die_take_no_other_with_them(
     command = ["method=physics", "budget=3", "trust=[sabotage]", *quick]
     done = process(program, "-m", *command, f"cost._target_={','.join(COSTS)}")
     (sweep,) = (tmp_path / "multirun").iterdir()
+    names = [f"physics+cost._target_={cost}" for cost in COSTS]
     *lines, last = done.stderr.splitlines()
-    assert last == "afm-rl: 4 of 6 jobs failed; the same command tries them again"
-    assert lines == [
-        f"afm-rl: job {n} (cost._target_={COSTS[n]}): failed: {why} ({sweep}/{n}/log.txt)"
-        for n, why in REASONS.items()
-    ]
+    assert last.startswith("afm-rl: 4 of 6 jobs failed (")
+    assert sorted(lines) == sorted(f"afm-rl: {names[n]}: failed: {w}" for n, w in REASONS.items())
     assert done.returncode == 1
-    finished = {path.parent.name for path in sweep.glob("*/finished")}
-    assert finished == {path.parent.name for path in sweep.glob("*/missions.csv")} == {"0", "5"}
-    assert "Traceback" in (sweep / "3" / "log.txt").read_text()
-    # A job alone gives the same numbers as the same job inside a sweep, bit for bit.
-    assert afm_rl(*command, f"hydra.run.dir={tmp_path}/alone").status == 0
-    folders = (tmp_path / "alone", sweep / "0", sweep / "5")
-    steps = [pd.read_parquet(folder / "steps.parquet") for folder in folders]
-    for one, other in pairwise(steps):
-        pd.testing.assert_frame_equal(one, other, check_exact=True)
+    finished = {path.parent.name for path in sweep.glob("jobs/*/manifest.json")}
+    assert finished == {names[0], names[5]}
+    assert "Traceback" in (sweep / "jobs" / names[3] / "log.txt").read_text()
+    assert pd.read_csv(sweep / "missions.csv")["method"].tolist() == [names[0], names[5]]
+    # A job alone gives the same bytes as the same job inside a sweep.
+    alone = tmp_path / "alone"
+    assert afm_rl(*command, f"label={names[0]}", f"hydra.run.dir={alone}").status == 0
+    for name in ("missions.csv", "steps.parquet"):
+        assert check_manifest(alone)[name] == check_manifest(sweep / "jobs" / names[0])[name]
 
 
 @pytest.mark.slow
-def test_a_job_is_taken_up_where_an_attempt_was_killed(tmp_path, quick):
-    folder = tmp_path / "it's, a [folder]"
-    folder.mkdir()
-    (folder / "missions.csv").write_text("written before the attempt was killed, while drawing")
-    job = Job(folder, "abc", "", ("method=physics", "budget=2", *quick), tmp_path)
-    assert run(job) is None
-    assert job.finished
+@pytest.mark.parametrize("kind", ["run", "study"])
+def test_ctrl_c_keeps_what_was_done(process, program, tmp_path, kind):
+    """Interrupted once on the way, and taken up by the same program under its other name."""
+    settings = ["tracks=ethz_1", "regimes=[{v_gain: -1.0}]", "seeds=1", "budget=200"]
+    settings += ["hydra.run.dir=mine", "method=physics", "figures=false", "tensorboard=false"]
+    settings += ["study=ugv"] * (kind == "study")
+    env = os.environ | {"OMP_NUM_THREADS": "1"}
+    how = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
+    folder = tmp_path / "mine"
+    with subprocess.Popen(
+        [program, *settings, "checkpoints.every=0"], cwd=tmp_path, env=env, **how
+    ) as running:
+        while not list(folder.rglob("checkpoint-*")):
+            assert running.poll() is None
+            time.sleep(0.02)
+        running.send_signal(signal.SIGINT)
+        said = running.stderr.read().splitlines()
+    assert running.returncode == 130
+    assert said[-1].startswith("afm-rl: interrupted; what was done is in")
+    assert list(folder.rglob("checkpoint-*")) and not list(folder.rglob("missions.csv"))
+    done = process(sys.executable, "-m", "afm_rl.cli", *settings)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.rstrip().endswith(f"Results: {folder}")
     assert len(pd.read_csv(folder / "missions.csv")) == 1
-
-
-def test_a_job_ends_with_its_parent(process, tmp_path):
-    module = [sys.executable, "-m", "afm_rl.cli.launchers.child"]
-    done = process(
-        *module, tmp_path / "job", "abc", "method=physics"
-    )  # its standard input has ended already
-    assert done.returncode == -signal.SIGTERM
-    assert not (tmp_path / "job" / "missions.csv").exists()
-
-
-def test_the_end_of_the_parent_is_the_end_of_its_input(monkeypatch):
-    ended = []
-    monkeypatch.setattr(os, "read", lambda file, count: b"")
-    monkeypatch.setattr(os, "kill", lambda *args: ended.append(args))
-    child._end_with_parent()
-    assert ended == [(os.getpid(), signal.SIGTERM)]
+    assert not list(folder.rglob("checkpoint-*"))

@@ -1,4 +1,4 @@
-"""Sweeps on a Ray cluster: two nodes, both on this machine."""
+"""Jobs on a Ray cluster: two nodes, both on this machine."""
 
 import pytest
 
@@ -29,18 +29,18 @@ def test_jobs_run_on_both_nodes_and_one_that_dies_takes_no_other_with_it(
 
         if "seeds=3" in job.name:
             os._exit(3)
-        (job.folder / "node").write_text(ray.get_runtime_context().get_node_id())
-        while len(list(job.folder.parent.glob("*/node"))) < 2:  # needs both at the same time
+        (job.folder / f"{job.name}.node").write_text(ray.get_runtime_context().get_node_id())
+        while len(list(job.folder.parent.glob("*/*.node"))) < 2:  # needs both at the same time
             time.sleep(0.1)
 
     monkeypatch.setattr(ray_cluster, "run", meet)
     where = ["launcher=ray", f"hydra.launcher.address={address}", f"hydra.sweep.dir={tmp_path}"]
     done = afm_rl("-m", "method=physics", "seeds=1,2,3", *where)
     assert done.status == 1
-    nodes = {path.read_text() for path in tmp_path.glob("*/node")}
+    nodes = {path.read_text() for path in tmp_path.glob("jobs/*/*.node")}
     assert nodes == {node["NodeID"] for node in known_nodes(address)} and len(nodes) == 2
-    assert "job 0 (seeds=1): done" in done.out and "job 1 (seeds=2): done" in done.out
-    assert "afm-rl: job 2 (seeds=3): failed: " in done.err and "1 of 3 jobs failed" in done.err
+    assert "physics+seeds=1: done" in done.out and "physics+seeds=2: done" in done.out
+    assert "afm-rl: physics+seeds=3: failed: " in done.err and "1 of 3 jobs failed" in done.err
 
 
 def known_nodes(address):
@@ -52,5 +52,5 @@ def test_a_cluster_of_this_machine_for_the_time_of_the_sweep(afm_rl, tmp_path, q
     command = ["method=physics", "budget=2", *quick, f"hydra.sweep.dir={tmp_path}"]
     done = afm_rl("-m", *command, "launcher=ray")
     assert (done.status, done.err) == (0, "")
-    assert (tmp_path / "0" / "missions.csv").is_file()
+    assert (tmp_path / "missions.csv").is_file()
     assert not ray.is_initialized()

@@ -5,16 +5,32 @@ import sys
 from contextlib import nullcontext
 from types import ModuleType, SimpleNamespace
 
+import pandas as pd
 import pytest
 import yaml
 
+from afm_rl.cli import launch
 from afm_rl.cli.launchers import slurm
 from afm_rl.cli.launchers.base import needs
-from afm_rl.cli.launchers.job import FINISHED, Job, run
 from afm_rl.cli.overrides import with_sweep_folder
 from afm_rl.errors import ConfigurationError
+from afm_rl.jobs.local import LocalPool
+from afm_rl.jobs.run import _publish
+from afm_rl.manifest import write_manifest
 
 SWEEP = ["-m", "method=physics", "planner.horizon=3,5"]
+
+
+def pretend(job):
+    """Leave results without having run anything."""
+    new = job.folder / "unfinished"
+    label, seed = yaml.safe_load((new / "config.yaml").read_text())["label"], job.name[-1]
+    row = {"mission": 0, "method": label, "seed": seed, "steps": 4}
+    pd.DataFrame([row]).to_csv(new / "missions.csv", index=False)
+    row = {"method": label, "missions": 1, "steps": 5, "seconds": 1.0}
+    pd.DataFrame([row]).to_csv(new / "compute.csv", index=False)
+    write_manifest(new)
+    _publish(new, job.folder)
 
 
 @pytest.fixture
@@ -22,14 +38,17 @@ def ran(monkeypatch):
     """Have jobs done at once, unless ``failing`` names one; return what was run."""
     calls = SimpleNamespace(jobs=[], failing="none")
 
-    def work(job):
-        calls.jobs.append(job)
-        if calls.failing in job.name:
-            return "out of luck"
-        (job.folder / FINISHED).write_text(f"{job.digest}\n")
-        return None
+    def run(self, jobs):
+        for job in jobs:
+            calls.jobs.append(job)
+            if calls.failing in job.name:
+                yield job, "out of luck"
+            else:
+                pretend(job)
+                yield job, None
 
-    monkeypatch.setattr("afm_rl.cli.launchers.local.run", work)
+    monkeypatch.setattr(LocalPool, "run", run)
+    monkeypatch.setattr(launch, "report", lambda folder, *_: print(f"Results: {folder}"))
     return calls
 
 
@@ -40,19 +59,23 @@ def sweep(afm_rl, tmp_path, monkeypatch):
     return lambda *settings: afm_rl(*settings, f"hydra.sweep.dir={tmp_path}/sweep")
 
 
-def test_every_job_has_a_numbered_folder_that_says_what_was_asked(sweep, ran, tmp_path):
-    done = sweep(*SWEEP, "launcher=basic", "hydra.verbose=true")
+def names(ran):
+    found = [job.folder.name for job in ran.jobs]
+    ran.jobs.clear()
+    return found
+
+
+def test_every_job_has_a_folder_that_is_named_after_it(sweep, ran, tmp_path):
+    done = sweep(*SWEEP, "launcher=basic")
     assert (done.status, done.err) == (0, "")
-    assert [job.folder for job in ran.jobs] == [tmp_path / "sweep" / str(n) for n in range(2)]
-    assert [job.name for job in ran.jobs] == ["planner.horizon=3", "planner.horizon=5"]
-    told = yaml.safe_load((tmp_path / "sweep" / "1" / "job.yaml").read_text())
-    assert told["command"] == "afm-rl method=physics planner.horizon=5"
-    assert told["overrides"] == ["method=physics", "planner.horizon=5"]
-    assert ran.jobs[1].arguments == (
-        *("--config-name=config", "--config-path=pkg://afm_rl.conf"),
-        *("method=physics", "planner.horizon=5", "hydra.verbose=true"),
-    )
-    assert "[2/2] job 1 (planner.horizon=5): done" in done.out
+    both = ["physics+planner.horizon=3", "physics+planner.horizon=5"]
+    assert names(ran) == both
+    record = yaml.safe_load((tmp_path / "sweep" / "jobs.yaml").read_text())
+    assert record["jobs"] == both and record["command"].startswith("afm-rl -m method=physics")
+    stored = yaml.safe_load((tmp_path / "sweep" / "jobs" / both[1] / "config.yaml").read_text())
+    assert stored["label"] == both[1] and stored["planner"]["horizon"] == 5
+    assert pd.read_csv(tmp_path / "sweep" / "missions.csv")["method"].tolist() == both
+    assert "[2/2] physics+planner.horizon=5: done" in done.out
     assert done.out.rstrip().endswith(f"Results: {tmp_path}/sweep")
 
 
@@ -61,73 +84,70 @@ def test_finished_jobs_are_skipped_and_others_are_not(sweep, ran, tmp_path):
     done = sweep(*SWEEP)
     assert done.status == 1
     assert done.err == (
-        "afm-rl: job 1 (planner.horizon=5): failed: out of luck "
-        f"({tmp_path}/sweep/1/log.txt)\n"
-        "afm-rl: 1 of 2 jobs failed; the same command tries them again\n"
+        "afm-rl: physics+planner.horizon=5: failed: out of luck\n"
+        f"afm-rl: 1 of 2 jobs failed ({tmp_path}/sweep/jobs/*/log.txt); the same command tries "
+        "them again\n"
     )
-    ran.jobs, ran.failing = [], "none"
+    ran.failing = "none"
+    ran.jobs.clear()
     done = sweep(*SWEEP, "launcher=basic", "progress=false")  # neither makes another job
-    assert done.status == 0 and "2 jobs in" in done.out and ", 1 with results" in done.out
-    assert [job.folder.name for job in ran.jobs] == ["1"]
-    ran.jobs = []
-    assert sweep(*SWEEP).status == 0
+    assert done.status == 0 and "1 of 2 jobs have results already" in done.out
+    assert names(ran) == ["physics+planner.horizon=5"]
+    assert sweep(*SWEEP).status == 0 and ran.jobs == []
+    assert sweep(*SWEEP, "overwrite=true").status == 0 and len(ran.jobs) == 2
+
+
+def test_a_sweep_is_extended_and_other_settings_replace_nothing(sweep, ran):
+    assert sweep("-m", "method=physics", "seeds=1,2").status == 0
+    assert sweep("-m", "method=physics", "seeds=3,1").status == 0
+    assert names(ran) == [f"physics+seeds={seed}" for seed in (1, 2, 3)]
+    done = sweep("-m", "method=physics", "seeds=1,2", "budget=7")
+    assert done.status == 2 and "budget: 5000 -> 7" in done.err and done.err.count("\n") == 1
     assert ran.jobs == []
 
 
-def test_another_configuration_runs_anew_and_replaces_nothing(sweep, ran):
-    assert sweep("-m", "method=physics", "seeds=1,2", "launcher=basic").status == 0
-    assert sweep("-m", "method=physics", "seeds=3,1", "launcher=basic").status == 0
-    assert [job.folder.name for job in ran.jobs] == ["0", "1", "2"]
-    assert sweep("-m", "method=physics", "seeds=1", "budget=7", "launcher=basic").status == 0
-    assert [job.folder.name for job in ran.jobs] == ["0", "1", "2", "3"]
+def test_methods_seeds_and_settings_make_the_names(sweep, ran, tmp_path):
+    assert sweep("-m", "compare=[physics,oracle]", "budget=5,6").status == 0
+    labels = [f"{method}+budget={budget}" for budget in (5, 6) for method in ("physics", "oracle")]
+    assert names(ran) == labels
+    assert sweep("-m", "method=physics,oracle", "label=mine", "budget=8").status == 0
+    assert names(ran) == ["mine+method=physics", "mine+method=oracle"]
+    study = ["study=ugv", "compare=[physics]", "seeds=[4]", "tracks=ethz_1,ethz_2"]
+    assert sweep("-m", *study).status == 0
+    assert names(ran) == [f"physics+tracks=ethz_{track}+seed=4" for track in (1, 2)]
+    settings = tmp_path / "sweep" / "jobs" / "physics+tracks=ethz_1+seed=4" / "config.yaml"
+    assert yaml.safe_load(settings.read_text())["label"] == "physics"
 
 
 def test_what_is_asked_twice_is_run_once(sweep, ran):
     assert sweep("-m", "method=physics", "seeds=1,1").status == 0
-    assert len(ran.jobs) == 1 and ran.jobs[0].name == ""
-
-
-@pytest.mark.parametrize(
-    "apart",
-    [
-        ["label=mine"],
-        ["compare=[physics]"],
-        ["study=ugv"],
-        ["dynamics=physics"],  # the same part, but the user's choice: no comparison any more
-        ["seeds=2"],
-    ],
-)
-def test_settings_that_make_another_job(sweep, ran, apart):
-    assert sweep("-m", "budget=5").status == 0
-    assert sweep("-m", "budget=5", *apart).status == 0
-    assert len(ran.jobs) == 2
+    assert names(ran) == ["physics"]
 
 
 def test_a_setting_that_cannot_be_resolved_is_the_job_s_own_failure(sweep, ran):
-    assert sweep("-m", "method=physics", "budget=${nope},5").status == 0
-    assert len(ran.jobs) == 2
+    done = sweep("-m", "method=physics", "budget=${nope},5")
+    assert done.status == 1 and names(ran) == ["physics+budget=5"]
+    assert "afm-rl: budget=${nope}: failed: " in done.err and "1 of 2 jobs failed" in done.err
 
 
 def test_an_own_configuration_goes_to_the_jobs(sweep, ran, tmp_path):
     (tmp_path / "own").mkdir()
     (tmp_path / "own" / "mine.yaml").write_text("defaults: [config, _self_]\nbudget: 9\n")
-    assert (
-        sweep("-m", f"--config-dir={tmp_path}/own", "--config-name=mine", "seeds=1,2").status == 0
-    )
-    assert ran.jobs[0].arguments[:3] == (
-        *("--config-name=mine", "--config-path=pkg://afm_rl.conf"),
-        f"--config-dir={tmp_path}/own",
-    )
+    own = [f"--config-dir={tmp_path}/own", "--config-name=mine"]
+    assert sweep("-m", *own, "seeds=1,2", "compare=[physics]").status == 0
+    stored = (tmp_path / "sweep" / "jobs" / "physics+seeds=1" / "config.yaml").read_text()
+    assert yaml.safe_load(stored)["budget"] == 9
 
 
 def test_an_interrupted_sweep_says_how_to_go_on(sweep, monkeypatch, tmp_path):
-    def interrupt(job):
+    def interrupt(self, jobs):
         raise KeyboardInterrupt
+        yield
 
-    monkeypatch.setattr("afm_rl.cli.launchers.local.run", interrupt)
+    monkeypatch.setattr(LocalPool, "run", interrupt)
     done = sweep(*SWEEP, "launcher=basic")
-    assert done.status == 130
-    assert done.err == f"afm-rl: interrupted; the same command goes on in {tmp_path}/sweep\n"
+    assert done.status == 130 and done.err.count("\n") == 1
+    assert done.err.startswith(f"afm-rl: interrupted; what was done is in {tmp_path}/sweep")
 
 
 def test_the_same_command_returns_to_the_same_folder(afm_rl, ran, monkeypatch, tmp_path):
@@ -166,11 +186,6 @@ def test_launchers_that_cannot_be_used(sweep, settings, named):
 def test_a_launcher_whose_package_is_missing_says_what_to_install():
     with pytest.raises(ConfigurationError, match=r"nowhere: pip install 'afm-rl\[sweeps\]'"):
         needs("nowhere", "sweeps")
-
-
-def test_a_job_that_cannot_be_started_has_a_reason(tmp_path):
-    job = Job(tmp_path, "0" * 64, "", (), tmp_path / "nowhere")
-    assert run(job) == f"{tmp_path}/nowhere: No such file or directory"
 
 
 def test_hydra_s_own_launchers_can_still_be_chosen(afm_rl, tmp_path, quick):
@@ -222,8 +237,8 @@ def test_submitit_survives_jobs_whose_process_the_cluster_ends(
     monkeypatch.setattr(slurm, "run", leave)
     done = sweep("-m", "method=physics", "seeds=1,2", f"launcher={launcher}")
     assert done.status == 1
-    assert "job 0 (seeds=1): done" in done.out
-    assert "afm-rl: job 1 (seeds=2): failed: " in done.err
+    assert "physics+seeds=1: done" in done.out
+    assert "afm-rl: physics+seeds=2: failed: " in done.err
     assert f"{tmp_path}/sweep/.submitit/" in done.err and "1 of 2 jobs failed" in done.err
 
 
@@ -249,10 +264,10 @@ def test_ray_survives_nodes_that_die(sweep, monkeypatch):
     fake.exceptions = SimpleNamespace(RayError=RayError)
     fake.init = lambda address, **settings: asked.append(address) or nullcontext()
     fake.remote = lambda **resources: lambda run: SimpleNamespace(remote=lambda job: job)
-    fake.wait = lambda running: (running[:1], running[1:])
+    fake.wait = lambda running, timeout: (running[:1], running[1:])
     fake.get = get
     monkeypatch.setitem(sys.modules, "ray", fake)
     done = sweep("-m", "method=physics", "seeds=1,2", "launcher=ray", "hydra.launcher.address=auto")
     assert (done.status, asked) == (1, ["auto"])
-    assert "job 0 (seeds=1): done" in done.out
-    assert "afm-rl: job 1 (seeds=2): failed: The node died. (" in done.err
+    assert "physics+seeds=1: done" in done.out
+    assert "afm-rl: physics+seeds=2: failed: The node died.\n" in done.err

@@ -20,9 +20,9 @@ from afm_rl.dynamics import (
 )
 from afm_rl.flow import AxisNetwork, CFMLoss
 from afm_rl.learning import (
-    FreshAdam,
     GaussianNLLLoss,
     OnlineUpdater,
+    ResetAdam,
     RLSUpdater,
     StreamXUpdater,
     UnmatchedUpdater,
@@ -150,7 +150,7 @@ def policy(seed=0, dtype=torch.float32):
 
 
 FEW = {"population": 12, "iterations": 2}
-ADAM = partial(FreshAdam, lr=1e-2)
+ADAM = partial(ResetAdam, lr=1e-2)
 TRACKING = TrackingCost([1.0, 1.0, 0.0], [0.01, 0.01], coordinates=[0, 1])
 
 MODULES = {

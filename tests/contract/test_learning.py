@@ -15,12 +15,12 @@ from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
 from afm_rl.flow import AxisNetwork, CFMLoss, draw_examples
-from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater, Updater, UpdaterHook
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam, Updater, UpdaterHook
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 
 
 def adam(parameters):
-    return FreshAdam(parameters, lr=1e-3)
+    return ResetAdam(parameters, lr=1e-3)
 
 
 def updater_of(model):

@@ -16,7 +16,7 @@ from afm_rl.correction import LeastSquares
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
-from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater, Updater
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam, Updater
 from afm_rl.planning import ICEM, MPPI, GoalDistance, PlanningEnv
 from afm_rl.regimes import Schedule
 from afm_rl.transforms import ActionFlowTransform
@@ -108,7 +108,7 @@ def test_a_compiled_environment_steps_alike(small_flow):
 
 def taught(box, make_ensemble):
     model = make_ensemble()
-    updater = OnlineUpdater(GaussianNLLLoss(model), lambda p: FreshAdam(p, lr=1e-3))
+    updater = OnlineUpdater(GaussianNLLLoss(model), lambda p: ResetAdam(p, lr=1e-3))
     return model, updater
 
 

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 
 from afm_rl.dynamics import ensemble as module
 from afm_rl.errors import ConfigurationError
-from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 
 TOLERANCE = 0.02  # standard deviations of the state change: two roundings to 8 bits per layer
 
@@ -117,7 +117,7 @@ def test_the_copies_follow_the_parameters(fast, transitions, grow_apart):
     assert agree(fast, state, action)
     grow_apart(fast.expand_(4))
     assert agree(fast, state, action)
-    updater = OnlineUpdater(GaussianNLLLoss(fast), lambda p: FreshAdam(p, lr=0.1))
+    updater = OnlineUpdater(GaussianNLLLoss(fast), lambda p: ResetAdam(p, lr=0.1))
     before = fast(state, action)
     td = TensorDict({"observation": state[:, 0], "action": action[:, 0]}, [4])
     updater(td.set(("next", "observation"), state[:, 1]))

@@ -9,9 +9,9 @@ from tensordict import TensorDict
 from afm_rl.dynamics import Calibrated, Dubins, Ensemble
 from afm_rl.errors import ConfigurationError, NonFiniteError
 from afm_rl.learning import (
-    FreshAdam,
     GaussianNLLLoss,
     OnlineUpdater,
+    ResetAdam,
     RLSUpdater,
     StreamXUpdater,
     UnmatchedUpdater,
@@ -99,9 +99,9 @@ def test_double_observations_and_single_actions(trained_ensemble, transitions):
     mixed = mixed.set(("next", "observation"), after.double())
     fit_ensemble(model, mixed, **SHORT)
     assert {p.dtype for p in model.parameters()} == {torch.float32}
-    learner = partial(OnlineUpdater, optimizer=FreshAdam)
+    learner = partial(OnlineUpdater, optimizer=ResetAdam)
     for updater in (
-        OnlineUpdater(GaussianNLLLoss(model), FreshAdam),
+        OnlineUpdater(GaussianNLLLoss(model), ResetAdam),
         StreamXUpdater(GaussianNLLLoss(model)),
         UnmatchedUpdater(GaussianNLLLoss(model), learner, [1, 1]),
         RLSUpdater(GaussianNLLLoss(Calibrated(model, torch.ones(2)))),

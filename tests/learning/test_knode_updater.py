@@ -126,7 +126,7 @@ def test_a_busy_trainer_leaves_the_latest_rows():
     ticks = stream(9)
     _, updater = teach(ticks[:7], epochs=1, latency=0.25)
     latest = torch.cat([td["next", "trace"][:, :-1] for td in ticks[4:7]], 1)
-    assert torch.equal(updater.window.rows.state[:, 0], latest)
+    assert torch.equal(updater.window.parts.state[:, 0], latest)
 
 
 def test_random_numbers_are_of_the_seed_and_paired_by_missions():

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins
-from afm_rl.learning import FreshAdam, GaussianNLLLoss, OnlineUpdater
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 
 
 def transition(state, action, factor=-1.0):
@@ -17,7 +17,7 @@ def transition(state, action, factor=-1.0):
 
 
 def updater_of(model, lr=1e-2, **settings):
-    return OnlineUpdater(GaussianNLLLoss(model), lambda p: FreshAdam(p, lr=lr), **settings)
+    return OnlineUpdater(GaussianNLLLoss(model), lambda p: ResetAdam(p, lr=lr), **settings)
 
 
 def weights(model, index=...):

@@ -9,18 +9,18 @@ from tensordict import TensorDict
 from afm_rl.dynamics import Dubins, Ensemble
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import (
-    FreshAdam,
     GaussianNLLLoss,
     OnlineUpdater,
+    ResetAdam,
     StreamXUpdater,
     UnmatchedUpdater,
     pretrain_ensemble,
 )
-from afm_rl.learning.effects import take_apart
+from afm_rl.learning.error_decomposition import decompose_error
 from afm_rl.manifold import Manifold
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
-GRADIENT = partial(OnlineUpdater, optimizer=partial(FreshAdam, lr=1e-3))
+GRADIENT = partial(OnlineUpdater, optimizer=partial(ResetAdam, lr=1e-3))
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +55,9 @@ def transitions(gain, push=0.0):
 
 def rest(updater, td):
     """Return what no action explains, in standard deviations: the mean of missions."""
-    rows = td["observation"], td["action"] / HIGH, td["next", "observation"]
-    return take_apart(updater.loss.model, *rows, HIGH).rest.abs().amax(-1).mean().item()
+    rows = td["observation"], td["action"], td["next", "observation"]
+    parts = decompose_error(updater.loss.model, *rows, HIGH)
+    return parts.unmatched.abs().amax(-1).mean().item()
 
 
 def weights(updater):

@@ -107,7 +107,7 @@ def test_seeds(written, chosen):
     "written", [0, -3, 1.5, True, None, "three", [], [1, 1], [-1], [1.0], [True], [2**63]]
 )
 def test_seeds_that_cannot_be_used(written):
-    with pytest.raises(ConfigurationError, match="^seeds=.*count of at least 1, or a list of dist"):
+    with pytest.raises(ConfigurationError, match="^seeds=.*count in 1..100000, or a list of dist"):
         select_seeds(written)
 
 

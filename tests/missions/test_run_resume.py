@@ -1,6 +1,7 @@
 """Runs that are interrupted and go on give what they would have given, to the bit."""
 
 import random
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -9,15 +10,17 @@ import torch
 
 from afm_rl.artefacts import read_tensors
 from afm_rl.errors import AFMError, ArtefactError, ConfigurationError
+from afm_rl.learning import Updater
+from afm_rl.mission_state import MissionState
 from afm_rl.missions import run
-from afm_rl.missions.checkpoint import Checkpoint, Stopped
+from afm_rl.missions.checkpoint import Checkpoints, Stopped
 from afm_rl.missions.log import StepLog
 from afm_rl.missions.state import fingerprint
 from afm_rl.missions.tree import flatten, unflatten
 
 METHODS = [
     *("physics", "online_pe", "oracle", "afm_physics", "afm_paper", "stream_x_pe"),
-    *("adaptive_gain", "physics planner=cem", "online_pe dynamics.propagation=sample"),
+    *("adaptive_gain", "rls", "physics planner=cem", "online_pe dynamics.propagation=sample"),
     "online_pe updater.optimizer._target_=torch.optim.Adam",
 ]
 
@@ -31,8 +34,7 @@ def agent(make_agent, ring, spot):
     """Make an agent for three missions on two tracks, of which one ends early."""
 
     def make(method, **settings):
-        tracks = [ring] if "Adam" in method else [ring, spot]  # Adam's moments cannot be selected
-        settings = {"tracks": tracks, "seeds": [3, 8], "budget": 14, **settings}
+        settings = {"tracks": [ring, spot], "seeds": [3, 8], "budget": 14, **settings}
         return make_agent(*f"method={method}".split(), **settings)
 
     return make
@@ -50,17 +52,17 @@ def same(left, right):
 def test_interrupted_runs_are_bit_identical(agent, tmp_path, method):
     whole = run(agent(method))
     for seed in range(2):
-        path = tmp_path / f"{seed}.safetensors"
+        path = tmp_path / str(seed)
         for stop in sorted(random.Random(seed).sample(range(1, 14), 3)):
             with pytest.raises(Stopped, match=f"step {stop}"):
-                run(agent(method), checkpoint=path, watch=lambda loop, at=stop: loop.step == at)
+                run(agent(method), checkpoint=path, stopped=lambda loop, at=stop: loop.step == at)
             torch.rand(5)  # the global generator goes its own way
         same(whole, run(agent(method), checkpoint=path))
 
 
 @pytest.mark.parametrize("method", ["online_pe", "afm_physics"])
 def test_a_run_killed_at_each_write_in_turn(agent, tmp_path, method, monkeypatch):
-    whole, path = run(agent(method)), tmp_path / "run.safetensors"
+    whole, path = run(agent(method)), tmp_path / "run"
     left = 0
 
     def replace(source, target):
@@ -75,42 +77,44 @@ def test_a_run_killed_at_each_write_in_turn(agent, tmp_path, method, monkeypatch
     real = os.replace
     for left in (1, 3, 1, 4):  # noqa: B007
         with monkeypatch.context() as patched, pytest.raises(Killed):
-            patched.setattr("afm_rl.artefacts.os.replace", replace)
+            patched.setattr("afm_rl.files.os.replace", replace)
             run(agent(method), checkpoint=path, every=0)
-    assert list(tmp_path.glob(".run*")) == []
+    assert list(path.glob(".*")) == []
     same(whole, run(agent(method), checkpoint=path, every=0))
 
 
 def test_a_checkpoint_is_written_when_it_is_time_and_stays(agent, tmp_path):
-    path = tmp_path / "deep" / "run.safetensors"
+    path = tmp_path / "deep" / "run"
     whole = run(agent("physics"), checkpoint=path)
     assert not path.exists()
     same(whole, run(agent("physics"), checkpoint=path, every=0))
-    assert path.exists()
+    assert [file.name for file in path.iterdir()] == [
+        f"checkpoint-{step:07d}.safetensors" for step in (13, 14)
+    ]
     same(whole, run(agent("physics"), checkpoint=path))  # nothing is left to do
-    assert path.read_bytes()
 
 
 def test_seconds_add_up_over_interruptions(agent, tmp_path):
-    path = tmp_path / "run.safetensors"
+    path = tmp_path / "run"
     with pytest.raises(Stopped):
-        run(agent("physics"), checkpoint=path, watch=lambda loop: loop.step == 7)
+        run(agent("physics"), checkpoint=path, stopped=lambda loop: loop.step == 7)
     first = run(agent("physics"), checkpoint=path)
     assert first.missions["seconds"].gt(0).all()
 
 
 def test_a_run_without_a_checkpoint_can_be_stopped_too(agent):
     with pytest.raises(Stopped):
-        run(agent("physics"), watch=lambda loop: True)
+        run(agent("physics"), stopped=lambda loop: True)
 
 
 @pytest.fixture
 def kept(agent, tmp_path):
     """The checkpoint of a run that was stopped."""
-    path = tmp_path / "run.safetensors"
+    path = tmp_path / "run"
     with pytest.raises(Stopped):
-        run(agent("physics"), checkpoint=path, watch=lambda loop: loop.step == 3)
-    return path
+        run(agent("physics"), checkpoint=path, stopped=lambda loop: loop.step == 3)
+    (file,) = path.iterdir()
+    return file
 
 
 @pytest.mark.parametrize(
@@ -124,16 +128,19 @@ def kept(agent, tmp_path):
 )
 def test_checkpoints_of_other_missions_are_refused(agent, kept, method, settings, named):
     before = kept.read_bytes()
+    other = agent(method, **settings)
+    whole = fingerprint(other)
     with pytest.raises(ArtefactError, match="made by other missions") as found:
-        run(agent(method, **settings), checkpoint=kept)
+        run(other, checkpoint=kept.parent)
+    assert fingerprint(other) == whole
     assert named in str(found.value) and str(kept) in str(found.value)
     assert kept.read_bytes() == before
 
 
 def test_a_checkpoint_of_other_weights_is_refused(agent, tmp_path):
-    path = tmp_path / "run.safetensors"
+    path = tmp_path / "run"
     with pytest.raises(Stopped):
-        run(agent("frozen_pe"), checkpoint=path, watch=lambda loop: loop.step == 3)
+        run(agent("frozen_pe"), checkpoint=path, stopped=lambda loop: loop.step == 3)
     other = agent("frozen_pe")
     other.model.biases[0].data += 1e-6
     with pytest.raises(ArtefactError, match="parts: "):
@@ -141,28 +148,34 @@ def test_a_checkpoint_of_other_weights_is_refused(agent, tmp_path):
 
 
 def test_settings_without_influence_may_change(agent, kept):
-    run(agent("physics", progress=False, threads=2, cache="elsewhere"), checkpoint=kept)
+    run(agent("physics", progress=False, threads=2, cache="elsewhere"), checkpoint=kept.parent)
 
 
 def test_a_damaged_checkpoint_is_refused(agent, kept):
     data = bytearray(kept.read_bytes())
     data[-9] ^= 1
     kept.write_bytes(data)
-    with pytest.raises(ArtefactError, match="damaged"):
-        run(agent("physics"), checkpoint=kept)
+    learning = agent("online_pe")
+    whole = fingerprint(learning)
+    with pytest.raises(ArtefactError, match="damaged.* to start anew"):
+        run(learning, checkpoint=kept.parent)
+    assert fingerprint(learning) == whole  # its parameters are not expanded either
+    (kept.parent / "checkpoint-0000001.safetensors").touch()
+    with pytest.raises(ArtefactError, match="to go on from checkpoint-0000001.safetensors"):
+        run(agent("physics"), checkpoint=kept.parent)
 
 
 @pytest.mark.parametrize("every", [-1, float("nan"), "often"])
 def test_times_that_cannot_be_used(agent, tmp_path, every):
-    with pytest.raises(ConfigurationError, match=f"every={every!r}"):
-        Checkpoint(tmp_path / "run", agent("physics"), every)
+    with pytest.raises(ConfigurationError, match=f"checkpoints.every={every!r}"):
+        Checkpoints(tmp_path / "run", agent("physics"), every)
 
 
 def test_a_checkpoint_holds_everything_that_moves(agent, tmp_path):
-    path = tmp_path / "run.safetensors"
+    path = tmp_path / "run"
     with pytest.raises(Stopped):
-        run(agent("stream_x_pe"), checkpoint=path, watch=lambda loop: loop.step == 5)
-    tensors, _ = read_tensors(path)
+        run(agent("stream_x_pe"), checkpoint=path, stopped=lambda loop: loop.step == 5)
+    tensors, _ = read_tensors(*path.iterdir())
     names = " ".join(tensors)
     for part in ("running.mean", "weights.0", '"planner.streams"', "_generator", "pose", "global"):
         assert part in names
@@ -195,3 +208,67 @@ def test_a_log_grows_on_after_it_was_taken_up():
 
 def test_stopped_is_an_error_of_the_library():
     assert issubclass(Stopped, AFMError)
+
+
+class Latest(NamedTuple):
+    """The latest rewards of missions."""
+
+    reward: torch.Tensor
+
+
+class Curious(Updater):
+    """An updater that remembers something of a new kind; the last part of each name says how."""
+
+    learns = True
+
+    def __init__(self, loss, kind):
+        super().__init__(loss)
+        self.kind, self.count, self.rows = kind, 0, []
+        self.register_buffer("rates", torch.zeros(3), persistent=False)
+        self.state = MissionState(Latest(torch.zeros(3)))
+
+    def _learn(self, found, transitions, learn):
+        if self.kind == "list":
+            self.rows.append(float(found["loss"].sum()))
+        elif self.kind == "attribute":
+            self.mean = found["loss"]
+        elif self.kind == "buffer":
+            self.rates = found["loss"]
+        else:
+            self.count += 1
+            before = self.state.parts.reward
+            before = before if before.shape == learn.shape else torch.zeros(learn.shape)
+            self.state.keep(Latest(before + found["loss"]))
+
+
+@pytest.mark.parametrize("kind", ["list", "attribute", "buffer"])
+def test_state_that_nobody_saves_or_cuts_is_an_error(agent, tmp_path, kind):
+    for settings in ({}, {"checkpoint": tmp_path / kind, "every": 0}):  # a mission ends early
+        made = agent("physics")
+        made.updater = Curious(made.updater.loss, kind)
+        with pytest.raises(ConfigurationError, match=r"updater\.(rows|mean|rates) changes during"):
+            run(made, **settings)
+
+
+def test_state_of_a_new_kind_is_saved_and_cut(agent, tmp_path):
+    totals = []
+    for stops in ([], [3, 5, 9]):
+        for stop in [*stops, None]:
+            made = agent("physics")
+            made.updater = Curious(made.updater.loss, "kept")
+            try:
+                watch = None if stop is None else lambda loop, at=stop: loop.step == at
+                run(made, checkpoint=tmp_path / str(len(stops)), watch=watch)
+            except Stopped:
+                continue
+        totals.append((made.updater.count, made.updater.state.parts.reward))
+    assert totals[0][0] == totals[1][0] > 10
+    assert torch.equal(totals[0][1], totals[1][1])
+    assert totals[0][1].shape == (2,)  # those that ran to the end
+
+
+def test_moments_of_optimisers_are_cut_with_their_missions(agent):
+    made = agent("online_pe updater.optimizer._target_=torch.optim.Adam")
+    run(made)
+    for parameter, state in made.updater.optimizer.state.items():
+        assert state["exp_avg"].shape == parameter.shape

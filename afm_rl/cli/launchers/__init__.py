@@ -1,7 +1,6 @@
-"""Where the jobs of a sweep run: on this machine, on a SLURM cluster, on a Ray cluster.
+"""Where jobs run: on this machine, on a SLURM cluster, on a Ray cluster.
 
-Whatever the launcher, a job is a process of its own that runs the same command without sweeping,
-so that no job can harm another.
+Whatever the launcher, a job is a process of its own, so that no job can harm another.
 """
 
 from __future__ import annotations
@@ -12,11 +11,11 @@ from types import ModuleType
 
 from hydra.core.plugins import Plugins
 
-from afm_rl.cli.launchers.local import JoblibLauncher
+from afm_rl.cli.launchers.local import LocalLauncher
 from afm_rl.cli.launchers.ray_cluster import RayLauncher
 from afm_rl.cli.launchers.slurm import SubmititLauncher
 
-__all__ = ["JoblibLauncher", "RayLauncher", "SubmititLauncher", "register"]
+__all__ = ["LocalLauncher", "RayLauncher", "SubmititLauncher", "register"]
 
 NAMESPACE = "hydra_plugins"
 
@@ -33,6 +32,6 @@ def register() -> None:
         namespace = sys.modules[NAMESPACE] = ModuleType(NAMESPACE)
         namespace.__path__ = []
     vars(namespace)["afm_rl"] = sys.modules[__name__]
-    for launcher in (JoblibLauncher, RayLauncher, SubmititLauncher):
+    for launcher in (LocalLauncher, RayLauncher, SubmititLauncher):
         launcher.__module__ = f"{NAMESPACE}.afm_rl"
         Plugins.instance().register(launcher)

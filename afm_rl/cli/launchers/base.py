@@ -1,9 +1,8 @@
-"""What all launchers have in common: folders of jobs, what is done already, what failed."""
+"""What all launchers have in common: Hydra's side of a sweep."""
 
 from __future__ import annotations
 
 import importlib
-import sys
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,20 +10,23 @@ from types import ModuleType
 
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.utils import JobReturn, JobStatus, setup_globals
+from hydra.errors import HydraException
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from afm_rl.cli.launchers.job import LOG, Job
+from afm_rl.cli.error_messages import explain
 from afm_rl.errors import AFMError, ConfigurationError
+from afm_rl.jobs.process import Job
 
 
-class SweepError(AFMError):
-    """Some jobs of a sweep have no results."""
+class JobsFailed(AFMError):
+    """Some jobs have no results."""
 
 
 class JobLauncher(Launcher):
-    """Runs the jobs of a sweep that have no results yet, and says which failed.
+    """Runs jobs, those of a sweep as well as those of a comparison or a study.
 
     Subclasses say where, by :meth:`run`.
     """
@@ -39,51 +41,45 @@ class JobLauncher(Launcher):
         self.config = config
 
     @abstractmethod
-    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None]]:
-        """Run jobs, in any order; yield each that is over, and why it failed, if it did."""
+    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None] | None]:
+        """Run jobs, as :class:`afm_rl.jobs.batch.Pool` says."""
 
     def launch(
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
-        """Run the jobs of a sweep.
+        """Run the jobs of a sweep and report on them.
 
         Raises:
-            SweepError: if some have no results, once the others are done.
+            JobsFailed: if some have no results, once the others are done.
         """
-        from afm_rl.cli.launchers.plan import plan  # with torch, which takes seconds
+        from afm_rl.cli import launch  # with torch, which takes seconds
+        from afm_rl.cli.methods import jobs_of
 
         setup_globals()
-        folder = Path(self.config.hydra.sweep.dir).absolute()
+        film = launch.check_settings(self.config)
         configs = [self.loader.load_sweep_config(self.config, list(o)) for o in job_overrides]
-        jobs = plan(folder, configs)
-        waiting = [job for job in dict.fromkeys(jobs) if not job.finished]
-        before = len(set(jobs)) - len(waiting)
-        print(f"{len(jobs)} jobs in {folder}" + (f", {before} with results" if before else ""))
-        try:
-            failures = self._work(waiting)
-        except KeyboardInterrupt:
-            print(f"afm-rl: interrupted; the same command goes on in {folder}", file=sys.stderr)
-            sys.exit(130)
-        for job in filter(failures.get, waiting):
-            print(f"afm-rl: {job}: failed: {failures[job]} ({job.folder / LOG})", file=sys.stderr)
-        print(f"Results: {folder}")
-        if failures:
-            raise SweepError(
-                f"{len(failures)} of {len(jobs)} jobs failed; the same command tries them again"
-            )
+        common = set.intersection(*map(set, job_overrides))
+        jobs: dict[str, DictConfig] = {}
+        failures = {}
+        for cfg, overrides in zip(configs, job_overrides, strict=True):
+            swept = [text for text in overrides if text not in common]
+            try:
+                found = jobs_of(cfg, cfg.hydra, swept)
+                for job in found.values():
+                    OmegaConf.to_container(job, resolve=True)
+                jobs |= found
+            except (AFMError, HydraException, OmegaConfBaseException) as error:
+                failures[" ".join(swept or overrides)] = explain(error) or str(error)
+        folder = Path(self.config.hydra.sweep.dir).absolute()
+        asked = self.config.hydra.overrides.task
+        failed = launch.run_together(folder, jobs, self, self.config, ["-m", *asked], failures)
+        launch.report(folder, self.config, film)
+        if failed:
+            raise failed
         return [
             JobReturn(overrides=list(overrides), cfg=cfg, status=JobStatus.COMPLETED)
             for overrides, cfg in zip(job_overrides, configs, strict=True)
         ]
-
-    def _work(self, waiting: Sequence[Job]) -> dict[Job, str]:
-        """Run jobs, tell of each that is over, and return why some failed."""
-        failures = {}
-        for count, (job, reason) in enumerate(self.run(waiting) if waiting else (), 1):
-            print(f"[{count}/{len(waiting)}] {job}: {'failed' if reason else 'done'}", flush=True)
-            if reason:
-                failures[job] = reason
-        return failures
 
 
 def needs(package: str, extra: str) -> ModuleType:

@@ -1,12 +1,14 @@
-"""Sweeps on a Ray cluster."""
+"""Jobs on a Ray cluster."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
 from afm_rl.cli.launchers.base import JobLauncher, needs
-from afm_rl.cli.launchers.job import Job, run
 from afm_rl.errors import check_number
+from afm_rl.jobs.process import Job, run
+
+TICK = 0.5  # seconds between two signs of life
 
 
 class RayLauncher(JobLauncher):
@@ -14,7 +16,7 @@ class RayLauncher(JobLauncher):
 
     Args:
         address: of the cluster, as ``ray.init`` takes it; None for the one that ``RAY_ADDRESS``
-            names, or else one of this machine that lasts as long as the sweep.
+            names, or else one of this machine that lasts as long as the command.
         num_cpus: cores that a job takes up.
         num_gpus: GPUs that a job takes up.
 
@@ -33,16 +35,20 @@ class RayLauncher(JobLauncher):
         }
         self.ray = needs("ray", "ray")
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None]]:
+    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None] | None]:
+        if not jobs:
+            return
         ray = self.ray
         with ray.init(self.address, log_to_driver=False, ignore_reinit_error=True):
             # Not tried again elsewhere: a job that outgrows a node would bring down the next one.
             remote = ray.remote(max_retries=0, **self.resources)(run)
             running = {remote.remote(job): job for job in jobs}
             while running:
-                (ready,), _ = ray.wait(list(running))
-                job = running.pop(ready)
-                try:
-                    yield job, ray.get(ready)
-                except ray.exceptions.RayError as error:
-                    yield job, str(error).splitlines()[0]
+                ready, _ = ray.wait(list(running), timeout=TICK)
+                for handle in ready:
+                    job = running.pop(handle)
+                    try:
+                        yield job, ray.get(handle)
+                    except ray.exceptions.RayError as error:
+                        yield job, str(error).splitlines()[0]
+                yield None

@@ -1,15 +1,16 @@
-"""Sweeps on a SLURM cluster."""
+"""Jobs on a SLURM cluster."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from afm_rl.cli.launchers.base import JobLauncher, needs
-from afm_rl.cli.launchers.job import Job, run
 from afm_rl.errors import ConfigurationError, check_choice
+from afm_rl.jobs.process import Job, run
 
-POLL = 2.0  # seconds between two looks at jobs; the cluster itself is asked more rarely
+POLL = 0.5  # seconds between two looks at jobs; the cluster itself is asked more rarely
 
 
 class SubmititLauncher(JobLauncher):
@@ -30,18 +31,22 @@ class SubmititLauncher(JobLauncher):
         self.parameters = {key: value for key, value in parameters.items() if value is not None}
         self.submitit = needs("submitit", "sweeps")
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None]]:
-        folder = jobs[0].folder.parent / ".submitit"
+    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None] | None]:
+        if not jobs:
+            return
+        folder = jobs[0].folder.parent.parent / ".submitit"
         try:
             executor = self.submitit.AutoExecutor(folder, cluster=self.cluster)
             executor.update_parameters(**{"name": "afm-rl"} | self.parameters)
         except (RuntimeError, NameError, TypeError) as error:  # no cluster, no such parameter
             raise ConfigurationError(f"hydra.launcher: {error}") from error
         with executor.batch():
-            handles = [executor.submit(run, job) for job in jobs]
-        jobs_by_handle = dict(zip(handles, jobs, strict=True))
-        for handle in self.submitit.helpers.as_completed(handles, poll_frequency=POLL):
-            yield jobs_by_handle[handle], _outcome(handle)
+            running = {executor.submit(run, job): job for job in jobs}
+        while running:
+            for handle in [handle for handle in running if handle.done()]:
+                yield running.pop(handle), _outcome(handle)
+            yield None
+            time.sleep(POLL)
 
 
 def _outcome(handle: Any) -> str | None:

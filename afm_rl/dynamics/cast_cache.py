@@ -1,4 +1,4 @@
-"""Copies of parameters in another precision."""
+"""Parameters cast to another precision, once per change."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 
-class Copies:
+class CastCache:
     """Cast tensors once, and again only when they have changed.
 
     Changes through optimisers, ``copy_``, ``load_state_dict`` or a new ``data`` are noticed;
@@ -17,11 +17,11 @@ class Copies:
     Args:
         dtype: precision of the copies.
 
-    >>> weight, copies = torch.ones(2), Copies(torch.bfloat16)
-    >>> first = copies.of([weight])[0]
-    >>> copies.of([weight])[0] is first
+    >>> weight, cache = torch.ones(2), CastCache(torch.bfloat16)
+    >>> first = cache.of([weight])[0]
+    >>> cache.of([weight])[0] is first
     True
-    >>> copies.of([weight.mul_(3)])[0]
+    >>> cache.of([weight.mul_(3)])[0]
     tensor([3., 3.], dtype=torch.bfloat16)
     """
 
@@ -30,7 +30,7 @@ class Copies:
         self._seen: list[tuple[Tensor, int]] = []
         self._copies: list[Tensor] = []
 
-    def __deepcopy__(self, memo: dict) -> Copies:
+    def __deepcopy__(self, memo: dict) -> CastCache:
         """Return an empty one: a copied model's parameters are others."""
         return type(self)(self.dtype)
 

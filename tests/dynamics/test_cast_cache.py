@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from afm_rl.dynamics.copies import Copies
+from afm_rl.dynamics.cast_cache import CastCache
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def dropped(weights):
 
 @pytest.mark.parametrize("change", [replaced, cut, turned, added, stepped, dropped])
 def test_every_change_is_seen(weights, change):
-    copies = Copies(torch.bfloat16)
+    copies = CastCache(torch.bfloat16)
     weights[0].data = weights[0].data[:3]
     assert true_to(copies, weights)
     change(weights)
@@ -60,7 +60,7 @@ def test_every_change_is_seen(weights, change):
 
 
 def test_nothing_is_cast_twice_and_memory_serves_again(weights):
-    copies = Copies(torch.bfloat16)
+    copies = CastCache(torch.bfloat16)
     first = list(copies.of(weights))
     versions = [one._version for one in first]
     assert all(a is b for a, b in zip(copies.of(weights), first, strict=True))
@@ -71,7 +71,7 @@ def test_nothing_is_cast_twice_and_memory_serves_again(weights):
 
 
 def test_a_copied_model_has_copies_of_its_own(weights):
-    copies = Copies(torch.float64)
+    copies = CastCache(torch.float64)
     first = copies.of(weights)
     twin = copy.deepcopy(copies)
     assert twin.dtype is torch.float64 and twin.of(weights)[0] is not first[0]

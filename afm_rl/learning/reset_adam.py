@@ -13,7 +13,7 @@ from afm_rl.errors import check_number
 PIECE = 2**16  # numbers: three times 256 KiB in float32 fit into a second-level cache
 
 
-class FreshAdam(Optimizer):
+class ResetAdam(Optimizer):
     r"""Adam that is created anew at every step, as in the published runs.
 
     The first step of Adam is :math:`w \leftarrow w - \eta\, g / (|g| + \epsilon)`, a sign
@@ -27,7 +27,7 @@ class FreshAdam(Optimizer):
 
     >>> w = nn.Parameter(torch.tensor([1.0, 1.0]))
     >>> w.grad = torch.tensor([5.0, 0.0])
-    >>> FreshAdam([w], lr=0.1).step()
+    >>> ResetAdam([w], lr=0.1).step()
     >>> w.data
     tensor([0.9000, 1.0000])
     """

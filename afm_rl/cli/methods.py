@@ -1,0 +1,119 @@
+"""The methods that a command asks for, each with a configuration of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hydra import compose
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
+
+from afm_rl.cli.overrides import PARTS, has, optional
+from afm_rl.errors import ConfigurationError
+from afm_rl.missions.selection import select_seeds
+
+IN_TABLES = ("method", "label", "compare", "study", "seeds", "tracks", "regimes")
+"""Settings whose effect the tables show: methods need not be named after them."""
+NAMED = ("method", "compare", "label")
+"""Settings whose effect is in the label already."""
+
+
+def jobs_of(cfg: DictConfig, hydra: DictConfig, swept: Sequence[str] = ()) -> dict[str, DictConfig]:
+    """Return the configuration of each job that a command asks for, by name.
+
+    A job is one method; in a study, one method with one seed.
+
+    Args:
+        cfg: the composed configuration.
+        hydra: Hydra's part of it.
+        swept: overrides that not all jobs of a sweep have; they are part of the names of jobs,
+            and, unless the tables show their effect anyway, of the labels of methods.
+
+    Raises:
+        ConfigurationError: for methods, seeds or labels that cannot be used.
+    """
+    methods = _methods(cfg, hydra)
+    keys = {text: text.lstrip("+~").split("=")[0] for text in swept}
+    jobs: dict[str, DictConfig] = {}
+    for method in methods:
+        parts = method.label.split("+")
+        extra = [t for t, key in keys.items() if key not in IN_TABLES and t not in parts]
+        method.label = "+".join([method.label, *extra])
+        told = [t for t, key in keys.items() if key in IN_TABLES]
+        told = [t for t in told if keys[t] not in NAMED or (cfg.label and keys[t] == "method")]
+        name = "+".join([method.label, *told])
+        if cfg.get("study") is None:
+            jobs[name] = method
+            continue
+        for seed in select_seeds(method.seeds):
+            jobs[f"{name}+seed={seed}"] = OmegaConf.merge(method, {"seeds": [seed]})
+    return jobs
+
+
+def _methods(cfg: DictConfig, hydra: DictConfig) -> list[DictConfig]:
+    """Return one configuration per method, each with its label; none compares any more."""
+    overrides, method = list(hydra.overrides.task), hydra.runtime.choices.get("method")
+    compare = cfg.compare
+    if compare is not None:
+        names = list(compare) if isinstance(compare, ListConfig) else [None]
+        if not all(isinstance(n, str) for n in names) or len(set(names)) < len(names):
+            raise ConfigurationError(f"compare={compare}: expected a list of distinct methods")
+    given = {text.split("=")[0] for text in overrides}
+    by_hand = given.isdisjoint({"compare", "study"}) and not given.isdisjoint(PARTS)
+    alone = method is not None or by_hand or not cfg.compare
+    chosen = (
+        [(method, cfg)] if alone else _compared(list(compare), overrides, hydra.job.config_name)
+    )
+    own = []
+    for name, each in chosen:
+        each = OmegaConf.masked_copy(each, [k for k in each if k not in ("hydra", "study")])
+        label = each.label if len(chosen) == 1 and each.label else _label(name, overrides)
+        if not isinstance(label, str):
+            raise ConfigurationError(f"label={label!r}: expected a text")
+        with open_dict(each):
+            each.compare, each.label = [], label
+        own.append(each)
+    return own
+
+
+def _compared(
+    names: Sequence[str], overrides: Sequence[str], root: str
+) -> list[tuple[str, DictConfig]]:
+    """Compose each method with those settings of its parts that it has.
+
+    Raises:
+        ConfigurationError: for a setting that none of them has.
+    """
+    some = optional(overrides)
+    common = [text for text in overrides if text not in some.values()]
+    bare = {name: compose(root, [*common, f"method={name}"]) for name in names}
+    if not some:
+        return list(bare.items())
+    plain: dict[str, Any] = {
+        name: OmegaConf.to_container(each, resolve=False) for name, each in bare.items()
+    }
+    for key, text in some.items():
+        without = [name for name in names if not has(plain[name], key)]
+        if len(without) == len(names):
+            raise ConfigurationError(f"{text.lstrip('+')}: none of {', '.join(names)} has {key}")
+        for name in without:
+            print(f"{name}: has no {key}, so it stays as it is")
+    return [
+        (name, compose(root, [*common, *_fitting(some, plain[name]), f"method={name}"]))
+        for name in names
+    ]
+
+
+def _fitting(some: Mapping[str, str], settings: Mapping[str, Any]) -> list[str]:
+    """Return the overrides of settings that there are."""
+    return [text for key, text in some.items() if has(settings, key)]
+
+
+def _label(method: str | None, overrides: Sequence[str]) -> str:
+    """Name a method after its preset and the parts that were chosen by hand.
+
+    >>> _label("online_pe", ["seeds=2", "updater=rls", "corrector=afm"])
+    'online_pe+updater=rls+corrector=afm'
+    """
+    parts = [text for text in overrides if text.split("=")[0] in PARTS]
+    return "+".join([*([method] if method else []), *parts]) or "physics"

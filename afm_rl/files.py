@@ -1,0 +1,90 @@
+"""Files that are written whole or not at all, and folders that one process writes at a time."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from afm_rl.errors import ConfigurationError
+
+LOCK = ".lock"
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file so that readers see the old content or the new, never a part.
+
+    The content and the file's name are on the disk when this returns.
+
+    Raises:
+        ConfigurationError: if the file cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f".{path.name}.{secrets.token_hex(6)}")
+        try:
+            with open(part, "xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(part, path)
+        except BaseException:
+            part.unlink(missing_ok=True)
+            raise
+        sync_folder(path.parent)
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {path}: {error.strerror}") from error
+
+
+def remove_parts(folder: Path, name: str = "*") -> None:
+    """Remove what a killed :func:`write_whole` may have left beside files of a name.
+
+    Only for files that no other process writes at the same time.
+    """
+    for part in folder.glob(f".{name}.{'[0-9a-f]' * 12}"):
+        part.unlink(missing_ok=True)
+
+
+def sync_folder(folder: Path) -> None:
+    """Write to the disk which files a folder holds."""
+    if os.name != "posix":  # elsewhere a folder cannot be opened
+        return
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
+
+
+@contextmanager
+def locked(folder: Path, name: str = LOCK, wait: bool = False) -> Iterator[None]:
+    """Hold the lock of a folder, which is made if it is not there.
+
+    The lock ends with the process that holds it, however that ends.
+
+    Args:
+        folder: where the file of the lock is; it stays.
+        name: of this file.
+        wait: wait for another process to let go.
+
+    Raises:
+        ConfigurationError: if another process holds the lock, or the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / name, timeout=-1 if wait else 0)
+        lock.acquire()
+    except Timeout:
+        raise ConfigurationError(
+            f"{folder}: another process is at work in this folder; wait for it, or end it"
+        ) from None
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {folder}: {error.strerror}") from error
+    try:
+        yield
+    finally:
+        lock.release()

@@ -1,0 +1,119 @@
+"""Batches: the jobs of a comparison, a sweep or a study, in a folder that can be returned to."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Protocol
+
+from omegaconf import DictConfig
+from yaml import safe_dump
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.files import locked, remove_parts, write_whole
+from afm_rl.jobs.layout import JOBS, MISSIONS, RECORD, is_batch, recorded
+from afm_rl.jobs.process import Job
+from afm_rl.jobs.progress import Board
+from afm_rl.jobs.run import begin, needs_run
+from afm_rl.jobs.tables import write_tables
+from afm_rl.manifest import MANIFEST, write_manifest
+from afm_rl.targets import trusted
+
+LONGEST = 120  # characters of the name of a job's folder
+
+
+class Pool(Protocol):
+    """Where jobs run."""
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None] | None]:
+        """Run jobs, in any order.
+
+        Yields:
+            Each job that is over, with the reason if it failed; and, at least twice a second,
+            None. When the iterator is closed, jobs that still run are ended.
+        """
+
+
+def run_batch(
+    folder: Path,
+    configs: Mapping[str, DictConfig],
+    pool: Pool,
+    *,
+    command: str = "",
+    overwrite: bool = False,
+    progress: bool = False,
+    echo: Callable[[str], object] = print,
+) -> dict[str, str]:
+    """Run the jobs of a batch, or what is left of them.
+
+    Jobs that have results are skipped; those that were killed go on from their last checkpoint,
+    with the same results to the bit. Files: see :mod:`afm_rl.jobs.layout`.
+
+    Args:
+        folder: the batch's own; more jobs extend a batch that is there.
+        configs: settings of each job, by name; each of one method, with its label.
+        pool: where the jobs run.
+        command: what the user asked, for people.
+        overwrite: run jobs again that have results; these stay until the new ones are whole.
+        progress: show progress.
+        echo: receives lines of text.
+
+    Returns:
+        Why jobs have no results, by name.
+
+    Raises:
+        ConfigurationError: if the folder holds something else, or another process is at work in it.
+        ArtefactError: if results in it are damaged.
+    """
+    if not is_batch(folder) and (folder / MISSIONS).exists():
+        raise ConfigurationError(
+            f"hydra.run.dir={folder}: holds the results of a run; choose another folder"
+        )
+    own = (Path.cwd(), tuple(trusted()))
+    jobs = [Job(name, folder / JOBS / file_name(name), *own) for name in configs]
+    with locked(folder):
+        waiting = [job for job in jobs if needs_run(job.folder, configs[job.name], overwrite)]
+        remove_parts(folder)
+        _record(folder, jobs, command)
+        for job in waiting:
+            begin(job.folder, configs[job.name])
+        if len(waiting) < len(jobs):
+            echo(f"{len(jobs) - len(waiting)} of {len(jobs)} jobs have results already")
+        failures: dict[str, str] = {}
+        with Board(waiting, len(jobs), progress, echo) as board, closing(pool.run(waiting)) as ends:
+            for end in ends:
+                if end is not None:
+                    job, failure = end
+                    board.end(job, failure)
+                    if failure:
+                        failures[job.name] = failure
+                board.look()
+        write_tables(folder)
+        return failures
+
+
+def _record(folder: Path, jobs: Sequence[Job], command: str) -> None:
+    """Write down which jobs are asked for; those of earlier commands stay."""
+    names = [job.folder.name for job in jobs]
+    names += [name for name in recorded(folder) if name not in names]
+    (folder / MANIFEST).unlink(missing_ok=True)
+    text = safe_dump({"command": command, "jobs": names}, sort_keys=False)
+    write_whole(folder / RECORD, text.encode())
+    write_manifest(folder, [RECORD])
+
+
+def file_name(name: str) -> str:
+    """Return a name for the folder of a job: readable, and another one for every job.
+
+    >>> file_name("physics+planner.horizon=5")
+    'physics+planner.horizon=5'
+    >>> file_name("physics+tracks=[a/b]")
+    'physics+tracks=_a_b_-d3577f'
+    """
+    plain = re.sub(r"[^-+.,=\w]", "_", name).lstrip(".")[:LONGEST]
+    if plain == name:
+        return name
+    return f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:6]}"

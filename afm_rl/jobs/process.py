@@ -1,0 +1,159 @@
+"""One job, in a process of its own.
+
+Imported wherever a job is waited for, also on the nodes of a cluster: without torch.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import traceback
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing import connection
+from multiprocessing.context import ForkServerProcess, SpawnProcess
+from pathlib import Path
+
+from afm_rl.errors import AFMError
+from afm_rl.files import locked
+from afm_rl.jobs.layout import LOG, UNFINISHED, is_finished
+from afm_rl.targets import TRUST
+
+START = "forkserver"  # torch is imported once, and jobs are forked from there
+FAILURE, PROGRESS = "failure.txt", "progress.json"  # in the folder of unfinished results
+Process = ForkServerProcess | SpawnProcess
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run that is one of several.
+
+    Args:
+        name: what sets it apart from the others.
+        folder: its own.
+        cwd: where the command was given, which relative paths are relative to.
+        trust: packages that the command trusts, see :mod:`afm_rl.targets`.
+    """
+
+    name: str
+    folder: Path
+    cwd: Path
+    trust: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return self.name
+
+
+def start(job: Job) -> Process:
+    """Start the process of a job. It ends, with a checkpoint, when this process ends."""
+    for name in (FAILURE, PROGRESS):  # of an earlier attempt
+        (job.folder / UNFINISHED / name).unlink(missing_ok=True)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    context = multiprocessing.get_context(START)
+    if START == "forkserver":
+        context.set_forkserver_preload(["afm_rl.jobs.run", "afm_rl.envs"])
+    process = context.Process(target=work, args=(job,), name=job.name, daemon=True)
+    process.start()
+    return process
+
+
+def run(job: Job) -> str | None:
+    """Run a job in a process of its own, and wait for it.
+
+    Returns:
+        Why there are no results; None if there are.
+    """
+    process = start(job)
+    process.join()
+    return reason(job, process)
+
+
+def reason(job: Job, process: Process) -> str | None:
+    """Say why a job whose process has ended has no results; None if it has."""
+    new = job.folder / UNFINISHED
+    if process.exitcode == 0 and is_finished(job.folder) and not new.exists():
+        return None
+    if (new / FAILURE).exists():
+        return (new / FAILURE).read_text()
+    return last_words(process.exitcode or 0)
+
+
+def last_words(status: int) -> str:
+    """Say how a process ended.
+
+    >>> last_words(-9)
+    'its process was ended by SIGKILL; was there enough memory?'
+    >>> last_words(3)
+    'its process ended with status 3 before its results were whole'
+    """
+    if status >= 0:
+        return f"its process ended with status {status} before its results were whole"
+    hint = "; was there enough memory?" if status == -signal.SIGKILL else ""
+    return f"its process was ended by {signal.Signals(-status).name}{hint}"
+
+
+def work(job: Job) -> None:
+    """Finish a job: the main function of its process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
+    log = open(job.folder / LOG, "a", buffering=1)  # open as long as the process lives
+    for number in (1, 2):
+        os.dup2(log.fileno(), number)
+    sys.stdout = sys.stderr = log
+    os.chdir(job.cwd)
+    os.environ[TRUST] = ",".join(job.trust)
+    try:
+        _finish(job.folder)
+    except KeyboardInterrupt:  # told to stop
+        return
+    except BaseException as error:
+        traceback.print_exc()
+        with suppress(OSError):
+            (job.folder / UNFINISHED / FAILURE).write_text(explain(error))
+        sys.exit(1)
+
+
+def _finish(folder: Path) -> None:
+    from afm_rl.jobs.run import Stop, finish
+    from afm_rl.missions.checkpoint import Stopped
+    from afm_rl.progress import Bar
+
+    def report(line: str, share: float) -> None:
+        part = path.with_suffix(".part")
+        with suppress(OSError):  # such as a full disk: the missions matter more
+            part.write_text(json.dumps({"line": line, "share": share}))
+            os.replace(part, path)
+
+    path = folder / UNFINISHED / PROGRESS
+    with Stop().on(signal.SIGTERM) as stop, locked(folder, wait=True):
+        # The lock: an orphan of a command that was killed may be in its last step.
+        threading.Thread(target=_end_with_parent, daemon=True).start()
+        Bar.listener = report
+        report("starting", 0.0)
+        try:
+            finish(folder, stop=stop)
+        except Stopped:
+            return
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def explain(error: BaseException) -> str:
+    """Say in one line what went wrong.
+
+    >>> explain(ZeroDivisionError("division by zero"))
+    'ZeroDivisionError: division by zero'
+    """
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, AFMError):
+        cause = cause.__cause__ or cause.__context__
+    text = f"{type(error).__name__}: {error}" if cause is None else str(cause)
+    return " ".join(text.split()).removesuffix(":")

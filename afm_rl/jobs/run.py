@@ -1,0 +1,229 @@
+"""A run in its folder: what it is asked, its missions, and its results, whole or not at all."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+import pandas as pd
+from omegaconf import DictConfig, OmegaConf
+from yaml import YAMLError, safe_load
+
+from afm_rl import measures
+from afm_rl._version import __version__
+from afm_rl.csv_text import csv_text
+from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.files import remove_parts, sync_folder, write_whole
+from afm_rl.jobs.layout import COMPUTE, CONFIG, MISSIONS, STEPS, UNFINISHED, is_batch, is_finished
+from afm_rl.manifest import MANIFEST, check_manifest, read_manifest, write_manifest
+from afm_rl.missions import Agent, Results, build, prepare, run
+from afm_rl.missions.settings import differences, influential
+
+REPLACED = "replaced.json"  # the manifest of results that are being replaced
+SHOWN = ("figures", "video", "tensorboard")  # folders of what is drawn from the results
+FILES = (CONFIG, MISSIONS, STEPS, COMPUTE, measures.FILE)
+
+
+def needs_run(folder: Path, cfg: DictConfig, overwrite: bool = False) -> bool:
+    """Return whether the missions of a configuration are still to be run in a folder.
+
+    Nothing is written.
+
+    Args:
+        folder: of the run.
+        cfg: settings of one method, with its label.
+        overwrite: the folder may hold anything, which will be replaced.
+
+    Raises:
+        ConfigurationError: if the folder holds something else.
+        ArtefactError: if what it holds is damaged.
+    """
+    if is_batch(folder):
+        raise ConfigurationError(f"hydra.run.dir={folder}: holds jobs; choose another folder")
+    if overwrite:
+        return True
+    begun = folder / UNFINISHED / CONFIG
+    if is_finished(folder):
+        check_manifest(folder)
+        _check_same(folder / CONFIG, cfg, read_manifest(folder)["version"])
+        return False
+    if begun.exists():
+        _check_same(begun, cfg, __version__)
+    elif any((folder / name).exists() for name in FILES):
+        raise ConfigurationError(
+            f"hydra.run.dir={folder}: holds results without {MANIFEST}; choose another folder, or "
+            "overwrite=true"
+        )
+    return True
+
+
+def _check_same(path: Path, cfg: DictConfig, version: str) -> None:
+    """Check that results belong to a configuration and to this version."""
+    try:
+        stored = influential(safe_load(path.read_bytes()))
+    except (YAMLError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise ArtefactError(f"{path}: damaged; delete it to start anew") from error
+    wanted = influential(safe_load(OmegaConf.to_yaml(cfg, resolve=True)))
+    apart = differences({"version": version} | stored, {"version": __version__} | wanted)
+    if apart:
+        raise ConfigurationError(
+            f"{path}: belongs to other settings ({'; '.join(apart)}); choose another folder, or "
+            "overwrite=true"
+        )
+
+
+def begin(folder: Path, cfg: DictConfig) -> None:
+    """Write down what a run is asked. Checkpoints of other settings are removed.
+
+    Args:
+        folder: of the run.
+        cfg: settings of one method, with its label.
+    """
+    new = folder / UNFINISHED
+    if (new / CONFIG).exists():
+        try:
+            _check_same(new / CONFIG, cfg, __version__)
+        except (ArtefactError, ConfigurationError):
+            shutil.rmtree(new)
+    if not is_finished(new):
+        write_whole(new / CONFIG, OmegaConf.to_yaml(cfg, resolve=True).encode())
+
+
+def finish(
+    folder: Path,
+    agent: Agent | None = None,
+    stop: Stop | None = None,
+    progress: bool = False,
+    echo: Callable[[str], None] = print,
+) -> None:
+    """Run the missions that a folder asks for, or what is left of them, and publish the results.
+
+    The caller holds the folder's lock.
+
+    Args:
+        folder: of the run, after :func:`begin`; a finished one is left alone.
+        agent: built from its configuration; None to build it here.
+        stop: says when to stop.
+        progress: show progress.
+        echo: receives lines of text.
+
+    Raises:
+        Stopped: if ``stop`` said so; what was done is kept.
+    """
+    new, stop = folder / UNFINISHED, stop or Stop()
+    if not (new / CONFIG).exists():  # another process has finished it meanwhile
+        return
+    if not is_finished(new):
+        cfg = OmegaConf.create(safe_load((new / CONFIG).read_bytes()))
+        agent = agent or build(cfg)
+        prepare(agent, cfg.cache, progress, echo)
+        every, keep = cfg.checkpoints.every, cfg.checkpoints.keep
+        with stop.between_steps():
+            results = run(agent, progress, new, every, keep, lambda loop: stop.asked)
+        _write_results(new, results)
+    _publish(new, folder)
+
+
+def _write_results(folder: Path, results: Results) -> None:
+    missions, buffer = results.missions, io.BytesIO()
+    results.steps.to_parquet(buffer, index=False, compression="zstd")
+    write_whole(folder / STEPS, buffer.getvalue())
+    write_whole(folder / measures.FILE, results.measures.to_json().encode())
+    write_whole(folder / COMPUTE, csv_of(compute(missions)))
+    # Times differ from run to run: without them the same missions make the same file.
+    write_whole(folder / MISSIONS, csv_of(missions.drop(columns="seconds")))
+    write_manifest(folder, FILES)
+
+
+def csv_of(table: pd.DataFrame) -> bytes:
+    """Return a table as the text of a CSV file."""
+    return csv_text(table).encode()
+
+
+def compute(missions: pd.DataFrame) -> pd.DataFrame:
+    """Return what each method took: one core's time, summed over its missions.
+
+    >>> row = {"method": "a", "steps": 99, "seconds": 0.5}
+    >>> compute(pd.DataFrame([row, row])).values.tolist()
+    [['a', 2, 200, 1.0]]
+    """
+    rows = missions.assign(missions=1, steps=missions["steps"] + 1)  # the last step's number
+    columns = ["missions", "steps", "seconds"]
+    return rows.groupby("method", sort=False)[columns].sum().reset_index()
+
+
+def _publish(new: Path, folder: Path) -> None:
+    """Move finished results to their place. If this is interrupted, it is done again.
+
+    From the removal of the old manifest to the arrival of the new one the folder counts as
+    unfinished: nobody reads a mixture of old and new files.
+    """
+    remove_parts(folder)
+    if is_finished(folder):
+        os.replace(folder / MANIFEST, new / REPLACED)
+    for name in _names(new, REPLACED):
+        (folder / name).unlink(missing_ok=True)
+    for name in SHOWN:
+        shutil.rmtree(folder / name, ignore_errors=True)
+    for name in _names(new, MANIFEST):
+        if name != CONFIG and (new / name).exists():  # it has not been moved yet
+            os.replace(new / name, folder / name)
+    write_whole(folder / CONFIG, (new / CONFIG).read_bytes())
+    for path in new.iterdir():
+        if path.name not in (CONFIG, MANIFEST):
+            path.unlink()
+    os.replace(new / MANIFEST, folder / MANIFEST)
+    sync_folder(folder)
+    (new / CONFIG).unlink()  # the last one: as long as it is there, there is something to do
+    new.rmdir()
+
+
+def _names(folder: Path, manifest: str) -> list[str]:
+    """Return the files that a manifest names; none if it is damaged or not there."""
+    try:
+        return [*read_manifest(folder, manifest)["files"]]
+    except ArtefactError:
+        return []
+
+
+class Stop:
+    """Ends a run when it is told to: between two steps of its missions, else at once."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._waits = False
+
+    def __call__(self, number: int = 0, frame: FrameType | None = None) -> None:
+        """Ask the run to end; a handler of signals.
+
+        Raises:
+            KeyboardInterrupt: if there is no step to wait for, or if asked twice.
+        """
+        again, self.asked = self.asked, True
+        if again or not self._waits:
+            raise KeyboardInterrupt
+
+    @contextmanager
+    def between_steps(self) -> Iterator[None]:
+        """While missions run, let them complete their step."""
+        self._waits = not self.asked
+        try:
+            yield
+        finally:
+            self._waits = False
+
+    @contextmanager
+    def on(self, *numbers: signal.Signals) -> Iterator[Stop]:
+        """Ask for the end when one of these signals arrives."""
+        before = {number: signal.signal(number, self) for number in numbers}
+        try:
+            yield self
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)

@@ -1,0 +1,38 @@
+"""The gate of an agent's corrector, fitted over a learned model."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from afm_rl.correction import PaperFlow
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.learning import fit_gate
+from afm_rl.missions.build import Agent
+from afm_rl.sampling import uniform
+
+TRANSITIONS = 20_000
+
+
+@torch.no_grad()
+def fit_agents_gate(agent: Agent) -> float | None:
+    """Fit the gate to ``false_alarms`` on fresh transitions of the nominal robot; return it.
+
+    States and actions are drawn from the boxes of the pre-training.
+
+    Returns:
+        The gate, or None where it stays as it was set: without a corrector, over equations, for
+        the published corrector, whose gate is in other units, and with ``false_alarms=null``.
+    """
+    rate, transform = agent.settings["false_alarms"], agent.transform
+    learned = any(isinstance(part.module, DynamicsModel) for part in agent.trainings)
+    if rate is None or transform is None or not learned:
+        return None
+    if isinstance(transform.corrector, PaperFlow):
+        return None
+    robot, generator = agent.robot, torch.Generator().manual_seed(1)
+    state = robot.model.manifold.project(uniform(*robot.state_box, TRANSITIONS, generator))
+    action = uniform(*robot.action_box, TRANSITIONS, generator)
+    healthy = TensorDict({"observation": state, "action": action}, [TRANSITIONS])
+    healthy.set(("next", "observation"), robot.model(state, action))
+    return fit_gate(transform.corrector, agent.model, healthy, rate)

@@ -1,0 +1,51 @@
+"""Progress of long work: a bar in a terminal, a line every ten seconds elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from tqdm import tqdm
+
+BAR = "{desc}: {percentage:3.0f} %|{bar}| {elapsed} so far, {remaining} left{postfix}"
+LINE = "{desc}: {percentage:.0f} %, {elapsed} so far, {remaining} left{postfix}"
+
+
+class Bar(tqdm):
+    """A tqdm bar that suits both terminals and log files.
+
+    Off a terminal it writes a line to standard error every ten seconds.
+
+    Args:
+        *args: as of ``tqdm``.
+        shown: show anything at all.
+        **settings: as of ``tqdm``.
+
+    Attributes:
+        listener: if set, receives each line and the share of the work done, once a second, and
+            nothing is shown.
+
+    >>> sum(Bar(range(3), desc="adding", shown=False))
+    3
+    """
+
+    listener: Callable[[str, float], None] | None = None
+
+    def __init__(self, *args: Any, shown: bool = True, **settings: Any) -> None:
+        self.live = sys.stderr.isatty() and Bar.listener is None
+        often = 0.1 if self.live else 1.0 if Bar.listener else 10.0
+        form = BAR if self.live else LINE
+        shown = shown or Bar.listener is not None
+        own = {"mininterval": often, "miniters": 1, "bar_format": form, "leave": False}
+        super().__init__(*args, disable=not shown, **own | settings)
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> None:
+        """Show the present state."""
+        if self.live:
+            super().display(msg, pos)
+        elif self.n and msg is None:
+            if Bar.listener:
+                Bar.listener(str(self), self.n / self.total if self.total else 0.0)
+            else:
+                print(self, file=sys.stderr, flush=True)

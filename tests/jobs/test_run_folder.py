@@ -1,0 +1,222 @@
+"""A run's folder holds its old results or its new ones, whole, or says that it is unfinished."""
+
+import os
+import random
+import signal
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.files import locked
+from afm_rl.jobs.layout import is_finished
+from afm_rl.jobs.run import Stop, begin, finish, needs_run
+from afm_rl.manifest import check_manifest, extend_manifest
+from afm_rl.missions.checkpoint import Stopped
+
+RESULTS = {"config.yaml", "missions.csv", "steps.parquet", "compute.csv", "measures.json"}
+SAME = ("missions.csv", "steps.parquet")  # to the byte
+
+
+def files(folder):
+    """Return the names and contents of all files in a folder, but for locks."""
+    paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+class Killed(BaseException):
+    """Stands for SIGKILL."""
+
+
+def go(folder, cfg, overwrite=False):
+    """Run what is left to run."""
+    if needs_run(folder, cfg, overwrite):
+        begin(folder, cfg)
+        finish(folder, echo=lambda line: None)
+    return files(folder)
+
+
+def test_what_a_run_leaves_behind(configure, tmp_path):
+    go(tmp_path, configure())
+    assert files(tmp_path).keys() == {*RESULTS, "manifest.json"}
+    assert check_manifest(tmp_path).keys() == RESULTS
+    compute = pd.read_csv(tmp_path / "compute.csv").to_dict("records")[0]
+    assert (compute["method"], compute["missions"], compute["steps"]) == ("physics", 1, 12)
+    assert compute["seconds"] > 0 and "seconds" not in pd.read_csv(tmp_path / "missions.csv")
+
+
+def test_a_finished_run_is_left_alone(configure, tmp_path):
+    before = go(tmp_path, configure())
+    assert not needs_run(tmp_path, configure(progress=False, threads=2, cache="elsewhere"))
+    finish(tmp_path)
+    assert files(tmp_path) == before
+
+
+def test_results_of_other_settings_are_refused(configure, tmp_path):
+    before = go(tmp_path, configure())
+    with pytest.raises(ConfigurationError) as found:
+        needs_run(tmp_path, configure(**{"planner.population": 17, "seeds": 3}))
+    assert str(found.value) == (
+        f"{tmp_path}/config.yaml: belongs to other settings (planner.population: 16 -> 17; "
+        "seeds: 1 -> 3); choose another folder, or overwrite=true"
+    )
+    assert files(tmp_path) == before
+
+
+def test_results_of_another_version_are_refused(configure, tmp_path, monkeypatch):
+    go(tmp_path, configure())
+    monkeypatch.setattr("afm_rl.jobs.run.__version__", "99")
+    with pytest.raises(ConfigurationError, match=r"\(version: .* -> 99\)"):
+        needs_run(tmp_path, configure())
+
+
+def test_results_without_a_manifest_are_refused(configure, tmp_path):
+    (tmp_path / "missions.csv").write_text("mine\n")
+    with pytest.raises(ConfigurationError, match="without manifest.json"):
+        needs_run(tmp_path, configure())
+    assert needs_run(tmp_path, configure(), overwrite=True)
+
+
+def test_the_folder_of_a_batch_is_refused(configure, tmp_path):
+    (tmp_path / "jobs").mkdir()
+    with pytest.raises(ConfigurationError, match="holds jobs"):
+        needs_run(tmp_path, configure(), overwrite=True)
+
+
+@pytest.mark.parametrize("name", ["missions.csv", "steps.parquet", "config.yaml", "compute.csv"])
+def test_damaged_results_are_refused_and_named(configure, tmp_path, name):
+    before, dice = go(tmp_path, configure())[name], random.Random(0)
+    for _ in range(100):
+        damaged = bytearray(before)
+        damaged[dice.randrange(len(before))] ^= 1 << dice.randrange(8)
+        (tmp_path / name).write_bytes(damaged)
+        with pytest.raises(ArtefactError, match=f"{name}: damaged"):
+            needs_run(tmp_path, configure())
+
+
+@pytest.mark.parametrize("text", [b"", b"a: [", b"- 3", b"\xff", b"[" * 9999])
+def test_unfinished_runs_with_damaged_settings_are_refused(configure, tmp_path, text):
+    (tmp_path / "unfinished").mkdir()
+    (tmp_path / "unfinished" / "config.yaml").write_bytes(text)
+    with pytest.raises(ArtefactError, match="unfinished/config.yaml: damaged"):
+        needs_run(tmp_path, configure())
+
+
+def stopped_after(count):
+    """Return a stop that is asked for after some steps."""
+
+    class Later(Stop):
+        left = count
+
+        @property
+        def asked(self):
+            self.left -= 1
+            return self.left <= 0
+
+        @asked.setter
+        def asked(self, value):
+            pass
+
+    return Later()
+
+
+@pytest.mark.parametrize("method", ["physics", "oracle"])
+def test_a_stopped_run_goes_on_to_the_same_bytes(configure, tmp_path, method):
+    whole, folder = go(tmp_path / "whole", configure(method)), tmp_path / "stopped"
+    for _ in range(3):
+        begin(folder, configure(method))
+        with pytest.raises(Stopped):
+            finish(folder, stop=stopped_after(3))
+    assert len(list(folder.glob("unfinished/checkpoint-*"))) == 2
+    again = go(folder, configure(method))
+    assert all(again[name] == whole[name] for name in SAME) and again.keys() == whole.keys()
+
+
+def test_an_unfinished_run_of_other_settings_is_refused_or_replaced(configure, tmp_path):
+    begin(tmp_path, configure())
+    with pytest.raises(Stopped):
+        finish(tmp_path, stop=stopped_after(3))
+    other = configure(budget=9)
+    with pytest.raises(ConfigurationError, match="budget: 12 -> 9"):
+        needs_run(tmp_path, other)
+    assert (
+        len(pd.read_parquet(tmp_path / "steps.parquet" if go(tmp_path, other, True) else "")) == 9
+    )
+
+
+def test_new_results_replace_old_ones_whole_or_not_at_all(configure, tmp_path, monkeypatch):
+    """A kill at each change of the disk in turn: never a mixture, and nothing is lost."""
+    old = go(tmp_path, configure())
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "old.png").write_bytes(b"old")
+    extend_manifest(tmp_path, ["figures"])
+    new = go(tmp_path.parent / "new", configure(seeds=[5]))
+    real, kills = {name: getattr(os, name) for name in ("replace", "unlink", "rmdir")}, 0
+    begin(tmp_path, configure(seeds=[5]))
+    while True:
+        left = 1
+
+        def count(name, *args, **settings):
+            nonlocal left
+            if left == 0:
+                raise Killed
+            left -= name == "replace" or Path(args[0]).suffix != ""
+            return real[name](*args, **settings)
+
+        with monkeypatch.context() as patched:
+            for name in real:
+                patched.setattr(os, name, lambda *args, _n=name, **more: count(_n, *args, **more))
+            try:
+                finish(tmp_path, echo=lambda line: None)
+                break
+            except Killed:
+                kills += 1
+        if is_finished(tmp_path):
+            check_manifest(tmp_path)
+            now = files(tmp_path)
+            assert any(all(now[name] == each[name] for name in SAME) for each in (old, new))
+        assert kills < 99
+    assert kills > 9
+    now = files(tmp_path)
+    assert now.keys() == new.keys() and all(now[name] == new[name] for name in SAME)
+    check_manifest(tmp_path)
+
+
+def test_a_failure_half_way_leaves_the_old_results(configure, tmp_path, monkeypatch):
+    old = go(tmp_path, configure())
+    monkeypatch.setattr(pd.DataFrame, "to_csv", lambda *args, **settings: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        go(tmp_path, configure(seeds=[5]), overwrite=True)
+    now = files(tmp_path)
+    assert {name: now[name] for name in old} == old
+    check_manifest(tmp_path)
+
+
+def test_one_process_at_a_time(tmp_path):
+    with locked(tmp_path), pytest.raises(ConfigurationError, match="another process is at work"):
+        with locked(tmp_path):
+            pass
+
+
+def test_folders_that_cannot_be_written_are_named(tmp_path):
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(ConfigurationError, match="cannot write .*file/run"),
+        locked(tmp_path / "file" / "run"),
+    ):
+        pass
+
+
+def test_a_signal_waits_for_the_step_and_a_second_one_does_not():
+    stop, before = Stop(), signal.getsignal(signal.SIGTERM)
+    with stop.on(signal.SIGTERM), stop.between_steps():
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.01)
+        assert stop.asked
+        with pytest.raises(KeyboardInterrupt):
+            stop()
+    with pytest.raises(KeyboardInterrupt):
+        Stop()()
+    assert signal.getsignal(signal.SIGTERM) == before

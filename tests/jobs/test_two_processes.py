@@ -1,0 +1,41 @@
+"""Two processes give the same bytes, whatever the method, over hundreds of steps."""
+
+import pytest
+from omegaconf import OmegaConf
+
+from afm_rl.jobs.batch import run_batch
+from afm_rl.jobs.layout import run_folders
+from afm_rl.jobs.local import LocalPool
+from afm_rl.manifest import check_manifest
+
+METHODS = ["physics", "online_pe", "afm_physics", "stream_x_pe", "adaptive_gain", "rls", "oracle"]
+SMALL = {
+    "dynamics.members": 2,
+    "dynamics.hidden": [16, 16],
+    "dynamics.pretrain.samples": 512,
+    "dynamics.pretrain.epochs": 1,
+    "corrector.hidden": [16, 16],
+    "corrector.latent": 8,
+    "corrector.width": 8,
+    "corrector.train.iterations": 20,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("forked")
+def test_two_processes_give_the_same_bytes(configure, tmp_path):
+    """The first one trains the parts, the second one finds them in the cache."""
+    jobs = {}
+    for method in METHODS:
+        cfg = configure(method, budget=200, cache=str(tmp_path / "cache"))
+        for key in SMALL.keys() - {k for k in SMALL if OmegaConf.select(cfg, k) is None}:
+            OmegaConf.update(cfg, key, SMALL[key])
+        jobs[method] = cfg
+    for folder in ("one", "other"):
+        assert run_batch(tmp_path / folder, jobs, LocalPool(2), echo=lambda line: None) == {}
+    for one, other in zip(
+        *(run_folders(tmp_path / name) for name in ("one", "other")), strict=True
+    ):
+        sums = check_manifest(one), check_manifest(other)
+        for name in ("missions.csv", "steps.parquet"):
+            assert sums[0][name] == sums[1][name], one.name

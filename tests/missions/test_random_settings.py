@@ -1,0 +1,60 @@
+"""Whatever a setting is changed to, a run is built, or refused with a reason."""
+
+import copy
+import random
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from afm_rl.errors import AFMError
+from afm_rl.missions import build
+
+METHODS = (
+    *("method=physics", "method=afm_physics", "method=online_pe", "method=rls"),
+    "robot=quadrotor method=online_knode",
+)
+CHANGES = 500
+VALUES = """
+0 1 -1 2 3 0.5 -0.0 1e-300 1e300 1e400 -1e30 nan inf -inf 99999999999999999999 2147483648 true
+false null none all abc "" "../../x" ".." "/" [] [0] [1,2] [[]] [null] [nan,inf] [x,x,x] {} {a:1}
+[1e30,-1e30] {v_gain:1e30} [{}] [{v_gain:-1}] [{saturation:0}] [[{},{}]] {_target_:os.system}
+[-1,0,1] [a,b,c] cuda:7
+""".split()
+SMALL = {"planner.population": 8, "dynamics.hidden": [8]}
+
+
+def leaves(node, place=""):
+    """Name every setting, also those that hold others."""
+    for key, value in node.items():
+        where = f"{place}.{key}" if place else str(key)
+        yield where
+        if isinstance(value, dict):
+            yield from leaves(value, where)
+
+
+@pytest.mark.timeout(600)
+def test_random_settings_end_in_a_run_or_in_one_line(composed, no_training):
+    dice, parse = random.Random(0), OverridesParser.create().parse_override
+    refused = built = 0
+    for number in range(CHANGES):
+        base = composed(*METHODS[number % len(METHODS)].split())
+        keys = sorted(leaves(OmegaConf.to_container(base, resolve=False)))
+        cfg = copy.deepcopy(base)
+        for key, value in SMALL.items():
+            if OmegaConf.select(cfg, key) is not None:
+                OmegaConf.update(cfg, key, value)
+        change = f"{dice.choice(keys)}={dice.choice(VALUES)}"
+        try:
+            override = parse(change)
+            OmegaConf.update(cfg, override.key_or_group, override.value(), merge=False)
+            build(cfg)
+            built += 1
+        except (AFMError, HydraException, OmegaConfBaseException) as error:
+            assert str(error).strip(), change
+            refused += 1
+        except Exception as error:
+            raise AssertionError(f"{change}: {error!r}") from error
+    assert refused > CHANGES / 2 and built > CHANGES / 10, (refused, built)
