@@ -36,7 +36,7 @@ class Robot:
         action_high: highest action.
         state_low: lowest corner of the box from which training states are drawn.
         state_high: its highest corner.
-        features: indices of the state coordinates that the dynamics depend on; all if none is given.
+        features: indices of the state coordinates that the dynamics depend on; all if none.
         env: makes the environment from ``tracks``, ``regime``, ``schedule``, ``max_steps``
             and the action bounds.
         model: nominal physics.
