@@ -76,7 +76,7 @@ def check_settings(cfg: DictConfig) -> str | None:
     Raises:
         ConfigurationError: for one that cannot be used.
     """
-    torch.set_num_threads(check_count("threads", cfg.threads))
+    torch.set_num_threads(check_count("threads", cfg.threads, high=256))
     for name in SWITCHES:
         check_flag(name, cfg[name])
     if not isinstance(cfg.cache, str):

@@ -53,8 +53,21 @@ class KnownDynamics(DynamicsModel):
         self.register_buffer("noise", torch.tensor(checked).expand(size).clone(), persistent=False)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the next state ``(*B, S)``."""
-        return self.step(state, action)
+        """Return the next state ``(*B, S)``.
+
+        Raises:
+            ConfigurationError: if the step function returns anything else.
+        """
+        ahead = self.step(state, action)
+        batch = torch.broadcast_shapes(state.shape[:-1], action.shape[:-1])
+        if not isinstance(ahead, Tensor) or ahead.shape != (*batch, state.shape[-1]):
+            found = tuple(ahead.shape) if isinstance(ahead, Tensor) else type(ahead).__name__
+            raise ConfigurationError(
+                f"dynamics.step: returned {found} for states {tuple(state.shape)} and actions "
+                f"{tuple(action.shape)}; expected a tensor {(*batch, state.shape[-1])}: a step "
+                "function in torch that works on the last dimension, as in state[..., 0]"
+            )
+        return ahead
 
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return a single member's mean and unit variance, in units of ``noise_std``."""

@@ -88,11 +88,14 @@ def _take(drawn: Drawn, index: Tensor) -> Drawn:
 
 
 @torch.no_grad()
-def evaluate(network: AxisNetwork, count: int = 512, seed: int = 1) -> dict[str, list[float]]:
-    """Return the median error of the action, in half ranges, by kind and number of actions.
+def evaluate(
+    network: AxisNetwork, count: int = 512, seed: int = 1
+) -> dict[str, list[tuple[float, float]]]:
+    """Return median errors of the action, in half ranges, by kind and number of actions.
 
-    The columns are 1, 2, 6 and 17 actions. Windows are those of the training: some are nearly
-    empty, some change regime half-way, so no error can be zero.
+    Of the flow, and of doing nothing, each the largest over the axes, for 1, 2, 6 and 17 actions.
+    Windows are those of the training: some are nearly empty, some change regime half-way, so no
+    error can be zero.
     """
     kinds = {name: ({name: 1.0}, {"none": 1.0}) for name in KINDS}
     kinds |= {name: ({"linear": 1.0}, {name: 1.0}) for name in MIXES if name != "none"}
@@ -103,12 +106,14 @@ def evaluate(network: AxisNetwork, count: int = 512, seed: int = 1) -> dict[str,
     return table
 
 
-def _error(network, count, size, shares, generator) -> float:
+def _error(network, count, size, shares, generator) -> tuple[float, float]:
     drawn = draw_examples(count, size, max(12, size + 4), 1, "mixed", generator, *shares)
     known = network.encode(drawn.rows, fit_experts(drawn.rows))
     asked = network.ask(known, drawn.planned, "mixed")
     end = midpoint(lambda tau, x: network.velocity(asked, tau, x), drawn.planned, 1)
-    return float((end.clamp(-1, 1) - drawn.intended).abs().amax(-1).median())
+    both = ((x.clamp(-1, 1) - drawn.intended).abs().amax(-1) for x in (end, drawn.planned))
+    flow, nothing = (float(x.median()) for x in both)
+    return flow, nothing
 
 
 def main() -> None:
@@ -121,9 +126,10 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.evaluate:
-        print(f"{'':14}" + "".join(f"{size:>8}" for size in (1, 2, 6, 17)))
+        print("| kind | 1 action | 2 | 6 | 17 |\n|---|---|---|---|---|")
         for name, errors in evaluate(load_universal()).items():
-            print(f"{name:14}" + "".join(f"{error:8.3f}" for error in errors))
+            cells = (f"{flow:.3f} ({nothing:.3f})" for flow, nothing in errors)
+            print(f"| {name} | {' | '.join(cells)} |")
         return
     network = AxisNetwork(seed=given.seed)
     pretrain(network, given.iterations, seed=given.seed + 1)

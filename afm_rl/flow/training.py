@@ -12,7 +12,13 @@ from tensordict.nn import dispatch
 from torch import Tensor, nn
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import check_choice, check_count, check_instance, check_number
+from afm_rl.errors import (
+    ConfigurationError,
+    check_choice,
+    check_count,
+    check_instance,
+    check_number,
+)
 from afm_rl.flow.experts import Rows, fit_experts
 from afm_rl.flow.network import AxisNetwork
 from afm_rl.flow.prior import Drawn
@@ -178,6 +184,7 @@ def train_flow(
     check_count("corrector.train.batch_size", batch_size, low=2)
     check_count("corrector.train.seed", seed, low=0)
     check_number("corrector.train.lr", lr, low=0.0, open_low=True)
+    check_states(states, model)
     generator = torch.Generator().manual_seed(seed)
     world = model, regime, states
 
@@ -186,6 +193,20 @@ def train_flow(
 
     optimise(list(flow.parameters()), loss, iterations, lr, progress)
     return flow.held_out_error(*world, 2048, generator)
+
+
+def check_states(states: States, model: DynamicsModel) -> None:
+    """Check that states can be drawn from a box, or from a pool.
+
+    Raises:
+        ConfigurationError: for sizes that do not fit the model, or ends that are not finite.
+    """
+    for rows in states if isinstance(states, tuple) else [states]:
+        if rows.shape[-1] != model.state_size or not bool(rows.isfinite().all()):
+            raise ConfigurationError(
+                f"states={rows.tolist() if rows.numel() < 20 else tuple(rows.shape)}: expected "
+                f"finite states of {model.state_size} numbers; give the box in which it moves"
+            )
 
 
 def optimise(

@@ -31,7 +31,7 @@ def read_steps(folder: Path) -> pd.DataFrame:
     """Return the steps of a run or a batch, with the numbers that missions have there."""
     missions, parts = _missions(folder), []
     for run, rows in missions.groupby("run", sort=False):
-        numbers = pd.Series(rows["mission"].to_numpy(), rows["own"].astype(int))
+        numbers = pd.Series(rows["mission"].to_numpy("int32"), rows["own"].astype(int))
         steps = pd.read_parquet(Path(str(run)) / STEPS)
         parts.append(steps.assign(mission=steps["mission"].map(numbers)))
     return pd.concat(parts, ignore_index=True)

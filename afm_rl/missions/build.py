@@ -134,6 +134,8 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     whole = TransformedEnv(env, Compose(*chain))
     check_cost(cost, model, whole, getattr(planner, "stages", None))
     check_keys("planner", planner, whole)
+    if transform is not None:  # which writes what that key names; without it there is nothing
+        check_keys("planner", planner, whole, ["box_key"])
     check_keys("updater", updater, whole)
     return Agent(
         label=label or "unnamed",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from inspect import signature
 from typing import Any
@@ -162,14 +162,14 @@ def check_cost(cost: Cost, model: DynamicsModel, env: EnvBase, stages: int | Non
         cost(state, action, state, *(torch.zeros(size) for size in cost.in_sizes))
 
 
-def check_keys(group: str, part: Any, env: EnvBase) -> None:
+def check_keys(group: str, part: Any, env: EnvBase, names: Iterable[str] = KEYS) -> None:
     """Check that the entries that a part was told to read are there.
 
     Raises:
         ConfigurationError: otherwise.
     """
     given = list(env.observation_spec.keys(True, True))
-    for name in KEYS:
+    for name in names:
         key = getattr(part, name, None)
         bare = key[1:] if isinstance(key, tuple) and key[0] == "next" else key
         if key is not None and unravel_key(bare) not in given:

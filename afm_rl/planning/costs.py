@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey
@@ -97,6 +99,27 @@ class GoalDistance(Cost):
         return torch.as_tensor(total).sqrt()
 
 
+def check_arguments(name: str, function: Callable[..., Any], count: int) -> None:
+    """Check that a function takes ``count`` arguments, as far as it says so.
+
+    Raises:
+        ConfigurationError: otherwise.
+
+    >>> check_arguments("cost.reward", lambda state, action, next_state: 0.0, 3)
+    """
+    try:
+        expected = inspect.signature(function)
+    except (TypeError, ValueError):  # of functions in C nothing is known
+        return
+    try:
+        expected.bind(*[None] * count)
+    except TypeError as error:
+        raise ConfigurationError(
+            f"{name}{expected}: expected a function of {count} arguments: state, action, next "
+            f"state, and an entry of the task for each of in_keys; {error}"
+        ) from error
+
+
 class KnownReward(Cost):
     """The reward of somebody else's task, written down: the cost is its negative.
 
@@ -123,6 +146,7 @@ class KnownReward(Cost):
             raise ConfigurationError(
                 f"in_sizes={self.in_sizes}: expected one for each of in_keys={self.in_keys}"
             )
+        check_arguments("cost.reward", reward, 3 + len(self.in_keys))
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, *task: Tensor) -> Tensor:
         """Return the negative reward ``(*B)``."""

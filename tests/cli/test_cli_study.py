@@ -127,7 +127,7 @@ def test_jobs_that_failed_are_listed(afm_rl, tmp_path, monkeypatch):
     assert done.status == 1
     assert f"Results: {tmp_path}" in done.out
     assert "afm-rl: oracle+seed=3: failed: out of luck\n" in done.err
-    assert "afm-rl: 1 of 11 jobs failed" in done.err
+    assert "afm-rl: 1 of 10 jobs failed" in done.err
 
 
 def test_damaged_files_are_one_line(afm_rl, tmp_path, monkeypatch):

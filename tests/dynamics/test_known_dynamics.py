@@ -68,3 +68,16 @@ def test_a_model_of_ones_own_needs_three_methods():
     assert torch.equal(model.forecast(state, state)[1], torch.ones(4, 1))
     assert torch.equal(model.jacobian(state, state), torch.zeros(4, 1, 1))
     assert model.expand_(3).select_(torch.tensor([0])).lead == ()
+
+
+@pytest.mark.parametrize(
+    ("step", "complaint"),
+    [
+        (lambda s, a: s.numpy() + 1, "returned ndarray for states"),
+        (lambda s, a: torch.stack([s[0] + a[0], s[1]]), r"returned \(2, 2\) for .*, as in state"),
+        (lambda s, a: s.sum(-1), r"returned \(4,\) for .*expected a tensor \(4, 2\)"),
+    ],
+)
+def test_a_step_function_that_is_not_in_torch_or_not_batched_is_named(step, complaint):
+    with pytest.raises(ConfigurationError, match=f"dynamics.step: {complaint}"):
+        KnownDynamics(step, Manifold(2), action_size=1)(torch.zeros(4, 2), torch.zeros(4, 1))

@@ -212,3 +212,11 @@ def test_experts_fitted_while_driving_can_be_used_in_training(drawn):
     later = draw_examples(2, 5, 7, 4, "clip", torch.Generator().manual_seed(0))
     net = network()
     flow_losses(net, later, "clip", torch.Generator())[0].mean().backward()
+
+
+@pytest.mark.parametrize(
+    "box", [(torch.zeros(2), torch.ones(2)), (torch.zeros(3), torch.full((3,), math.inf))], ids=str
+)
+def test_a_box_of_states_that_cannot_be_drawn_from_is_refused(box):
+    with pytest.raises(ConfigurationError, match="states=.*expected finite states of 3 numbers"):
+        train_flow(None, Dubins(), None, box)

@@ -73,6 +73,7 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
         (["+cost.in_keys=[gaol]"], "cost: reads 2 numbers from 'gaol', .* gives nothing there"),
         (["+cost.goal_size=1"], "cost: reads 1 numbers from 'goal', .* gives 2 there"),
         (["planner.seed_key=[mission, sed]"], r"planner.seed_key=\('mission', 'sed'\): expected"),
+        (["method=adaptive_gain", "planner.box_key=[afm, reech]"], "planner.box_key=.*: expected"),
         (["method=online_pe", "+updater.mask_key=mask"], "updater.mask_key='mask': expected one"),
         (["method=oracle", "updater.regime_key=gain"], "updater.regime_key='gain': expected one"),
         (

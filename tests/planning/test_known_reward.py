@@ -34,3 +34,9 @@ def test_it_may_depend_on_the_task():
 def test_sizes_and_keys_belong_together():
     with pytest.raises(ConfigurationError, match=r"in_sizes=\[\]: expected one for each"):
         KnownReward(lambda *_: None, in_keys=["goal"])
+
+
+def test_a_reward_with_an_argument_missing_or_too_many_is_named():
+    for reward, keys in ((lambda s: s, []), (lambda s, a: s, []), (lambda s, a, n: s, ["goal"])):
+        with pytest.raises(ConfigurationError, match="cost.reward.*a function of [34] arg"):
+            KnownReward(reward, keys, [1] * len(keys))
