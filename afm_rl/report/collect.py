@@ -67,12 +67,11 @@ def collect(folders: Sequence[str | Path]) -> Collection:
     measures: Measures | None = None
     for place, folder in enumerate(map(Path, folders)):
         for run in run_folders(folder):
-            if not (run / "missions.csv").is_file():
+            if not any((run / name).is_file() for name in ("missions.csv", MANIFEST)):
                 notes.append(f"{run} has no results yet.")
                 plans.append(_plan(run))
                 continue
-            if (run / MANIFEST).exists():
-                check_manifest(run)
+            check_manifest(run)
             plans.append(_plan(run))
             declared = read_measures(run / FILE)
             if declared != (measures or declared):
@@ -122,11 +121,7 @@ def run_folders(folder: Path) -> list[Path]:
             raise ConfigurationError(f"{record}: damaged; expected a list of jobs")
         rank = {str(name): place for place, name in enumerate(named)}
         return sorted(jobs, key=lambda path: (rank.get(path.name, len(rank)), path.name))
-    shards = sorted(path.parent for path in folder.glob("shards/*/*/missions.csv"))
-    shards = shards or sorted(path.parent for path in folder.glob("*/job.yaml"))
-    if shards:
-        return shards
-    if not any((folder / name).is_file() for name in ("missions.csv", "config.yaml")):
+    if not any((folder / name).is_file() for name in ("missions.csv", MANIFEST)):
         what = "holds no missions.csv" if folder.is_dir() else "no such folder"
         raise ConfigurationError(f"{folder}: {what}; expected the folder of a run, or of several")
     return [folder]

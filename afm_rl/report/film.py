@@ -18,6 +18,7 @@ from afm_rl.files import write_whole
 from afm_rl.report.collect import collect
 from afm_rl.report.events import folder_names
 from afm_rl.report.frames import first_missions, steps_of
+from afm_rl.report.learning import last_step
 from afm_rl.report.results_files import read_steps
 from afm_rl.report.scenes import COLUMNS, Scene, map_scene, space_scene
 from afm_rl.report.style import FEW
@@ -62,8 +63,9 @@ def write_films(
     """Write a film of each method's first mission, ``METHOD.gif`` or ``METHOD.mp4``.
 
     Of several methods on a map, one more film shows all of them at once (``all_methods.gif``),
-    six at most. A film has at most 150 frames, 15 a second, whatever the length of the mission.
-    Files of the same name are replaced; each is written whole or not at all.
+    six at most, until soon after the last one finished. A film has at most 150 frames, 15 a
+    second, whatever the length of the mission. Files of the same name are replaced; each is
+    written whole or not at all.
 
     Args:
         folder: where to; made if it is not there.
@@ -94,6 +96,8 @@ def write_films(
     together = first[first["cell"] == cell][:FEW]
     if len(together) > 1 and not space:
         runs = {m.method: _checked(rows, m.mission, steps) for m in together.itertuples()}
+        end = last_step(together)
+        runs = {name: own[own["t"] <= end] for name, own in runs.items()}
         scene = map_scene(cell, runs, roads.get(together["track"].iloc[0]))
         write(TOGETHER, scene, max(map(len, runs.values())))
     names = folder_names([TOGETHER, *first["method"]])[1:]

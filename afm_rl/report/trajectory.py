@@ -20,7 +20,7 @@ from afm_rl.report.track_plot import MARGIN, Box, DrawableTrack, distance_to, dr
 
 PANELS = 12
 WIDE, TALL, NARROW = 9.9, 3.4, 1.9  # inches: all maps side by side; one map: at most, at least
-TITLES, ENDS, SIDE = 0.5, 1.15, 0.5  # inches: titles of a row; legend and footnote; labels
+TITLES, ENDS, SIDE = 0.5, 0.95, 0.5  # inches: titles of a row; legend and footnote; labels
 
 NOMINAL: dict[str, Any] = {"color": style.NOMINAL, "linewidth": 1.1}
 CHANGED: dict[str, Any] = {"color": style.REGIME, "linewidth": 1.6}

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from afm_rl.cli import report
+from afm_rl.manifest import write_manifest
 from afm_rl.measures import FILE
 from afm_rl.missions import LapScore
 
@@ -52,6 +53,7 @@ def run_folder(tmp_path):
     (tmp_path / FILE).write_text(LapScore.measures.to_json())
     pd.DataFrame(table).to_csv(tmp_path / "missions.csv", index=False)
     pd.DataFrame(steps).to_parquet(tmp_path / "steps.parquet")
+    write_manifest(tmp_path)
     return tmp_path
 
 
