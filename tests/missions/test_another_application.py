@@ -1,0 +1,55 @@
+"""Our groups in a configuration of somebody else's."""
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.missions import build
+
+APPLICATION = """
+defaults:
+  - cost: goal_position
+  - planner: mppi
+  - dynamics: physics
+  - updater: frozen
+  - corrector: none
+  - _self_
+  - robot: ugv
+tracks: ethz_1
+regimes: none
+mine: {anything: 3}
+hydra:
+  searchpath: ["pkg://afm_rl.conf"]
+"""
+
+
+@pytest.fixture
+def there(tmp_path):
+    (tmp_path / "config.yaml").write_text(APPLICATION)
+
+    def make(*overrides):
+        with initialize_config_dir(str(tmp_path), version_base="1.3"):
+            return compose("config", list(overrides))
+
+    return make
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [[], ["corrector=adaptive_gain"], ["+method=afm_physics"], ["+method=rls"]],
+    ids=str,
+)
+def test_groups_and_presets_build_an_agent(there, overrides):
+    agent = build(there(*overrides))
+    assert (agent.label, len(agent.missions)) == ("unnamed", 1)
+    assert (agent.transform is None) == (overrides in ([], ["+method=rls"]))
+
+
+def test_what_is_missing_is_named(there):
+    for group in ("planner", "robot"):
+        cfg = there()
+        OmegaConf.set_struct(cfg, False)
+        del cfg[group]
+        with pytest.raises(ConfigurationError, match=f"^{group}: expected a setting; build needs"):
+            build(cfg)
