@@ -49,7 +49,7 @@ def blaming(group: str) -> Iterator[None]:
         if isinstance(last, AFMError):
             raise ConfigurationError(str(last)) from error
         found = re.search(r"full_key: (\S+)", str(error))
-        text = str(last).partition("\nfull_key:")[0]
+        text = str(last).partition("\nfull_key:")[0] or type(last).__name__
         place = found[1] if found else group
         place = place if place.startswith(group) else f"{group}.{place}"
         raise ConfigurationError(f"{place}: {text}") from error

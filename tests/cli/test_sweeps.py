@@ -124,10 +124,10 @@ def test_what_is_asked_twice_is_run_once(sweep, ran):
     assert names(ran) == ["physics"]
 
 
-def test_a_setting_that_cannot_be_resolved_is_the_job_s_own_failure(sweep, ran):
+def test_a_setting_that_cannot_be_resolved_is_refused_before_anything_runs(sweep, ran):
     done = sweep("-m", "method=physics", "budget=${nope},5")
-    assert done.status == 1 and names(ran) == ["physics+budget=5"]
-    assert "afm-rl: budget=${nope}: failed: " in done.err and "1 of 2 jobs failed" in done.err
+    assert done.status == 2 and not names(ran)
+    assert done.err == "afm-rl: Interpolation key 'nope' not found\n"
 
 
 def test_an_own_configuration_goes_to_the_jobs(sweep, ran, tmp_path):

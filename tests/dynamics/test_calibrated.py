@@ -19,7 +19,7 @@ def calibrated(base=None, missions=None, dtype=torch.float64):
     draw = torch.Generator().manual_seed(1)
 
     def normal(*shape):
-        return torch.randn(*model.lead, *shape, generator=draw, dtype=dtype)
+        return torch.randn((*model.lead, *shape), generator=draw, dtype=dtype)
 
     size = base.action_size
     slip = 0.4 + 0.01 * normal().abs()

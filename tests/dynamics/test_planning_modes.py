@@ -137,7 +137,7 @@ def test_the_copies_are_made_once_per_change(fast, transitions):
     state, action = transitions(20)
     with torch.no_grad():
         fast(state, action)
-        cast = fast._copies.of([*fast.weights[1:-1], *fast.biases[1:-1]])
+        cast = fast._cast.of([*fast.weights[1:-1], *fast.biases[1:-1]])
         versions = [one._version for one in cast]
         fast(state, action)
         assert [one._version for one in cast] == versions

@@ -34,7 +34,7 @@ def test_interrupted_runs_are_bit_identical(make_agent, ring, spot, tmp_path, st
     }  # fmt: skip
     whole, path = run(make_agent("method=rls", **settings)), tmp_path / "run.safetensors"
     with pytest.raises(Stopped):
-        stopped = {"checkpoint": path, "watch": lambda loop: loop.step == stop}
+        stopped = {"checkpoint": path, "stopped": lambda loop: loop.step == stop}
         run(make_agent("method=rls", **settings), **stopped)
     same(whole, run(make_agent("method=rls", **settings), checkpoint=path))
     assert whole.steps["regime_active"].any()
