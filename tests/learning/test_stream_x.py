@@ -197,7 +197,7 @@ def test_presets_choose_what_their_name_says(method):
     with initialize_config_module("afm_rl.conf", version_base=None):
         cfg = compose("config", overrides=[f"method={method}"])
         literal = compose("config", overrides=["updater=stream_x_literal"]).updater
-    assert (cfg.corrector.get("window") is not None) == method.startswith("afm")
+    assert (cfg.corrector.get("samples") is not None) == method.startswith("afm")
     loss = GaussianNLLLoss(instantiate(cfg.dynamics)(instantiate(cfg.robot)).module)
     updater = instantiate(cfg.updater)(loss)
     learner = getattr(updater, "updater", updater)  # beside AFM it learns what no action can undo

@@ -29,13 +29,12 @@ class Sensor(Transform):
 
     def __init__(self, steps, value=None):
         super().__init__(in_keys=["observation"])
-        self.steps, self.value, self.kept = steps, value, None
+        self.steps, self.value = steps, value
 
     def _step(self, tensordict, next_tensordict):
         seen = next_tensordict["observation"].clone()
         if int(next_tensordict["step"][0]) - 1 in self.steps:
-            seen[0] = self.kept if self.value is None else self.value
-        self.kept = seen[0].clone()
+            seen[0] = tensordict["observation"][0] if self.value is None else self.value
         return next_tensordict.set("observation", seen)
 
     def _reset(self, tensordict, tensordict_reset):

@@ -18,7 +18,7 @@ def prepared(configure):
         settings = {"corrector.train": REFINED, **settings}
         agent, lines = build(configure(METHOD, *overrides, **settings)), []
         prepare(agent, cache, echo=lines.append)
-        return agent, lines
+        return agent, [line for line in lines if "held-out error" in line]
 
     return make
 
@@ -38,7 +38,7 @@ def test_trained_once_then_from_the_cache(prepared, tmp_path):
     assert all("(from the cache)" in line for line in repeated)
     for one, other in zip(parameters(first), parameters(again), strict=True):
         assert torch.equal(one, other)
-    assert len(list((tmp_path / "new").iterdir())) == 2
+    assert len(list((tmp_path / "new").glob("[!.]*"))) == 2
 
 
 def test_only_what_the_result_depends_on_is_part_of_the_key(prepared, cache):
@@ -67,14 +67,14 @@ def test_a_damaged_file_is_named_not_used(prepared, tmp_path):
 
 def test_a_cache_that_cannot_be_written_is_refused_first(prepared, tmp_path, no_training):
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigurationError, match="^cache=.*file/below: cannot be written: Not a"):
+    with pytest.raises(ConfigurationError, match="file/below: .*Not a directory"):
         prepared(tmp_path / "file" / "below")
 
 
 def test_a_home_folder_may_be_meant(prepared, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     prepared("~/parts")
-    assert len(list((tmp_path / "parts").iterdir())) == 2
+    assert len(list((tmp_path / "parts").glob("[!.]*"))) == 2
 
 
 def test_nothing_to_train_needs_no_cache(configure, no_training):

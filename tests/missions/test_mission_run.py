@@ -250,4 +250,5 @@ def test_progress_is_shown_if_asked_for(make_agent, spot, capsys, monkeypatch):
     assert capsys.readouterr().err == ""
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     run_missions(make_agent(budget=51), progress=True)
-    assert "unnamed: 100%" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert "unnamed:" in err and "1 missions ended" in err

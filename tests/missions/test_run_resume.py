@@ -258,7 +258,7 @@ def test_state_of_a_new_kind_is_saved_and_cut(agent, tmp_path):
             made.updater = Curious(made.updater.loss, "kept")
             try:
                 watch = None if stop is None else lambda loop, at=stop: loop.step == at
-                run(made, checkpoint=tmp_path / str(len(stops)), watch=watch)
+                run(made, checkpoint=tmp_path / str(len(stops)), stopped=watch)
             except Stopped:
                 continue
         totals.append((made.updater.count, made.updater.state.parts.reward))
