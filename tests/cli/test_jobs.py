@@ -87,7 +87,7 @@ def test_ctrl_c_keeps_what_was_done(process, program, tmp_path, kind):
     assert said[-1].startswith("afm-rl: interrupted; what was done is in")
     assert list(folder.rglob("checkpoint-*")) and not list(folder.rglob("missions.csv"))
     done = process(sys.executable, "-m", "afm_rl.cli", *settings)
-    assert done.returncode == 0
+    assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.rstrip().endswith(f"Results: {folder}")
     assert len(pd.read_csv(folder / "missions.csv")) == 1
     assert not list(folder.rglob("checkpoint-*"))

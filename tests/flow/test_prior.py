@@ -58,7 +58,7 @@ def test_plans_that_cannot_be_had_are_saturated_as_robots_do_it(mode):
     share = (gains.abs() / planned.squeeze(1).abs()).amin(-1)
     clear = ((share - 0.3).abs() > 0.05).unsqueeze(-1)  # the scale is searched for
     off = ((found - expected).abs().amax(-1) < 0.02) | ~clear
-    assert off.float().mean() > 0.98
+    assert off.float().mean() > 0.99
 
 
 def test_what_cannot_be_had_at_all_gives_the_nearest_effect():

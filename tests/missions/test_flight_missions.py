@@ -174,7 +174,7 @@ def test_networks_learn_from_the_plants_own_steps_and_by_seed(fly):
     settings = {"updater.begin": 0.0, "updater.epochs": 2, "budget": 5}
     flown = fly("method=online_knode", seeds=2, **settings)
     # three ticks went into a network, which came a tick later; two wait for the next
-    assert flown.agent.updater.window.parts.state.shape[1:] == (1, 2 * 25, 13)
+    assert flown.agent.updater.window.parts.state.shape == (2, 1, 2 * 25, 13)
     first, second = (rows["loss"].to_numpy() for _, rows in flown.steps.groupby("mission"))
     assert (first[:4] == second[:4]).all() and first[4] != second[4]
 

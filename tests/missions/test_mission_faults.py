@@ -161,9 +161,9 @@ def state(agent):
 def test_a_robot_without_power_is_not_taken_for_a_frozen_sensor_forever(three):
     settings = {"regimes": [{"v_gain": 0.0, "omega_gain": 0.0}], "robot.schedule.at": []}
     quiet = {"robot.env.process_noise": 0.0, "robot.env.start_noise": 0.0}
-    steps = drive(three("method=rls", budget=50, **settings, **quiet)).steps
+    steps = drive(three("method=rls", budget=26, **settings, **quiet)).steps
     assert steps[steps["fault"] == 1]["t"].unique().tolist() == list(range(21))
-    assert steps[steps["t"] > 44]["loss"].notna().all()  # learned from, guard and updater waited
+    assert steps[steps["t"] > 20]["loss"].notna().all()  # learned from
 
 
 @pytest.mark.parametrize(("x", "y"), [(1e7, 1e7), (500_000.0, 5_400_000.0)])

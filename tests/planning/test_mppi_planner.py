@@ -43,7 +43,7 @@ def test_both_backends_plan_the_same(world, settings):
     assert MPPI(world, **SMALL).backend == "fast"
     for batch in [(), (3,), (2, 2)]:
         td = situation(*batch)
-        torch.testing.assert_close(plan(fast, td), plan(slow, td), rtol=0, atol=5e-4)
+        torch.testing.assert_close(plan(fast, td), plan(slow, td), rtol=0, atol=1e-5)
 
 
 def test_an_environment_without_returns_is_stepped(world):
