@@ -97,7 +97,7 @@ class ActionFlow(PairCorrector):
         choose: the ``"best"`` sample by its predicted effect, or always their ``"mean"``.
         saturation: what gives way when a plan cannot be had in full, see
             :func:`~afm_rl.flow.saturation.saturate`.
-        compile: run the tick as machine code, which is some five times as fast for a single
+        compile: run the tick as machine code, which is faster for a single
             mission; it is compiled once and kept in the cache. Where there is no compiler, the
             tick runs as it is. Results agree to rounding.
         cache: folder of compiled ticks.
