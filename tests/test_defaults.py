@@ -9,6 +9,7 @@ import yaml
 
 import afm_rl.conf
 from afm_rl.missions import factories as made
+from afm_rl.missions.build import DEFAULTS
 
 CONF = Path(afm_rl.conf.__file__).parent
 MAKES = {  # what a factory hands its settings to
@@ -80,3 +81,8 @@ def test_defaults_of_the_command_line_are_those_of_the_library(path):
         if plain(value) != plain(default) and "${" not in str(value)
     }
     assert differ == {}
+
+
+def test_what_a_configuration_may_leave_out_has_the_values_of_ours():
+    ours = yaml.safe_load((CONF / "config.yaml").read_text())
+    assert {name: ours[name] for name in DEFAULTS} == DEFAULTS

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
@@ -10,9 +9,7 @@ from pathlib import Path
 
 from afm_rl._version import __version__
 from afm_rl.artefacts import cached
-from afm_rl.errors import ConfigurationError
 from afm_rl.missions.build import Agent
-from afm_rl.missions.factories import Training
 from afm_rl.missions.gate import fit_agents_gate
 
 
@@ -33,27 +30,14 @@ def prepare(
     """
     folder = Path(cache).expanduser()
 
-    def train(part: Training) -> float:
-        _check_writable(folder)
-        return part.train(progress)
-
     for part in agent.trainings:
         description = {"name": part.title, "version": __version__, "settings": part.settings}
         description.update(getattr(part.module, "signature", {}))
         start = time.perf_counter()
-        error, found = cached(folder, part.module, description, partial(train, part))
+        error, found = cached(folder, part.module, description, partial(part.train, progress))
         spent = "from the cache" if found else f"trained in {time.perf_counter() - start:.0f} s"
         echo(f"{part.title}: held-out error {error:.4f} {part.unit} ({spent})")
     gate = fit_agents_gate(agent)
     if gate is not None:
         rate = 100 * agent.settings["false_alarms"]
         echo(f"corrector: gate {gate:.1f} standard deviations, for {rate:g} % false alarms")
-
-
-def _check_writable(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise ConfigurationError(f"cache={folder}: cannot be written: {error.strerror}") from error

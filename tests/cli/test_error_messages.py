@@ -28,7 +28,6 @@ physics         threads=0                                threads=0
 physics         overwrite=perhaps                        overwrite='perhaps'
 physics         figures=3                                figures=3
 physics         video=avi                                video='avi' gif mp4
-physics         video=true,study=ugv                     video=True afm-rl-report
 physics         ~tensorboard                             tensorboard
 physics         cache=null                               cache=None
 -               compare=[nope]                           method/nope afm_physics
@@ -126,7 +125,7 @@ def test_a_cache_that_cannot_be_written(afm_rl, tmp_path, quick, monkeypatch):
     folder = f"hydra.run.dir={tmp_path}/run"
     done = afm_rl("method=afm_paper", f"cache={tmp_path}/file/parts", folder, *quick)
     assert done.status == 2
-    assert done.err.startswith(f"afm-rl: cache={tmp_path}/file/parts: cannot be written: Not a ")
+    assert done.err.startswith(f"afm-rl: cannot write {tmp_path}/file/parts: Not a ")
 
 
 def test_a_checkpoint_for_another_robot(refuse, tmp_path):
