@@ -33,18 +33,19 @@ class Bar(tqdm):
     listener: Callable[[str, float], None] | None = None
 
     def __init__(self, *args: Any, shown: bool = True, **settings: Any) -> None:
-        self.live = sys.stderr.isatty() and Bar.listener is None
+        self.live, self.begun = sys.stderr.isatty() and Bar.listener is None, False
         often = 0.1 if self.live else 1.0 if Bar.listener else 10.0
         form = BAR if self.live else LINE
         shown = shown or Bar.listener is not None
-        own = {"mininterval": often, "miniters": 1, "bar_format": form, "leave": False}
+        own = {"mininterval": often, "miniters": 1, "bar_format": form, "leave": self.live}
         super().__init__(*args, disable=not shown, **own | settings)
+        self.begun = True
 
     def display(self, msg: str | None = None, pos: int | None = None) -> None:
         """Show the present state."""
         if self.live:
             super().display(msg, pos)
-        elif self.n and msg is None:
+        elif self.begun and msg is None:
             if Bar.listener:
                 Bar.listener(str(self), self.n / self.total if self.total else 0.0)
             else:

@@ -45,7 +45,8 @@ def jobs_of(cfg: DictConfig, hydra: DictConfig, swept: Sequence[str] = ()) -> di
         if cfg.get("study") is None:
             jobs[name] = method
             continue
-        for seed in select_seeds(method.seeds):
+        settings: Any = OmegaConf.to_container(method, resolve=True)
+        for seed in select_seeds(settings["seeds"]):
             jobs[f"{name}+seed={seed}"] = OmegaConf.merge(method, {"seeds": [seed]})
     return jobs
 

@@ -111,7 +111,7 @@ def file_name(name: str) -> str:
     >>> file_name("physics+planner.horizon=5")
     'physics+planner.horizon=5'
     >>> file_name("physics+tracks=[a/b]")
-    'physics+tracks=_a_b_-...'
+    'physics+tracks=_a_b_-32a2f2'
     """
     plain = re.sub(r"[^-+.,=\w]", "_", name).lstrip(".")[:LONGEST]
     if plain == name:

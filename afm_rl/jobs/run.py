@@ -167,11 +167,12 @@ def _publish(new: Path, folder: Path) -> None:
     remove_parts(folder)
     if is_finished(folder):
         os.replace(folder / MANIFEST, new / REPLACED)
-    for name in _names(new, REPLACED):
+    files = _names(new, MANIFEST)
+    for name in set(_names(new, REPLACED)) - set(files):
         (folder / name).unlink(missing_ok=True)
     for name in SHOWN:
         shutil.rmtree(folder / name, ignore_errors=True)
-    for name in _names(new, MANIFEST):
+    for name in files:
         if name != CONFIG and (new / name).exists():  # it has not been moved yet
             os.replace(new / name, folder / name)
     write_whole(folder / CONFIG, (new / CONFIG).read_bytes())

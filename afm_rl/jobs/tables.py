@@ -63,7 +63,7 @@ def write_tables(folder: Path) -> None:
 
 
 def _finished(folder: Path) -> list[Path]:
-    return [run for run in run_folders(folder) if is_finished(run)]
+    return [run for run in run_folders(folder) if is_finished(run) and (run / MISSIONS).exists()]
 
 
 def _missions(folder: Path) -> pd.DataFrame:

@@ -2,9 +2,9 @@
 
 import os
 import random
+import shutil
 import signal
 import time
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -147,41 +147,49 @@ def test_an_unfinished_run_of_other_settings_is_refused_or_replaced(configure, t
 
 
 def test_new_results_replace_old_ones_whole_or_not_at_all(configure, tmp_path, monkeypatch):
-    """A kill at each change of the disk in turn: never a mixture, and nothing is lost."""
-    old = go(tmp_path, configure())
-    (tmp_path / "figures").mkdir()
-    (tmp_path / "figures" / "old.png").write_bytes(b"old")
-    extend_manifest(tmp_path, ["figures"])
-    new = go(tmp_path.parent / "new", configure(seeds=[5]))
-    real, kills = {name: getattr(os, name) for name in ("replace", "unlink", "rmdir")}, 0
-    begin(tmp_path, configure(seeds=[5]))
-    while True:
-        left = 1
+    """A kill before each change of the disk in turn: never a mixture, and nothing is lost."""
+    state = tmp_path / "state"
+    old, new = go(state, configure()), go(tmp_path / "new", configure(seeds=[5]))
+    (state / "figures").mkdir()
+    (state / "figures" / "old.png").write_bytes(b"old")
+    extend_manifest(state, ["figures"])
+    begin(state, configure(seeds=[5]))
+    with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
+        patched.setattr("afm_rl.jobs.run._publish", lambda *folders: 1 / 0)
+        finish(state, echo=lambda line: None)
+    real = {name: getattr(os, name) for name in ("replace", "unlink", "rmdir")}
+    for kills in range(99):
+        folder = shutil.copytree(state, tmp_path / str(kills))
+        left = kills
 
-        def count(name, *args, **settings):
+        def change(name, *args, **settings):
             nonlocal left
-            if left == 0:
+            left -= 1
+            if left < 0:
                 raise Killed
-            left -= name == "replace" or Path(args[0]).suffix != ""
             return real[name](*args, **settings)
 
-        with monkeypatch.context() as patched:
-            for name in real:
-                patched.setattr(os, name, lambda *args, _n=name, **more: count(_n, *args, **more))
-            try:
-                finish(tmp_path, echo=lambda line: None)
-                break
-            except Killed:
-                kills += 1
-        if is_finished(tmp_path):
-            check_manifest(tmp_path)
-            now = files(tmp_path)
-            assert any(all(now[name] == each[name] for name in SAME) for each in (old, new))
-        assert kills < 99
-    assert kills > 9
-    now = files(tmp_path)
-    assert now.keys() == new.keys() and all(now[name] == new[name] for name in SAME)
-    check_manifest(tmp_path)
+        killed = False
+        for _ in range(2):  # killed twice at the same place
+            with monkeypatch.context() as patched:
+                left = kills
+                for name in real:
+                    patched.setattr(os, name, lambda *a, _n=name, **more: change(_n, *a, **more))
+                try:
+                    finish(folder, echo=lambda line: None)
+                except Killed:
+                    killed = True
+            if is_finished(folder):
+                check_manifest(folder)
+                now = files(folder)
+                assert any(all(now[name] == each[name] for name in SAME) for each in (old, new))
+        finish(folder, echo=lambda line: None)
+        now = files(folder)
+        assert now.keys() == new.keys() and all(now[name] == new[name] for name in SAME)
+        check_manifest(folder)
+        if not killed:
+            break
+    assert 9 < kills < 99
 
 
 def test_a_failure_half_way_leaves_the_old_results(configure, tmp_path, monkeypatch):

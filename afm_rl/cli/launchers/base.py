@@ -71,7 +71,8 @@ class JobLauncher(Launcher):
             except (AFMError, HydraException, OmegaConfBaseException) as error:
                 failures[" ".join(swept or overrides)] = explain(error) or str(error)
         folder = Path(self.config.hydra.sweep.dir).absolute()
-        asked = self.config.hydra.overrides.task
+        # As text: an override may hold an interpolation that leads nowhere.
+        asked = OmegaConf.to_container(self.config.hydra.overrides.task, resolve=False)
         failed = launch.run_together(folder, jobs, self, self.config, ["-m", *asked], failures)
         launch.report(folder, self.config, film)
         if failed:
