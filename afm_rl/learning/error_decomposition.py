@@ -27,7 +27,7 @@ class ErrorParts(NamedTuple):
 
 
 def decompose_error(
-    model: DynamicsModel, state: Tensor, guess: Tensor, next_state: Tensor, half_range: Tensor
+    model: DynamicsModel, state: Tensor, action: Tensor, next_state: Tensor, half_range: Tensor
 ) -> ErrorParts:
     r"""Find the action that explains a transition best, and what it leaves over.
 
@@ -39,7 +39,7 @@ def decompose_error(
     Args:
         model: the dynamics, f.
         state: ``(*B, S)``.
-        guess: where the search for the action begins, in units of the action, ``(*B, A)``.
+        action: the executed action, where the search begins, ``(*B, A)``.
         next_state: the realised one, ``(*B, S)``.
         half_range: half ranges of the action, ``(A,)``.
 
@@ -50,8 +50,8 @@ def decompose_error(
     >>> parts.effective.round(decimals=3), parts.unmatched.abs().round()
     (tensor([-0.5000, -0.2000]), tensor([ 0., 10.,  0.]))
     """
-    half_range = half_range.to(guess)
-    found = effective_action(model, state, guess, next_state, half_range)
+    half_range = half_range.to(action)
+    found = effective_action(model, state, action, next_state, half_range, quiet=-1.0)
     ahead, noise = model.forecast(state, found.action)
     error = model.manifold.difference(next_state, ahead) / noise
     jacobian = (model.jacobian(state, found.action) * half_range / noise.unsqueeze(-1)).double()

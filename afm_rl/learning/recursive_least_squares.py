@@ -11,6 +11,8 @@ PRIOR_DECAY, LEAST_PRIOR = 0.5, 1e-4  # of the prior per transition, and what st
 NOISE_RATE = 0.2  # growth or decay of the noise level per transition
 SCORE_MEMORY = 0.8  # weight of the past in the comparison of hypotheses
 MARGIN = 0.7  # by how much the mean log squared error must be lower than the nominal model's
+SIMPLER = 1.0  # and lower than the first hypothesis's, for one of the others to be used
+CREDIBLE = 1.0  # above the lowest mean log squared error: hypotheses beyond explain nothing
 
 
 class Information(NamedTuple):
@@ -89,7 +91,9 @@ class Filter(NamedTuple):
     @property
     def best(self) -> Tensor:
         """The hypothesis to use ``(l)``; -1: the nominal model, which none clearly beats."""
-        score, index = self.score[:, 1:].min(1)
+        score = self.score[:, 1:].clone()
+        score[:, 1:] += SIMPLER
+        score, index = score.min(1)
         return torch.where(score < self.score[:, 0] - MARGIN, index, -1)
 
 
@@ -125,9 +129,10 @@ def fading_prior(prior: Tensor, age: Tensor) -> Tensor:
 def update(now: Filter, news: News, forgetting: float, gate: float) -> Filter:
     """Take in one transition per mission.
 
-    * An innovation beyond the gate under *every* hypothesis is held back. If the next transition
-      is none, it was an outlier and is dropped. If it is one too, the regime has changed: both
-      are kept and everything before them is forgotten.
+    * An innovation beyond the gate under every *credible* hypothesis is held back, once there are
+      enough transitions to know. If the next transition is none, it was an outlier and is
+      dropped. If it is one too, the regime has changed: both are kept and everything before them
+      is forgotten.
     * The gate is in units of the typical innovation, if that exceeds the model's own noise: under
       a flickering gain every transition is a surprise, but nothing changes.
     * The hypothesis with the lowest mean log squared error of late is used, if it clearly beats
@@ -136,8 +141,10 @@ def update(now: Filter, news: News, forgetting: float, gate: float) -> Filter:
     Missions whose transition is not valid stay as they are. Transitions that tell nothing
     about slopes are learnt from, but let nothing be forgotten.
     """
-    innovation = news.innovation.amin(1)
-    suspect = innovation > gate * now.noise
+    credible = now.score <= now.score.amin(1, keepdim=True) + CREDIBLE
+    innovation = torch.where(credible, news.innovation, torch.inf).amin(1)
+    ready = now.age > now.moment.shape[-1] + 1  # else a change looks like a poor fit
+    suspect = ready & (innovation > gate * now.noise)
     held, changed = suspect & ~now.held, suspect & now.held
     keep = torch.where(news.exciting, forgetting, 1.0).to(now.noise)
     keep = torch.where(changed, 0.0, keep)
@@ -148,10 +155,12 @@ def update(now: Filter, news: News, forgetting: float, gate: float) -> Filter:
         return torch.where(held.reshape(shape), old, keep.reshape(shape) * old + confirmed + new)
 
     level = now.noise * torch.where(innovation > now.noise, NOISE_RATE, -NOISE_RATE).exp()
+    level = torch.where(ready & ~held, level, now.noise)
     latest = news.error.square().log1p()
-    # After a change the fits are as good as new, and the nominal model as good as it just was.
+    # After a change fits are taken to be no better than the gate, the nominal model as it just was.
     score = torch.lerp(latest, now.score, SCORE_MEMORY)
-    begun = torch.cat([latest[:, :1], torch.zeros_like(latest[:, 1:])], 1)
+    fresh = (gate * now.noise).square().log1p()[:, None].expand_as(latest[:, 1:])
+    begun = torch.cat([latest[:, :1], fresh], 1)
     score = torch.where(changed[:, None], begun, score)
     frozen = (held | ~news.exciting)[:, None]
     after = Filter(

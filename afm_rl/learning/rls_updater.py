@@ -151,9 +151,7 @@ class RLSUpdater(Updater):
         )
         offset = model.offset.unsqueeze(-2)
         cleared = model.manifold.add(after, -offset.to(after))
-        apart = decompose_error(
-            model.model, state, model.effective(action), cleared, model.half_range
-        )
+        apart = decompose_error(model.model, state, action, cleared, model.half_range)
 
         def flat(part: Tensor) -> Tensor:
             return part.double().reshape(len(valid), -1, *part.shape[len(lead) + 1 :])

@@ -84,7 +84,8 @@ def test_regimes_are_learnt_and_left_again(regime, steps, missions):
     world.drive(20)
     assert world.plain and not torch.stack(world.errors).any()
     world.drive(60, **regime)
-    level = 5e-3 if "slip" in regime else 3e-4  # m, rad; between two slips of the grid
+    # m, rad: between two slips of the grid; the prior of the bias is a narrow one
+    level = 5e-3 if regime.keys() & {"slip", "bias"} else 3e-4
     assert 2 <= world.recovered(20, level) <= steps
     assert (world.model.slip > 0).all() == ("slip" in regime)
     world.drive(10)
@@ -133,13 +134,15 @@ def test_it_goes_home_once_the_nominal_model_is_as_good():
     assert world.plain
 
 
-def test_what_explains_nothing_is_not_believed():
-    world = World(slips=0)
-    noise = torch.Generator().manual_seed(5)
-    for _ in range(100):  # actuators that flicker
-        matrix = EYE + torch.randn(2, 2, generator=noise, dtype=torch.float64)
-        world.drive(1, matrix=matrix)
-    assert (world.updater.matched.parts.best < 0).all() and world.plain
+def test_what_explains_nothing_does_little_harm():
+    world, frozen, noise = World(8, slips=0), World(8, slips=0), torch.Generator().manual_seed(5)
+    frozen.updater._learn = lambda *_: None
+    for _ in range(80):  # actuators that flicker
+        flicker = 0.3 * torch.randn(8, 2, 2, generator=noise, dtype=torch.float64)
+        for each in (world, frozen):
+            each.drive(1, matrix=EYE + flicker)
+    learnt, nominal = (torch.stack(each.errors[40:]).median() for each in (world, frozen))
+    assert learnt < 1.25 * nominal
 
 
 def test_what_no_action_explains_becomes_the_offset():
