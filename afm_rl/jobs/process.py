@@ -155,5 +155,7 @@ def explain(error: BaseException) -> str:
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, AFMError):
         cause = cause.__cause__ or cause.__context__
-    text = f"{type(error).__name__}: {error}" if cause is None else str(cause)
-    return " ".join(text.split()).removesuffix(":")
+    if cause is None:
+        return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+    text = " ".join(str(cause).split())  # may end in what a MemoryError says: nothing
+    return f"{text} {type(cause.__cause__).__name__}" if text.endswith(":") else text

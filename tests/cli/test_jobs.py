@@ -60,7 +60,7 @@ def test_jobs_that_fail_or_die_take_no_other_with_them(
     assert pd.read_csv(sweep / "missions.csv")["method"].tolist() == [names[0], names[5]]
     # A job alone gives the same bytes as the same job inside a sweep.
     alone = tmp_path / "alone"
-    assert afm_rl(*command, f"label={names[0]}", f"hydra.run.dir={alone}").status == 0
+    assert afm_rl(*command, f"label='{names[0]}'", f"hydra.run.dir={alone}").status == 0
     for name in ("missions.csv", "steps.parquet"):
         assert check_manifest(alone)[name] == check_manifest(sweep / "jobs" / names[0])[name]
 
