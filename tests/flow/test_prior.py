@@ -57,8 +57,9 @@ def test_plans_that_cannot_be_had_are_saturated_as_robots_do_it(mode):
     expected = intend(regime, planned, gains.unsqueeze(1), planned, low, high, mode)
     share = (gains.abs() / planned.squeeze(1).abs()).amin(-1)
     clear = ((share - 0.3).abs() > 0.05).unsqueeze(-1)  # the scale is searched for
-    off = ((found - expected).abs().amax(-1) < 0.02) | ~clear
-    assert off.float().mean() > 0.99
+    # What `intend` has by bisection is an effect, to 0.01; a small gain makes more of it in actions.
+    apart = (gains.unsqueeze(1) * (found - expected)).abs().amax(-1)
+    assert ((apart < 0.015) | ~clear).float().mean() > 0.99
 
 
 def test_what_cannot_be_had_at_all_gives_the_nearest_effect():
