@@ -5,8 +5,7 @@ import torch
 
 from afm_rl.flow import draw_examples
 from afm_rl.flow.prior import GRID, Draw, Maps, draw_actions, draw_maps, draw_masks
-from afm_rl.flow.saturation import LIMIT, MODES, intend
-from afm_rl.regimes import ActionGain
+from afm_rl.flow.saturation import LEAST, LIMIT, MODES
 
 SIZES = [1, 2, 3, 6, 17]
 
@@ -52,14 +51,13 @@ def test_plans_that_cannot_be_had_are_saturated_as_robots_do_it(mode):
     gains = 0.2 + 1.3 * torch.rand(300, 2, generator=generator)
     gains = gains * torch.where(torch.rand(300, 2, generator=generator) < 0.5, -1.0, 1.0)
     planned = 2 * torch.rand(300, 1, 2, generator=generator) - 1
-    regime, low, high = ActionGain(["a", "b"]), -torch.ones(2), torch.ones(2)
-    found = linear(gains).inverse(planned, mode)
-    expected = intend(regime, planned, gains.unsqueeze(1), planned, low, high, mode)
-    share = (gains.abs() / planned.squeeze(1).abs()).amin(-1)
-    clear = ((share - 0.3).abs() > 0.05).unsqueeze(-1)  # the scale is searched for
-    # What `intend` has by bisection is an effect, to 0.01; a small gain makes more of it in actions.
-    apart = (gains.unsqueeze(1) * (found - expected)).abs().amax(-1)
-    assert ((apart < 0.015) | ~clear).float().mean() > 0.99
+    limit = gains.abs().unsqueeze(1)
+    share = (limit / planned.abs()).amin(-1, keepdim=True).clamp_max(1.0)
+    nearest, slower = planned.clamp(-limit, limit), share * planned
+    mixed = torch.where(share > LEAST, nearest, slower)
+    expected = {"clip": nearest, "direction": slower, "mixed": mixed}[mode]
+    effect = gains.unsqueeze(1) * linear(gains).inverse(planned, mode)
+    torch.testing.assert_close(effect, expected, rtol=0, atol=1e-4)
 
 
 def test_what_cannot_be_had_at_all_gives_the_nearest_effect():
