@@ -16,30 +16,27 @@ from torch import Tensor, nn
 
 from afm_rl._version import __version__
 
-Tick = Callable[..., Sequence[Tensor]]
-
 
 def compile_tick(
-    tick: Tick, module: nn.Module, inputs: Sequence[Tensor], cache: str | Path
-) -> Tick | None:
+    tick: nn.Module, inputs: Sequence[Tensor], cache: str | Path
+) -> Callable[..., Sequence[Tensor]] | None:
     """Return a function on tensors as machine code, for any number of missions.
 
     It is compiled ahead of time (AOTInductor), which takes half a minute of one core, and only if
     the cache does not hold it already for these weights, shapes, and versions.
 
     Args:
-        tick: takes tensors whose first dimension counts missions, returns tensors.
-        module: whose weights and buffers it uses.
+        tick: takes tensors whose first dimension counts missions, returns such tensors.
         inputs: an example, of two missions or more.
         cache: folder of compiled functions.
 
     Returns:
         The compiled function; None, with a warning, where there is no compiler or it fails.
     """
-    path = Path(cache).expanduser() / "compiled" / f"{_digest(module, inputs)}.pt2"
+    path = Path(cache).expanduser() / "compiled" / f"{_digest(tick, inputs)}.pt2"
     try:
         if not path.exists():
-            _compile(tick, module, inputs, path)
+            _compile(tick, inputs, path)
         return torch._inductor.aoti_load_package(str(path))
     except Exception as error:  # compilers fail in many ways
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -47,25 +44,27 @@ def compile_tick(
         return None
 
 
-def _compile(tick: Tick, module: nn.Module, inputs: Sequence[Tensor], path: Path) -> None:
+def _compile(tick: nn.Module, inputs: Sequence[Tensor], path: Path) -> None:
     if not any(shutil.which(name) for name in (os.environ.get("CXX", "c++"), "g++", "clang++")):
         raise RuntimeError("no C++ compiler was found")
     print("compiling the correction, once for this robot (about half a minute)", flush=True)
 
-    class Whole(nn.Module):
+    class Plain(nn.Module):
+        """The tick with a plain tuple: others cannot be exported."""
+
         def __init__(self) -> None:
             super().__init__()
-            self.module = module  # so that its weights are found
+            self.tick = tick
 
         def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
-            return tuple(tick(*given))
+            return tuple(self.tick(*given))
 
     missions = torch.export.Dim("missions", min=1, max=2**20)
     shapes = (tuple({0: missions} for _ in inputs),)
     path.parent.mkdir(parents=True, exist_ok=True)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        program = torch.export.export(Whole(), tuple(inputs), dynamic_shapes=shapes)
+        program = torch.export.export(Plain(), tuple(inputs), dynamic_shapes=shapes)
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             made = torch._inductor.aoti_compile_and_package(
                 program, package_path=str(Path(folder) / path.name)

@@ -120,7 +120,7 @@ def correct(
         touched = (executed != found.executed).any(-1, keepdim=True)
         predicted = torch.where(touched & ~misaligned.unsqueeze(-1), executed, predicted)
     if not enabled:
-        predicted = executed
+        predicted, misaligned = executed, torch.zeros_like(misaligned)
     wide = extend_action_box and enabled and model.extrapolates
     entries = {
         "planned_action": planned,

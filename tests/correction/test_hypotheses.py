@@ -153,7 +153,7 @@ def test_the_hypothesis_that_a_delay_needs_is_believed(line, drive, plans, delay
         sent.append(found.executed)
         state = model(state, -late(delay)(sent))
         memory = flow.observe(memory, state)
-    losses = flow.unpack(memory, 2)["losses"] + flow.penalty
+    losses = flow.unpack(memory, 2)["losses"] + flow.tick.penalty
     names = [*flow.hypotheses, IDENTITY]
     believed = {names[int(k)] for k in losses.argmin(-1)}
     assert believed <= ({f"delay_{delay}"} if delay else {"recent", "newest", "long"})

@@ -1,0 +1,202 @@
+"""What happens at a tick: from what is remembered to the action that is executed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from afm_rl.correction.choice import nearest_of, probes_of, source_points_of
+from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY, Layout, lay_out, read_rows
+from afm_rl.errors import check_choice, check_count, check_number
+from afm_rl.flow.experts import Rows, fit_experts
+from afm_rl.flow.network import AxisNetwork, Encoded
+from afm_rl.flow.saturation import MODES, attainable
+from afm_rl.flow.solver import midpoint
+
+TOLERANCE = 0.25  # half ranges: a prediction that misses by so much has half the largest loss
+
+
+class Answer(NamedTuple):
+    """What a tick makes of plans."""
+
+    losses: Tensor
+    """Of the hypotheses, ``(B, H + 1)``."""
+    forecasts: Tensor
+    """Effects that they predict of what acts now, in half ranges, ``(B, H + 1, A)``."""
+    executed: Tensor
+    """The action, in its own units, ``(B, A)``."""
+    predicted: Tensor
+    """The effect that it is predicted to have, in units of the action, ``(B, A)``."""
+    spread: Tensor
+    """Of the samples, in units of the action, ``(B, A)``."""
+    bounds: Tensor
+    """Lowest and highest effect, in units of the action, ``(B, 2, A)``."""
+    misaligned: Tensor
+    """Is a correction believed? ``(B)``."""
+
+
+class Tick(nn.Module):
+    """Hypotheses, experts, flow and choice as one function of tensors, for B missions.
+
+    A function of its arguments alone, so that it can run as machine code
+    (:mod:`~afm_rl.correction.compiled`). The arguments are settings of
+    :class:`~afm_rl.correction.ActionFlow`.
+    """
+
+    centre: Tensor
+    half_range: Tensor
+    source_points: Tensor
+    probes: Tensor
+    penalty: Tensor
+
+    def __init__(
+        self,
+        network: AxisNetwork,
+        centre: Tensor,
+        half_range: Tensor,
+        hypotheses: Sequence[str],
+        identity: bool,
+        rows: int,
+        memory: int,
+        forgetting: float,
+        samples: int,
+        source_std: float,
+        steps: int,
+        choose: str,
+        saturation: str,
+    ) -> None:
+        super().__init__()
+        self.network, self.memory = network, memory
+        self.count, size = len(hypotheses), len(centre)
+        self.forgetting = check_number("corrector.forgetting", forgetting, low=0.0, high=1.0)
+        self.source_std = check_number("corrector.source_std", source_std, low=0.0)
+        self.steps = check_count("corrector.steps", steps)
+        self.choose = check_choice("corrector.choose", choose, ("best", "mean"))
+        self.saturation = check_choice("corrector.saturation", saturation, MODES)
+        chosen = [HYPOTHESES[name] for name in hypotheses]
+        self.by_place = any(h.near for h in chosen)
+        never = 0.0 if identity else torch.inf
+        penalty = [h.penalty for h in chosen] + [HYPOTHESES[IDENTITY].penalty + never]
+        fixed = {
+            "centre": centre,
+            "half_range": half_range,
+            "source_points": source_points_of(check_count("corrector.samples", samples), size),
+            "probes": probes_of(size),
+            "penalty": torch.tensor(penalty),
+        }
+        fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
+        for name, value in fixed.items():
+            self.register_buffer(name, value, persistent=False)
+
+    def forward(
+        self,
+        pairs: Tensor,
+        losses: Tensor,
+        forecasts: Tensor,
+        misaligned: Tensor,
+        place: Tensor,
+        planned: Tensor,
+        box: Tensor,
+    ) -> Answer:
+        """Return the answer for B missions whose model is misaligned.
+
+        Args:
+            pairs: what is remembered, the newest last, ``(B, M, D)``.
+            losses: of the hypotheses before the newest pair, ``(B, H + 1)``.
+            forecasts: effects that they predicted of it, ``(B, H + 1, A)``.
+            misaligned: was anything predicted? ``(B, 1)``.
+            place: where the missions are, ``(B, P)``.
+            planned: in units of the action, ``(B, A)``.
+            box: lowest and highest action, ``(B, 2, A)``.
+        """
+        unit = (planned - self.centre) / self.half_range
+        losses = self.judge(pairs, losses, forecasts, misaligned)
+        belief = (losses + self.penalty).argmin(-1)
+        encoded = self.encode(pairs, place)
+        action, effect, spread, bounds = self.propose(self.pick(encoded, belief), unit)
+        sound = (action + effect).isfinite().all(-1)
+        believed = sound & (belief < self.count)
+        action = torch.where(believed.unsqueeze(-1), action, unit)
+        forecasts = self.predict(encoded, pairs, action)
+        found = torch.stack([action, effect], -2) * self.half_range + self.centre
+        found = torch.where(believed[:, None, None], found, planned.unsqueeze(-2))
+        # Never a smaller box: the flow itself cuts what cannot be had.
+        low, high = (bounds * self.half_range + self.centre).unbind(-2)
+        low, high = torch.fmin(low, box[:, 0]), torch.fmax(high, box[:, 1])
+        return Answer(
+            losses,
+            forecasts,
+            *found.unbind(-2),
+            spread * self.half_range,
+            torch.stack([low, high], -2),
+            believed,
+        )
+
+    def judge(self, pairs: Tensor, losses: Tensor, forecasts: Tensor, misaligned: Tensor) -> Tensor:
+        """Return the hypotheses' losses ``(B, H + 1)`` after the newest pair."""
+        size = len(self.centre)
+        newest = pairs[:, -1:]
+        effective, std = newest[..., size : 2 * size], newest[..., 2 * size : 3 * size]
+        tolerance = TOLERANCE**2
+        miss = (forecasts - effective).square()
+        share = miss / ((miss + tolerance) * (1 + std.square() / tolerance))
+        valid = newest[..., 3 * size]
+        return self.forgetting * losses + valid * misaligned * share.mean(-1)
+
+    def encode(self, pairs: Tensor, place: Tensor) -> Encoded:
+        """Return what the network reads under every hypothesis, B H sets of rows."""
+        away, size = None, len(self.centre)
+        if self.by_place:
+            first = 3 * size + 2
+            away = (pairs[..., first:] - place.unsqueeze(-2)).square().sum(-1)
+            away = torch.where(pairs[..., first - 2] == 1.0, away, torch.inf)
+        layout = Layout(*(getattr(self, f"rows_{name}") for name in Layout._fields))
+        rows = read_rows(pairs, layout, size, away)
+        rows = Rows(*(part.flatten(0, 1) for part in rows))
+        return self.network.encode(rows, fit_experts(rows))
+
+    def pick(self, encoded: Encoded, belief: Tensor) -> Encoded:
+        """Return what is read under one hypothesis for each mission, ``(B,)``.
+
+        The first stands in for the identity, which reads nothing.
+        """
+        first = torch.arange(belief.shape[0], device=belief.device) * self.count
+        return encoded.pick(first + belief.where(belief < self.count, 0))
+
+    def propose(self, known: Encoded, planned: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return action, predicted effect and spread ``(B, A)``, and bounds ``(B, 2, A)``.
+
+        Args:
+            known: what is read under the hypothesis that is believed.
+            planned: ``(B, A)``, in half ranges.
+        """
+        plans = planned.unsqueeze(-2)
+        velocity = partial(self.network.velocity, self.network.ask(known, plans, self.saturation))
+        start = plans + self.source_std * self.source_points
+        ends = midpoint(velocity, start, self.steps)
+        mean, spread = ends.mean(-2, keepdim=True), ends.std(-2, correction=0)
+        proposals = mean if self.choose == "mean" else torch.cat([mean, ends], -2)
+        proposals = proposals.clamp(-1.0, 1.0)
+        count = proposals.shape[-2]
+        probes = self.probes.expand(planned.shape[0], -1, -1)
+        foreseen = self.network.effect(known, torch.cat([proposals, probes], -2))
+        effects, found = foreseen[:, :count], foreseen[:, count:]
+        low, high = found.amin(-2), found.amax(-2)
+        wanted = attainable(planned, low, high, self.saturation)
+        best = nearest_of(effects, wanted, 0.5 * (high - low))
+        chosen = torch.cat([proposals, effects], -1)
+        chosen = chosen.gather(-2, best.expand(best.shape[0], 1, chosen.shape[-1])).squeeze(-2)
+        action, effect = chosen.tensor_split(2, -1)
+        return action, effect, spread, torch.stack([low, high], -2)
+
+    def predict(self, encoded: Encoded, pairs: Tensor, executed: Tensor) -> Tensor:
+        """Return the effects ``(B, H + 1, A)`` that the hypotheses predict of what acts now."""
+        size = len(self.centre)
+        sent = torch.cat([pairs[..., :size], executed.unsqueeze(-2)], -2)
+        acted = sent.index_select(-2, self.memory - self.rows_delay)  # (B, H, A)
+        effects = self.network.effect(encoded, acted.reshape(-1, 1, size)).view_as(acted)
+        return torch.cat([effects, executed.unsqueeze(-2)], -2)
