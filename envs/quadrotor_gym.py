@@ -44,6 +44,7 @@ class CrazyflieTrackGym(MissionGym):
     ((19,), 0.0)
     """
 
+    native: CrazyflieTrack
     metadata: dict[str, Any] = {"render_modes": [], "render_fps": 20}
 
     def __init__(

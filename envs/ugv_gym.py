@@ -21,6 +21,7 @@ from afm_rl.envs.gym_adapter import (
 )
 from afm_rl.envs.rendering import canvas_of
 from afm_rl.envs.track import Track
+from afm_rl.envs.ugv import UGVTrack
 from afm_rl.envs.ugv_vector import UGVTrackVectorEnv
 from afm_rl.errors import check_choice
 from afm_rl.regimes import Regime, Schedule
@@ -56,6 +57,7 @@ class UGVTrackGym(MissionGym):
     ((5,), 0)
     """
 
+    native: UGVTrack
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
 
     def __init__(

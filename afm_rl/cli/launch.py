@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -48,12 +48,12 @@ def launch(cfg: DictConfig) -> None:
     film = check_settings(cfg)
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
-    jobs = jobs_of(cfg, hydra)
+    jobs = jobs_of(cfg, cast(DictConfig, hydra))
     agents = {job.label: build(job) for job in {job.label: job for job in jobs.values()}.values()}
     roads = [getattr(agent.base_env, "tracks", ()) for agent in agents.values()]  # flights: none
     tracks = list({track.name: track for some in roads for track in some}.values())
     if cfg.get("study") is None and len(jobs) == 1:
-        _run_alone(folder, *jobs.values(), *agents.values())
+        _run_alone(folder, next(iter(jobs.values())), next(iter(agents.values())))
         show(folder, cfg, tracks, film)
         return
     chosen = instantiate(hydra.launcher)  # Hydra's own launchers only know sweeps

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 from hydra import compose
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
@@ -47,7 +47,8 @@ def jobs_of(cfg: DictConfig, hydra: DictConfig, swept: Sequence[str] = ()) -> di
             continue
         settings: Any = OmegaConf.to_container(method, resolve=True)
         for seed in select_seeds(settings["seeds"]):
-            jobs[f"{name}+seed={seed}"] = OmegaConf.merge(method, {"seeds": [seed]})
+            one = OmegaConf.merge(method, {"seeds": [seed]})
+            jobs[f"{name}+seed={seed}"] = cast(DictConfig, one)
     return jobs
 
 
@@ -67,7 +68,7 @@ def _methods(cfg: DictConfig, hydra: DictConfig) -> list[DictConfig]:
     )
     own = []
     for name, each in chosen:
-        each = OmegaConf.masked_copy(each, [k for k in each if k not in ("hydra", "study")])
+        each = OmegaConf.masked_copy(each, [str(k) for k in each if k not in ("hydra", "study")])
         label = each.label if len(chosen) == 1 and each.label else _label(name, overrides)
         if not isinstance(label, str):
             raise ConfigurationError(f"label={label!r}: expected a text")

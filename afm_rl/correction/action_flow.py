@@ -124,7 +124,7 @@ class ActionFlow(PairCorrector):
                 f"{rows} rows and the hypotheses {', '.join(self.hypotheses)}"
             )
         self.saturation = saturation
-        self.compile, self.cache = check_flag("corrector.compile", compile), Path(cache)
+        self.compiles, self.cache = check_flag("corrector.compile", compile), Path(cache)
         self.__dict__["_machine_code"] = None
         self.tick = Tick(
             load_universal() if network is None else network,
@@ -186,16 +186,17 @@ class ActionFlow(PairCorrector):
         given = [parts[name] for name in ("pairs", "losses", "forecasts", "misaligned")]
         given += [self.place_of(parts["state"]), planned, box]
         given = [_flat(part, len(batch)).to(kind) for part in given]
-        answer = self._machine(given)(*given) if self.compile else self.tick(*given)
+        answer = self._machine(given)(*given) if self.compiles else self.tick(*given)
         return Answer(*(part.view((*batch, *part.shape[1:])) for part in answer))
 
     def _machine(self, given: list[Tensor]) -> Callable[..., Sequence[Tensor]]:
         """Return the tick as machine code, or as it is where that cannot be had."""
-        if self._machine_code is None:
+        found = self.__dict__["_machine_code"]
+        if found is None:
             two = [part[:1].repeat(2, *[1] * (part.dim() - 1)) for part in given]
-            found = compile_tick(self.tick, two, self.cache)
-            self.__dict__["_machine_code"] = self.tick if found is None else found
-        return self._machine_code
+            found = compile_tick(self.tick, two, self.cache) or self.tick
+            self.__dict__["_machine_code"] = found
+        return found
 
     def place_of(self, state: Tensor) -> Tensor:
         """Return where a state is, in the unit in which ground differs."""

@@ -134,7 +134,8 @@ def read_rows(pairs: Tensor, layout: Layout, size: int, away: Tensor | None) -> 
         there = near.unsqueeze(-3).expand(shape).split(sizes, -1)
         parts = [torch.cat([part, more], -3) for part, more in zip(parts, there, strict=False)]
     filled = parts[3] * layout.filled
-    return Rows(*(part * filled for part in parts[:3]), filled)
+    executed, effective, std = (part * filled for part in parts[:3])
+    return Rows(executed, effective, std, filled)
 
 
 def _nearest(pairs: Tensor, away: Tensor, rows: int) -> Tensor:

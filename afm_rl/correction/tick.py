@@ -52,6 +52,7 @@ class Tick(nn.Module):
     source_points: Tensor
     probes: Tensor
     penalty: Tensor
+    rows_delay: Tensor
 
     def __init__(
         self,
@@ -127,10 +128,12 @@ class Tick(nn.Module):
         # Never a smaller box: the flow itself cuts what cannot be had.
         low, high = (bounds * self.half_range + self.centre).unbind(-2)
         low, high = torch.fmin(low, box[:, 0]), torch.fmax(high, box[:, 1])
+        executed, effect = found.unbind(-2)
         return Answer(
             losses,
             forecasts,
-            *found.unbind(-2),
+            executed,
+            effect,
             spread * self.half_range,
             torch.stack([low, high], -2),
             believed,

@@ -247,8 +247,9 @@ class Ensemble(PerMissionModel):
     def network_rows(self, state: Tensor, action: Tensor) -> Tensor:
         """Return standardised inputs ``(*L, *N, in)`` in the precision of the networks."""
         raw = self.inputs(state, action)
-        known = self.running is not None
-        rows = self.running(raw) if known else (raw - self.input_mean) / self.input_std
+        if self.running is not None:
+            return self.running(raw).to(self.weights[0])
+        rows = (raw - self.input_mean) / self.input_std
         return rows.to(self.weights[0])
 
     def _per_member(self, rows: Tensor) -> Tensor:

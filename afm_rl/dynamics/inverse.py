@@ -82,7 +82,7 @@ def effective_action(
     if bool((innovation <= quiet).all()):  # false for NaN
         std = (ASSUMED * half_range).expand_as(action)
         return EffectiveAction(action.to(dtype), std.to(dtype), innovation.to(dtype))
-    effective, limit = action, 1.0
+    effective, limit = action, torch.ones_like(innovation).unsqueeze(-1)
     for last in (False,) * (rounds - 1) + (True,):
         jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()
         precision = jacobian.mT @ jacobian

@@ -171,7 +171,7 @@ class MuJoCoDynamics(KnownDynamics):
         found, skip = read_model(model)
         found.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         skip = skip if frame_skip is None else check_count("dynamics.frame_skip", frame_skip)
-        simulator = Simulator(found, skip, check_count("dynamics.threads", threads, low=0))
+        simulator: Any = Simulator(found, skip, check_count("dynamics.threads", threads, low=0))
         if not isinstance(noise_std, int | float) and len(noise_std) == 2:
             position, velocity = noise_std
             noise_std = [position] * found.nv + [velocity] * found.nv + [position] * found.na
@@ -214,5 +214,6 @@ class MuJoCoDynamics(KnownDynamics):
         batch = torch.broadcast_shapes(state.shape[:-1], actions.shape[:-2])
         rows = state.expand(*batch, -1).reshape(-1, state.shape[-1])
         plans = actions.expand(*batch, -1, -1).reshape(-1, *actions.shape[-2:])
-        after = self.step(*(x.detach().cpu().double().numpy() for x in (rows, plans)))
+        step: Any = self.step  # of plans, in numpy
+        after = step(*(x.detach().cpu().double().numpy() for x in (rows, plans)))
         return torch.from_numpy(after).to(state).reshape(*batch, *after.shape[1:])

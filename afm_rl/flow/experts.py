@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -279,8 +279,8 @@ def fit_experts(rows: Rows) -> Experts:
     long = weights[..., 1, :]
     moved = (long * (e.abs() > STUCK)).unsqueeze(-2)
     sign = u.sign()
-    terms = [u * u, u, sign * sign, u * e, e, sign * u, sign * e, torch.ones_like(u)]
-    terms = torch.stack(terms, -1).flatten(0, 1)  # (N A, K, 8)
+    each = [u * u, u, sign * sign, u * e, e, sign * u, sign * e, torch.ones_like(u)]
+    terms = torch.stack(each, -1).flatten(0, 1)  # (N A, K, 8)
     flat = torch.cat([weights, moved], -2).flatten(0, 1)  # (N A, 3, K)
     moments = torch.baddbmm(prior, flat, terms)
     gains = moments[:, :2, 3] / moments[:, :2, 0]
@@ -337,7 +337,7 @@ def _constants(rows: int, size: int, device: torch.device) -> tuple[Tensor, Tens
 
     Those of the lines are ``(3, 8)``, those of the affine map ``(A + 1, A + 1)``.
     """
-    kind = {"dtype": torch.float64, "device": device}
+    kind: dict[str, Any] = {"dtype": torch.float64, "device": device}
     age = torch.arange(rows - 1, -1, -1, **kind)
     prior = torch.zeros(3, 8, **kind)
     prior[:, [0, 3]], prior[:, [2, 7]] = PRIOR, 10 * PRIOR

@@ -156,12 +156,14 @@ class AxisNetwork(nn.Module):
             point: x at that time.
         """
         at = point.mT.unsqueeze(-1)
+        time: Tensor | float
+        left: Tensor | float
         if isinstance(tau, Tensor):
-            tau = tau.mT.unsqueeze(-1)
-            left = (1 - tau).clamp_min(LEAST_TIME)
+            time = tau.mT.unsqueeze(-1)
+            left = (1 - time).clamp_min(LEAST_TIME)
         else:
-            left = max(1 - tau, LEAST_TIME)
-        hidden = asked.hidden + at * self.point_weight + tau * self.time_weight
+            time, left = tau, max(1 - tau, LEAST_TIME)
+        hidden = asked.hidden + at * self.point_weight + time * self.time_weight
         return self._blend(self.plan_head(hidden.relu()), (asked.answers - at) / left)
 
     def effect(self, encoded: Encoded, executed: Tensor) -> Tensor:

@@ -168,10 +168,11 @@ def _draw_tables(count: int, axes: int, draw: Draw, kinds: Mapping[str, float]) 
     kind = draw.choice(kinds, KINDS, count).view(-1, 1, 1)
     at, size = parameter(0.2, 0.8), grid.abs()
     forward, backward = parameter(-1.2, 0.4).exp(), parameter(-1.2, 0.4).exp()
-    waves = sum(
+    once, twice = (
         parameter(-0.25, 0.25) * (math.pi * k * grid + parameter(-math.pi, math.pi)).sin()
         for k in (1, 2)
     )
+    waves = once + twice
     levels = parameter(2.0, 16.0).round()
     tables = [
         grid.expand(count, axes, GRID),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Protocol
@@ -15,7 +15,7 @@ from yaml import safe_dump
 from afm_rl.errors import ConfigurationError
 from afm_rl.files import locked, remove_parts, write_whole
 from afm_rl.jobs.layout import JOBS, MISSIONS, RECORD, is_batch, recorded
-from afm_rl.jobs.process import Job
+from afm_rl.jobs.process import Ends, Job
 from afm_rl.jobs.progress import Board
 from afm_rl.jobs.run import begin, needs_run
 from afm_rl.jobs.tables import write_tables
@@ -28,7 +28,7 @@ LONGEST = 120  # characters of the name of a job's folder
 class Pool(Protocol):
     """Where jobs run."""
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None] | None]:
+    def run(self, jobs: Sequence[Job]) -> Ends:
         """Run jobs, in any order.
 
         Yields:

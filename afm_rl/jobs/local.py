@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from multiprocessing.connection import wait
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.jobs.process import Job, Process, reason, start
+from afm_rl.jobs.process import Ends, Job, Process, reason, start
 
 GRACE = 20.0  # seconds in which a job that is told to stop may write its checkpoint
 TICK = 0.25  # seconds between two signs of life
@@ -33,7 +33,7 @@ class LocalPool:
         cores = os.cpu_count() or 1
         self.size = n_jobs if n_jobs > 0 else max(1, cores + 1 + n_jobs)
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None] | None]:
+    def run(self, jobs: Sequence[Job]) -> Ends:
         """Run jobs, as :class:`~afm_rl.jobs.batch.Pool` says."""
         waiting, running = deque(jobs), dict[Job, Process]()
         try:

@@ -12,11 +12,13 @@ import signal
 import sys
 import threading
 import traceback
+from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.context import ForkServerProcess, SpawnProcess
 from pathlib import Path
+from typing import Any
 
 from afm_rl.errors import AFMError
 from afm_rl.files import locked
@@ -48,12 +50,16 @@ class Job:
         return self.name
 
 
+Ends = Generator[tuple[Job, str | None] | None, None, None]
+"""Jobs that are over, with the reason if they failed, and None from time to time."""
+
+
 def start(job: Job) -> Process:
     """Start the process of a job. It ends, with a checkpoint, when this process ends."""
     for name in (FAILURE, PROGRESS):  # of an earlier attempt
         (job.folder / UNFINISHED / name).unlink(missing_ok=True)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    context = multiprocessing.get_context(START)
+    context: Any = multiprocessing.get_context(START)  # every kind has processes
     if START == "forkserver":
         context.set_forkserver_preload(["afm_rl.jobs.run", "afm_rl.envs"])
     process = context.Process(target=work, args=(job,), name=job.name, daemon=True)

@@ -148,7 +148,7 @@ def afm(
     flow = ActionFlow(*robot.flow_box, place=place, place_scale=scale, **settings)
     if train is None and checkpoint is None:
         return Part(_transform(dynamics, flow, enabled, extend_action_box))
-    own = {name: settings[name] for name in ("hypotheses", "rows") if name in settings}
+    own: dict[str, Any] = {k: v for k, v in settings.items() if k in ("hypotheses", "rows")}
     training = _training(flow, robot, dynamics, train or {}, checkpoint, own, "half ranges")
     return Part(_transform(dynamics, flow, enabled, extend_action_box), training)
 

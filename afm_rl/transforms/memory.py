@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -141,7 +142,7 @@ def bounds_of(action_spec: TensorSpec) -> tuple[Tensor, Tensor]:
     Raises:
         ConfigurationError: if its actions are no real numbers between bounds.
     """
-    space = getattr(action_spec, "space", None)
+    space: Any = getattr(action_spec, "space", None)
     if not hasattr(space, "low") or not action_spec.dtype.is_floating_point:
         raise ConfigurationError(
             f"action_spec={action_spec}: expected a Bounded spec of real numbers; limit the "

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import importlib
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import cast
 
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.utils import JobReturn, JobStatus, setup_globals
@@ -18,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from afm_rl.cli.error_messages import explain
 from afm_rl.errors import AFMError, ConfigurationError
-from afm_rl.jobs.process import Job
+from afm_rl.jobs.process import Ends, Job
 
 
 class JobsFailed(AFMError):
@@ -41,7 +42,7 @@ class JobLauncher(Launcher):
         self.config = config
 
     @abstractmethod
-    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None] | None]:
+    def run(self, jobs: Sequence[Job]) -> Ends:
         """Run jobs, as :class:`afm_rl.jobs.batch.Pool` says."""
 
     def launch(
@@ -73,7 +74,9 @@ class JobLauncher(Launcher):
         folder = Path(self.config.hydra.sweep.dir).absolute()
         # As text: an override may hold an interpolation that leads nowhere.
         asked = OmegaConf.to_container(self.config.hydra.overrides.task, resolve=False)
-        failed = launch.run_together(folder, jobs, self, self.config, ["-m", *asked], failures)
+        failed = launch.run_together(
+            folder, jobs, self, self.config, ["-m", *cast(list, asked)], failures
+        )
         launch.report(folder, self.config, film)
         if failed:
             raise failed

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from afm_rl.cli.launchers.base import JobLauncher, needs
 from afm_rl.errors import check_number
-from afm_rl.jobs.process import Job, run
+from afm_rl.jobs.process import Ends, Job, run
 
 TICK = 0.5  # seconds between two signs of life
 
@@ -35,7 +35,7 @@ class RayLauncher(JobLauncher):
         }
         self.ray = needs("ray", "ray")
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None] | None]:
+    def run(self, jobs: Sequence[Job]) -> Ends:
         if not jobs:
             return
         ray = self.ray

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from afm_rl.cli.launchers.base import JobLauncher, needs
 from afm_rl.errors import ConfigurationError, check_choice
-from afm_rl.jobs.process import Job, run
+from afm_rl.jobs.process import Ends, Job, run
 
 POLL = 0.5  # seconds between two looks at jobs; the cluster itself is asked more rarely
 
@@ -31,7 +31,7 @@ class SubmititLauncher(JobLauncher):
         self.parameters = {key: value for key, value in parameters.items() if value is not None}
         self.submitit = needs("submitit", "sweeps")
 
-    def run(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None] | None]:
+    def run(self, jobs: Sequence[Job]) -> Ends:
         if not jobs:
             return
         folder = jobs[0].folder.parent.parent / ".submitit"
