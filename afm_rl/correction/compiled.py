@@ -44,8 +44,13 @@ def compile_tick(
         return None
 
 
+def has_compiler() -> bool:
+    """Return whether there is a C++ compiler."""
+    return any(shutil.which(name) for name in (os.environ.get("CXX", "c++"), "g++", "clang++"))
+
+
 def _compile(tick: nn.Module, inputs: Sequence[Tensor], path: Path) -> None:
-    if not any(shutil.which(name) for name in (os.environ.get("CXX", "c++"), "g++", "clang++")):
+    if not has_compiler():
         raise RuntimeError("no C++ compiler was found")
     print("compiling the correction, once for this robot (about half a minute)", flush=True)
 

@@ -16,7 +16,7 @@ METHODS = (
     *("method=physics", "method=afm_physics", "method=online_pe", "method=rls"),
     "robot=quadrotor method=online_knode",
 )
-CHANGES = 500
+CHANGES = 100  # of each method
 VALUES = """
 0 1 -1 2 3 0.5 -0.0 1e-300 1e300 1e400 -1e30 nan inf -inf 99999999999999999999 2147483648 true
 false null none all abc "" "../../x" ".." "/" [] [0] [1,2] [[]] [null] [nan,inf] [x,x,x] {} {a:1}
@@ -36,16 +36,17 @@ def leaves(node, place=""):
 
 
 @pytest.mark.timeout(600)
-def test_random_settings_end_in_a_run_or_in_one_line(composed, no_training):
-    dice, parse = random.Random(0), OverridesParser.create().parse_override
+@pytest.mark.parametrize("method", METHODS)
+def test_random_settings_end_in_a_run_or_in_one_line(composed, no_training, method):
+    dice, parse = random.Random(method), OverridesParser.create().parse_override
+    base = composed(*method.split())
+    keys = sorted(leaves(OmegaConf.to_container(base, resolve=False)))
+    for key, value in SMALL.items():
+        if OmegaConf.select(base, key) is not None:
+            OmegaConf.update(base, key, value)
     refused = built = 0
-    for number in range(CHANGES):
-        base = composed(*METHODS[number % len(METHODS)].split())
-        keys = sorted(leaves(OmegaConf.to_container(base, resolve=False)))
+    for _ in range(CHANGES):
         cfg = copy.deepcopy(base)
-        for key, value in SMALL.items():
-            if OmegaConf.select(cfg, key) is not None:
-                OmegaConf.update(cfg, key, value)
         change = f"{dice.choice(keys)}={dice.choice(VALUES)}"
         try:
             override = parse(change)

@@ -1,0 +1,50 @@
+"""The tick as machine code."""
+
+import pytest
+import torch
+
+from afm_rl.correction import ActionFlow, compiled
+from afm_rl.flow import AxisNetwork
+
+
+def flow_of(cache, **settings):
+    network = AxisNetwork(width=8, latent=8)
+    settings |= {"source_std": 0.0}  # among samples that are as good, rounding would decide
+    return ActionFlow(-torch.ones(1), torch.ones(1), network=network, cache=cache, **settings)
+
+
+def reversed_drive(sent):
+    return -sent[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_machine_code_says_the_same_for_any_number_of_missions(
+    line, drive, plans, tmp_path, monkeypatch
+):
+    if not compiled.has_compiler():
+        pytest.skip("no C++ compiler")
+    code = flow_of(tmp_path, compile=True)
+    for batch in [(), (3,), (2, 2)]:
+        planned = plans(6, *batch, 1)
+        expected, _ = drive(flow_of(tmp_path), line(1), reversed_drive, planned)
+        found, _ = drive(code, line(1), reversed_drive, planned)
+        assert expected[-1][1:].all()
+        for one, other in zip(found, expected, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-4)
+    assert len(list((tmp_path / "compiled").iterdir())) == 1
+
+    def refuse(*_):
+        raise AssertionError("it was compiled again")
+
+    monkeypatch.setattr(compiled, "_compile", refuse)
+    drive(flow_of(tmp_path, compile=True), line(1), reversed_drive, plans(4, 1))
+
+
+def test_without_a_compiler_the_tick_runs_as_it_is(line, drive, plans, tmp_path, monkeypatch):
+    monkeypatch.setattr(compiled, "has_compiler", lambda: False)
+    planned = plans(4, 1)
+    with pytest.warns(UserWarning, match="compile=true: goes on uncompiled: no C.. compiler"):
+        found, _ = drive(flow_of(tmp_path, compile=True), line(1), reversed_drive, planned)
+    expected, _ = drive(flow_of(tmp_path), line(1), reversed_drive, planned)
+    assert torch.equal(found[0], expected[0])
