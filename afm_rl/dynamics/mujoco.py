@@ -85,6 +85,29 @@ def space_of(model: Any) -> MuJoCoSpace:
     return MuJoCoSpace(model.nq + model.nv + model.na, angles, quaternions)
 
 
+def state_names(model: Any) -> list[str]:
+    """Name positions ``q_JOINT``, velocities ``v_JOINT`` and activations ``w_k``."""
+    places, turn, rates = ("_x", "_y", "_z"), ("_qw", "_qx", "_qy", "_qz"), ("_wx", "_wy", "_wz")
+    positions, velocities = [], []
+    ends: tuple[str, ...]
+    moves: tuple[str, ...]
+    for joint, kind in enumerate(model.jnt_type):
+        name = model.joint(joint).name or str(joint)
+        ends, moves = ("",), ("",)  # of a slide or a hinge
+        if kind == mujoco.mjtJoint.mjJNT_BALL:
+            ends, moves = turn, rates
+        elif kind == mujoco.mjtJoint.mjJNT_FREE:
+            ends, moves = (*places, *turn), (*places, *rates)
+        positions += [f"q_{name}{end}" for end in ends]
+        velocities += [f"v_{name}{end}" for end in moves]
+    return [*positions, *velocities, *(f"w_{k}" for k in range(model.na))]
+
+
+def actuator_names(model: Any) -> list[str]:
+    """Return the names of actuators; those without one are called ``a_k``."""
+    return [model.actuator(k).name or f"a_{k}" for k in range(model.nu)]
+
+
 class Simulator:
     """Simulates many copies of a MuJoCo model from given states, on some threads.
 
@@ -182,6 +205,21 @@ class MuJoCoDynamics(KnownDynamics):
         self.action_high = torch.where(limited, high, torch.inf)
         half = torch.where(limited, (high - low) / 2, 1.0)
         self.action_steps = STEP * torch.cat([torch.zeros(1, found.nu), half.diag()])
+
+    @property
+    def mjcf(self) -> Any:
+        """The compiled ``MjModel``."""
+        return self.step.settings[0]
+
+    @property
+    def dt(self) -> float:
+        """Time of an action (s)."""
+        return self.step.settings[1] * self.mjcf.opt.timestep
+
+    @property
+    def names(self) -> tuple[list[str], list[str]]:
+        """Names of the state coordinates, ``q_JOINT``, ``v_JOINT``, ``w_...``, and of actions."""
+        return state_names(self.mjcf), actuator_names(self.mjcf)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the next state ``(*B, S)``."""

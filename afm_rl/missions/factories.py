@@ -16,11 +16,12 @@ from torch import nn
 from afm_rl.artefacts import load_artefact
 from afm_rl.correction import ActionFlow, Corrector, L1Augmentation, LeastSquares, PaperFlow
 from afm_rl.dynamics import KNODE, Calibrated, Ensemble, Oracle, Quadrotor
-from afm_rl.errors import AFMError, ConfigurationError, check_flag
+from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_flag
 from afm_rl.flow import train_flow
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
 from afm_rl.missions.robot import Robot
+from afm_rl.planning.costs import SATURATIONS, KnownReward
 from afm_rl.transforms import ActionFlowTransform
 
 
@@ -127,6 +128,22 @@ def knode(
     shape = {"pretrain": dict(pretrain), "randomised": randomised, **settings}
     unit = "standard deviations of the model"
     return Part(model, Training("KNODE", model, train, unit, [shape]), shape)
+
+
+def reward(robot: Robot, saturation: str = "clip") -> KnownReward:
+    """Return the cost that is the negative reward of the robot's task.
+
+    Args:
+        robot: one with a reward.
+        saturation: see :class:`~afm_rl.planning.GoalDistance`.
+    """
+    if robot.reward is None:
+        raise ConfigurationError(
+            f"cost=reward: robot={robot.name} has no reward; choose cost=goal_position, or a "
+            "robot with a task: gymnasium, dm_control or mujoco"
+        )
+    check_choice("cost.saturation", saturation, SATURATIONS)
+    return KnownReward(robot.reward, list(robot.reward_reads), list(robot.reward_reads.values()))
 
 
 def no_correction(robot: Robot, dynamics: Part) -> Part:
