@@ -61,6 +61,7 @@ class MassEstimator(Learner):
     Raises:
         ConfigurationError: for a setting or model that cannot be used.
 
+    >>> from tensordict import TensorDict
     >>> from afm_rl.regimes import MassFactor
     >>> updater = MassEstimator(GaussianNLLLoss(Oracle(Quadrotor(), MassFactor())), share=1.0)
     >>> level = torch.zeros(2, 13).index_fill(1, torch.tensor(9), 1.0)

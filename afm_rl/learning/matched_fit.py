@@ -34,7 +34,7 @@ class Shapes(NamedTuple):
 
     shape: Tensor
     """``(l, 3)``."""
-    count: Tensor
+    steps: Tensor
     """Transitions so far, ``(l)``."""
 
 
@@ -72,24 +72,25 @@ class MatchedFit(nn.Module):
         """
         memory, each = self.memory.parts, valid.shape[1]
         theta, covariance = self._fit()
-        shape, count = self.shape.parts
+        shape, steps = self.shape.parts
         features = features_of(action, shape.unsqueeze(1))
         doubt = torch.einsum("lnr,lgrk,lnk->lng", features, covariance, features)
         doubt = where(memory.active, doubt, torch.zeros_like(doubt))
         error = (parts.effective - features @ theta.mT).square() * parts.weight
         nominal = (parts.effective - action).square() * parts.weight
         squares = error / (1 + parts.weight * doubt), error, nominal
+        innovation, error, nominal = (part.amax(-1).sqrt() for part in squares)
         exciting = (action.abs() > EXCITING).any(-1)
-        seen = Seen(*(part.amax(-1).sqrt() for part in squares), exciting, valid)
+        seen = Seen(innovation, error, nominal, exciting, valid)
         memory, verdict = advance(memory, seen, self.rules, len(self.prior) + 1, self._shaped)
         fresh = action, parts.effective, parts.weight * valid.unsqueeze(-1)
         rows = [torch.cat(pair, 1) for pair in zip(self.rows.parts, fresh, strict=True)]
-        memory, rows = latest(memory, tuple(rows), self.rules.window * each)
+        memory, rows = latest(memory, rows, self.rules.window * each)
         self.memory.keep(memory)
         self.rows.keep(Rows(*rows))
         lost = (verdict.began & self._shaped) | verdict.ended
         shape = where(lost, torch.tensor(PLAIN).to(shape).expand_as(shape), shape)
-        self.shape.keep(Shapes(shape, count + valid.any(1)))
+        self.shape.keep(Shapes(shape, steps + valid.any(1)))
         if self.shapes:
             self._look(verdict.suspect, each)
 
@@ -126,10 +127,10 @@ class MatchedFit(nn.Module):
         row of changes: then among the latest 8, 16, 32 ..., the more the more seldom.
         """
         memory, cap, shaped = self.memory.parts, self.rules.gate, self._shaped
-        shape, count = self.shape.parts
+        shape, steps = self.shape.parts
         size = memory.share.shape[1]
-        back = torch.arange(size, 0, -1, device=count.device) - 1
-        last = ENOUGH * (count & -count).unsqueeze(-1) * each  # 8 times the power of 2 in count
+        back = torch.arange(size, 0, -1, device=steps.device) - 1
+        last = ENOUGH * (steps & -steps).unsqueeze(-1) * each  # 8 times the power of 2 in steps
         share = self.rules.forgetting ** (back // each) * (back < last)
         share = where(shaped, memory.share, share.to(memory.share))
         rows = _weighted(self.rows.parts, share)
@@ -156,7 +157,7 @@ class MatchedFit(nn.Module):
             )
         )
         shape = where(chosen, shape.index_copy(0, index, found.shape), shape)
-        self.shape.keep(Shapes(shape, count))
+        self.shape.keep(Shapes(shape, steps))
 
 
 def _weighted(rows: Rows, share: Tensor) -> Rows:

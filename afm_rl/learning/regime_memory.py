@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -158,16 +159,16 @@ def advance(
         score=torch.where(ended | began, -CREDIT, score),
     )
     after = Memory(*(where(valid, *pair) for pair in zip(after, memory, strict=True)))
-    latest = (
-        (learn.unsqueeze(-1) & seen.valid).double(),
-        waits.unsqueeze(-1) & seen.valid,
-        seen.exciting & seen.valid,
+    counts = (learn.unsqueeze(-1) & seen.valid).double()
+    after = after._replace(
+        share=torch.cat([after.share, counts], -1),
+        suspect=torch.cat([after.suspect, waits.unsqueeze(-1) & seen.valid], -1),
+        exciting=torch.cat([after.exciting, seen.exciting & seen.valid], -1),
     )
-    rows = [torch.cat(pair, -1) for pair in zip(after[:3], latest, strict=True)]
-    return Memory(*rows, *after[3:]), Verdict(far & valid, began, ended)
+    return after, Verdict(far & valid, began, ended)
 
 
-def latest(memory: Memory, rows: tuple[Tensor, ...], size: int) -> tuple[Memory, list[Tensor]]:
+def latest(memory: Memory, rows: Sequence[Tensor], size: int) -> tuple[Memory, list[Tensor]]:
     """Keep ``size`` transitions of each mission, and their ``rows``, ``(l, K, ...)``.
 
     Those that do not count go first, of these and of the others those that tell nothing about
@@ -176,8 +177,8 @@ def latest(memory: Memory, rows: tuple[Tensor, ...], size: int) -> tuple[Memory,
     worth = 2 * ((memory.share > 0) | memory.suspect) + 1 * memory.exciting
     order = worth.argsort(dim=-1, stable=True)[:, -size:]
     mission = torch.arange(len(order), device=order.device).unsqueeze(-1)
-    kept = Memory(*(part[mission, order] for part in memory[:3]), *memory[3:])
-    return kept, [part[mission, order] for part in rows]
+    share, suspect, exciting, *kept = (part[mission, order] for part in (*memory[:3], *rows))
+    return memory._replace(share=share, suspect=suspect, exciting=exciting), kept
 
 
 def where(missions: Tensor, new: Tensor, old: Tensor) -> Tensor:

@@ -154,7 +154,7 @@ class RLSUpdater(Learner):
         for part in parts:
             valid = valid & part.flatten(2).isfinite().all(-1)
         parts = ErrorParts(*(torch.where(_wide(valid, part), part, 1.0) for part in parts))
-        calibration = {}
+        calibration: dict[str, Tensor] = {}
         if self.part != "unmatched":
             unit = torch.where(valid.unsqueeze(-1), flat(action / model.half_range), 0.0)
             self.matched.learn(unit, parts, valid)

@@ -61,10 +61,11 @@ class UnmatchedFit(nn.Module):
         doubt = (across @ covariance * across).sum(-1)
         doubt = where(memory.active, doubt, torch.zeros_like(doubt))
         errors = error / (1 + doubt).sqrt(), error, total
-        seen = Seen(*(part.abs().amax(-1) for part in errors), torch.ones_like(valid), valid)
+        innovation, error, nominal = (part.abs().amax(-1) for part in errors)
+        seen = Seen(innovation, error, nominal, torch.ones_like(valid), valid)
         memory, _ = advance(memory, seen, self.rules, self.size)
         pairs = zip(self.rows.parts, (across, total, parts.noise), strict=True)
-        rows = tuple(torch.cat(pair, 1) for pair in pairs)
+        rows = [torch.cat(pair, 1) for pair in pairs]
         memory, rows = latest(memory, rows, self.rules.window * valid.shape[1])
         self.memory.keep(memory)
         self.rows.keep(Offsets(*rows))

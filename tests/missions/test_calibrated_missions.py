@@ -42,9 +42,7 @@ def test_interrupted_runs_are_bit_identical(make_agent, ring, spot, tmp_path, st
     assert (late["error"] < 1e-2).all()  # learnt in two steps, with a little left
 
 
-@pytest.mark.parametrize(
-    ("method", "plain"), [("rls_pe", "frozen_pe"), ("afm_rls", "afm_physics")], ids=str
-)
+@pytest.mark.parametrize(("method", "plain"), [("rls_pe", "frozen_pe")], ids=str)
 def test_parts_are_trained_once_with_or_without_a_calibration(configure, method, plain):
     base = {key.replace("base.", ""): value for key, value in BASE.items()}
     cfg = [configure(f"method={method}", **(BASE if method == "rls_pe" else {}))]
