@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.planning.costs import check_arguments
 
 Reward = Callable[..., Tensor]
+ENDLESS = 1e30  # what unbounded specs say
 PROBE = 2, 3  # batch in which a reward is tried
 
 
@@ -61,7 +62,7 @@ class Task:
     def __post_init__(self) -> None:
         """Check limits and rewards."""
         bounds = torch.tensor([list(self.low), list(self.high)])
-        endless = (~bounds.isfinite()).any(0).nonzero().flatten().tolist()
+        endless = (~(bounds.abs() < ENDLESS).all(0)).nonzero().flatten().tolist()
         if endless:
             names = ", ".join(self.action_names[axis] for axis in endless)
             raise ConfigurationError(
@@ -95,9 +96,14 @@ class Task:
         """The reward to plan with."""
         return self.reward if self.plan is None else self.plan
 
-    def begin(self, seeds: Tensor) -> dict[str, Tensor]:
-        """Return ``pose`` ``(*B, S)`` and, if there is one, ``goal`` ``(*B, G)``, by seed."""
-        states, goals = zip(*map(self.start, seeds.flatten().tolist()), strict=True)
+    def begin(self, seeds: Tensor, rows: Tensor | None = None) -> dict[str, Tensor]:
+        """Return ``pose`` ``(*B, S)`` and, if there is one, ``goal`` ``(*B, G)``, by seed.
+
+        Where ``rows`` ``(*B)`` says no, nobody looks at them.
+        """
+        asked = seeds if rows is None else torch.where(rows, seeds, 0)
+        known = {seed: self.start(seed) for seed in set(asked.flatten().tolist())}
+        states, goals = zip(*(known[seed] for seed in asked.flatten().tolist()), strict=True)
         found = {"pose": torch.stack(states)}
         if self.goal_names:
             found["goal"] = torch.stack(goals)
@@ -112,3 +118,10 @@ class Task:
         lost = ~ahead.isfinite().all(-1)
         ended = lost if self.ends is None else lost | self.ends(ahead)
         return ahead, torch.where(lost, 0.0, reward), ended
+
+    def history(self) -> dict[str, Any]:
+        """Return what leads to the present state of a world that keeps it to itself: nothing."""
+        return {}
+
+    def replay(self, history: Mapping[str, Any]) -> None:
+        """Bring such a world into the state that a history led to."""

@@ -87,14 +87,18 @@ class TaskEnv(MissionEnv):
             task,
             check_regime(regime, lambda: default, len(task.state_names), len(low)),
             check_instance("schedule", schedule, Schedule),
-            *(bound.to(self.dtype) for bound in bounds),
-            steps=min(steps, task.steps),
+            bounds[0].to(self.dtype),
+            bounds[1].to(self.dtype),
+            min(steps, task.steps),
         ).to(self.device)
         self._complete([task.name], missions, bounds)
 
     def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:
         noise = self._actuator_noise(tensordict["mission", "seed"])
         return self.simulation.advance(tensordict, noise)
+
+    def _begun(self, mission: TensorDictBase, rows: Tensor | None) -> dict[str, Tensor]:
+        return self.simulation.begin(mission, self.dtype, rows)
 
     def _missions_of(self, given: TensorDictBase | None, batch: torch.Size) -> TensorDict:
         mission = super()._missions_of(given, batch)
@@ -128,13 +132,23 @@ class TaskSimulation(nn.Module, PhasedSimulation):
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
 
-    def begin(self, mission: TensorDictBase, dtype: torch.dtype) -> dict[str, Tensor]:
-        """Return the state at the beginning of missions."""
+    def begin(
+        self, mission: TensorDictBase, dtype: torch.dtype, rows: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Return the state at the beginning of missions; only ``rows`` are asked for."""
         first = {
             name: value.to(self.low.device, dtype if value.is_floating_point() else value.dtype)
-            for name, value in self.task.begin(mission["seed"]).items()
+            for name, value in self.task.begin(mission["seed"], rows).items()
         }
         return self.started(first.pop("pose"), mission, len(self.low), **first)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return what environments that keep their state to themselves have lived through."""
+        return self.task.history()
+
+    def set_extra_state(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`get_extra_state` returned."""
+        self.task.replay(state)
 
     def displaced(self, pose: Tensor, noise: Tensor) -> Tensor:
         """Return poses as they are: the task draws where missions begin."""

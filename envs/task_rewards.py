@@ -157,8 +157,8 @@ def stand(state: Tensor, action: Tensor, after: Tensor) -> Tensor:
 
 
 def upright(state: Tensor, action: Tensor, after: Tensor) -> Tensor:
-    """Return how well the pole stands in the middle, at most 0."""
-    return -(after[..., 1].square() + 0.05 * after[..., 0].square())
+    """Return how well the pole stands in the middle, at most 0; a fall costs 1 a step."""
+    return -(after[..., 1].square() + 0.05 * after[..., 0].square()) - fallen(after).to(after)
 
 
 def reach(state: Tensor, action: Tensor, after: Tensor) -> Tensor:

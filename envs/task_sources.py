@@ -9,6 +9,7 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
 from afm_rl.envs.task import Reward, Task
+from afm_rl.envs.task_hosts import environment_task
 from afm_rl.envs.task_rewards import DM_CONTROL, GYMNASIUM, Rewards
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.manifold import Manifold
@@ -32,7 +34,11 @@ def gymnasium_task(
     action_low: Limits = None,
     action_high: Limits = None,
 ) -> Task:
-    """Return a MuJoCo task of gymnasium, or its pendulum.
+    """Return a task of gymnasium.
+
+    Of MuJoCo tasks and of Pendulum-v1 the state is whole and the physics are known; of others the
+    state is the observation, and a model has to be learned, see
+    :func:`~afm_rl.envs.environment_task`.
 
     Args:
         id: name in gymnasium's registry.
@@ -54,14 +60,20 @@ def gymnasium_task(
             env = gymnasium.make(id)
     except (gymnasium.error.Error, ImportError, AttributeError) as error:
         raise ConfigurationError(f"robot.id={id!r}: {error}") from error
-    steps = steps or (env.spec.max_episode_steps if env.spec else None) or 1000
-    known = _known("robot.id", id, GYMNASIUM, reward, getattr(env.unwrapped, "model", None))
     limits = action_low, action_high
+    steps = steps or (env.spec.max_episode_steps if env.spec else None) or 1000
+    inner: Any = env.unwrapped
+    if not hasattr(inner, "model") and id not in GYMNASIUM:
+        from torchrl.envs import GymEnv
+
+        make = partial(GymEnv, id)
+        return environment_task(make, reward, steps, 0.05, "observation", *limits, id)
+    known = _known("robot.id", id, GYMNASIUM, reward, getattr(inner, "model", None))
     if id == "Pendulum-v1":
 
         def begin(seed: int) -> tuple[Tensor, Tensor]:
             env.reset(seed=seed)
-            return torch.tensor(env.unwrapped.state), NOWHERE
+            return torch.tensor(inner.state), NOWHERE
 
         return Task(
             name=id,
@@ -75,12 +87,10 @@ def gymnasium_task(
             dt=0.05,
             steps=steps,
         )
-    if not hasattr(env.unwrapped, "model"):
-        raise ConfigurationError(f"robot.id={id}: expected a MuJoCo task, or Pendulum-v1")
 
     def start(seed: int) -> tuple[Tensor, Tensor]:
         env.reset(seed=seed)
-        return _state_of(env.unwrapped.data), NOWHERE
+        return _state_of(inner.data), NOWHERE
 
     return _mujoco(id, MuJoCoDynamics(env), start, known, steps, *limits)
 
@@ -174,7 +184,11 @@ def mujoco_task(
             "robot.reward=MODULE.FUNCTION"
         )
     noise = check_number("robot.start_noise", start_noise, low=0.0)
-    world = MuJoCoDynamics(xml, check_count("robot.frame_skip", frame_skip))
+    skip = check_count("robot.frame_skip", frame_skip)
+    try:
+        world = MuJoCoDynamics(xml, skip)
+    except ConfigurationError as error:
+        raise ConfigurationError(str(error).replace("dynamics.model", "robot.xml")) from error
     data = mujoco.MjData(world.mjcf)
     if world.mjcf.nkey:
         mujoco.mj_resetDataKeyframe(world.mjcf, data, 0)
@@ -189,7 +203,7 @@ def mujoco_task(
     return _mujoco(name, world, start, {"reward": reward}, steps, *limits)
 
 
-def own_task(
+def function_task(
     step: Callable[[Tensor, Tensor], Tensor],
     reward: Reward,
     action_low: Sequence[float],
@@ -199,7 +213,6 @@ def own_task(
     angles: Sequence[int] = (),
     steps: int = 1000,
     dt: float = 0.1,
-    name: str = "own",
 ) -> Task:
     """Return a task whose world is a step function.
 
@@ -213,7 +226,6 @@ def own_task(
         angles: state coordinates that wrap at +-pi.
         steps: length of an episode.
         dt: time of a step (s).
-        name: short name.
     """
     first = torch.tensor([float(value) for value in start])
 
@@ -222,7 +234,7 @@ def own_task(
         return first + start_noise * drawn, NOWHERE
 
     return Task(
-        name=name,
+        name=getattr(step, "__name__", "function"),
         world=KnownDynamics(step, Manifold(len(first), angles), len(action_low)),
         start=begin,
         reward=reward,
@@ -249,15 +261,24 @@ def pendulum_step(state: Tensor, action: Tensor) -> Tensor:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Silence what packages say of missing screens, and of old settings in their own files."""
+    try:
+        from mujoco import set_mju_user_warning as say
+    except ImportError:  # an extra
+
+        def say(function: Callable[[str], None] | None) -> None:
+            """Do nothing."""
+
     logger = logging.getLogger("absl")
     before = logger.level
     logger.setLevel(logging.ERROR)
+    say(lambda message: None)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
         logger.setLevel(before)
+        say(None)
 
 
 def _known(

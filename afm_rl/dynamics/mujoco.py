@@ -65,6 +65,8 @@ def _parse(source: str | Path) -> Any:
         if not Path(text).is_file():
             raise ConfigurationError(f"dynamics.model={text}: no such file")
         return mujoco.MjModel.from_xml_path(text)
+    except ConfigurationError:
+        raise
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise ConfigurationError(f"dynamics.model={text[:80]!r}: {reason}") from error
@@ -199,22 +201,14 @@ class MuJoCoDynamics(KnownDynamics):
             position, velocity = noise_std
             noise_std = [position] * found.nv + [velocity] * found.nv + [position] * found.na
         super().__init__(simulator, space_of(found), found.nu, noise_std)
+        self.mjcf = found
+        self.dt = skip * float(found.opt.timestep)
         low, high = torch.as_tensor(found.actuator_ctrlrange).unbind(-1)
         limited = torch.as_tensor(found.actuator_ctrllimited).bool()
         self.action_low = torch.where(limited, low, -torch.inf)
         self.action_high = torch.where(limited, high, torch.inf)
         half = torch.where(limited, (high - low) / 2, 1.0)
         self.action_steps = STEP * torch.cat([torch.zeros(1, found.nu), half.diag()])
-
-    @property
-    def mjcf(self) -> Any:
-        """The compiled ``MjModel``."""
-        return self.step.settings[0]
-
-    @property
-    def dt(self) -> float:
-        """Time of an action (s)."""
-        return self.step.settings[1] * self.mjcf.opt.timestep
 
     @property
     def names(self) -> tuple[list[str], list[str]]:

@@ -1,6 +1,7 @@
 """Missions: compose an agent from a configuration and run it."""
 
 from afm_rl.missions.build import Agent, build
+from afm_rl.missions.collected import Collection
 from afm_rl.missions.laps import LapScore
 from afm_rl.missions.prepare import prepare
 from afm_rl.missions.return_score import ReturnScore
@@ -12,6 +13,7 @@ from afm_rl.missions.tracking_score import TrackingScore
 
 __all__ = [
     "Agent",
+    "Collection",
     "LapScore",
     "Results",
     "ReturnScore",

@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.missions.collected import Collection
 from afm_rl.missions.laps import LapScore
 from afm_rl.missions.score import Score
 from afm_rl.regimes import Regime, Schedule
@@ -60,6 +61,8 @@ class Robot:
             to plan with; see :class:`~afm_rl.planning.KnownReward`.
         reward_reads: entries of the environment that it reads after the states, with their sizes.
         dt: time of an action (s), for correctors that are not told.
+        data: how transitions are collected from which models are learned; None where these are
+            drawn from the nominal physics, in the boxes above.
     """
 
     name: str
@@ -87,6 +90,7 @@ class Robot:
     reward: Callable[..., Tensor] | None = None
     reward_reads: Mapping[str, int] = field(default_factory=dict)
     dt: float | None = None
+    data: Collection | None = None
 
     def __post_init__(self) -> None:
         """Check that boxes, names and features fit the model.

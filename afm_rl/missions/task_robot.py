@@ -8,6 +8,7 @@ from typing import Any
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
+from afm_rl.missions.collected import Collection
 from afm_rl.missions.return_score import ReturnScore
 from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Compose, Regime, Schedule, actuator_regimes
@@ -27,6 +28,8 @@ class TaskRobot(Robot):
         regime: what else can happen to actions, instead.
         schedule: when it does.
         features: state coordinates that the dynamics depend on; those the task names if None.
+        data: how transitions are collected for models that are learned; from the boxes of states
+            and actions and the nominal model if None.
         settings: of the source; ``reward`` and ``step`` may be given as ``module.function``.
 
     Raises:
@@ -41,6 +44,7 @@ class TaskRobot(Robot):
         regime: Regime | None = None,
         schedule: Schedule | None = None,
         features: Sequence[int] | None = None,
+        data: Collection | None = None,
         **settings: Any,
     ) -> None:
         code = {key: settings[key] for key in CODE if isinstance(settings.get(key), str)}
@@ -75,6 +79,7 @@ class TaskRobot(Robot):
             families={name: {"draw": [name]} for name in families},
             score=ReturnScore(task.steps, task.goal_names),
             dt=task.dt,
+            data=data,
             reward=task.planned,
             reward_reads={"goal": len(task.goal_names)} if task.goal_names else {},
         )
