@@ -23,10 +23,8 @@ How a stale sensor and a robot that stands still differ:
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
-READINGS = ("observation", "trace")  # what sensors write into the tensordict of our environments
 ABSURD = 1e12  # in any unit: a reading beyond it is a fault, also where an angle would wrap it
 PATIENCE = 20  # repetitions in a row that count as a stale sensor
 
@@ -118,23 +116,3 @@ def safe_action(action: Tensor, low: Tensor, high: Tensor, last: Tensor) -> tupl
     held = ~action.isfinite().all(-1)
     sound = torch.where(held.unsqueeze(-1), last.nan_to_num(), action.to(last.dtype))
     return sound.clamp(low, high), held
-
-
-def blanked(tensordict: TensorDictBase, sound: Tensor) -> TensorDictBase:
-    """Return a transition whose next readings are NaN where it is not ``sound`` ``(*B)``.
-
-    Updaters refuse transitions with NaN, so nothing is learned there.
-
-    Args:
-        tensordict: a transition, ``(*B)``; it stays as it is.
-        sound: where it can be learned from.
-    """
-    if bool(sound.all()):
-        return tensordict
-    following = tensordict["next"].copy()
-    for key in READINGS:
-        if key in following.keys():
-            value = following[key]
-            kept = sound.reshape(*sound.shape, *[1] * (value.dim() - sound.dim()))
-            following[key] = torch.where(kept, value, torch.nan)
-    return tensordict.copy().set("next", following)

@@ -31,7 +31,10 @@ HYDRA = ("hydra_plugins", "hydra._internal.core_plugins")
 """Launchers and sweepers; Hydra itself takes no other classes from there."""
 TRUST = "AFM_RL_TRUST"
 """Environment variable in which the command line tells its other processes what is trusted."""
+CODE = ("reward", "step")
+"""Settings of a robot that may name a function."""
 STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
+PLACES = [f"robot.{name}" for name in CODE]
 HANDLERS = ("logging.StreamHandler", "logging.FileHandler")
 
 
@@ -77,7 +80,7 @@ def check_targets(settings: Any, trust: Iterable[str] = ()) -> None:
     trust = [*trusted(), *check_trust(list(trust))]
     for place, target in _targets(settings, ""):
         _check_name(place, target, [*ALLOWED, *trust])
-        found = _find(place, target)
+        found = find_code(place, target)
         home = str(getattr(found, "__module__", None) or type(found).__module__)
         makes = isinstance(found, type) or home == FACTORIES
         if not _inside(home, [*ALLOWED, *trust]) or (_inside(home, MISSIONS) and not makes):
@@ -111,7 +114,7 @@ def check_composed(settings: Mapping[str, Any], trust: Iterable[str] = ()) -> No
 
 def _targets(settings: Any, place: str) -> Iterator[tuple[str, Any]]:
     for where, key, value in _texts(settings, place):
-        if key == "_target_":
+        if key == "_target_" or (where in PLACES and isinstance(value, str)):
             yield where, value
 
 
@@ -145,8 +148,12 @@ def _inside(name: str, packages: Iterable[str]) -> bool:
     return any(name == package or name.startswith(f"{package}.") for package in packages)
 
 
-def _find(place: str, target: str) -> Any:
-    """Return what a dotted name leads to; the way must not leave its package."""
+def find_code(place: str, target: str) -> Any:
+    """Return the class or function that a dotted name leads to; whether it is trusted is not asked.
+
+    Raises:
+        ConfigurationError: if there is none, or the way to it leaves its package.
+    """
     first, *rest = target.split(".")
     try:
         found: Any = import_module(first)

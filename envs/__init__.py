@@ -17,6 +17,10 @@ from afm_rl.envs.references import (
 )
 from afm_rl.envs.rendering import TrackCanvas
 from afm_rl.envs.settings import schedule_in_seconds
+from afm_rl.envs.task import Task
+from afm_rl.envs.task_env import TaskEnv
+from afm_rl.envs.task_hosts import environment_task
+from afm_rl.envs.task_sources import dm_control_task, function_task, gymnasium_task, mujoco_task
 from afm_rl.envs.track import Track
 from afm_rl.envs.tracks import load_track
 from afm_rl.envs.ugv import UGVTrack
@@ -34,14 +38,21 @@ __all__ = [
     "MissionNoise",
     "Reference",
     "Table",
+    "Task",
+    "TaskEnv",
     "Track",
     "TrackCanvas",
     "UGVTrack",
     "UGVTrackGym",
     "UGVTrackVectorEnv",
     "Waypoints",
+    "dm_control_task",
+    "environment_task",
     "find_reference",
+    "gymnasium_task",
     "load_reference",
     "load_track",
+    "mujoco_task",
+    "function_task",
     "schedule_in_seconds",
 ]

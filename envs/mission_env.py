@@ -124,6 +124,10 @@ class MissionEnv(EnvBase):
     def _check_pose(self, pose: Tensor) -> None:
         """Check states that missions are to go on from."""
 
+    def _begun(self, mission: TensorDictBase, rows: Tensor | None) -> dict[str, Tensor]:
+        """Return the state at the beginning of missions, of which only ``rows`` count."""
+        return self.simulation.begin(mission, self.dtype)
+
     def _described(
         self, mission: TensorDictBase, state: dict[str, Tensor], rows: Tensor | None
     ) -> TensorDictBase:
@@ -138,7 +142,7 @@ class MissionEnv(EnvBase):
         mission = self._missions_of(given, batch)
         rows = given.get("_reset", None)
         rows = None if rows is None else rows.reshape(batch)
-        state = self.simulation.begin(mission, self.dtype)
+        state = self._begun(mission, rows)
         if set_state and "pose" in given.keys():
             self._check_pose(given["pose"])
             state = {

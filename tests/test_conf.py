@@ -5,6 +5,7 @@ import functools
 import itertools
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_module
@@ -35,6 +36,9 @@ SMALL = {  # settings that are there are made small
     "corrector.train.iterations": 5,
     "budget": 5,
 }
+ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+OWN = [f"robot.xml={ASSETS / 'inverted_pendulum.xml'}"]
+OWN += ["robot.reward=afm_rl.envs.task_rewards.upright"]
 PARTNERS = {  # what else must be chosen for a choice to make sense
     "dynamics=oracle": ["updater=oracle"],
     "dynamics=knode": ["robot=quadrotor"],
@@ -58,6 +62,8 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "method=afm_offline_knode": ["robot=quadrotor"],
     "method=afm_online_knode": ["robot=quadrotor"],
     "cost=tracking": ["robot=quadrotor"],
+    "cost=reward": ["robot=gymnasium"],
+    "robot=mujoco": OWN,
 }
 
 

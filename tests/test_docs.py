@@ -21,8 +21,8 @@ PAGES = [
     *sorted((DOCS / "howto").glob("*.md")),
     *sorted((DOCS / "methods").glob("*.md")),
 ]
-FENCE = re.compile(r"^```(python|yaml|sh)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-NAME = re.compile(r"# (\S+\.(?:py|yaml))\n")
+FENCE = re.compile(r"^```(python|yaml|sh|xml)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+NAME = re.compile(r"(?:# |<!-- )(\S+\.(?:py|yaml|xml))(?: -->)?\n")
 PATHS = re.compile(r"`((?:afm_rl|envs|conf|examples|notebooks|tests|benchmarks)/[\w./]+)`")
 
 
@@ -61,7 +61,7 @@ def desk(monkeypatch, tmp_path):
 def write_files(page, folder):
     """Write the blocks that are files; return the other Python blocks."""
     rest = []
-    for kind in ("python", "yaml"):
+    for kind in ("python", "yaml", "xml"):
         for text in blocks(page, kind):
             named = NAME.match(text)
             if named:

@@ -10,6 +10,7 @@ from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.mujoco import MuJoCoDynamics
 from afm_rl.dynamics.oracle import Oracle
 from afm_rl.dynamics.quadrotor import Quadrotor
+from afm_rl.dynamics.unknown import UnknownDynamics
 
 __all__ = [
     "KNODE",
@@ -22,6 +23,7 @@ __all__ = [
     "MuJoCoDynamics",
     "Oracle",
     "Quadrotor",
+    "UnknownDynamics",
     "dubins_step",
     "effective_action",
 ]

@@ -6,20 +6,21 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.dynamics.base import DynamicsModel, linearised
+from afm_rl.dynamics.hammerstein import PLAIN, shaped, shaped_slope
 from afm_rl.dynamics.per_mission import PerMissionModel
 from afm_rl.errors import ConfigurationError
 
-CALIBRATION = ("matrix", "bias", "slip", "offset")
+CALIBRATION = ("matrix", "bias", "shape", "offset")
 
 
 class Calibrated(PerMissionModel):
     r"""A frozen model behind a static map of its action and in front of an offset.
 
     .. math:: f(s, a) = \mathrm{model}(s,\ a') \oplus c,\qquad
-              a' = h \odot (D\,\psi(a / h) + b),\qquad \psi(u) = u\,e^{-\kappa |u|}
+              a' = h \odot (D\,\psi(a / h) + b)
 
-    with h the half ranges of the action. D, b and the slip :math:`\kappa \ge 0` (a Hammerstein
-    model: the more command, the less traction) describe what other actions can undo (*matched*
+    with h the half ranges of the action. D, b and the static shape :math:`\psi`
+    (:func:`~afm_rl.dynamics.hammerstein.shaped`) describe what other actions can undo (*matched*
     uncertainty), c what no action can (*unmatched*). For missions whose calibration is the
     identity, predictions are those of the model to the bit.
 
@@ -44,7 +45,7 @@ class Calibrated(PerMissionModel):
     half_range: Tensor
     matrix: Tensor
     bias: Tensor
-    slip: Tensor
+    shape: Tensor
     offset: Tensor
 
     def __init__(self, model: DynamicsModel, half_range: Tensor) -> None:
@@ -64,15 +65,15 @@ class Calibrated(PerMissionModel):
         self.register_buffer("half_range", half_range, persistent=False)
         self.register_buffer("matrix", torch.eye(size))
         self.register_buffer("bias", torch.zeros(size))
-        self.register_buffer("slip", torch.zeros(()))
+        self.register_buffer("shape", torch.tensor(PLAIN))
         self.register_buffer("offset", torch.zeros(model.manifold.tangent_size))
 
     def calibrate_(self, **calibration: Tensor) -> None:
         """Set parts of the calibration, in place.
 
         Args:
-            calibration: any of ``matrix`` ``(*L, A, A)``, ``bias`` ``(*L, A)``, ``slip``
-                ``(*L)`` and ``offset`` ``(*L, D)``.
+            calibration: any of ``matrix`` ``(*L, A, A)``, ``bias`` ``(*L, A)``, ``shape``
+                ``(*L, 3)`` and ``offset`` ``(*L, D)``.
         """
         for name, value in calibration.items():
             now = self.get_buffer(name)
@@ -83,8 +84,8 @@ class Calibrated(PerMissionModel):
         unit = action / self.half_range
         matrix, moved = self._wide(self.matrix, action), self._wide(self.bias, action)
         command = unit
-        if _any(self.slip):
-            command = unit * (-self._wide(self.slip, action).unsqueeze(-1) * unit.abs()).exp()
+        if _any(self.shape != self.shape.new_tensor(PLAIN)):
+            command = shaped(unit, self._wide(self.shape, action))
         for axis in range(self.action_size):  # faster than products of very small matrices
             moved = torch.addcmul(moved, matrix[..., axis], command[..., axis, None])
         return action + self.half_range * (moved - unit)  # plus exactly 0 for the identity
@@ -92,6 +93,14 @@ class Calibrated(PerMissionModel):
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the expected next state ``(*L, *N, S)``."""
         return self._shifted(self.model(state, self.effective(action)))
+
+    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+        """Return the states of whole plans: as the model does it, where there is no offset."""
+        states = self.model.rollout(state, self.effective(actions))
+        if _any(self.offset):
+            moved = self._wide((self.offset != 0).any(-1, keepdim=True), states)
+            states = torch.where(moved.bool(), super().rollout(state, actions), states)
+        return states
 
     def forecast(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return expected next state and noise scale, as the model has them."""
@@ -147,9 +156,8 @@ class Calibrated(PerMissionModel):
 
     def _slope(self, action: Tensor) -> Tensor:
         """Return the derivative of a' ``(*L, *N, A, A)``."""
-        matrix, slip = self._wide(self.matrix, action), self._wide(self.slip, action)
-        size = slip.unsqueeze(-1) * (action / self.half_range).abs()
-        bend = (-size).exp() * (1 - size)
+        matrix, shape = self._wide(self.matrix, action), self._wide(self.shape, action)
+        bend = shaped_slope(action / self.half_range, shape)
         return self.half_range.unsqueeze(-1) * matrix * (bend / self.half_range).unsqueeze(-2)
 
     def _wide(self, part: Tensor, like: Tensor) -> Tensor:

@@ -48,7 +48,7 @@ def effective_action(
 
     A model that is affine in its action takes one round. With others, a round moves each axis by
     half a range at most, a row is only changed where its error becomes smaller (its next step is
-    a quarter as long where it does not), and the rounds end early when little is left that an
+    a quarter as long where it does not), and its rounds end early when little is left that an
     action can explain. ``std`` grows by the root mean square of the normalised error that remains,
     where that exceeds 1: a contact that the rounds did not resolve tells little.
 
@@ -83,11 +83,13 @@ def effective_action(
         std = (ASSUMED * half_range).expand_as(action)
         return EffectiveAction(action.to(dtype), std.to(dtype), innovation.to(dtype))
     effective, limit = action, torch.ones_like(innovation).unsqueeze(-1)
+    going, covariance = limit > 0, limit.double().unsqueeze(-1)
     for last in (False,) * (rounds - 1) + (True,):
         jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()
         precision = jacobian.mT @ jacobian
         precision.diagonal(dim1=-2, dim2=-1).add_(UNSEEN**-2)
-        covariance = torch.cholesky_inverse(torch.linalg.cholesky_ex(precision).L)
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(precision).L)
+        covariance = torch.where(going.unsqueeze(-1), inverse, covariance)
         slope = jacobian.mT @ error.unsqueeze(-1).double()
         step = (covariance @ slope).squeeze(-1)
         if model.affine:
@@ -95,11 +97,12 @@ def effective_action(
             break
         trial = effective + (step.clamp(-limit, limit) * half_range).to(action)
         remaining = model.manifold.difference(next_state, model(state, trial)) / noise
-        better = remaining.square().sum(-1, True) < error.square().sum(-1, True)
+        better = going & (remaining.square().sum(-1, True) < error.square().sum(-1, True))
         effective = torch.where(better, trial, effective)
         error = torch.where(better, remaining, error)
         limit = limit * torch.where(better, 1.0, 0.25)
-        if last or not bool(((step * slope.squeeze(-1)).sum(-1) > ENOUGH).any()):
+        going = going & ((step * slope.squeeze(-1)).sum(-1, True) > ENOUGH)
+        if last or not bool(going.any()):
             break
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     if not model.affine:  # what the rounds could not explain, per coordinate

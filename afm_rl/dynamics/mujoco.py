@@ -65,6 +65,8 @@ def _parse(source: str | Path) -> Any:
         if not Path(text).is_file():
             raise ConfigurationError(f"dynamics.model={text}: no such file")
         return mujoco.MjModel.from_xml_path(text)
+    except ConfigurationError:
+        raise
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise ConfigurationError(f"dynamics.model={text[:80]!r}: {reason}") from error
@@ -83,6 +85,29 @@ def space_of(model: Any) -> MuJoCoSpace:
         elif kind == mujoco.mjtJoint.mjJNT_FREE:
             quaternions.append(int(first) + 3)
     return MuJoCoSpace(model.nq + model.nv + model.na, angles, quaternions)
+
+
+def state_names(model: Any) -> list[str]:
+    """Name positions ``q_JOINT``, velocities ``v_JOINT`` and activations ``w_k``."""
+    places, turn, rates = ("_x", "_y", "_z"), ("_qw", "_qx", "_qy", "_qz"), ("_wx", "_wy", "_wz")
+    positions, velocities = [], []
+    ends: tuple[str, ...]
+    moves: tuple[str, ...]
+    for joint, kind in enumerate(model.jnt_type):
+        name = model.joint(joint).name or str(joint)
+        ends, moves = ("",), ("",)  # of a slide or a hinge
+        if kind == mujoco.mjtJoint.mjJNT_BALL:
+            ends, moves = turn, rates
+        elif kind == mujoco.mjtJoint.mjJNT_FREE:
+            ends, moves = (*places, *turn), (*places, *rates)
+        positions += [f"q_{name}{end}" for end in ends]
+        velocities += [f"v_{name}{end}" for end in moves]
+    return [*positions, *velocities, *(f"w_{k}" for k in range(model.na))]
+
+
+def actuator_names(model: Any) -> list[str]:
+    """Return the names of actuators; those without one are called ``a_k``."""
+    return [model.actuator(k).name or f"a_{k}" for k in range(model.nu)]
 
 
 class Simulator:
@@ -176,12 +201,19 @@ class MuJoCoDynamics(KnownDynamics):
             position, velocity = noise_std
             noise_std = [position] * found.nv + [velocity] * found.nv + [position] * found.na
         super().__init__(simulator, space_of(found), found.nu, noise_std)
+        self.mjcf = found
+        self.dt = skip * float(found.opt.timestep)
         low, high = torch.as_tensor(found.actuator_ctrlrange).unbind(-1)
         limited = torch.as_tensor(found.actuator_ctrllimited).bool()
         self.action_low = torch.where(limited, low, -torch.inf)
         self.action_high = torch.where(limited, high, torch.inf)
         half = torch.where(limited, (high - low) / 2, 1.0)
         self.action_steps = STEP * torch.cat([torch.zeros(1, found.nu), half.diag()])
+
+    @property
+    def names(self) -> tuple[list[str], list[str]]:
+        """Names of the state coordinates, ``q_JOINT``, ``v_JOINT``, ``w_...``, and of actions."""
+        return state_names(self.mjcf), actuator_names(self.mjcf)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the next state ``(*B, S)``."""

@@ -5,17 +5,19 @@ from afm_rl.learning.fitting import FitReport, fit_ensemble
 from afm_rl.learning.gate import fit_gate, largest_innovation
 from afm_rl.learning.hook import UpdaterHook
 from afm_rl.learning.knode_updater import KNODEUpdater
+from afm_rl.learning.learner import Learner
 from afm_rl.learning.loss import InPlaceLoss
 from afm_rl.learning.mass_estimator import MassEstimator
 from afm_rl.learning.nll import GaussianNLLLoss, gaussian_nll
 from afm_rl.learning.obgd import ObGD
+from afm_rl.learning.online_updater import OnlineUpdater
 from afm_rl.learning.pretrain import pretrain_ensemble
 from afm_rl.learning.pretrain_knode import pretrain_knode
 from afm_rl.learning.reset_adam import ResetAdam
 from afm_rl.learning.rls_updater import RLSUpdater
 from afm_rl.learning.stream_x import StreamXUpdater
 from afm_rl.learning.unmatched_updater import UnmatchedUpdater
-from afm_rl.learning.updater import OnlineUpdater, OracleUpdater, Updater
+from afm_rl.learning.updater import OracleUpdater, Updater
 
 __all__ = [
     "FitReport",
@@ -23,6 +25,7 @@ __all__ = [
     "GaussianNLLLoss",
     "InPlaceLoss",
     "KNODEUpdater",
+    "Learner",
     "MassEstimator",
     "ObGD",
     "OnlineUpdater",

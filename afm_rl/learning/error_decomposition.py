@@ -58,9 +58,13 @@ def decompose_error(
     gram = jacobian.mT @ jacobian
     ridge = 1e-6 * gram.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(1e-12)
     gram.diagonal(dim1=-2, dim2=-1).add_(ridge.unsqueeze(-1))
-    matched = jacobian @ torch.linalg.inv_ex(gram).inverse @ jacobian.mT
+    inverse = torch.linalg.inv_ex(gram).inverse @ jacobian.mT
+    matched = jacobian @ inverse
     eye = torch.eye(noise.shape[-1], device=noise.device, dtype=matched.dtype)
     projection = (eye - matched).to(error)
     unmatched = (projection @ error.unsqueeze(-1)).squeeze(-1)
     weight = (half_range / found.std).square()
-    return ErrorParts(found.action / half_range, weight, unmatched, projection, noise)
+    effective = found.action / half_range
+    if model.affine:  # exact but for the prior: undo its small pull towards the executed action
+        effective = effective + (inverse @ error.unsqueeze(-1).double()).squeeze(-1).to(action)
+    return ErrorParts(effective, weight, unmatched, projection, noise)

@@ -22,8 +22,8 @@ from afm_rl.faults import whole
 from afm_rl.keys import as_key
 from afm_rl.learning.flight_window import FlightWindow, Rows
 from afm_rl.learning.knode_fit import fit_network
+from afm_rl.learning.learner import Learner
 from afm_rl.learning.nll import GaussianNLLLoss
-from afm_rl.learning.updater import Updater
 from afm_rl.mission_state import MissionState
 from afm_rl.streams import Streams
 
@@ -47,7 +47,7 @@ class Pending(NamedTuple):
         return cls(*(torch.zeros(0) for _ in cls._fields))
 
 
-class KNODEUpdater(Updater):
+class KNODEUpdater(Learner):
     r"""A new network for every window of a flight (Jiahao et al. 2022, Online-KNODE-MPC).
 
     Rows (state, action, next state) are gathered for ``window`` seconds. A new network is then
@@ -58,7 +58,7 @@ class KNODEUpdater(Updater):
 
     Rows are the plant's own time steps where the transition has a ``trace``: states
     ``(*B, K + 1, S)`` at K equal steps of the tick, start and end included. Without, there is
-    one row per tick. Transitions that are refused (:class:`~afm_rl.learning.Updater`) or that
+    one row per tick. Transitions that are refused (:class:`~afm_rl.learning.Learner`) or that
     ``mask_key`` excludes are left out.
 
     Time is counted in calls since :meth:`start`, for all missions alike. Missions learn from
@@ -96,8 +96,6 @@ class KNODEUpdater(Updater):
     >>> bool((losses[-1] < losses[0]).all())
     True
     """
-
-    learns = True
 
     def __init__(
         self,
@@ -140,7 +138,6 @@ class KNODEUpdater(Updater):
             None if key is None else as_key(key) for key in (trace_key, seed_key)
         )
         self.streams = Streams(salt=4, seed=check_count("updater.seed", seed, low=0))
-        self.claim()
         self.window, self.pending = FlightWindow(), MissionState(Pending.empty())
         self.tick, self.due = 0, NONE
 

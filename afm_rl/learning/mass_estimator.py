@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import cast
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from afm_rl.airframe import saturate
 from afm_rl.dynamics import Oracle, Quadrotor
 from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.learning.learner import Learner
 from afm_rl.learning.nll import GaussianNLLLoss
-from afm_rl.learning.updater import Updater
 from afm_rl.rotations import body_z_axis
 
 
@@ -40,7 +40,7 @@ def inverse_mass(
     return lift / (thrust * dt * axis.square().sum(-1))
 
 
-class MassEstimator(Updater):
+class MassEstimator(Learner):
     r"""Tells a model the mass that the last changes of velocity speak for.
 
     :func:`inverse_mass` per tick, low-passed:
@@ -55,24 +55,26 @@ class MassEstimator(Updater):
         least: lowest factor of the nominal mass that is believed.
         most: highest one.
 
-    Ticks without a finite measurement leave the estimate as it is and are counted in
-    :attr:`refused` if their loss is not finite.
+    Ticks that are refused (:class:`~afm_rl.learning.Learner`) or without a finite measurement
+    leave the estimate as it is.
 
     Raises:
         ConfigurationError: for a setting or model that cannot be used.
 
+    >>> from tensordict import TensorDict
     >>> from afm_rl.regimes import MassFactor
     >>> updater = MassEstimator(GaussianNLLLoss(Oracle(Quadrotor(), MassFactor())), share=1.0)
     >>> level = torch.zeros(2, 13).index_fill(1, torch.tensor(9), 1.0)
     >>> action = torch.tensor([[0.2943, 0, 0, 0], [0.44145, 0, 0, 0]])
     >>> td = TensorDict({"observation": level, "action": action}, [2])
-    >>> _ = updater(td.set(("next", "observation"), level))  # both hover
+    >>> hovering = level.index_fill(1, torch.tensor(0), 1e-3)  # a bit aside: a fresh reading
+    >>> _ = updater(td.set(("next", "observation"), hovering))
     >>> updater.model.parameters_now
     tensor([[1.0000],
             [1.5000]])
     """
 
-    sets = "regime"
+    learns, sets = False, "regime"
 
     def __init__(
         self,
@@ -100,7 +102,6 @@ class MassEstimator(Updater):
         )
         self.least = check_number("updater.least", least, low=0.0, open_low=True)
         self.most = check_number("updater.most", most, low=self.least, open_low=True)
-        self.claim()
 
     @property
     def model(self) -> Oracle:
@@ -114,17 +115,17 @@ class MassEstimator(Updater):
             regime = torch.tensor(self.model.regime.identity)
             self.model.tell(regime.expand(*tensordict.batch_size, -1).clone())
 
-    @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Measure the loss, then tell the new estimate."""
-        batch = tensordict.batch_size
-        if self.model.parameters_now.shape[:-1] != batch:
+        if self.model.parameters_now.shape[:-1] != tensordict.batch_size:
             self.start(tensordict)
-        loss = super().forward(tensordict)["loss"]
-        self.refused += int((~loss.isfinite()).sum())
+        return super().forward(tensordict)
+
+    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+        """Tell the new estimate."""
         physics = cast(Quadrotor, self.model.model)
         body = physics.body
-        state, action, after = (tensordict.get(key) for key in self.loss.in_keys)
+        state, action, after = (transitions.get(key) for key in self.loss.in_keys)
         thrust = saturate(action, body)[..., 0]
         axis = (body_z_axis(state[..., 6:10]) + body_z_axis(after[..., 6:10])) / 2
         enough = thrust >= self.least_thrust * body.hover_thrust
@@ -134,6 +135,5 @@ class MassEstimator(Updater):
         factor = told[..., self.column]
         inverse = torch.lerp(1 / factor, seen * body.mass, self.share)
         fresh = 1 / inverse.clamp(1 / self.most, 1 / self.least)
-        told[..., self.column] = torch.where(enough & seen.isfinite(), fresh, factor)
+        told[..., self.column] = torch.where(learn & enough & seen.isfinite(), fresh, factor)
         self.model.tell(told)
-        return TensorDict({"loss": loss}, batch)

@@ -13,7 +13,7 @@ from afm_rl.dynamics import Ensemble
 from afm_rl.errors import ConfigurationError, check_choice
 from afm_rl.learning.nll import GaussianNLLLoss, gaussian_nll
 from afm_rl.learning.obgd import ObGD
-from afm_rl.learning.updater import OnlineUpdater
+from afm_rl.learning.online_updater import OnlineUpdater
 
 FORMS = ("error", "loss")
 

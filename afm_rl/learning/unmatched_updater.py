@@ -11,7 +11,8 @@ from torch import Tensor
 from afm_rl.errors import ConfigurationError, check_instance, check_number
 from afm_rl.learning.error_decomposition import decompose_error
 from afm_rl.learning.nll import GaussianNLLLoss
-from afm_rl.learning.updater import OnlineUpdater, Updater
+from afm_rl.learning.online_updater import OnlineUpdater
+from afm_rl.learning.updater import Updater
 
 MASK = "unmatched"
 
@@ -85,7 +86,7 @@ class UnmatchedUpdater(Updater):
         """Measure the loss, then learn."""
         with torch.no_grad():
             loss = self.loss(tensordict)["loss_nll"]
-        shown = tensordict.select(*self.loss.in_keys).copy()
+        shown = tensordict.select(*self.loss.in_keys, self.updater.sound_key, strict=False).copy()
         state, action, after = (shown.get(key) for key in self.loss.in_keys)
         scale = self.scale.to(action)
         with torch.no_grad():

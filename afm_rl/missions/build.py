@@ -26,7 +26,7 @@ from afm_rl.missions.selection import (
     select_seeds,
     select_tracks,
 )
-from afm_rl.planning import PlanningEnv
+from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.targets import check_targets
 from afm_rl.transforms import ActionFlowTransform, Guard
 
@@ -123,6 +123,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     model, transform = dynamics.module, corrector.module
     with blaming("cost"):
         cost = instantiate(settings["cost"], _convert_="all")
+        cost = cost if isinstance(cost, Cost) else cost(robot)
     planner = make("planner", PlanningEnv(model, cost, *robot.action_box))
     guard = Guard()
     executed_key = ("next", guard.key("executed_action"))

@@ -44,7 +44,7 @@ def blaming(group: str) -> Iterator[None]:
         raise
     except InstantiationException as error:
         last: BaseException = error
-        while last.__cause__ is not None:
+        while last.__cause__ is not None and not isinstance(last, AFMError):
             last = last.__cause__
         if isinstance(last, AFMError):
             raise ConfigurationError(str(last)) from error

@@ -7,6 +7,7 @@ it as a :class:`Training`, so that everything is built and checked before anythi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,12 +16,22 @@ from torch import nn
 
 from afm_rl.artefacts import load_artefact
 from afm_rl.correction import ActionFlow, Corrector, L1Augmentation, LeastSquares, PaperFlow
-from afm_rl.dynamics import KNODE, Calibrated, Ensemble, Oracle, Quadrotor
-from afm_rl.errors import AFMError, ConfigurationError, check_flag
+from afm_rl.dynamics import (
+    KNODE,
+    Calibrated,
+    DynamicsModel,
+    Ensemble,
+    Oracle,
+    Quadrotor,
+    UnknownDynamics,
+)
+from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_flag
 from afm_rl.flow import train_flow
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
+from afm_rl.missions.collected import fit_collected
 from afm_rl.missions.robot import Robot
+from afm_rl.planning.costs import SATURATIONS, KnownReward
 from afm_rl.transforms import ActionFlowTransform
 
 
@@ -50,12 +61,12 @@ class Part(NamedTuple):
 
 def physics(robot: Robot) -> Part:
     """Return the robot's nominal physics."""
-    return Part(robot.model)
+    return Part(_known(robot))
 
 
 def oracle(robot: Robot) -> Part:
     """Return the nominal physics seen through the true regime."""
-    return Part(Oracle(robot.model, robot.regime), settings={"model": "oracle"})
+    return Part(Oracle(_known(robot), robot.regime), settings={"model": "oracle"})
 
 
 def calibrated(robot: Robot, base: Callable[[Robot], Part]) -> Part:
@@ -71,11 +82,16 @@ def calibrated(robot: Robot, base: Callable[[Robot], Part]) -> Part:
 
 
 def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part:
-    """Return an ensemble to be pre-trained on the nominal physics."""
+    """Return an ensemble to be pre-trained on the nominal physics, or on what a robot collects."""
     nominal = robot.model
     least = {"samples": pretrain.get("batch_size", 1)}
     check_training("dynamics.pretrain", pretrain_ensemble, pretrain, **least)
     model = Ensemble(nominal.manifold, nominal.action_size, list(robot.features), **settings)
+    own = _without(settings, "propagation", "precision")
+    unit = "standard deviations of the data"
+    if robot.data is not None:
+        fit = partial(fit_collected, model, robot, robot.data)
+        return Part(model, Training("ensemble", model, fit, unit, [own]), own)
 
     def train(progress: bool) -> float:
         boxes = robot.state_box, robot.action_box
@@ -83,8 +99,7 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
         given = {"names": names, "progress": progress, **pretrain}
         return pretrain_ensemble(model, nominal, *boxes, **given).error
 
-    shape = {"pretrain": dict(pretrain), **_without(settings, "propagation", "precision")}
-    unit = "standard deviations of the data"
+    shape = {"pretrain": dict(pretrain), **own}
     return Part(model, Training("ensemble", model, train, unit, [shape]), shape)
 
 
@@ -127,6 +142,22 @@ def knode(
     shape = {"pretrain": dict(pretrain), "randomised": randomised, **settings}
     unit = "standard deviations of the model"
     return Part(model, Training("KNODE", model, train, unit, [shape]), shape)
+
+
+def reward(robot: Robot, saturation: str = "clip") -> KnownReward:
+    """Return the cost that is the negative reward of the robot's task.
+
+    Args:
+        robot: one with a reward.
+        saturation: see :class:`~afm_rl.planning.GoalDistance`.
+    """
+    if robot.reward is None:
+        raise ConfigurationError(
+            f"cost=reward: robot={robot.name} has no reward; choose cost=goal_position, or a "
+            "robot with a task: gymnasium, dm_control or mujoco"
+        )
+    check_choice("cost.saturation", saturation, SATURATIONS)
+    return KnownReward(robot.reward, list(robot.reward_reads), list(robot.reward_reads.values()))
 
 
 def no_correction(robot: Robot, dynamics: Part) -> Part:
@@ -239,6 +270,13 @@ def _training(
 
     shape = {**own, "train": settings}
     return Training("flow", flow, train, unit, [dynamics.settings or {}, shape])
+
+
+def _known(robot: Robot) -> DynamicsModel:
+    """Return the nominal physics, if there are any."""
+    if isinstance(robot.model, UnknownDynamics):
+        robot.model(torch.zeros(0), torch.zeros(0))  # says what to do
+    return robot.model
 
 
 def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:

@@ -9,16 +9,19 @@ from afm_rl.correction import PaperFlow
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.learning import fit_gate
 from afm_rl.missions.build import Agent
+from afm_rl.missions.collected import transitions
 from afm_rl.sampling import uniform
 
 TRANSITIONS = 20_000
+EPISODE = 800  # transitions under the planner
 
 
 @torch.no_grad()
 def fit_agents_gate(agent: Agent) -> float | None:
     """Fit the gate to ``false_alarms`` on fresh transitions of the nominal robot; return it.
 
-    States and actions are drawn from the boxes of the pre-training.
+    States and actions are drawn from the boxes of the pre-training; a robot that collects its data
+    is planned for, as in missions.
 
     Returns:
         The gate, or None where it stays as it was set: without a corrector, over equations, for
@@ -30,6 +33,9 @@ def fit_agents_gate(agent: Agent) -> float | None:
         return None
     if isinstance(transform.corrector, PaperFlow):
         return None
+    if agent.robot.data is not None:
+        healthy = transitions(agent.robot, EPISODE, agent.robot.data.seed + 1000, agent.planner)
+        return fit_gate(transform.corrector, agent.model, healthy, rate)
     robot, generator = agent.robot, torch.Generator().manual_seed(1)
     state = robot.model.manifold.project(uniform(*robot.state_box, TRANSITIONS, generator))
     action = uniform(*robot.action_box, TRANSITIONS, generator)

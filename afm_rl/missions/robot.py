@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.missions.collected import Collection
 from afm_rl.missions.laps import LapScore
 from afm_rl.missions.score import Score
 from afm_rl.regimes import Regime, Schedule
@@ -19,6 +20,8 @@ from afm_rl.regimes import Regime, Schedule
 SHAPE_TRAINING = (
     *("action_low", "action_high", "state_low", "state_high"),
     *("features", "model", "regime", "flow_low", "flow_high"),
+    *("source", "domain", "task", "id", "xml", "reward", "step", "frame_skip", "start", "angles"),
+    *("start_noise", "steps", "data"),
 )
 """What training data depend on."""
 
@@ -54,6 +57,12 @@ class Robot:
             the robot; all if None.
         place: indices of the state coordinates in which the ground may differ, if any.
         place_scale: distance at which ground counts as other ground, in their unit.
+        reward: the reward of its task, ``reward(state, action, next_state, *task)``, if it has one
+            to plan with; see :class:`~afm_rl.planning.KnownReward`.
+        reward_reads: entries of the environment that it reads after the states, with their sizes.
+        dt: time of an action (s), for correctors that are not told.
+        data: how transitions are collected from which models are learned; None where these are
+            drawn from the nominal physics, in the boxes above.
     """
 
     name: str
@@ -78,6 +87,10 @@ class Robot:
     hypotheses: Sequence[str] | None = None
     place: Sequence[int] = ()
     place_scale: float = 1.0
+    reward: Callable[..., Tensor] | None = None
+    reward_reads: Mapping[str, int] = field(default_factory=dict)
+    dt: float | None = None
+    data: Collection | None = None
 
     def __post_init__(self) -> None:
         """Check that boxes, names and features fit the model.

@@ -15,7 +15,6 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from afm_rl.errors import NonFiniteError
-from afm_rl.faults import blanked
 from afm_rl.measures import Measures
 from afm_rl.missions.build import Agent
 from afm_rl.missions.checkpoint import Checkpoints, Stopped
@@ -139,7 +138,7 @@ def _advance(agent: Agent, loop: Loop) -> None:
     errors, innovation = _errors(agent, td)
     guard = td["next", "guard"]
     fault = guard["held"] | ~(guard["sound"] | (innovation < STILL))
-    loss = agent.updater(blanked(td, guard["sound"]))["loss"]
+    loss = agent.updater(td)["loss"]
     loop.log.add(ids, loop.step, _row(agent, td, errors, innovation, loss, fault))
     if agent.faults == "raise" and bool(fault.any()):
         raise NonFiniteError(

@@ -1,5 +1,6 @@
 """Regimes: what changes under the robot, and when."""
 
+from afm_rl.regimes.actuators import actuator_regimes
 from afm_rl.regimes.asymmetric import AsymmetricGain
 from afm_rl.regimes.backlash import Backlash
 from afm_rl.regimes.base import Regime
@@ -52,6 +53,7 @@ __all__ = [
     "Schedule",
     "WheelSlip",
     "Wind",
+    "actuator_regimes",
     "blend_phases",
     "flight_regimes",
     "phase_parameters",

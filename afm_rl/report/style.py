@@ -12,6 +12,7 @@ import io
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -54,7 +55,11 @@ class Style(NamedTuple):
         width, apart = 2.6 - 0.3 * self.place, 0.28
         (line,) = axes.plot(x, y, color=self.color, linestyle=self.linestyle, linewidth=width)
         line.set(marker=self.marker, markersize=5.0, markeredgecolor="white", markeredgewidth=0.5)
-        line.set(markevery=(0.02 + apart * self.place / FEW, apart), gid=gid, **look)
+        values = np.asarray(y, dtype=float)
+        seen = bool((np.isfinite(values) & (values != 0)).any())  # a logarithmic scale hides zeros
+        line.set(
+            markevery=(0.02 + apart * self.place / FEW, apart) if seen else [], gid=gid, **look
+        )
         return line
 
     def handle(self) -> Line2D:

@@ -1,9 +1,12 @@
 """A model behind a calibration of its action."""
 
+import math
+
 import pytest
 import torch
 
 from afm_rl.dynamics import Calibrated, Dubins, Quadrotor
+from afm_rl.dynamics.hammerstein import PLAIN, shaped, shaped_slope
 from afm_rl.errors import ConfigurationError
 
 HALF = torch.tensor([1.0, 1.5])
@@ -22,10 +25,10 @@ def calibrated(base=None, missions=None, dtype=torch.float64):
         return torch.randn((*model.lead, *shape), generator=draw, dtype=dtype)
 
     size = base.action_size
-    slip = 0.4 + 0.01 * normal().abs()
+    shape = torch.tensor([0.1, 0.7, 0.4], dtype=dtype) + 0.01 * normal(3).abs()
     matrix, bias = torch.eye(size) + 0.3 * normal(size, size), 0.1 * normal(size)
     offset = 0.01 * normal(base.manifold.tangent_size)
-    model.calibrate_(matrix=matrix, bias=bias, slip=slip, offset=offset)
+    model.calibrate_(matrix=matrix, bias=bias, shape=shape, offset=offset)
     return model
 
 
@@ -56,8 +59,22 @@ def test_missions_without_a_calibration_stay_as_they_are_beside_others(transitio
     matrix[1], offset[1] = 2.0, 0.1
     model.calibrate_(matrix=matrix, offset=offset)
     state, action = transitions(3, 50)
-    same = (model(state, action) == base(state, action)).flatten(1).all(-1)
-    assert same.tolist() == [True, False, True]
+    plans = action.reshape(3, 5, 10, 2)
+    for found, nominal in (
+        (model(state, action), base(state, action)),
+        (model.rollout(state[:, 0], plans), base.rollout(state[:, 0], plans)),
+    ):
+        assert (found == nominal).flatten(1).all(-1).tolist() == [True, False, True]
+
+
+def test_plans_are_steps_in_a_row(transitions):
+    model = calibrated(missions=3)
+    for offset in (model.offset, torch.zeros_like(model.offset)):
+        model.calibrate_(offset=offset)
+        state, action = transitions(3, 20, dtype=torch.float64)
+        plans = action.reshape(3, 4, 5, 2)
+        expected = super(Calibrated, model).rollout(state[:, 0], plans)
+        torch.testing.assert_close(model.rollout(state[:, 0], plans), expected)
 
 
 @pytest.mark.parametrize("missions", [None, 4])
@@ -69,8 +86,7 @@ def test_what_it_predicts(transitions, missions):
         lead = model.lead
         return part.reshape(*lead, *(1,) * (2 - len(lead)), *part.shape[len(lead) :])
 
-    unit = action / model.half_range
-    unit = unit * (-wide(model.slip).unsqueeze(-1) * unit.abs()).exp()
+    unit = shaped(action / model.half_range, wide(model.shape))
     moved = (wide(model.matrix) @ unit.unsqueeze(-1)).squeeze(-1) + wide(model.bias)
     moved = moved * model.half_range
     expected = model.manifold.add(model.model(state, moved), wide(model.offset))
@@ -91,6 +107,8 @@ def test_what_it_predicts(transitions, missions):
 def test_derivatives_are_those_of_the_prediction(base, make, offset, transitions):
     state, action = make(3, 2) if make else transitions(3, 2, dtype=torch.float64)
     model = calibrated(base.double(), missions=3)
+    if make:  # its actions are small against the half ranges
+        model.calibrate_(shape=torch.tensor(PLAIN))
     if not offset:
         model.calibrate_(offset=torch.zeros(model.manifold.tangent_size))
     ahead, by_state, by_action = model.linearise(state, action)
@@ -132,3 +150,22 @@ def test_what_cannot_be_calibrated(make_ensemble):
     for half in (torch.ones(3), torch.tensor([1.0, 0.0])):
         with pytest.raises(ConfigurationError, match="dynamics.half_range=.*2 numbers > 0"):
             Calibrated(Dubins(), half)
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected"),
+    [
+        (PLAIN, [-0.8, -0.1, 0.0, 0.3, 0.9]),
+        ((0.2, math.inf, 0.0), [-0.6, 0.0, 0.0, 0.1, 0.7]),
+        ((0.0, 0.5, 0.0), [-0.5, -0.1, 0.0, 0.3, 0.5]),
+        ((0.2, 0.5, 0.0), [-0.3, 0.0, 0.0, 0.1, 0.3]),
+        ((0.0, math.inf, 1.0), [u * math.exp(-abs(u)) for u in (-0.8, -0.1, 0.0, 0.3, 0.9)]),
+    ],
+)
+def test_shapes_and_their_slopes(shape, expected):
+    unit = torch.tensor([-0.8, -0.1, 0.0, 0.3, 0.9], dtype=torch.float64)
+    shape = torch.tensor(shape, dtype=torch.float64)
+    torch.testing.assert_close(shaped(unit, shape), torch.tensor(expected, dtype=torch.float64))
+    step = 1e-7
+    slope = (shaped(unit + step, shape) - shaped(unit - step, shape)) / (2 * step)
+    torch.testing.assert_close(shaped_slope(unit, shape), slope, atol=1e-6, rtol=0)

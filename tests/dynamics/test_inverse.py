@@ -190,3 +190,22 @@ def test_a_dead_axis_has_the_largest_standard_deviation():
     )
     torch.testing.assert_close(found.std, torch.tensor([0.01, 8.0]), rtol=1e-3, atol=0)
     torch.testing.assert_close(found.action, torch.tensor([1.0, 0.0]), rtol=1e-3, atol=1e-3)
+
+
+def test_a_row_alone_is_found_as_among_others():
+    """Rows need a different number of rounds: each ends for itself."""
+
+    def step(state, action):
+        return state + action + action**3
+
+    model = KnownDynamics(step, Manifold(2), 2, noise_std=1e-2)
+    draw = torch.Generator().manual_seed(0)
+    state, action = torch.zeros(40, 2).double(), torch.rand(40, 2, generator=draw).double() - 0.5
+    size = 10.0 ** -torch.arange(40).remainder(5).double().unsqueeze(-1)
+    worth = action + size * torch.randn(40, 2, generator=draw).double()
+    reached = step(state, worth)
+    together = seen(model, state, action, reached)
+    for row in range(40):
+        alone = seen(model, *(part[row] for part in (state, action, reached)))
+        for one, many in zip(alone, together, strict=True):
+            torch.testing.assert_close(one, many[row], rtol=1e-12, atol=1e-12)

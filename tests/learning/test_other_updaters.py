@@ -1,10 +1,10 @@
-"""Updaters that do not learn."""
+"""Updaters that do not learn, and what learners learn from."""
 
 import torch
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins, Oracle
-from afm_rl.learning import GaussianNLLLoss, OracleUpdater, Updater
+from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, OracleUpdater, Updater
 
 
 def transition(state, action, next_state):
@@ -40,3 +40,16 @@ def test_the_oracle_is_told_the_regime_of_the_next_action(gains, transitions):
     loss = updater(td)["loss"]  # measured with what held during the transition
     torch.testing.assert_close(loss, torch.zeros(3), rtol=0, atol=1e-6)
     assert torch.equal(oracle.parameters_now, later)
+
+
+def test_a_guard_that_is_there_says_what_is_stale(make_ensemble, transitions):
+    updater = OnlineUpdater(GaussianNLLLoss(make_ensemble()), torch.optim.Adam)
+    state, action = transitions(3)
+    fresh, stale = (transition(state, action, after) for after in (state + 0.1, state))
+    assert updater(fresh)["loss"].isfinite().all() and updater(stale)["loss"].isnan().all()
+    for td in (fresh, stale):  # the guard's verdict, whatever the readings look like
+        td["next", "guard", "sound"] = torch.tensor([True, False, True])
+        assert updater(td)["loss"].isfinite().tolist() == [True, False, True]
+    stale["next", "observation"][2] = torch.nan
+    assert updater(stale)["loss"].isfinite().tolist() == [True, False, False]
+    assert updater.refused == 3 + 1 + 1 + 2

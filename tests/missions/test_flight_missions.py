@@ -170,11 +170,16 @@ def test_who_learns_keeps_the_height_better(fly, method):
     assert learner["mse_z"] < 0.2 * physics["mse_z"]
 
 
-def test_networks_learn_from_the_plants_own_steps_and_by_seed(fly):
-    settings = {"updater.begin": 0.0, "updater.epochs": 2, "budget": 5}
-    flown = fly("method=online_knode", seeds=2, **settings)
+def test_networks_learn_from_the_plants_own_steps_and_by_seed(make_agent):
+    settings = {**QUICK, "updater.begin": 0.0, "updater.epochs": 2, "budget": 6}
+    agent, windows = make_agent("robot=quadrotor", "method=online_knode", seeds=2, **settings), []
+
+    def look(loop):
+        windows.append(agent.updater.window.parts.state.shape)
+
+    flown = run(agent, stopped=look)
     # three ticks went into a network, which came a tick later; two wait for the next
-    assert flown.agent.updater.window.parts.state.shape == (2, 1, 2 * 25, 13)
+    assert windows[4] == (2, 1, 2 * 25, 13)
     first, second = (rows["loss"].to_numpy() for _, rows in flown.steps.groupby("mission"))
     assert (first[:4] == second[:4]).all() and first[4] != second[4]
 

@@ -10,7 +10,7 @@ import torch
 
 from afm_rl.artefacts import read_tensors
 from afm_rl.errors import AFMError, ArtefactError, ConfigurationError
-from afm_rl.learning import Updater
+from afm_rl.learning import Learner
 from afm_rl.mission_state import MissionState
 from afm_rl.missions import run
 from afm_rl.missions.checkpoint import Checkpoints, Stopped
@@ -216,10 +216,8 @@ class Latest(NamedTuple):
     reward: torch.Tensor
 
 
-class Curious(Updater):
+class Curious(Learner):
     """An updater that remembers something of a new kind; the last part of each name says how."""
-
-    learns = True
 
     def __init__(self, loss, kind):
         super().__init__(loss)

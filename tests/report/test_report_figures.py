@@ -54,6 +54,13 @@ def test_pictures_have_the_size_of_print(draw, make_results):
     assert DPI == 150
 
 
+def test_a_model_that_is_never_wrong_has_nothing_to_show_on_a_logarithmic_scale(make_results):
+    missions, steps = make_results(seeds=1)
+    exact = missions.loc[missions["method"] == "physics", "mission"]
+    steps.loc[steps["mission"].isin(exact), "error"] = 0.0
+    assert pixels(draw_learning(missions, steps, "m, rad")).std() > 0
+
+
 def test_letters_are_large_enough_to_read(draw, make_results):
     figure = draw(*make_results(seeds=2, v_gains=[-1.0, 2.0]))
     png_bytes(figure)  # labels of ticks come about here

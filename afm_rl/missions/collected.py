@@ -1,0 +1,94 @@
+"""Models of robots whose physics are not asked: learned from what their environment shows."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Compose, TransformedEnv
+
+from afm_rl.dynamics import Ensemble
+from afm_rl.errors import ConfigurationError, check_count, check_counts
+from afm_rl.learning import collect, fit_ensemble
+from afm_rl.planning import PlanningEnv
+from afm_rl.planning.costs import KnownReward
+
+if TYPE_CHECKING:
+    from afm_rl.missions.robot import Robot
+
+EPISODES = 8  # at a time
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collection:
+    """How transitions are collected, with nominal dynamics.
+
+    Args:
+        planner: makes a planner from a :class:`~afm_rl.planning.PlanningEnv`.
+        rounds: transitions of each round: random actions first, then those of the planner, in the
+            model that was learned from all rounds before.
+        fit: settings of :func:`~afm_rl.learning.fit_ensemble`.
+        seed: of the episodes.
+    """
+
+    planner: Callable[[PlanningEnv], TensorDictModuleBase]
+    rounds: Sequence[int] = (2000, 1000)
+    fit: Mapping[str, Any] = field(default_factory=dict)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check counts.
+
+        Raises:
+            ConfigurationError: for numbers that cannot be used.
+        """
+        check_counts("robot.data.rounds", self.rounds, least=1)
+        check_count("robot.data.seed", self.seed, low=0)
+
+
+def transitions(
+    robot: Robot, frames: int, seed: int, planner: TensorDictModuleBase | None = None
+) -> TensorDictBase:
+    """Return transitions of the nominal robot, by a planner or by random actions."""
+    env = robot.env(
+        tracks=list(robot.tracks)[:1],
+        regime=robot.regime,
+        schedule=robot.schedule,
+        max_steps=frames,
+        action_low=robot.action_low,
+        action_high=robot.action_high,
+        batch_size=[EPISODES],
+        seed=10_000 * (seed + 1),  # missions are counted from 0
+    )
+    if planner is not None and hasattr(planner, "make_tensordict_primer"):
+        env = TransformedEnv(env, Compose(planner.make_tensordict_primer()))
+    logger = logging.getLogger("torchrl")  # tells of every buffer
+    before = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        return collect(env, planner, frames, seed=10_000 * (seed + 1))[:]
+    finally:
+        logger.setLevel(before)
+
+
+def fit_collected(model: Ensemble, robot: Robot, how: Collection, progress: bool) -> float:
+    """Collect transitions round by round and fit the model to all; return its held-out error."""
+    if robot.reward is None:
+        raise ConfigurationError(f"robot.data: {robot.name} has no reward to plan with")
+    cost = KnownReward(robot.reward, list(robot.reward_reads), list(robot.reward_reads.values()))
+    first, parts, planner = copy.deepcopy(model.state_dict()), [], None
+    error = 0.0
+    for number, frames in enumerate(how.rounds):
+        with torch.no_grad():
+            parts.append(transitions(robot, frames, how.seed + number, planner))
+        model.load_state_dict(first)
+        settings = {"seed": how.seed, **how.fit, "progress": progress}
+        error = fit_ensemble(model, torch.cat(parts), names=robot.state_names, **settings).error
+        planner = how.planner(PlanningEnv(model, cost, *robot.action_box))
+    return error

@@ -1,0 +1,102 @@
+"""Missions in which there are rewards to collect."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from afm_rl.measures import Measure, Measures
+from afm_rl.missions.score import Score
+
+SOON = 20  # steps that count as "at" the change, and over which a recovery is told
+ENOUGH = 0.1  # share of the reward before that may be missing after a recovery
+
+
+class ReturnScore(Score):
+    r"""What was collected, before and after a change of the dynamics.
+
+    Let the change be that to the first phase that is not nominal (to the second one, where all
+    are), after c of T steps. Table: ``return``, the sum of rewards; ``before``, ``at`` and
+    ``after``, mean rewards per step in the steps [c/2, c), [c, c + 20) and [(c + T)/2, T);
+    ``recovery_steps``, the steps from c to the first 20 whose mean reward reaches ``before`` less a
+    tenth of its size; ``steps``; ``finished``, whether the mission did not
+    end early. Steps after an early end have no reward. What does not exist is NaN.
+
+    Args:
+        steps: most steps of a mission.
+        goal_names: coordinates of the goal, which are logged, too.
+    """
+
+    measures = Measures(
+        (
+            Measure("return", "return", "return", digits=1, headline=True),
+            Measure("before", "before", "reward per step before the change", digits=3),
+            Measure("at", "at", "reward per step right after the change", digits=3),
+            Measure("after", "after", "reward per step after the change", digits=3, headline=True),
+            Measure(*("recovery_steps", "recovery", "steps until recovered", "", "lower")),
+        )
+    )
+    reads = ("pose",)
+
+    def __init__(self, steps: int, goal_names: Sequence[str] = ()) -> None:
+        self.steps = steps
+        self.columns = ("reward", *(f"goal_{name}" for name in goal_names))
+
+    def goal(self, td: TensorDictBase) -> Tensor:
+        """Return no coordinates: the goal need not be a place."""
+        return td["observation"][..., :0]
+
+    def row(self, td: TensorDictBase) -> Tensor:
+        """Return the reward, and the goal if there is one."""
+        goal = [td["goal"]] if len(self.columns) > 1 else []
+        return torch.cat([td["next", "reward"], *goal], -1)
+
+    def start(self, missions: TensorDictBase) -> dict[str, Tensor]:
+        """Return no rewards, and nothing lost."""
+        count = len(missions)
+        return {"rewards": torch.zeros(count, self.steps), "ended": torch.zeros(count)}
+
+    def add(self, sums: dict[str, Tensor], ids: Tensor, td: TensorDictBase) -> None:
+        """Write the reward down."""
+        reward = td["next", "reward"].squeeze(-1)
+        sums["rewards"][ids, td["step"]] = reward.to(sums["rewards"])
+        sums["ended"][ids] = td["next", "terminated"].squeeze(-1).to(sums["ended"])
+
+    def table(
+        self, env: EnvBase, missions: TensorDictBase, sums: dict[str, Tensor]
+    ) -> dict[str, Any]:
+        """Return the columns."""
+        steps = env.simulation.steps
+        rewards = sums["rewards"][:, :steps].double()
+        parts = zip(rewards, env.simulation.changes_at(missions["mission"]).tolist(), strict=True)
+        rows = torch.tensor([_measured(row, at) for row, at in parts], dtype=torch.float64)
+        names = ("before", "at", "after", "recovery_steps")
+        return {
+            "return": rewards.sum(1),
+            **dict(zip(names, rows.unbind(-1), strict=True)),
+            "steps": sums["steps"].int(),
+            "finished": sums["ended"] == 0,
+        }
+
+
+def _measured(rewards: Tensor, change: int) -> list[float]:
+    """Return the mean rewards before, at and after a change, and the steps of the recovery.
+
+    >>> _measured(torch.tensor([1.0] * 100 + [0.0] * 30 + [1.0] * 70), change=100)
+    [1.0, 0.0, 1.0, 28.0]
+    """
+    middle = (change + len(rewards)) // 2
+    spans = (change // 2, change), (change, change + SOON), (middle, len(rewards))
+    before, at, after = (rewards[a:b].mean().item() for a, b in spans)
+    later, recovery = rewards[change:], math.nan
+    if len(later) >= SOON:
+        means = later.unfold(0, SOON, 1).mean(-1)
+        good = (means >= before - ENOUGH * abs(before)).nonzero()
+        recovery = float(good[0]) if len(good) else math.nan
+    return [before, at, after, recovery]

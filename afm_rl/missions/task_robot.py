@@ -1,0 +1,85 @@
+"""A robot made from somebody else's task."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import ConfigurationError
+from afm_rl.missions.collected import Collection
+from afm_rl.missions.return_score import ReturnScore
+from afm_rl.missions.robot import Robot
+from afm_rl.regimes import Compose, Regime, Schedule, actuator_regimes
+from afm_rl.targets import CODE, find_code
+
+
+class TaskRobot(Robot):
+    """A robot of which a task says everything.
+
+    Regimes are those of :func:`~afm_rl.regimes.actuator_regimes`; each of these families can be
+    asked for by its name. The nominal model is the task's own world, if not told otherwise.
+
+    Args:
+        source: makes the task, an :class:`afm_rl.envs.Task`, from the ``settings``.
+        make: makes the environment from the task.
+        model: another nominal model.
+        regime: what else can happen to actions, instead.
+        schedule: when it does.
+        features: state coordinates that the dynamics depend on; those the task names if None.
+        data: how transitions are collected for models that are learned; from the boxes of states
+            and actions and the nominal model if None.
+        settings: of the source; ``reward`` and ``step`` may be given as ``module.function``.
+
+    Raises:
+        ConfigurationError: if the model does not fit the task.
+    """
+
+    def __init__(
+        self,
+        source: Callable[..., Any],
+        make: Callable[..., Any],
+        model: DynamicsModel | None = None,
+        regime: Regime | None = None,
+        schedule: Schedule | None = None,
+        features: Sequence[int] | None = None,
+        data: Collection | None = None,
+        **settings: Any,
+    ) -> None:
+        code = {key: settings[key] for key in CODE if isinstance(settings.get(key), str)}
+        found = {key: find_code(f"robot.{key}", name) for key, name in code.items()}
+        task = source(**{**settings, **found})
+        model = task.world if model is None else model
+        sizes = model.state_size, model.action_size
+        wanted = len(task.state_names), len(task.low)
+        if sizes != wanted:
+            raise ConfigurationError(
+                f"robot.model: {sizes[0]} state coordinates and {sizes[1]} actions; expected "
+                f"{wanted[0]} and {wanted[1]}, as {task.name} has them: "
+                f"{', '.join((*task.state_names, *task.action_names))}"
+            )
+        low, high, first = list(task.low), list(task.high), task.start(0)[0].tolist()
+        families = actuator_regimes(low, high)
+        prior = [["gain"], ["bias"], ["gain", "bias"]]
+        super().__init__(
+            name=task.name,
+            state_names=task.state_names,
+            action_names=task.action_names,
+            action_low=low,
+            action_high=high,
+            state_low=[value - 1.0 for value in first],
+            state_high=[value + 1.0 for value in first],
+            features=list(task.features) if features is None else features,
+            env=partial(make, task),
+            model=model,
+            regime=Compose(families, prior) if regime is None else regime,
+            schedule=Schedule([0.5]) if schedule is None else schedule,
+            tracks=[task.name],
+            families={name: {"draw": [name]} for name in families},
+            score=ReturnScore(task.steps, task.goal_names),
+            dt=task.dt,
+            data=data,
+            reward=task.planned,
+            reward_reads={"goal": len(task.goal_names)} if task.goal_names else {},
+        )

@@ -1,0 +1,127 @@
+"""Somebody else's task: the few facts by which missions can be run in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import ConfigurationError
+from afm_rl.planning.costs import check_arguments
+
+Reward = Callable[..., Tensor]
+ENDLESS = 1e30  # what unbounded specs say
+PROBE = 2, 3  # batch in which a reward is tried
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """A task whose world is a dynamics model.
+
+    Args:
+        name: short name.
+        world: how the world moves, from whole states ``(*B, S)`` and effective actions.
+        start: returns the first state ``(S,)`` and the goal ``(G,)`` for a seed.
+        reward: ``reward(state, action, next_state, *goal) -> reward``, batched.
+        low: lowest action, ``(A,)``.
+        high: highest action, ``(A,)``.
+        dt: time of a step (s).
+        steps: length of an episode.
+        state_names: of the state coordinates.
+        action_names: of the action's components.
+        goal_names: of the goal's coordinates; none without a goal.
+        plan: the reward to plan with; that of the task if None.
+        ends: ``ends(next_state) -> bool``, where episodes end early; nowhere if None.
+        features: state coordinates that the dynamics depend on; all if none.
+        draw: draws states ``(T, S)`` and a goal as pictures; None if nothing can.
+
+    Raises:
+        ConfigurationError: for actions without limits, or a reward that cannot be used.
+    """
+
+    name: str
+    world: DynamicsModel
+    start: Callable[[int], tuple[Tensor, Tensor]]
+    reward: Reward
+    low: Sequence[float]
+    high: Sequence[float]
+    dt: float
+    steps: int
+    state_names: Sequence[str]
+    action_names: Sequence[str]
+    goal_names: Sequence[str] = ()
+    plan: Reward | None = None
+    ends: Callable[[Tensor], Tensor] | None = None
+    features: Sequence[int] = ()
+    draw: Callable[..., Any] | None = None
+
+    def __post_init__(self) -> None:
+        """Check limits and rewards."""
+        bounds = torch.tensor([list(self.low), list(self.high)])
+        endless = (~(bounds.abs() < ENDLESS).all(0)).nonzero().flatten().tolist()
+        if endless:
+            names = ", ".join(self.action_names[axis] for axis in endless)
+            raise ConfigurationError(
+                f"robot: {self.name}: actions {names} have no limits; give robot.action_low and "
+                "robot.action_high"
+            )
+        for reward in (self.reward, self.planned):
+            self._check(reward)
+
+    def _check(self, reward: Reward) -> None:
+        goals = [torch.zeros(*PROBE, len(self.goal_names))] if self.goal_names else []
+        check_arguments("robot.reward", reward, 3 + len(goals))
+        state = self.start(0)[0].float().expand(*PROBE, -1)
+        action = torch.zeros(*PROBE, len(self.low))
+        try:
+            found = reward(state, action, state, *goals)
+        except Exception as error:  # of somebody else's function
+            raise ConfigurationError(
+                f"robot.reward: fails for states {tuple(state.shape)} and actions "
+                f"{tuple(action.shape)}: {error}"
+            ) from error
+        shape = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
+        if shape != PROBE:
+            raise ConfigurationError(
+                f"robot.reward: returned {shape} for states {tuple(state.shape)}; expected a "
+                f"tensor {PROBE}, one number per state"
+            )
+
+    @property
+    def planned(self) -> Reward:
+        """The reward to plan with."""
+        return self.reward if self.plan is None else self.plan
+
+    def begin(self, seeds: Tensor, rows: Tensor | None = None) -> dict[str, Tensor]:
+        """Return ``pose`` ``(*B, S)`` and, if there is one, ``goal`` ``(*B, G)``, by seed.
+
+        Where ``rows`` ``(*B)`` says no, nobody looks at them.
+        """
+        asked = seeds if rows is None else torch.where(rows, seeds, 0)
+        known = {seed: self.start(seed) for seed in set(asked.flatten().tolist())}
+        states, goals = zip(*(known[seed] for seed in asked.flatten().tolist()), strict=True)
+        found = {"pose": torch.stack(states)}
+        if self.goal_names:
+            found["goal"] = torch.stack(goals)
+        return {name: value.reshape(*seeds.shape, -1) for name, value in found.items()}
+
+    def step(self, data: Any, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return next state, reward ``(*B)`` and whether the episode ends ``(*B)``."""
+        state = data["pose"]
+        ahead = self.world(state, action)
+        goal = [data["goal"]] if self.goal_names else []
+        reward = self.reward(state, action, ahead, *goal)
+        lost = ~ahead.isfinite().all(-1)
+        ended = lost if self.ends is None else lost | self.ends(ahead)
+        return ahead, torch.where(lost, 0.0, reward), ended
+
+    def history(self) -> dict[str, Any]:
+        """Return what leads to the present state of a world that keeps it to itself: nothing."""
+        return {}
+
+    def replay(self, history: Mapping[str, Any]) -> None:
+        """Bring such a world into the state that a history led to."""

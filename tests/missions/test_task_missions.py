@@ -1,0 +1,228 @@
+"""Missions in other people's tasks, from settings to tables."""
+
+import math
+import sys
+
+import pandas as pd
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.missions import build, prepare, run
+from afm_rl.missions.checkpoint import Stopped
+from afm_rl.missions.return_score import _measured
+
+FLIP = "regimes=[{gain_0: -1}]"
+SMALL = ["planner.population=16", "planner.elites=4", "planner.horizon=8"]
+MODEL = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="0.1"/></body>
+</worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
+PENDULUM = ["robot=gymnasium", "robot.id=Pendulum-v1"]
+
+
+def agent_of(*overrides):
+    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+        return build(compose("config", list(overrides)), ["tests"])
+
+
+def row_of(*overrides):
+    return run(agent_of(*overrides)).missions.iloc[0]
+
+
+def test_a_reversal_is_undone_in_a_task_of_dm_control():
+    pytest.importorskip("dm_control")
+    reacher = ["robot=dm_control", "robot.domain=reacher", "robot.task=easy", "robot.steps=60"]
+    flipped = ["regimes=[{gain_0: -1, gain_1: -1}]", "robot.schedule.at=[]", "seeds=[1]"]
+    planner = ["planner.population=24", "planner.elites=6"]
+    found = {
+        method: row_of(*reacher, *flipped, *planner, f"method={method}")
+        for method in ("physics", "afm_physics", "oracle")
+    }
+    assert found["physics"]["after"] < 0.1
+    assert found["afm_physics"]["after"] >= 0.9
+    assert found["oracle"]["after"] >= 0.9
+    assert math.isnan(found["oracle"]["before"])
+
+
+def test_rewards_before_and_after_a_change():
+    rewards = torch.tensor([1.0] * 100 + [0.0] * 30 + [1.0] * 70)
+    assert _measured(rewards, 100) == [1.0, 0.0, 1.0, 28.0]
+    assert _measured(rewards, 0)[1:3] == [1.0, pytest.approx(0.7)]
+    assert math.isnan(_measured(0.0 * rewards + torch.arange(200) // -100, 100)[3])
+    assert _measured(-rewards, 100)[3] == 0.0
+
+
+def test_the_change_comes_when_the_schedule_says(tmp_path):
+    small = [*PENDULUM, *SMALL, "robot.steps=30", FLIP, "method=physics"]
+    for more, at in ((["robot.schedule.at=[0.5]"], 15), (["robot.schedule.at=[]"], 0)):
+        agent = agent_of(*small, *more)
+        results = run(agent)
+        active = results.steps["regime_active"].tolist()
+        assert active.index(1) == at
+        assert agent.base_env.simulation.changes_at(agent.missions["mission"]).item() == at
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["robot=gymnasium", "robot.id=Nothing-v0"], "robot.id='Nothing-v0': .*doesn't exist"),
+        (["robot=gymnasium", "robot.id=Swimmer-v5"], "robot.id=Swimmer-v5: its reward is not"),
+        (["robot=dm_control", "robot.domain=nothing"], "robot.domain=nothing robot.task=hard: "),
+        (["robot=dm_control", "robot.task=nothing"], "robot.domain=reacher robot.task=nothing: "),
+        (["robot=mujoco"], "robot.xml: expected a setting"),
+        (["robot=mujoco", "robot.xml=no.xml", "robot.reward=tests.x"], "robot.reward='tests.x': "),
+        ([*PENDULUM, "robot.reward=os.getcwd"], "robot.reward='os.getcwd': only parts of afm_rl"),
+        ([*PENDULUM, "tracks=ethz_2"], "tracks=.*: expected all, or Pendulum-v1"),
+        ([*PENDULUM, "cost=goal_position"], "cost: reads 2 numbers from 'goal'"),
+        (["cost=reward"], "cost=reward: robot=ugv has no reward"),
+    ],
+)
+def test_mistakes_are_said_in_one_line(overrides, message):
+    with pytest.raises(ConfigurationError, match=message) as error:
+        agent_of(*overrides, "method=physics")
+    assert "\n" not in str(error.value)
+
+
+MINE = """
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+class Boat(EnvBase):
+    def __init__(self):
+        super().__init__(batch_size=())
+        self.observation_spec = Composite(observation=Unbounded((2,)))
+        self.action_spec = Bounded(-1.0, 1.0, (1,))
+        self.reward_spec = Unbounded((1,))
+
+    def _set_seed(self, seed):
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.state = torch.rand(2, generator=self.generator)
+        return TensorDict({"observation": self.state.clone()})
+
+    def _step(self, tensordict):
+        place, speed = self.state
+        drift = 0.01 * torch.randn((), generator=self.generator)
+        speed = speed + 0.2 * tensordict["action"][0] + drift
+        self.state = torch.stack([place + 0.1 * speed, speed])
+        out = {"observation": self.state.clone(), "reward": -self.state[:1].abs()}
+        return TensorDict({**out, "done": self.state[:1].abs() > 2.0})
+
+class Free(Boat):
+    def __init__(self):
+        super().__init__()
+        self.action_spec = Unbounded((1,))
+
+def home(state, action, after):
+    return -after[..., 0].abs() - 0.1 * after[..., 1].abs()
+
+def wide(state, action, after):
+    return -after.abs()
+
+def short(state):
+    return -state[..., 0].abs()
+
+def glide(state, action):
+    speed = state[..., 1:] + 0.2 * action
+    return torch.cat([state[..., :1] + 0.1 * speed, speed], -1)
+
+def broken(state, action, after):
+    raise KeyError("mine")
+"""
+SOURCE = "_target_: afm_rl.envs.%s, _partial_: true"
+BOAT = ["+robot.env={_target_: mine.Boat, _partial_: true}", "robot.reward=mine.home"]
+LIMITS = ["robot.action_low=[-1]", "robot.action_high=[0]"]
+BOAT += ["robot.source={%s}" % (SOURCE % "environment_task"), "~robot.id", "robot.steps=24"]
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    """Make agents whose settings name code of a module of the user's."""
+    (tmp_path / "mine.py").write_text(MINE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    sys.modules.pop("mine", None)
+
+    def make(*overrides, small=True):
+        size = [*SMALL, "dynamics.members=2", "dynamics.hidden=[16]"] if small else SMALL
+        data = ["robot.data.rounds=[120,40]", "robot.data.fit.epochs=8"]
+        with initialize_config_module("afm_rl.conf", version_base="1.3"):
+            cfg = compose("config", ["robot=gymnasium", FLIP, *size, *data, *overrides])
+        return build(cfg, ["mine"])
+
+    yield make
+    sys.modules.pop("mine", None)
+
+
+@pytest.mark.filterwarnings("ignore:the model leaves")
+def test_an_environment_of_mine_learns_and_goes_on_where_it_was_stopped(mine, tmp_path):
+    chosen = [*BOAT, "method=afm_frozen_pe", "seeds=3", "false_alarms=null"]
+
+    def agent():
+        made = mine(*chosen)
+        prepare(made, tmp_path / "cache", echo=lambda line: None)
+        return made
+
+    whole = run(agent())
+    assert whole.missions["steps"].nunique() > 1 or whole.missions["finished"].all()
+    with pytest.raises(Stopped):
+        run(agent(), checkpoint=tmp_path / "run", stopped=lambda loop: loop.step == 9)
+    again = run(agent(), checkpoint=tmp_path / "run")
+    pd.testing.assert_frame_equal(whole.steps, again.steps, check_exact=True)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ([*BOAT, "method=physics"], "robot.model: the physics of this robot are not known"),
+        ([*BOAT, "robot.reward=mine.wide"], r"robot.reward: returned \(2, 3, 2\) for states"),
+        ([*BOAT, "robot.reward=mine.short"], r"robot.reward\(state\): expected a function of 3"),
+        ([*BOAT, "robot.reward=mine.broken"], "robot.reward: fails for states .*'mine'"),
+        ([*BOAT, "robot.reward=mine.nothing"], "robot.reward='mine.nothing': cannot be found"),
+        ([*BOAT, "robot.reward=null"], "robot.reward: expected a function, to plan with"),
+        ([*BOAT, "robot.env._target_=mine.Free"], "robot: Free: actions a_0 have no limits"),
+        (
+            [
+                *BOAT,
+                "robot.env._target_=mine.Free",
+                "robot.action_low=[-1]",
+                "robot.action_high=[0]",
+            ],
+            "",
+        ),
+        (
+            ["robot.model={_target_: afm_rl.dynamics.Dubins}", "method=physics"],
+            "robot.model: 3 state coordinates and 2 actions; expected 2 and 1, as Pendulum-v1",
+        ),
+    ],
+)
+def test_mistakes_in_code_of_mine_are_said_in_one_line(mine, overrides, message):
+    method = [] if any("method" in text for text in overrides) else ["method=frozen_pe"]
+    small = "method=physics" not in overrides
+    if not message:
+        assert mine(*overrides, *method).robot.action_high == [0]
+        return
+    with pytest.raises(ConfigurationError, match=message) as error:
+        mine(*overrides, *method, small=small)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("xml", "message"),
+    [
+        ("<mujoco><bodi/></mujoco>", "robot.xml='<mujoco><bodi/></mujoco>': .*unrecognized"),
+        ("<mujoco/>", "expected actuators, found none"),
+        (MODEL.replace('ctrlrange="-1 1"', ""), "robot: mjcf: actions a_0 have no limits"),
+        ("nothing.xml", "robot.xml=nothing.xml: no such file"),
+    ],
+)
+def test_mistakes_in_models_are_said_in_one_line(mine, xml, message):
+    pytest.importorskip("mujoco")
+    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+        cfg = compose("config", ["robot=mujoco", "robot.reward=mine.home", "method=physics"])
+    cfg.robot.xml = xml
+    with pytest.raises(ConfigurationError, match=message) as error:
+        build(cfg, ["mine"])
+    assert "\n" not in str(error.value)
