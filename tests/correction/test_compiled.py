@@ -9,7 +9,8 @@ from afm_rl.flow import AxisNetwork
 
 def flow_of(cache, **settings):
     network = AxisNetwork(width=8, latent=8)
-    settings |= {"source_std": 0.0}  # among samples that are as good, rounding would decide
+    # Among samples or hypotheses that are as good, rounding would decide.
+    settings |= {"source_std": 0.0, "hypotheses": ["recent"]}
     return ActionFlow(-torch.ones(1), torch.ones(1), network=network, cache=cache, **settings)
 
 
