@@ -24,13 +24,13 @@ from afm_rl.flow.saturation import LEAST, LIMIT
 GRID = 257  # points of a tabulated map
 EDGE = 1.6  # centres of narrow windows are drawn in this box and cut: many actions saturate
 KINDS = {  # share of each kind of scalar map among the regimes
-    "linear": 0.40,
-    "slip": 0.20,
-    "dead_zone": 0.14,
-    "saturation": 0.06,
-    "asymmetry": 0.06,
-    "distortion": 0.10,
-    "quantisation": 0.04,
+    "linear": 0.52,
+    "slip": 0.17,
+    "dead_zone": 0.12,
+    "saturation": 0.05,
+    "asymmetry": 0.04,
+    "distortion": 0.07,
+    "quantisation": 0.03,
 }
 MIXES = {  # share of each kind of mixing matrix, for two axes or more
     "none": 0.72,
@@ -290,11 +290,11 @@ def draw_examples(
 
 
 def draw_actions(count: int, rows: int, axes: int, draw: Draw) -> Tensor:
-    """Draw executed actions ``(N, K, A)``: half of the windows keep near one action."""
+    """Draw executed actions ``(N, K, A)``: two windows of five keep near one action."""
     wide = draw.uniform(-1.0, 1.0, count, rows, axes)
     around = EDGE * draw.uniform(-1.0, 1.0, count, 1, axes)
     spread = draw.log_uniform(0.01, 0.6, count, 1, axes)
-    return torch.where(draw.chance(0.5, count, 1, 1), wide, (around + spread * wide).clamp(-1, 1))
+    return torch.where(draw.chance(0.6, count, 1, 1), wide, (around + spread * wide).clamp(-1, 1))
 
 
 def draw_masks(count: int, rows: int, draw: Draw) -> tuple[Tensor, Tensor]:
