@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -42,6 +43,12 @@ class MissionState(nn.Module):
         """Replace it."""
         for name, part in zip(self.kind._fields, parts, strict=True):
             self.register_buffer(name, part, persistent=False)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> MissionState:
+        """Move it to another device; its precision is its own, whatever that of the module."""
+        self.keep(self.kind(*(part.to(fn(part).device) for part in self.parts)))
+        self.missions = self.missions.to(fn(self.missions).device)
+        return self
 
     def select_(self, index: Tensor) -> None:
         """Keep the missions in ``index``; what has no rows as yet stays as it is."""

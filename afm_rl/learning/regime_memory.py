@@ -51,7 +51,7 @@ class Memory(NamedTuple):
 class Rules(NamedTuple):
     """How a :class:`Memory` is kept."""
 
-    window: int = 32
+    window: int = 64
     """Transitions that are kept, K; with n simultaneous ones n times as many."""
     forgetting: float = 0.97
     """Weight of a transition relative to the next one, in (0, 1]."""

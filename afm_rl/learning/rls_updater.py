@@ -93,7 +93,7 @@ class RLSUpdater(Learner):
         patience: int = 10,
         confirm: bool = True,
         restart: bool = True,
-        window: int = 32,
+        window: int = 64,
         shapes: bool = True,
         spread: float = 1.0,
         mask_key: NestedKey | None = None,

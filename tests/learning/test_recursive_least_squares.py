@@ -260,6 +260,17 @@ def test_a_stale_sensor_teaches_nothing():
     assert world.errors[-1][0] < 1e-5
 
 
+def test_what_was_learnt_keeps_its_digits():
+    world, other = World(), World()
+    for each in (world, other):
+        each.drive(10, matrix=GAINS)
+    other.updater.float()
+    other.model.double()
+    for each in (world, other):
+        each.drive(3, matrix=GAINS)
+    torch.testing.assert_close(other.model.matrix, world.model.matrix, atol=1e-6, rtol=0)
+
+
 def test_a_mask_says_what_to_learn_from():
     world = World(missions=2, mask_key="mask")
     world.drive(10, matrix=GAINS, mask=torch.tensor([True, False]).unsqueeze(-1))
