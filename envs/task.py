@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning.costs import check_arguments
 
@@ -109,9 +109,19 @@ class Task:
             found["goal"] = torch.stack(goals)
         return {name: value.reshape(*seeds.shape, -1) for name, value in found.items()}
 
-    def step(self, data: Any, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return next state, reward ``(*B)`` and whether the episode ends ``(*B)``."""
+    def step(
+        self, data: Any, action: Tensor, physics: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return next state, reward ``(*B)`` and whether the episode ends ``(*B)``.
+
+        Args:
+            data: the state.
+            action: effective action, ``(*B, A)``.
+            physics: see :class:`~afm_rl.regimes.Physics`, ``(*B, P)``; for MuJoCo worlds.
+        """
         state = data["pose"]
+        if physics is not None and isinstance(self.world, MuJoCoDynamics):
+            self.world.tell(physics)
         ahead = self.world(state, action)
         goal = [data["goal"]] if self.goal_names else []
         reward = self.reward(state, action, ahead, *goal)

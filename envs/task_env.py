@@ -181,8 +181,10 @@ class TaskSimulation(nn.Module, PhasedSimulation):
         mission, pose = data["mission"], data["pose"]
         action = data["action"].to(pose.dtype).clamp(self.low, self.high)
         past = data["past"] if self.regime.history else None
-        effective = self.regime.apply(action, self.regime_now(mission, data), pose, past, actuator)
-        moved, reward, ended = self.task.step(data, effective)
+        parameters = self.regime_now(mission, data)
+        effective = self.regime.apply(action, parameters, pose, past, actuator)
+        physics = self.regime.physics_of(parameters)
+        moved, reward, ended = self.task.step(data, effective, physics)
         state = {"pose": moved.to(pose), "step": data["step"] + 1}
         state |= {name: data[name] for name in ("goal", "slot") if name in data.keys()}
         out = self.describe(mission, self.followed(mission, data, state, action))

@@ -72,7 +72,9 @@ class HostedTask(Task):
         slots = torch.arange(seeds.numel()).reshape(seeds.shape)
         return {"pose": poses.reshape(*seeds.shape, -1), "slot": slots}
 
-    def step(self, data: Any, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def step(
+        self, data: Any, action: Tensor, physics: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return next observation, reward ``(*B)`` and whether the episode ends ``(*B)``."""
         slots, plan = data["slot"].flatten().tolist(), action.flatten(0, -2)
         after = [self.hosts[slot].step(own) for slot, own in zip(slots, plan, strict=True)]

@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics.known import KnownDynamics
+from afm_rl.dynamics.mujoco_physics import changed_model
 from afm_rl.dynamics.mujoco_space import MuJoCoSpace
 from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.regimes import Physics
 
 try:
     import mujoco
@@ -23,6 +25,7 @@ except ImportError:  # an extra
 
 STEP = 1e-4  # of finite differences, in half ranges and units of the state: far above the
 # tolerance of the contact solver, far below what bends a trajectory
+MOST_MODELS = 256  # with changed physics that are kept
 HUGE = 1e9  # MuJoCo resets a simulation that holds larger numbers
 
 
@@ -126,6 +129,7 @@ class Simulator:
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
         self.rest = np.empty(mujoco.mj_stateSize(model, kind))
         mujoco.mj_getState(model, self.data[0], self.rest, kind)
+        self.changed: dict[tuple[float, ...], Any] = {}
         self.state = slice(1, 1 + model.nq + model.nv + model.na)  # the time stands before it
 
     def __reduce__(self):  # threads can neither be copied nor sent to another process
@@ -134,12 +138,26 @@ class Simulator:
     def __deepcopy__(self, memo: dict) -> Simulator:
         return type(self)(*self.settings)
 
-    def __call__(self, states: np.ndarray, controls: np.ndarray) -> np.ndarray:
+    def models(self, physics: np.ndarray) -> list[Any]:
+        """Return the model of each row of physics ``(N, P)``, made when it is first met."""
+        if len(self.changed) > MOST_MODELS:
+            self.changed.clear()
+        rows, model = [tuple(row) for row in physics.tolist()], self.settings[0]
+        for row in set(rows) - self.changed.keys():
+            self.changed[row] = model if row == Physics.identity else changed_model(model, row)
+        return [self.changed[row] for row in rows]
+
+    def __call__(
+        self, states: np.ndarray, controls: np.ndarray, physics: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return the states ``(N, H, S)`` that controls ``(N, H, A)`` lead to from ``(N, S)``.
 
-        A row with numbers that are not finite, or huge, leads to NaN.
+        A row with numbers that are not finite, or huge, leads to NaN. With ``physics`` ``(N, P)``
+        each row has its own, see :class:`~afm_rl.regimes.Physics`.
         """
         model, skip, _ = self.settings
+        if physics is not None:
+            model = self.models(physics)
         bad = ~((np.abs(states).max(-1) < HUGE) & (np.abs(controls).max((-2, -1)) < HUGE))
         full = np.repeat(self.rest[None], len(states), 0)
         full[:, self.state] = states
@@ -185,6 +203,7 @@ class MuJoCoDynamics(KnownDynamics):
 
     extrapolates = True
     stiff = True
+    physics_now: Tensor
 
     def __init__(
         self,
@@ -201,6 +220,7 @@ class MuJoCoDynamics(KnownDynamics):
             position, velocity = noise_std
             noise_std = [position] * found.nv + [velocity] * found.nv + [position] * found.na
         super().__init__(simulator, space_of(found), found.nu, noise_std)
+        self.register_buffer("physics_now", torch.zeros(0), persistent=False)
         self.mjcf = found
         self.dt = skip * float(found.opt.timestep)
         low, high = torch.as_tensor(found.actuator_ctrlrange).unbind(-1)
@@ -214,6 +234,14 @@ class MuJoCoDynamics(KnownDynamics):
     def names(self) -> tuple[list[str], list[str]]:
         """Names of the state coordinates, ``q_JOINT``, ``v_JOINT``, ``w_...``, and of actions."""
         return state_names(self.mjcf), actuator_names(self.mjcf)
+
+    def tell(self, physics: Tensor) -> None:
+        """Change the physics from now on: rows ``(P,)``, or ``(*L, P)`` for leading dimensions.
+
+        See :class:`~afm_rl.regimes.Physics`.
+        """
+        nominal = physics == torch.tensor(Physics.identity).to(physics)
+        self.physics_now = physics.new_zeros(0) if bool(nominal.all()) else physics.detach()
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the next state ``(*B, S)``."""
@@ -247,5 +275,10 @@ class MuJoCoDynamics(KnownDynamics):
         rows = state.expand(*batch, -1).reshape(-1, state.shape[-1])
         plans = actions.expand(*batch, -1, -1).reshape(-1, *actions.shape[-2:])
         step: Any = self.step  # of plans, in numpy
-        after = step(*(x.detach().cpu().double().numpy() for x in (rows, plans)))
+        numbers = [rows, plans]
+        if len(self.physics_now):
+            told = self.physics_now
+            told = told.reshape(*told.shape[:-1], *[1] * (len(batch) + 1 - told.dim()), -1)
+            numbers.append(told.expand(*batch, -1).reshape(len(rows), -1))
+        after = step(*(x.detach().cpu().double().numpy() for x in numbers))
         return torch.from_numpy(after).to(state).reshape(*batch, *after.shape[1:])

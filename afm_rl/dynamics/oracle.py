@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics.base import DynamicsModel, linearised
+from afm_rl.dynamics.mujoco import MuJoCoDynamics
 from afm_rl.regimes import Regime
 
 
@@ -48,6 +49,9 @@ class Oracle(DynamicsModel):
     def tell(self, parameters: Tensor) -> None:
         """Set the regime parameters that hold from now on."""
         self.parameters_now = parameters.detach()
+        physics = self.regime.physics_of(self.parameters_now)
+        if physics is not None and isinstance(self.model, MuJoCoDynamics):
+            self.model.tell(physics)
 
     def effective(self, state: Tensor, action: Tensor) -> Tensor:
         """Return what ``action`` is worth under the present regime."""
@@ -59,6 +63,12 @@ class Oracle(DynamicsModel):
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the true expected next state."""
         return self.model(state, self.effective(state, action))
+
+    def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
+        """Return the states ``(*B, N, H, S)`` of whole plans; at once if effects are known."""
+        if self.regime.by_state:
+            return super().rollout(state, actions)
+        return self.model.rollout(state, self.effective(state[..., None, None, :], actions))
 
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return next state and derivatives: those of the nominal model, by the chain rule."""

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions.collected import Collection
 from afm_rl.missions.return_score import ReturnScore
 from afm_rl.missions.robot import Robot
-from afm_rl.regimes import Compose, Regime, Schedule, actuator_regimes
+from afm_rl.regimes import Compose, Physics, Regime, Schedule, actuator_regimes
 from afm_rl.targets import CODE, find_code
 
 
 class TaskRobot(Robot):
     """A robot of which a task says everything.
 
-    Regimes are those of :func:`~afm_rl.regimes.actuator_regimes`; each of these families can be
-    asked for by its name. The nominal model is the task's own world, if not told otherwise.
+    Regimes are those of :func:`~afm_rl.regimes.actuator_regimes` and, in MuJoCo,
+    :class:`~afm_rl.regimes.Physics`; each of these families can be asked for by its name. The
+    nominal model is the task's own world, if not told otherwise.
 
     Args:
         source: makes the task, an :class:`afm_rl.envs.Task`, from the ``settings``.
@@ -50,7 +52,7 @@ class TaskRobot(Robot):
         code = {key: settings[key] for key in CODE if isinstance(settings.get(key), str)}
         found = {key: find_code(f"robot.{key}", name) for key, name in code.items()}
         task = source(**{**settings, **found})
-        model = task.world if model is None else model
+        model = copy.deepcopy(task.world) if model is None else model
         sizes = model.state_size, model.action_size
         wanted = len(task.state_names), len(task.low)
         if sizes != wanted:
@@ -61,6 +63,8 @@ class TaskRobot(Robot):
             )
         low, high, first = list(task.low), list(task.high), task.start(0)[0].tolist()
         families = actuator_regimes(low, high)
+        if isinstance(task.world, MuJoCoDynamics):
+            families["physics"] = Physics()
         prior = [["gain"], ["bias"], ["gain", "bias"]]
         super().__init__(
             name=task.name,

@@ -23,6 +23,7 @@ from afm_rl.regimes.gain_noise import GainNoise
 from afm_rl.regimes.lag import Lag
 from afm_rl.regimes.patches import Patches
 from afm_rl.regimes.permutation import Permutation
+from afm_rl.regimes.physics import Physics
 from afm_rl.regimes.quantisation import Quantisation
 from afm_rl.regimes.rotation import Rotation
 from afm_rl.regimes.saturation import Saturation
@@ -47,6 +48,7 @@ __all__ = [
     "MotorEfficiency",
     "Patches",
     "Payload",
+    "Physics",
     "Regime",
     "Rotation",
     "Saturation",

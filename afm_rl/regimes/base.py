@@ -29,6 +29,7 @@ class Regime(ABC):
         limits: lowest and highest value of those parameters that cannot be any number.
         history: how many previous actions the effect depends on, D.
         noisy: whether the effect is random.
+        by_state: whether it depends on the state.
     """
 
     names: tuple[str, ...]
@@ -36,6 +37,7 @@ class Regime(ABC):
     limits: Mapping[str, tuple[float, float]] = MappingProxyType({})
     history: int = 0
     noisy: bool = False
+    by_state: bool = False
 
     @abstractmethod
     def apply(
@@ -153,6 +155,10 @@ class Regime(ABC):
         nominal = torch.tensor(self.identity, dtype=row.dtype).tolist()
         pairs = zip(self.names, row.tolist(), nominal, strict=True)
         return ", ".join(f"{name} = {x:g}" for name, x, usual in pairs if x != usual) or "nominal"
+
+    def physics_of(self, parameters: Tensor) -> Tensor | None:
+        """Return the columns of :class:`~afm_rl.regimes.Physics`, ``(*B, P)``; None without."""
+        return None
 
     def is_identity(self, parameters: Tensor) -> Tensor:
         """Return ``(*B)`` booleans: is this the nominal regime?"""

@@ -61,6 +61,7 @@ class Compose(Regime):
             )
         self.limits = {name: limit for each in families for name, limit in each.limits.items()}
         self.history = sum(regime.history for regime in families)
+        self.by_state = any(regime.by_state for regime in families)
         self.noisy = any(regime.noisy for regime in families)
         ends = itertools.accumulate(len(regime.names) for regime in families)
         self._nominal = Constant(self.identity)
@@ -148,6 +149,12 @@ class Compose(Regime):
             ],
             -1,
         )
+
+    def physics_of(self, parameters: Tensor) -> Tensor | None:
+        """Return the columns of the first family that has any."""
+        parts = zip(self.regimes.values(), self._parts, strict=True)
+        found = (regime.physics_of(parameters[..., at]) for regime, at in parts)
+        return next((rows for rows in found if rows is not None), None)
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
         """Return the parameter row ``(F,)``; every family checks its own values."""

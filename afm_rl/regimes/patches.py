@@ -38,6 +38,8 @@ class Patches(Regime):
             [-1.,  1.]])
     """
 
+    by_state = True
+
     def __init__(
         self,
         size: float = 2.0,

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from afm_rl.dynamics import Dubins, DynamicsModel, MuJoCoDynamics, effective_action
+from afm_rl.dynamics import Dubins, DynamicsModel, MuJoCoDynamics, Oracle, effective_action
 from afm_rl.errors import ConfigurationError
+from afm_rl.regimes import ActionGain, Compose, Physics
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -150,3 +151,56 @@ def test_bad_models_are_named(source, word):
     with pytest.raises(ConfigurationError, match=word) as caught:
         MuJoCoDynamics(source)
     assert "\n" not in str(caught.value)
+
+
+POLE = """<mujoco><option timestep="0.01" gravity="0 0 -10"/><worldbody>
+<body name="cart" pos="0 0 1"><joint name="x" type="slide" axis="1 0 0" damping="2"/>
+  <geom type="box" size=".1 .1 .1" mass="1" contype="0"/>
+  <body name="pole"><joint name="turns" type="hinge" axis="0 1 0"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -1" size=".01" mass=".2" contype="0"/>
+</body></body></worldbody>
+<actuator><motor joint="x" gear="1" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+def told(**values):
+    """Return how a cart with a hanging pole accelerates from rest, and after 3 s of swinging."""
+    model = MuJoCoDynamics(POLE)
+    model.tell(Physics().encode(values))
+    model.double()
+    still, push = torch.zeros(4).double(), torch.ones(1).double()
+    swung = model.rollout(torch.tensor([0, 0.1, 0, 0]).double(), torch.zeros(1, 600, 1).double())
+    crossings = (swung[0, :, 1].diff().sign().diff() != 0).nonzero().flatten()
+    return model(still, push)[2].item() / 0.01, crossings.double().diff().mean().item()
+
+
+def test_other_physics_are_what_their_names_say():
+    speed, period = told()
+    assert speed == pytest.approx(1 / 1.05, rel=0.02)  # a pole that hangs takes a quarter along
+    assert told(mass=2.0)[0] == pytest.approx(speed / 2, rel=0.02)
+    assert told(payload=1.0)[0] == pytest.approx(1 / 2.25, rel=0.02)
+    assert told(wind_x=0.5)[0] == pytest.approx(speed + 0.5, rel=0.02)
+    assert told(gravity=4.0)[1] == pytest.approx(period / 2, rel=0.05)
+    assert told(length=0.25)[1] == pytest.approx(period / 2, rel=0.05)
+    model = MuJoCoDynamics(POLE)
+    moving, none = torch.tensor([0.0, 0.0, 1.0, 0.0]), torch.zeros(1)
+    lost = 1 - model(moving, none)[2]
+    model.tell(Physics().encode({"damping": 2.0}))
+    assert (1 - model(moving, none)[2]) / lost == pytest.approx(2.0, rel=0.05)
+
+
+def test_each_mission_has_physics_of_its_own():
+    model, physics = MuJoCoDynamics(POLE), Physics()
+    rows = torch.stack([physics.encode({}), physics.encode({"mass": 3.0})])
+    plans = torch.rand(2, 5, 7, 1, generator=torch.Generator().manual_seed(0))
+    state = torch.zeros(2, 4)
+    model.tell(rows)
+    together = model.rollout(state, plans)
+    for row, plan, found in zip(rows, plans, together, strict=True):
+        model.tell(row)
+        assert torch.equal(model.rollout(state[0], plan), found)
+    oracle = Oracle(MuJoCoDynamics(POLE), Compose([ActionGain(["gain_0"]), physics]))
+    oracle.tell(torch.cat([torch.tensor([[1.0], [-1.0]]), rows], -1))
+    plans[1] = -plans[1]
+    assert torch.equal(oracle.rollout(state, plans), together)
+    oracle.select_(torch.tensor([1]))
+    assert torch.equal(oracle.rollout(state[:1], plans[1:]), together[1:])

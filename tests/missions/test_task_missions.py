@@ -226,3 +226,18 @@ def test_mistakes_in_models_are_said_in_one_line(mine, xml, message):
     with pytest.raises(ConfigurationError, match=message) as error:
         build(cfg, ["mine"])
     assert "\n" not in str(error.value)
+
+
+def test_physics_change_under_way_and_the_oracle_knows_them():
+    pytest.importorskip("mujoco")
+    pole = ["robot=gymnasium", "robot.id=InvertedPendulum-v5", "robot.steps=12", *SMALL]
+    changed = ["regimes=[{mass: 3.0, gravity: 0.5}]", "seeds=2"]
+    errors = {}
+    for method in ("physics", "oracle"):
+        steps = run(agent_of(*pole, *changed, f"method={method}")).steps
+        errors[method] = steps.groupby("regime_active")["error"].max()
+    assert errors["physics"][0] == 0.0
+    assert errors["physics"][1] > 0.01
+    assert errors["oracle"][1] == 0.0
+    drawn = agent_of(*pole, "regimes=[physics, permutation]", "seeds=3", "method=physics")
+    assert drawn.regime_names == ["physics"] * 3 + ["permutation"] * 3

@@ -1,0 +1,75 @@
+"""What can change about a body in MuJoCo, beside its actuators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from afm_rl.regimes.base import Regime
+
+FACTORS: Mapping[str, tuple[float, float]] = {
+    "mass": (0.5, 2.0),
+    "friction": (0.2, 1.5),
+    "damping": (0.2, 5.0),
+    "gravity": (0.8, 1.2),
+    "length": (0.8, 1.2),
+}
+"""Factors, and the ranges from which they are drawn."""
+ADDED: Mapping[str, tuple[float, float]] = {
+    "payload": (0.0, 0.5),
+    "wind_x": (-1.0, 1.0),
+    "wind_y": (-1.0, 1.0),
+}
+
+
+class Physics(Regime):
+    """Other physics; actions stay what they are.
+
+    A world that knows these parameters moves differently, see
+    :func:`afm_rl.dynamics.mujoco_physics.changed_model` for what they do there: factors ``mass``,
+    ``friction``, ``damping``, ``gravity`` and ``length``; ``payload``, a share of the whole mass;
+    ``wind_x`` and ``wind_y``, steady accelerations (m/s^2).
+
+    >>> heavy = Physics().encode({"mass": 2.0})
+    >>> Physics().physics_of(heavy)[0]
+    tensor(2.)
+    """
+
+    names = (*FACTORS, *ADDED)
+    identity = (*[1.0] * len(FACTORS), *[0.0] * len(ADDED))
+    limits = {
+        **dict.fromkeys(FACTORS, (0.01, 100.0)),
+        "gravity": (0.0, 100.0),
+        "payload": (0.0, 100.0),
+    }
+
+    def apply(
+        self,
+        action: Tensor,
+        parameters: Tensor,
+        state: Tensor,
+        past: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """Return the action."""
+        return action.expand(*torch.broadcast_shapes(action.shape[:-1], parameters.shape[:-1]), -1)
+
+    def inverse(
+        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
+    ) -> Tensor:
+        """Return the action, clamped."""
+        return action.clamp(low, high)
+
+    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
+        """Draw one parameter each, uniform in its range; the others stay nominal."""
+        low, high = torch.tensor([*FACTORS.values(), *ADDED.values()]).unbind(-1)
+        drawn = low + (high - low) * torch.rand(*shape, len(low), generator=generator)
+        chosen = torch.randint(len(low), (*shape, 1), generator=generator)
+        mine = torch.arange(len(low)) == chosen
+        return torch.where(mine, drawn, torch.tensor(self.identity))
+
+    def physics_of(self, parameters: Tensor) -> Tensor:
+        """Return all parameters."""
+        return parameters
