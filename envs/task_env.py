@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.envs.mission_env import MissionEnv
 from afm_rl.envs.mission_noise import MissionNoise
 from afm_rl.envs.phases import PhasedSimulation
 from afm_rl.envs.settings import check_bounds, check_regime
 from afm_rl.envs.task import Task
+from afm_rl.envs.task_film import film
 from afm_rl.errors import ConfigurationError, check_count, check_instance
 from afm_rl.regimes import ActionGain, Regime, Schedule
 
@@ -92,6 +96,16 @@ class TaskEnv(MissionEnv):
             min(steps, task.steps),
         ).to(self.device)
         self._complete([task.name], missions, bounds)
+
+    def draw(self, steps: pd.DataFrame) -> Iterator[np.ndarray]:
+        """Yield a picture ``(H, W, 3)`` of each row of a table of steps.
+
+        Raises:
+            ConfigurationError: for worlds that are not MuJoCo's.
+        """
+        if not isinstance(self.task.world, MuJoCoDynamics):
+            raise ConfigurationError(f"video: of {self.task.name} there is nothing to be drawn")
+        return film(self.task.world.mjcf, steps[list(self.task.state_names)].to_numpy())
 
     def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:
         noise = self._actuator_noise(tensordict["mission", "seed"])

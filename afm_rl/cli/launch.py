@@ -52,15 +52,16 @@ def launch(cfg: DictConfig) -> None:
     agents = {job.label: build(job) for job in {job.label: job for job in jobs.values()}.values()}
     roads = [getattr(agent.base_env, "tracks", ()) for agent in agents.values()]  # flights: none
     tracks = list({track.name: track for some in roads for track in some}.values())
+    draw = next((getattr(agent.base_env, "draw", None) for agent in agents.values()), None)
     if cfg.get("study") is None and len(jobs) == 1:
         _run_alone(folder, next(iter(jobs.values())), next(iter(agents.values())))
-        show(folder, cfg, tracks, film)
+        show(folder, cfg, tracks, film, draw)
         return
     chosen = instantiate(hydra.launcher)  # Hydra's own launchers only know sweeps
     pool = chosen if isinstance(chosen, JobLauncher) else LocalPool()
     failed = run_together(folder, jobs, pool, cfg, hydra.overrides.task)
     if cfg.get("study") is None and not failed:
-        show(folder, cfg, tracks, film)
+        show(folder, cfg, tracks, film, draw)
     else:
         report(folder, cfg, film)
     if failed:
@@ -132,7 +133,9 @@ def run_together(
     )
 
 
-def show(folder: Path, cfg: DictConfig, tracks: Sequence[Any], film: str | None) -> None:
+def show(
+    folder: Path, cfg: DictConfig, tracks: Sequence[Any], film: str | None, draw: Any = None
+) -> None:
     """Draw the results of a run or a comparison, and print their table."""
     missions, steps, measures = read_missions(folder), read_steps(folder), read_measures(folder)
     with locked(folder):
@@ -142,7 +145,10 @@ def show(folder: Path, cfg: DictConfig, tracks: Sequence[Any], film: str | None)
         what = {"figures": cfg.figures, "tensorboard": cfg.tensorboard, "tables": False}
         write_run(folder, missions, steps, measures, tracks, **what)
         if film is not None:
-            write_films(folder / "video", missions, steps, tracks, film)
+            try:
+                write_films(folder / "video", missions, steps, tracks, film, draw=draw)
+            except ConfigurationError as error:  # such as a robot that cannot be drawn
+                print(f"afm-rl: no film: {error}", file=sys.stderr)
         extend_manifest(folder, [name for name in SHOWN if (folder / name).is_dir()])
     print_summary(missions, measures)
     print(f"Results: {folder}")

@@ -230,6 +230,7 @@ def l1(
     **settings: Any,
 ) -> Part:
     """Return the transform with L1 adaptive augmentation, which needs no training."""
+    settings["dt"] = robot.dt if settings.get("dt") is None else settings["dt"]
     corrector = L1Augmentation(*robot.flow_box, **settings)
     return Part(_transform(dynamics, corrector, enabled, extend_action_box))
 

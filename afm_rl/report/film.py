@@ -27,6 +27,7 @@ from afm_rl.report.track_plot import DrawableTrack, LoadTrack, load_tracks
 FRAMES, RATE = 150, 15  # at most; per second
 DPI, COLOURS = 100, 128
 LAST = 1500  # ms, how long the last frame of a GIF stays
+Draw = Callable[[pd.DataFrame], Iterable[np.ndarray]]
 TOGETHER = "all_methods"  # file name
 
 
@@ -59,6 +60,7 @@ def write_films(
     tracks: Sequence[DrawableTrack] = (),
     form: str = "gif",
     echo: Callable[[str], object] = print,
+    draw: Draw | None = None,
 ) -> list[Path]:
     """Write a film of each method's first mission, ``METHOD.gif`` or ``METHOD.mp4``.
 
@@ -74,6 +76,7 @@ def write_films(
         tracks: tracks to draw, found by name.
         form: ``"gif"`` or ``"mp4"``.
         echo: receives one line per film.
+        draw: returns pictures of a mission's steps, for robots that are not on a map.
 
     Returns:
         The files written.
@@ -84,8 +87,16 @@ def write_films(
     roads = {track.name: track for track in tracks}
     first = first_missions(missions).drop_duplicates("method")
     rows = steps_of(steps, first["mission"])
+    if draw is not None:
+        names, written = folder_names([TOGETHER, *first["method"]])[1:], []
+        for mission, name in zip(first.itertuples(), names, strict=True):
+            own = rows[mission.mission]
+            written.append(folder / f"{name}.{form}")
+            write_whole(written[-1], ENCODERS[form](draw(own.iloc[_shown(len(own))])))
+            echo(f"wrote {written[-1]}")
+        return written
     space = {"z", "goal_z"} <= set(steps.dropna(axis=1, how="all"))
-    written: list[Path] = []
+    written = []
 
     def write(name: str, scene: Scene, count: int) -> None:
         written.append(folder / f"{name}.{form}")
@@ -155,12 +166,17 @@ def frames(scene: Scene, count: int) -> Iterator[np.ndarray]:
         artist.set_animated(True)
     canvas.draw()
     background = canvas.copy_from_bbox(figure.bbox)
-    for row in np.unique(np.linspace(0, count - 1, min(count, FRAMES)).round().astype(int)):
+    for row in _shown(count):
         canvas.restore_region(background)
         scene.show(int(row))
         for artist in scene.moving:
             figure.draw_artist(artist)
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _shown(count: int) -> np.ndarray:
+    """Return which of so many steps are shown."""
+    return np.unique(np.linspace(0, count - 1, min(count, FRAMES)).round().astype(int))
 
 
 def _checked(rows: dict[int, pd.DataFrame], mission: int, steps: pd.DataFrame) -> pd.DataFrame:

@@ -251,3 +251,17 @@ def test_a_form_that_cannot_be_written_is_refused(monkeypatch):
 def test_unknown_forms_are_refused(video):
     with pytest.raises(ConfigurationError, match="expected false, true, gif or mp4"):
         check_video(video)
+
+
+def test_a_robot_that_is_drawn_by_others(make_results, tmp_path):
+    missions, steps = make_results(methods=("physics", "oracle"))
+    asked = []
+
+    def draw(own):
+        asked.append(len(own))
+        return [np.full((16, 16, 3), k, np.uint8) for k in (0, 100, 200)]
+
+    paths = write_films(tmp_path, missions, steps, draw=draw, echo=quiet)
+    assert [path.name for path in paths] == ["physics.gif", "oracle.gif"]
+    assert all(count <= FRAMES for count in asked)
+    assert len(pictures(paths[0].read_bytes())[0]) == 3
