@@ -6,6 +6,7 @@ Their packages are imported when they are asked for: none of them is needed for 
 from __future__ import annotations
 
 import logging
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -279,6 +280,9 @@ def _quiet() -> Iterator[None]:
     finally:
         logger.setLevel(before)
         say(None)
+        absl: Any = sys.modules.get("absl.logging")
+        if absl is not None:  # it would close what stood for stderr when it was imported
+            absl.get_absl_handler().python_handler.stream = sys.__stderr__
 
 
 def _known(
