@@ -228,7 +228,7 @@ def test_mistakes_in_models_are_said_in_one_line(mine, xml, message):
     assert "\n" not in str(error.value)
 
 
-def test_physics_change_under_way_and_the_oracle_knows_them():
+def test_physics_change_under_way_and_the_oracle_knows_them(tmp_path):
     pytest.importorskip("mujoco")
     pole = ["robot=gymnasium", "robot.id=InvertedPendulum-v5", "robot.steps=12", *SMALL]
     changed = ["regimes=[{mass: 3.0, gravity: 0.5}]", "seeds=2"]
@@ -239,5 +239,11 @@ def test_physics_change_under_way_and_the_oracle_knows_them():
     assert errors["physics"][0] == 0.0
     assert errors["physics"][1] > 0.01
     assert errors["oracle"][1] == 0.0
+    whole = run(agent_of(*pole, *changed, "method=oracle"))
+    with pytest.raises(Stopped):
+        stop = {"checkpoint": tmp_path, "stopped": lambda loop: loop.step == 8}
+        run(agent_of(*pole, *changed, "method=oracle"), **stop)
+    again = run(agent_of(*pole, *changed, "method=oracle"), checkpoint=tmp_path)
+    pd.testing.assert_frame_equal(whole.steps, again.steps, check_exact=True)
     drawn = agent_of(*pole, "regimes=[physics, permutation]", "seeds=3", "method=physics")
     assert drawn.regime_names == ["physics"] * 3 + ["permutation"] * 3
