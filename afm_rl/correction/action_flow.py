@@ -128,8 +128,7 @@ class ActionFlow(PairCorrector):
         self.__dict__["_machine_code"] = None
         self.tick = Tick(
             load_universal() if network is None else network,
-            self.centre,
-            self.half_range,
+            self.scale,
             self.hypotheses,
             IDENTITY in hypotheses,
             rows,
@@ -232,7 +231,8 @@ class ActionFlow(PairCorrector):
         """Return the root mean square error of the action on new windows, in half ranges."""
         drawn = self._draw(model, regime, states, count, generator)
         known = self.network.encode(drawn.rows, fit_experts(drawn.rows))
-        found = [self.tick.propose(known, plan)[0] for plan in drawn.planned.unbind(1)]
+        box = torch.stack([self.lowest, self.highest]).expand(count, -1, -1)
+        found = [self.tick.propose(known, plan, box)[0] for plan in drawn.planned.unbind(1)]
         return float((torch.stack(found, 1) - drawn.intended).square().mean().sqrt())
 
     def _draw(self, model, regime, states, count, generator) -> Drawn:

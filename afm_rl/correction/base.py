@@ -49,8 +49,9 @@ class Corrector(nn.Module, ABC):
 
     A corrector is a pure function on a memory, one flat tensor ``(*B, P)`` per mission:
     :meth:`begin` makes it, :meth:`correct` turns a planned action into the one to execute, and
-    :meth:`observe` adds the state that this led to. Inside, actions are in half ranges around the
-    centre of their box, u in [-1, 1]^A.
+    :meth:`observe` adds the state that this led to. Inside, an action is divided by the largest one
+    that its box has, u in [-1, 1]^A: a factor on an action stays one, also where it cannot be
+    negative, as a thrust.
 
     Args:
         action_low: lowest action, ``(A,)``.
@@ -62,8 +63,9 @@ class Corrector(nn.Module, ABC):
         ConfigurationError: for bounds or numbers that cannot be used.
     """
 
-    centre: Tensor
-    half_range: Tensor
+    scale: Tensor
+    lowest: Tensor
+    highest: Tensor
 
     def __init__(self, action_low: Tensor, action_high: Tensor, gate: float, recent: int) -> None:
         super().__init__()
@@ -76,13 +78,15 @@ class Corrector(nn.Module, ABC):
             )
         self.gate = check_number("corrector.gate", gate, low=0.0)
         self.recent = check_count("corrector.recent", recent)
-        self.register_buffer("centre", (low + high) / 2, persistent=False)
-        self.register_buffer("half_range", (high - low) / 2, persistent=False)
+        scale = torch.maximum(low.abs(), high.abs())
+        ends = {"scale": scale, "lowest": low / scale, "highest": high / scale}
+        for name, value in ends.items():
+            self.register_buffer(name, value, persistent=False)
 
     @property
     def action_size(self) -> int:
         """Number of action components, A."""
-        return len(self.centre)
+        return len(self.scale)
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes of the parts of a memory; subclasses add theirs."""
@@ -178,11 +182,15 @@ class Corrector(nn.Module, ABC):
 
     def normalise(self, action: Tensor) -> Tensor:
         """Return u for an action in its own units."""
-        return (action - self.centre) / self.half_range
+        return action / self.scale
 
     def denormalise(self, unit: Tensor) -> Tensor:
         """Return the action for u."""
-        return self.centre + self.half_range * unit
+        return self.scale * unit
+
+    def within(self, share: Tensor) -> Tensor:
+        """Return the u whose place between lowest (-1) and highest (1) is ``share`` ``(*B, A)``."""
+        return self.lowest + 0.5 * (share + 1) * (self.highest - self.lowest)
 
 
 @lru_cache(maxsize=64)

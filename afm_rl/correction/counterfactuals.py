@@ -46,21 +46,21 @@ def draw_counterfactuals(
     parameters = torch.where(fresh == 1.0, now.unsqueeze(1), before.unsqueeze(1))
     state = draw_states(states, count * rows, generator).view(count, rows, -1)
     state = model.manifold.project(state)
-    executed = corrector.denormalise(draw_actions(count, rows, axes, draw))
-    low, high = (corrector.denormalise(torch.full((axes,), end)) for end in (-1.0, 1.0))
+    executed = corrector.denormalise(corrector.within(draw_actions(count, rows, axes, draw)))
+    low, high = (corrector.denormalise(end) for end in (corrector.lowest, corrector.highest))
     effect = regime.apply(executed, parameters, state)
     reached = imagine(model, state, effect, low, high, generator)
-    seen = effective_action(model, state, executed, reached, corrector.half_range)
+    seen = effective_action(model, state, executed, reached, corrector.scale)
     pairs = Rows(
         corrector.normalise(executed),
         corrector.normalise(seen.action).clamp(-LIMIT, LIMIT),
-        (seen.std / corrector.half_range).clamp_max(LIMIT),
+        (seen.std / corrector.scale).clamp_max(LIMIT),
         valid,
     )
     many = (count, plans, axes)
     here, ruled = state[:, -1:].expand(-1, plans, -1), now.unsqueeze(1).expand(-1, plans, -1)
     anywhere, other, probe = (
-        corrector.denormalise(draw.uniform(-1.0, 1.0, *many)) for _ in range(3)
+        corrector.denormalise(corrector.within(draw.uniform(-1.0, 1.0, *many))) for _ in range(3)
     )
     inside = draw.chance(0.5, count, plans, 1)
     planned = torch.where(inside, anywhere, regime.apply(other, ruled, here))

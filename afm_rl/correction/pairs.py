@@ -68,9 +68,9 @@ class PairCorrector(Corrector):
         unit = self.normalise(executed)
         awake = bool(parts["misaligned"].any())
         seen = effective_action(
-            model, state, executed, reached, self.half_range, quiet=0.0 if awake else self.gate
+            model, state, executed, reached, self.scale, quiet=0.0 if awake else self.gate
         )
-        std = (seen.std / self.half_range).clamp_max(LIMIT)
+        std = (seen.std / self.scale).clamp_max(LIMIT)
         rows = torch.cat(
             [
                 unit,

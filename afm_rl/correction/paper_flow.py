@@ -141,7 +141,7 @@ class PaperFlow(Corrector):
     def _examples(self, model, states, count, generator) -> tuple[Tensor, Tensor, Tensor]:
         """Return features ``(N, C)``, planned and explaining actions ``(N, A)``."""
         state = model.manifold.project(draw_states(states, count, generator))
-        box = (self.centre - self.half_range, self.centre + self.half_range)
+        box = self.denormalise(self.lowest), self.denormalise(self.highest)
         planned, other = (uniform(*box, count, generator) for _ in range(2))
         error = model.manifold.difference(model(state, other), model(state, planned))
         return self._features(state, planned, error), planned, other
@@ -167,7 +167,7 @@ class PaperFlow(Corrector):
             features = torch.where(held, parts["features"], features)
         found = self.unchanged(planned, size, box)
         if bool(misaligned.any()):
-            action = self._integrate(features.to(self.centre), planned.to(self.centre))
+            action = self._integrate(features.to(self.scale), planned.to(self.scale))
             action = torch.where(misaligned.unsqueeze(-1), action.to(planned), planned)
             found = found._replace(executed=action, misaligned=misaligned)
         parts |= {"planned": planned, "executed": found.executed, "features": features}

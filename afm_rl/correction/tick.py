@@ -47,8 +47,7 @@ class Tick(nn.Module):
     :class:`~afm_rl.correction.ActionFlow`.
     """
 
-    centre: Tensor
-    half_range: Tensor
+    scale: Tensor
     source_points: Tensor
     probes: Tensor
     penalty: Tensor
@@ -57,8 +56,7 @@ class Tick(nn.Module):
     def __init__(
         self,
         network: AxisNetwork,
-        centre: Tensor,
-        half_range: Tensor,
+        scale: Tensor,
         hypotheses: Sequence[str],
         identity: bool,
         rows: int,
@@ -72,7 +70,7 @@ class Tick(nn.Module):
     ) -> None:
         super().__init__()
         self.network, self.memory = network, memory
-        self.count, size = len(hypotheses), len(centre)
+        self.count, size = len(hypotheses), len(scale)
         self.forgetting = check_number("corrector.forgetting", forgetting, low=0.0, high=1.0)
         self.source_std = check_number("corrector.source_std", source_std, low=0.0)
         self.steps = check_count("corrector.steps", steps)
@@ -83,8 +81,7 @@ class Tick(nn.Module):
         never = 0.0 if identity else torch.inf
         penalty = [h.penalty for h in chosen] + [HYPOTHESES[IDENTITY].penalty + never]
         fixed = {
-            "centre": centre,
-            "half_range": half_range,
+            "scale": scale,
             "source_points": source_points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "penalty": torch.tensor(penalty),
@@ -114,19 +111,19 @@ class Tick(nn.Module):
             planned: in units of the action, ``(B, A)``.
             box: lowest and highest action, ``(B, 2, A)``.
         """
-        unit = (planned - self.centre) / self.half_range
+        unit, ends = planned / self.scale, box / self.scale
         losses = self.judge(pairs, losses, forecasts, misaligned)
         belief = (losses + self.penalty).argmin(-1)
         encoded = self.encode(pairs, place)
-        action, effect, spread, bounds = self.propose(self.pick(encoded, belief), unit)
+        action, effect, spread, bounds = self.propose(self.pick(encoded, belief), unit, ends)
         sound = (action + effect).isfinite().all(-1)
         believed = sound & (belief < self.count)
         action = torch.where(believed.unsqueeze(-1), action, unit)
         forecasts = self.predict(encoded, pairs, action)
-        found = torch.stack([action, effect], -2) * self.half_range + self.centre
+        found = torch.stack([action, effect], -2) * self.scale
         found = torch.where(believed[:, None, None], found, planned.unsqueeze(-2))
         # Never a smaller box: the flow itself cuts what cannot be had.
-        low, high = (bounds * self.half_range + self.centre).unbind(-2)
+        low, high = (bounds * self.scale).unbind(-2)
         low, high = torch.fmin(low, box[:, 0]), torch.fmax(high, box[:, 1])
         executed, effect = found.unbind(-2)
         return Answer(
@@ -134,14 +131,14 @@ class Tick(nn.Module):
             forecasts,
             executed,
             effect,
-            spread * self.half_range,
+            spread * self.scale,
             torch.stack([low, high], -2),
             believed,
         )
 
     def judge(self, pairs: Tensor, losses: Tensor, forecasts: Tensor, misaligned: Tensor) -> Tensor:
         """Return the hypotheses' losses ``(B, H + 1)`` after the newest pair."""
-        size = len(self.centre)
+        size = len(self.scale)
         newest = pairs[:, -1:]
         effective, std = newest[..., size : 2 * size], newest[..., 2 * size : 3 * size]
         tolerance = TOLERANCE**2
@@ -152,7 +149,7 @@ class Tick(nn.Module):
 
     def encode(self, pairs: Tensor, place: Tensor) -> Encoded:
         """Return what the network reads under every hypothesis, B H sets of rows."""
-        away, size = None, len(self.centre)
+        away, size = None, len(self.scale)
         if self.by_place:
             first = 3 * size + 2
             away = (pairs[..., first:] - place.unsqueeze(-2)).square().sum(-1)
@@ -170,12 +167,15 @@ class Tick(nn.Module):
         first = torch.arange(belief.shape[0], device=belief.device) * self.count
         return encoded.pick(first + belief.where(belief < self.count, 0))
 
-    def propose(self, known: Encoded, planned: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def propose(
+        self, known: Encoded, planned: Tensor, box: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return action, predicted effect and spread ``(B, A)``, and bounds ``(B, 2, A)``.
 
         Args:
             known: what is read under the hypothesis that is believed.
-            planned: ``(B, A)``, in half ranges.
+            planned: u, ``(B, A)``.
+            box: its lowest and highest, ``(B, 2, A)``.
         """
         plans = planned.unsqueeze(-2)
         velocity = partial(self.network.velocity, self.network.ask(known, plans, self.saturation))
@@ -183,9 +183,10 @@ class Tick(nn.Module):
         ends = midpoint(velocity, start, self.steps)
         mean, spread = ends.mean(-2, keepdim=True), ends.std(-2, correction=0)
         proposals = mean if self.choose == "mean" else torch.cat([mean, ends], -2)
-        proposals = proposals.clamp(-1.0, 1.0)
+        least, most = box.split(1, -2)
+        proposals = torch.minimum(torch.maximum(proposals, least), most)
         count = proposals.shape[-2]
-        probes = self.probes.expand(planned.shape[0], -1, -1)
+        probes = torch.lerp(least, most, 0.5 * (self.probes + 1))
         foreseen = self.network.effect(known, torch.cat([proposals, probes], -2))
         effects, found = foreseen[:, :count], foreseen[:, count:]
         low, high = found.amin(-2), found.amax(-2)
@@ -198,7 +199,7 @@ class Tick(nn.Module):
 
     def predict(self, encoded: Encoded, pairs: Tensor, executed: Tensor) -> Tensor:
         """Return the effects ``(B, H + 1, A)`` that the hypotheses predict of what acts now."""
-        size = len(self.centre)
+        size = len(self.scale)
         sent = torch.cat([pairs[..., :size], executed.unsqueeze(-2)], -2)
         acted = sent.index_select(-2, self.memory - self.rows_delay)  # (B, H, A)
         effects = self.network.effect(encoded, acted.reshape(-1, 1, size)).view_as(acted)

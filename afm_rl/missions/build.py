@@ -130,7 +130,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=executed_key)
     if settings["updater"].get("scale", 0) is None:
-        low, high = robot.flow_box
+        low, high = robot.usual_box
         settings["updater"] = {**settings["updater"], "scale": ((high - low) / 2).tolist()}
     updater = make("updater", loss)
     check_updater(updater, model)

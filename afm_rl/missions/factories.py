@@ -77,7 +77,7 @@ def calibrated(robot: Robot, base: Callable[[Robot], Part]) -> Part:
         base: makes the model.
     """
     part = base(robot)
-    low, high = robot.flow_box
+    low, high = robot.usual_box
     return part._replace(module=Calibrated(part.module, (high - low) / 2))
 
 
@@ -133,7 +133,7 @@ def knode(
     check_training("dynamics.pretrain", pretrain_knode, pretrain)
 
     def train(progress: bool) -> float:
-        (low, high), (least, most) = robot.action_box, robot.flow_box
+        (low, high), (least, most) = robot.action_box, robot.usual_box
         actions = torch.maximum(low, least), torch.minimum(high, most)
         regime = robot.regime if randomised else None
         boxes = robot.state_box, actions
@@ -176,7 +176,7 @@ def afm(
 ) -> Part:
     """Return the transform with the universal action flow; ``train`` refines it on the robot."""
     place, scale = list(robot.place), robot.place_scale
-    flow = ActionFlow(*robot.flow_box, place=place, place_scale=scale, **settings)
+    flow = ActionFlow(*robot.action_box, place=place, place_scale=scale, **settings)
     if train is None and checkpoint is None:
         return Part(_transform(dynamics, flow, enabled, extend_action_box))
     own: dict[str, Any] = {k: v for k, v in settings.items() if k in ("hypotheses", "rows")}
@@ -204,7 +204,7 @@ def paper_flow(
             f"corrector=paper: robot={robot.name} has states with rotations; choose corrector=afm"
         )
     size, features = model.state_size, list(robot.features)
-    flow = PaperFlow(*robot.flow_box, features=features, state_size=size, **settings)
+    flow = PaperFlow(*robot.action_box, features=features, state_size=size, **settings)
     own = _without(settings, "gate", "steps", "error_action", "wrap", "latch")
     training = _training(flow, robot, dynamics, train, checkpoint, own, "action units")
     return Part(_transform(dynamics, flow, enabled, extend_action_box), training)
@@ -218,7 +218,7 @@ def least_squares(
     **settings: Any,
 ) -> Part:
     """Return the transform with least squares with forgetting, which need no training."""
-    corrector = LeastSquares(*robot.flow_box, **settings)
+    corrector = LeastSquares(*robot.action_box, **settings)
     return Part(_transform(dynamics, corrector, enabled, extend_action_box))
 
 
@@ -231,7 +231,7 @@ def l1(
 ) -> Part:
     """Return the transform with L1 adaptive augmentation, which needs no training."""
     settings["dt"] = robot.dt if settings.get("dt") is None else settings["dt"]
-    corrector = L1Augmentation(*robot.flow_box, **settings)
+    corrector = L1Augmentation(*robot.action_box, **settings)
     return Part(_transform(dynamics, corrector, enabled, extend_action_box))
 
 

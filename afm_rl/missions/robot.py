@@ -19,7 +19,7 @@ from afm_rl.regimes import Regime, Schedule
 
 SHAPE_TRAINING = (
     *("action_low", "action_high", "state_low", "state_high"),
-    *("features", "model", "regime", "flow_low", "flow_high"),
+    *("features", "model", "regime", "usual_low", "usual_high"),
     *("source", "domain", "task", "id", "xml", "reward", "step", "frame_skip", "start", "angles"),
     *("start_noise", "steps", "data"),
 )
@@ -50,9 +50,9 @@ class Robot:
         families: regimes of which every seed gets a draw of its own, by name; see
             :class:`~afm_rl.missions.families.Family`.
         score: the metrics of missions; targets reached if None.
-        flow_low: lowest corner of the box in which flows correct actions; the actions' if None.
-            Where planned actions keep to a small part of their box, a smaller one helps.
-        flow_high: its highest corner.
+        usual_low: lowest corner of the box that actions mostly keep to, the unit of calibrations
+            and the box in which residual networks are trained; the action box if None.
+        usual_high: its highest corner.
         hypotheses: those of :data:`~afm_rl.correction.hypotheses.HYPOTHESES` that make sense for
             the robot; all if None.
         place: indices of the state coordinates in which the ground may differ, if any.
@@ -82,8 +82,8 @@ class Robot:
     paper_regimes: Sequence[Mapping[str, float]] = ()
     families: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     score: Score | None = None
-    flow_low: Sequence[float] | None = None
-    flow_high: Sequence[float] | None = None
+    usual_low: Sequence[float] | None = None
+    usual_high: Sequence[float] | None = None
     hypotheses: Sequence[str] | None = None
     place: Sequence[int] = ()
     place_scale: float = 1.0
@@ -122,8 +122,8 @@ class Robot:
                 )
         check_number("robot.place_scale", self.place_scale, low=0.0, open_low=True)
 
-        if self.flow_low is not None or self.flow_high is not None:
-            self._check_box("flow", self.model.action_size)
+        if self.usual_low is not None or self.usual_high is not None:
+            self._check_box("usual", self.model.action_size)
         if self.score is not None and not isinstance(self.score, Score):
             raise ConfigurationError(f"robot.score={self.score!r}: expected a Score, or null")
 
@@ -145,11 +145,11 @@ class Robot:
         return LapScore() if self.score is None else self.score
 
     @property
-    def flow_box(self) -> tuple[Tensor, Tensor]:
-        """Lowest and highest action in which flows correct, ``(A,)`` each."""
-        if self.flow_low is None:
+    def usual_box(self) -> tuple[Tensor, Tensor]:
+        """Lowest and highest action that are usual, ``(A,)`` each."""
+        if self.usual_low is None:
             return self.action_box
-        return torch.tensor(self.flow_low), torch.tensor(self.flow_high)
+        return torch.tensor(self.usual_low), torch.tensor(self.usual_high)
 
     @property
     def action_box(self) -> tuple[Tensor, Tensor]:

@@ -150,7 +150,7 @@ def compose(task: Task, method: str, learned: Learned, seed: int, lr: float = 1e
     if method == "online":
         updater = learner(loss)
     elif method == "afm_online":  # the transform undoes what actions can: learn the rest
-        updater = UnmatchedUpdater(loss, learner, flow.half_range, flow.gate)
+        updater = UnmatchedUpdater(loss, learner, flow.scale, flow.gate)
     elif method == "oracle":
         updater = OracleUpdater(loss, regime_key=("regime", "parameters"))
     else:

@@ -34,8 +34,8 @@ def drive():
     def run(corrector, model, effect, plans, state=None, noise=0.0):
         """``effect(executed so far)`` is of the last one; plans are ``(T, *B, A)``."""
         batch, size = plans.shape[1:-1], plans.shape[-1]
-        low = corrector.denormalise(-torch.ones(size)).expand(*batch, size)
-        high = corrector.denormalise(torch.ones(size)).expand(*batch, size)
+        low = corrector.denormalise(corrector.lowest).expand(*batch, size)
+        high = corrector.denormalise(corrector.highest).expand(*batch, size)
         box = torch.stack([low, high], -2).to(plans)
         state = plans.new_zeros(*batch, model.state_size) if state is None else state
         memory, found, sent, effects = corrector.begin(state), [], [], []

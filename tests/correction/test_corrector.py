@@ -49,12 +49,14 @@ def corrector(request):
     return correctors()[request.param]
 
 
-def test_actions_are_handled_in_half_ranges():
-    corrector = Watching(torch.tensor([0.0, -1.0]), torch.tensor([4.0, 3.0]))
-    corners = torch.tensor([[0.0, -1.0], [2.0, 1.0], [4.0, 3.0]])
+def test_actions_are_handled_as_shares_of_the_largest():
+    corrector = Watching(torch.tensor([0.0, -1.0]), torch.tensor([4.0, 2.0]))
+    corners = torch.tensor([[0.0, -1.0], [2.0, 1.0], [4.0, 2.0]])
     unit = corrector.normalise(corners)
-    assert unit.tolist() == [[-1.0, -1.0], [0.0, 0.0], [1.0, 1.0]]
+    assert unit.tolist() == [[0.0, -0.5], [0.5, 0.5], [1.0, 1.0]]
     assert torch.equal(corrector.denormalise(unit), corners)
+    shares = torch.tensor([[-1.0, -1.0], [0.0, 0.0], [1.0, 1.0]])
+    assert corrector.within(shares).tolist() == [[0.0, -0.5], [0.5, 0.25], [1.0, 1.0]]
     assert corrector.action_size == 2
 
 

@@ -25,7 +25,7 @@ def after(flow, state, planned, reached, executed=None, begun=None, model=None):
     memory = flow.begin(state) if begun is None else begun
     memory = flow.executing(memory, planned, planned if executed is None else executed)
     memory = flow.observe(memory, reached)
-    box = torch.stack([flow.denormalise(end * torch.ones(2)) for end in (-1.0, 1.0)])
+    box = torch.stack([flow.denormalise(end) for end in (flow.lowest, flow.highest)])
     box = box.expand(*state.shape[:-1], 2, 2)
     memory, found = flow.correct(memory, planned, model or Dubins(), box)
     return flow.unpack(memory, 3), found

@@ -123,18 +123,18 @@ def test_a_lost_flight_leaves_the_batch(fly):
     assert np.isnan(flown.missions["mse_phase_2"]).all()
 
 
-def test_flows_correct_in_a_box_of_their_own(fly):
+def test_a_thrust_that_cannot_be_negative_is_corrected_as_a_share_of_the_largest(fly):
     flown = fly("method=afm_physics", "corrector.hypotheses=[recent]")
     flow, robot = flown.agent.transform.corrector, flown.agent.robot
-    torch.testing.assert_close(flow.half_range, torch.tensor([0.575, 3e-4, 3e-4, 1e-4]))
+    torch.testing.assert_close(flow.scale, torch.tensor(robot.action_high))
     steps = flown.steps
     assert steps["misaligned"].sum() > 0
     for name, low, high in zip(
         robot.action_names, robot.action_low, robot.action_high, strict=True
     ):
         assert steps[f"executed_{name}"].between(low - 1e-7, high + 1e-7).all()
-    whole = dataclasses.replace(robot, flow_low=None, flow_high=None)
-    assert torch.equal(whole.flow_box[1], robot.action_box[1])
+    whole = dataclasses.replace(robot, usual_low=None, usual_high=None)
+    assert torch.equal(whole.usual_box[1], robot.action_box[1])
 
 
 @pytest.mark.parametrize(
@@ -149,8 +149,11 @@ def test_flows_correct_in_a_box_of_their_own(fly):
         (["robot.score=null"], "robot.score=LapScore: reads goal, .* gives no goal, reached"),
         (["robot.score=3"], "robot.score=3: expected a Score, or null"),
         (["robot.score.band=0"], "score.band=0: expected a finite number"),
-        (["robot.flow_low=null"], r"robot.flow_low=\[\], .* expected 4 numbers each"),
-        (["robot.flow_low=[0, 1, 1, 1]"], "robot.flow_low=.* expected 4 numbers each, low <= high"),
+        (["robot.usual_low=null"], r"robot.usual_low=\[\], .* expected 4 numbers each"),
+        (
+            ["robot.usual_low=[0, 1, 1, 1]"],
+            "robot.usual_low=.* expected 4 numbers each, low <",
+        ),
         (["robot.env.start=up"], "start='up': expected one of rest, moving"),
         (["regimes=[{v_gain: 0.5}]"], "regimes: unknown parameter 'v_gain'"),
     ],

@@ -212,7 +212,7 @@ def test_nothing_but_a_model_is_needed(box):
     env = TransformedEnv(world, ActionFlowTransform(Dubins()))
     check_env_specs(env)
     flow = env.transform.corrector
-    assert isinstance(flow, ActionFlow) and torch.equal(flow.half_range, box[1])
+    assert isinstance(flow, ActionFlow) and torch.equal(flow.scale, box[1])
     assert env.rollout(3)["next", "afm", "executed_action"].shape == (3, 2)
 
 
