@@ -129,9 +129,10 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     executed_key = ("next", guard.key("executed_action"))
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=executed_key)
-    if settings["updater"].get("scale", 0) is None:
+    given = settings["updater"]
+    if isinstance(given, Mapping) and given.get("scale", 0) is None:
         low, high = robot.usual_box
-        settings["updater"] = {**settings["updater"], "scale": ((high - low) / 2).tolist()}
+        settings["updater"] = {**given, "scale": ((high - low) / 2).tolist()}
     updater = make("updater", loss)
     check_updater(updater, model)
     chain = [guard] if transform is None else [guard, transform]
