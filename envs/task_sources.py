@@ -176,8 +176,6 @@ def mujoco_task(
     Raises:
         ConfigurationError: for a file or a setting that cannot be used.
     """
-    import mujoco
-
     if xml is None or reward is None:
         missing = "robot.xml" if xml is None else "robot.reward"
         raise ConfigurationError(
@@ -190,6 +188,8 @@ def mujoco_task(
         world = MuJoCoDynamics(xml, skip)
     except ConfigurationError as error:
         raise ConfigurationError(str(error).replace("dynamics.model", "robot.xml")) from error
+    import mujoco
+
     data = mujoco.MjData(world.mjcf)
     if world.mjcf.nkey:
         mujoco.mj_resetDataKeyframe(world.mjcf, data, 0)
