@@ -190,6 +190,9 @@ class Tick(nn.Module):
         foreseen = self.network.effect(known, torch.cat([proposals, probes], -2))
         effects, found = foreseen[:, :count], foreseen[:, count:]
         low, high = found.amin(-2), found.amax(-2)
+        # Where a line explains all rows, it is believed to go on where nothing was tried.
+        line = known.experts.lines(box)
+        low, high = torch.fmin(low, line.amin(-2)), torch.fmax(high, line.amax(-2))
         wanted = attainable(planned, low, high, self.saturation)
         best = nearest_of(effects, wanted, 0.5 * (high - low))
         chosen = torch.cat([proposals, effects], -1)

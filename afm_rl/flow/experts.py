@@ -14,6 +14,7 @@ STUCK = 5e-3  # half ranges: an action with less effect is held by friction
 PRIOR = 1e-4  # weight of the nominal map in every fit
 LEAST_GAIN = 0.02  # smallest gain that is divided by
 NOISE = 0.1  # half ranges: a pair with this standard deviation counts half
+EXACT = 0.02  # half ranges: a fit that misses by less explains all rows
 LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
 NEAR = 0.15  # half ranges: a pair so far from the question counts half as much
 SHORT, LONG = 0.5, 0.9  # forgetting per row
@@ -258,6 +259,12 @@ class Experts(NamedTuple):
         linear = self.gain[..., :3] * unit + self.offset[..., :3]
         rubbed = apply_friction(self.gain[..., 3:], self.offset[..., 3:], unit)
         return linear, rubbed, (self.matrix @ actions + self.bias).unsqueeze(-1)
+
+    def lines(self, actions: Tensor) -> Tensor:
+        """Return the effects ``(N, C, A)`` of actions by gain and offset, NaN where these miss."""
+        exact = self.misses[..., 2].exp() < EXACT  # (N, A, 1)
+        effect = self.gain[..., 2] * actions.mT.to(self.bias) + self.offset[..., 2]
+        return torch.where(exact, effect, torch.nan).mT.to(actions)
 
     def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
         """Return the log-weight of each row for ``unit`` ``(N, A, C, 1)``, ``(N, A, C, K)``."""

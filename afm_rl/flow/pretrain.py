@@ -120,7 +120,7 @@ def main() -> None:
     """Train, or evaluate."""
     parser = argparse.ArgumentParser(prog="python -m afm_rl.flow.pretrain", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("universal.safetensors"))
-    parser.add_argument("--iterations", type=int, default=36_000)
+    parser.add_argument("--iterations", type=int, default=40_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--evaluate", action="store_true", help="print errors, train nothing")
     given = parser.parse_args()

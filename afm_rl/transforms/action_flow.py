@@ -32,7 +32,8 @@ class ActionFlowTransform(Transform):
       action stays the planned one, so losses should read the executed one,
     * ``(prefix, "predicted_effect")`` ``(*B, A)``: the effect that the executed action is
       predicted to have; where nothing is corrected, itself,
-    * ``(prefix, "misaligned")`` ``(*B)``: was the action corrected?
+    * ``(prefix, "misaligned")`` ``(*B)``: does the model misjudge actions, so that they are
+      corrected (with ``enabled=False``: so that they would be)?
     * ``(prefix, "innovation")`` ``(*B)``: the misalignment, in the unit of the gate,
     * ``(prefix, "spread")`` ``(*B, A)``: standard deviation of the flow's samples,
     * ``(prefix, "effect_bounds")`` ``(*B, 2, A)``: lowest and highest effect that an action can

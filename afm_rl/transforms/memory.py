@@ -121,14 +121,14 @@ def correct(
         touched = (executed != found.executed).any(-1, keepdim=True)
         predicted = torch.where(touched & ~misaligned.unsqueeze(-1), executed, predicted)
     if not enabled:
-        predicted, misaligned = executed, torch.zeros_like(misaligned)
+        predicted = executed
     wide = extend_action_box and enabled and model.extrapolates
     entries = {
         "planned_action": planned,
         "executed_action": executed,
         "predicted_effect": predicted,
         "effect_bounds": found.bounds if wide else box,
-        "spread": found.spread,
+        "spread": found.spread if enabled else torch.zeros_like(found.spread),
         "innovation": found.innovation,
         "misaligned": misaligned,
         "memory": memory,
