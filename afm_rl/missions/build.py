@@ -108,9 +108,9 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     robot.metrics.check(env, robot.goal_names)
     missions = build_missions(env, tracks, regimes, seeds)
 
-    def make(group: str, *args: Any) -> Any:
+    def make(group: str, *args: Any, **changed: Any) -> Any:
         with blaming(group):
-            return instantiate(settings[group], _convert_="all")(*args)
+            return instantiate({**settings[group], **changed}, _convert_="all")(*args)
 
     dynamics = make("dynamics", robot)
     corrector = make("corrector", robot, dynamics)
@@ -124,7 +124,10 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     with blaming("cost"):
         cost = instantiate(settings["cost"], _convert_="all")
         cost = cost if isinstance(cost, Cost) else cost(robot)
-    planner = make("planner", PlanningEnv(model, cost, *robot.action_box))
+    # Without a transform nobody tells the planner which effects can be had.
+    no_box = transform is None and "box_key" in settings["planner"]
+    changed = {"box_key": None} if no_box else {}
+    planner = make("planner", PlanningEnv(model, cost, *robot.action_box), **changed)
     guard = Guard()
     executed_key = ("next", guard.key("executed_action"))
     loss = GaussianNLLLoss(model)
@@ -141,7 +144,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     whole = TransformedEnv(env, Compose(*chain))
     check_cost(cost, model, whole, getattr(planner, "stages", None))
     check_keys("planner", planner, whole)
-    if transform is not None:  # which writes what that key names; without it there is nothing
+    if transform is not None:
         check_keys("planner", planner, whole, ["box_key"])
     check_keys("updater", updater, whole)
     return Agent(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -89,8 +91,8 @@ class MPPI(SamplingPlanner):
         seed_key: entry ``(*B)`` with each mission's seed: missions of one seed share their
             noise whoever else is in the batch. Without it noise is drawn for the batch.
         box_key: entry ``(*B, 2, A)`` with the lowest and highest action to plan with, such as the
-            ``reach`` of :class:`~afm_rl.transforms.ActionFlowTransform`; the action's own bounds
-            where there is none.
+            ``effect_bounds`` of :class:`~afm_rl.transforms.ActionFlowTransform`; the action's own
+            bounds, with a warning, where there is none.
         action_key: where the action goes.
         seed: seed of the noise without ``seed_key``.
 
@@ -168,6 +170,12 @@ class MPPI(SamplingPlanner):
         space = self.action_spec.space
         box = None if self.box_key is None else td.get(self.box_key, None)
         if box is None:
+            if self.box_key is not None:
+                warnings.warn(
+                    f"planner.box_key={self.box_key!r}: the tensordict has no such entry, so plans "
+                    "keep to the action's own bounds",
+                    stacklevel=2,
+                )
             return space.low, space.high, self.scale
         low, high = box.unsqueeze(-3).unbind(-2)
         return low, high, self.scale * (high - low) / (space.high - space.low)

@@ -293,6 +293,7 @@ def test_a_box_per_mission_replaces_that_of_the_actions(world, box):
     assert (plain >= low).all() and (plain <= high).all()
 
 
+@pytest.mark.filterwarnings("ignore:planner.box_key")
 @pytest.mark.parametrize("key", [None, "box", ("afm", "effect_bounds")])
 def test_without_a_box_or_with_that_of_the_actions_plans_are_the_same(world, box, key):
     td = situation(3)
@@ -300,6 +301,11 @@ def test_without_a_box_or_with_that_of_the_actions_plans_are_the_same(world, box
     if key == "box":
         td["box"] = torch.stack(box).expand(3, 2, 2).clone()
     torch.testing.assert_close(plan(MPPI(world, box_key=key, **SMALL), td), expected)
+
+
+def test_a_box_key_that_nobody_writes_is_announced(world):
+    with pytest.warns(UserWarning, match="box_key='bocks': the tensordict has no such entry"):
+        plan(MPPI(world, box_key="bocks", **SMALL), situation(1))
 
 
 def test_noise_grows_with_the_box(world, box):
