@@ -44,8 +44,8 @@ class FlightWindow(MissionState):
     def gather(self, rows: Rows, most: int) -> None:
         """Add rows and keep the latest ``most``; those that do not count become zeros."""
         counts = rows.counts.unsqueeze(-1)
-        blanked = {name: torch.where(counts, part, 0.0) for name, part in rows._asdict().items()}
-        rows = Rows(**blanked | {"counts": rows.counts})
+        state, action, after = (torch.where(counts, part, 0.0) for part in rows[:3])
+        rows = Rows(state, action, after, rows.counts)
         if self.size:
             rows = Rows(*(torch.cat(pair, 2) for pair in zip(self.parts, rows, strict=True)))
         self.keep(Rows(*(part[:, :, -most:].contiguous() for part in rows)))
