@@ -23,7 +23,7 @@ demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and f
 	@echo "A robot drives along a track. After the second target its motors drive it backwards."
 	@echo "Four methods meet that: the old physics alone (physics), an ensemble that learns from every"
 	@echo "step (online_pe), the old physics behind AFM (afm_physics), and an oracle that knows it."
-	@$(BIN)/afm-rl hydra.run.dir=outputs/demo overwrite=true budget=800 video=gif
+	@$(BIN)/afm-rl hydra.run.dir=outputs/demo overwrite=true budget=600 video=gif
 	@echo "Look at outputs/demo/figures/trajectory.png and at the film outputs/demo/video/all_methods.gif"
 
 test: $(VENV)/.with-test ## Run all tests with coverage (at least 95 %)
