@@ -21,7 +21,7 @@ FLOORS = [
     {"flow": 2},
     {"learning": 2},
     {"dynamics": 2},
-    {"regimes": 2},
+    {"regimes": 2, "diagnosis": 4},
     {"foundations": 2},
 ]
 

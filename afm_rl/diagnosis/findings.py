@@ -1,0 +1,114 @@
+"""What a diagnosis says: one :class:`Actuator` each, and the :class:`Diagnosis` of all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+Status = Literal["healthy", "changed", "dead", "cannot tell"]
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Actuator:
+    r"""How the response of one actuator follows its command.
+
+    .. math:: y(t) = g\, L_\tau[c_s(z(u(t - d)))] + b + \mathrm{noise}
+
+    with the dead zone z, the cut c at s (the saturation), and a lag L of first order.
+    """
+
+    name: str
+    status: Status = "cannot tell"
+    gain: float = math.nan
+    """g, response per command; that of ``driven_by`` where the own command has no influence."""
+    gain_interval: Interval = (-math.inf, math.inf)
+    """95 % interval."""
+    reversed: bool = False
+    offset: float = math.nan
+    """b, in units of the response."""
+    offset_interval: Interval = (-math.inf, math.inf)
+    dead_zone: float = 0.0
+    """Size of commands up to which nothing happens, in units of the command; 0: none was seen."""
+    saturation: float | None = None
+    """Size of commands beyond which nothing more happens; None: none was seen."""
+    backlash: float = 0.0
+    """Half of the play, in units of the command; 0: none was seen."""
+    delay_s: float = 0.0
+    """d (s)."""
+    lag_s: float = 0.0
+    """Time constant of the lag (s)."""
+    driven_by: str | None = None
+    """Another actuator whose command has an influence, alone (swapped) or beside the own one."""
+    coupling: Mapping[str, float] = field(default_factory=dict)
+    """Response per command of other actuators."""
+    noise: float = math.nan
+    """Standard deviation of what the fit leaves, in units of the response."""
+    unexplained: float = math.nan
+    """Share of the response's variance that the fit leaves."""
+    command_range: Interval = (math.nan, math.nan)
+    """The commands between which 98 % of the rows are."""
+    unit: float = 1.0
+    """Gain of a healthy actuator: pi / 180 where commands are degrees and responses radians."""
+    drift: Mapping[str, Interval] = field(default_factory=dict)
+    """``gain`` or ``offset`` at begin and end of the log, where it changes little by little."""
+    changes: tuple[Change, ...] = ()
+    """What changed on the way; the numbers above are those after the last change."""
+    rows: int = 0
+    """Rows that the numbers above are fitted to."""
+    sentence: str = ""
+
+    @property
+    def reach(self) -> float:
+        """Half of the range of commands."""
+        low, high = self.command_range
+        return 0.5 * (high - low)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """Something that changed suddenly."""
+
+    t: float
+    """When (s since the log began)."""
+    before: Actuator
+    after: Actuator
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """What is known of all actuators of a robot.
+
+    >>> wrist = Actuator(name="wrist", status="healthy", gain=1.0, sentence="wrist: healthy")
+    >>> print(Diagnosis(actuators=(wrist,)))
+    wrist: healthy
+    """
+
+    actuators: tuple[Actuator, ...]
+    step_s: float = 1.0
+    """Time between two rows (s), the median."""
+    rows: int = 0
+    notes: tuple[str, ...] = ()
+    """What a reader must know of the log."""
+
+    def __str__(self) -> str:
+        return "\n".join(actuator.sentence for actuator in self.actuators)
+
+    @property
+    def healthy(self) -> bool:
+        """Is nothing wrong with any actuator?"""
+        return all(actuator.status == "healthy" for actuator in self.actuators)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the diagnosis as plain lists and numbers; None where one is not known."""
+        return _plain(asdict(self))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

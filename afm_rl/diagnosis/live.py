@@ -1,0 +1,175 @@
+"""A diagnosis in a few milliseconds, from the pairs that a corrector remembers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.special import stdtrit
+
+from afm_rl.diagnosis.findings import Actuator, Diagnosis
+from afm_rl.diagnosis.words import MATTERS, judge
+from afm_rl.errors import ConfigurationError
+
+DELAYS = 5  # 0 to 4 steps
+FEWEST = 8  # pairs
+CLEAR = 5.0  # standard errors by which another command has to show
+BETTER = 0.5  # share of the squared residual that another delay or command may leave
+STALE = 9.0  # times the newest pairs' squared residual: the older ones were another regime
+ROUNDING = 1e-4  # share of the range of commands: smaller residuals are rounding
+
+
+def explain(
+    executed: Any,
+    effective: Any,
+    names: Sequence[str] | None = None,
+    std: Any = None,
+    step: float = 1.0,
+) -> Diagnosis:
+    r"""Say what pairs of executed and effective actions show of each actuator.
+
+    Each actuator is fitted by :math:`u_\mathrm{eff} = g\,u_i(t - d) + b`, with the own command or
+    another, and whole steps of delay; then other commands are looked for in what is left. Where the
+    older pairs contradict the newest, only the newest half or quarter counts. Forty pairs of
+    seven actuators take about four milliseconds.
+
+    Args:
+        executed: ``(K, A)``, oldest first, one row per step; numpy or torch.
+        effective: their effective actions, ``(K, A)``.
+        names: of the actuators.
+        std: standard deviations of the effective actions, ``(K, A)``; None if all are alike.
+        step: time of a step (s).
+
+    Raises:
+        ConfigurationError: for shapes that do not fit.
+
+    >>> u = np.random.default_rng(0).uniform(-1, 1, (40, 2))
+    >>> print(explain(u, u * [-0.5, 1.0], names=["left", "right"]))
+    left: reversed, 50 % of the command
+    right: healthy
+    """
+    u, y = np.asarray(executed, dtype=float), np.asarray(effective, dtype=float)
+    weight = np.ones_like(y) if std is None else np.asarray(std, dtype=float)
+    if u.ndim != 2 or u.shape != y.shape or u.shape != weight.shape:
+        raise ConfigurationError(
+            f"explain: executed {u.shape}, effective {y.shape}, std {weight.shape}: expected "
+            "three arrays (K, A) of one shape"
+        )
+    size = u.shape[1]
+    names = [str(k) for k in range(size)] if names is None else list(names)
+    if len(names) != size:
+        raise ConfigurationError(f"explain: {len(names)} names: expected {size}, one per action")
+    if std is not None:
+        weight = 1 / (weight**2 + (0.1 * np.ptp(u, 0).clip(1e-9)) ** 2)
+    sound = np.isfinite(u).all(1) & np.isfinite(y).all(1) & np.isfinite(weight).all(1)
+    u, y, weight = u[sound], y[sound], weight[sound]
+    if len(u) < FEWEST:
+        found = [judge(Actuator(name=name, rows=len(u))) for name in names]
+        return Diagnosis(actuators=tuple(found), step_s=step, rows=len(u))
+    late = np.zeros((DELAYS, *u.shape))
+    for delay in range(DELAYS):
+        late[delay, delay:] = u[: len(u) - delay]
+    shown = [_fit(late, y[:, j], weight[:, j], j, names, step) for j in range(size)]
+    return Diagnosis(actuators=tuple(shown), step_s=step, rows=len(u))
+
+
+def _fit(
+    late: np.ndarray, y: np.ndarray, weight: np.ndarray, own: int, names: Sequence[str], step: float
+) -> Actuator:
+    """Fit one actuator's effects ``(K,)`` by the commands, ``(D, K, A)`` with each delay."""
+    rows = len(y)
+    shortest, rounding = DELAYS + FEWEST, float((10 * ROUNDING) ** 2 * late[0].var(0).max())
+    for share in (4, 2, 1):  # the newest quarter, half, all
+        first = max(rows - max(rows // share, shortest), min(DELAYS - 1, rows - FEWEST))
+        found = _line(late[:, first:], y[first:], weight[first:], own)
+        if share == 4:
+            newest, start = found, first
+        elif first < start and found[-1] > STALE * max(newest[-1], rounding):
+            break
+        best, start = found, first
+    delay, driver, gain, offset, _ = best
+    x, y, weight = late[delay, start:], y[start:], weight[start:]
+    residual = y - gain * x[:, driver] - offset
+    coupling, used = {}, [driver]
+    spread = x.std(0)
+    whole = (weight[:, None] * (x - x.mean(0)) ** 2).sum(0)
+    for _ in range(x.shape[1] - 1 if driver == own else 0):
+        design = np.column_stack([x[:, used], np.ones(len(x))])
+        rest = x - design @ np.linalg.lstsq(design, x, rcond=None)[0]
+        power = (weight[:, None] * rest**2).sum(0)
+        slope = (weight * residual) @ rest / np.maximum(power, 1e-300)
+        error = np.sqrt((residual**2).mean() / np.maximum((rest**2).sum(0), 1e-300))
+        clear = (np.abs(slope) > CLEAR * error) & (power > 0.01 * whole)
+        clear &= np.abs(slope) * spread > MATTERS * max(spread[own], ROUNDING)
+        clear[used] = False
+        if not clear.any() or len(x) < len(used) + FEWEST:
+            break
+        used.append(int(np.argmax(np.where(clear, slope**2 * power, -1.0))))
+        design = np.column_stack([x[:, used], np.ones(len(x))])
+        root = np.sqrt(weight)[:, None]
+        solution = np.linalg.lstsq(root * design, root[:, 0] * y, rcond=None)[0]
+        residual = y - design @ solution
+        gain, offset = solution[0], solution[-1]
+        coupling = {names[i]: float(g) for i, g in zip(used[1:], solution[1:-1], strict=True)}
+    design = np.column_stack([x[:, used], np.ones(len(x))])
+    gram = (design * weight[:, None]).T @ design
+    covariance = np.linalg.inv(gram + 1e-12 * gram.trace() * np.eye(len(gram)))
+    freedom = max(len(x) - design.shape[1], 1)
+    # Neighbouring residuals may be alike: that many rows tell as little as fewer independent ones.
+    alike = 0.0
+    if residual.any():
+        alike = max(0.0, residual[1:] @ residual[:-1] / (residual @ residual))
+    inflation = (1 + min(alike, 0.9)) / (1 - min(alike, 0.9))
+    scale = (weight * residual**2).sum() / freedom * inflation
+    times = stdtrit(max(freedom / inflation, 2.0), 0.975)
+    width = times * np.sqrt(scale * covariance.diagonal())
+    least, most = float(x[:, driver].min()), float(x[:, driver].max())
+    if not most > least:
+        width = np.full_like(width, np.inf)
+    others = max(coupling, key=lambda name: abs(coupling[name])) if coupling else None
+    total = y.var()
+    actuator = Actuator(
+        name=names[own],
+        gain=float(gain),
+        gain_interval=(float(gain - width[0]), float(gain + width[0])),
+        reversed=bool(gain + width[0] < 0),
+        offset=float(offset),
+        offset_interval=(float(offset - width[-1]), float(offset + width[-1])),
+        delay_s=delay * step,
+        driven_by=others if driver == own else names[driver],
+        coupling=coupling,
+        noise=float(np.sqrt(scale / inflation / weight.mean())),
+        unexplained=float(min(residual.var() / total, 1.0)) if total else 0.0,
+        command_range=(least, most),
+        rows=len(x),
+    )
+    return judge(actuator, step)
+
+
+def _line(
+    x: np.ndarray, y: np.ndarray, weight: np.ndarray, own: int
+) -> tuple[int, int, float, float, float]:
+    """Return delay, driver, gain, offset and squared residual of the best line.
+
+    Args:
+        x: commands with each delay, ``(D, K, A)``.
+        y: effects, ``(K,)``.
+        weight: of the pairs, ``(K,)``.
+        own: index of the actuator's own command.
+    """
+    share = weight / weight.sum()
+    mean, level = share @ x, share @ y  # (D, A)
+    centred, moved = x - mean[:, None], y - level
+    power = share @ centred**2
+    slope = (share * moved) @ centred / np.maximum(power, 1e-12)
+    left = np.maximum((share * moved) @ moved - slope**2 * power, 0.0)
+    left += ROUNDING**2 * np.maximum(power.max(), 1e-300)
+    # the own command without delay, unless another is clearly better
+    clear = left[:, own].min() < BETTER * left[0, own]
+    best = (int(left[:, own].argmin()) if clear else 0, own)
+    other = np.unravel_index(left.argmin(), left.shape)
+    if left[other] < BETTER**2 * left[best]:
+        best = (int(other[0]), int(other[1]))
+    gain = float(slope[best])
+    return best[0], best[1], gain, float(level - gain * mean[best]), float(left[best])
