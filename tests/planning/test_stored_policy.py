@@ -1,0 +1,46 @@
+"""Policies in files are the networks that were stored."""
+
+import pytest
+import torch
+from torch import nn
+
+from afm_rl.artefacts import save_tensors
+from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.planning import load_policy, save_policy
+
+
+@pytest.fixture
+def stored(tmp_path):
+    torch.manual_seed(0)
+    linear = [nn.Linear(3, 8), nn.Linear(8, 8), nn.Linear(8, 2)]
+    layers = [(part.weight.half().float(), part.bias.half().float()) for part in linear]
+    low, high = torch.tensor([-2.0, 0.0]), torch.tensor([2.0, 1.0])
+    save_policy(tmp_path / "policy.safetensors", layers, low, high, {"id": "Some-v0"})
+    return tmp_path / "policy.safetensors", layers
+
+
+def test_what_comes_back_is_the_network(stored):
+    file, layers = stored
+    policy, about = load_policy(file)
+    seen = torch.randn(7, 3)
+    hidden = seen
+    for weight, bias in layers[:-1]:
+        hidden = (hidden @ weight.T + bias).clamp_min(0)
+    unit = (hidden @ layers[-1][0].T + layers[-1][1]).tanh()
+    wanted = torch.stack([2 * unit[:, 0], (unit[:, 1] + 1) / 2], -1)
+    torch.testing.assert_close(policy(seen), wanted)
+    assert about["id"] == "Some-v0" and policy.observation_size == 3
+    assert not policy(seen).requires_grad
+
+
+def test_types_follow_the_observation(stored):
+    policy, _ = load_policy(stored[0])
+    assert policy(torch.zeros(3, dtype=torch.float64)).dtype == torch.float64
+
+
+def test_files_that_hold_no_policy_are_refused(tmp_path):
+    with pytest.raises(ConfigurationError, match="no such file"):
+        load_policy(tmp_path / "nothing.safetensors")
+    save_tensors(tmp_path / "other.safetensors", {"a": torch.zeros(1)}, {})
+    with pytest.raises(ArtefactError, match="holds no policy"):
+        load_policy(tmp_path / "other.safetensors")
