@@ -174,7 +174,7 @@ class ActionFlow(PairCorrector):
 
                 parts |= put(parts, "losses", "forecasts")
                 found = found._replace(**put(found._asdict(), *CORRECTED))
-            parts |= {"planned": planned, "executed": found.executed}
+            parts |= {"planned": planned, "executed": found.executed, "predicted": found.predicted}
             parts["misaligned"] = surprised.unsqueeze(-1).to(planned.dtype)
             return self.pack(parts), found
 

@@ -49,6 +49,7 @@ class PairCorrector(Corrector):
         return {
             **super().shapes(state_size),
             "pairs": (self.memory, self.pair_size),
+            "predicted": (self.action_size,),
             "misaligned": (1,),
         }
 
@@ -67,8 +68,13 @@ class PairCorrector(Corrector):
         state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
         unit = self.normalise(executed)
         awake = bool(parts["misaligned"].any())
+        # The newest action was predicted to have an effect; older ones were asked about before.
+        before = parts["pairs"][..., self.memory - count + 1 :, self.action_size :]
+        guess = self.denormalise(before[..., : self.action_size])
+        guess = torch.cat([guess, parts["predicted"].unsqueeze(-2)], -2)
+        quiet = 0.0 if awake else self.gate
         seen = effective_action(
-            model, state, executed, reached, self.scale, quiet=0.0 if awake else self.gate
+            model, state, executed, reached, self.scale, quiet=quiet, guess=guess
         )
         std = (seen.std / self.scale).clamp_max(LIMIT)
         rows = torch.cat(
@@ -122,7 +128,7 @@ class ClassicalCorrector(PairCorrector):
             action, effect = self.answer(self.rows(parts["pairs"][use]), unit)
             executed[use], predicted[use] = self.denormalise(action), self.denormalise(effect)
             found = found._replace(executed=executed, predicted=predicted, misaligned=misaligned)
-        parts |= {"planned": planned, "executed": found.executed}
+        parts |= {"planned": planned, "executed": found.executed, "predicted": found.predicted}
         parts["misaligned"] = misaligned.unsqueeze(-1).to(planned.dtype)
         return self.pack(parts), found
 

@@ -81,7 +81,7 @@ class Tick(nn.Module):
         never = 0.0 if identity else torch.inf
         penalty = [h.penalty for h in chosen] + [HYPOTHESES[IDENTITY].penalty + never]
         fixed = {
-            "scale": scale,
+            "scale": scale.to(network.modes),
             "source_points": source_points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "penalty": torch.tensor(penalty),

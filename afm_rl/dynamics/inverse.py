@@ -33,6 +33,7 @@ def effective_action(
     half_range: Tensor,
     rounds: int = 3,
     quiet: float = 0.0,
+    guess: Tensor | None = None,
 ) -> EffectiveAction:
     r"""Express a prediction error in action space, for any model and robot.
 
@@ -46,9 +47,11 @@ def effective_action(
     and leaves it where it is. The noise :math:`\Sigma` is that of the executed action's forecast;
     ``std`` is the square root of C's diagonal, in units of the action.
 
-    A model that is affine in its action takes one round. With others, a round moves each axis by
-    half a range at most, a row is only changed where its error becomes smaller (its next step is
-    a quarter as long where it does not), and its rounds end early when little is left that an
+    A model that is affine in its action takes one round. With others, the rounds of a row begin at
+    the ``guess`` where that explains the transition better than the executed action: contacts have
+    many local minima, and a correction that is right lies in the deepest. A round moves each axis
+    by half a range at most, a row is only changed where its error becomes smaller (its next step
+    is a quarter as long where it does not), and its rounds end early when little is left that an
     action can explain. ``std`` grows by the root mean square of the normalised error that remains,
     where that exceeds 1: a contact that the rounds did not resolve tells little.
 
@@ -64,6 +67,7 @@ def effective_action(
         rounds: Gauss-Newton steps at most.
         quiet: innovations up to this size need no explanation: if there is no larger one, the
             executed actions are returned at once, with a standard deviation of a tenth.
+        guess: where else to begin, such as the effect that was predicted, ``(*B, A)``.
 
     >>> from afm_rl.dynamics import Dubins
     >>> s, a = torch.zeros(3), torch.tensor([0.5, 0.2])
@@ -82,7 +86,13 @@ def effective_action(
     if bool((innovation <= quiet).all()):  # false for NaN
         std = (ASSUMED * half_range).expand_as(action)
         return EffectiveAction(action.to(dtype), std.to(dtype), innovation.to(dtype))
-    effective, limit = action, torch.ones_like(innovation).unsqueeze(-1)
+    effective = action
+    if guess is not None and not model.affine:
+        guess = guess.to(action)
+        there = model.manifold.difference(next_state, model(state, guess)) / noise
+        better = there.square().sum(-1, True) < error.square().sum(-1, True)
+        effective, error = torch.where(better, guess, action), torch.where(better, there, error)
+    limit = torch.ones_like(innovation).unsqueeze(-1)
     going, covariance = limit > 0, limit.double().unsqueeze(-1)
     for last in (False,) * (rounds - 1) + (True,):
         jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from afm_rl.artefacts import load_artefact, save_artefact
-from afm_rl.correction import ActionFlow, PaperFlow
+from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
 from afm_rl.correction.choice import nearest_of, probes_of, source_points_of
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ArtefactError, ConfigurationError
@@ -45,6 +45,13 @@ def test_corrections_are_finite_and_in_the_box(line, drive, plans, size, mode):
     assert all(part.isfinite().all() for part in found) and misaligned[1:].all()
     assert (executed.abs() <= 1 + 1e-6).all()
     assert (bounds[:, :, 0] <= -1 + 1e-6).all() and (bounds[:, :, 1] >= 1 - 1e-6).all()
+
+
+@pytest.mark.parametrize("corrector", [ActionFlow, LeastSquares])
+def test_bounds_in_double_precision_are_answered_in_it(line, drive, plans, corrector):
+    ends = torch.ones(2, dtype=torch.float64)
+    found, _ = drive(corrector(-ends, ends), line(2), upset, plans(4, 2).double())
+    assert found[-1][1:].all() and found[0].dtype == torch.float64
 
 
 @pytest.mark.parametrize("size", [1, 2, 6])

@@ -174,6 +174,20 @@ def test_rounds_bring_a_bent_model_to_the_true_action():
     assert median[2] < 1e-3
 
 
+def test_a_guess_that_explains_more_leads_out_of_a_local_minimum():
+    wavy = KnownDynamics(lambda s, a: s + (3 * a).sin() + 0.1 * a, Manifold(1), 1, noise_std=0.01)
+    state, executed, true = torch.zeros(3, 1), -torch.ones(1), torch.tensor([0.9])
+    reached = wavy(state, true.expand(3, 1))
+    guess = torch.tensor([[-1.0], [0.8], [-0.9]])  # as executed, near the truth, no better
+    found = [
+        effective_action(wavy, state, executed.expand(3, 1), reached, torch.ones(1), guess=start)
+        for start in (None, guess)
+    ]
+    assert bool(((found[0].action - true).abs() > 0.5).all())
+    torch.testing.assert_close(found[1].action[1], true, atol=0.01, rtol=0)
+    torch.testing.assert_close(found[1].innovation, found[0].innovation)
+
+
 def test_the_standard_deviation_is_that_of_repeated_transitions():
     generator = torch.Generator().manual_seed(0)
     state, true = torch.zeros(4000, 2).double(), torch.tensor([0.3, -0.2]).double()
