@@ -3,7 +3,7 @@
 from afm_rl.regimes.actuators import actuator_regimes
 from afm_rl.regimes.asymmetric import AsymmetricGain
 from afm_rl.regimes.backlash import Backlash
-from afm_rl.regimes.base import Regime
+from afm_rl.regimes.base import DelayedRegime, Regime, StaticRegime
 from afm_rl.regimes.bias import Bias
 from afm_rl.regimes.compose import Compose
 from afm_rl.regimes.dead import DeadActuator
@@ -31,28 +31,30 @@ from afm_rl.regimes.schedule import Schedule, blend_phases, phase_parameters
 from afm_rl.regimes.slip import WheelSlip
 
 __all__ = [
-    "Quantisation",
-    "Permutation",
-    "Lag",
-    "DeadActuator",
-    "Backlash",
-    "AsymmetricGain",
     "ActionGain",
+    "AsymmetricGain",
+    "Backlash",
     "Bias",
     "Compose",
+    "DeadActuator",
     "DeadZone",
     "Delay",
+    "DelayedRegime",
     "GainNoise",
     "InertiaFactor",
+    "Lag",
     "MassFactor",
     "MotorEfficiency",
     "Patches",
     "Payload",
+    "Permutation",
     "Physics",
+    "Quantisation",
     "Regime",
     "Rotation",
     "Saturation",
     "Schedule",
+    "StaticRegime",
     "WheelSlip",
     "Wind",
     "actuator_regimes",

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import check_number
-from afm_rl.regimes.base import Regime
+from afm_rl.regimes.base import StaticRegime
 from afm_rl.regimes.gain import MOST_GAIN, divide
 from afm_rl.regimes.settings import check_span, draw_between
 
 
-class AsymmetricGain(Regime):
+class AsymmetricGain(StaticRegime):
     r"""One gain for commands above zero and another one for those below, on each axis.
 
     .. math:: a_\mathrm{eff} = \begin{cases} g^+ a & a > 0 \\ g^- a & \text{otherwise}\end{cases}
@@ -45,22 +45,13 @@ class AsymmetricGain(Regime):
         check_number("span", low, low=0.0, open_low=True)
         self.span = math.log(low), math.log(high)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Multiply by the gain of the command's direction; the state plays no part."""
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
+        """Multiply by the gain of the command's direction."""
         return action * self._gains(action, parameters)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Divide by the gain of the effect's direction and clamp."""
-        return divide(action, self._gains(action, parameters)).clamp(low, high)
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Divide by the gain of the effect's direction."""
+        return divide(effect, self._gains(effect, parameters))
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw gains ``(*shape, 2 A)``: all upward ones, then all downward ones."""

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import check_count
-from afm_rl.regimes.base import Regime
-from afm_rl.regimes.settings import HalfRange, check_span, draw_between
+from afm_rl.regimes.base import DelayedRegime
+from afm_rl.regimes.settings import HalfRange, check_span
 
 
-class Backlash(Regime):
+class Backlash(DelayedRegime):
     r"""The play operator, the same width on all axes: a hysteresis.
 
     .. math:: y_t = \min(\max(y_{t-1}, u_t - b), u_t + b)
@@ -48,30 +48,11 @@ class Backlash(Regime):
         self.span = check_span("span", span, 0.0, 1.0)
         self.history = check_count("history", history)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Follow the commands from the oldest one on; the state plays no part."""
-        if past is None:
-            return action
+    def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
+        """Follow the commands from the oldest one on."""
         width = parameters * self.half_range.like(action)
-        oldest, *later = reversed(past[..., : self.history, :].unbind(-2))
+        oldest, *later = reversed(past.unbind(-2))
         effect = oldest
         for command in (*later, action):
             effect = torch.minimum(torch.maximum(effect, command - width), command + width)
         return effect
-
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Clamp: where in the play the gear stands is not known."""
-        return action.clamp(low, high)
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw half widths ``(*shape, 1)``, uniform."""
-        return draw_between(self.span, (*shape, 1), generator)

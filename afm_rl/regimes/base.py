@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError
+from afm_rl.regimes.settings import draw_between
 
 SEARCH_POINTS, SEARCH_ROUNDS, SEARCH_SHRINK = 64, 8, 0.45
 
@@ -30,6 +31,8 @@ class Regime(ABC):
         history: how many previous actions the effect depends on, D.
         noisy: whether the effect is random.
         by_state: whether it depends on the state.
+        span: lowest and highest value in the prior, of families whose prior is uniform and the
+            same for all parameters.
     """
 
     names: tuple[str, ...]
@@ -38,6 +41,7 @@ class Regime(ABC):
     history: int = 0
     noisy: bool = False
     by_state: bool = False
+    span: tuple[float, float]
 
     @abstractmethod
     def apply(
@@ -59,9 +63,9 @@ class Regime(ABC):
             noise: standard normal numbers, ``(*B, A)``; None for the mean effect.
         """
 
-    @abstractmethod
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw parameters ``(*shape, F)`` from the family's prior."""
+        """Draw parameters ``(*shape, F)`` from the family's prior: uniform in ``span``."""
+        return draw_between(self.span, (*shape, len(self.names)), generator)
 
     def inverse(
         self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
@@ -164,3 +168,59 @@ class Regime(ABC):
         """Return ``(*B)`` booleans: is this the nominal regime?"""
         nominal = torch.tensor(self.identity, device=parameters.device, dtype=parameters.dtype)
         return (parameters == nominal).all(-1)
+
+
+class StaticRegime(Regime):
+    """A regime in which neither the state, nor earlier actions, nor chance play a part."""
+
+    @abstractmethod
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
+        """Return the effects of actions, ``(*B, A)``."""
+
+    @abstractmethod
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Return the actions with an ``effect``, in the box or not, ``(*B, A)``."""
+
+    def apply(
+        self,
+        action: Tensor,
+        parameters: Tensor,
+        state: Tensor,
+        past: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        return self.effect_of(action, parameters)
+
+    def inverse(
+        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
+    ) -> Tensor:
+        return self.command_for(action, parameters).clamp(low, high)
+
+
+class DelayedRegime(Regime):
+    """A regime that depends on the previous actions; without them the action stays what it is.
+
+    In the long run, or where the previous actions are not known, the best command for an effect is
+    the effect itself.
+    """
+
+    @abstractmethod
+    def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
+        """Return the effects ``(*B, A)`` of actions after those of ``past`` ``(*B, D, A)``."""
+
+    def apply(
+        self,
+        action: Tensor,
+        parameters: Tensor,
+        state: Tensor,
+        past: Tensor | None = None,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        if past is None:
+            return action
+        return self.effect_of(action, parameters, past[..., : self.history, :])
+
+    def inverse(
+        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
+    ) -> Tensor:
+        return action.clamp(low, high)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime
-from afm_rl.regimes.settings import MOST, HalfRange, check_span, draw_between
+from afm_rl.regimes.base import StaticRegime
+from afm_rl.regimes.settings import MOST, HalfRange, check_span
 
 
-class Bias(Regime):
+class Bias(StaticRegime):
     r"""Per-axis offsets: :math:`a_\mathrm{eff} = a + b \odot h`.
 
     Args:
@@ -22,6 +21,7 @@ class Bias(Regime):
     Raises:
         ConfigurationError: for a setting that cannot be used.
 
+    >>> import torch
     >>> bias = Bias(["v_bias", "omega_bias"], half_range=[1.0, 2.0])
     >>> bias.apply(torch.zeros(2), bias.encode({"omega_bias": 0.25}), torch.zeros(3))
     tensor([0.0000, 0.5000])
@@ -39,23 +39,8 @@ class Bias(Regime):
         self.identity = (0.0,) * len(self.names)
         self.span = check_span("span", span)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Add; the state plays no part."""
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         return action + parameters * self.half_range.like(action)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Subtract and clamp."""
-        return (action - parameters * self.half_range.like(action)).clamp(low, high)
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw offsets ``(*shape, A)``, uniform."""
-        return draw_between(self.span, (*shape, len(self.names)), generator)
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        return effect - parameters * self.half_range.like(effect)

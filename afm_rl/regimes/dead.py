@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime
+from afm_rl.regimes.base import StaticRegime
 from afm_rl.regimes.gain import divide
 
 
-class DeadActuator(Regime):
+class DeadActuator(StaticRegime):
     r"""Loss of effectiveness: :math:`a_\mathrm{eff} = (1 - l) \odot a`; 1 is a dead actuator.
 
     The prior kills one axis and leaves the others nominal.
@@ -32,22 +32,12 @@ class DeadActuator(Regime):
         self.identity = (0.0,) * len(self.names)
         self.limits = dict.fromkeys(self.names, (0.0, 1.0))
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Multiply; the state plays no part."""
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         return action * (1 - parameters)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Divide and clamp; a dead actuator is given zero."""
-        return divide(action, 1 - parameters).clamp(low, high)
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Divide; a dead actuator is given zero."""
+        return divide(effect, 1 - parameters)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw one dead axis each, ``(*shape, A)``."""

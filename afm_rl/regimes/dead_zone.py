@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime
-from afm_rl.regimes.settings import HalfRange, check_span, draw_between
+from afm_rl.regimes.base import StaticRegime
+from afm_rl.regimes.settings import HalfRange, check_span
 
 
-class DeadZone(Regime):
+class DeadZone(StaticRegime):
     r"""A loss that has to be overcome first, the same on all axes; 0 loses nothing.
 
     .. math:: u_\mathrm{eff} = \mathrm{sign}(u) \max(|u| - d, 0)
@@ -23,6 +22,7 @@ class DeadZone(Regime):
     Raises:
         ConfigurationError: for a setting that cannot be used.
 
+    >>> import torch
     >>> stiff = DeadZone(half_range=[1.0, 2.0])
     >>> stiff.apply(torch.tensor([-0.25, 1.0]), stiff.encode({"dead_zone": 0.25}), torch.zeros(3))
     tensor([-0.0000, 0.5000])
@@ -36,25 +36,12 @@ class DeadZone(Regime):
         self.half_range = HalfRange(half_range)
         self.span = check_span("span", span, 0.0, 1.0)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Take the loss off the size; the state plays no part."""
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
+        """Take the loss off the size."""
         loss = parameters * self.half_range.like(action)
         return action.sign() * (action.abs() - loss).clamp(min=0.0)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Add the loss and clamp; the command for no effect is zero."""
-        loss = parameters * self.half_range.like(action)
-        return (action + action.sign() * loss).clamp(low, high)
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw losses ``(*shape, 1)``, uniform."""
-        return draw_between(self.span, (*shape, 1), generator)
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Add the loss; the command for no effect is zero."""
+        loss = parameters * self.half_range.like(effect)
+        return effect + effect.sign() * loss

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_counts
-from afm_rl.regimes.base import Regime
+from afm_rl.regimes.base import DelayedRegime
 
 MOST_STEPS = 8
 
 
-class Delay(Regime):
+class Delay(DelayedRegime):
     r"""The command of d steps ago: :math:`a_\mathrm{eff} = a_{t - d}`, with d up to 8.
 
     Between whole steps, as in a ramp, the neighbouring commands are mixed linearly. Whoever does
@@ -38,35 +38,19 @@ class Delay(Regime):
     history = MOST_STEPS
 
     def __init__(self, span: Sequence[int] = (1, 2)) -> None:
-        self.span = check_counts("span", span)
-        if len(self.span) != 2 or not self.span[0] <= self.span[1] <= MOST_STEPS:
+        self.steps = check_counts("span", span)
+        if len(self.steps) != 2 or not self.steps[0] <= self.steps[1] <= MOST_STEPS:
             raise ConfigurationError(
                 f"span={list(span)}: expected two numbers of steps, 1 <= lowest <= highest <= "
                 f"{MOST_STEPS}"
             )
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Pick the command out of the past; the state plays no part."""
-        if past is None:
-            return action
-        kept = past[..., :MOST_STEPS, :].unbind(-2)
+    def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
+        """Pick the command out of the past."""
         effect = action * (1 - parameters).clamp(min=0.0)
-        for steps, command in enumerate(kept, 1):
+        for steps, command in enumerate(past.unbind(-2), 1):
             effect = effect + command * (1 - (parameters - steps).abs()).clamp(min=0.0)
         return effect
-
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Clamp: what was commanded before cannot be changed."""
-        return action.clamp(low, high)
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
         """Return the parameter row; only whole steps are taken.
@@ -82,5 +66,5 @@ class Delay(Regime):
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw steps ``(*shape, 1)``."""
-        low, high = self.span
+        low, high = self.steps
         return torch.randint(low, high + 1, (*shape, 1), generator=generator).float()

@@ -6,14 +6,13 @@ exact: the nominal body under the effective action moves as the changed body doe
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from afm_rl.airframe import QuadrotorBody, mix, unmix
-from afm_rl.regimes.base import Regime
+from afm_rl.regimes.base import Regime, StaticRegime
 from afm_rl.regimes.compose import Compose
 from afm_rl.regimes.gain import ActionGain, divide
 from afm_rl.regimes.settings import check_span, draw_between
@@ -21,36 +20,7 @@ from afm_rl.regimes.settings import check_span, draw_between
 LEAST, MOST = 0.01, 100.0  # factors beyond these are typing errors
 
 
-class FlightRegime(Regime):
-    """A regime in which neither the state, nor earlier actions, nor chance play a part."""
-
-    @abstractmethod
-    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        """Return the effects of actions, ``(*B, 4)``."""
-
-    @abstractmethod
-    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Return the actions with an ``effect``, in the box or not, ``(*B, 4)``."""
-
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Return :meth:`effect_of`."""
-        return self.effect_of(action, parameters)
-
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Return :meth:`command_for`, clamped."""
-        return self.command_for(action, parameters).clamp(low, high)
-
-
-class _Divisor(FlightRegime):
+class _Divisor(StaticRegime):
     """A factor that divides some components of the action."""
 
     divided: tuple[bool, bool, bool, bool]
@@ -59,16 +29,10 @@ class _Divisor(FlightRegime):
         self.span = check_span("span", span, LEAST, MOST)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        """Divide."""
         return action / self._divisors(parameters)
 
     def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Multiply."""
         return effect * self._divisors(parameters)
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw factors ``(*shape, 1)``, uniform."""
-        return draw_between(self.span, (*shape, 1), generator)
 
     def _divisors(self, factor: Tensor) -> Tensor:
         one = torch.ones_like(factor)
@@ -122,7 +86,7 @@ class InertiaFactor(_Divisor):
         super().__init__(span)
 
 
-class MotorEfficiency(FlightRegime):
+class MotorEfficiency(StaticRegime):
     r"""Motors of which each gives a share :math:`\eta_i` of its thrust and drag.
 
     .. math:: u_\mathrm{eff} = X\,\mathrm{diag}(\eta)\,X^{-1} u
@@ -161,12 +125,8 @@ class MotorEfficiency(FlightRegime):
         forces = unmix(effect, self.body)
         return effect + mix(divide(forces, parameters) - forces, self.body)
 
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw shares ``(*shape, 4)``, uniform."""
-        return draw_between(self.span, (*shape, 4), generator)
 
-
-class Payload(FlightRegime):
+class Payload(StaticRegime):
     r"""A small load of mass p m, fixed at (x, y) in the plane of the rotors.
 
     The centre of mass moves to :math:`d = p / (1 + p)\,(x, y)`; the thrust has a moment about it:
@@ -225,7 +185,7 @@ class Payload(FlightRegime):
         return torch.cat([none, -moved * y, moved * x, none], -1)
 
 
-class Wind(FlightRegime):
+class Wind(StaticRegime):
     """A steady wind, as an acceleration (m/s^2) in the world frame.
 
     No action does what it does, so :meth:`apply` leaves the action alone: simulators ask
@@ -249,16 +209,10 @@ class Wind(FlightRegime):
         self.span = check_span("span", span)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        """Return the action."""
         return action
 
     def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Return the effect."""
         return effect
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw accelerations ``(*shape, 3)``, uniform."""
-        return draw_between(self.span, (*shape, 3), generator)
 
 
 def wind_of(regime: Regime, parameters: Tensor) -> Tensor | None:

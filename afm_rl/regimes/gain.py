@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.regimes.base import Regime
+from afm_rl.regimes.base import StaticRegime
 
 MOST_GAIN = 100.0  # gains beyond are typing errors
 
 
-class ActionGain(Regime):
+class ActionGain(StaticRegime):
     r"""Per-axis gains: :math:`a_\mathrm{eff} = g \odot a` (paper, section V-B).
 
     The prior draws each gain's size log-uniformly, its sign at random, and leaves an axis
@@ -48,15 +48,8 @@ class ActionGain(Regime):
             raise ConfigurationError(f"low={low!r}: expected at most high={high!r}")
         self.nominal = check_number("nominal", nominal, low=0.0, high=1.0)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Multiply; the state plays no part.
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
+        """Multiply.
 
         Raises:
             ConfigurationError: for another number of actions than of names.
@@ -68,11 +61,9 @@ class ActionGain(Regime):
             )
         return action * parameters
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Divide and clamp; a gain of zero leaves nothing to choose and gives zero."""
-        return torch.minimum(torch.maximum(divide(action, parameters), low), high)
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Divide; a gain of zero leaves nothing to choose and gives zero."""
+        return divide(effect, parameters)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw gains ``(*shape, A)``."""

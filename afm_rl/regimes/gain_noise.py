@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from afm_rl.regimes.base import Regime
-from afm_rl.regimes.settings import MOST, check_span, draw_between
+from afm_rl.regimes.settings import MOST, check_span
 
 
 class GainNoise(Regime):
@@ -24,6 +23,7 @@ class GainNoise(Regime):
     Raises:
         ConfigurationError: for a setting that cannot be used.
 
+    >>> import torch
     >>> shaky, noise = GainNoise(), torch.tensor([1.0, -2.0])
     >>> shaky.apply(torch.ones(2), shaky.encode({"gain_noise": 0.25}), torch.zeros(3), noise=noise)
     tensor([1.2500, 0.5000])
@@ -53,7 +53,3 @@ class GainNoise(Regime):
     ) -> Tensor:
         """Clamp: the mean effect of an action is the action."""
         return action.clamp(low, high)
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw standard deviations ``(*shape, 1)``, uniform."""
-        return draw_between(self.span, (*shape, 1), generator)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from afm_rl.errors import check_count
-from afm_rl.regimes.base import Regime
-from afm_rl.regimes.settings import check_span, draw_between
+from afm_rl.regimes.base import DelayedRegime
+from afm_rl.regimes.settings import check_span
 
 SLOWEST = 8.0  # steps
 
 
-class Lag(Regime):
+class Lag(DelayedRegime):
     r"""A low-pass filter of first order with a time constant of T steps, the same on all axes.
 
     .. math:: y_t = a_t + e^{-1 / T} (y_{t-1} - a_t)
@@ -29,6 +28,7 @@ class Lag(Regime):
     Raises:
         ConfigurationError: for a setting that cannot be used.
 
+    >>> import torch
     >>> slow, past = Lag(history=3), torch.zeros(3, 1)
     >>> slow.apply(torch.ones(1), slow.encode({"lag": 1.0}), torch.zeros(3), past)
     tensor([0.6321])
@@ -42,30 +42,11 @@ class Lag(Regime):
         self.span = check_span("span", span, 0.0, SLOWEST)
         self.history = check_count("history", history)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Filter the commands from the oldest one on; the state plays no part."""
-        if past is None:
-            return action
+    def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
+        """Filter the commands from the oldest one on."""
         keep = (-1 / parameters.abs()).exp()  # 0 where there is no lag
-        oldest, *later = reversed(past[..., : self.history, :].unbind(-2))
+        oldest, *later = reversed(past.unbind(-2))
         effect = oldest
         for command in (*later, action):
             effect = command + keep * (effect - command)
         return effect
-
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Clamp: what was commanded before is not known, and in the long run it plays no part."""
-        return action.clamp(low, high)
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw time constants ``(*shape, 1)``, uniform."""
-        return draw_between(self.span, (*shape, 1), generator)

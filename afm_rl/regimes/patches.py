@@ -63,13 +63,11 @@ class Patches(Regime):
         past: Tensor | None = None,
         noise: Tensor | None = None,
     ) -> Tensor:
-        """Multiply on the odd squares."""
         return action * self._gains(parameters, state)
 
     def inverse(
         self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
     ) -> Tensor:
-        """Divide on the odd squares and clamp."""
         return divide(action, self._gains(parameters, state)).clamp(low, high)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:

@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes.base import Regime
+from afm_rl.regimes.base import StaticRegime
 from afm_rl.regimes.settings import HalfRange
 
 
-class Permutation(Regime):
+class Permutation(StaticRegime):
     r"""Each actuator gets the command of another one: :math:`u_{\mathrm{eff}, i} = u_{p_i}`.
 
     u are actions in half ranges. The parameter of axis i is the index :math:`p_i`; in between, as
@@ -38,25 +38,16 @@ class Permutation(Regime):
         self.identity = tuple(float(axis) for axis in range(axes))
         self.limits = dict.fromkeys(self.names, (0.0, axes - 1.0))
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Pick each axis from its source; the state plays no part."""
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
+        """Pick each axis from its source."""
         source, ratio = self._sources(action, parameters)
         return action.expand_as(source).gather(-1, source) * ratio
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Send each axis to its source and clamp."""
-        source, ratio = self._sources(action, parameters)
-        command = torch.zeros(source.shape, dtype=action.dtype, device=action.device)
-        return command.scatter(-1, source, action / ratio).clamp(low, high)
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Send each axis to its source."""
+        source, ratio = self._sources(effect, parameters)
+        command = torch.zeros(source.shape, dtype=effect.dtype, device=effect.device)
+        return command.scatter(-1, source, effect / ratio)
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
         """Return the parameter row ``(A,)``.

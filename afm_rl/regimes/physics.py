@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime
+from afm_rl.regimes.base import StaticRegime
 
 FACTORS: Mapping[str, tuple[float, float]] = {
     "mass": (0.5, 2.0),
@@ -24,7 +24,7 @@ ADDED: Mapping[str, tuple[float, float]] = {
 }
 
 
-class Physics(Regime):
+class Physics(StaticRegime):
     """Other physics; actions stay what they are.
 
     A world that knows these parameters moves differently, see
@@ -45,22 +45,11 @@ class Physics(Regime):
         "payload": (0.0, 100.0),
     }
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Return the action."""
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         return action.expand(*torch.broadcast_shapes(action.shape[:-1], parameters.shape[:-1]), -1)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Return the action, clamped."""
-        return action.clamp(low, high)
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        return effect
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw one parameter each, uniform in its range; the others stay nominal."""
@@ -71,5 +60,4 @@ class Physics(Regime):
         return torch.where(mine, drawn, torch.tensor(self.identity))
 
     def physics_of(self, parameters: Tensor) -> Tensor:
-        """Return all parameters."""
         return parameters

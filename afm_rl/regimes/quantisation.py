@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime
-from afm_rl.regimes.settings import HalfRange, check_span, draw_between
+from afm_rl.regimes.base import StaticRegime
+from afm_rl.regimes.settings import HalfRange, check_span
 
 
-class Quantisation(Regime):
+class Quantisation(StaticRegime):
     r"""Commands rounded to multiples of a step q, the same on all axes; 0 rounds nothing.
 
     .. math:: u_\mathrm{eff} = q\,\mathrm{round}(u / q)
@@ -36,26 +36,12 @@ class Quantisation(Regime):
         self.half_range = HalfRange(half_range)
         self.span = check_span("span", span, 0.0, 1.0)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Round; the state plays no part."""
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         step = parameters * self.half_range.like(action)
         fine = step == 0
         step = torch.where(fine, 1.0, step)
         return torch.where(fine, action, (action / step).round() * step)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
         """Return the nearest position, or the end of the box that is nearest to it."""
-        return self.apply(action, parameters, state).clamp(low, high)
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw steps ``(*shape, 1)``, uniform."""
-        return draw_between(self.span, (*shape, 1), generator)
+        return self.effect_of(effect, parameters)

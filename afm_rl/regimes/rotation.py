@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes.base import Regime
-from afm_rl.regimes.settings import HalfRange, check_span, draw_between
+from afm_rl.regimes.base import StaticRegime
+from afm_rl.regimes.settings import HalfRange, check_span
 
 
-class Rotation(Regime):
+class Rotation(StaticRegime):
     r"""The action, in half ranges, turned by an angle: :math:`u_\mathrm{eff} = R(\phi)\,u`.
 
     Args:
@@ -26,7 +26,7 @@ class Rotation(Regime):
     >>> coupling = Rotation(half_range=[1.0, 2.0])
     >>> row = coupling.encode({"rotation": math.pi / 2})
     >>> coupling.apply(torch.tensor([0.5, 0.0]), row, torch.zeros(3)).round(decimals=4)
-    tensor([-0.,  1.])
+    tensor([-0., 1.])
     """
 
     names = ("rotation",)
@@ -41,26 +41,12 @@ class Rotation(Regime):
             raise ConfigurationError(f"half_range={half_range!r}: expected two action axes")
         self.span = check_span("span", span)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Rotate; the state plays no part."""
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         return self._turned(action, parameters)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Rotate back and clamp; not the nearest effect where that does not fit the box."""
-        return self._turned(action, -parameters).clamp(low, high)
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw angles ``(*shape, 1)``, uniform."""
-        return draw_between(self.span, (*shape, 1), generator)
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Rotate back; not the nearest effect where that does not fit the box."""
+        return self._turned(effect, -parameters)
 
     def _turned(self, action: Tensor, angle: Tensor) -> Tensor:
         # The half ranges stand in the matrix: at angle 0 the action is kept to the bit.

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime
-from afm_rl.regimes.settings import HalfRange, check_span, draw_between
+from afm_rl.regimes.base import StaticRegime
+from afm_rl.regimes.settings import HalfRange, check_span
 
 
-class Saturation(Regime):
+class Saturation(StaticRegime):
     r"""Commands cut at a fraction of the half range, the same on all axes; 1 cuts nothing.
 
     .. math:: u_\mathrm{eff} = \mathrm{clamp}(u, -s, s)
@@ -36,24 +36,10 @@ class Saturation(Regime):
         self.half_range = HalfRange(half_range)
         self.span = check_span("span", span, *self.limits["saturation"])
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Cut; the state plays no part."""
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         most = torch.where(parameters < 1.0, parameters, torch.inf) * self.half_range.like(action)
         return action.clamp(-most, most)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Return the smallest command with the nearest effect: the action, cut alike."""
-        return self.apply(action, parameters, state).clamp(low, high)
-
-    def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw fractions ``(*shape, 1)``, uniform."""
-        return draw_between(self.span, (*shape, 1), generator)
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Return the smallest command with the nearest effect: the effect, cut alike."""
+        return self.effect_of(effect, parameters)

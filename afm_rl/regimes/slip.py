@@ -8,14 +8,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime
+from afm_rl.regimes.base import StaticRegime
 from afm_rl.regimes.settings import MOST, HalfRange, check_span, draw_between
 
 END = (2 * math.sqrt(2) / 3 - 1) / 2  # makes the starting point of `rising_load` exact at r = 0
 NEAR = 0.05  # so near to the peak the starting point is better than a step, which divides by zero
 
 
-class WheelSlip(Regime):
+class WheelSlip(StaticRegime):
     r"""Traction that peaks at a command c with the value m, the same on all axes.
 
     .. math:: u_\mathrm{eff} = m\,\frac{u}{c}\,e^{1 - |u| / c}
@@ -50,15 +50,7 @@ class WheelSlip(Regime):
         self.at = check_span("at", at, 0.0, MOST)
         self.peak = check_span("peak", peak, 0.0, MOST)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        """Slip; the state plays no part."""
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         at, peak = parameters[..., :1], parameters[..., 1:]
         grip = at == 0  # the limit of no slip, which the formula does not have
         at = torch.where(grip, 1.0, at)
@@ -66,15 +58,13 @@ class WheelSlip(Regime):
         traction = peak / at * (1 - load.abs()).exp()
         return torch.where(grip, action, action * traction)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
         """Return the command on the rising side, |u| <= c; at most the peak is achievable."""
         at, peak = parameters[..., :1], parameters[..., 1:]
-        half = self.half_range.like(action)
-        most = (peak * half).clamp_min(torch.finfo(action.dtype).tiny)
-        load = rising_load((action.abs() / most).clamp(max=1.0))
-        return torch.where(at == 0, action, action.sign() * (at * half) * load).clamp(low, high)
+        half = self.half_range.like(effect)
+        most = (peak * half).clamp_min(torch.finfo(effect.dtype).tiny)
+        load = rising_load((effect.abs() / most).clamp(max=1.0))
+        return torch.where(at == 0, effect, effect.sign() * (at * half) * load)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw c and m ``(*shape, 2)``, uniform."""
