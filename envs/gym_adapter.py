@@ -18,7 +18,6 @@ from torch import Tensor
 from afm_rl.envs.mission_env import MissionEnv
 from afm_rl.envs.track import Track
 from afm_rl.envs.ugv import UGVTrack
-from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import Regime, Schedule
 
 UGV_BOUND = (np.inf, np.inf, np.pi, np.inf, np.inf)  # x, y, theta, goal x, goal y
@@ -65,25 +64,21 @@ class MissionGym(gymnasium.Env):
 
 
 def build_ugv(
-    track: str | Path | Track,
-    regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None,
-    gains: Mapping[str, float | None],
-    schedule: Schedule | Sequence[float] | None,
-    ramp: int,
-    family: Regime | None,
-    batch_size: tuple[int, ...],
-    settings: Mapping[str, Any],
+    track: str | Path | Track = "ethz_2",
+    regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+    schedule: Schedule | Sequence[float] | None = None,
+    ramp: int = 0,
+    family: Regime | None = None,
+    **settings: Any,
 ) -> UGVTrack:
     """Return the ground robot, with the same regime for every mission.
 
     Args:
-        track: name, CSV path or track.
-        regime: parameters of the changed phase, or one mapping per phase.
-        gains: more parameters of the changed phase; None where not given.
-        schedule: a schedule, or breakpoints of the progress.
-        ramp: steps that each change takes.
-        family: regime family; gains on v and omega if None.
-        batch_size: number of missions.
+        track: ``ethz_1``, ``ethz_2``, the path of a CSV file, or a track.
+        regime: regime parameters of the changed phase, or one mapping per phase.
+        schedule: a schedule, or breakpoints of the progress; by default 0.15 and 0.80.
+        ramp: steps over which the regime changes; 0 for sudden changes.
+        family: regime family, which names the parameters; gains on v and omega if None.
         settings: further arguments of :class:`~afm_rl.envs.UGVTrack`.
 
     Raises:
@@ -91,15 +86,8 @@ def build_ugv(
     """
     if schedule is not None and not isinstance(schedule, Schedule):
         schedule = Schedule(schedule)
-    given = {name: value for name, value in gains.items() if value is not None}
-    if given:
-        if regime is not None and not isinstance(regime, Mapping):
-            raise ConfigurationError(f"regime={regime!r}: per phase, so {given} belongs inside it")
-        regime = {**(regime or {}), **given}
     missions = {"regime": regime, "ramp": ramp}
-    return UGVTrack(
-        (track,), family, schedule, batch_size=batch_size, missions=missions, **settings
-    )
+    return UGVTrack((track,), family, schedule, missions=missions, **settings)
 
 
 def spaces(env: MissionEnv, bound: Sequence[float]) -> tuple[Box, Box]:

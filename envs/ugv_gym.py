@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -20,13 +18,8 @@ from afm_rl.envs.gym_adapter import (
     require_reset,
 )
 from afm_rl.envs.rendering import canvas_of
-from afm_rl.envs.track import Track
 from afm_rl.envs.ugv import UGVTrack
-from afm_rl.envs.ugv_vector import UGVTrackVectorEnv
 from afm_rl.errors import check_choice
-from afm_rl.regimes import Regime, Schedule
-
-__all__ = ["UGVTrackGym", "UGVTrackVectorEnv"]
 
 
 class UGVTrackGym(MissionGym):
@@ -36,22 +29,16 @@ class UGVTrackGym(MissionGym):
     and rad/s. ``gymnasium.make`` adds the time limit of 5000 steps; the class itself has none.
 
     Args:
-        track: ``ethz_1``, ``ethz_2``, the path of a CSV file, or a track.
-        regime: regime parameters of the changed phase, or one mapping per phase.
-        schedule: a schedule, or breakpoints of the progress; by default 0.15 and 0.80.
         render_mode: None or ``"rgb_array"``.
-        v_gain: short for ``regime={"v_gain": ...}``.
-        omega_gain: short for ``regime={"omega_gain": ...}``.
-        ramp: steps over which the regime changes; 0 for sudden changes.
-        family: regime family, which names the parameters; gains on v and omega if None.
-        settings: further arguments of :class:`~afm_rl.envs.UGVTrack`.
+        settings: of :func:`~afm_rl.envs.gym_adapter.build_ugv`: ``track``, ``regime``,
+            ``schedule``, ``ramp``, ``family``, and those of :class:`~afm_rl.envs.UGVTrack`.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
         NonFiniteError: at a step whose action is NaN or infinite.
 
     >>> import afm_rl  # registers the name
-    >>> env = gymnasium.make("afm_rl/UGVTrack-v0", track="ethz_2", v_gain=-1.0)
+    >>> env = gymnasium.make("afm_rl/UGVTrack-v0", regime={"v_gain": -1.0})
     >>> observation, info = env.reset(seed=0)
     >>> observation.shape, info["reached"]
     ((5,), 0)
@@ -60,25 +47,12 @@ class UGVTrackGym(MissionGym):
     native: UGVTrack
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
 
-    def __init__(
-        self,
-        track: str | Path | Track = "ethz_2",
-        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
-        schedule: Schedule | Sequence[float] | None = None,
-        render_mode: str | None = None,
-        v_gain: float | None = None,
-        omega_gain: float | None = None,
-        ramp: int = 0,
-        family: Regime | None = None,
-        **settings: Any,
-    ) -> None:
+    def __init__(self, render_mode: str | None = None, **settings: Any) -> None:
         if render_mode is not None:
             check_choice("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
-        gains = {"v_gain": v_gain, "omega_gain": omega_gain}
         settings.setdefault("max_steps", 2**62)  # gymnasium limits time by a wrapper
-        native = build_ugv(track, regime, gains, schedule, ramp, family, (), settings)
-        super().__init__(native, UGV_BOUND)
+        super().__init__(build_ugv(**settings), UGV_BOUND)
         self._trail: list[Tensor] = []
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,9 +19,7 @@ from afm_rl.envs.gym_adapter import (
     spaces,
 )
 from afm_rl.envs.rendering import canvas_of
-from afm_rl.envs.track import Track
 from afm_rl.errors import ConfigurationError, check_choice, check_count
-from afm_rl.regimes import Regime, Schedule
 
 
 class UGVTrackVectorEnv(VectorEnv):
@@ -38,15 +34,8 @@ class UGVTrackVectorEnv(VectorEnv):
         num_envs: number of missions.
         autoreset_mode: ``AutoresetMode.SAME_STEP`` or ``AutoresetMode.DISABLED``.
         max_episode_steps: steps after which an episode is truncated.
-        track: see :class:`~afm_rl.envs.ugv_gym.UGVTrackGym`, as all that follow.
-        regime: parameters of the changed phase, or one mapping per phase.
-        schedule: a schedule, or breakpoints of the progress.
         render_mode: None or ``"rgb_array"``.
-        v_gain: short for ``regime={"v_gain": ...}``.
-        omega_gain: short for ``regime={"omega_gain": ...}``.
-        ramp: steps over which the regime changes; 0 for sudden changes.
-        family: regime family, which names the parameters; gains on v and omega if None.
-        settings: further arguments of :class:`~afm_rl.envs.UGVTrack`.
+        settings: see :class:`~afm_rl.envs.ugv_gym.UGVTrackGym`.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -68,14 +57,7 @@ class UGVTrackVectorEnv(VectorEnv):
         num_envs: int = 1,
         autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
         max_episode_steps: int = 5000,
-        track: str | Path | Track = "ethz_2",
-        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
-        schedule: Schedule | Sequence[float] | None = None,
         render_mode: str | None = None,
-        v_gain: float | None = None,
-        omega_gain: float | None = None,
-        ramp: int = 0,
-        family: Regime | None = None,
         **settings: Any,
     ) -> None:
         if render_mode is not None:
@@ -89,9 +71,7 @@ class UGVTrackVectorEnv(VectorEnv):
         self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
         self.num_envs = check_count("num_envs", num_envs)
         settings.setdefault("max_steps", max_episode_steps)
-        gains = {"v_gain": v_gain, "omega_gain": omega_gain}
-        size = (self.num_envs,)
-        self.native = build_ugv(track, regime, gains, schedule, ramp, family, size, settings)
+        self.native = build_ugv(batch_size=(self.num_envs,), **settings)
         self.single_observation_space, self.single_action_space = spaces(self.native, UGV_BOUND)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
