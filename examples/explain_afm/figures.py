@@ -52,8 +52,7 @@ def draw_progress(axes: Axes, budget: int) -> None:
     styles = method_styles(FORMS)
     for name, overrides in FORMS.items():
         steps = run(agent_of(TURNED, f"budget={budget}", *overrides)).steps
-        lines = {"color": styles[name].color, "linestyle": styles[name].linestyle}
-        axes.plot(steps["t"], steps["reached"], label=name, **lines)
+        styles[name].line(axes, steps["t"], steps["reached"], gid=name, label=name)
         if name == "oracle":
             turned = steps.loc[steps["regime_active"] > 0, "t"]
             axes.axvspan(turned.min(), budget, color="#e69f00", alpha=0.15, lw=0)
@@ -70,15 +69,15 @@ def draw_losses(axes: Axes, regimes: str, budget: int) -> None:
     rollout = agent.env.rollout(budget, agent.planner, auto_reset=False, tensordict=start)
     flow, entries = agent.transform.corrector, rollout["next", "afm"][0]
     losses = flow.unpack(entries["memory"], agent.model.state_size)["losses"]
-    believed, active = (losses + flow.penalty).argmin(-1), entries["innovation"] > flow.gate
+    believed, active = (losses + flow.tick.penalty).argmin(-1), entries["innovation"] > flow.gate
     first = int(active.int().argmax()) - 5
     styles = method_styles(NAMES)
     for k, name in enumerate([*flow.hypotheses, "identity"]):
         if name not in NAMES:
             continue
         times = first + torch.arange(len(losses[first : first + 80]))
-        lines = {"color": styles[name].color, "linestyle": styles[name].linestyle}
-        axes.plot(times, losses[first : first + 80, k], label=NAMES[name], lw=1.2, **lines)
+        shown = losses[first : first + 80, k]
+        styles[name].line(axes, times, shown, gid=name, label=NAMES[name], linewidth=1.2)
         rows = [int(t) for t in times if active[t] and believed[t] == k]
         axes.plot(rows, [-0.25] * len(rows), "s", ms=3, color=styles[name].color)
     axes.set(xlabel="step", ylabel="discounted loss $L$", ylim=(-0.5, None))
