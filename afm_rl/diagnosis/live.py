@@ -119,7 +119,7 @@ def _fit(
     # Neighbouring residuals may be alike: that many rows tell as little as fewer independent ones.
     alike = 0.0
     if residual.any():
-        alike = max(0.0, residual[1:] @ residual[:-1] / (residual @ residual))
+        alike = max(0.0, float(residual[1:] @ residual[:-1] / (residual @ residual)))
     inflation = (1 + min(alike, 0.9)) / (1 - min(alike, 0.9))
     scale = (weight * residual**2).sum() / freedom * inflation
     times = stdtrit(max(freedom / inflation, 2.0), 0.975)

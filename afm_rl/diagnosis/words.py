@@ -19,7 +19,9 @@ SURE = 1.8
 """Times the 95 % interval: what a fault has to exceed, so that few are false (99.95 %)."""
 
 
-def judge(actuator: Actuator, step: float = 1.0, usual_delay: float = 0.0) -> Actuator:
+def judge(
+    actuator: Actuator, step: float = 1.0, usual_delay: float = 0.0, doubt: str = ""
+) -> Actuator:
     """Return the actuator with its status and its sentence.
 
     A fault is a deviation that is significant and large enough to matter: more than 5 % of the
@@ -29,6 +31,7 @@ def judge(actuator: Actuator, step: float = 1.0, usual_delay: float = 0.0) -> Ac
         actuator: with all numbers.
         step: time between two rows (s).
         usual_delay: delay and lag of the healthy robot (s).
+        doubt: why nothing can be told, if the log shows so.
 
     >>> elbow = Actuator(name="elbow", gain=-0.62, gain_interval=(-0.63, -0.61), reversed=True,
     ...                  command_range=(-1.0, 1.0), delay_s=0.04)
@@ -40,7 +43,9 @@ def judge(actuator: Actuator, step: float = 1.0, usual_delay: float = 0.0) -> Ac
     width = 0.5 * (high - low) / actuator.unit
     size = abs(actuator.gain) / actuator.unit
     status: Status
-    if max(-low, high) < DEAD * actuator.unit and actuator.driven_by is None:
+    if doubt:
+        status, faults = "cannot tell", [f"cannot tell: {doubt}"]
+    elif max(-low, high) < DEAD * actuator.unit and actuator.driven_by is None:
         status, faults = "dead", ["does not answer its command"]
     elif not width < VAGUE * max(1.0, size) and not (faults and not low <= 0.0 <= high):
         status, faults = "cannot tell", [f"cannot tell: {_reason(actuator)}"]
@@ -77,7 +82,11 @@ def _faults(actuator: Actuator, step: float, usual_delay: float) -> Iterator[str
         yield f"{100 * share:.0f} % of the command"
     for name, gain in actuator.coupling.items():
         yield f"takes in {100 * gain / unit:+.0f} % of the command of {name}"
-    if outside(widened(actuator.offset_interval)) and abs(actuator.offset) > MATTERS * unit * reach:
+    if (
+        "offset" not in actuator.drift
+        and outside(widened(actuator.offset_interval))
+        and abs(actuator.offset) > MATTERS * unit * reach
+    ):
         yield f"offset {actuator.offset:+.3g}"
     if actuator.dead_zone > MATTERS * reach:
         yield f"no motion for commands below {actuator.dead_zone:.3g}"

@@ -1,0 +1,64 @@
+"""Intervals that hold where residuals are not independent of each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import stdtrit
+
+ORDER = 12  # of the autoregression, at most
+LEAST = 0.03  # of one minus the sum of its coefficients
+
+
+def half_widths(influence: np.ndarray) -> np.ndarray:
+    r"""Return half widths ``(P,)`` of 95 % intervals.
+
+    The variance of the sum of N influences is N times their spectral density at frequency 0, which
+    an autoregression of their own order gives, :math:`\sigma^2 / (1 - \sum_i \phi_i)^2` (Andrews
+    and Monahan 1992; Den Haan and Levin 1997). Student's quantile is that of as many rows as would
+    tell as much if they were independent.
+
+    Args:
+        influence: of each row on each parameter, ``(N, P)``: the estimate minus the truth is their
+            sum.
+
+    >>> noise = np.random.default_rng(0).standard_normal((10000, 1))
+    >>> half_widths(noise / 10000).round(3)
+    array([0.02])
+    """
+    rows = len(influence)
+    widths = []
+    for series in (influence - influence.mean(0)).T:
+        power = float(series @ series) / rows
+        if not power > 0:
+            widths.append(0.0)
+            continue
+        density = _density_at_zero(series, power)
+        effective = max(rows * min(power / density, 1.0) - len(influence.T), 3.0)
+        widths.append(stdtrit(effective, 0.975) * np.sqrt(rows * density))
+    return np.array(widths)
+
+
+def independence(residual: np.ndarray) -> float:
+    """Return how many independent rows a row of residuals ``(N,)`` counts as, at most 1."""
+    power = float(residual @ residual) / len(residual)
+    return min(1.0, power / _density_at_zero(residual, power)) if power > 0 else 1.0
+
+
+def _density_at_zero(series: np.ndarray, power: float) -> float:
+    """Return the long-run variance by the autoregression with the least AIC (Levinson)."""
+    rows = len(series)
+    order = min(ORDER, rows // 10)
+    lags = np.array([series[k:] @ series[: rows - k] for k in range(order + 1)]) / rows
+    best, density = 0.0, power
+    coefficients, error = np.zeros(0), power
+    for p in range(1, order + 1):
+        reflection = (lags[p] - coefficients @ lags[p - 1 : 0 : -1]) / error
+        coefficients = np.append(coefficients - reflection * coefficients[::-1], reflection)
+        error *= 1 - reflection**2
+        if not error > 0:
+            break
+        criterion = rows * np.log(error / power) + 2 * p
+        if criterion < best:
+            best = criterion
+            density = error / max(1 - coefficients.sum(), LEAST) ** 2
+    return max(density, 0.3 * power)

@@ -1,0 +1,155 @@
+"""What a robot logged: commands and responses, row by row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from afm_rl.errors import ConfigurationError
+
+FEWEST = 20  # rows
+GAP = 1.5  # steps: where the time between two rows is longer, commands between them are not known
+EVEN = 0.02  # steps: time stamps that scatter less are even
+
+
+@dataclass(frozen=True)
+class Log:
+    """Commands and responses of A actuators.
+
+    Args:
+        names: of the actuators.
+        command: ``(N, A)``.
+        response: ``(N, A)``.
+        t: times of the rows (s), ascending within each episode; None: one second per row.
+        episode: number of the episode of each row, ``(N,)``; None: one episode.
+        usual_delay: delay and lag of the healthy robot (s).
+        notes: what a reader must know.
+
+    Raises:
+        ConfigurationError: for shapes that do not fit, numbers that are not finite, time that does
+            not go on, or fewer than 20 rows.
+    """
+
+    names: tuple[str, ...]
+    command: np.ndarray
+    response: np.ndarray
+    t: np.ndarray | None = None
+    episode: np.ndarray | None = None
+    usual_delay: float = 0.0
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        rows, size = len(self.command), len(self.names)
+        if not self.command.shape == self.response.shape == (rows, size):
+            raise ConfigurationError(
+                f"log: commands {self.command.shape}, responses {self.response.shape}: expected "
+                f"{size} columns each, one per actuator"
+            )
+        if rows < FEWEST:
+            raise ConfigurationError(
+                f"log: {rows} rows: expected at least {FEWEST}; log for a longer time"
+            )
+        if not (np.isfinite(self.command).all() and np.isfinite(self.response).all()):
+            raise ConfigurationError("log: commands or responses are not finite; drop such rows")
+        if (np.diff(self.seconds)[~self.begins[1:]] <= 0).any():
+            raise ConfigurationError("log: t does not go on: expected ascending times (s)")
+
+    @property
+    def seconds(self) -> np.ndarray:
+        """Times of the rows (s), ``(N,)``."""
+        return np.arange(len(self.command), dtype=float) if self.t is None else self.t
+
+    @property
+    def begins(self) -> np.ndarray:
+        """Which rows begin an episode, ``(N,)``."""
+        first = np.zeros(len(self.command), dtype=bool)
+        first[0] = True
+        if self.episode is not None:
+            first[1:] = self.episode[1:] != self.episode[:-1]
+        return first
+
+    @property
+    def step(self) -> float:
+        """Time between two rows (s), the median."""
+        return float(np.median(np.diff(self.seconds)[~self.begins[1:]]))
+
+    @property
+    def since(self) -> np.ndarray:
+        """Time since the log began (s), episodes one after the other, ``(N,)``."""
+        step = np.diff(self.seconds, prepend=self.seconds[0])
+        step[self.begins] = self.step
+        return np.cumsum(step) - self.step
+
+    def part(self, rows: slice | np.ndarray) -> Log:
+        """Return some rows, a slice of them or those that are named in ascending order.
+
+        Rows that do not follow each other become episodes of their own.
+        """
+        index = np.arange(len(self.command))[rows]
+        kept = np.cumsum(self.begins)[index]
+        apart = np.diff(index, prepend=index[:1] - 1) > 1
+        return replace(
+            self,
+            command=self.command[index],
+            response=self.response[index],
+            t=self.seconds[index],
+            episode=np.cumsum(apart | (np.diff(kept, prepend=kept[:1]) != 0)),
+        )
+
+    def thinned(self, rows: int, blocks: int = 20) -> Log:
+        """Return a log of at most so many rows: blocks in a row, evenly spread."""
+        if len(self.command) <= rows:
+            return self
+        length = rows // blocks
+        first = np.linspace(0, len(self.command) - length, blocks).astype(int)
+        return self.part((first[:, None] + np.arange(length)).reshape(-1))
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Where in a log to look for the command of some time ago.
+
+    Args:
+        time: of each row, in steps, ``(N,)``.
+        start: first row of each row's episode, ``(N,)``.
+        hold: a command holds until the next one; otherwise it moves there in a straight line.
+    """
+
+    time: np.ndarray
+    start: np.ndarray
+    hold: bool = False
+
+    def places(self, delay: float) -> np.ndarray:
+        """Return at which row, with fractions, the time was ``delay`` steps ago, ``(N,)``."""
+        rows = np.arange(len(self.time), dtype=float)
+        if self.even:
+            place = rows - delay
+        else:
+            place = np.interp(self.time - delay, self.time, rows)
+            if self.hold:
+                place = np.floor(place + 1e-9)
+        return np.maximum(place, self.start)
+
+    @property
+    def even(self) -> bool:
+        """Are all rows one step apart?"""
+        return bool(self.time[-1] - self.time[0] == len(self.time) - 1)
+
+
+def clocks_of(log: Log) -> list[Clock]:
+    """Return the clocks that a log may have been written by: one if its rows are evenly spaced.
+
+    Otherwise commands may move between rows or hold, or a delay may be one of rows: time stamps
+    can scatter where the robot's own cycle does not.
+    """
+    begins = log.begins
+    rows = np.arange(len(begins))
+    start = np.maximum.accumulate(np.where(begins, rows, 0))
+    steps = np.diff(log.seconds, prepend=log.seconds[0] - log.step) / log.step
+    steps[begins] = 1.0
+    even = Clock(rows.astype(float), start)
+    if np.abs(steps - 1.0).max() < EVEN:
+        return [even]
+    time = np.cumsum(steps)
+    return [Clock(time, start), Clock(time, start, hold=True), even]

@@ -1,0 +1,155 @@
+"""A diagnosis from a log."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
+from afm_rl.diagnosis.log import Log
+from afm_rl.diagnosis.parts import SEARCHED, Part, find_parts, settle
+from afm_rl.diagnosis.search import find_leads
+from afm_rl.diagnosis.words import judge
+
+UNITS = {"degrees": math.pi / 180, "radians": 180 / math.pi, "m": 1000.0, "mm": 0.001}
+UNITS |= {"rpm": math.pi / 30, "rad/s": 30 / math.pi}
+"""Gain of a healthy actuator whose command is in this unit, and its response in the other one."""
+ALIKE = 0.1  # deviation of the median gain of all actuators from such a gain
+NEAR = 0.05  # of a single actuator's
+COPY = 0.999  # correlation of two commands that cannot be told apart
+
+
+def diagnose(log: Log) -> Diagnosis:
+    """Say what each actuator of a log does.
+
+    Each response is fitted by the model of :class:`Actuator`: first lines with every delay, lag
+    and command, then the numbers that its response needs, by robust nonlinear least squares.
+    The log is split where an actuator changed. Intervals take residuals that depend on each other
+    into account, and commands that hardly differ.
+
+    >>> u = np.random.default_rng(0).uniform(-1, 1, (400, 2))
+    >>> y = u * [1.0, -0.5] + 0.01 * np.random.default_rng(1).standard_normal((400, 2))
+    >>> print(diagnose(Log(("shoulder", "elbow"), u, y)))
+    shoulder: healthy
+    elbow: reversed, 50 % of the command
+    """
+    low, high = np.quantile(log.command, [0.01, 0.99], axis=0)
+    reach = 0.5 * (high - low)
+    reach = np.where(
+        reach > 1e-9 * (1e-9 + np.abs(log.command).max(0)), reach, 0.5 * np.ptp(log.command, 0)
+    )
+    moved = reach > 1e-9 * (1e-9 + np.abs(log.command).max(0))
+    spread = _spread(log.response)
+    scaled = replace(
+        log,
+        command=np.where(moved, log.command / np.where(moved, reach, 1.0), 0.0),
+        response=log.response / spread,
+    )
+    size = len(log.names)
+    leads = find_leads(scaled.thinned(SEARCHED), range(size))
+    actuators, doubts = [], []
+    for j, lead in enumerate(leads):
+        doubts.append(_doubt(scaled, j, moved))
+        parts = find_parts(scaled, j, lead)
+        found = [_report(log, scaled, part, j, reach, spread) for part in parts]
+        actuators.append((parts, found))
+    units = _units([found[-1] for _, found in actuators])
+    final = []
+    since = log.since
+    for (parts, found), unit, doubt in zip(actuators, units, doubts, strict=True):
+        said = [judge(replace(a, unit=unit), log.step, log.usual_delay, doubt) for a in found]
+        changes = tuple(
+            Change(t=float(since[part.first]), before=before, after=after)
+            for part, before, after in zip(parts[1:], said[:-1], said[1:], strict=True)
+        )
+        last = replace(said[-1], changes=changes)
+        final.append(judge(last, log.step, log.usual_delay, doubt))
+    notes = [*log.notes]
+    return Diagnosis(
+        actuators=tuple(final), step_s=log.step, rows=len(log.command), notes=tuple(notes)
+    )
+
+
+def _spread(response: np.ndarray) -> np.ndarray:
+    """Return a standard deviation of each response that outliers hardly change, ``(A,)``."""
+    low, high = np.quantile(response, [0.02, 0.98], axis=0)
+    spread = np.clip(response, low, high).std(0)
+    spread = np.where(spread > 0, spread, response.std(0))
+    return np.where(spread > 1e-12 * (1e-300 + np.abs(response).max(0)), spread, 1.0)
+
+
+def _doubt(log: Log, j: int, moved: np.ndarray) -> str:
+    """Return why nothing can be told of an actuator, if so."""
+    if not moved[j]:
+        return "its command does not change"
+    u = log.command - log.command.mean(0)
+    power = np.sqrt((u**2).sum(0))
+    alike = np.abs(u.T @ u[:, j]) / np.maximum(power * power[j], 1e-300)
+    copies = [name for i, name in enumerate(log.names) if i != j and alike[i] > COPY]
+    return f"its command is that of {copies[0]}, up to a factor" if copies else ""
+
+
+def _units(actuators: Sequence[Actuator]) -> list[float]:
+    """Return the gain of each actuator if it were healthy: 1, or that of two known units."""
+    gains = np.array([abs(a.gain) for a in actuators])
+    clear = [a.gain_interval[0] * a.gain_interval[1] > 0 and abs(a.gain) > 1e-4 for a in actuators]
+    common, units = 1.0, []
+    if any(clear):
+        middle = float(np.median(gains[clear]))
+        common = next((u for u in UNITS.values() if abs(middle / u - 1) < ALIKE), 1.0)
+    for gain, sure in zip(gains, clear, strict=True):
+        near = (u for u in UNITS.values() if sure and abs(gain / u - 1) < NEAR)
+        units.append(next(near, common))
+    return units
+
+
+def _report(
+    log: Log, scaled: Log, part: Part, j: int, reach: np.ndarray, spread: np.ndarray
+) -> Actuator:
+    """Return the numbers of a part in the units of the log."""
+    part, problem, widths = settle(scaled, j, part)
+    model, shape = part.model, part.model.shape
+    unit = reach[model.driver]
+    scale = spread[j] / unit
+    gain, gain_width = model.gain * scale, widths[0] * scale
+    offset, offset_width = model.offset * spread[j], widths[1] * spread[j]
+    y = problem.y[problem.use]
+    residual = y - model.predict(problem)[problem.use]
+    total = float(y.var())
+    rows = slice(part.first, part.last)
+    low, high = np.quantile(log.command[rows, model.driver], [0.01, 0.99])
+    coupling = {
+        log.names[i]: float(g * spread[j] / reach[i])
+        for i, g in zip(model.others, model.gains, strict=True)
+    }
+    largest = max(coupling, key=lambda name: abs(coupling[name]), default=None)
+    ends = [abs(end) * unit for end in (shape.low, shape.high) if math.isfinite(end)]
+    drift = {}
+    for name, value, change in zip(
+        ("gain", "offset"), (gain, offset), np.multiply(part.drift, (scale, spread[j])), strict=True
+    ):
+        if change:
+            drift[name] = (float(value - change / 2), float(value + change / 2))
+    return Actuator(
+        name=log.names[j],
+        gain=float(gain),
+        gain_interval=(float(gain - gain_width), float(gain + gain_width)),
+        reversed=bool(gain + gain_width < 0),
+        offset=float(offset),
+        offset_interval=(float(offset - offset_width), float(offset + offset_width)),
+        dead_zone=float(shape.dead_zone * unit),
+        saturation=float(np.mean(ends)) if ends else None,
+        backlash=float(shape.play * unit),
+        delay_s=shape.delay * log.step,
+        lag_s=-log.step / math.log(shape.keep) if shape.keep > 1e-6 else 0.0,
+        driven_by=log.names[model.driver] if model.driver != j else largest,
+        coupling=coupling,
+        noise=float(residual.std() * spread[j]),
+        unexplained=float(min(residual.var() / total, 1.0)) if total > 0 else 0.0,
+        command_range=(float(low), float(high)),
+        drift=drift,
+        rows=part.rows,
+    )

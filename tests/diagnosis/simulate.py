@@ -1,0 +1,87 @@
+"""Logs of actuators with known faults, written without the package: one row after the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass
+class Fault:
+    """What one actuator does."""
+
+    gain: float = 1.0
+    offset: float = 0.0
+    dead_zone: float = 0.0
+    jump: bool = False
+    saturation: float | None = None
+    backlash: float = 0.0
+    delay: float = 0.0  # steps
+    lag: float = 0.0  # steps
+    source: int | None = None
+    coupling: tuple[int, float] | None = None
+    quantum: float = 0.0
+    drift: float = 0.0  # of the offset, from begin to end
+
+
+def commands(rng, rows, size, kind="smooth"):
+    """Return commands between about -1 and 1, ``(rows, size)``."""
+    t = np.arange(rows)[:, None]
+    if kind == "white":
+        return rng.uniform(-1, 1, (rows, size))
+    if kind == "steps":
+        hold = rng.integers(5, 30)
+        return np.repeat(rng.uniform(-1, 1, (rows // hold + 1, size)), hold, axis=0)[:rows]
+    if kind == "walk":
+        u = np.zeros((rows, size))
+        for k in range(1, rows):
+            u[k] = 0.95 * u[k - 1] + 0.3 * rng.standard_normal(size)
+        return np.clip(u, -1, 1)
+    waves = np.zeros((rows, size))
+    for _ in range(4):
+        period = rng.uniform(15, 150, size)
+        waves += rng.uniform(0.2, 0.5, size) * np.sin(2 * np.pi * (t / period + rng.random(size)))
+    return waves
+
+
+def respond(u, fault: Fault, j: int, step=1.0):
+    """Return the response ``(rows,)`` without noise."""
+    own = u[:, j if fault.source is None else fault.source]
+    rows = np.arange(len(u), dtype=float)
+    x = np.interp(rows - fault.delay, rows, own)
+    if fault.backlash:
+        y = x[0]
+        out = []
+        for value in x:
+            y = min(max(y, value - fault.backlash), value + fault.backlash)
+            out.append(y)
+        x = np.array(out)
+    if fault.saturation is not None:
+        x = np.clip(x, -fault.saturation, fault.saturation)
+    if fault.jump:
+        x = np.where(np.abs(x) > fault.dead_zone, x, 0.0)
+    else:
+        x = np.sign(x) * np.maximum(np.abs(x) - fault.dead_zone, 0.0)
+    y = fault.gain * x
+    if fault.coupling is not None:
+        other, share = fault.coupling
+        y = y + share * np.interp(rows - fault.delay, rows, u[:, other])
+    if fault.lag:
+        keep, out = np.exp(-1 / fault.lag), [y[0]]
+        for value in y[1:]:
+            out.append(value + keep * (out[-1] - value))
+        y = np.array(out)
+    y = y + fault.offset + fault.drift * rows / len(rows)
+    return np.round(y / fault.quantum) * fault.quantum if fault.quantum else y
+
+
+def noise(rng, rows, size, scale=0.02, kind="gauss"):
+    if kind == "heavy":
+        return scale * rng.standard_t(2.5, (rows, size))
+    if kind == "red":
+        e = scale * rng.standard_normal((rows, size))
+        for k in range(1, rows):
+            e[k] = 0.9 * e[k - 1] + np.sqrt(1 - 0.81) * e[k]
+        return e
+    return scale * rng.standard_normal((rows, size))
