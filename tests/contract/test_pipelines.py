@@ -93,9 +93,9 @@ class Short(gymnasium.Env):
         return self.state.numpy(), 0.0, self.count == 4, False, {}
 
 
-def test_a_compiled_environment_steps_alike(small_flow):
+def test_a_compiled_environment_steps_alike(box):
     base = UGVTrack(batch_size=(3,), process_noise=0.0, **REVERSED)
-    env = TransformedEnv(base, Compose(ActionFlowTransform(Dubins(), small_flow())))
+    env = TransformedEnv(base, Compose(afm(box)))
     start = env.rollout(3)[:, -1]
     td = step_mdp(start).set("action", torch.full((3, 2), 0.4))
     expected = env.step(td.clone())
@@ -104,6 +104,7 @@ def test_a_compiled_environment_steps_alike(small_flow):
     compiled = torch.compile(transform._inv_call, backend="eager")
     executed = compiled(td.clone())["action"]
     torch.testing.assert_close(executed, expected["next", "afm", "executed_action"])
+    assert expected["next", "afm", "misaligned"].all()
 
 
 def taught(box, make_ensemble):
@@ -143,7 +144,7 @@ def test_worker_processes_with_a_frozen_model(box):
         return car(box, model=Dubins(), max_steps=3)
 
     settings = {"frames_per_batch": 6, "total_frames": 6, "cat_results": 0}
-    collector = MultiSyncCollector([make, make], **settings)
+    collector = MultiSyncCollector([make], **settings)
     try:
         (data,) = list(collector)
     finally:
@@ -162,7 +163,7 @@ def test_worker_processes_with_a_model_that_learns_are_refused(box, make_ensembl
         return car(box, model=model)
 
     with pytest.raises(ConfigurationError, match="learns in another process"):
-        MultiSyncCollector([make, make], frames_per_batch=6, total_frames=6)
+        MultiSyncCollector([make], frames_per_batch=6, total_frames=6)
     parallel = ParallelEnv(2, make, mp_start_method="fork")
     with pytest.raises(RuntimeError, match="worker"):
         parallel.reset()
