@@ -1,7 +1,7 @@
 """Faulty readings and unsafe actions: pure functions for transforms, updaters and loops.
 
 A reading is *whole* if all its numbers are finite and of a possible size. It is *stale* if the
-sensor has sent the previous reading again. Whoever keeps transitions keeps the number of
+sensor has sent the previous reading again. Code that keeps transitions keeps the number of
 repetitions beside the state and asks for both ends of a transition::
 
     after = count_repeats(next_state, state, count)

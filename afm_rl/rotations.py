@@ -156,7 +156,6 @@ class RigidBodySpace(Manifold):
         self.tangent_size = 12
 
     def project(self, raw: Tensor) -> Tensor:
-        """Scale the quaternions in ``(*B, 13)`` to length 1."""
         turned = quaternion_normalise(raw[..., 6:10])
         return torch.cat([raw[..., :6], turned, raw[..., 10:]], -1)
 
@@ -174,13 +173,11 @@ class RigidBodySpace(Manifold):
         return torch.cat([state[..., plain], matrix.flatten(-2)], -1)
 
     def difference(self, state: Tensor, origin: Tensor) -> Tensor:
-        """Return the tangent vector ``(*B, 12)`` that leads from ``origin`` to ``state``."""
         raw = state - origin
         turn = quaternion_multiply(quaternion_conjugate(origin[..., 6:10]), state[..., 6:10])
         return torch.cat([raw[..., :6], quaternion_log(turn), raw[..., 10:]], -1)
 
     def add(self, origin: Tensor, tangent: Tensor) -> Tensor:
-        """Return the state ``(*B, 13)`` reached from ``origin`` along ``tangent``."""
         turned = quaternion_multiply(origin[..., 6:10], quaternion_exp(tangent[..., 6:9]))
         moved = origin[..., :6] + tangent[..., :6]
         return torch.cat([moved, turned, origin[..., 10:] + tangent[..., 9:]], -1)

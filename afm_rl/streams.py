@@ -88,7 +88,6 @@ class Streams:
         return {"seed": torch.tensor(self.seed), **states}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore what :meth:`state_dict` returned."""
         self.manual_seed(int(state["seed"]))
         for key in state.keys() - {"seed"}:
             seed, device = key.split("@")

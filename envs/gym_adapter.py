@@ -48,7 +48,6 @@ class MissionGym(gymnasium.Env):
         return self._described(self._data)
 
     def step(self, action: np.ndarray):
-        """Apply the action for one time step."""
         data = require_reset(self._data)
         data["action"] = torch.as_tensor(np.asarray(action), device=self.native.device)
         following = self.native.step(data)["next"]

@@ -209,5 +209,4 @@ class MissionEnv(EnvBase):
         return self.noise.state_dict()
 
     def set_extra_state(self, state: dict[str, dict[str, Tensor]]) -> None:
-        """Restore what :meth:`get_extra_state` returned."""
         self.noise.load_state_dict(state)

@@ -67,7 +67,6 @@ class MissionNoise:
         return {name: stream.state_dict() for name, stream in self.streams.items()}
 
     def load_state_dict(self, state: dict[str, dict[str, Tensor]]) -> None:
-        """Restore what :meth:`state_dict` returned."""
         for name, stream in self.streams.items():
             stream.load_state_dict(state[name])
 

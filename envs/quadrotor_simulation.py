@@ -56,11 +56,9 @@ class QuadrotorSimulation(PhasedSimulation):
         return self.started(torch.cat([wanted, turning], -1), mission, 4, lost=none.bool())
 
     def displaced(self, pose: Tensor, noise: Tensor) -> Tensor:
-        """Return poses whose positions are moved by noise (m), ``(*B, 3)``."""
         return torch.cat([pose[..., :3] + noise, pose[..., 3:]], -1)
 
     def progress(self, mission: TensorDictBase, state: Any) -> Tensor:
-        """Return the share of the flight's time."""
         return state["step"].to(mission["at"].dtype) / self.steps
 
     def advance(
@@ -115,7 +113,6 @@ class QuadrotorSimulation(PhasedSimulation):
     def describe(
         self, mission: TensorDictBase, state: dict[str, Tensor], sensor: Tensor | None = None
     ) -> TensorDict:
-        """Return the state and what is seen of it; no error is known yet."""
         pose, step = state["pose"], state["step"]
         ticks = torch.arange(self.horizon + 1, device=pose.device) * self.preview
         times = ((step.unsqueeze(-1) + ticks) * self.dt).to(pose.dtype)

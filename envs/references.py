@@ -57,7 +57,6 @@ class Hover(Reference):
         self.position = _points("hover: position", [position])[0]
 
     def at(self, time: Tensor) -> Tensor:
-        """Return the position, and no velocity."""
         here = torch.cat([self.position, torch.zeros_like(self.position)]).to(time)
         return here.expand(*time.shape, 6)
 
@@ -84,7 +83,6 @@ class Circle(Reference):
         self.name = f"circle_{self.radius:g}m_{self.speed:g}mps"
 
     def at(self, time: Tensor) -> Tensor:
-        """Return points of the circle and their velocities."""
         angle = time * (self.speed / self.radius)
         cos, sin, none = angle.cos(), angle.sin(), torch.zeros_like(angle)
         here = torch.stack([cos, sin, none], -1) * self.radius
@@ -116,7 +114,6 @@ class FigureEight(Reference):
         self.name = f"figure_8_{period:g}s"
 
     def at(self, time: Tensor) -> Tensor:
-        """Return points of the figure and their velocities."""
         angle = time * self.pulse
         none, fast = torch.zeros_like(angle), self.width * 2 * self.pulse
         here = [self.length * angle.sin(), self.width * (2 * angle).sin(), none]
@@ -166,7 +163,6 @@ class Waypoints(Reference):
         self.velocities = torch.cat([moving, torch.zeros_like(moving[:1])])
 
     def at(self, time: Tensor) -> Tensor:
-        """Return points of the lines and their velocities."""
         starts, times, velocities = (x.to(time) for x in (self.starts, self.times, self.velocities))
         if self.closed:
             time = time.remainder(times[-1])
@@ -209,7 +205,6 @@ class Table(Reference):
         self.times, self.rows = times, torch.cat([local, velocities], -1)
 
     def at(self, time: Tensor) -> Tensor:
-        """Return the rows, mixed linearly."""
         times, rows = self.times.to(time), self.rows.to(time)
         inside = time.clamp(times[0], times[-1])
         last = torch.searchsorted(times, inside.contiguous(), right=True).clamp(1, len(times) - 1)

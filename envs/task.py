@@ -99,7 +99,7 @@ class Task:
     def begin(self, seeds: Tensor, rows: Tensor | None = None) -> dict[str, Tensor]:
         """Return ``pose`` ``(*B, S)`` and, if there is one, ``goal`` ``(*B, G)``, by seed.
 
-        Where ``rows`` ``(*B)`` says no, nobody looks at them.
+        Where ``rows`` ``(*B)`` is false, they are not used.
         """
         asked = seeds if rows is None else torch.where(rows, seeds, 0)
         known = {seed: self.start(seed) for seed in set(asked.flatten().tolist())}
@@ -121,7 +121,7 @@ class Task:
         """
         state = data["pose"]
         if physics is not None and isinstance(self.world, MuJoCoDynamics):
-            self.world.tell(physics)
+            self.world.set_physics(physics)
         ahead = self.world(state, action)
         goal = [data["goal"]] if self.goal_names else []
         reward = self.reward(state, action, ahead, *goal)

@@ -161,7 +161,6 @@ class TaskSimulation(nn.Module, PhasedSimulation):
         return self.task.history()
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`get_extra_state` returned."""
         self.task.replay(state)
 
     def displaced(self, pose: Tensor, noise: Tensor) -> Tensor:
@@ -209,5 +208,4 @@ class TaskSimulation(nn.Module, PhasedSimulation):
         return out
 
     def describe(self, mission: TensorDictBase, state: dict[str, Tensor]) -> TensorDict:
-        """Return the state and what is seen of it: all."""
         return self.described(mission, state, observation=state["pose"].clone())

@@ -86,7 +86,6 @@ class HostedTask(Task):
         return ahead, reward, done
 
     def history(self) -> dict[str, dict[str, Any]]:
-        """Return what leads to the present state of each environment."""
         empty = torch.zeros(0, len(self.low))
         return {
             str(slot): {

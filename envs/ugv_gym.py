@@ -56,7 +56,6 @@ class UGVTrackGym(MissionGym):
         self._trail: list[Tensor] = []
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Begin an episode; ``seed`` restarts the noise, no seed continues it."""
         self._trail = []
         return super().reset(seed=seed, options=options)
 

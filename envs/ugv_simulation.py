@@ -50,16 +50,13 @@ class UGVSimulation(nn.Module, PhasedSimulation):
         self.max_steps = max_steps
 
     def begin(self, mission: TensorDictBase, dtype: torch.dtype) -> dict[str, Tensor]:
-        """Return the state at the beginning of missions: at the start, nothing reached."""
         pose = _wrapped(self.course.starts[mission["track"]].to(dtype))
         return self.started(pose, mission, 2, reached=torch.zeros_like(mission["track"]))
 
     def displaced(self, pose: Tensor, noise: Tensor) -> Tensor:
-        """Return poses moved by noise (m, m, rad), ``(*B, 3)``."""
         return _wrapped(pose + noise)
 
     def progress(self, mission: TensorDictBase, state: Any) -> Tensor:
-        """Return the share of targets reached."""
         return self.course.progress(mission["track"], state["reached"])
 
     def advance(
@@ -94,7 +91,6 @@ class UGVSimulation(nn.Module, PhasedSimulation):
         return out
 
     def describe(self, mission: TensorDictBase, state: dict[str, Tensor]) -> TensorDict:
-        """Return the state and what is seen of it."""
         goal = self.course.goal(mission["track"], state["reached"])
         return self.described(mission, state, observation=state["pose"].clone(), goal=goal)
 

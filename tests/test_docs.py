@@ -106,6 +106,16 @@ def test_pages_are_short_and_what_they_name_exists(page):
         assert text.count("\n") <= 60
 
 
+def test_the_design_page_names_what_is_there():
+    page = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+    named = re.findall(r"`([\w.]+)`(?:, | in )`((?:afm_rl|envs)/[\w/]+\.py)`", page)
+    assert len(named) >= 15
+    for name, path in named:
+        code = (ROOT / path).read_text(encoding="utf-8")
+        for part in name.split("."):
+            assert re.search(rf"(def|class) {part}\b", code), (name, path)
+
+
 def test_every_page_is_in_the_navigation():
     nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
 

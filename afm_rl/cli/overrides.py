@@ -96,7 +96,7 @@ def optional(overrides: Sequence[str]) -> dict[str, str]:
 
 
 def has(settings: Mapping[str, Any], key: str) -> bool:
-    """Is there a setting of this name?
+    """Return whether there is a setting of this name.
 
     >>> has({"corrector": {"gate": 5.0}}, "corrector.gate"), has({}, "corrector.gate")
     (True, False)

@@ -47,7 +47,7 @@ class ActionFlow(PairCorrector):
     4. *Experts* fit its pairs, and the network encodes both.
     5. *Flow*: straight paths :math:`x_\tau = (1-\tau)(u_0 + \sigma\epsilon) + \tau u_1` lead from
        around the plan :math:`u_0` to the inverse :math:`u_1 = T^{-1}(u_0)`.
-    6. *Choice*: the sample, or their mean, whose predicted effect is nearest to what can be had
+    6. *Choice*: the sample, or their mean, whose predicted effect is nearest to the achievable part
        of the plan is executed.
 
     Args:
@@ -62,10 +62,10 @@ class ActionFlow(PairCorrector):
         forgetting: :math:`\lambda`, of the hypotheses' losses.
         gate: in standard deviations of the model.
         samples: starting points of the flow.
-        source_std: :math:`\sigma`, in half ranges.
+        source_std: :math:`\sigma`, a share of the largest action.
         steps: midpoint steps.
         choose: the ``"best"`` sample by its predicted effect, or always their ``"mean"``.
-        saturation: what gives way when a plan cannot be had in full, see
+        saturation: what gives way when a plan is not achievable in full, see
             :func:`~afm_rl.flow.saturation.saturate`.
         compile: run the tick as machine code, which is faster for a single
             mission; it is compiled once and kept in the cache. Where there is no compiler, the
@@ -189,7 +189,7 @@ class ActionFlow(PairCorrector):
         return Answer(*(part.view((*batch, *part.shape[1:])) for part in answer))
 
     def _machine(self, given: list[Tensor]) -> Callable[..., Sequence[Tensor]]:
-        """Return the tick as machine code, or as it is where that cannot be had."""
+        """Return the tick as machine code, or as it is where that is not possible."""
         found = self.__dict__["_machine_code"]
         if found is None:
             two = [part[:1].repeat(2, *[1] * (part.dim() - 1)) for part in given]
@@ -228,7 +228,7 @@ class ActionFlow(PairCorrector):
         count: int,
         generator: torch.Generator,
     ) -> float:
-        """Return the root mean square error of the action on new windows, in half ranges."""
+        """Return the RMS error of the action on new windows, a share of the largest one."""
         drawn = self._draw(model, regime, states, count, generator)
         known = self.network.encode(drawn.rows, fit_experts(drawn.rows))
         box = torch.stack([self.lowest, self.highest]).expand(count, -1, -1)

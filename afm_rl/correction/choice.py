@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 PROBES = 32  # actions whose effects are asked for the reach
-LEAST_REACH = 0.01  # half ranges
+LEAST_REACH = 0.01  # shares of the largest action
 
 
 def source_points_of(count: int, size: int) -> Tensor:
@@ -16,7 +16,7 @@ def source_points_of(count: int, size: int) -> Tensor:
 
 
 def probes_of(size: int) -> Tensor:
-    """Return actions ``(P, A)`` in half ranges: ends of the axes, and between them.
+    """Return actions ``(P, A)``, shares of the largest action: ends of the axes, and between them.
 
     >>> probes_of(1)[:2].tolist()
     [[1.0], [-1.0]]
@@ -29,13 +29,13 @@ def probes_of(size: int) -> Tensor:
 def nearest_of(effects: Tensor, wanted: Tensor, reach: Tensor) -> Tensor:
     """Return which effect comes nearest to what is wanted, ``(*B, 1, 1)``.
 
-    Errors are relative to what can be had at all on their axis: an axis of which little can be
-    had counts as much as any other.
+    Errors are relative to the achievable range of their axis: an axis with a small range counts
+    as much as any other.
 
     Args:
-        effects: what proposals are expected to be worth, ``(*B, P, A)``.
+        effects: the predicted effects of proposals, ``(*B, P, A)``.
         wanted: ``(*B, A)``.
-        reach: half of the range of effects that can be had, ``(*B, A)``.
+        reach: half of the range of achievable effects, ``(*B, A)``.
 
     >>> nearest_of(torch.tensor([[0.5], [0.9]]), torch.ones(1), torch.ones(1))
     tensor([[1]])

@@ -28,7 +28,7 @@ def draw_counterfactuals(
 
     The newest rows of each window come from the regime to correct, the older ones from the regime
     before; some windows are not full. Half of the plans are in the action box, the others are
-    effects that can be had.
+    achievable effects.
 
     Args:
         corrector: whose actions they are.
@@ -36,7 +36,7 @@ def draw_counterfactuals(
         regime: the prior.
         states: lowest and highest state, or a pool of them, ``(P, S)``.
         size: windows, their rows and plans for each, (N, K, C).
-        mode: of plans that cannot be had, see :func:`~afm_rl.flow.saturation.saturate`.
+        mode: of plans that are not achievable, see :func:`~afm_rl.flow.saturation.saturate`.
         generator: of all that is drawn.
     """
     count, rows, plans = size

@@ -28,7 +28,7 @@ class Hypothesis(NamedTuple):
     delay: int = 0
     """Steps from a command to its effect."""
     near: bool = False
-    """Read the pairs nearest in place instead of in time?"""
+    """Whether it reads the pairs nearest in place instead of in time."""
     penalty: float = 0.0
     """How much worse than the first it must be expected to predict."""
 

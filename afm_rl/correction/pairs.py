@@ -15,7 +15,7 @@ from afm_rl.flow.experts import LIMIT, Rows
 
 
 class PairCorrector(Corrector):
-    """A corrector that remembers M pairs (executed, effective action) in half ranges.
+    """A corrector that remembers M pairs (executed, effective action), shares of the largest.
 
     The model counts as misaligned while the largest normalised innovation of the newest
     transitions exceeds ``gate`` standard deviations of the model's own noise. While it is

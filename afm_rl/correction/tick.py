@@ -17,7 +17,7 @@ from afm_rl.flow.network import AxisNetwork, Encoded
 from afm_rl.flow.saturation import MODES, attainable
 from afm_rl.flow.solver import midpoint
 
-TOLERANCE = 0.25  # half ranges: a prediction that misses by so much has half the largest loss
+TOLERANCE = 0.25  # of the largest action: at an error of this size the loss is half its maximum
 
 
 class Answer(NamedTuple):
@@ -26,7 +26,7 @@ class Answer(NamedTuple):
     losses: Tensor
     """Of the hypotheses, ``(B, H + 1)``."""
     forecasts: Tensor
-    """Effects that they predict of what acts now, in half ranges, ``(B, H + 1, A)``."""
+    """Effects predicted of what acts now, shares of the largest action, ``(B, H + 1, A)``."""
     executed: Tensor
     """The action, in its own units, ``(B, A)``."""
     predicted: Tensor
@@ -122,7 +122,7 @@ class Tick(nn.Module):
         forecasts = self.predict(encoded, pairs, action)
         found = torch.stack([action, effect], -2) * self.scale
         found = torch.where(believed[:, None, None], found, planned.unsqueeze(-2))
-        # Never a smaller box: the flow itself cuts what cannot be had.
+        # Never a smaller box: the flow itself cuts what is not achievable.
         low, high = (bounds * self.scale).unbind(-2)
         low, high = torch.fmin(low, box[:, 0]), torch.fmax(high, box[:, 1])
         executed, effect = found.unbind(-2)

@@ -19,7 +19,7 @@ class DynamicsModel(nn.Module, ABC):
     leading dimensions of missions that own parameters (:attr:`lead`, empty for a shared
     model); ``N`` is any number of further dimensions, such as candidates. The random part of
     the prediction is described by :meth:`moments`, for losses, and :meth:`noise_scale`, for
-    whoever asks whether an error is surprising.
+    gates that judge whether an error is large.
 
     Args:
         manifold: the state space.
@@ -30,13 +30,13 @@ class DynamicsModel(nn.Module, ABC):
     """Number of the process in which an updater changes the model; None: it stays as it is."""
 
     affine: bool = False
-    """Is the next state affine in the action? Then one Gauss-Newton step inverts the model."""
+    """Whether the next state is affine in the action: one Gauss-Newton step inverts it."""
 
     stiff: bool = False
-    """Does rounding to single precision matter? Contacts and stiff joints magnify it."""
+    """Whether rounding to single precision matters: contacts and stiff joints magnify it."""
 
     extrapolates: bool = False
-    """Can it foresee what actions beyond their box would do? Equations can, networks cannot."""
+    """Whether it predicts actions beyond their box: equations do, networks do not."""
 
     conditioned_on: str | None = None
     """What an updater sets in it: ``regime``, ``calibration``, or nothing."""

@@ -91,7 +91,6 @@ class Calibrated(PerMissionModel):
         return action + self.half_range * (moved - unit)  # plus exactly 0 for the identity
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the expected next state ``(*L, *N, S)``."""
         return self._shifted(self.model(state, self.effective(action)))
 
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
@@ -103,7 +102,6 @@ class Calibrated(PerMissionModel):
         return states
 
     def forecast(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return expected next state and noise scale, as the model has them."""
         ahead, noise = self.model.forecast(state, self.effective(action))
         return self._shifted(ahead), noise
 
@@ -114,7 +112,6 @@ class Calibrated(PerMissionModel):
         return self.model.jacobian(state, self.effective(action)) @ self._slope(action)
 
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return next state and derivatives: those of the model, by the chain rule."""
         ahead, by_state, by_action = self.model.linearise(state, self.effective(action))
         by_action = by_action @ self._slope(action)
         if self._flat:
@@ -131,11 +128,9 @@ class Calibrated(PerMissionModel):
         return mean + moved.unsqueeze(-2), log_variance
 
     def standardise(self, change: Tensor) -> Tensor:
-        """Use the model's units."""
         return self.model.standardise(change)
 
     def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the model's noise scale at a'."""
         return self.model.noise_scale(state, self.effective(action))
 
     def _owned(self) -> list[tuple[nn.Module, str]]:
@@ -143,7 +138,7 @@ class Calibrated(PerMissionModel):
 
     @property
     def _flat(self) -> bool:
-        """Does adding c leave derivatives as they are?"""
+        """Whether adding c leaves derivatives as they are."""
         return self.manifold.tangent_size == self.manifold.size
 
     def _shifted(self, ahead: Tensor) -> Tensor:

@@ -48,7 +48,7 @@ class CastCache:
         return self._copies
 
     def _current(self, tensors: Sequence[Tensor]) -> bool:
-        """Are these the tensors seen last, unchanged?"""
+        """Return whether these are the tensors seen last, unchanged."""
         return len(tensors) == len(self._seen) and all(
             (one.data_ptr(), one.shape, one.stride(), one._version)
             == (alias.data_ptr(), alias.shape, alias.stride(), version)

@@ -174,7 +174,6 @@ class Ensemble(PerMissionModel):
         return (change - self.target_mean) / self.target_std
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the expected next state ``(*L, *N, S)``."""
         size, parameters = self.manifold.tangent_size, self._planning_parameters()
         if self.propagation == "sample":
             mean, log_variance = self._moments(self._run(state, action, 2 * size, parameters))
@@ -189,7 +188,6 @@ class Ensemble(PerMissionModel):
         return self.manifold.add(state, change * self.target_std + self.target_mean)
 
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return standardised mean and log-variance ``(*L, *N, E, D)``."""
         parameters = self.weights, self.biases
         return self._moments(self._run(state, action, 2 * self.manifold.tangent_size, parameters))
 
@@ -209,7 +207,6 @@ class Ensemble(PerMissionModel):
         return mean, low + F.softplus(raw - low)
 
     def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the standard deviation of the mixture of members ``(*L, *N, D)``."""
         return self.forecast(state, action)[1]
 
     def forecast(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -287,7 +284,7 @@ class Ensemble(PerMissionModel):
         return out.reshape(*shape, self.members, size)
 
     def _enough(self, state: Tensor) -> bool:
-        """Are there candidates, and no fewer than members?"""
+        """Return whether there are candidates, and no fewer than members."""
         return state.dim() - 1 > len(self.lead) and state.shape[-2] >= self.members
 
     def _run_shared_out(

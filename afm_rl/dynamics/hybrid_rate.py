@@ -54,7 +54,6 @@ class HeldHybrid(HeldRate):
         return self.nominal(state) + value
 
     def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rate of change and its derivative, the action in the last columns."""
         rate, turn = self.nominal.tangent(state, through)
         value, slope = residual_slope(self.inputs(state), self.network)
         actions = self.action.shape[-1]

@@ -143,7 +143,6 @@ class KNODE(PerMissionModel):
         return self
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the expected next state ``(*L, *N, S)``."""
         return self.advance(state, action, self.dt, self.substeps)
 
     def advance(
@@ -186,13 +185,11 @@ class KNODE(PerMissionModel):
         return slope.reshape(*batch, *slope.shape[-2:])
 
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return next state and derivatives, in closed form."""
         ahead, through = self._through(state, action, slice(None))
         size = self.state_size
         return ahead, through[..., :size], through[..., size:]
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the derivative by the action ``(*L, *N, D, A)`` on the tangent space."""
         moved = self._through(state, action, slice(self.state_size, None))
         return on_tangent(self.manifold, *moved, state)
 
@@ -210,11 +207,9 @@ class KNODE(PerMissionModel):
         return mean.unsqueeze(-2), torch.zeros_like(mean).unsqueeze(-2)
 
     def standardise(self, change: Tensor) -> Tensor:
-        """Use the nominal model's units."""
         return self.nominal.standardise(change)
 
     def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the nominal model's noise scale."""
         return self.nominal.noise_scale(state, action)
 
     @property

@@ -75,9 +75,7 @@ class KnownDynamics(DynamicsModel):
         return mean.unsqueeze(-2), torch.zeros_like(mean).unsqueeze(-2)
 
     def standardise(self, change: Tensor) -> Tensor:
-        """Divide by ``noise_std``."""
         return change / self.noise
 
     def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return ``noise_std`` for every coordinate."""
         return self.noise.to(state).expand(*state.shape[:-1], -1)

@@ -235,7 +235,7 @@ class MuJoCoDynamics(KnownDynamics):
         """Names of the state coordinates, ``q_JOINT``, ``v_JOINT``, ``w_...``, and of actions."""
         return state_names(self.mjcf), actuator_names(self.mjcf)
 
-    def tell(self, physics: Tensor) -> None:
+    def set_physics(self, physics: Tensor) -> None:
         """Change the physics from now on: rows ``(P,)``, or ``(*L, P)`` for leading dimensions.
 
         See :class:`~afm_rl.regimes.Physics`.

@@ -1,4 +1,4 @@
-"""A model that is told the regime: the yardstick, not a method."""
+"""A model conditioned on the true regime: an upper bound, not a method."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class Oracle(DynamicsModel):
         model: the nominal dynamics.
         regime: the regime family of the environment.
 
-    :meth:`tell` sets the parameters ``(F,)`` or, per mission, ``(*L, F)``.
+    :meth:`set_regime` sets the parameters ``(F,)`` or, per mission, ``(*L, F)``.
 
     >>> from afm_rl.dynamics import Dubins
     >>> from afm_rl.regimes import ActionGain
     >>> gains = ActionGain(["v_gain", "omega_gain"])
     >>> oracle = Oracle(Dubins(), gains)
-    >>> oracle.tell(gains.encode({"v_gain": -1.0}))
+    >>> oracle.set_regime(gains.encode({"v_gain": -1.0}))
     >>> oracle(torch.zeros(3), torch.tensor([1.0, 0.0]))
     tensor([-0.2000,  0.0000,  0.0000])
     """
@@ -43,25 +43,24 @@ class Oracle(DynamicsModel):
 
     @property
     def lead(self) -> torch.Size:
-        """Leading dimensions of the parameters last told."""
+        """Leading dimensions of the parameters last set."""
         return self.parameters_now.shape[:-1]
 
-    def tell(self, parameters: Tensor) -> None:
+    def set_regime(self, parameters: Tensor) -> None:
         """Set the regime parameters that hold from now on."""
         self.parameters_now = parameters.detach()
         physics = self.regime.physics_of(self.parameters_now)
         if physics is not None and isinstance(self.model, MuJoCoDynamics):
-            self.model.tell(physics)
+            self.model.set_physics(physics)
 
     def effective(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return what ``action`` is worth under the present regime."""
-        told = self.parameters_now
-        extra = action.dim() - told.dim()
-        told = told.reshape(*told.shape[:-1], *(1,) * extra, told.shape[-1])
-        return self.regime.apply(action, told, state)
+        """Return the effective action under the present regime."""
+        now = self.parameters_now
+        extra = action.dim() - now.dim()
+        now = now.reshape(*now.shape[:-1], *(1,) * extra, now.shape[-1])
+        return self.regime.apply(action, now, state)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the true expected next state."""
         return self.model(state, self.effective(state, action))
 
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
@@ -71,25 +70,20 @@ class Oracle(DynamicsModel):
         return self.model.rollout(state, self.effective(state[..., None, None, :], actions))
 
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return next state and derivatives: those of the nominal model, by the chain rule."""
         effective, in_state, in_action = linearised(self.effective, state, action)
         ahead, by_state, by_effective = self.model.linearise(state, effective)
         return ahead, by_state + by_effective @ in_state, by_effective @ in_action
 
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the nominal model's moments at the effective action."""
         return self.model.moments(state, self.effective(state, action))
 
     def standardise(self, change: Tensor) -> Tensor:
-        """Use the nominal model's units."""
         return self.model.standardise(change)
 
     def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the nominal model's noise scale at the effective action."""
         return self.model.noise_scale(state, self.effective(state, action))
 
     def select_(self, index: Tensor) -> Oracle:
-        """Keep the missions in ``index``."""
         if self.lead:
-            self.tell(self.parameters_now[index])
+            self.set_regime(self.parameters_now[index])
         return self

@@ -33,7 +33,6 @@ class PerMissionModel(DynamicsModel):
 
     @property
     def lead(self) -> torch.Size:
-        """Leading mission dimensions, () or (B,)."""
         return self.missions.shape
 
     @abstractmethod
@@ -41,7 +40,6 @@ class PerMissionModel(DynamicsModel):
         """Return the parameters and buffers of missions: the module and the name in it."""
 
     def expand_(self: Self, missions: int) -> Self:
-        """Give each of ``missions`` parameters of its own, in place."""
         if self.lead:
             raise ConfigurationError(f"dynamics: already expanded to {tuple(self.lead)} missions")
         self._replace_owned(lambda part: part.expand(missions, *part.shape).clone())

@@ -58,13 +58,11 @@ class Quadrotor(KnownDynamics):
         self.body, self.dt, self.substeps = body, dt, substeps
 
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return next state and derivatives, in closed form."""
         state, action = aligned(state, action)
         ahead, slope = self._through(state, action, undisturbed(state, self.action_size))
         return ahead, slope[..., :13], slope[..., 13:]
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
-        """Return the derivative by the action on the tangent space, ``(*B, 12, 4)``."""
         state, action = aligned(state, action)
         still = undisturbed(state, self.action_size)[..., 13:]
         return on_tangent(self.manifold, *self._through(state, action, still), state)

@@ -52,7 +52,6 @@ class HeldFlight(HeldRate):
         return self._rate(state, self._sums(state))
 
     def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rate of change and its derivative, the action in the last four columns."""
         tables, sums = self.tables, self._sums(state)
         slope = (state[..., 6:] @ tables.slope).unflatten(-1, (10, 7)) * self.gain.unsqueeze(-1)
         rest = slope @ through[..., 6:, :]
@@ -87,11 +86,9 @@ class QuadrotorRate(Rate):
         self.body = body
 
     def hold(self, action: Tensor) -> HeldFlight:
-        """Return the rate of change under ``action``."""
         return HeldFlight(action, self.body)
 
     def finish(self, state: Tensor) -> Tensor:
-        """Scale the quaternions to length 1."""
         return unit(state)
 
     def finish_tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:

@@ -66,11 +66,9 @@ class FunctionRate(Rate):
         self.manifold = manifold
 
     def hold(self, action: Tensor) -> HeldRate:
-        """Return the rate of change under ``action``."""
         return _HeldFunction(self.function, action)
 
     def finish(self, state: Tensor) -> Tensor:
-        """Wrap the angles."""
         return torch.where(self.manifold.is_angle, wrap_angle(state), state)
 
     def finish_tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""What stands for physics that nobody wrote down."""
+"""A stand-in for physics that are not known."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ class UnknownDynamics(DynamicsModel):
         )
 
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Raise."""
         return self(state, action), state
 
     def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
-        """Raise."""
         return self(state, action)

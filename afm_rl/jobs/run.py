@@ -162,7 +162,7 @@ def _publish(new: Path, folder: Path) -> None:
     """Move finished results to their place. If this is interrupted, it is done again.
 
     From the removal of the old manifest to the arrival of the new one the folder counts as
-    unfinished: nobody reads a mixture of old and new files.
+    unfinished: a mixture of old and new files is never read.
     """
     remove_parts(folder)
     if is_finished(folder):

@@ -1,4 +1,4 @@
-"""Fitting of an ensemble to transitions, whoever made them."""
+"""Fitting of an ensemble to recorded transitions."""
 
 from __future__ import annotations
 

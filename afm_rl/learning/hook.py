@@ -74,7 +74,6 @@ class UpdaterHook(TrainerHookBase):
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
         self.updater.load_state_dict(state_dict["updater"])
         self._started = state_dict["started"]
         if self._optimizer is not None:

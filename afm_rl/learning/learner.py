@@ -43,7 +43,7 @@ class Learner(Updater, ABC):
     """Where a guard says whether the readings of a transition are sound ``(*B)``."""
 
     by_gradient = False
-    """Does learning need the gradients of what is measured?"""
+    """Whether learning needs the gradients of what is measured."""
 
     def __init__(self, loss: GaussianNLLLoss, mask_key: NestedKey | None = None) -> None:
         super().__init__(loss)
@@ -57,7 +57,6 @@ class Learner(Updater, ABC):
         self.readings.keep(Readings(torch.zeros(())))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Measure the loss, then learn."""
         self.follow()
         batch = tensordict.batch_size
         kept = tensordict.select(*self.loss.in_keys).detach()

@@ -41,7 +41,7 @@ def inverse_mass(
 
 
 class MassEstimator(Learner):
-    r"""Tells a model the mass that the last changes of velocity speak for.
+    r"""Sets the mass of a model to an estimate from the last changes of velocity.
 
     :func:`inverse_mass` per tick, low-passed:
     :math:`1/m \leftarrow s\,k + (1 - s) / m`. Nothing else about the flight is estimated.
@@ -49,7 +49,7 @@ class MassEstimator(Learner):
     Args:
         loss: a loss over an :class:`~afm_rl.dynamics.Oracle` of a
             :class:`~afm_rl.dynamics.Quadrotor` whose regime has a ``mass``, such as
-            :class:`~afm_rl.regimes.MassFactor`. It is told the estimate, not the truth.
+            :class:`~afm_rl.regimes.MassFactor`. It is conditioned on the estimate, not the truth.
         share: s, weight of the latest measurement, in (0, 1].
         least_thrust: thrust, as a share of the weight, below which nothing is measured.
         least: lowest factor of the nominal mass that is believed.
@@ -105,7 +105,7 @@ class MassEstimator(Learner):
 
     @property
     def model(self) -> Oracle:
-        """The model that is told."""
+        """The model whose mass is set."""
         return cast(Oracle, self.loss.model)
 
     def start(self, tensordict: TensorDictBase | None = None) -> None:
@@ -113,16 +113,15 @@ class MassEstimator(Learner):
         super().start()
         if tensordict is not None:
             regime = torch.tensor(self.model.regime.identity)
-            self.model.tell(regime.expand(*tensordict.batch_size, -1).clone())
+            self.model.set_regime(regime.expand(*tensordict.batch_size, -1).clone())
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Measure the loss, then tell the new estimate."""
         if self.model.parameters_now.shape[:-1] != tensordict.batch_size:
             self.start(tensordict)
         return super().forward(tensordict)
 
     def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
-        """Tell the new estimate."""
+        """Set the new estimate."""
         physics = cast(Quadrotor, self.model.model)
         body = physics.body
         state, action, after = (transitions.get(key) for key in self.loss.in_keys)
@@ -131,9 +130,9 @@ class MassEstimator(Learner):
         enough = thrust >= self.least_thrust * body.hover_thrust
         speeds = state[..., 3:6], after[..., 3:6]
         seen = inverse_mass(*speeds, axis, thrust.where(enough, 1.0), physics.dt, body.gravity)
-        told = self.model.parameters_now.clone()
-        factor = told[..., self.column]
+        regime = self.model.parameters_now.clone()
+        factor = regime[..., self.column]
         inverse = torch.lerp(1 / factor, seen * body.mass, self.share)
         fresh = 1 / inverse.clamp(1 / self.most, 1 / self.least)
-        told[..., self.column] = torch.where(learn & enough & seen.isfinite(), fresh, factor)
-        self.model.tell(told)
+        regime[..., self.column] = torch.where(learn & enough & seen.isfinite(), fresh, factor)
+        self.model.set_regime(regime)

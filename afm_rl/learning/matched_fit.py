@@ -74,11 +74,11 @@ class MatchedFit(nn.Module):
         theta, covariance = self._fit()
         shape, steps = self.shape.parts
         features = features_of(action, shape.unsqueeze(1))
-        doubt = torch.einsum("lnr,lgrk,lnk->lng", features, covariance, features)
-        doubt = where(memory.active, doubt, torch.zeros_like(doubt))
+        variance = torch.einsum("lnr,lgrk,lnk->lng", features, covariance, features)
+        variance = where(memory.active, variance, torch.zeros_like(variance))
         error = (parts.effective - features @ theta.mT).square() * parts.weight
         nominal = (parts.effective - action).square() * parts.weight
-        squares = error / (1 + parts.weight * doubt), error, nominal
+        squares = error / (1 + parts.weight * variance), error, nominal
         innovation, error, nominal = (part.amax(-1).sqrt() for part in squares)
         exciting = (action.abs() > EXCITING).any(-1)
         seen = Seen(innovation, error, nominal, exciting, valid)

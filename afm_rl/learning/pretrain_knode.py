@@ -78,7 +78,7 @@ def pretrain_knode(
     state = space.project(uniform(*state_box, total, generator))
     if regime is not None:
         teacher = Oracle(teacher, regime)
-        teacher.tell(regime.sample((total,), generator))
+        teacher.set_regime(regime.sample((total,), generator))
     path, actions = [state], uniform(*action_box, ticks * total, generator).split(total)
     with torch.no_grad():
         for action in actions:

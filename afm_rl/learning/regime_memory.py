@@ -21,7 +21,7 @@ class Memory(NamedTuple):
     suspect: Tensor
     """Was it, as the latest one, too far from its prediction? ``(l, K)``."""
     exciting: Tensor
-    """Does it tell anything about slopes? ``(l, K)``."""
+    """Whether it says anything about slopes, ``(l, K)``."""
     level: Tensor
     """Median innovation under the fit, at least 1: the level of the noise, ``(l)``."""
     quiet: Tensor
@@ -75,7 +75,7 @@ class Seen(NamedTuple):
     nominal: Tensor
     """Error of the nominal model, in its standard deviations, ``(l, n)``."""
     exciting: Tensor
-    """Do they tell anything about slopes? ``(l, n)``."""
+    """Whether they say anything about slopes, ``(l, n)``."""
     valid: Tensor
     """Do they count at all? ``(l, n)``."""
 
@@ -115,7 +115,7 @@ def advance(
       model's: a robot of which no transition is as predicted is noisy, it does not change.
 
     Nothing happens to missions without a valid transition, but for a blank one at the end.
-    Transitions that tell nothing about slopes are learnt from, but let nothing be forgotten.
+    Transitions that say nothing about slopes are learnt from, but nothing is forgotten for them.
 
     Returns:
         The memory with n more transitions, K + n; and what was decided.
@@ -171,11 +171,11 @@ def advance(
 def latest(memory: Memory, rows: Sequence[Tensor], size: int) -> tuple[Memory, list[Tensor]]:
     """Keep ``size`` transitions of each mission, and their ``rows``, ``(l, K, ...)``.
 
-    Those that do not count go first, of these and of the others those that tell nothing about
+    Those that do not count go first, of these and of the others those that say nothing about
     slopes, and then the older ones: a robot that stands still forgets nothing.
     """
-    worth = 2 * ((memory.share > 0) | memory.suspect) + 1 * memory.exciting
-    order = worth.argsort(dim=-1, stable=True)[:, -size:]
+    rank = 2 * ((memory.share > 0) | memory.suspect) + 1 * memory.exciting
+    order = rank.argsort(dim=-1, stable=True)[:, -size:]
     mission = torch.arange(len(order), device=order.device).unsqueeze(-1)
     share, suspect, exciting, *kept = (part[mission, order] for part in (*memory[:3], *rows))
     return memory._replace(share=share, suspect=suspect, exciting=exciting), kept

@@ -41,7 +41,6 @@ class ResetAdam(Optimizer):
     def step(  # type: ignore[override]
         self, closure: Callable[[], float] | None = None
     ) -> float | None:
-        """Take one step."""
         loss = None
         if closure is not None:
             with torch.enable_grad():

@@ -58,9 +58,9 @@ class UnmatchedFit(nn.Module):
         across = parts.projection / parts.noise.unsqueeze(-2)
         total = parts.unmatched + (across @ offset.unsqueeze(-1)).squeeze(-1)
         error = total - (across @ theta.unsqueeze(-1)).squeeze(-1)
-        doubt = (across @ covariance * across).sum(-1)
-        doubt = where(memory.active, doubt, torch.zeros_like(doubt))
-        errors = error / (1 + doubt).sqrt(), error, total
+        variance = (across @ covariance * across).sum(-1)
+        variance = where(memory.active, variance, torch.zeros_like(variance))
+        errors = error / (1 + variance).sqrt(), error, total
         innovation, error, nominal = (part.abs().amax(-1) for part in errors)
         seen = Seen(innovation, error, nominal, torch.ones_like(valid), valid)
         memory, _ = advance(memory, seen, self.rules, self.size)

@@ -18,7 +18,7 @@ MASK = "unmatched"
 
 
 class UnmatchedUpdater(Updater):
-    r"""Another updater, which is shown what each action was worth, not what was executed.
+    r"""Another updater, which learns from effective actions, not from executed ones.
 
     The transform undoes what actions can undo. A model that learns the same from the executed
     actions works against it: both correct one error, and the transform reads its window through
@@ -83,7 +83,6 @@ class UnmatchedUpdater(Updater):
         self.gate = check_number("updater.gate", gate, low=0.0)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Measure the loss, then learn."""
         with torch.no_grad():
             loss = self.loss(tensordict)["loss_nll"]
         shown = tensordict.select(*self.loss.in_keys, self.updater.sound_key, strict=False).copy()

@@ -38,7 +38,7 @@ class Updater(nn.Module):
     """
 
     learns = False
-    """Do missions need parameters of their own?"""
+    """Whether missions need parameters of their own."""
 
     sets: str | None = None
     """What it sets in models that are conditioned on it: ``regime``, ``calibration``, or None."""
@@ -93,16 +93,15 @@ class OracleUpdater(Updater):
 
     @property
     def oracle(self) -> Oracle:
-        """The model to tell."""
+        """The model whose regime is set."""
         return cast(Oracle, self.loss.model)
 
     def start(self, tensordict: TensorDictBase | None = None) -> None:
         """Tell the first regime."""
         if tensordict is not None:
-            self.oracle.tell(tensordict.get(self.regime_key))
+            self.oracle.set_regime(tensordict.get(self.regime_key))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Measure the loss, then tell the next regime."""
         result = super().forward(tensordict)
         self.start(tensordict.get("next"))
         return result

@@ -124,7 +124,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     with blaming("cost"):
         cost = instantiate(settings["cost"], _convert_="all")
         cost = cost if isinstance(cost, Cost) else cost(robot)
-    # Without a transform nobody tells the planner which effects can be had.
+    # Without a transform the planner does not know which effects are achievable.
     no_box = transform is None and "box_key" in settings["planner"]
     changed = {"box_key": None} if no_box else {}
     planner = make("planner", PlanningEnv(model, cost, *robot.action_box), **changed)

@@ -34,6 +34,8 @@ from afm_rl.missions.robot import Robot
 from afm_rl.planning.costs import SATURATIONS, KnownReward
 from afm_rl.transforms import ActionFlowTransform
 
+FLOW_UNIT = "shares of the largest action"
+
 
 class Training(NamedTuple):
     """How a part is trained, if it is not taken from the cache."""
@@ -180,7 +182,7 @@ def afm(
     if train is None and checkpoint is None:
         return Part(_transform(dynamics, flow, enabled, extend_action_box))
     own: dict[str, Any] = {k: v for k, v in settings.items() if k in ("hypotheses", "rows")}
-    training = _training(flow, robot, dynamics, train or {}, checkpoint, own, "half ranges")
+    training = _training(flow, robot, dynamics, train or {}, checkpoint, own, FLOW_UNIT)
     return Part(_transform(dynamics, flow, enabled, extend_action_box), training)
 
 

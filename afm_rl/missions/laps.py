@@ -39,7 +39,6 @@ class LapScore(Score):
     reads = ("goal", "reached")
 
     def goal(self, td: TensorDictBase) -> Tensor:
-        """Return the present target."""
         return td["goal"]
 
     def row(self, td: TensorDictBase) -> Tensor:
@@ -47,17 +46,14 @@ class LapScore(Score):
         return td["reached"].float().unsqueeze(-1)
 
     def start(self, missions: TensorDictBase) -> dict[str, Tensor]:
-        """Return no targets."""
         return {"reached": torch.zeros(len(missions))}
 
     def add(self, sums: dict[str, Tensor], ids: Tensor, td: TensorDictBase) -> None:
-        """Keep the latest number of targets."""
         sums["reached"][ids] = td["next", "reached"].float()
 
     def table(
         self, env: EnvBase, missions: TensorDictBase, sums: dict[str, Tensor]
     ) -> dict[str, Any]:
-        """Return the columns."""
         reached = sums["reached"].int()
         targets = env.course.counts[missions["mission", "track"]].int()
         return {

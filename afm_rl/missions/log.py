@@ -61,7 +61,6 @@ class StepLog:
         return {"values": self._values[: self._count], "keys": self._keys[: self._count]}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Go on from what :meth:`state_dict` returned."""
         self._count = len(state["keys"])
         spare = max(self._count, FIRST_ROWS)
         self._values, self._keys = (

@@ -53,17 +53,14 @@ class ReturnScore(Score):
         return td["observation"][..., :0]
 
     def row(self, td: TensorDictBase) -> Tensor:
-        """Return the reward, and the goal if there is one."""
         goal = [td["goal"]] if len(self.columns) > 1 else []
         return torch.cat([td["next", "reward"], *goal], -1)
 
     def start(self, missions: TensorDictBase) -> dict[str, Tensor]:
-        """Return no rewards, and nothing lost."""
         count = len(missions)
         return {"rewards": torch.zeros(count, self.steps), "ended": torch.zeros(count)}
 
     def add(self, sums: dict[str, Tensor], ids: Tensor, td: TensorDictBase) -> None:
-        """Write the reward down."""
         reward = td["next", "reward"].squeeze(-1)
         sums["rewards"][ids, td["step"]] = reward.to(sums["rewards"])
         sums["ended"][ids] = td["next", "terminated"].squeeze(-1).to(sums["ended"])
@@ -71,7 +68,6 @@ class ReturnScore(Score):
     def table(
         self, env: EnvBase, missions: TensorDictBase, sums: dict[str, Tensor]
     ) -> dict[str, Any]:
-        """Return the columns."""
         steps = env.simulation.steps
         rewards = sums["rewards"][:, :steps].double()
         parts = zip(rewards, env.simulation.changes_at(missions["mission"]).tolist(), strict=True)

@@ -53,7 +53,6 @@ class TrackingScore(Score):
         self.hold = max(1, math.ceil(check_number("score.hold", hold, low=0.0) / dt - 1e-6))
 
     def goal(self, td: TensorDictBase) -> Tensor:
-        """Return the reference's present position."""
         return td["reference"][..., 0, :3]
 
     def row(self, td: TensorDictBase) -> Tensor:
@@ -62,7 +61,6 @@ class TrackingScore(Score):
         return torch.cat([square, td["phase"].unsqueeze(-1).to(square)], -1)
 
     def start(self, missions: TensorDictBase) -> dict[str, Tensor]:
-        """Return nothing flown."""
         count, phases = missions["mission", "parameters"].shape[:2]
         return {
             "square_error": torch.zeros(count, phases, 3),
@@ -93,7 +91,6 @@ class TrackingScore(Score):
     def table(
         self, env: EnvBase, missions: TensorDictBase, sums: dict[str, Tensor]
     ) -> dict[str, Any]:
-        """Return the columns."""
         square, flown = sums["square_error"], sums["flown"]
         mean = square.sum(1) / flown.sum(1, keepdim=True)
         phases = square.mean(-1) / flown

@@ -17,8 +17,8 @@ class Backlash(DelayedRegime):
 
     .. math:: y_t = \min(\max(y_{t-1}, u_t - b), u_t + b)
 
-    u are commands in half ranges. y begins at the oldest command that is remembered. Whoever does
-    not know the previous commands sees no backlash.
+    u are commands in half ranges. y begins at the oldest command that is remembered. Without
+    the previous commands there is no backlash.
 
     Args:
         half_range: half ranges of the action axes.

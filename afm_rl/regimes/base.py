@@ -165,7 +165,7 @@ class Regime(ABC):
         return None
 
     def is_identity(self, parameters: Tensor) -> Tensor:
-        """Return ``(*B)`` booleans: is this the nominal regime?"""
+        """Return whether this is the nominal regime, ``(*B)`` booleans."""
         nominal = torch.tensor(self.identity, device=parameters.device, dtype=parameters.dtype)
         return (parameters == nominal).all(-1)
 

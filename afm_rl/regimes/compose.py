@@ -72,7 +72,6 @@ class Compose(Regime):
 
     @property
     def closed_form(self) -> bool:
-        """Whether all families have one."""
         return all(regime.closed_form for regime in self.regimes.values())
 
     def apply(
@@ -83,7 +82,6 @@ class Compose(Regime):
         past: Tensor | None = None,
         noise: Tensor | None = None,
     ) -> Tensor:
-        """Apply every family in turn."""
         action = _spread(action, parameters)
         active = self._active(parameters)
         late = sum(regime.history > 0 for regime, _ in active)
@@ -157,7 +155,6 @@ class Compose(Regime):
         return next((rows for rows in found if rows is not None), None)
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
-        """Return the parameter row ``(F,)``; every family checks its own values."""
         self.check_names(values)
         families = self.regimes.values()
         own = [{name: values[name] for name in f.names if name in values} for f in families]

@@ -16,8 +16,8 @@ MOST_STEPS = 8
 class Delay(DelayedRegime):
     r"""The command of d steps ago: :math:`a_\mathrm{eff} = a_{t - d}`, with d up to 8.
 
-    Between whole steps, as in a ramp, the neighbouring commands are mixed linearly. Whoever does
-    not know the previous commands sees no delay, and so the inverse is the action itself. The
+    Between whole steps, as in a ramp, the neighbouring commands are mixed linearly. Without
+    the previous commands there is no delay, and so the inverse is the action itself. The
     prior draws whole steps.
 
     Args:
@@ -65,6 +65,5 @@ class Delay(DelayedRegime):
         return row
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw steps ``(*shape, 1)``."""
         low, high = self.steps
         return torch.randint(low, high + 1, (*shape, 1), generator=generator).float()

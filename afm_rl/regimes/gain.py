@@ -66,7 +66,6 @@ class ActionGain(StaticRegime):
         return divide(effect, parameters)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw gains ``(*shape, A)``."""
         size = (*shape, len(self.names))
         uniform = torch.rand((3, *size), generator=generator)
         span = math.log(self.high / self.low)

@@ -45,7 +45,6 @@ class GainNoise(Regime):
         past: Tensor | None = None,
         noise: Tensor | None = None,
     ) -> Tensor:
-        """Multiply; the state plays no part."""
         return action if noise is None else action * (1 + parameters * noise)
 
     def inverse(

@@ -18,8 +18,8 @@ class Lag(DelayedRegime):
 
     .. math:: y_t = a_t + e^{-1 / T} (y_{t-1} - a_t)
 
-    0 is no lag. y begins at the oldest command that is remembered. Whoever does not know the
-    previous commands sees no lag.
+    0 is no lag. y begins at the oldest command that is remembered. Without the previous
+    commands there is no lag.
 
     Args:
         span: lowest and highest time constant T (steps) in the prior, uniform.

@@ -71,7 +71,6 @@ class Patches(Regime):
         return divide(action, self._gains(parameters, state)).clamp(low, high)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw gains ``(*shape, A)``."""
         first = -draw_between(self.span, (*shape, 1), generator).exp()
         return torch.cat([first, torch.ones(*shape, len(self.names) - 1)], -1)
 

@@ -18,7 +18,7 @@ PROFILE_CAPTION = (
     "Performance profile: the share of a method's missions that were finished within tau times the "
     "fewest {name} that any method (the oracle included) needed for the same cell and seed. Where "
     "a line starts (tau = 1) says how often the method was best; how high it ends, how often it "
-    "finished. Missions that nobody finished count as not solved."
+    "finished. Missions that no method finished count as not solved."
 )
 PROGRESS_CAPTION = (
     "Share of what there is to reach ({name}) by a step, mean over all missions of a method; after "

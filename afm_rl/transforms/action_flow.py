@@ -215,7 +215,6 @@ class ActionFlowTransform(Transform):
         return spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the entries."""
         return self._with_memory(observation_spec)
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:

@@ -159,7 +159,6 @@ class Guard(Transform):
         return spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the memory."""
         return self._with_memory(observation_spec)
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:

@@ -44,7 +44,7 @@ def test_gains_are_recovered_about_from_an_ensemble(trained_ensemble, gains, tra
 
 def test_the_told_oracle_sees_nothing_amiss(gains, transitions):
     oracle = Oracle(Dubins(), gains)
-    oracle.tell(gains.encode({"v_gain": -1.5}))
+    oracle.set_regime(gains.encode({"v_gain": -1.5}))
     state, action = transitions(20)
     reached = oracle(state, action)
     assert float(seen(oracle, state, action, reached).innovation.max()) < 1e-2

@@ -22,7 +22,7 @@ def model(request, make_ensemble, gains):
     if request.param == "ensemble":
         return make_ensemble().double()
     oracle = Oracle(Dubins() if request.param == "oracle" else make_ensemble().double(), gains)
-    oracle.tell(told)
+    oracle.set_regime(told)
     return oracle
 
 
@@ -58,7 +58,7 @@ def test_missions_have_jacobians_of_their_own(make_ensemble, transitions):
 
 def test_oracles_of_missions_have_jacobians_of_their_own(gains, transitions):
     oracle = Oracle(Dubins(), gains)
-    oracle.tell(torch.tensor([[2.0, 1.0], [1.0, -1.0]]).double())
+    oracle.set_regime(torch.tensor([[2.0, 1.0], [1.0, -1.0]]).double())
     state, action = transitions(2, 5, dtype=torch.float64)
     jacobian = oracle.jacobian(state, action)
     torch.testing.assert_close(jacobian, finite_differences(oracle, state, action))

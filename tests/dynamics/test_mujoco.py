@@ -165,7 +165,7 @@ POLE = """<mujoco><option timestep="0.01" gravity="0 0 -10"/><worldbody>
 def told(**values):
     """Return how a cart with a hanging pole accelerates from rest, and after 3 s of swinging."""
     model = MuJoCoDynamics(POLE)
-    model.tell(Physics().encode(values))
+    model.set_physics(Physics().encode(values))
     model.double()
     still, push = torch.zeros(4).double(), torch.ones(1).double()
     swung = model.rollout(torch.tensor([0, 0.1, 0, 0]).double(), torch.zeros(1, 600, 1).double())
@@ -184,7 +184,7 @@ def test_other_physics_are_what_their_names_say():
     model = MuJoCoDynamics(POLE)
     moving, none = torch.tensor([0.0, 0.0, 1.0, 0.0]), torch.zeros(1)
     lost = 1 - model(moving, none)[2]
-    model.tell(Physics().encode({"damping": 2.0}))
+    model.set_physics(Physics().encode({"damping": 2.0}))
     assert (1 - model(moving, none)[2]) / lost == pytest.approx(2.0, rel=0.05)
 
 
@@ -193,13 +193,13 @@ def test_each_mission_has_physics_of_its_own():
     rows = torch.stack([physics.encode({}), physics.encode({"mass": 3.0})])
     plans = torch.rand(2, 5, 7, 1, generator=torch.Generator().manual_seed(0))
     state = torch.zeros(2, 4)
-    model.tell(rows)
+    model.set_physics(rows)
     together = model.rollout(state, plans)
     for row, plan, found in zip(rows, plans, together, strict=True):
-        model.tell(row)
+        model.set_physics(row)
         assert torch.equal(model.rollout(state[0], plan), found)
     oracle = Oracle(MuJoCoDynamics(POLE), Compose([ActionGain(["gain_0"]), physics]))
-    oracle.tell(torch.cat([torch.tensor([[1.0], [-1.0]]), rows], -1))
+    oracle.set_regime(torch.cat([torch.tensor([[1.0], [-1.0]]), rows], -1))
     plans[1] = -plans[1]
     assert torch.equal(oracle.rollout(state, plans), together)
     oracle.select_(torch.tensor([1]))

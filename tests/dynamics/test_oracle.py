@@ -10,7 +10,7 @@ def test_it_predicts_what_the_regime_does(gains, transitions):
     oracle, state_action = Oracle(Dubins(), gains), transitions(6)
     state, action = state_action
     assert torch.equal(oracle(state, action), Dubins()(state, action))  # nothing told yet
-    oracle.tell(gains.encode({"v_gain": -0.5, "omega_gain": 2.0}))
+    oracle.set_regime(gains.encode({"v_gain": -0.5, "omega_gain": 2.0}))
     effective = action * torch.tensor([-0.5, 2.0])
     torch.testing.assert_close(oracle(state, action), Dubins()(state, effective))
 
@@ -18,13 +18,13 @@ def test_it_predicts_what_the_regime_does(gains, transitions):
 def test_each_mission_may_be_told_another_regime(gains, transitions):
     oracle = Oracle(Dubins(), gains)
     rows = gains.sample((4,), torch.Generator().manual_seed(0))
-    oracle.tell(rows)
+    oracle.set_regime(rows)
     assert oracle.lead == (4,)
     state, action = transitions(4, 7)
     together = oracle(state, action)
     for mission in range(4):
         single = Oracle(Dubins(), gains)
-        single.tell(rows[mission])
+        single.set_regime(rows[mission])
         expected = single(state[mission], action[mission])
         torch.testing.assert_close(together[mission], expected)
     oracle.select_(torch.tensor([2, 0]))
@@ -35,7 +35,7 @@ def test_noise_and_units_are_those_of_the_model_behind(gains, transitions, make_
     behind = make_ensemble()
     oracle = Oracle(behind, gains)
     told = gains.encode({"v_gain": 2.0})
-    oracle.tell(told)
+    oracle.set_regime(told)
     state, action = transitions(5)
     expected = behind.moments(state, action * told)
     for found, right in zip(oracle.moments(state, action), expected, strict=True):
@@ -48,7 +48,7 @@ def test_noise_and_units_are_those_of_the_model_behind(gains, transitions, make_
 
 def test_what_it_is_told_does_not_outlive_the_run(gains):
     oracle = Oracle(Dubins(), gains)
-    oracle.tell(torch.full((2,), 2.0, requires_grad=True))
+    oracle.set_regime(torch.full((2,), 2.0, requires_grad=True))
     assert oracle.state_dict() == {}
     assert not oracle.parameters_now.requires_grad
     assert oracle.select_(torch.tensor([0])) is oracle and oracle.lead == ()
@@ -59,7 +59,7 @@ def test_its_derivatives_are_those_of_the_effect():
     oracle, generator = Oracle(Quadrotor(), regime).double(), torch.Generator().manual_seed(0)
     rows = regime.sample((3,), generator).double()
     rows[0, regime.names.index("motor_1")] = 0.6  # a moment that depends on the thrust
-    oracle.tell(rows)
+    oracle.set_regime(rows)
     state = torch.randn(3, 5, 13, generator=generator).double()
     state[..., 6:10] /= state[..., 6:10].norm(dim=-1, keepdim=True)
     action = torch.rand(3, 5, 4, generator=generator) * torch.tensor([0.5, 1e-4, 1e-4, 1e-5])

@@ -242,7 +242,7 @@ def test_missions_are_linearised_with_parameters_of_their_own():
     regimes, (state, action) = flight_regimes(), flights(2, 5)
     oracle = Oracle(Quadrotor(), regimes)
     rows = [regimes.encode({"mass": factor}) for factor in (0.5, 2.0)]
-    oracle.tell(torch.stack(rows).double())
+    oracle.set_regime(torch.stack(rows).double())
     by_action = oracle.linearise(state, action)[2]
     for row, factor in enumerate((0.5, 2.0)):
         effective = action[row] / torch.tensor([factor, 1, 1, 1])

@@ -16,7 +16,7 @@ ACTIONS = torch.tensor([0.2, 0.0, 0.0, 0.0]), torch.tensor([0.4, 0.0, 0.0, 0.0])
 
 def train(model, **settings):
     teacher = Oracle(Quadrotor(), MassFactor())
-    teacher.tell(torch.tensor([1.2]))
+    teacher.set_regime(torch.tensor([1.2]))
     settings = {"flights": 20, "ticks": 4, "epochs": 60, **settings}
     return pretrain_knode(model, teacher, STATES, ACTIONS, **settings)
 

@@ -89,4 +89,5 @@ def test_progress_is_shown_if_asked_for(configure, tmp_path):
         for part in agent.trainings
     ]
     prepare(agent, tmp_path, progress=True, echo=seen.append)
-    assert seen == [True, "flow: held-out error 0.5000 half ranges (trained in 0 s)"]
+    unit = "shares of the largest action"
+    assert seen == [True, f"flow: held-out error 0.5000 {unit} (trained in 0 s)"]
