@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+
 Status = Literal["healthy", "changed", "dead", "cannot tell"]
 Interval = tuple[float, float]
 
@@ -92,6 +94,8 @@ class Diagnosis:
     rows: int = 0
     notes: tuple[str, ...] = ()
     """What a reader must know of the log."""
+    fitted: np.ndarray | None = field(default=None, repr=False, compare=False)
+    """Responses by the fits, ``(N, A)``, for figures."""
 
     def __str__(self) -> str:
         return "\n".join(actuator.sentence for actuator in self.actuators)
@@ -103,7 +107,8 @@ class Diagnosis:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain lists and numbers; None where one is not known."""
-        return _plain(asdict(self))
+        parts = {"actuators": [asdict(actuator) for actuator in self.actuators]}
+        return _plain(parts | {"step_s": self.step_s, "rows": self.rows, "notes": self.notes})
 
 
 def _plain(value: Any) -> Any:

@@ -13,7 +13,7 @@ from afm_rl.diagnosis.intervals import half_widths, independence
 from afm_rl.diagnosis.log import Clock
 from afm_rl.diagnosis.response import Shape, look_back, respond
 
-PENALTY = 12.0  # per number: twice the logarithm of the likelihood that it has to win
+PENALTY = 10.0  # per number: twice the logarithm of the likelihood that it has to win
 VISIBLE = 0.02  # standard deviations of the response: what changes it less is left out
 FLOOR = 1e-7  # share of the variance: better fits are all the same
 ROBUST = 2.0  # standard deviations: larger residuals count less
@@ -100,7 +100,7 @@ def fit_response(problem: Problem, driver: int, starts: Sequence[Shape]) -> Mode
     """
     model = _dynamics(problem, driver, starts)
     for added in range(5):
-        found = [refine(problem, candidate) for candidate in _larger(problem, model)]
+        found = [refine(problem, candidate) for candidate in larger(problem, model)]
         better = min(found, key=_cost, default=model)
         if not (_needed(problem, better, model) and _visible(problem, better, model)):
             return _smaller(problem, model) if added else model
@@ -146,7 +146,7 @@ def _visible(problem: Problem, one: Model, other: Model) -> bool:
     return bool(apart.std() > VISIBLE)
 
 
-def _larger(problem: Problem, model: Model) -> Iterator[Model]:
+def larger(problem: Problem, model: Model) -> Iterator[Model]:
     """Yield models with one number more, each with a good beginning for it."""
     own = problem.u[:, model.driver]
     size = np.quantile(np.abs(own), 0.98)
@@ -214,7 +214,8 @@ def _with_another(problem: Problem, model: Model) -> Iterator[Model]:
     kept = power / len(residual) > 1e-4 * spread**2  # not a copy of the driver
     influence = np.abs(slope) * spread
     main = abs(model.gain) * parts[0].std()
-    error = half_widths(residual[:, None] * others / np.maximum(power, 1e-300)) / 1.96
+    left = residual[:, None] - slope * others  # of each, were it the one
+    error = half_widths(left * others / np.maximum(power, 1e-300)) / 1.96
     good = kept & (np.abs(slope) > CLEAR * error) & (influence > COUPLED * main)
     if good.any():
         best = int(np.argmax(np.where(good, slope**2 * power, -1.0)))

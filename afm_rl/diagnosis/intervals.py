@@ -47,8 +47,12 @@ def independence(residual: np.ndarray) -> float:
 def _density_at_zero(series: np.ndarray, power: float) -> float:
     """Return the long-run variance by the autoregression with the least AIC (Levinson)."""
     rows = len(series)
-    order = min(ORDER, rows // 10)
+    order = max(min(ORDER, rows // 10), 1)
     lags = np.array([series[k:] @ series[: rows - k] for k in range(order + 1)]) / rows
+    # The first order counts in any case, without its bias in few rows (Kendall 1954).
+    first = lags[1] / power
+    first = min(first + (1 + 4 * first) / rows, 1 - LEAST)
+    least = power * (1 - first**2) / (1 - first) ** 2 if first > 0 else 0.3 * power
     best, density = 0.0, power
     coefficients, error = np.zeros(0), power
     for p in range(1, order + 1):
@@ -61,4 +65,4 @@ def _density_at_zero(series: np.ndarray, power: float) -> float:
         if criterion < best:
             best = criterion
             density = error / max(1 - coefficients.sum(), LEAST) ** 2
-    return max(density, 0.3 * power)
+    return max(density, least)

@@ -14,9 +14,11 @@ from afm_rl.diagnosis.fit import (
     Problem,
     fit_response,
     interval_widths,
+    larger,
     mean_cost,
     refine,
     scale_of,
+    values_of,
     weight_of,
 )
 from afm_rl.diagnosis.intervals import half_widths, independence
@@ -25,10 +27,12 @@ from afm_rl.diagnosis.response import Shape, lagging, look_back
 from afm_rl.diagnosis.search import Lead, find_leads
 from afm_rl.diagnosis.words import MATTERS, SURE
 
-SEARCHED, SHAPED, FITTED = 6000, 3000, 20000  # rows that a step looks at, at most
+SEARCHED, SHAPED, FITTED = 4000, 3000, 12000  # rows that a step looks at, at most
 BLOCKS = 60  # of a log: changes are looked for at their borders first
 SHORTEST = 40  # rows of a part
 PARTS = 6  # at most
+PLAUSIBLE = 4.0  # twice the logarithm of the likelihood that another explanation may lack
+DOUBTFUL = 6.0  # less for each number more
 STEADY = 1.05  # times the squared residual of a sudden change: a drift explains it as well
 
 
@@ -137,12 +141,7 @@ def _likely_change(log: Log, j: int, part: Part) -> int | None:
     length = max(part.rows // BLOCKS, 5)
     count = part.rows // length
     ends = np.append(np.arange(1, count) * length, part.rows)
-    sums = np.add.reduceat(
-        (table[:, :, None] * table[:, None, :]).reshape(len(y), -1)
-        if len(y) * size**2 < 2e7
-        else np.stack([t.T @ t for t in np.split(table, ends[:-1])]).reshape(len(ends), -1),
-        np.concatenate([[0], ends[:-1]]) if len(y) * size**2 < 2e7 else np.arange(len(ends)),
-    ).reshape(-1, size, size)
+    sums = np.stack([block.T @ block for block in np.split(table, ends[:-1])])
     before = np.cumsum(sums, 0)[:-1]
     places = ends[:-1]
     least = max(SHORTEST, 2 * size)
@@ -207,11 +206,11 @@ def _apart(log: Log, j: int, whole: Part, steady: Part, left: Part, right: Part)
 def _with_drift(log: Log, j: int, part: Part) -> Part:
     """Return the part with the drift of its gain and offset, if there is any that matters."""
     problem = problem_of(log, j, part.lead)
-    rows = slice(part.first, part.last)
-    use = problem.use[rows]
-    own = part.model.parts(problem)[0][rows][use]
-    y, fitted = problem.y[rows][use], part.model.predict(problem)[rows][use]
-    time = np.linspace(-0.5, 0.5, part.rows)[use]
+    rows = np.arange(part.first, part.last)
+    rows = rows[problem.use[rows]][:: max(part.rows // FITTED, 1)]
+    own = part.model.parts(problem)[0][rows]
+    y, fitted = problem.y[rows], part.model.predict(problem)[rows]
+    time = (rows - part.first) / part.rows - 0.5
     design = np.column_stack([own * time, time, own, np.ones(len(own))])
     residual = y - fitted
     scale = 2 * scale_of(residual)
@@ -242,12 +241,57 @@ def _drifted(log: Log, j: int, part: Part) -> np.ndarray:
     return (part.drift[0] * own + part.drift[1]) * time
 
 
+def predict(log: Log, j: int, part: Part) -> np.ndarray:
+    """Return the response that a part explains, ``(N,)``."""
+    return part.model.predict(problem_of(log, j, part.lead)) + _drifted(log, j, part)
+
+
 def settle(log: Log, j: int, part: Part) -> tuple[Part, Problem, np.ndarray]:
-    """Return the part without its drift, fitted once more, its problem, and half widths."""
+    """Return the part without its drift, fitted once more, its problem, and intervals ``(2, 2)``.
+
+    These are of gain and offset, lowest and highest value.
+    """
     if any(part.drift):
         response = log.response.copy()
         response[:, j] -= _drifted(log, j, part)
         log = replace(log, response=response)
         part = replace(fit_part(log, j, part.first, part.last, part.lead), drift=part.drift)
     problem = problem_of(log.part(slice(part.first, part.last)).thinned(FITTED), j, part.lead)
-    return part, problem, interval_widths(problem, part.model)
+    return part, problem, _intervals(problem, part.model, part.lead)
+
+
+def _intervals(problem: Problem, model: Model, lead: Lead) -> np.ndarray:
+    """Return the intervals of gain and offset, ``(2, 2)``.
+
+    They span those of every mixture of delay and lag that explains the response about as well, and
+    of a model with one number more that explains it a little better: what was left out because it
+    is not sure may still be there.
+    """
+    rows = problem.use.sum() * weight_of(problem, model)
+    late = model.shape.delay
+    if model.shape.keep > 0:
+        late -= 1 / math.log(model.shape.keep)
+    rest = tuple(name for name in model.active if name not in ("delay", "keep"))
+    lag = math.exp(-1 / max(late, 0.3))
+    mixed = model.shape._replace(delay=late / 2, keep=math.exp(-2 / max(late, 0.3)))
+    others = (
+        []
+        if len(problem.y) > SHAPED
+        else [
+            replace(
+                model, active=(*rest, "delay"), shape=model.shape._replace(delay=late, keep=0.0)
+            ),
+            replace(model, active=(*rest, "keep"), shape=model.shape._replace(delay=0.0, keep=lag)),
+            replace(model, active=(*rest, "delay", "keep"), shape=mixed),
+        ]
+    )
+    if len(problem.y) <= SHAPED:
+        others += larger(problem, model)
+    ends = []
+    for found in [model, *(refine(problem, other) for other in others)]:
+        lost = rows * math.log((found.cost + FLOOR) / (model.cost + FLOOR))
+        if lost < PLAUSIBLE - DOUBTFUL * max(found.size - max(model.size, 1), 0):
+            middle, widths = values_of(found)[:2], interval_widths(problem, found)[:2]
+            ends.append([middle - widths, middle + widths])
+    lows, highs = np.moveaxis(np.array(ends), 1, 0)
+    return np.stack([lows.min(0), highs.max(0)], -1)

@@ -12,7 +12,7 @@ from afm_rl.diagnosis.log import Clock, Log, clocks_of
 from afm_rl.diagnosis.response import lagging, look_back
 
 LONGEST = 40  # steps of delay
-LAGS = (0.0, 0.7, 1.5, 3.0, 6.0, 12.0, 25.0)  # steps
+LAGS = (0.0, 1.0, 2.5, 6.0, 15.0)  # steps
 OTHERS = 0.5  # share of the squared residual that another command may leave, to be the driver
 RIDGE = 1e-9
 OUTLIERS = 4.0  # times the distance from the median to the far quantile: where responses are cut
@@ -68,7 +68,7 @@ def _scan(log: Log, clock: Clock, response: np.ndarray) -> tuple[np.ndarray, ...
     for lag in (lag for lag in LAGS if lag * 10 < len(u)):
         keep = math.exp(-1 / lag) if lag else 0.0
         slow = lagging(clock, u, keep) if keep else u
-        for delay in range(longest + 1):
+        for delay in range(longest + 1 if not keep else longest // 2 + 1):
             x = look_back(clock, slow, delay)[inside]
             x = x - x.mean(0)
             gram, cross = x.T @ x, x.T @ y

@@ -10,7 +10,7 @@ import numpy as np
 
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.parts import SEARCHED, Part, find_parts, settle
+from afm_rl.diagnosis.parts import SEARCHED, Part, find_parts, predict, settle
 from afm_rl.diagnosis.search import find_leads
 from afm_rl.diagnosis.words import judge
 
@@ -36,41 +36,45 @@ def diagnose(log: Log) -> Diagnosis:
     shoulder: healthy
     elbow: reversed, 50 % of the command
     """
-    low, high = np.quantile(log.command, [0.01, 0.99], axis=0)
-    reach = 0.5 * (high - low)
-    reach = np.where(
-        reach > 1e-9 * (1e-9 + np.abs(log.command).max(0)), reach, 0.5 * np.ptp(log.command, 0)
+    reach, moved, spread = (
+        _reach(log.command),
+        np.ptp(log.command, axis=0) > 0,
+        _spread(log.response),
     )
-    moved = reach > 1e-9 * (1e-9 + np.abs(log.command).max(0))
-    spread = _spread(log.response)
-    scaled = replace(
-        log,
-        command=np.where(moved, log.command / np.where(moved, reach, 1.0), 0.0),
-        response=log.response / spread,
-    )
-    size = len(log.names)
-    leads = find_leads(scaled.thinned(SEARCHED), range(size))
-    actuators, doubts = [], []
-    for j, lead in enumerate(leads):
-        doubts.append(_doubt(scaled, j, moved))
-        parts = find_parts(scaled, j, lead)
-        found = [_report(log, scaled, part, j, reach, spread) for part in parts]
-        actuators.append((parts, found))
-    units = _units([found[-1] for _, found in actuators])
-    final = []
-    since = log.since
-    for (parts, found), unit, doubt in zip(actuators, units, doubts, strict=True):
-        said = [judge(replace(a, unit=unit), log.step, log.usual_delay, doubt) for a in found]
+    scaled = replace(log, command=log.command / reach, response=log.response / spread)
+    leads = find_leads(scaled.thinned(SEARCHED), range(len(log.names)))
+    parts = [find_parts(scaled, j, lead) for j, lead in enumerate(leads)]
+    fitted = np.empty_like(scaled.response)
+    found: list[list[Actuator]] = []
+    for j, own in enumerate(parts):
+        found.append([_report(log, scaled, part, j, reach, spread) for part in own])
+        for part in own:
+            rows = slice(part.first, part.last)
+            fitted[rows, j] = predict(scaled, j, part)[rows]
+    units, since = _units([own[-1] for own in found]), log.since
+    actuators = []
+    for j, (numbers, unit) in enumerate(zip(found, units, strict=True)):
+        how = (log.step, log.usual_delay, _doubt(scaled, j, moved))
+        said = [judge(replace(actuator, unit=unit), *how) for actuator in numbers]
         changes = tuple(
             Change(t=float(since[part.first]), before=before, after=after)
-            for part, before, after in zip(parts[1:], said[:-1], said[1:], strict=True)
+            for part, before, after in zip(parts[j][1:], said[:-1], said[1:], strict=True)
         )
-        last = replace(said[-1], changes=changes)
-        final.append(judge(last, log.step, log.usual_delay, doubt))
-    notes = [*log.notes]
+        actuators.append(judge(replace(said[-1], changes=changes), *how))
     return Diagnosis(
-        actuators=tuple(final), step_s=log.step, rows=len(log.command), notes=tuple(notes)
+        actuators=tuple(actuators),
+        step_s=log.step,
+        rows=len(log.command),
+        notes=log.notes,
+        fitted=fitted * spread,
     )
+
+
+def _reach(command: np.ndarray) -> np.ndarray:
+    """Return half of the range of each command, ``(A,)``; 1 if it does not change."""
+    low, high = np.quantile(command, [0.01, 0.99], axis=0)
+    reach = 0.5 * np.where(high > low, high - low, np.ptp(command, axis=0))
+    return np.where(reach > 0, reach, 1.0)
 
 
 def _spread(response: np.ndarray) -> np.ndarray:
@@ -110,12 +114,12 @@ def _report(
     log: Log, scaled: Log, part: Part, j: int, reach: np.ndarray, spread: np.ndarray
 ) -> Actuator:
     """Return the numbers of a part in the units of the log."""
-    part, problem, widths = settle(scaled, j, part)
+    part, problem, intervals = settle(scaled, j, part)
     model, shape = part.model, part.model.shape
     unit = reach[model.driver]
     scale = spread[j] / unit
-    gain, gain_width = model.gain * scale, widths[0] * scale
-    offset, offset_width = model.offset * spread[j], widths[1] * spread[j]
+    gain, offset = model.gain * scale, model.offset * spread[j]
+    gains, offsets = intervals[0] * scale, intervals[1] * spread[j]
     y = problem.y[problem.use]
     residual = y - model.predict(problem)[problem.use]
     total = float(y.var())
@@ -136,10 +140,10 @@ def _report(
     return Actuator(
         name=log.names[j],
         gain=float(gain),
-        gain_interval=(float(gain - gain_width), float(gain + gain_width)),
-        reversed=bool(gain + gain_width < 0),
+        gain_interval=(float(gains[0]), float(gains[1])),
+        reversed=bool(gains[1] < 0),
         offset=float(offset),
-        offset_interval=(float(offset - offset_width), float(offset + offset_width)),
+        offset_interval=(float(offsets[0]), float(offsets[1])),
         dead_zone=float(shape.dead_zone * unit),
         saturation=float(np.mean(ends)) if ends else None,
         backlash=float(shape.play * unit),

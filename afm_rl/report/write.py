@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
@@ -31,6 +32,13 @@ from afm_rl.report.table import Table
 from afm_rl.report.track_plot import LoadTrack, load_tracks
 
 TEMPLATE = Path(__file__).with_name("page.html")
+REFERENCES = (
+    "R. Agarwal, M. Schwarzer, P. S. Castro, A. Courville, M. G. Bellemare: Deep Reinforcement "
+    "Learning at the Edge of the Statistical Precipice. NeurIPS 2021 (interquartile mean, "
+    "stratified bootstrap, probability of improvement, performance profiles).",
+    "E. D. Dolan, J. J. Moré: Benchmarking optimization software with performance profiles. "
+    "Mathematical Programming 91, 2002.",
+)
 BASELINES = ("online_pe", "adaptive_affine")
 
 
@@ -111,12 +119,17 @@ def write_report(
             pictures.append({"name": name, "title": title, "caption": caption, "data": data})
         echo(f"wrote {len(pictures)} figures: {out / 'figures'}")
     title = f"Results: {len(collection.methods)} methods, {missions['cell'].nunique()} cells"
-    environment = Environment(autoescape=True, undefined=StrictUndefined)
-    page = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
     content = {"title": title, "summary": summary, "notes": notes, "tables": tables}
-    write_whole(out / "index.html", page.render(**content, figures=pictures).encode())
+    page = render_page(**content, figures=pictures, references=REFERENCES)
+    write_whole(out / "index.html", page.encode())
     echo(f"Report: {out / 'index.html'}")
     return out / "index.html"
+
+
+def render_page(**content: Any) -> str:
+    """Return the page of a report: title, summary, notes, figures, tables and references."""
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(**content)
 
 
 def _tables(

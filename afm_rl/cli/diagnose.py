@@ -1,0 +1,86 @@
+"""The command ``afm-rl-diagnose``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import NoReturn
+
+from afm_rl.cli.error_messages import explain, one_line
+
+NAME = "afm-rl-diagnose"
+ABOUT = """\
+Say what the actuators of a robot do, from what it logged.
+
+  afm-rl-diagnose log.csv                          columns command.NAME, response.NAME, and t (s)
+  afm-rl-diagnose log.parquet --out report         diagnosis.json and index.html in report/
+  afm-rl-diagnose datasets/pick_cube               a data set of LeRobot's
+  afm-rl-diagnose log.csv --delay 0.1              a robot whose healthy response takes 0.1 s
+  afm-rl-diagnose log.csv --model mine.step        columns action.NAME, state.NAME; the responses
+                                                   are the actions that explain the states
+
+Per actuator: gain with its 95 % interval, reversed, offset, dead zone, saturation, backlash, delay,
+lag, which other command drives it, noise; what changed on the way, and when. An actuator is
+healthy, changed, dead, or the log cannot tell.
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong in one line."""
+        print(f"{NAME}: {message} (see {NAME} --help)", file=sys.stderr)
+        sys.exit(2)
+
+
+def main() -> None:
+    """Run ``afm-rl-diagnose``; a mistake ends in one line and exit status 2."""
+    parser = _Parser(
+        prog=NAME, description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("file", metavar="FILE", type=Path, help="a log (.csv, .parquet), or a folder of LeRobot's")
+    add("--out", metavar="DIR", type=Path, help="where to (FILE_diagnosis, beside FILE)")
+    healthy = "delay and lag of the healthy robot (s): 0; one frame in LeRobot's data sets"
+    add("--delay", metavar="SECONDS", type=float, help=healthy)
+    model = "a step function, step(state, action) -> next state, in torch; code that you trust"
+    add("--model", metavar="MODULE.FUNCTION", help=model)
+    add("--no-page", dest="page", action="store_false", help="write diagnosis.json only")
+    options = parser.parse_args()
+
+    try:
+        _run(options)
+    except BrokenPipeError:  # nobody reads on, as in `afm-rl-diagnose log.csv | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except Exception as error:
+        message = explain(error)
+        if message is None:
+            raise
+        print(f"{NAME}: {one_line(message)}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _run(options: argparse.Namespace) -> None:
+    from dataclasses import replace
+
+    from afm_rl.diagnosis import diagnose
+    from afm_rl.diagnosis.read import read_log
+    from afm_rl.errors import check_number
+    from afm_rl.report.diagnosis import print_diagnosis, write_diagnosis
+
+    if options.model is None:
+        log = read_log(options.file)
+    else:
+        from afm_rl.cli.effective import read_effective  # torch takes seconds
+
+        log = read_effective(options.file, options.model)
+    if options.delay is not None:
+        log = replace(log, usual_delay=check_number("--delay", options.delay, low=0.0))
+    found = diagnose(log)
+    file = options.file.resolve()
+    out = options.out or file.with_name(f"{file.stem}_diagnosis")
+    print_diagnosis(found)
+    for path in write_diagnosis(found, log, out, str(options.file), page=options.page):
+        print(f"wrote {path}")
