@@ -99,7 +99,7 @@ def fit_response(problem: Problem, driver: int, starts: Sequence[Shape]) -> Mode
         starts: delays and lags to begin with.
     """
     model = _dynamics(problem, driver, starts)
-    for added in range(5):
+    for added in range(6):
         found = [refine(problem, candidate) for candidate in larger(problem, model)]
         better = min(found, key=_cost, default=model)
         if not (_needed(problem, better, model) and _visible(problem, better, model)):
@@ -160,6 +160,10 @@ def larger(problem: Problem, model: Model) -> Iterator[Model]:
         tries["low"] = [low + (high - low) * share for share in (0.08, 0.16, 0.25, 0.35, 0.45)]
     if not model.shape.play:
         tries["play"] = [(high - low) * share for share in (0.02, 0.05, 0.1, 0.18, 0.28)]
+    if "keep" not in model.active:
+        tries["keep"] = [0.4, 0.65, 0.85]
+    if "delay" not in model.active:
+        tries["delay"] = [0.5, 1.0, 2.0, 4.0]
     shapes = {
         name: [model.shape._replace(**{name: value}) for value in values]
         for name, values in tries.items()
@@ -380,11 +384,11 @@ def interval_widths(problem: Problem, model: Model) -> np.ndarray:
     pull = residual / np.sqrt(1 + share)
     stiff = ((1 + share) ** -1.5).mean()
     gram = columns.T @ columns * stiff
-    size = np.sqrt(np.maximum(gram.diagonal(), 1e-300))
+    size = np.sqrt(np.maximum(gram.diagonal(), 1e-100))
     unit = gram / np.outer(size, size)
     values, vectors = np.linalg.eigh(unit)
     values = np.maximum(values, 1e-10)
-    inverse = (vectors / values) @ vectors.T / np.outer(size, size)
+    inverse = (vectors / values) @ vectors.T / size
     freedom = math.sqrt(len(residual) / max(len(residual) - len(size), 1))
-    widths = half_widths((columns * pull[:, None]) @ inverse) * freedom
+    widths = half_widths((columns / size * pull[:, None]) @ inverse) * freedom
     return widths[:count]

@@ -27,7 +27,7 @@ def half_widths(influence: np.ndarray) -> np.ndarray:
     """
     rows = len(influence)
     widths = []
-    for series in (influence - influence.mean(0)).T:
+    for series in np.ascontiguousarray((influence - influence.mean(0)).T):
         power = float(series @ series) / rows
         if not power > 0:
             widths.append(0.0)
@@ -48,7 +48,7 @@ def _density_at_zero(series: np.ndarray, power: float) -> float:
     """Return the long-run variance by the autoregression with the least AIC (Levinson)."""
     rows = len(series)
     order = max(min(ORDER, rows // 10), 1)
-    lags = np.array([series[k:] @ series[: rows - k] for k in range(order + 1)]) / rows
+    lags = np.array([(series[k:] * series[: rows - k]).sum() for k in range(order + 1)]) / rows
     # The first order counts in any case, without its bias in few rows (Kendall 1954).
     first = lags[1] / power
     first = min(first + (1 + 4 * first) / rows, 1 - LEAST)

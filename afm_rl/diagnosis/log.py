@@ -97,7 +97,7 @@ class Log:
             episode=np.cumsum(apart | (np.diff(kept, prepend=kept[:1]) != 0)),
         )
 
-    def thinned(self, rows: int, blocks: int = 20) -> Log:
+    def thinned(self, rows: int, blocks: int = 5) -> Log:
         """Return a log of at most so many rows: blocks in a row, evenly spread."""
         if len(self.command) <= rows:
             return self

@@ -1,0 +1,188 @@
+"""A diagnosis from logs of a simulator that knows what is wrong."""
+
+import re
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulate import Fault, commands, noise, respond
+
+from afm_rl.diagnosis import Log, diagnose
+from afm_rl.errors import ConfigurationError
+
+NAMES = ("base", "shoulder", "elbow", "wrist", "roll", "gripper", "finger", "h", "i", "j")
+
+
+def log_of(faults, rows=1500, kind="smooth", scale=0.02, sort="gauss", seed=0, later=None, **how):
+    """Return the log of some actuators; from 60 % on ``later`` holds."""
+    rng = np.random.default_rng(seed)
+    u = commands(rng, rows, len(faults), kind)
+    y = np.column_stack([respond(u, fault, j) for j, fault in enumerate(faults)])
+    if later:
+        after = np.column_stack([respond(u, fault, j) for j, fault in enumerate(later)])
+        y[int(0.6 * rows) :] = after[int(0.6 * rows) :]
+    y += noise(rng, rows, len(faults), scale, sort)
+    return Log(NAMES[: len(faults)], u, y, **how)
+
+
+def test_each_fault_is_named():
+    faults = [
+        Fault(),
+        Fault(gain=-0.62, delay=2),
+        Fault(dead_zone=0.2, offset=0.3),
+        Fault(saturation=0.5, lag=3),
+        Fault(source=5),
+        Fault(source=4),
+        Fault(coupling=(0, 0.4), backlash=0.2),
+    ]
+    found = diagnose(log_of(faults, kind="walk", t=0.02 * np.arange(1500)))
+    said = re.sub(r"\d+\.\d+", lambda x: f"{float(x[0]):.1f}", str(found)).splitlines()
+    assert said == [
+        "base: healthy",
+        "shoulder: reversed, 62 % of the command, 2 steps late",
+        "elbow: offset +0.3, no motion for commands below 0.2",
+        "wrist: no more for commands beyond 0.5, a lag of 3 steps",
+        "roll: follows the command of gripper",
+        "gripper: follows the command of roll",
+        "finger: takes in +40 % of the command of base, play of 0.4",
+    ]
+    shoulder, roll = found.actuators[1], found.actuators[4]
+    assert shoulder.delay_s == pytest.approx(0.04, abs=0.002) and shoulder.reversed
+    assert roll.driven_by == "gripper" and roll.gain == pytest.approx(1, abs=0.02)
+    assert found.step_s == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("kind", ["white", "steps", "walk", "smooth"])
+def test_healthy_logs_raise_no_alarm(kind):
+    for seed, sort in enumerate(["gauss", "heavy", "red"]):
+        log = log_of([Fault()] * 7, 600, kind, 0.05, sort, seed)
+        assert not [a for a in diagnose(log).actuators if a.status in ("changed", "dead")]
+
+
+def test_gain_intervals_hold_what_they_promise():
+    """95 % of 200 logs: with a chance of 95 % each, fewer than 181 have a chance of 0.1 %."""
+    inside = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        gains = rng.uniform(0.4, 1.5, 10) * rng.choice([-1, 1], 10)
+        faults = [Fault(gain=g, offset=0.1, delay=rng.choice([0, 1.5])) for g in gains]
+        log = log_of(faults, 300, "walk", 0.1, "red" if seed % 2 else "gauss", seed)
+        ends = [a.gain_interval for a in diagnose(log).actuators]
+        inside += sum(low <= g <= high for (low, high), g in zip(ends, gains, strict=True))
+    assert inside >= 181
+
+
+def test_what_changes_on_the_way_is_found():
+    before = [Fault(), Fault(), Fault(source=3), Fault()]
+    after = [Fault(gain=-0.6), Fault(delay=4), Fault(), Fault(gain=0)]
+    found = diagnose(log_of(before, 1500, "walk", later=after, t=0.1 * np.arange(1500)))
+    for actuator in found.actuators:
+        (change,) = actuator.changes
+        assert change.t == pytest.approx(90, abs=1)
+    base, shoulder, elbow, wrist = found.actuators
+    assert base.sentence == "base: changed at 90 s: healthy, then reversed, 60 % of the command"
+    assert shoulder.sentence.endswith("healthy, then 4 steps late")
+    assert elbow.sentence.endswith("follows the command of wrist, then healthy")
+    assert wrist.status == "dead"
+
+
+def test_a_drift_is_no_sudden_change():
+    (actuator,) = diagnose(log_of([Fault(drift=0.5)])).actuators
+    assert not actuator.changes and actuator.status == "changed"
+    assert actuator.drift["offset"] == pytest.approx((0, 0.5), abs=0.02)
+
+
+def test_the_log_cannot_tell():
+    log = log_of([Fault()] * 4, 300)
+    u, y = log.command.copy(), log.response.copy()
+    u[:, 0] = 0.4  # constant
+    u[:, 2] = -2 * u[:, 1]  # the same command twice
+    y[:, 3] += 5 * np.random.default_rng(0).standard_normal(300)  # nothing but noise
+    found = diagnose(replace(log, command=u, response=y)).actuators
+    assert [a.status for a in found] == ["cannot tell"] * 4
+    assert found[0].sentence == "base: cannot tell: its command does not change"
+    assert (
+        found[1].sentence == "shoulder: cannot tell: its command is that of elbow, up to a factor"
+    )
+
+
+def test_a_dead_actuator():
+    log = log_of([Fault(), Fault(gain=0.0)])
+    quiet = log.response.copy()
+    quiet[:, 0] = 0.25
+    dead = diagnose(replace(log, response=quiet)).actuators
+    assert [a.status for a in dead] == ["dead", "dead"]
+    assert dead[1].sentence == "shoulder: does not answer its command"
+
+
+def test_units_are_no_fault():
+    log = log_of([Fault(), Fault(gain=-0.5), Fault()])
+    degrees = replace(log, command=np.degrees(log.command))
+    found = diagnose(degrees).actuators
+    assert [a.status for a in found] == ["healthy", "changed", "healthy"]
+    assert found[1].sentence == "shoulder: reversed, 50 % of the command"
+    assert found[0].gain == pytest.approx(np.pi / 180, rel=0.01)
+
+
+def test_time_need_not_be_even():
+    rng = np.random.default_rng(0)
+    fine = np.arange(0, 40, 0.001)
+    u = np.column_stack([np.sin(2.1 * fine) + np.sin(5.3 * fine + k) for k in range(2)])
+    late = np.column_stack([-0.7 * np.interp(fine - 0.05, fine, u[:, 0]), u[:, 1]])
+    t = np.cumsum(rng.uniform(0.01, 0.03, 1700))
+    t = np.delete(t, rng.integers(0, 1700, 100))  # lost rows
+    rows = np.searchsorted(fine, t)
+    y = late[rows] + 0.02 * rng.standard_normal((len(t), 2))
+    base, shoulder = diagnose(Log(NAMES[:2], u[rows], y, t)).actuators
+    assert base.reversed and base.delay_s == pytest.approx(0.05, abs=0.005)
+    assert shoulder.status == "healthy"
+
+
+def test_nothing_is_taken_across_the_border_of_an_episode():
+    log = log_of([Fault(delay=3)] * 2, 2000, "steps")
+    u, y, episode = log.command.copy(), log.response.copy(), np.arange(2000) // 50
+    for first in range(0, 2000, 50):  # each begins at rest
+        y[first : first + 3] = u[first]
+    found = diagnose(replace(log, command=u, response=y, episode=episode)).actuators
+    assert [a.sentence[-12:] for a in found] == ["3 steps late"] * 2
+    assert all(a.noise < 0.03 for a in found)
+
+
+def test_a_healthy_delay_is_no_fault():
+    log = log_of([Fault(delay=2), Fault(delay=6)])
+    first, second = diagnose(replace(log, usual_delay=2.0)).actuators
+    assert first.status == "healthy" and first.delay_s == pytest.approx(2, abs=0.1)
+    assert second.sentence == "shoulder: 6 steps late"
+
+
+def test_outliers_and_a_coarse_sensor_do_not_matter():
+    log = log_of([Fault(gain=-0.8), Fault(quantum=0.05)], scale=0.01)
+    y = log.response.copy()
+    y[::50, 0] = 40.0
+    first, second = diagnose(replace(log, response=y)).actuators
+    assert first.gain == pytest.approx(-0.8, abs=0.02)
+    assert second.status == "healthy"
+
+
+def test_seven_joints_take_seconds():
+    log = log_of([Fault(), Fault(gain=-0.5)] * 3 + [Fault(delay=2)], 100_000, "white")
+    begin = time.process_time()
+    found = diagnose(log)
+    assert time.process_time() - begin < 5
+    assert [a.status for a in found.actuators] == ["healthy", "changed"] * 3 + ["changed"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"command": np.zeros((30, 2))}, "expected 1 columns"),
+        ({"command": np.zeros((5, 1)), "response": np.zeros((5, 1))}, "at least 20"),
+        ({"response": np.full((30, 1), np.nan)}, "not finite"),
+        ({"t": np.zeros(30)}, "t does not go on"),
+    ],
+)
+def test_logs_that_cannot_be_used(change, message):
+    parts = {"names": ("a",), "command": np.zeros((30, 1)), "response": np.zeros((30, 1))}
+    with pytest.raises(ConfigurationError, match=message):
+        Log(**(parts | change))
