@@ -64,7 +64,7 @@ def _scan(log: Log, clock: Clock, response: np.ndarray) -> tuple[np.ndarray, ...
     y = y[inside] - y[inside].mean(0)
     power = np.maximum((y**2).sum(0), 1e-300)
     size = u.shape[1]
-    grid, singles, alls, slopes = [], [], [], []
+    grid, singles, joint, slopes = [], [], [], []
     for lag in (lag for lag in LAGS if lag * 10 < len(u)):
         keep = math.exp(-1 / lag) if lag else 0.0
         slow = lagging(clock, u, keep) if keep else u
@@ -75,11 +75,11 @@ def _scan(log: Log, clock: Clock, response: np.ndarray) -> tuple[np.ndarray, ...
             own = np.maximum(gram.diagonal(), 1e-300)
             singles.append(1 - (cross**2 / own[:, None] / power).T)
             solution = np.linalg.solve(gram + RIDGE * gram.trace() * np.eye(size) + 1e-300, cross)
-            alls.append(1 - (solution * cross).sum(0) / power)
+            joint.append(1 - (solution * cross).sum(0) / power)
             slopes.append(solution.T)
             grid.append((delay, keep))
     scale = np.maximum(log.command.std(0), 1e-12)
-    return np.array(grid), np.array(singles), np.array(alls), np.array(slopes) / scale
+    return np.array(grid), np.array(singles), np.array(joint), np.array(slopes) / scale
 
 
 def _choose(scan: tuple[np.ndarray, ...], place: int, j: int, clock: int) -> Lead:
