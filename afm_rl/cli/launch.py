@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
+import pandas as pd
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
@@ -28,6 +29,8 @@ from afm_rl.jobs.tables import read_measures, read_missions, read_steps
 from afm_rl.manifest import extend_manifest, read_manifest, write_manifest
 from afm_rl.missions import Agent, build
 from afm_rl.missions.checkpoint import Stopped
+from afm_rl.missions.explained import explain_mission
+from afm_rl.missions.robot import Robot
 from afm_rl.report import (
     check_video,
     film_results,
@@ -36,6 +39,7 @@ from afm_rl.report import (
     write_report,
     write_run,
 )
+from afm_rl.report.diagnosis import write_diagnosis
 
 SWITCHES = ("overwrite", "progress", "figures", "tensorboard")
 
@@ -52,16 +56,17 @@ def launch(cfg: DictConfig) -> None:
     agents = {job.label: build(job) for job in {job.label: job for job in jobs.values()}.values()}
     roads = [getattr(agent.base_env, "tracks", ()) for agent in agents.values()]  # flights: none
     tracks = list({track.name: track for some in roads for track in some}.values())
+    robot = next(iter(agents.values())).robot
     draw = next((getattr(agent.base_env, "draw", None) for agent in agents.values()), None)
     if cfg.get("study") is None and len(jobs) == 1:
         _run_alone(folder, next(iter(jobs.values())), next(iter(agents.values())))
-        show(folder, cfg, tracks, film, draw)
+        show(folder, cfg, tracks, film, robot, draw)
         return
     chosen = instantiate(hydra.launcher)  # Hydra's own launchers only know sweeps
     pool = chosen if isinstance(chosen, JobLauncher) else LocalPool()
     failed = run_together(folder, jobs, pool, cfg, hydra.overrides.task)
     if cfg.get("study") is None and not failed:
-        show(folder, cfg, tracks, film, draw)
+        show(folder, cfg, tracks, film, robot, draw)
     else:
         report(folder, cfg, film)
     if failed:
@@ -134,9 +139,14 @@ def run_together(
 
 
 def show(
-    folder: Path, cfg: DictConfig, tracks: Sequence[Any], film: str | None, draw: Any = None
+    folder: Path,
+    cfg: DictConfig,
+    tracks: Sequence[Any],
+    film: str | None,
+    robot: Robot,
+    draw: Any = None,
 ) -> None:
-    """Draw the results of a run or a comparison, and print their table."""
+    """Draw the results of a run or a comparison, print their table, and explain a mission."""
     missions, steps, measures = read_missions(folder), read_steps(folder), read_measures(folder)
     with locked(folder):
         # What is drawn anew leaves the manifest first, so that this may be interrupted.
@@ -149,9 +159,26 @@ def show(
                 write_films(folder / "video", missions, steps, tracks, film, draw=draw)
             except ConfigurationError as error:  # such as a robot that cannot be drawn
                 print(f"afm-rl: no film: {error}", file=sys.stderr)
+        explained = _explain(folder, cfg.figures, missions, steps, robot)
         extend_manifest(folder, [name for name in SHOWN if (folder / name).is_dir()])
     print_summary(missions, measures)
+    print(explained, end="")
     print(f"Results: {folder}")
+
+
+def _explain(
+    folder: Path, page: bool, missions: pd.DataFrame, steps: pd.DataFrame, robot: Robot
+) -> str:
+    """Return what the first mission shows of the actuators, one line each; write the page."""
+    first = missions.iloc[0]
+    try:
+        found, log = explain_mission(robot, steps[steps["mission"] == first["mission"]])
+    except AFMError:  # such as a mission of a few steps
+        return ""
+    which = f"{first['method']}, {first['track']}, seed {first['seed']}"
+    if page:
+        list(write_diagnosis(found, log, folder / "diagnosis", which))
+    return f"Actuators, by the steps of {which}:\n{found}\n"
 
 
 def report(folder: Path, cfg: DictConfig, film: str | None) -> None:

@@ -181,15 +181,15 @@ def larger(problem: Problem, model: Model) -> Iterator[Model]:
         trial = replace(model, active=(*model.active, *name.split()))
         found.append(min((_lines(problem, replace(trial, shape=s)) for s in options), key=_cost))
     if "dead_zone" in tries:
-        sizes = np.quantile(np.abs(own), np.linspace(0.03, 0.8, 24))
+        sizes = np.quantile(np.abs(own), np.linspace(0.03, 0.8, 16))
         options = [model.shape._replace(dead_zone=float(z)) for z in sizes]
         jumps = (_lines(problem, replace(model, shape=s, jump=True)) for s in options)
         best = min(jumps, key=_cost)
-        near = best.shape.dead_zone * np.linspace(0.85, 1.15, 16)
+        near = best.shape.dead_zone * np.linspace(0.88, 1.12, 9)
         options = [model.shape._replace(dead_zone=float(z)) for z in near]
         jumps = (_lines(problem, replace(model, shape=s, jump=True)) for s in options)
         found.append(min([best, *jumps], key=_cost))
-    yield from sorted((m for m in found if m.cost < model.cost), key=_cost)[:2]
+    yield from sorted(found, key=_cost)[:2]
     yield from _with_another(problem, model)
 
 
@@ -267,15 +267,18 @@ def mean_cost(residual: np.ndarray, scale: float | None = None) -> float:
     return float((2 * scale**2 * (np.sqrt(1 + (residual / scale) ** 2) - 1)).mean())
 
 
-def _lines(problem: Problem, model: Model) -> Model:
-    """Return the model with the best gains and offset for its shape."""
+def _lines(problem: Problem, model: Model, rounds: int = 0) -> Model:
+    """Return the model with the best gains and offset for its shape.
+
+    Each round takes weight from residuals that are large.
+    """
     use = problem.use
     design = np.column_stack([*(x[use] for x in model.parts(problem)), np.ones(use.sum())])
     y = problem.y[use]
     gram = design.T @ design
     gram += 1e-12 * gram.trace() * np.eye(len(gram))
     solution = np.linalg.solve(gram, design.T @ y)
-    for _ in range(2):
+    for _ in range(rounds):
         residual = y - design @ solution
         scale = ROBUST * scale_of(residual)
         if not scale > 1e-9:
@@ -294,7 +297,7 @@ def _lines(problem: Problem, model: Model) -> Model:
 
 def refine(problem: Problem, model: Model) -> Model:
     """Return the model with the best numbers near those that it has."""
-    model = _lines(problem, model)
+    model = _lines(problem, model, 2)
     if not model.active:
         return model
     use = problem.use
@@ -326,7 +329,7 @@ def refine(problem: Problem, model: Model) -> Model:
         ftol=1e-6,
         xtol=1e-6,
     )
-    better = _lines(problem, _with_values(model, found.x))
+    better = _lines(problem, _with_values(model, found.x), 2)
     return better if better.cost < model.cost else model
 
 

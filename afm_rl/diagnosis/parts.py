@@ -198,9 +198,12 @@ def _apart(log: Log, j: int, whole: Part, steady: Part, left: Part, right: Part)
     weight = min(independence((y - split)[use]), 0.5 + 0.5 * whole.weight)
     more = left.model.size + right.model.size + 4 - whole.model.size
     gained = len(y) * weight * math.log((mean_cost((y - one)[use], scale) + FLOOR) / cost)
-    apart, response = (first - second)[use].std(), split[use].std()
-    apart = math.hypot(apart, float((first - second)[use].mean()))
-    return gained > PENALTY * max(more, 2) and apart > MATTERS * 2 * response
+    apart = min(
+        float(np.sqrt(((first - second)[side][use[side]] ** 2).mean()))
+        for side in (slice(left.rows), slice(left.rows, None))
+        if use[side].any()
+    )
+    return gained > PENALTY * max(more, 2) and apart > 2 * MATTERS * split[use].std()
 
 
 def _with_drift(log: Log, j: int, part: Part) -> Part:

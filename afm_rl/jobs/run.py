@@ -26,7 +26,12 @@ from afm_rl.missions import Agent, Results, build, prepare, run
 from afm_rl.missions.settings import differences, influential
 
 REPLACED = "replaced.json"  # the manifest of results that are being replaced
-SHOWN = ("figures", "video", "tensorboard")  # folders of what is drawn from the results
+SHOWN = (
+    "diagnosis",
+    "figures",
+    "video",
+    "tensorboard",
+)  # folders of what is drawn from the results
 FILES = (CONFIG, MISSIONS, STEPS, COMPUTE, measures.FILE)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pandas as pd
 from jinja2 import Environment, StrictUndefined
 
 from afm_rl.csv_text import csv_text
+from afm_rl.errors import ArtefactError
 from afm_rl.files import write_whole
 from afm_rl.measures import Measures
 from afm_rl.report import style
@@ -27,6 +29,7 @@ from afm_rl.report.events import folder_names
 from afm_rl.report.figures import draw_all, excerpts, telling_cells
 from afm_rl.report.missing_runs import find_missing, missing_lines, missing_table
 from afm_rl.report.recovery import recovery_table
+from afm_rl.report.results_files import LONGEST, read_text
 from afm_rl.report.summary import budget_notes, count_budgets
 from afm_rl.report.table import Table
 from afm_rl.report.track_plot import LoadTrack, load_tracks
@@ -82,6 +85,7 @@ def write_report(
     measures = collection.measures
     missions = count_budgets(collection.missions, measures)
     notes = [*collection.notes, *budget_notes(collection.missions, measures)]
+    notes += [f"{folder}: {sentence}" for folder in folders for sentence in _diagnosed(folder)]
     if baselines is None:
         baselines = [name for name in BASELINES if name in collection.methods]
         baselines = baselines or collection.methods[:1]
@@ -124,6 +128,18 @@ def write_report(
     write_whole(out / "index.html", page.encode())
     echo(f"Report: {out / 'index.html'}")
     return out / "index.html"
+
+
+def _diagnosed(folder: str | Path) -> list[str]:
+    """Return what a run found of its robot's actuators, one sentence each."""
+    path = Path(folder) / "diagnosis" / "diagnosis.json"
+    if not path.is_file():
+        return []
+    try:
+        found = json.loads(read_text(path))["actuators"]
+        return [str(actuator["sentence"])[:LONGEST] for actuator in found]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ArtefactError(f"{path}: damaged; delete it") from error
 
 
 def render_page(**content: Any) -> str:

@@ -1,0 +1,48 @@
+"""What steps of missions show of the actuators."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
+from afm_rl.missions.explained import explain_mission
+
+ROBOT = SimpleNamespace(
+    model=Dubins(dt=0.2), dt=0.2, state_names=["x", "y", "theta"], action_names=["v", "omega"]
+)
+
+
+def drive(steps):
+    """Return the steps of a robot whose v is reversed from half-way on."""
+    actions = np.random.default_rng(0).uniform([-1, -1.5], [1, 1.5], (steps, 2))
+    effective = actions.copy()
+    effective[steps // 2 :, 0] *= -0.6
+    states = [torch.zeros(3)]
+    for action in effective[:-1]:
+        states.append(ROBOT.model(states[-1], torch.tensor(action, dtype=torch.float32)))
+    table = pd.DataFrame(torch.stack(states).numpy(), columns=ROBOT.state_names)
+    return table.assign(t=range(steps), executed_v=actions[:, 0], executed_omega=actions[:, 1])
+
+
+def test_a_mission_is_explained():
+    found, log = explain_mission(ROBOT, drive(300))
+    assert str(found).splitlines() == [
+        "v: changed at 30 s: healthy, then reversed, 60 % of the command",
+        "omega: healthy",
+    ]
+    assert len(log.command) == 299 and log.step == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("steps", [5, 0])
+def test_a_mission_of_a_few_steps_is_not(steps):
+    with pytest.raises(ConfigurationError, match="at least 20"):
+        explain_mission(ROBOT, drive(30)[:steps])
+
+
+def test_steps_that_are_not_finite_are_not():
+    with pytest.raises(ConfigurationError, match="not finite"):
+        explain_mission(ROBOT, drive(30).assign(x=np.nan))
