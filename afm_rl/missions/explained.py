@@ -7,6 +7,7 @@ import pandas as pd
 import torch
 
 from afm_rl.diagnosis import Diagnosis, Log, diagnose
+from afm_rl.diagnosis.log import FEWEST
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import ConfigurationError
@@ -43,6 +44,8 @@ def effective_log(
     """
     border = np.zeros(len(states), dtype=int) if episode is None else episode
     rows = np.flatnonzero(np.diff(border) == 0)
+    if len(rows) < FEWEST:
+        raise ConfigurationError(f"{len(states)} steps: expected at least {FEWEST} of an episode")
     state, action, after = (
         torch.as_tensor(x, dtype=torch.get_default_dtype())
         for x in (states[rows], actions[rows], states[rows + 1])
