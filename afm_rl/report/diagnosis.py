@@ -20,6 +20,7 @@ from rich.text import Text
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
 from afm_rl.files import write_whole
 from afm_rl.report import style
+from afm_rl.report.console import WIDE
 from afm_rl.report.table import Table
 from afm_rl.report.write import render_page
 
@@ -50,7 +51,7 @@ def print_diagnosis(diagnosis: Diagnosis, file: IO[str] | None = None) -> None:
     <BLANKLINE>
     wrist: healthy
     """
-    console = Console(file=file, highlight=False, width=None if file is None else 200)
+    console = Console(file=file, width=WIDE, highlight=False)
     grid = Grid(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     shown = _table(diagnosis)
     shown = shown.loc[:, [name for name in shown if name in KEPT or (shown[name] != "-").any()]]

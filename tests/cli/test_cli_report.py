@@ -82,6 +82,18 @@ def test_a_report_of_a_run(call, run_folder):
     assert (run_folder / "report" / "figures" / "heat_ethz_2.png").exists()
 
 
+def test_what_a_run_found_of_its_actuators(call, run_folder):
+    path = run_folder / "diagnosis" / "diagnosis.json"
+    path.parent.mkdir()
+    path.write_text('{"actuators": [{"name": "v", "sentence": "v: reversed"}]}')
+    done = call(run_folder, "--no-figures")
+    assert f"{run_folder}: v: reversed" in done.out.splitlines()
+    assert "v: reversed</li>" in (run_folder / "report" / "index.html").read_text()
+    path.write_text("[]")
+    done = call(run_folder, "--no-figures")
+    assert (done.status, done.err) == (2, f"afm-rl-report: {path}: damaged; delete it\n")
+
+
 def test_films_in_place_of_a_report(call, afm_rl, tmp_path):
     chosen = ["method=physics", "budget=3", "planner.population=8", f"hydra.run.dir={tmp_path}"]
     quick = ["progress=false", "figures=false", "tensorboard=false"]
