@@ -106,7 +106,7 @@ def _with_interval(value: float, interval: tuple[float, float]) -> str:
         return "-"
     if not math.isfinite(width):
         return f"{_text(value)} [-, -]"
-    digits = 2 if not width > 0 else min(max(2, 1 - math.floor(math.log10(width))), 6)
+    digits = 2 if not width > 0 else min(max(2, -math.floor(math.log10(width))), 6)
     return f"{value:.{digits}f} [{interval[0]:.{digits}f}, {interval[1]:.{digits}f}]"
 
 

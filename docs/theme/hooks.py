@@ -23,6 +23,7 @@ API = {
     "Dynamics": "dynamics",
     "Learning": "learning",
     "Regimes": "regimes",
+    "Diagnosis": "diagnosis",
     "Environments": "envs",
     "Missions": "missions",
     "Reports": "report",
