@@ -103,7 +103,7 @@ class ActionFlow(PairCorrector):
         source_std: float = 0.3,
         steps: int = 1,
         choose: str = "best",
-        saturation: str = "mixed",
+        saturation: str = "clip",
         compile: bool = False,
         cache: str | Path = "~/.cache/afm_rl",
         network: AxisNetwork | None = None,

@@ -14,10 +14,11 @@ from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY, Layout, lay_out, 
 from afm_rl.errors import check_choice, check_count, check_number
 from afm_rl.flow.experts import Rows, fit_experts
 from afm_rl.flow.network import AxisNetwork, Encoded
-from afm_rl.flow.saturation import MODES, attainable
+from afm_rl.flow.saturation import DEAD, MODES, attainable, cut_off
 from afm_rl.flow.solver import midpoint
 
 TOLERANCE = 0.25  # of the largest action: at an error of this size the loss is half its maximum
+LEAST_WIDTH = 0.02  # of the box: effects that a planner may still ask for
 
 
 class Answer(NamedTuple):
@@ -116,15 +117,14 @@ class Tick(nn.Module):
         belief = (losses + self.penalty).argmin(-1)
         encoded = self.encode(pairs, place)
         action, effect, spread, bounds = self.propose(self.pick(encoded, belief), unit, ends)
+        bounds = self.hope(pairs, ends, bounds)
         sound = (action + effect).isfinite().all(-1)
         believed = sound & (belief < self.count)
         action = torch.where(believed.unsqueeze(-1), action, unit)
         forecasts = self.predict(encoded, pairs, action)
         found = torch.stack([action, effect], -2) * self.scale
         found = torch.where(believed[:, None, None], found, planned.unsqueeze(-2))
-        # Never a smaller box: the flow itself cuts what is not achievable.
-        low, high = (bounds * self.scale).unbind(-2)
-        low, high = torch.fmin(low, box[:, 0]), torch.fmax(high, box[:, 1])
+        bounds = torch.where(believed[:, None, None], bounds * self.scale, box)
         executed, effect = found.unbind(-2)
         return Answer(
             losses,
@@ -132,7 +132,7 @@ class Tick(nn.Module):
             executed,
             effect,
             spread * self.scale,
-            torch.stack([low, high], -2),
+            bounds,
             believed,
         )
 
@@ -177,7 +177,12 @@ class Tick(nn.Module):
             planned: u, ``(B, A)``.
             box: its lowest and highest, ``(B, 2, A)``.
         """
+        # Where a line explains all rows, it is believed to go on where nothing was tried.
+        line = known.experts.lines(box)
         plans = planned.unsqueeze(-2)
+        if self.saturation != "clip":  # for an axis without influence nothing need be slower
+            dead = line.diff(dim=-2).abs() < DEAD * box.diff(dim=-2)
+            plans = torch.where(dead, line.mean(-2, keepdim=True), plans)
         velocity = partial(self.network.velocity, self.network.ask(known, plans, self.saturation))
         start = plans + self.source_std * self.source_points
         ends = midpoint(velocity, start, self.steps)
@@ -190,15 +195,34 @@ class Tick(nn.Module):
         foreseen = self.network.effect(known, torch.cat([proposals, probes], -2))
         effects, found = foreseen[:, :count], foreseen[:, count:]
         low, high = found.amin(-2), found.amax(-2)
-        # Where a line explains all rows, it is believed to go on where nothing was tried.
-        line = known.experts.lines(box)
         low, high = torch.fmin(low, line.amin(-2)), torch.fmax(high, line.amax(-2))
-        wanted = attainable(planned, low, high, self.saturation)
+        wanted = attainable(plans.squeeze(-2), low, high, self.saturation)
         best = nearest_of(effects, wanted, 0.5 * (high - low))
         chosen = torch.cat([proposals, effects], -1)
         chosen = chosen.gather(-2, best.expand(best.shape[0], 1, chosen.shape[-1])).squeeze(-2)
         action, effect = chosen.tensor_split(2, -1)
         return action, effect, spread, torch.stack([low, high], -2)
+
+    def hope(self, pairs: Tensor, box: Tensor, bounds: Tensor) -> Tensor:
+        """Return the bounds of effects ``(B, 2, A)`` that plans should keep.
+
+        Smaller than the box only where most of it was tried of late: what was not tried may do
+        what the model says. And only where the saturation cuts a plan: where it makes the robot
+        slower instead, plans may ask for more.
+
+        Args:
+            pairs: what is remembered, ``(B, M, D)``.
+            box: lowest and highest action, ``(B, 2, A)``.
+            bounds: lowest and highest effect that is predicted of them, ``(B, 2, A)``.
+        """
+        tried = pairs[..., : len(self.scale)]
+        (least, most), (low, high) = box.unbind(-2), bounds.unbind(-2)
+        width = most - least
+        left = (1 - (tried.amax(-2) - tried.amin(-2)) / width).clamp_min(LEAST_WIDTH) * width
+        left = torch.where(cut_off((high - low) / width, self.saturation), left, width)
+        low = torch.fmin(low, torch.fmax(low - left, least))
+        high = torch.fmax(high, torch.fmin(high + left, most))
+        return torch.stack([low, high], -2)
 
     def predict(self, encoded: Encoded, pairs: Tensor, executed: Tensor) -> Tensor:
         """Return the effects ``(B, H + 1, A)`` that the hypotheses predict of what acts now."""

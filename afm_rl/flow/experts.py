@@ -15,6 +15,7 @@ PRIOR = 1e-4  # weight of the nominal map in every fit
 LEAST_GAIN = 0.02  # smallest gain that is divided by
 NOISE = 0.1  # half ranges: a pair with this standard deviation counts half
 EXACT = 0.02  # half ranges: a fit that misses by less explains all rows
+LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
 LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
 NEAR = 0.15  # half ranges: a pair so far from the question counts half as much
 SHORT, LONG = 0.5, 0.9  # forgetting per row
@@ -303,6 +304,7 @@ def fit_experts(rows: Rows) -> Experts:
     square = torch.baddbmm(nominal.flatten(), long, square).unflatten(-1, (size + 1, size + 1))
     cross = torch.baddbmm(nominal[:-1], long * e, outer)
     solution = torch.linalg.solve_ex(square, cross).result  # (N, A, A + 1)
+    solution = torch.where(*_drivers(u, e, long), solution)
     matrix, bias = solution[..., :-1], solution[..., -1:]
     ridge = torch.baddbmm(LEAST_GAIN**2 / PRIOR * nominal[:-1, :-1], matrix.mT, matrix)
     inverse = torch.linalg.solve_ex(ridge, matrix.mT).result
@@ -324,6 +326,36 @@ def fit_experts(rows: Rows) -> Experts:
     left = weights @ residuals.square() / mass
     left = torch.cat([left[..., :1, :1], left[..., 1:, 1:]], -1)
     return experts._replace(residuals=residuals, misses=(left.sqrt() + LEAST_MISS).log())
+
+
+def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Fit every effect to the one command that drives it: swapped cables need no more.
+
+    Of many axes an affine map needs many rows, and a gait that repeats itself shows only a few.
+
+    Args:
+        u: executed actions, ``(N, A, K)``.
+        e: effective actions.
+        weight: of both.
+
+    Returns:
+        Which axes are explained by one command, ``(N, A, 1)``, and their rows of the affine map,
+        ``(N, A, A + 1)``.
+    """
+    own = torch.eye(u.shape[-2], device=u.device, dtype=u.dtype)
+    pull = weight * e
+    square, mean, cross = weight @ (u * u).mT + PRIOR, weight @ u.mT, pull @ u.mT + PRIOR * own
+    mass, shift = weight.sum(-1, keepdim=True) + 10 * PRIOR, pull.sum(-1, keepdim=True)
+    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
+    slope = (mass * cross - mean * shift) / determinant
+    offset = (square * shift - mean * cross) / determinant
+    left = (pull * e).sum(-1, keepdim=True) - slope * cross - offset * shift
+    # An axis that its own command explains is driven by it, whatever else fits by chance.
+    left, driver = (left.abs() / mass - EXACT**2 * own).min(-1, keepdim=True)
+    limit = torch.where(own.bool(), 0.0, EXACT**2).expand_as(slope).gather(-1, driver)
+    explained = (left < limit) & (mass > LEAST_ROWS)
+    chosen = torch.zeros_like(slope).scatter(-1, driver, slope.gather(-1, driver))
+    return explained, torch.cat([chosen, offset.gather(-1, driver)], -1)
 
 
 PLACES = torch.tensor([[1], [2]]), torch.tensor([[0, 1, 7, 3, 4], [0, 5, 2, 3, 6]])

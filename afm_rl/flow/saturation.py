@@ -10,6 +10,7 @@ from afm_rl.regimes import Regime
 LIMIT = 4.0  # half ranges: effects beyond carry no more news
 MODES = ("mixed", "direction", "clip")
 LEAST = 0.3  # share of an action that must be had for "mixed" to clip it
+DEAD = 0.03  # share of which nothing can be had
 ROUNDS, TOLERANCE = 8, 0.01  # bisection of the scale; miss in half ranges that still counts
 
 
@@ -49,8 +50,23 @@ def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
     if mode == "clip":
         return unit
     limit = torch.where(unit < 0, -low, high).clamp_min(0.0)
-    share = (limit / unit.abs().clamp_min(1e-6)).amin(-1, keepdim=True).clamp_max(1.0)
+    share = torch.where(limit < DEAD, 1.0, limit / unit.abs().clamp_min(1e-6))
+    share = share.amin(-1, keepdim=True).clamp_max(1.0)
     return unit * share if mode == "direction" else torch.where(share < LEAST, unit * share, unit)
+
+
+def cut_off(share: Tensor, mode: str) -> Tensor:
+    """Where is a plan cut, and not done slower, if only this share of the box can be had?
+
+    No slowness helps where nothing can be had at all.
+
+    >>> cut_off(torch.tensor([0.01, 0.2, 0.5]), "mixed")
+    tensor([ True, False,  True])
+    """
+    if mode == "clip":
+        return torch.ones_like(share, dtype=torch.bool)
+    dead = share < DEAD
+    return dead if mode == "direction" else dead | (share > LEAST)
 
 
 def intend(

@@ -122,12 +122,15 @@ def correct(
         predicted = torch.where(touched & ~misaligned.unsqueeze(-1), executed, predicted)
     if not enabled:
         predicted = executed
-    wide = extend_action_box and enabled and model.extrapolates
+    bounds = found.bounds if enabled else box
+    if not (extend_action_box and model.extrapolates):
+        low, high = box.unbind(-2)
+        bounds = torch.minimum(torch.maximum(bounds, low.unsqueeze(-2)), high.unsqueeze(-2))
     entries = {
         "planned_action": planned,
         "executed_action": executed,
         "predicted_effect": predicted,
-        "effect_bounds": found.bounds if wide else box,
+        "effect_bounds": bounds,
         "spread": found.spread if enabled else torch.zeros_like(found.spread),
         "innovation": found.innovation,
         "misaligned": misaligned,

@@ -56,9 +56,7 @@ def test_faults_are_corrected_within_few_steps(line, drive, plans, name, size):
     assert can.all()
     idle = (REGIMES[name]([planned[after:]]) - planned[after:]).square().mean().sqrt()
     miss = miss_of(effects, planned, after)
-    # Which two of 17 are swapped cannot be told from so few pairs; it must do no harm.
-    least = 1.0 if (name, size) == ("two swapped", 17) else 0.35
-    assert miss.median() < 0.05 and miss.square().mean().sqrt() < least * idle
+    assert miss.median() < 0.05 and miss.square().mean().sqrt() < 0.35 * idle
     foreseen = (found[1] - effects)[after:].square().mean().sqrt()
     assert foreseen < 0.12
 
@@ -109,6 +107,33 @@ def test_an_outlier_does_little_harm(line, drive, plans):
 def test_bounds_say_what_can_be_had(line, drive, plans, gain):
     found, _ = drive(flow_of(2), line(2), lambda sent: gain * sent[-1], plans(12, 4, 2, size=0.4))
     low, high = found[3][-1].unbind(-2)
-    expected = max(gain, 1.0)  # never less than the box
+    expected = max(gain, 1.0)  # little was tried: never less than the box
     torch.testing.assert_close(high, torch.full((4, 2), expected), rtol=0.25, atol=0)
     torch.testing.assert_close(low, torch.full((4, 2), -expected), rtol=0.25, atol=0)
+
+
+@pytest.mark.parametrize(("mode", "weak"), [("clip", 0.2), ("clip", 0.0), ("mixed", 0.5)])
+def test_bounds_say_what_has_become_unavailable(line, drive, plans, mode, weak):
+    """The first axis is weak or dead; the second one does as it is told."""
+    factor = torch.tensor([weak, 1.0])
+    flow, planned = flow_of(2, saturation=mode), plans(24, 4, 2, size=1.0)
+    found, _ = drive(flow, line(2), lambda sent: factor * sent[-1], planned)
+    low, high = found[3][-1].unbind(-2)
+    assert (high[:, 0] < weak + 0.3).all() and (low[:, 0] > -weak - 0.3).all()
+    assert (high[:, 1] > 0.9).all() and (low[:, 1] < -0.9).all()
+
+
+@pytest.mark.parametrize("mode", ["clip", "mixed"])
+def test_an_axis_without_influence_does_not_stop_the_others(line, drive, plans, mode):
+    factor, planned = torch.tensor([0.0, -1.0]), plans(24, 4, 2, size=0.8)
+    flow = flow_of(2, saturation=mode)
+    _, effects = drive(flow, line(2), lambda sent: factor * sent[-1], planned)
+    assert miss_of(effects[..., 1], planned[..., 1], 8).max() < 0.1
+
+
+def test_where_plans_are_done_slower_they_may_ask_for_more(line, drive, plans):
+    factor = torch.tensor([0.1, 1.0])
+    flow, planned = flow_of(2, saturation="mixed"), plans(24, 4, 2, size=1.0)
+    found, _ = drive(flow, line(2), lambda sent: factor * sent[-1], planned)
+    low, high = found[3][-1].unbind(-2)
+    assert (high >= 1).all() and (low <= -1).all()
