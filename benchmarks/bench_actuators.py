@@ -2,9 +2,10 @@
 
     python benchmarks/bench_actuators.py --episodes 3
 
-gymnasium's HalfCheetah-v5 and the linear policy of `examples/policies`; the model is the very same
-simulation. From step 300 of 1000 on the actuators differ. Shown: the return of the last 500 steps,
-doubled. `alone` is the policy by itself, `ideal` the exact inverse from ten steps after the change.
+gymnasium's HalfCheetah-v5 and the linear policy of `examples/policies`, or one that
+`examples/policies/train_sac.py` stored (`--policy FILE`); the model is the very same simulation.
+From step 300 of 1000 on the actuators differ. Shown: the return of the last 500 steps, doubled.
+`alone` is the policy by itself, `ideal` the exact inverse from ten steps after the change.
 Finished episodes stand in a file and are not run again.
 """
 
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
 from statistics import mean
 
@@ -23,6 +25,7 @@ from safetensors.torch import load_file
 
 from afm_rl.correction import ActionFlow, LeastSquares
 from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.planning import load_policy
 
 POLICY = Path(__file__).parents[1] / "examples" / "policies" / "half_cheetah.safetensors"
 AT, LATE, STEPS = 300, 10, 1000
@@ -48,14 +51,19 @@ CORRECTORS = {
 }
 
 
+def linear(weights: dict[str, torch.Tensor]) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return the linear policy with these weights."""
+    weight, bias = weights["weight"].double(), weights["bias"].double()
+    return lambda observation: (weight @ observation + bias).clamp(-1, 1)
+
+
 class Bed:
     """The robot, its policy and its model."""
 
-    def __init__(self) -> None:
+    def __init__(self, policy: Path | None) -> None:
         self.env = gymnasium.make("HalfCheetah-v5")
         self.model = MuJoCoDynamics(self.env)
-        weights = load_file(POLICY)
-        self.weight, self.bias = weights["weight"].numpy(), weights["bias"].numpy()
+        self.policy = load_policy(policy)[0] if policy else linear(load_file(POLICY))
 
     def state(self) -> torch.Tensor:
         """Return the state, which the observation tells but for the distance."""
@@ -72,7 +80,7 @@ class Bed:
         memory = corrector.begin(self.state()) if corrector else None
         box, total = torch.stack([LOW, HIGH]), 0.0
         for step in range(STEPS):
-            action = np.clip(self.weight @ observation + self.bias, -1, 1)
+            action = self.policy(torch.from_numpy(observation)).numpy()
             if corrector:
                 planned = torch.from_numpy(action)
                 memory, found = corrector.correct(memory, planned, self.model, box)
@@ -92,6 +100,7 @@ class Bed:
 def main() -> None:
     """Print a table, and how long an episode took."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--policy", type=Path, help="stored policy; left out: the linear one")
     parser.add_argument("--episodes", type=int, default=3)
     parser.add_argument("--correctors", nargs="+", choices=CORRECTORS, default=list(CORRECTORS))
     parser.add_argument("--changes", nargs="+", choices=CHANGES, default=list(CHANGES))
@@ -101,7 +110,7 @@ def main() -> None:
     args.out.parent.mkdir(parents=True, exist_ok=True)
     lines = args.out.read_text().splitlines() if args.out.exists() else []
     done = {tuple(row[:3]): row[3] for row in map(json.loads, lines)}
-    bed = Bed()
+    bed = Bed(args.policy)
     for change in args.changes:
         for name in args.correctors:
             for seed in range(args.episodes):

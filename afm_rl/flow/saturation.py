@@ -10,7 +10,7 @@ from afm_rl.regimes import Regime
 LIMIT = 4.0  # half ranges: effects beyond carry no more news
 MODES = ("mixed", "direction", "clip")
 LEAST = 0.3  # share of an action that must be had for "mixed" to clip it
-DEAD = 0.03  # share of which nothing can be had
+DEAD = 0.025  # share of which nothing can be had
 ROUNDS, TOLERANCE = 8, 0.01  # bisection of the scale; miss in half ranges that still counts
 
 
