@@ -50,7 +50,8 @@ def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
     if mode == "clip":
         return unit
     limit = torch.where(unit < 0, -low, high).clamp_min(0.0)
-    share = torch.where(limit < DEAD, 1.0, limit / unit.abs().clamp_min(1e-6))
+    share = limit / unit.abs().clamp_min(1e-6)
+    share = torch.where(high - low < 2 * DEAD, 1.0, share)  # no slowness helps there
     share = share.amin(-1, keepdim=True).clamp_max(1.0)
     return unit * share if mode == "direction" else torch.where(share < LEAST, unit * share, unit)
 
