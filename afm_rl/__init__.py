@@ -1,14 +1,18 @@
 """Action Flow Matching for continual robot learning, on TorchRL.
 
-Importing the package registers its gymnasium environments; everything else is imported from
-its own module, for example ``from afm_rl.transforms import ActionFlowTransform``.
+Importing the package registers its gymnasium environments, and gives the two wrappers for
+gymnasium when they are asked for; everything else is imported from its own module, for example
+``from afm_rl.transforms import ActionFlowTransform``.
 """
+
+from importlib import import_module
+from typing import Any
 
 import gymnasium
 
 from afm_rl._version import __version__
 
-__all__ = ["__version__"]
+__all__ = ["ActionFlowVectorWrapper", "ActionFlowWrapper", "__version__"]
 
 if "afm_rl/UGVTrack-v0" not in gymnasium.registry:  # strings only: nothing heavy is imported
     gymnasium.register(
@@ -20,3 +24,10 @@ if "afm_rl/UGVTrack-v0" not in gymnasium.registry:  # strings only: nothing heav
     gymnasium.register(
         id="afm_rl/CrazyflieTrack-v0", entry_point="afm_rl.envs.quadrotor_gym:CrazyflieTrackGym"
     )
+
+
+def __getattr__(name: str) -> Any:
+    """Import the wrappers when they are asked for: they are heavy."""
+    if name not in __all__:
+        raise AttributeError(f"module 'afm_rl' has no attribute {name!r}")
+    return getattr(import_module("afm_rl.transforms.gymnasium"), name)

@@ -1,4 +1,4 @@
-"""TorchRL transforms, and the same correction as a policy."""
+"""TorchRL transforms, and the same correction as a policy and as gymnasium's wrappers."""
 
 from afm_rl.transforms.action_flow import ActionFlowTransform
 from afm_rl.transforms.guard import Guard

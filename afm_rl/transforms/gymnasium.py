@@ -1,0 +1,378 @@
+"""The correction around gymnasium's environments, for whatever policy acts in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv, VectorWrapper
+from torch import Tensor
+from torchrl.data import Bounded
+
+from afm_rl.correction import Corrector
+from afm_rl.correction.pairs import PairCorrector
+from afm_rl.diagnosis import explain
+from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
+from afm_rl.errors import ConfigurationError, check_flag
+from afm_rl.learning.watching import Watching
+from afm_rl.manifold import Manifold
+from afm_rl.transforms.memory import begin, correct, corrector_for
+
+Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str
+State = Callable[[Any, Any], Any]
+AS_EXPECTED = "as the model expects"
+DIAGNOSED_EVERY = 10  # corrected steps
+ENDS = {"planned": "action", "executed": "action", "predicted": "effect"}
+
+
+class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
+    r"""Corrects the actions of whatever policy acts in a gymnasium environment.
+
+    The policy's action is the planned one. While the model explains what happens, it is executed
+    as it is, brought into the action space; when it does not, the corrector's answer is. Seeds,
+    rewards, ends and observations are the environment's own.
+
+    ``info["afm"]`` has, after each step, ``planned``, ``executed`` and ``predicted`` ``(A,)``, the
+    last being the effect that the executed action is expected to have; ``corrects``, whether the
+    planned action was replaced by the corrector's; the ``innovation``, in standard deviations of
+    the model; and the ``diagnosis`` of the actuators in words.
+
+    What the model takes for the state is, with ``"mujoco"`` or a
+    :class:`~afm_rl.dynamics.MuJoCoDynamics`, the whole state of the environment's simulation, else
+    the observation; ``state`` gives another.
+
+    Args:
+        env: with a vector of real numbers between finite bounds as action.
+        model: ``"mujoco"``, the environment's own model as it is now, with its frame skip; a
+            step function ``step(state, action) -> next_state`` in torch, batched; any
+            :class:`~afm_rl.dynamics.DynamicsModel`; or ``"learn"``, which watches healthy steps and
+            fits an ensemble between two episodes, see
+            :class:`~afm_rl.learning.watching.Watching`, of which one with other settings can be
+            given. Then ``info["afm"]["learned"]`` says whether there is a model yet, and
+            :attr:`watching` how many steps were watched and how good it is.
+        state: ``state(env, observation)`` returns the state ``(S,)`` that the model knows.
+        corrector: the correction, owned; None: the universal
+            :class:`~afm_rl.correction.ActionFlow` for the action space.
+        enabled: False to watch only.
+
+    Raises:
+        ConfigurationError: for spaces or a model that cannot be used, or do not fit each other.
+
+    >>> env = ActionFlowWrapper(gymnasium.make("Pendulum-v1"), "learn")
+    >>> env.reset(seed=0)[1]["afm"]["learned"]
+    False
+    >>> _, _, _, _, info = env.step(np.zeros(1, dtype=np.float32))
+    >>> info["afm"]["corrects"], env.watching.count
+    (False, 1)
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        model: Model = "mujoco",
+        state: State | None = None,
+        corrector: Corrector | None = None,
+        enabled: bool = True,
+    ) -> None:
+        given = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
+        RecordConstructorArgs.__init__(self, **given)
+        gymnasium.Wrapper.__init__(self, env)
+        inner: Any = env.unwrapped
+        spaces = env.observation_space, env.action_space
+        self._loop = CorrectionLoop(*spaces, model, state, corrector, enabled, env)
+        simulated = isinstance(self._loop.model, MuJoCoDynamics)
+        if simulated and hasattr(inner, "data") and env.action_space != inner.action_space:
+            raise ConfigurationError(
+                f"ActionFlowWrapper: actions of {env} are others than those of its simulation; "
+                "put the wrapper inside of those that change actions"
+            )
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Begin an episode with an empty memory."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._loop.begin(self._state(observation), seed=seed)
+        return observation, {**info, "afm": self._told()}
+
+    def step(self, action: Any):
+        """Execute the corrected action."""
+        executed = self._loop.act(np.asarray(action)[None])[0]
+        observation, reward, terminated, truncated, info = self.env.step(executed)
+        self._loop.observe(self._state(observation))
+        return observation, reward, terminated, truncated, {**info, "afm": self._told()}
+
+    @property
+    def watching(self) -> Watching | None:
+        """What has been learned, with ``model="learn"``."""
+        return self._loop.watching
+
+    def _state(self, observation: Any) -> np.ndarray:
+        return np.asarray(self._loop.state(self.env, observation))[None]
+
+    def _told(self) -> dict[str, Any]:
+        found = {name: value[0] for name, value in self._loop.told.items()}
+        return {k: v.item() if isinstance(v, np.generic) else v for k, v in found.items()}
+
+
+class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
+    """Corrects the actions of a policy in a vector of gymnasium environments.
+
+    As :class:`ActionFlowWrapper`, with arrays ``(N, ...)``, each environment with a memory of its
+    own that an automatic reset empties, in whichever mode. ``state(env, observations)`` returns
+    ``(N, S)``. ``infos["_afm"]`` ``(N,)`` says in which environments a step was made.
+
+    >>> envs = gymnasium.make_vec("Pendulum-v1", num_envs=2, vectorization_mode="sync")
+    >>> envs = ActionFlowVectorWrapper(envs, "learn")
+    >>> envs.reset(seed=0)[1]["afm"]["learned"].tolist()
+    [False, False]
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        model: Model = "mujoco",
+        state: State | None = None,
+        corrector: Corrector | None = None,
+        enabled: bool = True,
+    ) -> None:
+        given = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
+        RecordConstructorArgs.__init__(self, **given)
+        VectorWrapper.__init__(self, env)
+        spaces = env.single_observation_space, env.single_action_space
+        self._loop = CorrectionLoop(*spaces, model, state, corrector, enabled, env)
+        mode = (env.metadata or {}).get("autoreset_mode")
+        self._mode = getattr(mode, "name", "NEXT_STEP")  # gymnasium 1.0 knows no other
+        self._over = np.zeros(env.num_envs, dtype=bool)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None):
+        """Begin episodes with empty memories; of those in ``options["reset_mask"]``, if given."""
+        rows = (options or {}).get("reset_mask")
+        rows = np.ones(self.env.num_envs, dtype=bool) if rows is None else rows.copy()
+        observations, infos = self.env.reset(seed=seed, options=options)
+        first = seed[0] if isinstance(seed, list | tuple) else seed
+        self._loop.begin(self._loop.state(self.env, observations), rows, first)
+        self._over &= ~rows
+        return observations, {**infos, "afm": self._loop.told, "_afm": rows}
+
+    def step(self, actions: Any):
+        """Execute the corrected actions."""
+        executed = self._loop.act(np.asarray(actions))
+        observations, rewards, terminated, truncated, infos = self.env.step(executed)
+        made, over = ~self._over, np.asarray(terminated) | np.asarray(truncated)
+        same = self._mode == "SAME_STEP"
+        self._loop.observe(self._loop.state(self.env, observations), over if same else self._over)
+        self._over = over & (self._mode == "NEXT_STEP")
+        infos = {**infos, "afm": self._loop.told, "_afm": made}
+        return observations, rewards, terminated, truncated, infos
+
+    @property
+    def watching(self) -> Watching | None:
+        """What has been learned, with ``model="learn"``."""
+        return self._loop.watching
+
+
+class CorrectionLoop:
+    """The tick of :mod:`~afm_rl.transforms.memory` for N environments that speak numpy.
+
+    Args:
+        observations: space of one observation.
+        actions: space of one action.
+        model: see :class:`ActionFlowWrapper`, as further arguments.
+        state: reads the state.
+        corrector: the correction.
+        enabled: False to watch only.
+        source: environment, or vector of environments, that may have a simulation.
+    """
+
+    def __init__(
+        self,
+        observations: gymnasium.Space,
+        actions: gymnasium.Space,
+        model: Model,
+        state: State | None = None,
+        corrector: Corrector | None = None,
+        enabled: bool = True,
+        source: Any = None,
+    ) -> None:
+        if not isinstance(actions, Box) or len(actions.shape) != 1 or actions.dtype.kind != "f":
+            raise ConfigurationError(
+                f"ActionFlowWrapper: action_space={actions}: expected a Box of one vector of real "
+                "numbers"
+            )
+        self.space, self.enabled = actions, check_flag("wrapper.enabled", enabled)
+        self.watching = Watching() if isinstance(model, str) and model == "learn" else None
+        if isinstance(model, Watching):
+            self.watching = deepcopy(model)
+        self.model: Any = None if self.watching else model
+        if isinstance(model, str) and model == "mujoco":
+            self.model = _simulation(source)
+        elif isinstance(model, str) and model != "learn" or not callable(self.model or len):
+            raise ConfigurationError(
+                f"ActionFlowWrapper: model={model!r}: expected 'mujoco', 'learn', a step function "
+                "or a DynamicsModel"
+            )
+        self.corrector: Any = corrector
+        if state is None and isinstance(self.model, MuJoCoDynamics):
+            state = _vector_state if isinstance(source, VectorEnv) else _env_state
+        if state is None and not (isinstance(observations, Box) and len(observations.shape) == 1):
+            raise ConfigurationError(
+                f"ActionFlowWrapper: observation_space={observations}: expected a Box of one "
+                "vector; say what the state is by state=lambda env, observation: ..."
+            )
+        self.state: State = _observed if state is None else state
+        names = self.model.names[1] if isinstance(self.model, MuJoCoDynamics) else None
+        self.names = names or [f"actuator {k}" for k in range(actions.shape[0])]
+        self.entries: Any = None  # a tensordict, from the first reset on
+        self.told: dict[str, Any] = {}
+        self.random = np.random.default_rng(0)
+
+    @property
+    def learning(self) -> bool:
+        """Is there no model yet?"""
+        return self.watching is not None and self.watching.fitted is None
+
+    @torch.no_grad()
+    def begin(self, states: Any, rows: np.ndarray | None = None, seed: int | None = None) -> None:
+        """Begin episodes in ``states`` ``(N, S)``; only in ``rows`` ``(N,)``, if given."""
+        states = _tensor(states)
+        if seed is not None:
+            self.random = np.random.default_rng(seed)
+        if self.entries is None:
+            self._complete(states)
+        if self.watching and self.learning and self.watching.due:
+            self.watching.learn(self.corrector)
+            self.model, rows = self.watching.fitted or self.model, None
+        fresh = begin(self.corrector, states, self.spec)
+        count, every = len(states), rows is None or self.entries is None
+        if every:
+            self.entries, self.states = fresh, states
+            self.words, self.corrected = [AS_EXPECTED] * count, np.zeros(count, dtype=int)
+        else:
+            mask = torch.from_numpy(rows)
+            self.entries = torch.where(mask, fresh, self.entries)
+            self.states = torch.where(mask.unsqueeze(-1), states, self.states)
+            for row in rows.nonzero()[0]:
+                self.words[row], self.corrected[row] = AS_EXPECTED, 0
+        self.told = self._tell()
+
+    def _complete(self, states: Tensor) -> None:
+        """Build what depends on size and precision of the state."""
+        size, count = states.shape[-1], self.space.shape[0]
+        if self.model is None:
+            self.model = UnknownDynamics(Manifold(size), count)
+        elif not isinstance(self.model, DynamicsModel):
+            self.model = KnownDynamics(self.model, Manifold(size), count)
+        if states.dim() != 2 or size != self.model.state_size:
+            raise ConfigurationError(
+                f"ActionFlowWrapper: the state has {tuple(states.shape[1:])} numbers, that of the "
+                f"model {self.model.state_size}; say what it is by "
+                "state=lambda env, observation: ..."
+            )
+        low, high = (torch.as_tensor(x).to(states) for x in (self.space.low, self.space.high))
+        self.spec = Bounded(low, high, low.shape, dtype=low.dtype)
+        self.corrector = corrector_for("ActionFlowWrapper", self.model, self.corrector, self.spec)
+        self.corrector.to(states.dtype)
+
+    @torch.no_grad()
+    def act(self, planned: np.ndarray) -> np.ndarray:
+        """Return what to execute instead of ``planned`` ``(N, A)``."""
+        if self.entries is None:
+            raise ResetNeeded("call reset() before step()")
+        wanted = torch.as_tensor(planned).to(self.states)
+        if self.watching and self.learning:
+            low, high = self.spec.space.low, self.spec.space.high
+            noise = self.random.standard_normal(wanted.shape) * self.watching.noise
+            executed = wanted + torch.from_numpy(noise).to(wanted) * (high - low) / 2
+            executed = executed.clamp(low, high)
+            found = {"planned": wanted, "executed": executed, "predicted": executed}
+            self.entries.update({f"{name}_{ENDS[name]}": value for name, value in found.items()})
+        else:
+            memory, how = self.entries.get("memory"), (self.spec, self.enabled)
+            self.entries = correct(memory, wanted, self.model, self.corrector, *how)
+            self._diagnose()
+        self.told = self._tell()
+        return self.told["executed"].astype(self.space.dtype)
+
+    @torch.no_grad()
+    def observe(self, states: Any, fresh: np.ndarray | None = None) -> None:
+        """Add what the actions led to, ``(N, S)``; where ``fresh`` ``(N,)``, an episode began."""
+        states, entries = _tensor(states), self.entries
+        fresh = np.zeros(len(states), dtype=bool) if fresh is None else fresh
+        if self.watching and self.learning:
+            executed, valid = entries.get("executed_action"), torch.from_numpy(~fresh)
+            self.watching.add(self.states, executed, states, valid)
+        else:
+            entries.set("memory", self.corrector.observe(entries.get("memory"), states))
+        self.states, told = states, self.told
+        if fresh.any():
+            self.begin(states, fresh)
+            self.told = told
+
+    def _diagnose(self) -> None:
+        """Say in words what the pairs show, now and then, where actions are corrected."""
+        misaligned = self.entries.get("misaligned").numpy()
+        if not misaligned.any() or not isinstance(self.corrector, PairCorrector):
+            return
+        parts = self.corrector.unpack(self.entries.get("memory"), self.states.shape[-1])
+        for row in misaligned.nonzero()[0]:
+            if self.corrected[row] % DIAGNOSED_EVERY == 0:
+                size = self.corrector.action_size
+                pairs = parts["pairs"][row].split([size, size, size, 1, 1], -1)
+                executed, effective, std, valid, _ = (part.numpy() for part in pairs)
+                use, step = valid[:, 0] == 1, getattr(self.model, "dt", 1.0)
+                found = explain(executed[use], effective[use], self.names, std[use], step)
+                self.words[row] = str(found)
+            self.corrected[row] += 1
+
+    def _tell(self) -> dict[str, Any]:
+        """Return what is known of the newest step, ``(N, ...)`` each."""
+        told: dict[str, Any] = {
+            name: self.entries.get(f"{name}_{end}").numpy().copy() for name, end in ENDS.items()
+        }
+        corrects = self.entries.get("misaligned").numpy() & self.enabled
+        told |= {"corrects": corrects, "innovation": self.entries.get("innovation").numpy().copy()}
+        told["diagnosis"] = np.array(self.words, dtype=object)
+        if self.watching:
+            told["learned"] = np.full(len(corrects), not self.learning)
+        return told
+
+
+def _tensor(states: Any) -> Tensor:
+    """Return states as a tensor of real numbers, a copy."""
+    found = torch.tensor(np.asarray(states))
+    return found if found.is_floating_point() else found.to(torch.get_default_dtype())
+
+
+def _observed(env: Any, observation: Any) -> Any:
+    return observation
+
+
+def _env_state(env: Any, observation: Any) -> np.ndarray:
+    """Return positions, velocities and activations of a simulation."""
+    data = env.unwrapped.data
+    return np.concatenate([data.qpos, data.qvel, data.act])
+
+
+def _vector_state(env: Any, observations: Any) -> np.ndarray:
+    """Return positions and velocities of each simulation."""
+    return np.stack(env.unwrapped.call("state_vector"))
+
+
+def _simulation(source: Any) -> MuJoCoDynamics:
+    """Return the MuJoCo model of an environment, or of the first of a vector of them."""
+    try:
+        inner: Any = source.unwrapped
+        if not isinstance(inner, VectorEnv):
+            return MuJoCoDynamics(inner)
+        return MuJoCoDynamics(inner.get_attr("model")[0], inner.get_attr("frame_skip")[0])
+    except (ConfigurationError, AttributeError) as error:
+        raise ConfigurationError(
+            f"ActionFlowWrapper: model='mujoco', but {source} has no MuJoCo model ({error}); give "
+            "a step function, a DynamicsModel, or 'learn'"
+        ) from error
