@@ -302,7 +302,7 @@ def refine(problem: Problem, model: Model) -> Model:
         return model
     use = problem.use
     own = problem.u[:, model.driver]
-    most = float(np.abs(own).max())
+    most = max(float(np.abs(own).max()), 1e-6)
     residual = (problem.y - model.predict(problem))[use]
     scale = max(ROBUST * scale_of(residual), 1e-4)
     limits = {"dead_zone": (0.0, most), "play": (0.0, most), "low": (-most, most)}

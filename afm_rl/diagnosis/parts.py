@@ -33,6 +33,7 @@ SHORTEST = 40  # rows of a part
 PARTS = 6  # at most
 PLAUSIBLE = 4.0  # twice the logarithm of the likelihood that another explanation may lack
 DOUBTFUL = 6.0  # less for each number more
+UNCLEAR = 0.1  # share of the variance: a model that leaves more may mix several
 STEADY = 1.05  # times the squared residual of a sudden change: a drift explains it as well
 
 
@@ -80,7 +81,14 @@ def find_parts(log: Log, j: int, lead: Lead) -> list[Part]:
     than 5 % of the response; then each part in the same way. A change little by little is one
     part with a drift.
     """
-    return _divide(log, j, fit_part(log, j, 0, len(log.command), lead), PARTS)
+    parts = _divide(log, j, fit_part(log, j, 0, len(log.command), lead), PARTS)
+    for k in range(len(parts) - 1 if len(parts) > 2 else 0):  # borders, now that no part is mixed
+        left, right = parts[k : k + 2]
+        row = _exact_row(log, j, left, right, 0.5)
+        if abs(row - left.last) > 1:
+            parts[k] = fit_part(log, j, left.first, row)
+            parts[k + 1] = fit_part(log, j, row, right.last)
+    return parts
 
 
 def fit_part(log: Log, j: int, first: int, last: int, lead: Lead | None = None) -> Part:
@@ -114,10 +122,13 @@ def _divide(log: Log, j: int, whole: Part, most: int) -> list[Part]:
             break
         row = better
         left, right = fit_part(log, j, whole.first, row), fit_part(log, j, row, whole.last)
-    if not _apart(log, j, whole, steady, left, right):
+    apart = _apart(log, j, whole, steady, left, right)
+    if not apart and whole.model.cost < UNCLEAR:
         return [steady]
     first = _divide(log, j, left, most - 1)
-    return first + _divide(log, j, right, most - len(first))
+    found = first + _divide(log, j, right, most - len(first))
+    # What changes twice may show in the parts of a part only.
+    return found if apart or len(found) > 2 else [steady]
 
 
 def _likely_change(log: Log, j: int, part: Part) -> int | None:
@@ -153,7 +164,8 @@ def _likely_change(log: Log, j: int, part: Part) -> int | None:
     floor = FLOOR * len(y)
     gain = part.rows * np.log((_left_over(total[None])[0] + floor) / (left + floor))
     best = int(np.argmax(gain))
-    if gain[best] * part.weight < PENALTY + size:
+    weight = 1.0 if part.model.cost > UNCLEAR else part.weight
+    if gain[best] * weight < PENALTY + size:
         return None
     return part.first + int(places[good][best])
 
@@ -171,7 +183,7 @@ def _predictions(log: Log, j: int, *parts: Part) -> list[np.ndarray]:
     return [part.model.predict(problem_of(log, j, part.lead)) for part in parts]
 
 
-def _exact_row(log: Log, j: int, left: Part, right: Part) -> int:
+def _exact_row(log: Log, j: int, left: Part, right: Part, share: float = 0.05) -> int:
     """Return the row from which on the right explanation is better."""
     rows = slice(left.first, right.last)
     y = log.response[rows, j]
@@ -179,8 +191,11 @@ def _exact_row(log: Log, j: int, left: Part, right: Part) -> int:
     cut = 4 * min(np.median(m) for m in misses) / 0.6745 + 1e-9
     early, late = (np.minimum(m, cut) ** 2 for m in misses)
     total = np.concatenate([[0.0], np.cumsum(early - late)])
-    row = int(total[SHORTEST : len(total) - SHORTEST].argmin()) + SHORTEST
-    return left.first + row
+    # Close by: where one of both is a mixture itself, it may be worse wherever the other holds.
+    near = max(SHORTEST // 2, int(share * len(y)))
+    low = max(SHORTEST, left.rows - near)
+    high = min(len(y) - SHORTEST, left.rows + near) + 1
+    return left.first + low + int(total[low:high].argmin())
 
 
 def _apart(log: Log, j: int, whole: Part, steady: Part, left: Part, right: Part) -> bool:

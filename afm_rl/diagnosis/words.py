@@ -15,6 +15,8 @@ VAGUE = 0.25
 """Share of the usual gain: where the interval is wider to either side, nothing can be told."""
 LATE = 0.5
 """Steps: smaller delays and lags are no fault."""
+FOLLOWS = 0.2
+"""Share of the variance: a response of which less is unexplained does follow, however little."""
 SURE = 1.8
 """Times the 95 % interval: what a fault has to exceed, so that few are false (99.95 %)."""
 
@@ -45,7 +47,11 @@ def judge(
     status: Status
     if doubt:
         status, faults = "cannot tell", [f"cannot tell: {doubt}"]
-    elif max(-low, high) < DEAD * actuator.unit and actuator.driven_by is None:
+    elif (
+        max(-low, high) < DEAD * actuator.unit
+        and actuator.driven_by is None
+        and not (outside(widened((low, high))) and actuator.unexplained < FOLLOWS)
+    ):
         status, faults = "dead", ["does not answer its command"]
     elif not width < VAGUE * max(1.0, size) and not (faults and not low <= 0.0 <= high):
         status, faults = "cannot tell", [f"cannot tell: {_reason(actuator)}"]

@@ -87,6 +87,15 @@ def test_what_changes_on_the_way_is_found():
     assert wrist.status == "dead"
 
 
+def test_what_changes_and_comes_back_is_found():
+    log = log_of([Fault()] * 2, 600, "walk")
+    y = log.response.copy()
+    y[200:400, 0] *= -1
+    first, second = diagnose(replace(log, response=y)).actuators
+    assert [change.t for change in first.changes] == pytest.approx([200, 400], abs=2)
+    assert first.gain == pytest.approx(1, abs=0.03) and second.status == "healthy"
+
+
 def test_a_drift_is_no_sudden_change():
     (actuator,) = diagnose(log_of([Fault(drift=0.5)])).actuators
     assert not actuator.changes and actuator.status == "changed"
@@ -96,7 +105,7 @@ def test_a_drift_is_no_sudden_change():
 def test_the_log_cannot_tell():
     log = log_of([Fault()] * 4, 300)
     u, y = log.command.copy(), log.response.copy()
-    u[:, 0] = 0.4  # constant
+    u[:, 0] = 0.0  # constant
     u[:, 2] = -2 * u[:, 1]  # the same command twice
     y[:, 3] += 5 * np.random.default_rng(0).standard_normal(300)  # nothing but noise
     found = diagnose(replace(log, command=u, response=y)).actuators
