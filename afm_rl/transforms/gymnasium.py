@@ -81,7 +81,7 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         corrector: Corrector | None = None,
         enabled: bool = True,
     ) -> None:
-        given = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
+        given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
         RecordConstructorArgs.__init__(self, **given)
         gymnasium.Wrapper.__init__(self, env)
         inner: Any = env.unwrapped
@@ -141,7 +141,7 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         corrector: Corrector | None = None,
         enabled: bool = True,
     ) -> None:
-        given = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
+        given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
         RecordConstructorArgs.__init__(self, **given)
         VectorWrapper.__init__(self, env)
         spaces = env.single_observation_space, env.single_action_space
@@ -249,8 +249,8 @@ class CorrectionLoop:
             self.watching.learn(self.corrector)
             self.model, rows = self.watching.fitted or self.model, None
         fresh = begin(self.corrector, states, self.spec)
-        count, every = len(states), rows is None or self.entries is None
-        if every:
+        count = len(states)
+        if rows is None or self.entries is None:
             self.entries, self.states = fresh, states
             self.words, self.corrected = [AS_EXPECTED] * count, np.zeros(count, dtype=int)
         else:
@@ -368,7 +368,7 @@ def _simulation(source: Any) -> MuJoCoDynamics:
     """Return the MuJoCo model of an environment, or of the first of a vector of them."""
     try:
         inner: Any = source.unwrapped
-        if not isinstance(inner, VectorEnv):
+        if not isinstance(source, VectorEnv):
             return MuJoCoDynamics(inner)
         return MuJoCoDynamics(inner.get_attr("model")[0], inner.get_attr("frame_skip")[0])
     except (ConfigurationError, AttributeError) as error:
