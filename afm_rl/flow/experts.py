@@ -193,7 +193,8 @@ class Experts(NamedTuple):
     """Five least-squares fits of N sets of rows, and the rows themselves, axis by axis.
 
     Gains with short and with long memory; robust gain and offset; gain and friction; an affine
-    map; and, for what none of them expresses, a kernel average of the nearest pairs.
+    map, with one command only where that explains an axis (swapped cables); and, for what none of
+    them expresses, a kernel average of the nearest pairs.
 
     >>> u = torch.tensor([[[0.5], [-1.0]]])
     >>> experts = fit_experts(Rows(u, -2 * u, torch.zeros(1, 2, 1), torch.ones(1, 2, 1)))
