@@ -18,6 +18,7 @@ from afm_rl.flow.saturation import DEAD, MODES, attainable, cut_off
 from afm_rl.flow.solver import midpoint
 
 TOLERANCE = 0.25  # of the largest action: at an error of this size the loss is half its maximum
+EXCITED = 0.02  # standard deviation of actions that show whether an axis is dead
 LEAST_WIDTH = 0.02  # of the box: effects that a planner may still ask for
 
 
@@ -181,7 +182,8 @@ class Tick(nn.Module):
         line = known.experts.lines(box)
         plans = planned.unsqueeze(-2)
         if self.saturation != "clip":  # for an axis without influence nothing need be slower
-            dead = line.diff(dim=-2).abs() < DEAD * box.diff(dim=-2)
+            small = line.diff(dim=-2).abs() < DEAD * box.diff(dim=-2)
+            dead = small & (known.experts.excitation() > EXCITED)
             plans = torch.where(dead, line.mean(-2, keepdim=True), plans)
         velocity = partial(self.network.velocity, self.network.ask(known, plans, self.saturation))
         start = plans + self.source_std * self.source_points
