@@ -232,7 +232,9 @@ class ActionFlow(PairCorrector):
         drawn = self._draw(model, regime, states, count, generator)
         known = self.network.encode(drawn.rows, fit_experts(drawn.rows))
         box = torch.stack([self.lowest, self.highest]).expand(count, -1, -1)
-        found = [self.tick.propose(known, plan, box)[0] for plan in drawn.planned.unbind(1)]
+        sent = drawn.rows.executed
+        tried, plans = sent.amax(-2) - sent.amin(-2), drawn.planned.unbind(1)
+        found = [self.tick.propose(known, plan, box, tried)[0] for plan in plans]
         return float((torch.stack(found, 1) - drawn.intended).square().mean().sqrt())
 
     def _draw(self, model, regime, states, count, generator) -> Drawn:

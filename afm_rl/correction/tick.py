@@ -18,7 +18,7 @@ from afm_rl.flow.saturation import DEAD, MODES, attainable, cut_off
 from afm_rl.flow.solver import midpoint
 
 TOLERANCE = 0.25  # of the largest action: at an error of this size the loss is half its maximum
-EXCITED = 0.02  # standard deviation of actions that show whether an axis is dead
+EXCITED = 0.05  # range of the actions that show whether an axis is dead
 LEAST_WIDTH = 0.02  # of the box: effects that a planner may still ask for
 
 
@@ -117,8 +117,11 @@ class Tick(nn.Module):
         losses = self.judge(pairs, losses, forecasts, misaligned)
         belief = (losses + self.penalty).argmin(-1)
         encoded = self.encode(pairs, place)
-        action, effect, spread, bounds = self.propose(self.pick(encoded, belief), unit, ends)
-        bounds = self.hope(pairs, ends, bounds)
+        sent = pairs[..., : len(self.scale)]
+        tried = sent.amax(-2) - sent.amin(-2)
+        known = self.pick(encoded, belief)
+        action, effect, spread, bounds = self.propose(known, unit, ends, tried)
+        bounds = self.hope(tried, ends, bounds)
         sound = (action + effect).isfinite().all(-1)
         believed = sound & (belief < self.count)
         action = torch.where(believed.unsqueeze(-1), action, unit)
@@ -169,7 +172,7 @@ class Tick(nn.Module):
         return encoded.pick(first + belief.where(belief < self.count, 0))
 
     def propose(
-        self, known: Encoded, planned: Tensor, box: Tensor
+        self, known: Encoded, planned: Tensor, box: Tensor, tried: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return action, predicted effect and spread ``(B, A)``, and bounds ``(B, 2, A)``.
 
@@ -177,13 +180,15 @@ class Tick(nn.Module):
             known: what is read under the hypothesis that is believed.
             planned: u, ``(B, A)``.
             box: its lowest and highest, ``(B, 2, A)``.
+            tried: range of the remembered actions, ``(B, A)``.
         """
         # Where a line explains all rows, it is believed to go on where nothing was tried.
         line = known.experts.lines(box)
         plans = planned.unsqueeze(-2)
         if self.saturation != "clip":  # for an axis without influence nothing need be slower
             small = line.diff(dim=-2).abs() < DEAD * box.diff(dim=-2)
-            dead = small & (known.experts.excitation() > EXCITED)
+            # Of an action that never changed it is not known what another one would do.
+            dead = small & (tried > EXCITED).unsqueeze(-2)
             plans = torch.where(dead, line.mean(-2, keepdim=True), plans)
         velocity = partial(self.network.velocity, self.network.ask(known, plans, self.saturation))
         start = plans + self.source_std * self.source_points
@@ -205,7 +210,7 @@ class Tick(nn.Module):
         action, effect = chosen.tensor_split(2, -1)
         return action, effect, spread, torch.stack([low, high], -2)
 
-    def hope(self, pairs: Tensor, box: Tensor, bounds: Tensor) -> Tensor:
+    def hope(self, tried: Tensor, box: Tensor, bounds: Tensor) -> Tensor:
         """Return the bounds of effects ``(B, 2, A)`` that plans should keep.
 
         Smaller than the box only where most of it was tried of late: what was not tried may do
@@ -213,14 +218,13 @@ class Tick(nn.Module):
         slower instead, plans may ask for more.
 
         Args:
-            pairs: what is remembered, ``(B, M, D)``.
+            tried: range of the remembered actions, ``(B, A)``.
             box: lowest and highest action, ``(B, 2, A)``.
             bounds: lowest and highest effect that is predicted of them, ``(B, 2, A)``.
         """
-        tried = pairs[..., : len(self.scale)]
         (least, most), (low, high) = box.unbind(-2), bounds.unbind(-2)
         width = most - least
-        left = (1 - (tried.amax(-2) - tried.amin(-2)) / width).clamp_min(LEAST_WIDTH) * width
+        left = (1 - tried / width).clamp_min(LEAST_WIDTH) * width
         left = torch.where(cut_off((high - low) / width, self.saturation), left, width)
         low = torch.fmin(low, torch.fmax(low - left, least))
         high = torch.fmax(high, torch.fmin(high + left, most))

@@ -268,12 +268,6 @@ class Experts(NamedTuple):
         effect = self.gain[..., 2] * actions.mT.to(self.bias) + self.offset[..., 2]
         return torch.where(exact, effect, torch.nan).mT.to(actions)
 
-    def excitation(self) -> Tensor:
-        """Return the standard deviation of the executed actions ``(N, 1, A)``."""
-        share = self.trust.softmax(-1)
-        off = self.executed - (share * self.executed).sum(-1, keepdim=True)
-        return (share * off.square()).sum(-1).sqrt().mT
-
     def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
         """Return the log-weight of each row for ``unit`` ``(N, A, C, 1)``, ``(N, A, C, K)``."""
         return self.trust - ((among - unit) / NEAR).square()
