@@ -2,11 +2,11 @@
 
     python benchmarks/bench_actuators.py --episodes 3
 
-gymnasium's HalfCheetah-v5 and the linear policy of `examples/policies`, or one that
-`examples/policies/train_sac.py` stored (`--policy FILE`); the model is the very same simulation.
-From step 300 of 1000 on the actuators differ. Shown: the return of the last 500 steps, doubled.
-`alone` is the policy by itself, `ideal` the exact inverse from ten steps after the change.
-Finished episodes stand in a file and are not run again.
+gymnasium's HalfCheetah-v5 and a policy that `examples/policies/train_sac.py` trained; the model is
+the very same simulation, as it was before the change. From step 300 of 1000 on the actuators or the
+physics differ. Shown: the return of the last 500 steps, doubled, mean [worst, best] of episodes.
+`alone` is the policy by itself, `ideal` the exact inverse from ten steps after the change, where
+there is one. Finished episodes stand in a file and are not run again.
 """
 
 from __future__ import annotations
@@ -14,32 +14,54 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 from statistics import mean
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 import torch
-from safetensors.torch import load_file
 
 from afm_rl.correction import ActionFlow, LeastSquares
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.planning import load_policy
 
-POLICY = Path(__file__).parents[1] / "examples" / "policies" / "half_cheetah.safetensors"
+POLICY = Path(__file__).parents[1] / "examples" / "policies" / "half_cheetah_sac.safetensors"
 AT, LATE, STEPS = 300, 10, 1000
 LOW, HIGH = -torch.ones(6, dtype=torch.float64), torch.ones(6, dtype=torch.float64)
-ONES, ORDER = np.ones(6), np.arange(6)
-BACK, SWAPPED = ORDER == 0, np.array([3, 1, 2, 0, 4, 5])  # actuators 0 and 3 are the thighs
-CHANGES = {  # gain, offset, which command drives an actuator
-    "nothing": (ONES, 0.0, ORDER),
-    "back thigh reversed": (np.where(BACK, -1.0, 1.0), 0.0, ORDER),
-    "all reversed": (-ONES, 0.0, ORDER),
-    "all at half": (0.5 * ONES, 0.0, ORDER),
-    "all biased by .3": (ONES, 0.3, ORDER),
-    "thighs swapped": (ONES, 0.0, SWAPPED),
-    "back thigh dead": (np.where(BACK, 0.0, 1.0), 0.0, ORDER),
+PHYSICS = ("body_mass", "body_inertia", "geom_friction")
+
+
+class Change(NamedTuple):
+    """What is different from the change on."""
+
+    gain: Any = 1.0
+    offset: float = 0.0
+    order: tuple[int, ...] = (0, 1, 2, 3, 4, 5)  # which command drives an actuator
+    late: int = 0  # steps
+    physics: tuple[float, float, float] = (1.0, 1.0, 1.0)  # factors on mass, inertia, friction
+    gravity: float = 1.0  # factor
+
+
+def of_back_thigh(gain: float) -> np.ndarray:
+    """Return gains of which only the first one differs."""
+    return np.array([gain, 1, 1, 1, 1, 1])
+
+
+CHANGES = {
+    "nothing": Change(),
+    "back thigh reversed": Change(of_back_thigh(-1.0)),
+    "all reversed": Change(-1.0),
+    "all at half": Change(0.5),
+    "all biased by .3": Change(offset=0.3),
+    "thighs swapped": Change(order=(3, 1, 2, 0, 4, 5)),
+    "back thigh dead": Change(of_back_thigh(0.0)),
+    "late by 1 step": Change(late=1),
+    "late by 2 steps": Change(late=2),
+    "late by 4 steps": Change(late=4),
+    "mass times 1.5": Change(physics=(1.5, 1.5, 1.0)),
+    "friction times .5": Change(physics=(1.0, 1.0, 0.5)),
+    "gravity times 1.3": Change(gravity=1.3),
 }
 CORRECTORS = {
     "alone": None,
@@ -51,34 +73,37 @@ CORRECTORS = {
 }
 
 
-def linear(weights: dict[str, torch.Tensor]) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return the linear policy with these weights."""
-    weight, bias = weights["weight"].double(), weights["bias"].double()
-    return lambda observation: (weight @ observation + bias).clamp(-1, 1)
-
-
 class Bed:
     """The robot, its policy and its model."""
 
-    def __init__(self, policy: Path | None) -> None:
+    def __init__(self, policy: Path) -> None:
         self.env = gymnasium.make("HalfCheetah-v5")
         self.model = MuJoCoDynamics(self.env)
-        self.policy = load_policy(policy)[0] if policy else linear(load_file(POLICY))
+        self.policy = load_policy(policy)[0]
+        self.world = self.env.unwrapped.model
+        self.nominal = {name: getattr(self.world, name).copy() for name in PHYSICS}
+        self.gravity = self.world.opt.gravity.copy()
 
     def state(self) -> torch.Tensor:
         """Return the state, which the observation tells but for the distance."""
         data = self.env.unwrapped.data
         return torch.from_numpy(np.concatenate([data.qpos, data.qvel]))
 
+    def set_physics(self, change: Change) -> None:
+        """Change the robot, not its model."""
+        for name, factor in zip(PHYSICS, change.physics, strict=True):
+            getattr(self.world, name)[:] = factor * self.nominal[name]
+        self.world.opt.gravity[:] = change.gravity * self.gravity
+
     @torch.no_grad()
-    def episode(self, change: str, name: str, seed: int) -> float:
+    def episode(self, change: Change, name: str, seed: int) -> float:
         """Return twice the return of the second half of an episode."""
-        gain, offset, order = CHANGES[change]
-        inverse = np.empty(6)
+        order, inverse = list(change.order), np.empty(6)
         corrector = CORRECTORS[name] and CORRECTORS[name]()
+        self.set_physics(Change())
         observation, _ = self.env.reset(seed=seed)
         memory = corrector.begin(self.state()) if corrector else None
-        box, total = torch.stack([LOW, HIGH]), 0.0
+        box, total, sent = torch.stack([LOW, HIGH]), 0.0, []
         for step in range(STEPS):
             action = self.policy(torch.from_numpy(observation)).numpy()
             if corrector:
@@ -86,10 +111,13 @@ class Bed:
                 memory, found = corrector.correct(memory, planned, self.model, box)
                 action = found.executed.numpy()
             elif name == "ideal" and step >= AT + LATE:
-                inverse[order] = (action - offset) / np.where(gain == 0, 1.0, gain)
+                gain = np.where(np.equal(change.gain, 0), 1.0, change.gain)
+                inverse[order] = (action - change.offset) / gain
                 action = np.clip(inverse, -1, 1)
+            sent.append(action)
             if step >= AT:
-                action = np.clip(gain * action[order] + offset, -1, 1)
+                self.set_physics(change)
+                action = np.clip(change.gain * sent[-1 - change.late][order] + change.offset, -1, 1)
             observation, reward, *_ = self.env.step(action)
             if corrector:
                 memory = corrector.observe(memory, self.state())
@@ -100,7 +128,7 @@ class Bed:
 def main() -> None:
     """Print a table, and how long an episode took."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--policy", type=Path, help="stored policy; left out: the linear one")
+    parser.add_argument("--policy", type=Path, default=POLICY)
     parser.add_argument("--episodes", type=int, default=3)
     parser.add_argument("--correctors", nargs="+", choices=CORRECTORS, default=list(CORRECTORS))
     parser.add_argument("--changes", nargs="+", choices=CHANGES, default=list(CHANGES))
@@ -117,7 +145,7 @@ def main() -> None:
                 if (change, name, seed) in done:
                     continue
                 start = time.process_time()
-                done[change, name, seed] = bed.episode(change, name, seed)
+                done[change, name, seed] = bed.episode(CHANGES[change], name, seed)
                 spent = time.process_time() - start
                 with args.out.open("a") as file:
                     row = [change, name, seed, done[change, name, seed], round(spent, 1)]
@@ -125,7 +153,10 @@ def main() -> None:
         cells = {
             name: [done[change, name, k] for k in range(args.episodes)] for name in args.correctors
         }
-        shown = "  ".join(f"{name} {mean(values):.0f}" for name, values in cells.items())
+        shown = "  ".join(
+            f"{name} {mean(values):.0f} [{min(values):.0f}, {max(values):.0f}]"
+            for name, values in cells.items()
+        )
         print(f"{change}: {shown}", flush=True)
 
 

@@ -323,8 +323,8 @@ class CorrectionLoop:
         for row in misaligned.nonzero()[0]:
             if self.corrected[row] % DIAGNOSED_EVERY == 0:
                 size = self.corrector.action_size
-                pairs = parts["pairs"][row].split([size, size, size, 1, 1], -1)
-                executed, effective, std, valid, _ = (part.numpy() for part in pairs)
+                pairs = parts["pairs"][row, :, : 3 * size + 1].split([size, size, size, 1], -1)
+                executed, effective, std, valid = (part.numpy() for part in pairs)
                 use, step = valid[:, 0] == 1, getattr(self.model, "dt", 1.0)
                 found = explain(executed[use], effective[use], self.names, std[use], step)
                 self.words[row] = str(found)

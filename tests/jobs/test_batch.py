@@ -174,7 +174,7 @@ def test_a_batch_killed_twenty_times_gives_the_same_bytes(jobs, tmp_path):
             os.kill(victim, signal.SIGKILL)
         batch.join()
         kills += 1
-        latest = time.monotonic() + 20
+        latest = time.monotonic() + 120  # it may still be starting, on a slow machine
         while any(map(alive, orphans)):
             assert time.monotonic() < latest, "an orphan went on"
             time.sleep(0.02)

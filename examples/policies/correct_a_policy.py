@@ -1,0 +1,65 @@
+"""A policy that was trained on a healthy robot meets a reversed motor, with and without correction.
+
+    python examples/policies/correct_a_policy.py
+
+Stable-Baselines3, CleanRL, TorchRL: whatever acts, the wrapper stands between it and the robot.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import torch
+
+from afm_rl import ActionFlowWrapper
+from afm_rl.planning import load_policy
+
+REVERSED = np.array([-1, 1, 1, 1, 1, 1], dtype=np.float32)
+POLICY = Path(__file__).with_name("half_cheetah_sac.safetensors")
+
+
+class ReversedMotor(gymnasium.ActionWrapper):
+    """The motor of the back thigh is reversed from a step of the episode on."""
+
+    def __init__(self, env: gymnasium.Env, at: int) -> None:
+        super().__init__(env)
+        self.at, self.count = at, 0
+
+    def reset(self, **options):
+        self.count = 0
+        return super().reset(**options)
+
+    def action(self, action):
+        self.count += 1
+        return action * REVERSED if self.count > self.at else action
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--at", type=int, default=500, help="step at which the motor is reversed")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    policy, _ = load_policy(POLICY)
+    robot = ReversedMotor(gymnasium.make("HalfCheetah-v5"), args.at)
+    for name, env in {"alone": robot, "corrected": ActionFlowWrapper(robot)}.items():
+        (observation, _), info, rewards = env.reset(seed=0), {}, []
+        for _ in range(args.steps):
+            action = policy(torch.as_tensor(observation)).numpy()
+            observation, reward, _, _, info = env.step(action)
+            rewards.append(float(reward))
+        before, after = rewards[: args.at], rewards[args.at :]
+        print(f"{name}: a step {mean(before):.2f} before, {mean(after):.2f} after")
+        for line in str(info.get("afm", {}).get("diagnosis", "")).splitlines():
+            print(f"    {line}")
+
+
+def mean(values: list[float]) -> float:
+    return sum(values) / max(len(values), 1)
+
+
+if __name__ == "__main__":
+    main()
