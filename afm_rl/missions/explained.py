@@ -14,7 +14,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.missions.robot import Robot
 
 UNSEEN = 1.0  # half ranges: effective actions with a larger standard deviation are left out
-LONGEST, LONGEST_STIFF = 3000, 400  # steps that are looked at: a simulator takes its time
+LONGEST, LONGEST_STIFF = 3000, 400  # newest steps, which are looked at: a simulator takes its time
 
 
 @torch.no_grad()
@@ -74,7 +74,7 @@ def explain_mission(robot: Robot, steps: pd.DataFrame) -> tuple[Diagnosis, Log]:
     Raises:
         ConfigurationError: if there are too few steps, or none shows what an action did.
     """
-    steps = steps[: LONGEST_STIFF if robot.model.stiff else LONGEST]
+    steps = steps[-(LONGEST_STIFF if robot.model.stiff else LONGEST) :]
     columns = [list(robot.state_names), [f"executed_{name}" for name in robot.action_names]]
     states, actions = (steps[names].to_numpy(dtype=float) for names in columns)
     finite = np.isfinite(states).all(1) & np.isfinite(actions).all(1)
