@@ -164,6 +164,7 @@ class ActionFlow(PairCorrector):
             innovation = self.watch(parts, model)
             surprised = innovation > self.gate
             found = self.unchanged(planned, innovation, box)
+            parts["acting"] = planned
             if bool(surprised.any()):
                 use = rows_of(surprised)
                 asked = {name: part[use] for name, part in parts.items()}
@@ -172,9 +173,9 @@ class ActionFlow(PairCorrector):
                 def put(now: Any, *names: str) -> dict[str, Tensor]:
                     return {name: _put(now[name], use, getattr(answer, name)) for name in names}
 
-                parts |= put(parts, "losses", "forecasts")
+                parts |= put(parts, "losses", "forecasts", "acting")
                 found = found._replace(**put(found._asdict(), *CORRECTED))
-            parts |= {"planned": planned, "executed": found.executed, "predicted": found.predicted}
+            parts |= {"planned": planned, "executed": found.executed}
             parts["misaligned"] = surprised.unsqueeze(-1).to(planned.dtype)
             return self.pack(parts), found
 

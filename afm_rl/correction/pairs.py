@@ -49,7 +49,7 @@ class PairCorrector(Corrector):
         return {
             **super().shapes(state_size),
             "pairs": (self.memory, self.pair_size),
-            "predicted": (self.action_size,),
+            "acting": (self.action_size,),
             "misaligned": (1,),
         }
 
@@ -68,10 +68,10 @@ class PairCorrector(Corrector):
         state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
         unit = self.normalise(executed)
         awake = bool(parts["misaligned"].any())
-        # The newest action was predicted to have an effect; older ones were asked about before.
+        # What acted last was predicted to have an effect; older ones were asked about before.
         before = parts["pairs"][..., self.memory - count + 1 :, self.action_size :]
         guess = self.denormalise(before[..., : self.action_size])
-        guess = torch.cat([guess, parts["predicted"].unsqueeze(-2)], -2)
+        guess = torch.cat([guess, parts["acting"].unsqueeze(-2)], -2)
         quiet = 0.0 if awake else self.gate
         seen = effective_action(
             model, state, executed, reached, self.scale, quiet=quiet, guess=guess
@@ -128,7 +128,7 @@ class ClassicalCorrector(PairCorrector):
             action, effect = self.answer(self.rows(parts["pairs"][use]), unit)
             executed[use], predicted[use] = self.denormalise(action), self.denormalise(effect)
             found = found._replace(executed=executed, predicted=predicted, misaligned=misaligned)
-        parts |= {"planned": planned, "executed": found.executed, "predicted": found.predicted}
+        parts |= {"planned": planned, "executed": found.executed, "acting": found.predicted}
         parts["misaligned"] = misaligned.unsqueeze(-1).to(planned.dtype)
         return self.pack(parts), found
 

@@ -29,6 +29,8 @@ class Answer(NamedTuple):
     """Of the hypotheses, ``(B, H + 1)``."""
     forecasts: Tensor
     """Effects predicted of what acts now, shares of the largest action, ``(B, H + 1, A)``."""
+    acting: Tensor
+    """The one that is believed, in units of the action, ``(B, A)``."""
     executed: Tensor
     """The action, in its own units, ``(B, A)``."""
     predicted: Tensor
@@ -126,6 +128,7 @@ class Tick(nn.Module):
         believed = sound & (belief < self.count)
         action = torch.where(believed.unsqueeze(-1), action, unit)
         forecasts = self.predict(encoded, pairs, action)
+        acting = forecasts[torch.arange(len(belief), device=belief.device), belief] * self.scale
         found = torch.stack([action, effect], -2) * self.scale
         found = torch.where(believed[:, None, None], found, planned.unsqueeze(-2))
         bounds = torch.where(believed[:, None, None], bounds * self.scale, box)
@@ -133,6 +136,7 @@ class Tick(nn.Module):
         return Answer(
             losses,
             forecasts,
+            acting,
             executed,
             effect,
             spread * self.scale,
