@@ -37,6 +37,7 @@ class Task:
         plan: the reward to plan with; that of the task if None.
         ends: ``ends(next_state) -> bool``, where episodes end early; nowhere if None.
         features: state coordinates that the dynamics depend on; all if none.
+        observe: what a policy sees of states ``(*B, S)``, ``(*B, O)``; the states if None.
         draw: draws states ``(T, S)`` and a goal as pictures; None if nothing can.
 
     Raises:
@@ -57,6 +58,7 @@ class Task:
     plan: Reward | None = None
     ends: Callable[[Tensor], Tensor] | None = None
     features: Sequence[int] = ()
+    observe: Callable[[Tensor], Tensor] | None = None
     draw: Callable[..., Any] | None = None
 
     def __post_init__(self) -> None:

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -87,13 +88,15 @@ def gymnasium_task(
             **known,
             dt=0.05,
             steps=steps,
+            observe=pendulum_observation,
         )
 
     def start(seed: int) -> tuple[Tensor, Tensor]:
         env.reset(seed=seed)
         return _state_of(inner.data), NOWHERE
 
-    return _mujoco(id, MuJoCoDynamics(env), start, known, steps, *limits)
+    seen = {"observe": partial(_observation_of, inner)}
+    return _mujoco(id, MuJoCoDynamics(env), start, {**known, **seen}, steps, *limits)
 
 
 def dm_control_task(
@@ -117,8 +120,6 @@ def dm_control_task(
     Raises:
         ConfigurationError: if there is no dm_control, no such task, or nothing is known of it.
     """
-    import numpy as np
-
     draws = np.random.RandomState()
     with _quiet():
         try:
@@ -259,6 +260,16 @@ def pendulum_step(state: Tensor, action: Tensor) -> Tensor:
     return torch.stack([angle + 0.05 * speed, speed], -1)
 
 
+def pendulum_observation(state: Tensor) -> Tensor:
+    """Return what gymnasium's Pendulum-v1 shows: cosine and sine of the angle, and the speed.
+
+    >>> pendulum_observation(torch.tensor([0.0, 3.0]))
+    tensor([1., 0., 3.])
+    """
+    angle, speed = state.unbind(-1)
+    return torch.stack([angle.cos(), angle.sin(), speed], -1)
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Silence what packages say of missing screens, and of old settings in their own files."""
@@ -330,3 +341,19 @@ def _mujoco(
 def _state_of(data: Any) -> Tensor:
     """Return (qpos, qvel, act) of MuJoCo's data."""
     return torch.cat([torch.tensor(part) for part in (data.qpos, data.qvel, data.act)])
+
+
+def _observation_of(env: Any, state: Tensor) -> Tensor:
+    """Return what gymnasium's environment of a MuJoCo task shows in states, ``(*B, O)``.
+
+    Places of bodies, as of the finger in Reacher-v5, are those of the state; gymnasium's own are
+    a simulation step old. Forces, as in Ant-v5, are those of the environment's own last step.
+    """
+    rows = state.reshape(-1, state.shape[-1]).double().numpy()
+    shown, ends = [], (env.model.nq, env.model.nq + env.model.nv)
+    for row in rows:
+        position, velocity, activation = np.split(row, ends)
+        env.data.act[:] = activation
+        env.set_state(position, velocity)
+        shown.append(env._get_obs())
+    return torch.from_numpy(np.stack(shown)).to(state).reshape(*state.shape[:-1], -1)

@@ -34,9 +34,12 @@ SMALL = {  # settings that are there are made small
     "dynamics.base.pretrain.epochs": 1,
     "corrector.width": 8,
     "corrector.train.iterations": 5,
+    "robot.data.rounds": [64, 64],
+    "robot.data.fit.epochs": 1,
     "budget": 5,
 }
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+POLICY = Path(__file__).parents[1] / "examples" / "policies" / "pendulum_sac.safetensors"
 OWN = [f"robot.xml={ASSETS / 'inverted_pendulum.xml'}"]
 OWN += ["robot.reward=afm_rl.envs.task_rewards.upright"]
 PARTNERS = {  # what else must be chosen for a choice to make sense
@@ -54,6 +57,7 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "updater=knode": ["dynamics=knode", "robot=quadrotor"],
     "updater=mass": ["dynamics=oracle", "robot=quadrotor"],
     "planner=mpc": ["robot=quadrotor"],
+    "planner=policy": ["robot=gymnasium", f"planner.file={POLICY}"],
     "planner=geometric": ["robot=quadrotor"],
     "method=geometric": ["robot=quadrotor"],
     "method=mass_estimator": ["robot=quadrotor"],

@@ -51,8 +51,9 @@ def commands():
 
 @pytest.fixture
 def desk(monkeypatch, tmp_path):
-    """Work in an empty folder, from which modules are imported."""
+    """Work in a folder with the examples alone, from which modules are imported."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.syspath_prepend(str(tmp_path))
     yield tmp_path
     sys.modules.pop("mine", None)

@@ -55,10 +55,20 @@ class Oracle(DynamicsModel):
 
     def effective(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the effective action under the present regime."""
+        return self.regime.apply(action, self._regime_for(action), state)
+
+    def command(self, state: Tensor, effect: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        """Return the actions in a box ``(A,)`` whose effect is nearest to ``effect`` ``(*B, A)``.
+
+        See :meth:`~afm_rl.regimes.Regime.inverse`; a delay or a lag cannot be undone.
+        """
+        return self.regime.inverse(effect, self._regime_for(effect), state, low, high)
+
+    def _regime_for(self, action: Tensor) -> Tensor:
+        """Return the parameters of the present regime, for actions ``(*L, ..., A)``."""
         now = self.parameters_now
         extra = action.dim() - now.dim()
-        now = now.reshape(*now.shape[:-1], *(1,) * extra, now.shape[-1])
-        return self.regime.apply(action, now, state)
+        return now.reshape(*now.shape[:-1], *(1,) * extra, now.shape[-1])
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         return self.model(state, self.effective(state, action))

@@ -127,7 +127,10 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     # Without a transform the planner does not know which effects are achievable.
     no_box = transform is None and "box_key" in settings["planner"]
     changed = {"box_key": None} if no_box else {}
-    planner = make("planner", PlanningEnv(model, cost, *robot.action_box), **changed)
+    world = PlanningEnv(model, cost, *robot.action_box, observe=robot.observe)
+    planner = make("planner", world, **changed)
+    if hasattr(planner, "signature"):  # a file: its name does not tell what it holds
+        trainings = [t._replace(settings=[*t.settings, planner.signature]) for t in trainings]
     guard = Guard()
     executed_key = ("next", guard.key("executed_action"))
     loss = GaussianNLLLoss(model)

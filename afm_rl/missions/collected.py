@@ -90,5 +90,5 @@ def fit_collected(model: Ensemble, robot: Robot, how: Collection, progress: bool
         model.load_state_dict(first)
         settings = {"seed": how.seed, **how.fit, "progress": progress}
         error = fit_ensemble(model, torch.cat(parts), names=robot.state_names, **settings).error
-        planner = how.planner(PlanningEnv(model, cost, *robot.action_box))
+        planner = how.planner(PlanningEnv(model, cost, *robot.action_box, observe=robot.observe))
     return error

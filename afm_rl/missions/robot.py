@@ -60,6 +60,7 @@ class Robot:
         reward: the reward of its task, ``reward(state, action, next_state, *task)``, if it has one
             to plan with; see :class:`~afm_rl.planning.KnownReward`.
         reward_reads: entries of the environment that it reads after the states, with their sizes.
+        observe: what a policy sees of states ``(*B, S)``, ``(*B, O)``; the states if None.
         dt: time of an action (s), for correctors that are not told.
         data: how transitions are collected from which models are learned; None where these are
             drawn from the nominal physics, in the boxes above.
@@ -89,6 +90,7 @@ class Robot:
     place_scale: float = 1.0
     reward: Callable[..., Tensor] | None = None
     reward_reads: Mapping[str, int] = field(default_factory=dict)
+    observe: Callable[[Tensor], Tensor] | None = None
     dt: float | None = None
     data: Collection | None = None
 

@@ -84,6 +84,7 @@ class TaskRobot(Robot):
             score=ReturnScore(task.steps, task.goal_names),
             dt=task.dt,
             data=data,
+            observe=task.observe,
             reward=task.planned,
             reward_reads={"goal": len(task.goal_names)} if task.goal_names else {},
         )

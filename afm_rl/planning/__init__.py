@@ -7,7 +7,7 @@ from afm_rl.planning.mpc import MPC
 from afm_rl.planning.mppi import MPPI
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.shooting import CEM, TorchRLMPPI
-from afm_rl.planning.stored_policy import StoredPolicy, load_policy, save_policy
+from afm_rl.planning.stored_policy import PolicyPlanner, StoredPolicy, load_policy, save_policy
 from afm_rl.planning.tracking import QuadraticCost, TrackingCost
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "GoalDistance",
     "KnownReward",
     "PlanningEnv",
+    "PolicyPlanner",
     "QuadraticCost",
     "StoredPolicy",
     "TorchRLMPPI",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -29,6 +29,7 @@ class PlanningEnv(ModelBasedEnvBase):
         action_high: highest action, ``(A,)``.
         observation_key: where the state is.
         action_key: where the action is.
+        observe: what a policy sees of states ``(*B, S)``, ``(*B, O)``; the states if None.
 
     >>> from afm_rl.dynamics import Dubins
     >>> from afm_rl.planning import GoalDistance
@@ -46,12 +47,14 @@ class PlanningEnv(ModelBasedEnvBase):
         action_high: Sequence[float] | Tensor,
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
+        observe: Callable[[Tensor], Tensor] | None = None,
     ) -> None:
         check_instance("planner.env: dynamics", dynamics, DynamicsModel)
         check_instance("planner.env: cost", cost, Cost)
         super().__init__(dynamics, batch_size=torch.Size([]))
         self.dynamics = dynamics
         self.cost = cost
+        self.observe = observe
         self.observation_key = as_key(observation_key)
         low, high = (1.0 * torch.as_tensor(bound) for bound in (action_low, action_high))
         fits = low.shape == high.shape == (dynamics.action_size,)

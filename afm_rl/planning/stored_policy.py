@@ -6,10 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, exploration_type
 
-from afm_rl.artefacts import read_tensors, save_tensors
-from afm_rl.errors import ArtefactError
+from afm_rl.artefacts import digest_of, read_tensors, save_tensors
+from afm_rl.dynamics import Oracle
+from afm_rl.errors import ArtefactError, ConfigurationError, check_number
+from afm_rl.planning.planning_env import PlanningEnv
 
 
 class StoredPolicy(nn.Module):
@@ -86,3 +92,65 @@ def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
     count = range(description["layers"])
     layers = [(tensors[f"{index}.weight"], tensors[f"{index}.bias"]) for index in count]
     return StoredPolicy(layers, tensors["low"], tensors["high"]), description
+
+
+class PolicyPlanner(TensorDictModuleBase):
+    """A stored policy in the place of a planner: it acts on what it sees, and plans nothing.
+
+    In an :class:`~afm_rl.dynamics.Oracle` it sends the actions whose effects, under the regime
+    that the oracle is told, are nearest to the policy's: the yardstick for corrections.
+
+    Args:
+        env: the planning environment: where state and action are, the action's box, and what a
+            policy sees of a state.
+        file: written by :func:`save_policy`.
+        noise: standard deviation of normal noise on the actions, in half ranges, while TorchRL
+            explores, as its collectors do: without it a model cannot learn from the policy's data
+            what other actions would have done.
+
+    Raises:
+        ConfigurationError: if there is no such file, or the policy's sizes do not fit.
+        ArtefactError: if the file is damaged, or holds something else.
+    """
+
+    def __init__(self, env: PlanningEnv, file: str | Path | None, noise: float = 0.1) -> None:
+        super().__init__()
+        if not isinstance(file, str | Path):
+            raise ConfigurationError(
+                f"planner.file={file!r}: expected a file that save_policy wrote"
+            )
+        try:
+            self.policy, _ = load_policy(Path(file).expanduser())
+        except (ConfigurationError, ArtefactError) as error:
+            raise type(error)(f"planner.file: {error}") from error
+        self.env, self.noise = env, check_number("planner.noise", noise, low=0.0)
+        self.action_key = env.action_keys[0]
+        self.action_spec = env.full_action_spec[self.action_key]
+        self.in_keys, self.out_keys = [env.observation_key], [self.action_key]
+        box = self.action_spec.space
+        state = torch.zeros(1, env.dynamics.state_size, dtype=box.low.dtype)
+        wanted = self._seen(state).shape[-1], env.dynamics.action_size
+        sizes = self.policy.observation_size, len(self.policy.low)
+        if sizes != wanted:
+            raise ConfigurationError(
+                f"planner.file={file}: a policy of {sizes[0]} observations and {sizes[1]} actions; "
+                f"the robot has {wanted[0]} and {wanted[1]}"
+            )
+
+    @property
+    def signature(self) -> dict[str, str]:
+        """What tells this policy from others."""
+        return {"policy": digest_of(self.policy.state_dict())}
+
+    def _seen(self, state: Tensor) -> Tensor:
+        return state if self.env.observe is None else self.env.observe(state)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        state, box = tensordict.get(self.env.observation_key), self.action_spec.space
+        action = self.policy(self._seen(state))
+        if exploration_type() == ExplorationType.RANDOM:
+            action = action + 0.5 * self.noise * (box.high - box.low) * torch.randn_like(action)
+        if isinstance(self.env.dynamics, Oracle):
+            action = self.env.dynamics.command(state, action, box.low, box.high)
+        return tensordict.set(self.action_key, self.action_spec.project(action))
