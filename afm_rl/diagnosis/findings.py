@@ -28,6 +28,8 @@ class Actuator:
     """g, response per command; that of ``driven_by`` where the own command has no influence."""
     gain_interval: Interval = (-math.inf, math.inf)
     """95 % interval."""
+    gain_down: float | None = None
+    """Response per negative command, where ``gain`` is that of positive ones alone."""
     reversed: bool = False
     offset: float = math.nan
     """b, in units of the response."""
@@ -46,6 +48,10 @@ class Actuator:
     """Another actuator whose command has an influence, alone (swapped) or beside the own one."""
     coupling: Mapping[str, float] = field(default_factory=dict)
     """Response per command of other actuators."""
+    quantum: float = 0.0
+    """Size of the steps in which the response moves, in its units; 0: none were seen."""
+    lost: float = 0.0
+    """Share of the rows in which the response does not follow, now and then: they are left out."""
     noise: float = math.nan
     """Standard deviation of what the fit leaves, in units of the response."""
     unexplained: float = math.nan

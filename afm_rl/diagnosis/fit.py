@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from afm_rl.diagnosis.intervals import half_widths, independence
+from afm_rl.diagnosis.intervals import CHOSEN, half_widths, independence
 from afm_rl.diagnosis.log import Clock
-from afm_rl.diagnosis.response import Shape, look_back, respond
+from afm_rl.diagnosis.response import Shape, lagging, respond, shaped
 
 PENALTY = 10.0  # per number: twice the logarithm of the likelihood that it has to win
 VISIBLE = 0.02  # standard deviations of the response: what changes it less is left out
@@ -23,6 +23,7 @@ CURVED = ("dead_zone", "low", "high", "play")
 LEAST_WEIGHT = 0.05  # independent rows that a row counts as
 CLEAR = 4.5  # standard errors by which another command has to show
 COUPLED = 0.05  # share of the driver's influence
+DOWN = -1  # among the others: the driver's own command where it is negative
 
 
 @dataclass(frozen=True)
@@ -66,25 +67,21 @@ class Model:
 
     def parts(self, problem: Problem) -> list[np.ndarray]:
         """Return the responses at gain 1 to the driver and to the others, ``(N,)`` each."""
-        linear = Shape(self.shape.delay, self.shape.keep)
-        rest = [respond(problem.clock, problem.u[:, i], linear) for i in self.others]
-        own = problem.u[:, self.driver]
-        return [respond_to(problem.clock, own, self.shape, self.jump), *rest]
+        linear, clock = Shape(self.shape.delay, self.shape.keep), problem.clock
+        own = shaped(clock, problem.u[:, self.driver], self.shape, self.jump)
+        others = (
+            lagging(clock, np.minimum(own, 0.0), self.shape.keep)
+            if i == DOWN
+            else respond(clock, problem.u[:, i], linear)
+            for i in self.others
+        )
+        return [lagging(clock, own, self.shape.keep), *others]
 
     def predict(self, problem: Problem) -> np.ndarray:
         """Return the response ``(N,)``."""
         parts = self.parts(problem)
         gains = (self.gain, *self.gains)
         return self.offset + np.sum([g * x for g, x in zip(gains, parts, strict=True)], 0)
-
-
-def respond_to(clock: Clock, command: np.ndarray, shape: Shape, jump: bool) -> np.ndarray:
-    """Return the response at gain 1, also where the dead zone ends with a jump."""
-    if not jump:
-        return respond(clock, command, shape)
-    command = look_back(clock, command, shape.delay)
-    command = np.where(np.abs(command) > shape.dead_zone, command, 0.0)
-    return respond(clock, command, shape._replace(delay=0.0, dead_zone=0.0))
 
 
 def fit_response(problem: Problem, driver: int, starts: Sequence[Shape]) -> Model:
@@ -180,6 +177,9 @@ def larger(problem: Problem, model: Model) -> Iterator[Model]:
     for name, options in shapes.items():
         trial = replace(model, active=(*model.active, *name.split()))
         found.append(min((_lines(problem, replace(trial, shape=s)) for s in options), key=_cost))
+    if low < 0 < high and DOWN not in model.others:
+        sides = replace(model, others=(*model.others, DOWN), gains=(*model.gains, 0.0))
+        found.append(_lines(problem, sides))
     if "dead_zone" in tries:
         sizes = np.quantile(np.abs(own), np.linspace(0.03, 0.8, 16))
         options = [model.shape._replace(dead_zone=float(z)) for z in sizes]
@@ -394,4 +394,4 @@ def interval_widths(problem: Problem, model: Model) -> np.ndarray:
     inverse = (vectors / values) @ vectors.T / size
     freedom = math.sqrt(len(residual) / max(len(residual) - len(size), 1))
     widths = half_widths((columns / size * pull[:, None]) @ inverse) * freedom
-    return widths[:count]
+    return CHOSEN * widths[:count]

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 ORDER = 12  # of the autoregression, at most
+CHOSEN = 1.25  # times the usual interval, where the same rows chose the model
 LEAST = 0.03  # of one minus the sum of its coefficients
 
 

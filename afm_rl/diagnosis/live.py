@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from afm_rl.diagnosis.findings import Actuator, Diagnosis
+from afm_rl.diagnosis.intervals import CHOSEN
 from afm_rl.diagnosis.words import MATTERS, judge
 from afm_rl.errors import ConfigurationError
 
@@ -123,7 +124,7 @@ def _fit(
     inflation = (1 + min(alike, 0.9)) / (1 - min(alike, 0.9))
     scale = (weight * residual**2).sum() / freedom * inflation
     times = stdtrit(max(freedom / inflation, 2.0), 0.975)
-    width = times * np.sqrt(scale * covariance.diagonal())
+    width = CHOSEN * times * np.sqrt(scale * covariance.diagonal())
     least, most = float(x[:, driver].min()), float(x[:, driver].max())
     if not most > least:
         width = np.full_like(width, np.inf)

@@ -22,7 +22,7 @@ from afm_rl.diagnosis.fit import (
     weight_of,
 )
 from afm_rl.diagnosis.intervals import half_widths, independence
-from afm_rl.diagnosis.log import Log, clocks_of
+from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.response import Shape, lagging, look_back
 from afm_rl.diagnosis.search import Lead, find_leads
 from afm_rl.diagnosis.words import MATTERS, SURE
@@ -65,8 +65,7 @@ class Part:
 
 def problem_of(log: Log, j: int, lead: Lead) -> Problem:
     """Return the problem of one response; rows at the begin of an episode do not count."""
-    clocks = clocks_of(log)
-    clock = clocks[min(lead.clock, len(clocks) - 1)]
+    clock = lead.clock_of(log)
     warm = lead.delay + 1
     if lead.keep:
         warm += min(3 / -math.log(lead.keep), 0.05 * len(log.command))
@@ -139,13 +138,15 @@ def _likely_change(log: Log, j: int, part: Part) -> int | None:
     slow = lagging(problem.clock, u, shape.keep) if shape.keep else u
     late = [look_back(problem.clock, slow, shape.delay)[rows]]
     own = part.model.driver
+    if part.model.cost > UNCLEAR:  # a delay that is that of no part
+        late.append(u[rows, own, None])
     for more in (1, 3, 8) if part.rows > 400 else ():
         late.append(look_back(problem.clock, slow[:, own], shape.delay + more)[rows, None])
     late.append(part.model.parts(problem)[0][rows, None])
     if part.rows > 200 + 40 * u.shape[1]:
         design = np.column_stack(late)
     else:
-        design = np.column_stack(late[1:])
+        design = np.column_stack(late[1:])  # without other commands
     y = problem.y[rows]
     table = np.column_stack([design, np.ones(len(y)), y])
     size = table.shape[1]

@@ -39,15 +39,22 @@ def respond(clock: Clock, command: np.ndarray, shape: Shape) -> np.ndarray:
     >>> respond(clock, np.array([0.0, 1.0, 0.2, 0.2]), Shape(delay=1.0, dead_zone=0.5))
     array([0. , 0. , 0.5, 0. ])
     """
+    return lagging(clock, shaped(clock, command, shape), shape.keep)
+
+
+def shaped(clock: Clock, command: np.ndarray, shape: Shape, jump: bool = False) -> np.ndarray:
+    """Return the response ``(N,)`` before the lag; with a jump commands beyond z act in full."""
     if shape.delay:
         command = look_back(clock, command, shape.delay)
+    if jump:
+        command = np.where(np.abs(command) > shape.dead_zone, command, 0.0)
     if shape.play:
         command = follow_with_play(command, shape.play, clock.start)
     if shape.low > -np.inf or shape.high < np.inf:
         command = np.clip(command, shape.low, shape.high)
-    if shape.dead_zone:
+    if shape.dead_zone and not jump:
         command = command - np.clip(command, -shape.dead_zone, shape.dead_zone)
-    return lagging(clock, command, shape.keep) if shape.keep else command
+    return command
 
 
 def look_back(clock: Clock, values: np.ndarray, delay: float) -> np.ndarray:
@@ -65,6 +72,8 @@ def look_back(clock: Clock, values: np.ndarray, delay: float) -> np.ndarray:
 
 def lagging(clock: Clock, values: np.ndarray, keep: float) -> np.ndarray:
     """Return values ``(N, ...)`` behind a lag of first order, at rest where an episode begins."""
+    if not keep:
+        return values
     kept = np.full(len(values), keep)
     if not clock.even:
         kept[1:] = keep ** np.diff(clock.time)

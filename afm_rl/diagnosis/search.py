@@ -34,6 +34,11 @@ class Lead(NamedTuple):
     left: float
     """Share of the variance that the driver leaves."""
 
+    def clock_of(self, log: Log) -> Clock:
+        """Return the clock of a log, of which a part may have fewer."""
+        clocks = clocks_of(log)
+        return clocks[min(self.clock, len(clocks) - 1)]
+
 
 def find_leads(log: Log, actuators: Sequence[int]) -> list[Lead]:
     """Return where to begin with each of some actuators."""

@@ -9,16 +9,16 @@ from dataclasses import replace
 import numpy as np
 
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
+from afm_rl.diagnosis.fit import DOWN
 from afm_rl.diagnosis.log import Log
+from afm_rl.diagnosis.lost import without_lost
 from afm_rl.diagnosis.parts import SEARCHED, Part, find_parts, predict, settle
 from afm_rl.diagnosis.search import find_leads
-from afm_rl.diagnosis.words import judge
+from afm_rl.diagnosis.words import UNITS, judge
 
-UNITS = {"degrees": math.pi / 180, "radians": 180 / math.pi, "m": 1000.0, "mm": 0.001}
-UNITS |= {"rpm": math.pi / 30, "rad/s": 30 / math.pi}
-"""Gain of a healthy actuator whose command is in this unit, and its response in the other one."""
 ALIKE = 0.1  # deviation of the median gain of all actuators from such a gain
-NEAR = 0.05  # of a single actuator's
+FEW = 0.1  # share of the rows: a response with more values moves freely
+EXACT = 0.01  # of a step, by which steps may differ
 COPY = 0.999  # correlation of two commands that cannot be told apart
 
 
@@ -43,6 +43,10 @@ def diagnose(log: Log) -> Diagnosis:
     )
     scaled = replace(log, command=log.command / reach, response=log.response / spread)
     leads = find_leads(scaled.thinned(SEARCHED), range(len(log.names)))
+    lost = [0.0] * len(leads)
+    for j, lead in enumerate(leads):
+        scaled, lost[j] = without_lost(scaled, j, lead)
+    quanta = [_quantum(response) for response in log.response.T]
     parts = [find_parts(scaled, j, lead) for j, lead in enumerate(leads)]
     fitted = np.empty_like(scaled.response)
     found: list[list[Actuator]] = []
@@ -51,11 +55,14 @@ def diagnose(log: Log) -> Diagnosis:
         for part in own:
             rows = slice(part.first, part.last)
             fitted[rows, j] = predict(scaled, j, part)[rows]
-    units, since = _units([own[-1] for own in found]), log.since
+    unit, since = _unit([own[-1] for own in found]), log.since
     actuators = []
-    for j, (numbers, unit) in enumerate(zip(found, units, strict=True)):
+    for j, numbers in enumerate(found):
         how = (log.step, log.usual_delay, _doubt(scaled, j, moved))
-        said = [judge(replace(actuator, unit=unit), *how) for actuator in numbers]
+        whole = [
+            replace(actuator, unit=unit, lost=lost[j], quantum=quanta[j]) for actuator in numbers
+        ]
+        said = [judge(actuator, *how) for actuator in whole]
         changes = tuple(
             Change(t=float(since[part.first]), before=before, after=after)
             for part, before, after in zip(parts[j][1:], said[:-1], said[1:], strict=True)
@@ -85,6 +92,17 @@ def _spread(response: np.ndarray) -> np.ndarray:
     return np.where(spread > 1e-12 * (1e-300 + np.abs(response).max(0)), spread, 1.0)
 
 
+def _quantum(response: np.ndarray) -> float:
+    """Return the size of the steps of a response, 0 if it moves freely."""
+    values = np.unique(response)
+    steps = np.diff(values)
+    if not 3 <= len(values) < FEW * len(response) or not steps.min() > 1e-6 * np.ptp(values):
+        return 0.0
+    size = float(np.median(steps))
+    whole = steps / size
+    return size if np.abs(whole - whole.round()).max() < EXACT else 0.0
+
+
 def _doubt(log: Log, j: int, moved: np.ndarray) -> str:
     """Return why nothing can be told of an actuator, if so."""
     if not moved[j]:
@@ -96,18 +114,14 @@ def _doubt(log: Log, j: int, moved: np.ndarray) -> str:
     return f"its command is that of {copies[0]}, up to a factor" if copies else ""
 
 
-def _units(actuators: Sequence[Actuator]) -> list[float]:
-    """Return the gain of each actuator if it were healthy: 1, or that of two known units."""
+def _unit(actuators: Sequence[Actuator]) -> float:
+    """Return the gain of healthy actuators: 1, or that of two known units if most have it."""
     gains = np.array([abs(a.gain) for a in actuators])
     clear = [a.gain_interval[0] * a.gain_interval[1] > 0 and abs(a.gain) > 1e-4 for a in actuators]
-    common, units = 1.0, []
-    if any(clear):
-        middle = float(np.median(gains[clear]))
-        common = next((u for u in UNITS.values() if abs(middle / u - 1) < ALIKE), 1.0)
-    for gain, sure in zip(gains, clear, strict=True):
-        near = (u for u in UNITS.values() if sure and abs(gain / u - 1) < NEAR)
-        units.append(next(near, common))
-    return units
+    if not any(clear):
+        return 1.0
+    middle = float(np.median(gains[clear]))
+    return next((unit for unit in UNITS.values() if abs(middle / unit - 1) < ALIKE), 1.0)
 
 
 def _report(
@@ -128,7 +142,9 @@ def _report(
     coupling = {
         log.names[i]: float(g * spread[j] / reach[i])
         for i, g in zip(model.others, model.gains, strict=True)
+        if i != DOWN
     }
+    down = [g for i, g in zip(model.others, model.gains, strict=True) if i == DOWN]
     largest = max(coupling, key=lambda name: abs(coupling[name]), default=None)
     ends = [abs(end) * unit for end in (shape.low, shape.high) if math.isfinite(end)]
     drift = {}
@@ -141,7 +157,8 @@ def _report(
         name=log.names[j],
         gain=float(gain),
         gain_interval=(float(gains[0]), float(gains[1])),
-        reversed=bool(gains[1] < 0),
+        gain_down=float((model.gain + down[0]) * scale) if down else None,
+        reversed=bool(gains[1] < 0 and (not down or model.gain + down[0] < 0)),
         offset=float(offset),
         offset_interval=(float(offsets[0]), float(offsets[1])),
         dead_zone=float(shape.dead_zone * unit),

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
 from afm_rl.diagnosis.findings import Actuator, Interval, Status
 
+UNITS = {
+    "degrees for radians": 180 / math.pi,
+    "radians for degrees": math.pi / 180,
+    "mm for m": 1000.0,
+    "m for mm": 0.001,
+    "rpm for rad/s": 30 / math.pi,
+    "rad/s for rpm": math.pi / 30,
+}
+"""Gain of a healthy actuator whose response is in another unit than its command."""
 MATTERS = 0.05
 """Share of the gain, or of half the range of commands: smaller deviations are no fault."""
 DEAD = 0.1
@@ -17,7 +27,9 @@ LATE = 0.5
 """Steps: smaller delays and lags are no fault."""
 FOLLOWS = 0.2
 """Share of the variance: a response of which less is unexplained does follow, however little."""
-SURE = 1.8
+LEFT = 0.25
+"""Share of the variance: what leaves more than that unexplained says so."""
+SURE = 1.45
 """Times the 95 % interval: what a fault has to exceed, so that few are false (99.95 %)."""
 
 
@@ -50,6 +62,7 @@ def judge(
     elif (
         max(-low, high) < DEAD * actuator.unit
         and actuator.driven_by is None
+        and actuator.gain_down is None
         and not (outside(widened((low, high))) and actuator.unexplained < FOLLOWS)
     ):
         status, faults = "dead", ["does not answer its command"]
@@ -57,6 +70,8 @@ def judge(
         status, faults = "cannot tell", [f"cannot tell: {_reason(actuator)}"]
     else:
         status = "changed" if faults else "healthy"
+        if faults and actuator.unexplained > LEFT:
+            faults.append(f"{100 * actuator.unexplained:.0f} % of its motion unexplained")
     if actuator.changes:
         last = actuator.changes[-1]
         was = last.before.sentence.partition(": ")[2] or last.before.status
@@ -84,8 +99,19 @@ def _faults(actuator: Actuator, step: float, usual_delay: float) -> Iterator[str
     if actuator.reversed:
         yield "reversed"
         low, high = -high, -low
-    if not low <= 1.0 <= high and abs(share - 1.0) > MATTERS:
-        yield f"{100 * share:.0f} % of the command"
+    down = actuator.gain if actuator.gain_down is None else actuator.gain_down
+    if abs(down - actuator.gain) > MATTERS * unit:
+        sides = 100 * actuator.gain / unit, 100 * down / unit
+        yield f"{sides[0]:.0f} % of positive commands, {sides[1]:.0f} % of negative ones"
+    elif "gain" in actuator.drift:
+        pass
+    elif not low <= 1.0 <= high and abs(share - 1.0) > MATTERS:
+        odd = [name for name, gain in UNITS.items() if abs(share / gain - 1.0) < MATTERS]
+        yield (
+            f"{share:.3g} times its command: {odd[0]}"
+            if odd
+            else (f"{100 * share:.0f} % of the command")
+        )
     for name, gain in actuator.coupling.items():
         yield f"takes in {100 * gain / unit:+.0f} % of the command of {name}"
     if (
@@ -94,11 +120,13 @@ def _faults(actuator: Actuator, step: float, usual_delay: float) -> Iterator[str
         and abs(actuator.offset) > MATTERS * unit * reach
     ):
         yield f"offset {actuator.offset:+.3g}"
-    if actuator.dead_zone > MATTERS * reach:
+    if actuator.quantum > MATTERS * unit * reach:
+        yield f"moves in steps of {actuator.quantum:.3g}"
+    if actuator.dead_zone > max(MATTERS * reach, actuator.quantum / unit):
         yield f"no motion for commands below {actuator.dead_zone:.3g}"
     if actuator.saturation is not None:
         yield f"no more for commands beyond {actuator.saturation:.3g}"
-    if actuator.backlash > MATTERS * reach:
+    if actuator.backlash > max(MATTERS * reach, actuator.quantum / unit):
         yield f"play of {2 * actuator.backlash:.3g}"
     if actuator.delay_s > usual_delay + LATE * step:
         yield f"{_steps(actuator.delay_s / step)} late"
@@ -106,6 +134,8 @@ def _faults(actuator: Actuator, step: float, usual_delay: float) -> Iterator[str
         actuator.lag_s > LATE * step
     ):
         yield f"a lag of {_steps(actuator.lag_s / step)}"
+    if actuator.lost:
+        yield f"does not follow in {100 * actuator.lost:.0f} % of the rows"
     for name, (begin, end) in actuator.drift.items():
         yield f"{name} drifts from {begin:.3g} to {end:.3g}"
 
@@ -114,7 +144,7 @@ def widened(interval: Interval) -> Interval:
     """Return the interval that a fault has to exceed.
 
     >>> widened((-1.0, 1.0))
-    (-1.8, 1.8)
+    (-1.45, 1.45)
     """
     low, high = interval
     if high - low == float("inf"):

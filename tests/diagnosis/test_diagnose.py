@@ -125,6 +125,50 @@ def test_a_dead_actuator():
     assert dead[1].sentence == "shoulder: does not answer its command"
 
 
+def drop_out(u, rng):
+    """Return commands without about a fifth of the rows, at least 12 at a time."""
+    begins = rng.random(len(u)) < 0.018
+    lost = np.convolve(begins, np.ones(12))[: len(u)] > 0
+    return u * ~lost
+
+
+ODD = {
+    "100 % of positive commands, 50 % of negative ones": lambda u, rng: np.where(u > 0, u, u / 2),
+    r"does not follow in (1\d|2\d|3\d) % of the rows": drop_out,
+    r"does not follow in (2\d|3\d) % of the rows": lambda u, rng: u * (rng.random(len(u)) < 0.7),
+    "57.3 times its command: degrees for radians": lambda u, rng: np.degrees(u),
+    r"gain drifts from (1|0.99\d?|1.0\d?) to (0.5|0.49\d?|0.50\d?)": (
+        lambda u, rng: u * np.linspace(1, 0.5, len(u))
+    ),
+    r"changed at (597|598|599|600|601|602|603) s: healthy, then reversed": (
+        lambda u, rng: u * np.where(np.arange(len(u)) < 600, 1, -1)
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", ["white", "walk"])
+def test_faults_that_are_no_number_of_the_model_have_words(kind):
+    log = log_of([Fault()] * (1 + len(ODD)), 1200, kind, 0.0, seed=5)
+    rng, y = np.random.default_rng(5), log.response.copy()
+    for j, make in enumerate(ODD.values()):
+        y[:, j] = make(log.command[:, j], rng)
+    *found, last = diagnose(
+        replace(log, response=y + 0.02 * rng.standard_normal(y.shape))
+    ).actuators
+    for words, actuator in zip(ODD, found, strict=True):
+        assert re.fullmatch(words, actuator.sentence.partition(": ")[2]), actuator.sentence
+    assert last.status == "healthy"
+
+
+def test_a_coarse_sensor_has_no_dead_zone():
+    log = log_of([Fault(), Fault()])
+    y = log.response.copy()
+    y[:, 0] = np.round(y[:, 0] / 0.25) * 0.25
+    coarse, fine = diagnose(replace(log, response=y)).actuators
+    assert coarse.sentence == "base: moves in steps of 0.25" and coarse.dead_zone > 0
+    assert fine.status == "healthy" and fine.quantum == 0
+
+
 def test_units_are_no_fault():
     log = log_of([Fault(), Fault(gain=-0.5), Fault()])
     degrees = replace(log, command=np.degrees(log.command))
