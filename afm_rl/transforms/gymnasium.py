@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import deepcopy
 from typing import Any
 
@@ -28,8 +28,32 @@ from afm_rl.transforms.memory import begin, correct, corrector_for
 Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str
 State = Callable[[Any, Any], Any]
 AS_EXPECTED = "as the model expects"
-DIAGNOSED_EVERY = 10  # corrected steps
 ENDS = {"planned": "action", "executed": "action", "predicted": "effect"}
+
+
+class Told(dict[str, Any]):
+    """What is known of a step; its ``diagnosis``, some milliseconds, is made when it is asked for.
+
+    >>> told = Told({"corrects": False}, lambda: "healthy")
+    >>> told["diagnosis"], told["corrects"]
+    ('healthy', False)
+    """
+
+    def __init__(self, known: Mapping[str, Any], diagnose: Callable[[], Any]) -> None:
+        super().__init__(known)
+        self._diagnose = diagnose
+
+    def __missing__(self, key: str) -> Any:
+        if key != "diagnosis":
+            raise KeyError(key)
+        self[key] = self._diagnose()
+        return self[key]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Told:
+        return Told(deepcopy(dict(self), memo), self._diagnose)
+
+    def __reduce__(self) -> Any:
+        return dict, ({**self, "diagnosis": self["diagnosis"]},)
 
 
 class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
@@ -42,7 +66,7 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
     ``info["afm"]`` has, after each step, ``planned``, ``executed`` and ``predicted`` ``(A,)``, the
     last being the effect that the executed action is expected to have; ``corrects``, whether the
     planned action was replaced by the corrector's; the ``innovation``, in standard deviations of
-    the model; and the ``diagnosis`` of the actuators in words.
+    the model; and, when it is asked for, the ``diagnosis`` of the actuators in words.
 
     What the model takes for the state is, with ``"mujoco"`` or a
     :class:`~afm_rl.dynamics.MuJoCoDynamics`, the whole state of the environment's simulation, else
@@ -116,8 +140,10 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         return np.asarray(self._loop.state(self.env, observation))[None]
 
     def _told(self) -> dict[str, Any]:
-        found = {name: value[0] for name, value in self._loop.told.items()}
-        return {k: v.item() if isinstance(v, np.generic) else v for k, v in found.items()}
+        told = self._loop.told
+        found = {name: value[0] for name, value in told.items()}
+        known = {k: v.item() if isinstance(v, np.generic) else v for k, v in found.items()}
+        return Told(known, lambda: told["diagnosis"][0])
 
 
 class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
@@ -229,7 +255,7 @@ class CorrectionLoop:
         names = self.model.names[1] if isinstance(self.model, MuJoCoDynamics) else None
         self.names = names or [f"actuator {k}" for k in range(actions.shape[0])]
         self.entries: Any = None  # a tensordict, from the first reset on
-        self.told: dict[str, Any] = {}
+        self.told: Told = Told({}, lambda: AS_EXPECTED)
         self.random = np.random.default_rng(0)
 
     @property
@@ -249,16 +275,14 @@ class CorrectionLoop:
             self.watching.learn(self.corrector)
             self.model, rows = self.watching.fitted or self.model, None
         fresh = begin(self.corrector, states, self.spec)
-        count = len(states)
         if rows is None or self.entries is None:
             self.entries, self.states = fresh, states
-            self.words, self.corrected = [AS_EXPECTED] * count, np.zeros(count, dtype=int)
+            self.shown, self.odd = fresh.get("memory"), np.zeros(len(states), dtype=bool)
         else:
             mask = torch.from_numpy(rows)
             self.entries = torch.where(mask, fresh, self.entries)
             self.states = torch.where(mask.unsqueeze(-1), states, self.states)
-            for row in rows.nonzero()[0]:
-                self.words[row], self.corrected[row] = AS_EXPECTED, 0
+            self.odd = self.odd & ~rows
         self.told = self._tell()
 
     def _complete(self, states: Tensor) -> None:
@@ -295,7 +319,7 @@ class CorrectionLoop:
         else:
             memory, how = self.entries.get("memory"), (self.spec, self.enabled)
             self.entries = correct(memory, wanted, self.model, self.corrector, *how)
-            self._diagnose()
+            self._remember()
         self.told = self._tell()
         return self.told["executed"].astype(self.space.dtype)
 
@@ -314,33 +338,35 @@ class CorrectionLoop:
             self.begin(states, fresh)
             self.told = told
 
-    def _diagnose(self) -> None:
-        """Say in words what the pairs show, now and then, where actions are corrected."""
-        misaligned = self.entries.get("misaligned").numpy()
-        if not misaligned.any() or not isinstance(self.corrector, PairCorrector):
-            return
-        parts = self.corrector.unpack(self.entries.get("memory"), self.states.shape[-1])
-        for row in misaligned.nonzero()[0]:
-            if self.corrected[row] % DIAGNOSED_EVERY == 0:
-                size = self.corrector.action_size
-                pairs = parts["pairs"][row, :, : 3 * size + 1].split([size, size, size, 1], -1)
-                executed, effective, std, valid = (part.numpy() for part in pairs)
-                use, step = valid[:, 0] == 1, getattr(self.model, "dt", 1.0)
-                found = explain(executed[use], effective[use], self.names, std[use], step)
-                self.words[row] = str(found)
-            self.corrected[row] += 1
+    def _remember(self) -> None:
+        """Keep the pairs of where actions are corrected, for a diagnosis."""
+        misaligned, memory = self.entries.get("misaligned"), self.entries.get("memory")
+        if bool(misaligned.any()) and isinstance(self.corrector, PairCorrector):
+            self.shown = torch.where(misaligned.unsqueeze(-1), memory, self.shown)
+            self.odd = self.odd | misaligned.numpy()
 
-    def _tell(self) -> dict[str, Any]:
+    def _diagnosis(self, memory: Tensor, odd: np.ndarray) -> np.ndarray:
+        """Say in words what the pairs of a memory ``(N, P)`` show, of ``odd`` rows ``(N,)``."""
+        words = np.full(len(odd), AS_EXPECTED, dtype=object)
+        for row in odd.nonzero()[0]:
+            parts, size = self.corrector.unpack(memory[row], self.states.shape[-1]), len(self.names)
+            pairs = parts["pairs"][:, : 3 * size + 1].split([size, size, size, 1], -1)
+            executed, effective, std, valid = (part.numpy() for part in pairs)
+            use, step = valid[:, 0] == 1, getattr(self.model, "dt", 1.0)
+            words[row] = str(explain(executed[use], effective[use], self.names, std[use], step))
+        return words
+
+    def _tell(self) -> Told:
         """Return what is known of the newest step, ``(N, ...)`` each."""
         told: dict[str, Any] = {
             name: self.entries.get(f"{name}_{end}").numpy().copy() for name, end in ENDS.items()
         }
         corrects = self.entries.get("misaligned").numpy() & self.enabled
         told |= {"corrects": corrects, "innovation": self.entries.get("innovation").numpy().copy()}
-        told["diagnosis"] = np.array(self.words, dtype=object)
         if self.watching:
             told["learned"] = np.full(len(corrects), not self.learning)
-        return told
+        shown, odd = self.shown, self.odd
+        return Told(told, lambda: self._diagnosis(shown, odd))
 
 
 def _tensor(states: Any) -> Tensor:

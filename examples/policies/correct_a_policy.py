@@ -53,7 +53,7 @@ def main() -> None:
             rewards.append(float(reward))
         before, after = rewards[: args.at], rewards[args.at :]
         print(f"{name}: a step {mean(before):.2f} before, {mean(after):.2f} after")
-        for line in str(info.get("afm", {}).get("diagnosis", "")).splitlines():
+        for line in info["afm"]["diagnosis"].splitlines() if "afm" in info else ():
             print(f"    {line}")
 
 

@@ -1,6 +1,8 @@
 """The wrapper corrects, and an environment stays what it was."""
 
+import copy
 import math
+import pickle
 import warnings
 
 import gymnasium
@@ -10,7 +12,7 @@ import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Dict, Discrete
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
@@ -119,6 +121,23 @@ def test_reversed_actuators_do_what_was_planned():
     assert "actuator 0: reversed" in told[-1]["diagnosis"]
 
 
+def test_a_diagnosis_is_made_when_it_is_asked_for(monkeypatch):
+    asked = []
+
+    def explain(*args):
+        asked.append(args)
+        return "reversed"
+
+    monkeypatch.setattr("afm_rl.transforms.gymnasium.explain", explain)
+    *_, last = [info["afm"] for *_, info in play(ActionFlowWrapper(Puck(gain=-1.0), push), 20)]
+    kept = copy.deepcopy(last)
+    assert not asked and "diagnosis" not in kept
+    assert kept["diagnosis"] == kept["diagnosis"] == "reversed" and len(asked) == 1
+    assert pickle.loads(pickle.dumps(last))["diagnosis"] == "reversed"  # as between processes
+    with pytest.raises(KeyError):
+        last["something"]
+
+
 def test_watching_only_corrects_nothing():
     for *_, info in play(ActionFlowWrapper(Puck(gain=-1.0), push, enabled=False), 20):
         np.testing.assert_array_equal(info["afm"]["planned"], info["afm"]["executed"])
@@ -206,15 +225,23 @@ def test_vectors_have_a_memory_each(mode):
             plain.reset(options=options[1])
 
 
-def test_mujoco_in_a_vector():
+def test_mujoco_in_a_vector_of_one_process_or_of_several():
     pytest.importorskip("mujoco")
-    envs = gymnasium.make_vec("Reacher-v5", num_envs=2, vectorization_mode="sync")
-    envs = ActionFlowVectorWrapper(envs, "mujoco")
-    envs.reset(seed=0)
-    for _ in range(55):  # 50 steps are an episode
-        *_, infos = envs.step(envs.action_space.sample())
-        assert not infos["afm"]["corrects"].any()
-    assert infos["afm"]["executed"].shape == (2, 2)
+    ran, rng = [], np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (55, 3, 2)).astype(np.float32)  # 50 steps are an episode
+    for kind in (SyncVectorEnv, AsyncVectorEnv):
+        made = [lambda: gymnasium.make("Reacher-v5")] * 2
+        made.append(lambda: Reversed(gymnasium.make("Reacher-v5")))
+        envs = ActionFlowVectorWrapper(kind(made), "mujoco")
+        envs.reset(seed=0)
+        ran.append([envs.step(each) for each in actions])
+        envs.close()
+    for (seen, *_, infos), (other, *_, told) in zip(*ran, strict=True):
+        np.testing.assert_array_equal(seen, other)
+        np.testing.assert_array_equal(infos["afm"]["executed"], told["afm"]["executed"])
+        assert not infos["afm"]["corrects"][:2].any()
+    assert ran[0][40][-1]["afm"]["corrects"][2] and infos["afm"]["executed"].shape == (3, 2)
+    assert "a_0: reversed" in ran[1][40][-1]["afm"]["diagnosis"][2]
 
 
 @pytest.mark.filterwarnings("ignore")
