@@ -84,8 +84,8 @@ def cached(
     folder: Path,
     module: nn.Module,
     description: Mapping[str, Any],
-    train: Callable[[], float],
-) -> tuple[float, bool]:
+    train: Callable[[], Any],
+) -> tuple[Any, bool]:
     """Load a trained module from the cache, or train and store it.
 
     Args:
@@ -93,10 +93,10 @@ def cached(
         module: what is trained, in place.
         description: everything the result depends on; its hash names the file. Its ``name``
             begins the file name.
-        train: trains ``module`` and returns its held-out error.
+        train: trains ``module`` and returns its held-out error, or more, for JSON.
 
     Returns:
-        The held-out error, and whether it came from the cache.
+        What ``train`` returned, and whether it came from the cache.
     """
     text = json.dumps(description, sort_keys=True)
     digest = hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -105,7 +105,7 @@ def cached(
         if path.exists():
             load_artefact(path, module, description)
             with safe_open(path, framework="pt") as file:
-                return float(json.loads(file.metadata()["description"])["held_out_error"]), True
+                return json.loads(file.metadata()["description"])["held_out_error"], True
         remove_parts(path.parent, path.name)
         error = train()
         save_artefact(path, module, {**description, "held_out_error": error})

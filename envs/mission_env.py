@@ -65,6 +65,11 @@ class MissionEnv(EnvBase):
         self.seed = check_count("seed", seed, low=0)
         self.start_noise = check_number("start_noise", start_noise, low=0.0)
 
+    @property
+    def max_steps(self) -> int:
+        """Most steps of an episode."""
+        return self.simulation.steps
+
     def _complete(
         self,
         tracks: Sequence[str],

@@ -21,10 +21,12 @@ class PhasedSimulation(ABC):
     Attributes:
         regime: regime family.
         schedule: when regimes change.
+        steps: most steps of an episode.
     """
 
     regime: Regime
     schedule: Schedule
+    steps: int
 
     @abstractmethod
     def begin(self, mission: TensorDictBase, dtype: torch.dtype) -> dict[str, Tensor]:

@@ -133,7 +133,7 @@ class UGVTrack(MissionEnv):
             high=bounds[1].to(self.dtype),
             dt=check_number("dt", dt, low=0.0, open_low=True),
             reach=check_number("reach", reach, low=0.0, open_low=True),
-            max_steps=check_count("max_steps", max_steps),
+            steps=check_count("max_steps", max_steps),
         ).to(self.device)
         self._complete(names, missions, bounds)
 

@@ -37,7 +37,7 @@ class UGVSimulation(nn.Module, PhasedSimulation):
         high: Tensor,
         dt: float,
         reach: float,
-        max_steps: int,
+        steps: int,
     ) -> None:
         super().__init__()
         self.course = course
@@ -47,7 +47,7 @@ class UGVSimulation(nn.Module, PhasedSimulation):
         self.register_buffer("high", high, persistent=False)
         self.dt = dt
         self.reach = reach
-        self.max_steps = max_steps
+        self.steps = steps
 
     def begin(self, mission: TensorDictBase, dtype: torch.dtype) -> dict[str, Tensor]:
         pose = _wrapped(self.course.starts[mission["track"]].to(dtype))
@@ -86,7 +86,7 @@ class UGVSimulation(nn.Module, PhasedSimulation):
         out = self.describe(mission, self.followed(mission, data, state, action))
         out["reward"] = (gained + hit).unsqueeze(-1)
         out["terminated"] = self.course.finished(track, state["reached"]).unsqueeze(-1)
-        out["truncated"] = (state["step"] >= self.max_steps).unsqueeze(-1)
+        out["truncated"] = (state["step"] >= self.steps).unsqueeze(-1)
         out["done"] = out["terminated"] | out["truncated"]
         return out
 

@@ -105,7 +105,7 @@ def last_words(status: int) -> str:
 def work(job: Job) -> None:
     """Finish a job: the main function of its process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
-    log = open(job.folder / LOG, "a", buffering=1)  # open as long as the process lives
+    log = open(job.folder / LOG, "w", buffering=1)  # open as long as the process lives
     for number in (1, 2):
         os.dup2(log.fileno(), number)
     sys.stdout = sys.stderr = log

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from afm_rl.jobs.layout import UNFINISHED
+from afm_rl.jobs.layout import LOG, UNFINISHED
 from afm_rl.jobs.process import PROGRESS, Job
 
 EVERY = 10.0  # seconds between two lines, off a terminal
@@ -34,6 +35,7 @@ class Board:
         self.shown = shown
         self.echo = echo
         self.ended: set[Job] = set()
+        self.told: set[str] = set()
         self.shares = {job: state[1] for job in jobs if (state := self._state(job))}
         self.before = sum(self.shares.values())
         self.start = self.said = time.monotonic()
@@ -54,13 +56,17 @@ class Board:
         self.progress.stop()
 
     def end(self, job: Job, failure: str | None) -> None:
-        """Say that a job is over, and why it failed, if it did."""
+        """Say that a job is over, and why it failed, or what else it said that is new."""
         self.ended.add(job)
         self.shares[job] = 1.0
         if job in self.tasks:
             self.progress.remove_task(self.tasks.pop(job))
         over = self.count - len(self.jobs) + len(self.ended)
         line = f"[{over}/{self.count}] {job}: " + (f"failed: {failure}" if failure else "done")
+        with suppress(OSError):
+            told = [] if failure else (job.folder / LOG).read_text().splitlines()
+            line = "\n".join([line, *(f"  {text}" for text in told if text not in self.told)])
+            self.told.update(told)
         if self.live:
             self.progress.console.print(line, highlight=False, markup=False)
         else:

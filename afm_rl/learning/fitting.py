@@ -30,11 +30,12 @@ class FitReport:
     """Root mean square of each coordinate of the state change, in its own unit."""
     unexplained: tuple[float, ...]
     """Share of each coordinate's variance that is left: 0 is perfect, 1 is as good as the mean."""
+    names: tuple[str, ...] = ()
+    """Of the coordinates."""
 
-    def warn(self, names: Sequence[str] | None = None) -> None:
+    def warn(self) -> None:
         """Warn of coordinates of which more than a third of the variance is left."""
-        names = names or [f"coordinate {k}" for k in range(len(self.rms))]
-        rows = zip(names, self.rms, self.unexplained, strict=True)
+        rows = zip(self.names, self.rms, self.unexplained, strict=True)
         bad = [f"{n} ({100 * u:.0f} %, error {e:.3g})" for n, e, u in rows if not u <= TOLERATED]
         if bad:
             warnings.warn(
@@ -76,7 +77,7 @@ def fit_ensemble(
         lr: largest step size.
         held_out: share of the transitions, picked at random, that only judges.
         keys: where state, action and next state are.
-        names: of the coordinates of the tangent space, for the warning.
+        names: of the coordinates of the tangent space.
         seed: seed of the order.
         progress: show progress.
 
@@ -170,8 +171,9 @@ def fit_changes(
         float(best_error.mean().sqrt()),
         tuple((best_error.sqrt() * model.target_std).tolist()),
         tuple(torch.where(variance > 0, best_error / variance, 0.0).tolist()),
+        tuple(names or (f"coordinate {k}" for k in range(len(best_error)))),
     )
-    report.warn(names)
+    report.warn()
     return report
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -77,18 +77,23 @@ def transitions(
         logger.setLevel(before)
 
 
-def fit_collected(model: Ensemble, robot: Robot, how: Collection, progress: bool) -> float:
-    """Collect transitions round by round and fit the model to all; return its held-out error."""
+def fit_collected(model: Ensemble, robot: Robot, how: Collection, progress: bool) -> dict[str, Any]:
+    """Collect transitions round by round and fit the model to all.
+
+    Returns:
+        The last :class:`~afm_rl.learning.FitReport`, by name, and ``rewards``, the mean reward per
+        step of each round.
+    """
     if robot.reward is None:
         raise ConfigurationError(f"robot.data: {robot.name} has no reward to plan with")
     cost = KnownReward(robot.reward, list(robot.reward_reads), list(robot.reward_reads.values()))
     first, parts, planner = copy.deepcopy(model.state_dict()), [], None
-    error = 0.0
     for number, frames in enumerate(how.rounds):
         with torch.no_grad():
             parts.append(transitions(robot, frames, how.seed + number, planner))
         model.load_state_dict(first)
         settings = {"seed": how.seed, **how.fit, "progress": progress}
-        error = fit_ensemble(model, torch.cat(parts), names=robot.state_names, **settings).error
+        report = fit_ensemble(model, torch.cat(parts), names=robot.state_names, **settings)
         planner = how.planner(PlanningEnv(model, cost, *robot.action_box, observe=robot.observe))
-    return error
+    rewards = [float(part["next", "reward"].mean()) for part in parts]
+    return {**asdict(report), "rewards": rewards}

@@ -7,6 +7,7 @@ it as a :class:`Training`, so that everything is built and checked before anythi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,8 +45,9 @@ class Training(NamedTuple):
     """What is trained, for people."""
     module: nn.Module
     """Trained in place."""
-    train: Callable[[bool], float]
-    """Trains with or without a progress bar; returns the held-out error."""
+    train: Callable[[bool], float | Mapping[str, Any]]
+    """Trains with or without a progress bar; returns the held-out error, or, by name, a
+    :class:`~afm_rl.learning.FitReport` and the ``rewards`` of rounds of data."""
     unit: str
     """Unit of the held-out error."""
     settings: Sequence[Mapping[str, Any]] = ()
@@ -95,11 +97,11 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
         fit = partial(fit_collected, model, robot, robot.data)
         return Part(model, Training("ensemble", model, fit, unit, [own]), own)
 
-    def train(progress: bool) -> float:
+    def train(progress: bool) -> Mapping[str, Any]:
         boxes = robot.state_box, robot.action_box
         names = robot.state_names if model.manifold.tangent_size == model.state_size else None
         given = {"names": names, "progress": progress, **pretrain}
-        return pretrain_ensemble(model, nominal, *boxes, **given).error
+        return asdict(pretrain_ensemble(model, nominal, *boxes, **given))
 
     shape = {"pretrain": dict(pretrain), **own}
     return Part(model, Training("ensemble", model, train, unit, [shape]), shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -34,9 +34,17 @@ def prepare(
         description = {"name": part.title, "version": __version__, "settings": part.settings}
         description.update(getattr(part.module, "signature", {}))
         start = time.perf_counter()
-        error, found = cached(folder, part.module, description, partial(part.train, progress))
+        known, found = cached(folder, part.module, description, partial(part.train, progress))
         spent = "from the cache" if found else f"trained in {time.perf_counter() - start:.0f} s"
-        echo(f"{part.title}: held-out error {error:.4f} {part.unit} ({spent})")
+        known = known if isinstance(known, Mapping) else {"error": known}
+        echo(f"{part.title}: held-out error {known['error']:.4f} {part.unit} ({spent})")
+        if "rms" in known:
+            pairs = zip(known["names"], known["rms"], strict=True)
+            each = ", ".join(f"{name} {error:.2g}" for name, error in pairs)
+            echo(f"{part.title}: root mean square error of a step: {each}")
+        if "rewards" in known:
+            rewards = ", ".join(f"{reward:.3g}" for reward in known["rewards"])
+            echo(f"{part.title}: reward per step of each round of data, random first: {rewards}")
     gate = fit_agents_gate(agent)
     if gate is not None:
         rate = 100 * agent.settings["false_alarms"]

@@ -25,8 +25,9 @@ class ReturnScore(Score):
     are), after c of T steps. Table: ``return``, the sum of rewards; ``before``, ``at`` and
     ``after``, mean rewards per step in the steps [c/2, c), [c, c + 20) and [(c + T)/2, T);
     ``recovery_steps``, the steps from c to the first 20 whose mean reward reaches ``before`` less a
-    tenth of its size; ``steps``; ``finished``, whether the mission did not
-    end early. Steps after an early end have no reward. What does not exist is NaN.
+    tenth of its size; ``steps``; ``terminated``, whether the task
+    ended the episode before its last step. Steps after that have no reward. What does not exist is
+    NaN.
 
     Args:
         steps: most steps of a mission.
@@ -58,12 +59,12 @@ class ReturnScore(Score):
 
     def start(self, missions: TensorDictBase) -> dict[str, Tensor]:
         count = len(missions)
-        return {"rewards": torch.zeros(count, self.steps), "ended": torch.zeros(count)}
+        return {"rewards": torch.zeros(count, self.steps), "terminated": torch.zeros(count)}
 
     def add(self, sums: dict[str, Tensor], ids: Tensor, td: TensorDictBase) -> None:
         reward = td["next", "reward"].squeeze(-1)
         sums["rewards"][ids, td["step"]] = reward.to(sums["rewards"])
-        sums["ended"][ids] = td["next", "terminated"].squeeze(-1).to(sums["ended"])
+        sums["terminated"][ids] = td["next", "terminated"].squeeze(-1).to(sums["terminated"])
 
     def table(
         self, env: EnvBase, missions: TensorDictBase, sums: dict[str, Tensor]
@@ -77,7 +78,7 @@ class ReturnScore(Score):
             "return": rewards.sum(1),
             **dict(zip(names, rows.unbind(-1), strict=True)),
             "steps": sums["steps"].int(),
-            "finished": sums["ended"] == 0,
+            "terminated": sums["terminated"] == 1,
         }
 
 

@@ -91,9 +91,10 @@ def _run(
     loop = _start(agent)
     if checkpoints is not None and state is not None:
         checkpoints.resume(loop, state)
-    total, budget, clock = len(agent.missions), agent.settings["budget"], time.perf_counter()
+    total, clock, budget = len(agent.missions), time.perf_counter(), agent.settings["budget"]
+    most = min(budget, getattr(agent.base_env, "max_steps", budget))
     with Bar(
-        total=total * budget, initial=_done(loop, budget), desc=agent.label, shown=progress
+        total=total * most, initial=_done(loop, most), desc=agent.label, shown=progress
     ) as bar:
         while len(loop.ids):
             ids = loop.ids
@@ -103,7 +104,7 @@ def _run(
             clock = now
             ended = f"{total - len(loop.ids)} of {total} missions ended, step {loop.step}"
             bar.set_postfix_str(ended, refresh=False)
-            bar.update(_done(loop, budget) - bar.n)
+            bar.update(_done(loop, most) - bar.n)
             stop = stopped is not None and stopped(loop)
             if checkpoints is not None:
                 checkpoints.write(loop) if stop else checkpoints.write_if_due(loop)
@@ -112,10 +113,10 @@ def _run(
     return Results(_missions(agent, loop.ends), loop.log.table(), agent.robot.metrics.measures)
 
 
-def _done(loop: Loop, budget: int) -> int:
+def _done(loop: Loop, most: int) -> int:
     """Return the mission-steps that are behind: missions that have ended need no more."""
     running = len(loop.ids)
-    return (len(loop.ends["steps"]) - running) * budget + running * loop.step
+    return (len(loop.ends["steps"]) - running) * most + running * loop.step
 
 
 def _start(agent: Agent) -> Loop:
@@ -221,7 +222,11 @@ def _missions(agent: Agent, ends: dict[str, Tensor]) -> pd.DataFrame:
     frame.update(seed=mission["seed"])
     frame.update(agent.robot.metrics.table(base, agent.missions, ends))
     if agent.faults == "skip":
-        frame["finished"] = frame["finished"] & (ends["faults"] == 0)
+        whole = ends["faults"] == 0
+        if "finished" in frame:
+            frame["finished"] = frame["finished"] & whole
+        else:
+            frame["terminated"] = frame["terminated"] | ~whole
     frame.update(faults=ends["faults"].int(), seconds=ends["seconds"], regime=agent.regime_names)
     return pd.DataFrame({name: _plain(value) for name, value in frame.items()})
 

@@ -66,7 +66,10 @@ class Score(ABC):
     def table(
         self, env: EnvBase, missions: TensorDictBase, sums: dict[str, Tensor]
     ) -> dict[str, Any]:
-        """Return the columns of the table of missions, ``finished`` among them.
+        """Return the columns of the table of missions.
+
+        Among them ``finished``, whether the mission reached its goal, or ``terminated``, whether
+        the episode ended early, where there is none.
 
         Args:
             env: where the missions were.

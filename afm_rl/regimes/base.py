@@ -64,7 +64,16 @@ class Regime(ABC):
         """
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw parameters ``(*shape, F)`` from the family's prior: uniform in ``span``."""
+        """Draw parameters ``(*shape, F)`` from the family's prior: uniform in ``span``.
+
+        Raises:
+            ConfigurationError: for a family that has neither a ``span`` nor a ``sample``.
+        """
+        if not hasattr(self, "span"):
+            raise ConfigurationError(
+                f"{type(self).__name__}: has no prior to draw from; give it span = (low, high), or "
+                "a method sample(shape, generator)"
+            )
         return draw_between(self.span, (*shape, len(self.names)), generator)
 
     def inverse(

@@ -29,8 +29,9 @@ class Physics(StaticRegime):
 
     A world that knows these parameters moves differently, see
     :func:`afm_rl.dynamics.mujoco_physics.changed_model` for what they do there: factors ``mass``,
-    ``friction``, ``damping``, ``gravity`` and ``length``; ``payload``, a share of the whole mass;
-    ``wind_x`` and ``wind_y``, steady accelerations (m/s^2).
+    ``friction``, ``damping``, ``gravity`` and ``length`` (of links, whose masses stay what they
+    are); ``payload``, a share of the whole mass; ``wind_x`` and ``wind_y``, steady accelerations
+    (m/s^2).
 
     >>> heavy = Physics().encode({"mass": 2.0})
     >>> Physics().physics_of(heavy)[0]

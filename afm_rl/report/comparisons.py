@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from afm_rl.measures import Measure, Measures
+from afm_rl.report.frames import outcome
 from afm_rl.report.statistics import (
     interquartile_mean,
     probability_of_improvement,
@@ -129,10 +130,11 @@ def summary_table(means: pd.DataFrame, measures: Measures, oracle: str = "") -> 
     The best of all complete methods is bold, but for the oracle: it knows what no other method
     knows and does not compete, and neither does a method that was spared some cells.
     """
-    rows, signs = [], {}
+    rows, signs, ended = [], {}, outcome(means)
     for row in means.to_dict("records"):
         shown = {"method": row["method"], "missions": str(row["missions"])}
-        shown["finished (%)"], signs["finished"] = number(100 * row["finished"]), 1
+        shown[f"{ended} (%)"] = number(100 * row[ended])
+        signs[ended] = 1 if ended == "finished" else -1
         for measure in measures:
             for end, word in (("", ""), ("_iqm", ", IQM")):
                 if (name := f"{measure.column}{end}") in means:

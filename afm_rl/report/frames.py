@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 
 import pandas as pd
 
@@ -20,7 +20,7 @@ def check_frames(missions: pd.DataFrame, steps: pd.DataFrame, measures: Measures
             occurs twice, or a mission has no steps.
     """
     first = ["method", "track", "seed"]
-    wanted = list(dict.fromkeys([*first, *measures.columns, "steps", "finished", "mission"]))
+    wanted = list(dict.fromkeys([*first, *measures.columns, "steps", outcome(missions), "mission"]))
     for name, frame, columns in (("missions", missions, wanted), ("steps", steps, STEPS)):
         missing = [column for column in columns if column not in frame]
         if missing:
@@ -36,6 +36,18 @@ def check_frames(missions: pd.DataFrame, steps: pd.DataFrame, measures: Measures
     without = number[~number.isin(steps["mission"].unique())]
     if len(without):
         raise ConfigurationError(f"steps: no rows for mission {without.iloc[0]}")
+
+
+def outcome(columns: Container[str]) -> str:
+    """Return the name of the column that says how missions ended.
+
+    ``finished`` where there is a goal to reach; otherwise ``terminated``, whether the episode
+    ended before its time.
+
+    >>> outcome(["steps", "terminated"])
+    'terminated'
+    """
+    return "terminated" if "terminated" in columns else "finished"
 
 
 def regime_names(missions: pd.DataFrame) -> list[str]:

@@ -94,8 +94,8 @@ def last_step(missions: pd.DataFrame) -> float:
     >>> last_step(pd.DataFrame({"steps": [400, 430], "finished": [True, False]}))
     430.0
     """
-    longest = float(missions["steps"].max())
-    finished = missions.loc[missions["finished"].astype(bool), "steps"]
+    longest, goal = float(missions["steps"].max()), "finished" in missions
+    finished = missions.loc[missions["finished"].astype(bool) if goal else [], "steps"]
     end = longest if finished.empty else round(min(longest, BEYOND * float(finished.max())))
     return max(1.0, float(end))
 

@@ -18,6 +18,7 @@ import yaml
 from afm_rl.csv_text import plain_text
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.measures import Measures
+from afm_rl.report.frames import outcome
 
 WORDS = ["method", "track", "regime"]  # text, whatever they look like
 LONGEST = 500  # letters of a word
@@ -126,16 +127,17 @@ def read_missions(path: Path, measures: Measures) -> pd.DataFrame:
         ConfigurationError: if it cannot be read, a column is missing, or a value cannot be.
     """
     whole = ["seed", "steps", "mission"]
-    clock = ["seconds"] if "seconds" in read_text(path, TABLE).partition("\n")[0].split(",") else []
+    head = read_text(path, TABLE).partition("\n")[0].strip().split(",")
+    clock, ended = ["seconds"] if "seconds" in head else [], outcome(head)
     numbers = list(dict.fromkeys([*whole, *measures.columns, *clock]))
-    missions = read_table(path, numbers, ["method", "track", "finished"])
+    missions = read_table(path, numbers, ["method", "track", ended])
     if not len(missions):
         return missions
     for name in whole:
         if missions[name].isna().any() or (missions[name] % 1 != 0).any():
             raise ConfigurationError(f"{path}: {name}: expected a whole number in each row")
-    if missions["finished"].dtype != bool:
-        raise ConfigurationError(f"{path}: finished: expected True or False in each row")
+    if missions[ended].dtype != bool:
+        raise ConfigurationError(f"{path}: {ended}: expected True or False in each row")
     if missions["mission"].duplicated().any():
         raise ConfigurationError(f"{path}: mission: expected another number in each row")
     # Single precision as text has seven digits: 6/34 is the same number in all files again.

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from afm_rl.measures import Measures
-from afm_rl.report.frames import cell_names
+from afm_rl.report.frames import cell_names, outcome
 from afm_rl.report.statistics import stratified_interval
 
 
@@ -16,10 +16,10 @@ def summarise(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
     """Return one row per method, in the order in which they first occur.
 
     Columns: ``method``; ``missions`` and ``cells``, how many; the mean of each measure under the
-    name of its column, with ``_low`` and ``_high``; ``finished``, a share; ``faults`` and
-    ``seconds``, in all, if they are known. The bounds are 95 % intervals of the stratified
-    bootstrap, seeds drawn anew within cells; they are NaN where no cell has two missions, or where
-    all are alike. Missions without a value (NaN) are left out of its mean.
+    name of its column, with ``_low`` and ``_high``; ``finished`` or ``terminated``, a share;
+    ``faults`` and ``seconds``, in all, if they are known. The bounds are 95 % intervals of the
+    stratified bootstrap, seeds drawn anew within cells; they are NaN where no cell has two
+    missions, or where all are alike. Missions without a value (NaN) are left out of its mean.
 
     Args:
         missions: one row per mission.
@@ -41,7 +41,7 @@ def summarise_cells(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
 
 def _means(missions: pd.DataFrame, measures: Measures, by: Sequence[str]) -> pd.DataFrame:
     named = count_budgets(missions, measures)
-    rows = []
+    rows, ended = [], outcome(missions)
     for key, group in named.groupby(list(by), sort=False):
         row = dict(zip(by, key, strict=True)) | {"missions": len(group)}
         row["cells"] = group["cell"].nunique()
@@ -52,7 +52,7 @@ def _means(missions: pd.DataFrame, measures: Measures, by: Sequence[str]) -> pd.
             row |= {
                 f"{measure.column}_{end}": x for end, x in zip(("low", "high"), ends, strict=True)
             }
-        row["finished"] = float(group["finished"].mean())
+        row[ended] = float(group[ended].mean())
         for name in ("faults", "seconds"):
             if name in group:
                 row[name] = float(group[name].sum())
@@ -85,8 +85,7 @@ def count_budgets(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
 def budget_notes(missions: pd.DataFrame, measures: Measures) -> list[str]:
     """Say what a mission that did not finish counts as, and where budgets differ."""
     spent = measures.budget
-    given_up = missions[~missions["finished"].astype(bool)]
-    if spent is None or given_up.empty:
+    if spent is None or (given_up := missions[~missions["finished"].astype(bool)]).empty:
         return []
     ends = given_up.groupby("cell", sort=False)[spent.column].agg(["min", "max"])
     apart = [

@@ -180,7 +180,9 @@ def test_other_physics_are_what_their_names_say():
     assert told(payload=1.0)[0] == pytest.approx(1 / 2.25, rel=0.02)
     assert told(wind_x=0.5)[0] == pytest.approx(speed + 0.5, rel=0.02)
     assert told(gravity=4.0)[1] == pytest.approx(period / 2, rel=0.05)
-    assert told(length=0.25)[1] == pytest.approx(period / 2, rel=0.05)
+    push, short = told(length=0.25)
+    assert short == pytest.approx(period / 2, rel=0.05)
+    assert push == pytest.approx(speed, rel=0.02)  # masses stay
     model = MuJoCoDynamics(POLE)
     moving, none = torch.tensor([0.0, 0.0, 1.0, 0.0]), torch.zeros(1)
     lost = 1 - model(moving, none)[2]

@@ -218,12 +218,13 @@ def test_progress_is_live_in_a_terminal_and_a_line_elsewhere(monkeypatch, tmp_pa
         for clock.now in (9.0, 10.0, 19.0):
             board.look()
         assert said == ["1/3 jobs, 1 at work, 25 %, 0:10 so far"]
+        (jobs[0].folder / "log.txt").write_text("ensemble: held-out error 0.1\n")
         board.end(jobs[0], None)
         clock.now = 20.0
         board.look()
         board.end(jobs[1], "why")
         assert said[1:] == [
-            "[2/3] a: done",
+            "[2/3] a: done\n  ensemble: held-out error 0.1",
             "2/3 jobs, 0 at work, 50 %, 0:20 so far, 0:40 left",
             "[3/3] b: failed: why",
         ]

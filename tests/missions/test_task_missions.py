@@ -1,6 +1,7 @@
 """Missions in other people's tasks, from settings to tables."""
 
 import math
+import re
 import sys
 
 import pandas as pd
@@ -12,6 +13,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, prepare, run
 from afm_rl.missions.checkpoint import Stopped
 from afm_rl.missions.return_score import _measured
+from afm_rl.progress import Bar
 
 FLIP = "regimes=[{gain_0: -1}]"
 SMALL = ["planner.population=16", "planner.elites=4", "planner.horizon=8"]
@@ -162,15 +164,38 @@ def test_an_environment_of_mine_learns_and_goes_on_where_it_was_stopped(mine, tm
 
     def agent():
         made = mine(*chosen)
-        prepare(made, tmp_path / "cache", echo=lambda line: None)
+        prepare(made, tmp_path / "cache", echo=said.append)
         return made
 
+    said: list[str] = []
     whole = run(agent())
-    assert whole.missions["steps"].nunique() > 1 or whole.missions["finished"].all()
+    errors, rewards = said[1:3]
+    assert re.fullmatch(r"ensemble: root mean square error .*: s_0 [\d.e-]+, s_1 [\d.e-]+", errors)
+    assert rewards.count(",") == 2  # random first; two rounds
+    missions = whole.missions
+    assert (missions["terminated"] == (missions["steps"] < 23)).all()
     with pytest.raises(Stopped):
         run(agent(), checkpoint=tmp_path / "run", stopped=lambda loop: loop.step == 9)
     again = run(agent(), checkpoint=tmp_path / "run")
+    assert said[1:3] == said[-2:]  # from the cache, too
     pd.testing.assert_frame_equal(whole.steps, again.steps, check_exact=True)
+
+
+def test_progress_is_a_share_of_the_episode_not_of_the_budget(monkeypatch):
+    shares = []
+    monkeypatch.setattr(Bar, "listener", lambda line, share: None)
+    monkeypatch.setattr(Bar, "close", lambda bar: shares.append(bar.n / bar.total))
+    run(agent_of(*PENDULUM, *SMALL, "robot.steps=12", "budget=5000", FLIP, "method=physics"))
+    assert shares[0] == 1.0
+
+
+@pytest.mark.parametrize("robot", ["half_cheetah", "inverted_pendulum", "reacher"])
+def test_tasks_with_settings_of_their_own_plan_and_collect(robot):
+    pytest.importorskip("mujoco")
+    agent = agent_of(f"robot={robot}", "method=frozen_pe")
+    assert agent.robot.data.rounds[0] > 1000
+    assert len(agent.missions) == len(agent.settings["regimes"]) > 1
+    assert agent.base_env.max_steps == 200
 
 
 @pytest.mark.parametrize(

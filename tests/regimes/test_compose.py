@@ -32,6 +32,14 @@ class Shift(Regime):
         return torch.rand((*shape, 1), generator=generator)
 
 
+def test_a_family_without_a_prior_says_so_when_it_is_drawn_from():
+    class Offset(Shift):
+        sample = Regime.sample
+
+    with pytest.raises(ConfigurationError, match=r"Offset: has no prior .* give it span"):
+        Offset().sample((3,))
+
+
 @pytest.fixture
 def both(gains):
     return Compose([gains, Shift()])
