@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from afm_rl.correction.base import Correction, Fields, rows_of
-from afm_rl.correction.compiled import compile_tick
+from afm_rl.correction.base import Correction, rows_of
+from afm_rl.correction.compiled import Method, compile_module
 from afm_rl.correction.counterfactuals import draw_counterfactuals
 from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY, check_hypotheses, memory_of
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.correction.tick import Answer, Tick
+from afm_rl.correction.tick import Tick
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_flag, check_number
 from afm_rl.flow.experts import fit_experts
@@ -125,7 +125,7 @@ class ActionFlow(PairCorrector):
             )
         self.saturation = saturation
         self.compiles, self.cache = check_flag("corrector.compile", compile), Path(cache)
-        self.__dict__["_machine_code"] = None
+        self.__dict__["_codes"] = {}
         self.tick = Tick(
             load_universal() if network is None else network,
             self.scale,
@@ -160,43 +160,72 @@ class ActionFlow(PairCorrector):
     ) -> tuple[Tensor, Correction]:
         """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
         with torch.no_grad():
-            parts = self.unpack(memory, model.state_size)
-            innovation = self.watch(parts, model)
+            memory, innovation = self._look(memory, model)
             surprised = innovation > self.gate
             found = self.unchanged(planned, innovation, box)
-            parts["acting"] = planned
-            if bool(surprised.any()):
-                use = rows_of(surprised)
-                asked = {name: part[use] for name, part in parts.items()}
-                answer = self.answer(asked, planned[use], box[use])
+            if not bool(surprised.any()):
+                return self.executing(memory, planned, planned, surprised), found
+            use = rows_of(surprised)
+            answer = self._answer(memory[use], planned[use], box[use])
+            if use is not ...:
+                memory = self.executing(memory, planned, planned, surprised)
+            now = {"memory": memory, **found._asdict()}
+            now = {name: _put(now[name], use, part) for name, part in answer.items()}
+            return now.pop("memory"), found._replace(**now)
 
-                def put(now: Any, *names: str) -> dict[str, Tensor]:
-                    return {name: _put(now[name], use, getattr(answer, name)) for name in names}
+    def decide(self, memory: Tensor, planned: Tensor, box: Tensor) -> tuple[Tensor, ...]:
+        """Return the memories, and what to execute, of B missions whose model is misaligned.
 
-                parts |= put(parts, "losses", "forecasts", "acting")
-                found = found._replace(**put(found._asdict(), *CORRECTED))
-            parts |= {"planned": planned, "executed": found.executed}
-            parts["misaligned"] = surprised.unsqueeze(-1).to(planned.dtype)
-            return self.pack(parts), found
+        Args:
+            memory: with the newest pair, ``(B, P)``.
+            planned: ``(B, A)``.
+            box: lowest and highest action, ``(B, 2, A)``.
 
-    @torch.inference_mode()
-    def answer(self, parts: Fields, planned: Tensor, box: Tensor) -> Answer:
-        """Return the answer to plans ``(*B, A)`` of missions whose model is misaligned."""
-        batch, kind = planned.shape[:-1], self.tick.penalty.dtype
+        Returns:
+            The next memory, and the first five parts of a correction but the innovation.
+        """
+        parts, kind = self.unpack(memory, self.states_in(memory)), self.tick.penalty.dtype
         given = [parts[name] for name in ("pairs", "losses", "forecasts", "misaligned")]
         given += [self.place_of(parts["state"]), planned, box]
-        given = [_flat(part, len(batch)).to(kind) for part in given]
-        answer = self._machine(given)(*given) if self.compiles else self.tick(*given)
-        return Answer(*(part.view((*batch, *part.shape[1:])) for part in answer))
+        answer = self.tick(*(part.to(kind) for part in given))
+        changed = {name: getattr(answer, name) for name in ("losses", "forecasts", "acting")}
+        changed |= {"executed": answer.executed, "misaligned": torch.ones_like(memory[..., :1])}
+        parts |= {"planned": planned, **{name: part.to(memory) for name, part in changed.items()}}
+        return (self.pack(parts), *(getattr(answer, name) for name in CORRECTED))
 
-    def _machine(self, given: list[Tensor]) -> Callable[..., Sequence[Tensor]]:
-        """Return the tick as machine code, or as it is where that is not possible."""
-        found = self.__dict__["_machine_code"]
-        if found is None:
-            two = [part[:1].repeat(2, *[1] * (part.dim() - 1)) for part in given]
-            found = compile_tick(self.tick, two, self.cache) or self.tick
-            self.__dict__["_machine_code"] = found
-        return found
+    def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
+        """Return the memory with the transition to ``next_state`` ``(*B, S)``."""
+        if not self.compiles:
+            return super().observe(memory, next_state)
+        return self._run(PairCorrector.observe, memory, next_state)[0]
+
+    def _look(self, memory: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
+        # Machine code holds the model as it is now, and one round of Gauss and Newton.
+        if not (self.compiles and model.affine and model.taught_in is None):
+            return self.look(memory, model)
+        return self._run(PairCorrector.look, memory, model=model)
+
+    @torch.inference_mode()
+    def _answer(self, *given: Tensor) -> dict[str, Tensor]:
+        found = self._run(ActionFlow.decide, *given)
+        return dict(zip(("memory", *CORRECTED), found, strict=True))
+
+    def _run(
+        self, function: Callable, *given: Tensor, model: DynamicsModel | None = None
+    ) -> list[Tensor]:
+        """Return what a method makes of tensors with any batch dimensions, as machine code."""
+        batch = given[0].shape[:-1]
+        given = tuple(_flat(part, len(batch)) for part in given)
+        key = (function.__name__, id(model), given[0].dtype, given[0].shape[-1])
+        code = self.__dict__["_codes"].get(key)
+        if code is None:
+            code = Method(self, function, model)
+            if self.compiles:
+                two = [part[:1].repeat(2, *[1] * (part.dim() - 1)) for part in given]
+                traced = model is not None
+                code = compile_module(code, two, self.cache, traced) or code
+            self.__dict__["_codes"] = {**self.__dict__["_codes"], key: code}
+        return [part.view((*batch, *part.shape[1:])) for part in code(*given)]
 
     def place_of(self, state: Tensor) -> Tensor:
         """Return where a state is, in the unit in which ground differs."""

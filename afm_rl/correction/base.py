@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
@@ -79,14 +78,11 @@ class Corrector(nn.Module, ABC):
         self.gate = check_number("corrector.gate", gate, low=0.0)
         self.recent = check_count("corrector.recent", recent)
         scale = torch.maximum(low.abs(), high.abs())
+        self.action_size = len(scale)
+        self._layouts: dict[int, tuple[list[str], list[int], list[tuple[int, ...]]]] = {}
         ends = {"scale": scale, "lowest": low / scale, "highest": high / scale}
         for name, value in ends.items():
             self.register_buffer(name, value, persistent=False)
-
-    @property
-    def action_size(self) -> int:
-        """Number of action components, A."""
-        return len(self.scale)
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes of the parts of a memory; subclasses add theirs."""
@@ -95,13 +91,18 @@ class Corrector(nn.Module, ABC):
             "state": (state_size,),
             "planned": (size,),
             "executed": (size,),
+            "misaligned": (1,),
             "repeats": (1,),
             "transitions": (self.recent, 2 * state_size + 2 * size + 1),
         }
 
     def memory_size(self, state_size: int) -> int:
         """Return how many numbers a memory has, P."""
-        return sum(math.prod(shape) for shape in self.shapes(state_size).values())
+        return sum(self._layout(state_size)[1])
+
+    def states_in(self, memory: Tensor) -> int:
+        """Return how many numbers a state has in a memory ``(*B, P)``."""
+        return (memory.shape[-1] - self.memory_size(0)) // (2 * self.recent + 1)
 
     def begin(self, state: Tensor) -> Tensor:
         """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
@@ -139,25 +140,39 @@ class Corrector(nn.Module, ABC):
 
     def latest(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the present state, and the actions planned and executed last."""
-        size = self.action_size
-        first = (memory.shape[-1] - self.memory_size(0)) // (2 * self.recent + 1)
+        size, first = self.action_size, self.states_in(memory)
         state, planned, executed, _ = memory.tensor_split(
             [first, first + size, first + 2 * size], -1
         )
         return state, planned, executed
 
-    def executing(self, memory: Tensor, planned: Tensor, executed: Tensor) -> Tensor:
+    def executing(
+        self,
+        memory: Tensor,
+        planned: Tensor,
+        executed: Tensor,
+        misaligned: Tensor | None = None,
+    ) -> Tensor:
         """Return the memory with the actions that are planned and executed now, ``(*B, A)``.
 
-        For whoever executes another action than :meth:`correct` returned.
+        Also for whoever executes another action than :meth:`correct` returned.
+
+        Args:
+            memory: ``(*B, P)``.
+            planned: the planner's action.
+            executed: what is executed instead.
+            misaligned: is it corrected? ``(*B)``; None: as it was noted.
         """
         state, _, _ = self.latest(memory)
-        rest = memory[..., state.shape[-1] + 2 * self.action_size :]
-        return torch.cat([state, planned, executed, rest], -1)
+        parts, first = [state, planned, executed], state.shape[-1] + 2 * self.action_size
+        if misaligned is not None:
+            parts.append(misaligned.unsqueeze(-1).to(memory))
+            first += 1
+        return torch.cat([*parts, memory[..., first:]], -1)
 
     def unpack(self, memory: Tensor, state_size: int) -> Fields:
         """Return the parts of a memory."""
-        names, sizes, shapes = _layout(self, state_size)
+        names, sizes, shapes = self._layout(state_size)
         parts = memory.split(sizes, -1)
         return {
             name: part if len(shape) == 1 else part.unflatten(-1, shape)
@@ -169,6 +184,14 @@ class Corrector(nn.Module, ABC):
         lead = parts["state"].dim() - 1
         flat = [part if part.dim() == lead + 1 else part.flatten(lead) for part in parts.values()]
         return torch.cat(flat, -1)
+
+    def _layout(self, state_size: int) -> tuple[list[str], list[int], list[tuple[int, ...]]]:
+        """Return names, sizes and shapes of the parts of a memory, computed once."""
+        if state_size not in self._layouts:
+            shapes = self.shapes(state_size)
+            sizes = [math.prod(shape) for shape in shapes.values()]
+            self._layouts[state_size] = list(shapes), sizes, list(shapes.values())
+        return self._layouts[state_size]
 
     def split_transitions(self, rows: Tensor, state_size: int) -> tuple[Tensor, ...]:
         """Return state, planned, executed, next state and validity of rows of transitions."""
@@ -191,13 +214,3 @@ class Corrector(nn.Module, ABC):
     def within(self, share: Tensor) -> Tensor:
         """Return the u whose place between lowest (-1) and highest (1) is ``share`` ``(*B, A)``."""
         return self.lowest + 0.5 * (share + 1) * (self.highest - self.lowest)
-
-
-@lru_cache(maxsize=64)
-def _sizes(shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> tuple[list, list, list]:
-    names, forms = zip(*shapes, strict=True)
-    return list(names), [math.prod(form) for form in forms], list(forms)
-
-
-def _layout(corrector: Corrector, state_size: int) -> tuple[list, list, list]:
-    return _sizes(tuple(corrector.shapes(state_size).items()))

@@ -1,4 +1,4 @@
-"""The tick as machine code: compiled once, kept in the cache, loaded in milliseconds."""
+"""Modules as machine code: compiled once, kept in the cache, loaded in milliseconds."""
 
 from __future__ import annotations
 
@@ -17,26 +17,51 @@ from torch import Tensor, nn
 from afm_rl._version import __version__
 
 
-def compile_tick(
-    tick: nn.Module, inputs: Sequence[Tensor], cache: str | Path
-) -> Callable[..., Sequence[Tensor]] | None:
-    """Return a function on tensors as machine code, for any number of missions.
-
-    It is compiled ahead of time (AOTInductor), which takes half a minute of one core, and only if
-    the cache does not hold it already for these weights, shapes, and versions.
+class Method(nn.Module):
+    """A method on tensors as a module of its own.
 
     Args:
-        tick: takes tensors whose first dimension counts missions, returns such tensors.
+        owner: whose method.
+        function: as the class has it; returns a tensor or several.
+        more: what it takes after the tensors, a module; None: nothing.
+    """
+
+    def __init__(self, owner: nn.Module, function: Callable, more: nn.Module | None) -> None:
+        super().__init__()
+        self.owner, self.more, self.name = owner, more, function.__qualname__
+        self.__dict__["function"] = function
+
+    def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
+        """Return what the method returns, as a tuple."""
+        more = [] if self.more is None else [self.more]
+        found = self.function(self.owner, *given, *more)
+        return (found,) if isinstance(found, Tensor) else tuple(found)
+
+
+def compile_module(
+    module: nn.Module, inputs: Sequence[Tensor], cache: str | Path, traced: bool
+) -> Callable[..., Sequence[Tensor]] | None:
+    """Return a module as machine code, for any number of missions.
+
+    It is compiled ahead of time (AOTInductor), which takes half a minute of one core, and only if
+    the cache does not hold it already for these weights, shapes, settings and versions.
+
+    Args:
+        module: takes tensors whose first dimension counts missions, returns a tuple of such.
         inputs: an example, of two missions or more.
         cache: folder of compiled functions.
+        traced: whether it holds functions that are not ours: then what it computes is looked at
+            each time, which takes a second, before it is taken from the cache.
 
     Returns:
         The compiled function; None, with a warning, where there is no compiler or it fails.
     """
-    path = Path(cache).expanduser() / "compiled" / f"{_digest(tick, inputs)}.pt2"
     try:
+        program = _export(module, inputs) if traced else None
+        digest = _digest(module, inputs, program)
+        path = Path(cache).expanduser() / "compiled" / f"{digest}.pt2"
         if not path.exists():
-            _compile(tick, inputs, path)
+            _compile(module, inputs, program, path)
         return torch._inductor.aoti_load_package(str(path))
     except Exception as error:  # compilers fail in many ways
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -49,27 +74,27 @@ def has_compiler() -> bool:
     return any(shutil.which(name) for name in (os.environ.get("CXX", "c++"), "g++", "clang++"))
 
 
-def _compile(tick: nn.Module, inputs: Sequence[Tensor], path: Path) -> None:
+def _export(module: nn.Module, inputs: Sequence[Tensor]) -> torch.export.ExportedProgram:
+    missions = torch.export.Dim("missions", min=1, max=2**20)
+    shapes = (tuple({0: missions} for _ in inputs),)
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return torch.export.export(module, tuple(inputs), dynamic_shapes=shapes)
+
+
+def _compile(
+    module: nn.Module,
+    inputs: Sequence[Tensor],
+    program: torch.export.ExportedProgram | None,
+    path: Path,
+) -> None:
     if not has_compiler():
         raise RuntimeError("no C++ compiler was found")
     print("compiling the correction, once for this robot (about half a minute)", flush=True)
-
-    class Plain(nn.Module):
-        """The tick with a plain tuple: others cannot be exported."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.tick = tick
-
-        def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
-            return tuple(self.tick(*given))
-
-    missions = torch.export.Dim("missions", min=1, max=2**20)
-    shapes = (tuple({0: missions} for _ in inputs),)
+    program = _export(module, inputs) if program is None else program
     path.parent.mkdir(parents=True, exist_ok=True)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        program = torch.export.export(Plain(), tuple(inputs), dynamic_shapes=shapes)
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             made = torch._inductor.aoti_compile_and_package(
                 program, package_path=str(Path(folder) / path.name)
@@ -77,17 +102,22 @@ def _compile(tick: nn.Module, inputs: Sequence[Tensor], path: Path) -> None:
             os.replace(made, path)
 
 
-def _digest(module: nn.Module, inputs: Sequence[Tensor]) -> str:
+def _digest(
+    module: nn.Module, inputs: Sequence[Tensor], program: torch.export.ExportedProgram | None
+) -> str:
     """Return a hash of all that the compiled function depends on."""
     digest = hashlib.sha256()
     shapes = [[str(part.dtype), *part.shape[1:]] for part in inputs]
-    settings = {
-        name: value
-        for name, value in vars(module).items()
+    settings = [
+        (type(part).__name__, name, value)
+        for part in module.modules()
+        for name, value in sorted(vars(part).items())
         if isinstance(value, (bool, int, float, str, list))
-    }
-    about = [__version__, torch.__version__, shapes, sorted(settings.items())]
+    ]
+    code = None if program is None else program.graph_module.code
+    about = [__version__, torch.__version__, shapes, settings, code]
     digest.update(json.dumps(about, default=str).encode())
-    for part in (*module.parameters(), *module.buffers()):
+    constants = [] if program is None else program.constants.values()
+    for part in (*module.parameters(), *module.buffers(), *constants):
         digest.update(part.detach().cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:32]

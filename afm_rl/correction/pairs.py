@@ -7,7 +7,7 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from afm_rl.correction.base import Correction, Corrector, Fields, rows_of
+from afm_rl.correction.base import Correction, Corrector, rows_of
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import check_count
@@ -50,36 +50,34 @@ class PairCorrector(Corrector):
             **super().shapes(state_size),
             "pairs": (self.memory, self.pair_size),
             "acting": (self.action_size,),
-            "misaligned": (1,),
         }
 
     def place_of(self, state: Tensor) -> Tensor:
         """Return the coordinates of states that are remembered with pairs; none by default."""
         return state[..., :0]
 
-    def watch(self, parts: Fields, model: DynamicsModel) -> Tensor:
-        """Add the newest transitions to the pairs, in place; return the innovation ``(*B)``.
+    def look(self, memory: Tensor, model: DynamicsModel) -> tuple[Tensor, Tensor]:
+        """Return the memory with the newest transitions as pairs, and the innovation ``(*B)``.
 
         A model that stays as it is needs to be asked about the newest transition only, one that
         learns about all R.
         """
+        parts = self.unpack(memory, model.state_size)
         count = 1 if model.taught_in is None else self.recent
         rows = parts["transitions"][..., -count:, :]
         state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
-        unit = self.normalise(executed)
-        awake = bool(parts["misaligned"].any())
         # What acted last was predicted to have an effect; older ones were asked about before.
         before = parts["pairs"][..., self.memory - count + 1 :, self.action_size :]
         guess = self.denormalise(before[..., : self.action_size])
         guess = torch.cat([guess, parts["acting"].unsqueeze(-2)], -2)
-        quiet = 0.0 if awake else self.gate
+        quiet = torch.where(parts["misaligned"] == 1.0, 0.0, self.gate)
         seen = effective_action(
             model, state, executed, reached, self.scale, quiet=quiet, guess=guess
         )
         std = (seen.std / self.scale).clamp_max(LIMIT)
         rows = torch.cat(
             [
-                unit,
+                self.normalise(executed),
                 self.normalise(seen.action).clamp(-LIMIT, LIMIT),
                 std,
                 valid,
@@ -91,7 +89,8 @@ class PairCorrector(Corrector):
         sound = (valid == 1.0) & rows.isfinite().all(-1, keepdim=True)
         rows = torch.where(sound, rows, 0.0)
         parts["pairs"] = torch.cat([parts["pairs"][..., 1 : self.memory - count + 1, :], rows], -2)
-        return parts["pairs"][..., -self.recent :, 3 * self.action_size + 1].amax(-1)
+        innovation = parts["pairs"][..., -self.recent :, 3 * self.action_size + 1].amax(-1)
+        return self.pack(parts), innovation
 
 
 class ClassicalCorrector(PairCorrector):
@@ -117,15 +116,15 @@ class ClassicalCorrector(PairCorrector):
         self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
     ) -> tuple[Tensor, Correction]:
         """Answer where the model is misaligned."""
+        memory, innovation = self.look(memory, model)
         parts = self.unpack(memory, model.state_size)
-        innovation = self.watch(parts, model)
         found = self.unchanged(planned, innovation, box)
         misaligned = innovation > self.gate
         if bool(misaligned.any()):
             use = rows_of(misaligned)
             executed, predicted = planned.clone(), planned.clone()
-            unit = self.normalise(planned[use])
-            action, effect = self.answer(self.rows(parts["pairs"][use]), unit)
+            rows, unit = self.rows(parts["pairs"][use]), self.normalise(planned[use])
+            action, effect = self.answer(rows, unit)
             executed[use], predicted[use] = self.denormalise(action), self.denormalise(effect)
             found = found._replace(executed=executed, predicted=predicted, misaligned=misaligned)
         parts |= {"planned": planned, "executed": found.executed, "acting": found.predicted}

@@ -99,8 +99,8 @@ class PaperFlow(Corrector):
         }
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
-        """Return names and shapes, with what is kept while the gate is open."""
-        return {**super().shapes(state_size), "features": (self.feature_size,), "open": (1,)}
+        """Return names and shapes, with the features that are kept."""
+        return {**super().shapes(state_size), "features": (self.feature_size,)}
 
     def training_loss(
         self,
@@ -163,7 +163,7 @@ class PaperFlow(Corrector):
         misaligned = size >= self.gate
         features = torch.where(valid.unsqueeze(-1), self._features(state, plan, error), 0.0)
         if self.latch:
-            held = (parts["open"] == 1.0) & misaligned.unsqueeze(-1)
+            held = (parts["misaligned"] == 1.0) & misaligned.unsqueeze(-1)
             features = torch.where(held, parts["features"], features)
         found = self.unchanged(planned, size, box)
         if bool(misaligned.any()):
@@ -171,7 +171,7 @@ class PaperFlow(Corrector):
             action = torch.where(misaligned.unsqueeze(-1), action.to(planned), planned)
             found = found._replace(executed=action, misaligned=misaligned)
         parts |= {"planned": planned, "executed": found.executed, "features": features}
-        parts["open"] = misaligned.unsqueeze(-1).to(planned)
+        parts["misaligned"] = misaligned.unsqueeze(-1).to(planned)
         return self.pack(parts), found
 
     def _integrate(self, features: Tensor, planned: Tensor) -> Tensor:

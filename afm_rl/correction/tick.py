@@ -128,7 +128,7 @@ class Tick(nn.Module):
         believed = sound & (belief < self.count)
         action = torch.where(believed.unsqueeze(-1), action, unit)
         forecasts = self.predict(encoded, pairs, action)
-        acting = forecasts[torch.arange(len(belief), device=belief.device), belief] * self.scale
+        acting = forecasts.gather(1, belief[:, None, None].expand(-1, 1, len(self.scale)))
         found = torch.stack([action, effect], -2) * self.scale
         found = torch.where(believed[:, None, None], found, planned.unsqueeze(-2))
         bounds = torch.where(believed[:, None, None], bounds * self.scale, box)
@@ -136,7 +136,7 @@ class Tick(nn.Module):
         return Answer(
             losses,
             forecasts,
-            acting,
+            acting.squeeze(1) * self.scale,
             executed,
             effect,
             spread * self.scale,

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
+from afm_rl.dynamics.derivatives import derivative, linearised
 from afm_rl.errors import check_count
 from afm_rl.manifold import Manifold
 
@@ -98,19 +98,21 @@ class DynamicsModel(nn.Module, ABC):
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         r"""Return :math:`\partial f / \partial a` ``(*L, *N, D, A)`` on the tangent space.
 
-        Forward differentiation, one column per action axis; models with a closed form
+        Forward differentiation, all action axes in one batch; models with a closed form
         override this.
         """
+        axes = torch.eye(self.action_size, device=action.device, dtype=action.dtype)
+        before, act = (
+            part.unsqueeze(-2).expand(*part.shape[:-1], len(axes), -1).contiguous()
+            for part in (state.expand(*action.shape[:-1], -1), action)
+        )
 
         def change(act: Tensor) -> Tensor:
-            return self.manifold.difference(self(state, act), state)
+            return self.manifold.difference(self(before, act), before)
 
-        columns = [
-            torch.func.jvp(change, (action.contiguous(),), (axis.expand_as(action),))[1]
-            for axis in torch.eye(self.action_size, device=action.device, dtype=action.dtype)
-        ]
+        _, columns = derivative(change, (act,), (axes.expand_as(act),))
         # Torch differentiates single numbers times Python's in double precision.
-        return torch.stack(columns, -1).to(action.dtype)
+        return columns.mT.to(action.dtype)
 
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         r"""Return the next state and its derivatives by state and action.
@@ -135,34 +137,3 @@ class DynamicsModel(nn.Module, ABC):
     def select_(self, index: Tensor) -> DynamicsModel:
         """Keep the missions in ``index`` only, in place (see :meth:`expand_`)."""
         return self
-
-
-def linearised(
-    function: Callable[[Tensor, Tensor], Tensor], state: Tensor, action: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a function of state and action, and its derivatives by both.
-
-    Forward differentiation of all S + A columns in one batch.
-
-    Args:
-        function: takes states ``(*B, S)`` and actions ``(*B, A)``, returns ``(*B, R)``.
-        state: ``(*B, S)``.
-        action: ``(*B, A)``.
-
-    Returns:
-        The value ``(*B, R)`` and derivatives ``(*B, R, S)`` and ``(*B, R, A)``.
-
-    >>> value, by_state, by_action = linearised(torch.mul, torch.ones(2), torch.tensor([3.0, 4.0]))
-    >>> by_state.tolist(), by_action.tolist()
-    ([[3.0, 0.0], [0.0, 4.0]], [[1.0, 0.0], [0.0, 1.0]])
-    """
-    sizes = (state.shape[-1], action.shape[-1])
-    axes = torch.eye(sum(sizes), device=state.device, dtype=state.dtype)
-    inputs, tangents = [], []
-    for given, axis in zip((state, action), axes.split(sizes, -1), strict=True):
-        wide = given.unsqueeze(-2).expand(*given.shape[:-1], *axis.shape)
-        inputs.append(wide.contiguous())
-        tangents.append(axis.to(wide).expand_as(wide).contiguous())
-    result = torch.func.jvp(function, tuple(inputs), tuple(tangents))
-    by_state, by_action = result[1].mT.split(sizes, -1)
-    return result[0][..., 0, :], by_state, by_action

@@ -32,7 +32,7 @@ def effective_action(
     next_state: Tensor,
     half_range: Tensor,
     rounds: int = 3,
-    quiet: float = 0.0,
+    quiet: float | Tensor = 0.0,
     guess: Tensor | None = None,
 ) -> EffectiveAction:
     r"""Express a prediction error in action space, for any model and robot.
@@ -65,8 +65,8 @@ def effective_action(
         next_state: the realised next state, ``(*B, S)``.
         half_range: h, half ranges of the action box, ``(A,)``.
         rounds: Gauss-Newton steps at most.
-        quiet: innovations up to this size need no explanation: if there is no larger one, the
-            executed actions are returned at once, with a standard deviation of a tenth.
+        quiet: innovations up to this size need no explanation: the executed action is returned,
+            with a standard deviation of a tenth; one number, or one per row ``(*B)``.
         guess: where else to begin, such as the effect that was predicted, ``(*B, A)``.
 
     >>> from afm_rl.dynamics import Dubins
@@ -83,7 +83,8 @@ def effective_action(
     expected, noise = model.forecast(state, action)
     error = model.manifold.difference(next_state, expected) / noise
     innovation = error.abs().amax(-1)
-    if bool((innovation <= quiet).all()):  # false for NaN
+    silent = innovation <= quiet  # false for NaN
+    if not torch.compiler.is_compiling() and bool(silent.all()):  # nothing more to compute
         std = (ASSUMED * half_range).expand_as(action)
         return EffectiveAction(action.to(dtype), std.to(dtype), innovation.to(dtype))
     effective = action
@@ -118,9 +119,10 @@ def effective_action(
     if not model.affine:  # what the rounds could not explain, per coordinate
         std = (std * error.square().mean(-1, True).sqrt().clamp_min(1.0)).clamp_max(UNSEEN)
     known = innovation + std.sum(-1) < torch.inf
-    row = known.unsqueeze(-1)
+    row = (known & ~silent).unsqueeze(-1)
+    else_std = torch.where(silent, ASSUMED, UNSEEN).unsqueeze(-1)
     return EffectiveAction(
         torch.where(row, effective, action.nan_to_num()).to(dtype),
-        (torch.where(row, std, UNSEEN) * half_range).to(dtype),
+        (torch.where(row, std, else_std) * half_range).to(dtype),
         torch.where(known, innovation, 0.0).to(dtype),
     )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from afm_rl.dynamics.base import DynamicsModel, linearised
+from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.dynamics.derivatives import linearised
 from afm_rl.dynamics.mujoco import MuJoCoDynamics
 from afm_rl.regimes import Regime
 

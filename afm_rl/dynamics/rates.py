@@ -9,6 +9,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from afm_rl.dynamics.derivatives import derivative
 from afm_rl.manifold import Manifold, wrap_angle
 
 
@@ -86,14 +87,13 @@ class _HeldFunction(HeldRate):
     def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
         size = through.shape[-1]
         wide = [
-            given.unsqueeze(-2).expand(*given.shape[:-1], size, -1).contiguous()
+            given.unsqueeze(-2).expand(*given.shape[:-1], size, -1)
             for given in (state, self.action)
         ]
         actions = self.action.shape[-1]
         drive = torch.eye(size, dtype=state.dtype, device=state.device)[:, size - actions :]
-        moved = (through.mT.contiguous(), drive.expand_as(wide[1]).contiguous())
-        result = torch.func.jvp(self.function, tuple(wide), moved)
-        return result[0][..., 0, :], result[1].mT
+        value, slope = derivative(self.function, wide, (through.mT, drive.expand_as(wide[1])))
+        return value[..., 0, :], slope.mT
 
 
 def on_tangent(space: Manifold, state: Tensor, slope: Tensor, origin: Tensor) -> Tensor:
@@ -109,7 +109,7 @@ def on_tangent(space: Manifold, state: Tensor, slope: Tensor, origin: Tensor) ->
     tensor([[3.],
             [4.]])
     """
-    columns = slope.mT.contiguous()
-    wide = state.unsqueeze(-2).expand_as(columns).contiguous()
+    columns = slope.mT
+    wide = state.unsqueeze(-2).expand_as(columns)
     differ = partial(space.difference, origin=origin.unsqueeze(-2))
-    return torch.func.jvp(differ, (wide,), (columns,))[1].mT
+    return derivative(differ, (wide,), (columns,))[1].mT

@@ -69,7 +69,7 @@ def test_the_latch_keeps_what_opened_the_gate(make, transitions, latch):
     reached[:2, 0] += 1.0  # the third mission is aligned again
     fresh = after(flow, state, action, reached)[0]["features"]
     old = torch.full((3, flow.feature_size), 7.0)
-    parts = flow.unpack(flow.begin(state), 3) | {"features": old, "open": torch.ones(3, 1)}
+    parts = flow.unpack(flow.begin(state), 3) | {"features": old, "misaligned": torch.ones(3, 1)}
     parts, found = after(flow, state, action, reached, begun=flow.pack(parts))
     expected = torch.stack([old[0], old[1], fresh[2]]) if latch else fresh
     assert torch.equal(parts["features"], expected)
