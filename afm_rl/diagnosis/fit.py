@@ -77,6 +77,16 @@ class Model:
         )
         return [lagging(clock, own, self.shape.keep), *others]
 
+    def led_by(self, own: int) -> Model:
+        """Return the model with another of its commands as the driver, where both act alike."""
+        if own not in self.others or self.jump or DOWN in self.others or {*CURVED} & {*self.active}:
+            return self
+        gains = {self.driver: self.gain, **dict(zip(self.others, self.gains, strict=True))}
+        gain = gains.pop(own)
+        return replace(
+            self, driver=own, gain=gain, others=tuple(gains), gains=tuple(gains.values())
+        )
+
     def predict(self, problem: Problem) -> np.ndarray:
         """Return the response ``(N,)``."""
         parts = self.parts(problem)

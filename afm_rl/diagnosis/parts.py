@@ -99,7 +99,7 @@ def fit_part(log: Log, j: int, first: int, last: int, lead: Lead | None = None) 
     starts = [Shape(lead.delay, lead.keep)]
     if lead.keep:
         starts.append(Shape(lead.delay + 0.5 / -math.log(lead.keep)))
-    model = fit_response(small, lead.driver, starts)
+    model = fit_response(small, lead.driver, starts).led_by(j)
     weight = weight_of(small, model)
     if len(rows.command) > SHAPED:
         model = refine(problem_of(rows.thinned(FITTED), j, lead), model)

@@ -13,12 +13,14 @@ from afm_rl.diagnosis.fit import DOWN
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.lost import without_lost
 from afm_rl.diagnosis.parts import SEARCHED, Part, find_parts, predict, settle
-from afm_rl.diagnosis.search import find_leads
+from afm_rl.diagnosis.search import Lead, find_leads
 from afm_rl.diagnosis.words import UNITS, judge
 
 ALIKE = 0.1  # deviation of the median gain of all actuators from such a gain
 FEW = 0.1  # share of the rows: a response with more values moves freely
 EXACT = 0.01  # of a step, by which steps may differ
+LOOSE = 0.1  # share of the variance: a response of which less is left follows its command
+CLOSE = 0.3  # times what is left of the response: rates of change of which less is left follow
 COPY = 0.999  # correlation of two commands that cannot be told apart
 
 
@@ -43,6 +45,7 @@ def diagnose(log: Log) -> Diagnosis:
     )
     scaled = replace(log, command=log.command / reach, response=log.response / spread)
     leads = find_leads(scaled.thinned(SEARCHED), range(len(log.names)))
+    summed = _summed(scaled, leads)
     lost = [0.0] * len(leads)
     for j, lead in enumerate(leads):
         scaled, lost[j] = without_lost(scaled, j, lead)
@@ -58,7 +61,7 @@ def diagnose(log: Log) -> Diagnosis:
     unit, since = _unit([own[-1] for own in found]), log.since
     actuators = []
     for j, numbers in enumerate(found):
-        how = (log.step, log.usual_delay, _doubt(scaled, j, moved))
+        how = (log.step, log.usual_delay, _doubt(scaled, j, moved, summed))
         whole = [
             replace(actuator, unit=unit, lost=lost[j], quantum=quanta[j]) for actuator in numbers
         ]
@@ -103,10 +106,22 @@ def _quantum(response: np.ndarray) -> float:
     return size if np.abs(whole - whole.round()).max() < EXACT else 0.0
 
 
-def _doubt(log: Log, j: int, moved: np.ndarray) -> str:
+def _summed(log: Log, leads: Sequence[Lead]) -> set[int]:
+    """Return the actuators whose responses do not follow, but change as the commands say."""
+    odd = [j for j, lead in enumerate(leads) if lead.left > LOOSE]
+    rates = np.diff(log.response, axis=0, prepend=log.response[:1])
+    rates[log.begins] = 0.0
+    found = find_leads(replace(log, response=rates / _spread(rates)).thinned(SEARCHED), odd)
+    close = (rate.left < CLOSE * leads[j].left for j, rate in zip(odd, found, strict=True))
+    return {j for j, good in zip(odd, close, strict=True) if good}
+
+
+def _doubt(log: Log, j: int, moved: np.ndarray, summed: set[int]) -> str:
     """Return why nothing can be told of an actuator, if so."""
     if not moved[j]:
         return "its command does not change"
+    if j in summed:
+        return "its response adds up its command; log its rate of change"
     u = log.command - log.command.mean(0)
     power = np.sqrt((u**2).sum(0))
     alike = np.abs(u.T @ u[:, j]) / np.maximum(power * power[j], 1e-300)

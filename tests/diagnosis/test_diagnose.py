@@ -116,6 +116,15 @@ def test_the_log_cannot_tell():
     )
 
 
+def test_positions_that_answer_to_speeds():
+    log = log_of([Fault(), Fault()], 600, "walk")
+    y = log.response.copy()
+    y[:, 0] = np.cumsum(0.02 * y[:, 0])
+    base, shoulder = diagnose(replace(log, response=y)).actuators
+    assert base.sentence.endswith("its response adds up its command; log its rate of change")
+    assert shoulder.status == "healthy"
+
+
 def test_a_dead_actuator():
     log = log_of([Fault(), Fault(gain=0.0)])
     quiet = log.response.copy()
