@@ -38,7 +38,6 @@ class Task:
         ends: ``ends(next_state) -> bool``, where episodes end early; nowhere if None.
         features: state coordinates that the dynamics depend on; all if none.
         observe: what a policy sees of states ``(*B, S)``, ``(*B, O)``; the states if None.
-        draw: draws states ``(T, S)`` and a goal as pictures; None if nothing can.
 
     Raises:
         ConfigurationError: for actions without limits, or a reward that cannot be used.
@@ -59,7 +58,6 @@ class Task:
     ends: Callable[[Tensor], Tensor] | None = None
     features: Sequence[int] = ()
     observe: Callable[[Tensor], Tensor] | None = None
-    draw: Callable[..., Any] | None = None
 
     def __post_init__(self) -> None:
         """Check limits and rewards."""

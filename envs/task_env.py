@@ -17,7 +17,7 @@ from afm_rl.envs.mission_noise import MissionNoise
 from afm_rl.envs.phases import PhasedSimulation
 from afm_rl.envs.settings import check_bounds, check_regime
 from afm_rl.envs.task import Task
-from afm_rl.envs.task_film import film
+from afm_rl.envs.task_film import curves, film
 from afm_rl.errors import ConfigurationError, check_count, check_instance
 from afm_rl.regimes import ActionGain, Regime, Schedule
 
@@ -100,12 +100,12 @@ class TaskEnv(MissionEnv):
     def draw(self, steps: pd.DataFrame) -> Iterator[np.ndarray]:
         """Yield a picture ``(H, W, 3)`` of each row of a table of steps.
 
-        Raises:
-            ConfigurationError: for worlds that are not MuJoCo's.
+        Of MuJoCo's robots the body is drawn, of others the state as curves.
         """
-        if not isinstance(self.task.world, MuJoCoDynamics):
-            raise ConfigurationError(f"video: of {self.task.name} there is nothing to be drawn")
-        return film(self.task.world.mjcf, steps[list(self.task.state_names)].to_numpy())
+        states = steps[list(self.task.state_names)].to_numpy()
+        if isinstance(self.task.world, MuJoCoDynamics):
+            return film(self.task.world.mjcf, states)
+        return curves(steps["t"].to_numpy(), states, self.task.state_names)
 
     def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:
         noise = self._actuator_noise(tensordict["mission", "seed"])

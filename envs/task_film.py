@@ -1,9 +1,9 @@
-"""Pictures of MuJoCo robots: by MuJoCo's renderer, or as bones where nothing can render."""
+"""Pictures of MuJoCo robots, by its renderer or as bones, and of any state as curves."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 HEIGHT, WIDTH = 480, 640  # MuJoCo's own buffer
 DPI = 80
 PLANE, CAPSULE, CYLINDER = 0, 3, 5  # MuJoCo's numbers of kinds of geoms
+DOT = 0.05  # half length of a disc, in radii
 AROUND = 1.5  # how much more than the robot a picture shows
 BODY, FIXED = "#0072b2", "#999999"
 
@@ -76,13 +77,14 @@ def _bones(model: Any, states: np.ndarray) -> Iterator[np.ndarray]:
 def segments(model: Any, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return ends (m) of the axes of geoms, ``(T, K, 2, 3)``, and their radii (m), ``(K,)``.
 
-    Planes are left out; geoms that are not long have both ends in the middle.
+    Planes are left out; geoms that are not long have both ends near the middle: a line without any
+    length would not be drawn.
     """
     import mujoco
 
     data, solid = mujoco.MjData(model), _solid(model)
     long = np.isin(model.geom_type[solid], (CAPSULE, CYLINDER))
-    half = np.where(long, model.geom_size[solid, 1], 0.0)[:, None]
+    half = np.where(long, model.geom_size[solid, 1], DOT * model.geom_size[solid, 0])[:, None]
     ends = []
     for row in states:
         data.qpos = row[: model.nq]
@@ -90,6 +92,30 @@ def segments(model: Any, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         axis = half * data.geom_xmat[solid].reshape(-1, 3, 3)[..., 2]
         ends.append(np.stack([data.geom_xpos[solid] - axis, data.geom_xpos[solid] + axis], 1))
     return np.stack(ends), model.geom_size[solid, 0]
+
+
+def curves(t: np.ndarray, states: np.ndarray, names: Sequence[str]) -> Iterator[np.ndarray]:
+    """Yield pictures of curves that grow, one panel per state coordinate.
+
+    Args:
+        t: numbers of steps, ``(T,)``.
+        states: rows, ``(T, S)``.
+        names: of the coordinates.
+    """
+    figure = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+    lines = []
+    for panel, name, column in zip(panels, names, states.T, strict=True):
+        panel.plot(t, column, color=FIXED, alpha=0.3, linewidth=1)
+        panel.set_ylabel(name)
+        lines.append(panel.plot([], color=BODY)[0])
+    panels[-1].set_xlabel("step")
+    for end in range(1, len(states) + 1):
+        for line, column in zip(lines, states.T, strict=True):
+            line.set_data(t[:end], column[:end])
+        canvas.draw()
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def _solid(model: Any) -> np.ndarray:

@@ -27,6 +27,7 @@ from afm_rl.manifold import Manifold
 
 Limits = Sequence[float] | None
 NOWHERE = torch.zeros(0)  # the goal of a task without one
+FINE = 0.1  # error of a model of one's own, at most, in effects that the largest actions have
 
 
 def gymnasium_task(
@@ -201,8 +202,9 @@ def mujoco_task(
         return world.manifold.add(first, noise * drawn), NOWHERE
 
     name = "mjcf" if str(xml).lstrip().startswith("<") else Path(xml).stem
-    limits = action_low, action_high
-    return _mujoco(name, world, start, {"reward": reward}, steps, *limits)
+    low, high = action_low or world.action_low.tolist(), action_high or world.action_high.tolist()
+    _trust(world, first, low, high)
+    return _mujoco(name, world, start, {"reward": reward}, steps, low, high)
 
 
 def function_task(
@@ -235,9 +237,10 @@ def function_task(
         drawn = torch.randn(len(first), generator=torch.Generator().manual_seed(seed))
         return first + start_noise * drawn, NOWHERE
 
+    world = KnownDynamics(step, Manifold(len(first), angles), len(action_low))
     return Task(
         name=getattr(step, "__name__", "function"),
-        world=KnownDynamics(step, Manifold(len(first), angles), len(action_low)),
+        world=_trust(world, first, action_low, action_high),
         start=begin,
         reward=reward,
         low=action_low,
@@ -311,6 +314,21 @@ def _known(
     size = 0 if model is None else model.nq + model.nv + model.na
     features = [k for k in range(size) if k not in found.ignored] if found.ignored else []
     return {"reward": found.reward, "plan": found.plan, "ends": found.ends, "features": features}
+
+
+def _trust(
+    world: KnownDynamics, state: Tensor, low: Sequence[float], high: Sequence[float]
+) -> KnownDynamics:
+    """Bound a model's noise by a share of what actions effect in a step.
+
+    Short steps have small effects; a change of what they are would be lost in the noise of long
+    ones.
+    """
+    half = (torch.tensor([list(high), list(low)]).diff(dim=0)[0] / 2).abs().nan_to_num(posinf=1.0)
+    slopes = world.jacobian(state.float(), torch.zeros(len(half))).abs()
+    effect = FINE * (slopes * half).sum(-1)
+    world.noise = torch.where(effect > 0, torch.minimum(world.noise, effect), world.noise)
+    return world
 
 
 def _mujoco(

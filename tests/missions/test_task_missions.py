@@ -3,6 +3,7 @@
 import math
 import re
 import sys
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -187,6 +188,37 @@ def test_progress_is_a_share_of_the_episode_not_of_the_budget(monkeypatch):
     monkeypatch.setattr(Bar, "close", lambda bar: shares.append(bar.n / bar.total))
     run(agent_of(*PENDULUM, *SMALL, "robot.steps=12", "budget=5000", FLIP, "method=physics"))
     assert shares[0] == 1.0
+
+
+@pytest.fixture
+def how_to(tmp_path, monkeypatch):
+    """Write the files that a page shows; make agents that name them."""
+    page = (Path(__file__).parents[2] / "docs/howto/my_task.md").read_text()
+    (tmp_path / "conf" / "robot").mkdir(parents=True)
+    for text in re.findall(r"```\w+\n(.*?)```", page, re.DOTALL):
+        if name := re.search(r"(?:# |<!-- )([\w/]+\.(?:xml|py|yaml))", text):
+            (tmp_path / name[1]).write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    sys.modules.pop("mine", None)
+
+    def make(*overrides):
+        path = f"hydra.searchpath=[file://{tmp_path}/conf]"
+        with initialize_config_module("afm_rl.conf", version_base="1.3"):
+            return build(compose("config", [path, *overrides]), ["mine"])
+
+    yield make
+    sys.modules.pop("mine", None)
+
+
+def test_robots_of_the_how_to_are_corrected_as_it_shows_them(how_to):
+    pytest.importorskip("mujoco")
+    cart = ["robot=mujoco", "robot.xml=cart.xml", "robot.reward=mine.home", "robot.steps=40"]
+    for chosen in (cart, ["robot=glider", "robot.steps=40"]):
+        steps = run(how_to(*chosen, *SMALL, "method=afm_physics")).steps.iloc[26:]
+        planned, executed = (steps.filter(regex=f"^{name}_") for name in ("planned", "executed"))
+        assert (planned.to_numpy() * executed.to_numpy() <= 0).mean() > 0.9, chosen
+    assert how_to("robot=boat", "method=afm_frozen_pe").robot.data.rounds == [500, 300]
 
 
 @pytest.mark.parametrize("robot", ["half_cheetah", "inverted_pendulum", "reacher"])
