@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.correction.base import Correction, rows_of
-from afm_rl.correction.compiled import Method, compile_module
+from afm_rl.correction.compiled import MachineCode, in_one_batch
 from afm_rl.correction.counterfactuals import draw_counterfactuals
 from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY, check_hypotheses, memory_of
 from afm_rl.correction.pairs import PairCorrector
@@ -124,8 +124,8 @@ class ActionFlow(PairCorrector):
                 f"{rows} rows and the hypotheses {', '.join(self.hypotheses)}"
             )
         self.saturation = saturation
-        self.compiles, self.cache = check_flag("corrector.compile", compile), Path(cache)
-        self.__dict__["_codes"] = {}
+        self.compiles = check_flag("corrector.compile", compile)
+        self.__dict__["_machine_code"] = MachineCode(self, cache)
         self.tick = Tick(
             load_universal() if network is None else network,
             self.scale,
@@ -197,35 +197,21 @@ class ActionFlow(PairCorrector):
         """Return the memory with the transition to ``next_state`` ``(*B, S)``."""
         if not self.compiles:
             return super().observe(memory, next_state)
-        return self._run(PairCorrector.observe, memory, next_state)[0]
+        return self._machine_code(PairCorrector.observe, memory, next_state)[0]
 
     def _look(self, memory: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
         # Machine code holds the model as it is now, and one round of Gauss and Newton.
         if not (self.compiles and model.affine and model.taught_in is None):
             return self.look(memory, model)
-        return self._run(PairCorrector.look, memory, model=model)
+        return self._machine_code(PairCorrector.look, memory, model=model)
 
     @torch.inference_mode()
     def _answer(self, *given: Tensor) -> dict[str, Tensor]:
-        found = self._run(ActionFlow.decide, *given)
+        if self.compiles:
+            found = self._machine_code(ActionFlow.decide, *given)
+        else:
+            found = in_one_batch(self.decide, *given)
         return dict(zip(("memory", *CORRECTED), found, strict=True))
-
-    def _run(
-        self, function: Callable, *given: Tensor, model: DynamicsModel | None = None
-    ) -> list[Tensor]:
-        """Return what a method makes of tensors with any batch dimensions, as machine code."""
-        batch = given[0].shape[:-1]
-        given = tuple(_flat(part, len(batch)) for part in given)
-        key = (function.__name__, id(model), given[0].dtype, given[0].shape[-1])
-        code = self.__dict__["_codes"].get(key)
-        if code is None:
-            code = Method(self, function, model)
-            if self.compiles:
-                two = [part[:1].repeat(2, *[1] * (part.dim() - 1)) for part in given]
-                traced = model is not None
-                code = compile_module(code, two, self.cache, traced) or code
-            self.__dict__["_codes"] = {**self.__dict__["_codes"], key: code}
-        return [part.view((*batch, *part.shape[1:])) for part in code(*given)]
 
     def place_of(self, state: Tensor) -> Tensor:
         """Return where a state is, in the unit in which ground differs."""
@@ -273,11 +259,6 @@ class ActionFlow(PairCorrector):
             return draw_counterfactuals(
                 self, model, regime, states, size, self.saturation, generator
             )
-
-
-def _flat(part: Tensor, lead: int) -> Tensor:
-    """Return a part with its ``lead`` batch dimensions as one."""
-    return part.unsqueeze(0) if lead == 0 else part.flatten(0, lead - 1) if lead > 1 else part
 
 
 def _put(part: Tensor, use: Any, value: Tensor) -> Tensor:

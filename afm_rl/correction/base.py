@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor, nn
@@ -79,7 +80,6 @@ class Corrector(nn.Module, ABC):
         self.recent = check_count("corrector.recent", recent)
         scale = torch.maximum(low.abs(), high.abs())
         self.action_size = len(scale)
-        self._layouts: dict[int, tuple[list[str], list[int], list[tuple[int, ...]]]] = {}
         ends = {"scale": scale, "lowest": low / scale, "highest": high / scale}
         for name, value in ends.items():
             self.register_buffer(name, value, persistent=False)
@@ -187,11 +187,12 @@ class Corrector(nn.Module, ABC):
 
     def _layout(self, state_size: int) -> tuple[list[str], list[int], list[tuple[int, ...]]]:
         """Return names, sizes and shapes of the parts of a memory, computed once."""
-        if state_size not in self._layouts:
+        known = LAYOUTS.setdefault(self, {})
+        if state_size not in known:
             shapes = self.shapes(state_size)
             sizes = [math.prod(shape) for shape in shapes.values()]
-            self._layouts[state_size] = list(shapes), sizes, list(shapes.values())
-        return self._layouts[state_size]
+            known[state_size] = list(shapes), sizes, list(shapes.values())
+        return known[state_size]
 
     def split_transitions(self, rows: Tensor, state_size: int) -> tuple[Tensor, ...]:
         """Return state, planned, executed, next state and validity of rows of transitions."""
@@ -214,3 +215,7 @@ class Corrector(nn.Module, ABC):
     def within(self, share: Tensor) -> Tensor:
         """Return the u whose place between lowest (-1) and highest (1) is ``share`` ``(*B, A)``."""
         return self.lowest + 0.5 * (share + 1) * (self.highest - self.lowest)
+
+
+LAYOUTS: WeakKeyDictionary[Corrector, dict[int, tuple[list, list, list]]] = WeakKeyDictionary()
+"""Layouts that were computed, by corrector and size of the state."""

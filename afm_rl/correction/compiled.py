@@ -10,6 +10,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,14 +18,44 @@ from torch import Tensor, nn
 from afm_rl._version import __version__
 
 
-class Method(nn.Module):
-    """A method on tensors as a module of its own.
+class MachineCode:
+    """Methods of a module as machine code, each compiled when it is first called.
 
     Args:
-        owner: whose method.
-        function: as the class has it; returns a tensor or several.
-        more: what it takes after the tensors, a module; None: nothing.
+        owner: whose methods.
+        cache: folder of compiled functions.
     """
+
+    def __init__(self, owner: nn.Module, cache: str | Path) -> None:
+        self.owner, self.cache = owner, cache
+        self.codes: dict[tuple, Callable[..., Sequence[Tensor]]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"codes": {}}  # loaded code cannot be copied
+
+    def __call__(
+        self, function: Callable, *given: Tensor, model: nn.Module | None = None
+    ) -> list[Tensor]:
+        """Return what a method makes of tensors ``(*B, ...)``, or its plain form if it must be.
+
+        Args:
+            function: the method, as the class has it; returns a tensor or several.
+            given: its tensors.
+            model: what it takes after them.
+        """
+        key = (function.__name__, id(model), given[0].dtype, given[0].shape[-1])
+        code = self.codes.get(key)
+        if code is None:
+            code = Method(self.owner, function, model)
+            two = [part.reshape(-1, *part.shape[given[0].dim() - 1 :])[:1] for part in given]
+            two = [part.repeat(2, *[1] * (part.dim() - 1)) for part in two]
+            code = compile_module(code, two, self.cache, traced=model is not None) or code
+            self.codes[key] = code
+        return in_one_batch(code, *given)
+
+
+class Method(nn.Module):
+    """A method on tensors as a module of its own."""
 
     def __init__(self, owner: nn.Module, function: Callable, more: nn.Module | None) -> None:
         super().__init__()
@@ -36,6 +67,21 @@ class Method(nn.Module):
         more = [] if self.more is None else [self.more]
         found = self.function(self.owner, *given, *more)
         return (found,) if isinstance(found, Tensor) else tuple(found)
+
+
+def in_one_batch(function: Callable[..., Sequence[Tensor]], *given: Tensor) -> list[Tensor]:
+    """Return what a function of tensors ``(B, ...)`` makes of tensors ``(*B, ...)``.
+
+    >>> in_one_batch(lambda x: [x.sum(-1)], torch.ones(2, 3, 4))[0].shape  # a sum of four numbers
+    torch.Size([2, 3])
+    """
+    batch = given[0].shape[:-1]
+    lead = len(batch)
+    if lead == 0:
+        given = tuple(part.unsqueeze(0) for part in given)
+    elif lead > 1:
+        given = tuple(part.flatten(0, lead - 1) for part in given)
+    return [part.view((*batch, *part.shape[1:])) for part in function(*given)]
 
 
 def compile_module(

@@ -1,7 +1,7 @@
 """Training of the universal flow: ``python -m afm_rl.flow.pretrain --out universal.safetensors``.
 
 ``--evaluate`` prints the held-out errors of the weights of the package, by kind of regime and
-number of actions, as they stand in the model card.
+number of actions, as they stand in the model card; a training ends with the same table.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from afm_rl.flow.weights import load_universal
 SIZES = {1: 0.12, 2: 0.45, 3: 0.15, 4: 0.08, 6: 0.15, 9: 0.05}  # share of numbers of actions
 SHARES = {"mixed": 0.5, "clip": 0.3, "direction": 0.2}  # share of saturation modes
 PLANS = 4  # per window
+LESIONS = ("across", "experts", "noise")  # parts of the network that can be left out
 POOL = 8  # batches that are drawn at once
 
 
@@ -122,21 +123,29 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("universal.safetensors"))
     parser.add_argument("--iterations", type=int, default=40_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--leave-out", choices=LESIONS, help="train without a part, to see its worth"
+    )
     parser.add_argument("--evaluate", action="store_true", help="print errors, train nothing")
     given = parser.parse_args()
     torch.set_num_threads(1)
     if given.evaluate:
-        print("| kind | 1 action | 2 | 6 | 17 |\n|---|---|---|---|---|")
-        for name, errors in evaluate(load_universal()).items():
-            cells = (f"{flow:.3f} ({nothing:.3f})" for flow, nothing in errors)
-            print(f"| {name} | {' | '.join(cells)} |")
+        _print_table(load_universal())
         return
-    network = AxisNetwork(seed=given.seed)
+    network = AxisNetwork(seed=given.seed, **{part: part != given.leave_out for part in LESIONS})
     pretrain(network, given.iterations, seed=given.seed + 1)
     data = save({name: part.contiguous() for name, part in network.state_dict().items()})
     write_whole(given.out, data)
     checksum = f"{hashlib.sha256(data).hexdigest()}  {given.out.name}\n"
     write_whole(given.out.with_name(given.out.name + ".sha256"), checksum.encode())
+    _print_table(network)
+
+
+def _print_table(network: AxisNetwork) -> None:
+    print("| kind | 1 action | 2 | 6 | 17 |\n|---|---|---|---|---|")
+    for name, errors in evaluate(network).items():
+        cells = (f"{flow:.3f} ({nothing:.3f})" for flow, nothing in errors)
+        print(f"| {name} | {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":
