@@ -40,6 +40,8 @@ class Actuator:
     """Size of commands beyond which nothing more happens; None: none was seen."""
     backlash: float = 0.0
     """Half of the play, in units of the command; 0: none was seen."""
+    stick: float = 0.0
+    """Change of the command up to which nothing moves, and then all at once; 0: none was seen."""
     delay_s: float = 0.0
     """d (s)."""
     lag_s: float = 0.0

@@ -63,7 +63,7 @@ class Model:
     @property
     def size(self) -> int:
         """Count the numbers that are estimated."""
-        return len(self.active) + len(self.others) + self.jump
+        return len(self.active) + len(self.others) + self.jump + (self.shape.stick > 0)
 
     def parts(self, problem: Problem) -> list[np.ndarray]:
         """Return the responses at gain 1 to the driver and to the others, ``(N,)`` each."""
@@ -79,7 +79,8 @@ class Model:
 
     def led_by(self, own: int) -> Model:
         """Return the model with another of its commands as the driver, where both act alike."""
-        if own not in self.others or self.jump or DOWN in self.others or {*CURVED} & {*self.active}:
+        curved = self.jump or self.shape.stick or DOWN in self.others or {*CURVED} & {*self.active}
+        if own not in self.others or curved:
             return self
         gains = {self.driver: self.gain, **dict(zip(self.others, self.gains, strict=True))}
         gain = gains.pop(own)
@@ -190,17 +191,27 @@ def larger(problem: Problem, model: Model) -> Iterator[Model]:
     if low < 0 < high and DOWN not in model.others:
         sides = replace(model, others=(*model.others, DOWN), gains=(*model.gains, 0.0))
         found.append(_lines(problem, sides))
+    sizes = np.quantile(np.abs(own), np.linspace(0.03, 0.8, 16))
     if "dead_zone" in tries:
-        sizes = np.quantile(np.abs(own), np.linspace(0.03, 0.8, 16))
-        options = [model.shape._replace(dead_zone=float(z)) for z in sizes]
-        jumps = (_lines(problem, replace(model, shape=s, jump=True)) for s in options)
-        best = min(jumps, key=_cost)
-        near = best.shape.dead_zone * np.linspace(0.88, 1.12, 9)
-        options = [model.shape._replace(dead_zone=float(z)) for z in near]
-        jumps = (_lines(problem, replace(model, shape=s, jump=True)) for s in options)
-        found.append(min([best, *jumps], key=_cost))
+        found.append(_by_grid(problem, replace(model, jump=True), "dead_zone", sizes))
+    if not model.shape.stick:
+        free = tuple(name for name in model.active if name != "play")
+        still = replace(model, active=free, shape=model.shape._replace(play=0.0))
+        found.append(_by_grid(problem, still, "stick", sizes))
     yield from sorted(found, key=_cost)[:2]
     yield from _with_another(problem, model)
+
+
+def _by_grid(problem: Problem, model: Model, name: str, sizes: np.ndarray) -> Model:
+    """Return the model with the best of some sizes, or one close to it: it changes by jumps."""
+
+    def best_of(values: np.ndarray) -> Model:
+        shapes = (model.shape._replace(**{name: float(value)}) for value in values)
+        return min((_lines(problem, replace(model, shape=s)) for s in shapes), key=_cost)
+
+    coarse = best_of(sizes)
+    near = best_of(getattr(coarse.shape, name) * np.linspace(0.88, 1.12, 9))
+    return min(coarse, near, key=_cost)
 
 
 def _cost(model: Model) -> float:

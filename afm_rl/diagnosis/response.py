@@ -25,6 +25,8 @@ class Shape(NamedTuple):
     """Highest command that is followed."""
     play: float = 0.0
     """Half width of the backlash."""
+    stick: float = 0.0
+    """Change of the command up to which nothing moves; then the command is reached at once."""
 
 
 def respond(clock: Clock, command: np.ndarray, shape: Shape) -> np.ndarray:
@@ -50,6 +52,8 @@ def shaped(clock: Clock, command: np.ndarray, shape: Shape, jump: bool = False) 
         command = np.where(np.abs(command) > shape.dead_zone, command, 0.0)
     if shape.play:
         command = follow_with_play(command, shape.play, clock.start)
+    if shape.stick:
+        command = follow_sticking(command, shape.stick, clock.start)
     if shape.low > -np.inf or shape.high < np.inf:
         command = np.clip(command, shape.low, shape.high)
     if shape.dead_zone and not jump:
@@ -106,3 +110,17 @@ def follow_with_play(command: np.ndarray, width: float, start: np.ndarray) -> np
             break
         reach *= 2
     return low
+
+
+def follow_sticking(command: np.ndarray, width: float, start: np.ndarray) -> np.ndarray:
+    """Return what sticks to its place until the command is farther away than ``width``.
+
+    >>> follow_sticking(np.array([0.0, 0.1, 0.3, 0.2]), 0.2, np.zeros(4, dtype=int))
+    array([0. , 0. , 0.3, 0.3])
+    """
+    place, places = 0.0, []
+    for row, (value, first) in enumerate(zip(command.tolist(), start.tolist(), strict=True)):
+        if first == row or abs(value - place) > width:
+            place = value
+        places.append(place)
+    return np.array(places)

@@ -179,6 +179,7 @@ def _report(
         dead_zone=float(shape.dead_zone * unit),
         saturation=float(np.mean(ends)) if ends else None,
         backlash=float(shape.play * unit),
+        stick=float(shape.stick * unit),
         delay_s=shape.delay * log.step,
         lag_s=-log.step / math.log(shape.keep) if shape.keep > 1e-6 else 0.0,
         driven_by=log.names[model.driver] if model.driver != j else largest,

@@ -128,6 +128,8 @@ def _faults(actuator: Actuator, step: float, usual_delay: float) -> Iterator[str
         yield f"no more for commands beyond {actuator.saturation:.3g}"
     if actuator.backlash > max(MATTERS * reach, actuator.quantum / unit):
         yield f"play of {2 * actuator.backlash:.3g}"
+    if actuator.stick > max(MATTERS * reach, actuator.quantum / unit):
+        yield f"sticks for changes below {actuator.stick:.3g}"
     if actuator.delay_s > usual_delay + LATE * step:
         yield f"{_steps(actuator.delay_s / step)} late"
     if actuator.delay_s + actuator.lag_s > usual_delay + LATE * step and (

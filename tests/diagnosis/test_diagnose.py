@@ -141,7 +141,16 @@ def drop_out(u, rng):
     return u * ~lost
 
 
+def stick(u, rng):
+    """Return what moves only where the command is farther away than 0.2."""
+    places = [u[0]]
+    for value in u[1:]:
+        places.append(value if abs(value - places[-1]) > 0.2 else places[-1])
+    return np.array(places)
+
+
 ODD = {
+    r"sticks for changes below (0.19\d*|0.2|0.20\d*)": stick,
     "100 % of positive commands, 50 % of negative ones": lambda u, rng: np.where(u > 0, u, u / 2),
     r"does not follow in (1\d|2\d|3\d) % of the rows": drop_out,
     r"does not follow in (2\d|3\d) % of the rows": lambda u, rng: u * (rng.random(len(u)) < 0.7),
