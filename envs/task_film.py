@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -28,21 +29,30 @@ def film(model: Any, states: np.ndarray) -> Iterator[np.ndarray]:
     """
     import mujoco
 
-    data = mujoco.MjData(model)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
-    except Exception:  # each platform fails in its own way
+    if not can_render():
         yield from _bones(model, states)
         return
-    camera = 0 if model.ncam else -1
-    with renderer:
+    data, camera = mujoco.MjData(model), 0 if model.ncam else -1
+    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
         for row in states:
             data.qpos = row[: model.nq]
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
             yield renderer.render()
+
+
+@cache
+def can_render() -> bool:
+    """Tell whether MuJoCo can draw here; tried once, as a second failure may end the process."""
+    import mujoco
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 1, 1).close()
+    except Exception:  # each platform fails in its own way
+        return False
+    return True
 
 
 def _bones(model: Any, states: np.ndarray) -> Iterator[np.ndarray]:

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from afm_rl.envs import TaskEnv, gymnasium_task
-from afm_rl.envs.task_film import HEIGHT, WIDTH, film, segments
+from afm_rl.envs.task_film import HEIGHT, WIDTH, can_render, film, segments
 
 mujoco = pytest.importorskip("mujoco")
 MODEL = """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
@@ -21,12 +21,17 @@ def pole():
 
 @pytest.fixture
 def blind(monkeypatch):
-    """A computer on which nothing can render."""
+    """A computer on which nothing can render; returns how often that was tried."""
+    tries = []
 
     def fail(*args):
+        tries.append(args)
         raise RuntimeError("no OpenGL")
 
+    can_render.cache_clear()
     monkeypatch.setattr(mujoco, "Renderer", fail)
+    yield tries
+    can_render.cache_clear()
 
 
 def test_bones_are_where_the_body_is(pole):
@@ -45,6 +50,7 @@ def test_where_nothing_can_render_bones_are_drawn(pole, blind):
     assert (pictures[0] != pictures[2]).any()
     inside = (pictures[0] == (0, 114, 178)).all(-1)
     assert 500 < inside.sum() < HEIGHT * WIDTH / 4
+    assert len(list(film(pole, np.zeros((1, 1))))) == len(blind) == 1  # a second failure may kill
 
 
 def test_mujocos_renderer_is_used_where_there_is_one(pole, monkeypatch):
@@ -53,6 +59,9 @@ def test_mujocos_renderer_is_used_where_there_is_one(pole, monkeypatch):
     class Renderer:
         def __init__(self, model, height, width):
             self.picture = np.zeros((height, width, 3), np.uint8)
+
+        def close(self):
+            pass
 
         def __enter__(self):
             return self
@@ -67,8 +76,10 @@ def test_mujocos_renderer_is_used_where_there_is_one(pole, monkeypatch):
             return self.picture
 
     monkeypatch.setattr(mujoco, "Renderer", Renderer)
+    can_render.cache_clear()
     assert len(list(film(pole, np.array([[0.1], [0.2]])))) == 2
     assert shown == [(0.1, -1), (0.2, -1), "closed"]
+    can_render.cache_clear()
 
 
 def test_a_task_draws_the_steps_of_a_mission(blind):
