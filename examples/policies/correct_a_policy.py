@@ -41,20 +41,31 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--at", type=int, default=500, help="step at which the motor is reversed")
+    parser.add_argument("--model", choices=["mujoco", "learn"], default="mujoco")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    policy, _ = load_policy(POLICY)
-    robot = ReversedMotor(gymnasium.make("HalfCheetah-v5"), args.at)
-    for name, env in {"alone": robot, "corrected": ActionFlowWrapper(robot)}.items():
-        (observation, _), info, rewards = env.reset(seed=0), {}, []
-        for _ in range(args.steps):
-            action = policy(torch.as_tensor(observation)).numpy()
-            observation, reward, _, _, info = env.step(action)
-            rewards.append(float(reward))
+    robot = ReversedMotor(gymnasium.make("HalfCheetah-v5"), args.steps)
+    corrected = ActionFlowWrapper(robot, args.model)
+    while args.model == "learn" and not corrected.reset(seed=0)[1]["afm"]["learned"]:
+        play(corrected, args.steps)  # healthy: 20 episodes, and a minute for the fit
+    robot.at = args.at
+    for name, env in {"alone": robot, "corrected": corrected}.items():
+        rewards, info = play(env, args.steps, seed=0)
         before, after = rewards[: args.at], rewards[args.at :]
         print(f"{name}: a step {mean(before):.2f} before, {mean(after):.2f} after")
         for line in info["afm"]["diagnosis"].splitlines() if "afm" in info else ():
             print(f"    {line}")
+
+
+def play(env: gymnasium.Env, steps: int, seed: int | None = None) -> tuple[list[float], dict]:
+    """Return the rewards of an episode of the policy, and what was told of its last step."""
+    policy, _ = load_policy(POLICY)
+    (observation, info), rewards = env.reset(seed=seed), []
+    for _ in range(steps):
+        action = policy(torch.as_tensor(observation)).numpy()
+        observation, reward, _, _, info = env.step(action)
+        rewards.append(float(reward))
+    return rewards, info
 
 
 def mean(values: list[float]) -> float:
