@@ -46,8 +46,10 @@ def main() -> None:
     torch.set_num_threads(1)
     robot = ReversedMotor(gymnasium.make("HalfCheetah-v5"), args.steps)
     corrected = ActionFlowWrapper(robot, args.model)
-    while args.model == "learn" and not corrected.reset(seed=0)[1]["afm"]["learned"]:
-        play(corrected, args.steps)  # healthy: 20 episodes, and a minute for the fit
+    told = corrected.reset(seed=1)[1]["afm"]
+    while not told.get("learned", True):  # 20 healthy episodes, and a minute for the fit
+        play(corrected, args.steps)
+        told = corrected.reset()[1]["afm"]
     robot.at = args.at
     for name, env in {"alone": robot, "corrected": corrected}.items():
         rewards, info = play(env, args.steps, seed=0)
