@@ -22,7 +22,7 @@ PAGES = [
     *sorted((DOCS / "methods").glob("*.md")),
 ]
 FENCE = re.compile(r"^```(python|yaml|sh|xml)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-NAME = re.compile(r"(?:# |<!-- )(\S+\.(?:py|yaml|xml))(?: -->)?\n")
+NAME = re.compile(r"(?:# @.*\n)?(?:# |<!-- )(\S+\.(?:py|yaml|xml))(?:: .*| -->)?\n")
 PATHS = re.compile(r"`((?:afm_rl|envs|conf|examples|notebooks|tests|benchmarks)/[\w./]+)`")
 
 
@@ -68,7 +68,7 @@ def write_files(page, folder):
             if named:
                 path = folder / named[1]
                 path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(text[named.end() :])
+                path.write_text(text)  # as a reader pastes it
             elif kind == "python":
                 rest.append(text)
     return rest

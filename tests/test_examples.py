@@ -29,7 +29,7 @@ def lines_on_top(path):
 
 def test_every_example_says_how_to_run_it():
     found = [path for path in (ROOT / "examples").glob("*/*.py") if lines_on_top(path)]
-    assert {path.parent.name for path in found} >= {*LESS, "gymnasium_tasks", "explain_afm"}
+    assert {path.parent.name for path in found} >= {*LESS, "explain_afm"}
     for path in found:
         (line,) = lines_on_top(path)
         assert ROOT / shlex.split(line)[1] == path
