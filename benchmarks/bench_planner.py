@@ -4,11 +4,13 @@
 
 One mission, 1000 candidates, horizon 5, ensemble of 5 x (200, 200, 200), float32, one thread.
 Everything is timed in turns within one run, so the ratios hold when the machine's speed drifts. AFM
-is timed where it has nothing to do, and where it corrects every action.
+is timed where it has nothing to do, and where it corrects every action, as it is and as machine
+code (which is compiled at first, for a minute or two), against the same environment without it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from statistics import median
 
 import torch
@@ -18,7 +20,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from afm_rl.correction import ActionFlow
 from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY
-from afm_rl.dynamics import Dubins, DynamicsModel, Ensemble
+from afm_rl.dynamics import Dubins, DynamicsModel, Ensemble, KnownDynamics
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
@@ -33,12 +35,17 @@ def ensemble(seed: int) -> Ensemble:
     return Ensemble(Manifold(3, angles=[2]), 2, features=[2], hidden=HIDDEN, seed=seed)
 
 
+def axes(gain: float) -> DynamicsModel:
+    """Return six axes that move by a multiple of their action."""
+    return KnownDynamics(lambda s, a: s + gain * a, Manifold(6), 6, affine=True)
+
+
 def warm(env: EnvBase) -> TensorDictBase:
     """Return what a step starts from when the memory of the transform is full."""
-    td = env.reset()
-    for _ in range(50):
-        td = env.step_mdp(env.step(td.set("action", torch.tensor([0.5, 0.7]))))
-    return td.set("action", torch.ones(2))
+    td, size = env.reset(), env.action_spec.shape[-1]
+    for k in range(50):
+        td = env.step_mdp(env.step(td.set("action", torch.linspace(0.5, 0.7, size) * (k % 3 - 1))))
+    return td.set("action", torch.ones(size))
 
 
 def main() -> None:
@@ -52,18 +59,29 @@ def main() -> None:
     td = env.reset().set("goal", torch.ones(2))
     cases = {  # model, robot, and what the flow may believe
         "silent, over physics": (Dubins(), Dubins(), list(HYPOTHESES)),
-        "correcting, over the ensemble": (model, ensemble(1), CORRECTING),
-        "correcting, over physics": (Dubins(), model, CORRECTING),
+        "over physics": (Dubins(), model, CORRECTING),
+        "over the ensemble": (model, ensemble(1), CORRECTING),
+        "six actions": (axes(1.0), axes(-0.7), CORRECTING),
     }
 
-    def with_afm(model: DynamicsModel, robot: DynamicsModel, hypotheses: list[str]):
-        flow = ActionFlow(low, high, hypotheses, place=[0, 1], gate=1e-6)
-        plain = PlanningEnv(robot, GoalDistance(), low, high)
+    def with_afm(
+        model: DynamicsModel, robot: DynamicsModel, hypotheses: list[str], compile: bool
+    ) -> tuple[Callable, Callable]:
+        """Return a step with the correction, and the same one without."""
+        size = model.action_size
+        ends = (low, high) if size == 2 else (-torch.ones(size), torch.ones(size))
+        place = [0, 1] if size == 2 else []
+        flow = ActionFlow(*ends, hypotheses, place=place, gate=1e-6, compile=compile)
+        plain = PlanningEnv(robot, GoalDistance(range(min(2, size))), *ends)
         env = TransformedEnv(plain, ActionFlowTransform(model, flow))
-        start = warm(env)
-        return lambda: env.step(start.clone())
+        start, alone = warm(env), warm(plain)
+        return lambda: env.step(start.clone()), lambda: plain.step(alone.clone())
 
-    jobs = {f"with AFM, {name}": with_afm(*parts) for name, parts in cases.items()}
+    pairs = {
+        f"AFM, {name}{', compiled' if compiled else ''}": with_afm(*parts, compiled)
+        for name, parts in cases.items()
+        for compiled in (False, True)
+    }
     plain_td = world.reset().set("action", torch.ones(2))
     learner = ensemble(0)
     updater = OnlineUpdater(GaussianNLLLoss(learner), ResetAdam)
@@ -85,20 +103,21 @@ def main() -> None:
             "matrix products": products,
             "planning step": lambda: planner(td.clone()),
             "environment step": lambda: world.step(plain_td.clone()),
-            **jobs,
+            **{name: job for name, (job, _) in pairs.items()},
+            **{f"without, {name}": job for name, (_, job) in pairs.items()},
             "online update": lambda: updater(transition),
         },
         ROUNDS,
     )
     bare = median(spent["matrix products"])
-    print(f"{'':28}{'ms (median)':>14}{'/ products':>12}")
+    print(f"{'':36}{'ms (median)':>14}{'/ products':>12}")
     for name, values in spent.items():
-        print(f"{name:28}{median(values):14.2f}{median(values) / bare:12.3f}")
-    pairs = zip(spent["planning step"], spent["matrix products"], strict=True)
-    print(f"planning step / matrix products, round by round: {median(a / b for a, b in pairs):.3f}")
-    step, plan = (median(spent[name]) for name in ("environment step", "planning step"))
-    for name in jobs:
-        extra = median(spent[name]) - step
+        print(f"{name:36}{median(values):14.2f}{median(values) / bare:12.3f}")
+    turns = zip(spent["planning step"], spent["matrix products"], strict=True)
+    print(f"planning step / matrix products, round by round: {median(a / b for a, b in turns):.3f}")
+    plan = median(spent["planning step"])
+    for name in pairs:
+        extra = median(spent[name]) - median(spent[f"without, {name}"])
         print(f"{name}: adds {extra:.2f} ms, {extra / plan:.1%} of a plan")
 
 

@@ -7,6 +7,7 @@ believed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from afm_rl.errors import ConfigurationError, check_choice
 from afm_rl.flow.experts import Rows
 
 IDENTITY = "identity"  # actions have the effect that the model predicts
+FILTER = 6  # commands that a lag looks back on
 AGE = 20.0  # steps that separate two pairs as much as one unit of place does
 
 
@@ -27,6 +29,8 @@ class Hypothesis(NamedTuple):
     """Part of the K rows that is filled."""
     delay: int = 0
     """Steps from a command to its effect."""
+    lag: float = 0.0
+    """Time constant with which effects follow commands, in steps."""
     near: bool = False
     """Whether it reads the pairs nearest in place instead of in time."""
     penalty: float = 0.0
@@ -39,6 +43,7 @@ HYPOTHESES = {
     "newest": Hypothesis(share=1 / 6, penalty=0.02),  # right after a change
     "long": Hypothesis(share=1.0),
     **{f"delay_{k}": Hypothesis(delay=k, penalty=0.05) for k in range(1, 9)},
+    **{f"lag_{k}": Hypothesis(lag=k, penalty=0.05) for k in range(1, 4)},
     "near": Hypothesis(near=True, penalty=0.03),
     "nearest": Hypothesis(share=1 / 6, near=True),
     "here": Hypothesis(share=1 / 12, near=True, penalty=0.01),  # at the edge of two grounds
@@ -49,34 +54,45 @@ class Layout(NamedTuple):
     """How H hypotheses fill K rows, those by place last; ages count from the newest pair, 0."""
 
     command: Tensor
-    """Ages of the commands of the hypotheses by time, ``(T K,)``."""
+    """What the commands of the hypotheses by time weigh, by age, the oldest first, ``(T K, L)``."""
     effect: Tensor
     """Ages of their effects, ``(T K,)``."""
     filled: Tensor
     """Which rows are filled, ``(H, K, 1)``, 0 or 1."""
-    delay: Tensor
-    """Steps from command to effect, ``(H,)``."""
+    acting: Tensor
+    """What commands weigh in what acts now, by age, the oldest first, ``(H, L)``."""
 
 
 def lay_out(hypotheses: Sequence[Hypothesis], rows: int) -> Layout:
     """Return the layout of K ``rows``.
 
-    >>> lay_out([Hypothesis(share=1.0, delay=1)], rows=3).command
-    tensor([3, 2, 1])
+    >>> lay_out([Hypothesis(share=1.0, delay=1)], rows=2).command
+    tensor([[1., 0., 0.],
+            [0., 1., 0.]])
     """
     age = torch.arange(rows - 1, -1, -1)
     timed = [h for h in hypotheses if not h.near]
-    delay = torch.tensor([h.delay for h in hypotheses])
+    length = memory_of(hypotheses, rows)
+    acting = torch.stack([_weights(h, length) for h in hypotheses])
+    command = torch.stack([w.roll(-int(k)) for w in acting[: len(timed)] for k in age])
     count = torch.tensor([max(1, round(h.share * rows)) for h in hypotheses])
-    effect = age.repeat(len(timed))
-    late = delay[: len(timed)].repeat_interleave(rows)
     filled = (age < count.unsqueeze(-1)).unsqueeze(-1).float()
-    return Layout(effect + late, effect, filled, delay)
+    return Layout(command, age.repeat(len(timed)), filled, acting)
+
+
+def _weights(hypothesis: Hypothesis, length: int) -> Tensor:
+    """Return what the newest commands weigh in what acts now, the oldest first, ``(length,)``."""
+    newest = torch.zeros(length)
+    count, keep = (FILTER, math.exp(-1 / hypothesis.lag)) if hypothesis.lag else (1, 0.0)
+    for k in range(count):
+        share = 1.0 if k == count - 1 else 1 - keep  # the oldest stands for those before it
+        newest[hypothesis.delay + k] = share * keep**k
+    return newest.flip(0)
 
 
 def memory_of(hypotheses: Sequence[Hypothesis], rows: int) -> int:
     """Return how many pairs the hypotheses of K ``rows`` read at most."""
-    return rows + max(h.delay for h in hypotheses)
+    return rows + max(h.delay + (FILTER - 1 if h.lag else 0) for h in hypotheses)
 
 
 def check_hypotheses(names: Sequence[str], by_place: bool) -> list[str]:
@@ -122,8 +138,10 @@ def read_rows(pairs: Tensor, layout: Layout, size: int, away: Tensor | None) -> 
     """
     newest, rows = pairs.shape[-2] - 1, layout.filled.shape[-2]
     effects = pairs.index_select(-2, newest - layout.effect)
-    commands = pairs.index_select(-2, newest - layout.command)
-    executed, valid = commands[..., :size], commands[..., 3 * size : 3 * size + 1]
+    commands = pairs[..., -layout.command.shape[-1] :, :]
+    lost = 1 - commands[..., 3 * size : 3 * size + 1]
+    valid = ((layout.command > 0).to(lost) @ lost == 0).to(lost)
+    executed = layout.command.to(lost) @ commands[..., :size]
     effective, std, came = effects[..., size : 3 * size + 1].split([size, size, 1], -1)
     parts = [part.unflatten(-2, (-1, rows)) for part in (executed, effective, std, valid * came)]
     if away is not None:

@@ -55,7 +55,7 @@ class Tick(nn.Module):
     source_points: Tensor
     probes: Tensor
     penalty: Tensor
-    rows_delay: Tensor
+    rows_acting: Tensor
 
     def __init__(
         self,
@@ -238,6 +238,6 @@ class Tick(nn.Module):
         """Return the effects ``(B, H + 1, A)`` that the hypotheses predict of what acts now."""
         size = len(self.scale)
         sent = torch.cat([pairs[..., :size], executed.unsqueeze(-2)], -2)
-        acted = sent.index_select(-2, self.memory - self.rows_delay)  # (B, H, A)
+        acted = self.rows_acting @ sent[:, -self.rows_acting.shape[-1] :]  # (B, H, A)
         effects = self.network.effect(encoded, acted.reshape(-1, 1, size)).view_as(acted)
         return torch.cat([effects, executed.unsqueeze(-2)], -2)

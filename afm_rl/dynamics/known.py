@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics.base import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.errors import ConfigurationError, check_flag, check_number
 from afm_rl.manifold import Manifold
 
 
@@ -22,6 +22,8 @@ class KnownDynamics(DynamicsModel):
         noise_std: standard deviation of the model's own error per step, one number or one
             per coordinate, in the state's units: how far it is trusted, not the noise of a
             simulator.
+        affine: whether the next state is affine in the action; effective actions then take one
+            round, and machine code can hold the model.
 
     >>> def push(state, action):  # a cart: position (m), speed (m/s); force (N)
     ...     return state + 0.1 * torch.cat([state[..., 1:], action], -1)
@@ -38,8 +40,10 @@ class KnownDynamics(DynamicsModel):
         manifold: Manifold,
         action_size: int,
         noise_std: float | Sequence[float] = 1e-3,
+        affine: bool = False,
     ) -> None:
         super().__init__(manifold, action_size)
+        self.affine = self.affine or check_flag("dynamics.affine", affine)
         if not callable(step):
             raise ConfigurationError(f"dynamics.step={step!r}: expected a function")
         self.step = step

@@ -91,7 +91,8 @@ class PlanningEnv(ModelBasedEnvBase):
         next_state = self.dynamics(state, action)
         cost = self.cost(state, action, next_state, *task.values())
         done = torch.zeros((*cost.shape, 1), dtype=torch.bool, device=cost.device)
-        out = TensorDict({"done": done, "terminated": done.clone()}, tensordict.batch_size)
+        ends = {"done": done, "terminated": done.clone()}
+        out = TensorDict(ends, tensordict.batch_size, device=tensordict.device)
         out.set(self.observation_key, next_state)
         out.set("reward", -cost.unsqueeze(-1))
         for key, value in task.items():

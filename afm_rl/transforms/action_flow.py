@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torchrl.data import Composite, TensorSpec
 from torchrl.envs import FrameSkipTransform, Transform
 
@@ -154,10 +154,12 @@ class ActionFlowTransform(Transform):
         return tensordict.set(self.prefix, entries)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        entries = tensordict.get(self.prefix).clone(recurse=False)
-        state = next_tensordict.get(self.observation_key).to(entries.get("memory").dtype)
-        entries.set("memory", self.corrector.observe(entries.get("memory"), state))
-        return next_tensordict.set(self.prefix, entries)
+        entries = dict(tensordict.get(self.prefix).items())
+        state = next_tensordict.get(self.observation_key).to(entries["memory"].dtype)
+        entries["memory"] = self.corrector.observe(entries["memory"], state)
+        # Of the device that the next tensordict names: else every entry is moved to where it is.
+        device, batch = next_tensordict.device, next_tensordict.batch_size
+        return next_tensordict.set(self.prefix, TensorDict(entries, batch, device=device))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
