@@ -1,10 +1,13 @@
 """What each hypothesis reads in the memory."""
 
+import math
+
 import pytest
 import torch
 
 from afm_rl.correction import ActionFlow
 from afm_rl.correction.hypotheses import (
+    FILTER,
     HYPOTHESES,
     IDENTITY,
     Hypothesis,
@@ -70,6 +73,20 @@ def test_late_pairs_join_a_command_with_the_effect_that_came_later(delay):
     assert found.tolist() == [float(k not in (17, 17 + delay)) for k in range(16, 20)]
 
 
+@pytest.mark.parametrize("lag", [1, 2, 3])
+def test_slow_pairs_join_an_effect_with_the_commands_that_it_follows(lag):
+    hypothesis = HYPOTHESES[f"lag_{lag}"]._replace(share=1.0)
+    executed, effective, std, valid = read(hypothesis)
+    assert effective.tolist() == [116, 117, 118, 119] and valid.all()
+    for found, now in zip(executed, effective - 100, strict=True):
+        slow = now - FILTER + 1  # the oldest command that it looks back on
+        for command in range(int(slow) + 1, int(now) + 1):
+            slow = command + math.exp(-1 / lag) * (slow - command)
+        torch.testing.assert_close(found, slow)
+    found = read(hypothesis, pairs=without(MANY - 1 - FILTER))[3]
+    assert found.tolist() == [0, 0, 0, 1]
+
+
 def test_near_pairs_come_in_the_order_of_place_then_of_age():
     hypothesis = HYPOTHESES["near"]._replace(share=1.0)
     away = torch.tensor([0.0, 4.0]).repeat(MANY // 2)  # every second pair is from elsewhere
@@ -89,9 +106,9 @@ def test_what_does_not_count_fills_a_row_with_nothing():
         assert valid.tolist() == [0, 0, 0, 1] == (executed > 0).tolist() == (effective > 0).tolist()
 
 
-@pytest.mark.parametrize("delay", [0, 3, 8])
-def test_the_memory_is_as_long_as_they_look_back_and_no_longer(delay):
-    hypothesis = Hypothesis(share=1.0, delay=delay)
+@pytest.mark.parametrize(("delay", "lag"), [(0, 0.0), (3, 0.0), (8, 0.0), (0, 2.0), (3, 1.0)])
+def test_the_memory_is_as_long_as_they_look_back_and_no_longer(delay, lag):
+    hypothesis = Hypothesis(share=1.0, delay=delay, lag=lag)
     count = memory_of([hypothesis], 3)
     assert read(hypothesis, 3, pairs_of()[-count:])[3].all()
     with pytest.raises((RuntimeError, IndexError)):
