@@ -16,6 +16,7 @@ from statistics import median
 import torch
 from tensordict import TensorDict, TensorDictBase
 from timing import timed
+from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
 from afm_rl.correction import ActionFlow
@@ -35,9 +36,16 @@ def ensemble(seed: int) -> Ensemble:
     return Ensemble(Manifold(3, angles=[2]), 2, features=[2], hidden=HIDDEN, seed=seed)
 
 
-def axes(gain: float) -> DynamicsModel:
-    """Return six axes that move by a multiple of their action."""
-    return KnownDynamics(lambda s, a: s + gain * a, Manifold(6), 6, affine=True)
+class Axes(KnownDynamics):
+    """Six axes that move by a multiple of their action."""
+
+    def __init__(self, gain: float) -> None:
+        super().__init__(lambda s, a: s + gain * a, Manifold(6), 6, affine=True)
+        self.gain = gain
+
+    def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return the closed form."""
+        return self.gain * torch.eye(6).expand(*action.shape, 6)
 
 
 def warm(env: EnvBase) -> TensorDictBase:
@@ -61,7 +69,7 @@ def main() -> None:
         "silent, over physics": (Dubins(), Dubins(), list(HYPOTHESES)),
         "over physics": (Dubins(), model, CORRECTING),
         "over the ensemble": (model, ensemble(1), CORRECTING),
-        "six actions": (axes(1.0), axes(-0.7), CORRECTING),
+        "six actions": (Axes(1.0), Axes(-0.7), CORRECTING),
     }
 
     def with_afm(
@@ -89,7 +97,7 @@ def main() -> None:
     transition["next", "observation"] = torch.ones(3)
     weights = [weight.detach() for weight in model.weights]
     weights[-1] = weights[-1][..., :3].contiguous()  # the planner needs the means only
-    rows = torch.randn(5, POPULATION, 3)
+    rows = torch.randn(5, POPULATION, weights[0].shape[1])
 
     @torch.no_grad()
     def products() -> None:

@@ -200,8 +200,10 @@ class ActionFlow(PairCorrector):
         return self._machine_code(PairCorrector.observe, memory, next_state)[0]
 
     def _look(self, memory: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
-        # Machine code holds the model as it is now, and one round of Gauss and Newton.
-        if not (self.compiles and model.affine and model.taught_in is None):
+        # Machine code holds the model as it is now, one round of Gauss and Newton, and no
+        # automatic derivative.
+        derived = type(model).jacobian is DynamicsModel.jacobian
+        if not self.compiles or not model.affine or model.taught_in is not None or derived:
             return self.look(memory, model)
         return self._machine_code(PairCorrector.look, memory, model=model)
 

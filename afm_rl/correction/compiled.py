@@ -43,7 +43,7 @@ class MachineCode:
             given: its tensors.
             model: what it takes after them.
         """
-        key = (function.__name__, id(model), given[0].dtype, given[0].shape[-1])
+        key = (function.__name__, model, given[0].dtype, given[0].shape[-1])
         code = self.codes.get(key)
         if code is None:
             code = Method(self.owner, function, model)

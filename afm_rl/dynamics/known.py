@@ -22,8 +22,8 @@ class KnownDynamics(DynamicsModel):
         noise_std: standard deviation of the model's own error per step, one number or one
             per coordinate, in the state's units: how far it is trusted, not the noise of a
             simulator.
-        affine: whether the next state is affine in the action; effective actions then take one
-            round, and machine code can hold the model.
+        affine: whether the next state is affine in the action: effective actions then take one
+            round.
 
     >>> def push(state, action):  # a cart: position (m), speed (m/s); force (N)
     ...     return state + 0.1 * torch.cat([state[..., 1:], action], -1)
