@@ -88,6 +88,8 @@ class ActionFlow(PairCorrector):
     tensor([-0.5000, -0.2000])
     """
 
+    _machine_code: MachineCode
+
     def __init__(
         self,
         action_low: Tensor,

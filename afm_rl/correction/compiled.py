@@ -57,6 +57,8 @@ class MachineCode:
 class Method(nn.Module):
     """A method on tensors as a module of its own."""
 
+    function: Callable[..., Any]
+
     def __init__(self, owner: nn.Module, function: Callable, more: nn.Module | None) -> None:
         super().__init__()
         self.owner, self.more, self.name = owner, more, function.__qualname__

@@ -196,8 +196,8 @@ def larger(problem: Problem, model: Model) -> Iterator[Model]:
         found.append(_by_grid(problem, replace(model, jump=True), "dead_zone", sizes))
     if not model.shape.stick:
         free = tuple(name for name in model.active if name != "play")
-        still = replace(model, active=free, shape=model.shape._replace(play=0.0))
-        found.append(_by_grid(problem, still, "stick", sizes))
+        tight = replace(model, active=free, shape=model.shape._replace(play=0.0))
+        found.append(_by_grid(problem, tight, "stick", sizes))
     yield from sorted(found, key=_cost)[:2]
     yield from _with_another(problem, model)
 

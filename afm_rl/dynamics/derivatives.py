@@ -22,7 +22,8 @@ def derivative(
     inputs = tuple(part.contiguous() for part in inputs)
     tangents = tuple(part.contiguous() for part in tangents)
     if torch.compiler.is_compiling():
-        return torch.func.jvp(function, inputs, tangents)
+        found = torch.func.jvp(function, inputs, tangents)
+        return found[0], found[1]
     with forward_ad.dual_level():
         duals = [forward_ad.make_dual(*pair) for pair in zip(inputs, tangents, strict=True)]
         value, slope = forward_ad.unpack_dual(function(*duals))
