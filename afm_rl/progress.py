@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -31,6 +32,9 @@ class Bar(tqdm):
     """
 
     listener: Callable[[str, float], None] | None = None
+    # tqdm's own lock is one for all forked processes: one killed while it holds it stops the rest.
+    _lock = threading.RLock()
+    monitor_interval = 0  # no thread that could hold the lock while a process forks
 
     def __init__(self, *args: Any, shown: bool = True, **settings: Any) -> None:
         self.live, self.begun = sys.stderr.isatty() and Bar.listener is None, False

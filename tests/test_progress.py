@@ -1,0 +1,29 @@
+"""Progress bars: of processes that are killed."""
+
+import multiprocessing
+import os
+import signal
+
+from afm_rl.progress import Bar
+
+
+def show_one():
+    for _ in Bar(range(2), desc="one"):
+        pass
+
+
+def hold():
+    with Bar.get_lock():
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_process_killed_while_it_shows_progress_stops_no_other():
+    show_one()  # the forked processes inherit whatever lock a bar has made
+    fork = multiprocessing.get_context("fork").Process
+    for target, status in (hold, -signal.SIGKILL), (show_one, 0):
+        process = fork(target=target)
+        process.start()
+        process.join(60)
+        process.kill()
+        process.join()
+        assert process.exitcode == status
