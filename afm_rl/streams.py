@@ -70,9 +70,9 @@ class Streams:
             if bound is None:
                 return torch.randn(size, generator=generator, device=device, dtype=dtype)
             edge = math.erf(bound / math.sqrt(2))
-            uniform = torch.rand(size, generator=generator, device=device, dtype=dtype)
-            noise = torch.erfinv(uniform.mul_(2).sub_(1).mul_(edge)).mul_(math.sqrt(2))
-            return noise.clamp_(-bound, bound)
+            noise = torch.empty(size, device=device, dtype=dtype)
+            noise.uniform_(-edge, edge, generator=generator)
+            return noise.erfinv_().mul_(math.sqrt(2)).clamp_(-bound, bound)
 
         if seeds is None:
             return draw((*batch, *shape), self.generator(None, device))
@@ -80,7 +80,7 @@ class Streams:
             return torch.empty((*seeds.shape, *shape), device=device, dtype=dtype)
         distinct, index = torch.unique(seeds, return_inverse=True)
         drawn = [draw(shape, self.generator(int(seed), device)) for seed in distinct.tolist()]
-        return torch.stack(drawn)[index]
+        return torch.stack([drawn[k] for k in index.flatten().tolist()]).view(*seeds.shape, *shape)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return every generator's state, keyed ``seed@device``, and the default ``seed``."""

@@ -57,15 +57,16 @@ class Dubins(KnownDynamics):
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
         """Return the states ``(*B, N, H, 3)`` of whole plans, by cumulative sums."""
         x, y, theta = state[..., None, None, :].unbind(-1)
-        stride, turn = (actions * self.dt).unbind(-1)
+        # Sums are fast where the numbers of a plan lie together, and so are copies of the results.
+        stride, turn = (part.contiguous() * self.dt for part in actions.unbind(-1))
         heading = theta + turn.cumsum(-1)
-        before = torch.cat([theta.expand_as(heading[..., :1]), heading[..., :-1]], -1)
+        before = heading - turn
         moved = (
             x + (stride * before.cos()).cumsum(-1),
             y + (stride * before.sin()).cumsum(-1),
             wrap_angle(heading),
         )
-        return torch.stack(moved, -1)
+        return torch.stack(moved).movedim(0, -1)
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the closed form ``(*B, 3, 2)``."""

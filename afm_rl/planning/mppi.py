@@ -33,11 +33,27 @@ def smooth(plan: Tensor, past: Tensor, beta: float, low: Tensor, high: Tensor) -
     >>> smooth(torch.tensor([[1.0], [1.0], [9.0]]), torch.zeros(1), 0.5, *box).squeeze(-1)
     tensor([0.5000, 0.7500, 1.0000])
     """
-    smoothed = []
-    for raw in (beta * plan).unbind(-2):
-        past = torch.minimum(torch.maximum(raw + (1.0 - beta) * past, low), high)
-        smoothed.append(past)
-    return torch.stack(smoothed, -2)
+    if beta == 1.0:
+        return plan.clamp(rows_like(low, plan), rows_like(high, plan))
+    steps = plan.movedim(-1, 0).movedim(-1, 0).clone(memory_format=torch.contiguous_format)
+    steps *= beta  # (H, A, *B): what one step needs lies together
+    past, low, high = (
+        part.expand(*plan.shape[:-2], -1).movedim(-1, 0).contiguous() for part in (past, low, high)
+    )
+    for now in steps.unbind(0):
+        past = now.add_(past, alpha=1.0 - beta).clamp_(low, high)
+    return steps.movedim(1, -1).movedim(0, -2)
+
+
+def rows_like(values: Tensor, plan: Tensor) -> Tensor:
+    """Return values of the actions, ``(A,)`` or ``(*B, A)``, for each step of plans ``(*B, H, A)``.
+
+    Written out: operations that repeat a row of two or three numbers are several times slower.
+
+    >>> rows_like(torch.tensor([1.0, 2.0]), torch.zeros(7, 3, 2)).tolist()
+    [[1.0, 2.0], [1.0, 2.0], [1.0, 2.0]]
+    """
+    return values.unsqueeze(-2).expand(*values.shape[:-1], *plan.shape[-2:]).contiguous()
 
 
 def path_weights(returns: Tensor, temperature: float) -> Tensor:
@@ -160,7 +176,7 @@ class MPPI(SamplingPlanner):
         best = shifted
         for _ in range(self.iterations):
             eps = self._noise(td, mean, self.population, BOUND)
-            raw = best.unsqueeze(-3) + scale.unsqueeze(-2) * eps
+            raw = eps.mul_(rows_like(scale, eps)).add_(best.unsqueeze(-3))
             plans = smooth(raw, past.unsqueeze(-2), self.beta, low, high)
             best = self._blend(self._returns(td, plans), plans, best)
         return best[..., 0, :], [best]
@@ -188,7 +204,7 @@ class MPPI(SamplingPlanner):
     def _blend(self, returns: Tensor, plans: Tensor, fallback: Tensor) -> Tensor:
         """Return the weighted mean plan, or ``fallback`` where no return is finite."""
         weights = path_weights(returns, self.temperature)
-        mean = (weights.unsqueeze(-2) @ plans.flatten(-2)).squeeze(-2).view_as(fallback)
+        mean = (plans.flatten(-2).mT @ weights.unsqueeze(-1)).view_as(fallback)
         finite = returns.isfinite()
         if bool(finite.all()):
             return mean

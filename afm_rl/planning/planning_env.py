@@ -109,6 +109,7 @@ class PlanningEnv(ModelBasedEnvBase):
         """
         states = self.dynamics.rollout(state, actions)
         first = state[..., None, None, :].expand_as(states[..., :1, :])
-        before = torch.cat([first, states[..., :-1, :]], -2)
+        by_coordinate = [part.movedim(-1, 0) for part in (first, states[..., :-1, :])]
+        before = torch.cat(by_coordinate, -1).movedim(0, -1)
         wide = [entry[..., None, None, :] for entry in task]
         return -self.cost(before, actions, states, *wide).sum(-1)
