@@ -1,5 +1,6 @@
 """Environments: robots whose dynamics change under way."""
 
+from afm_rl.envs.actuator_inversion import actuator_inversion_task
 from afm_rl.envs.course import Course
 from afm_rl.envs.mission_noise import MissionNoise
 from afm_rl.envs.missions import MissionFormat
@@ -46,6 +47,7 @@ __all__ = [
     "UGVTrackGym",
     "UGVTrackVectorEnv",
     "Waypoints",
+    "actuator_inversion_task",
     "dm_control_task",
     "environment_task",
     "find_reference",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -14,6 +14,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.planning.costs import check_arguments
 
 Reward = Callable[..., Tensor]
+Contexts = Mapping[str, Sequence[tuple[Mapping[str, float], Mapping[str, float]]]]
 ENDLESS = 1e30  # what unbounded specs say
 PROBE = 2, 3  # batch in which a reward is tried
 
@@ -38,6 +39,10 @@ class Task:
         ends: ``ends(next_state) -> bool``, where episodes end early; nowhere if None.
         features: state coordinates that the dynamics depend on; all if none.
         observe: what a policy sees of states ``(*B, S)``, ``(*B, O)``; the states if None.
+        reward_in: the reward in a MuJoCo model with other physics, ``reward_in(model)``; the same
+            if None.
+        goal_in: the goal as the robot's sensors show it there, ``goal_in(model, goal)``.
+        contexts: regimes before and after the change, by the name of their family.
 
     Raises:
         ConfigurationError: for actions without limits, or a reward that cannot be used.
@@ -58,6 +63,9 @@ class Task:
     ends: Callable[[Tensor], Tensor] | None = None
     features: Sequence[int] = ()
     observe: Callable[[Tensor], Tensor] | None = None
+    reward_in: Callable[[Any], Reward] | None = None
+    goal_in: Callable[[Any, Tensor], Tensor] | None = None
+    contexts: Contexts = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check limits and rewards."""
@@ -96,7 +104,9 @@ class Task:
         """The reward to plan with."""
         return self.reward if self.plan is None else self.plan
 
-    def begin(self, seeds: Tensor, rows: Tensor | None = None) -> dict[str, Tensor]:
+    def begin(
+        self, seeds: Tensor, rows: Tensor | None = None, physics: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """Return ``pose`` ``(*B, S)`` and, if there is one, ``goal`` ``(*B, G)``, by seed.
 
         Where ``rows`` ``(*B)`` is false, they are not used.
@@ -107,6 +117,10 @@ class Task:
         found = {"pose": torch.stack(states)}
         if self.goal_names:
             found["goal"] = torch.stack(goals)
+            if self.goal_in is not None and physics is not None:
+                models = self._models(physics.reshape(-1, physics.shape[-1]))
+                pairs = zip(models, goals, strict=True)
+                found["goal"] = torch.stack([self.goal_in(model, goal) for model, goal in pairs])
         return {name: value.reshape(*seeds.shape, -1) for name, value in found.items()}
 
     def step(
@@ -124,10 +138,27 @@ class Task:
             self.world.set_physics(physics)
         ahead = self.world(state, action)
         goal = [data["goal"]] if self.goal_names else []
-        reward = self.reward(state, action, ahead, *goal)
+        reward = self._rewards(physics, state, action, ahead, *goal)
         lost = ~ahead.isfinite().all(-1)
         ended = lost if self.ends is None else lost | self.ends(ahead)
         return ahead, torch.where(lost, 0.0, reward), ended
+
+    def _models(self, physics: Tensor) -> list[Any]:
+        """Return the MuJoCo model of each row ``(N, P)``."""
+        return self.world.step.models(physics.cpu().double().numpy())
+
+    def _rewards(self, physics: Tensor | None, *given: Tensor) -> Tensor:
+        """Return the rewards ``(*B)`` in the worlds that there are."""
+        if physics is None or self.reward_in is None:
+            return self.reward(*given)
+        batch = given[0].shape[:-1]
+        kinds, which = physics.expand(*batch, -1).flatten(0, -2).unique(dim=0, return_inverse=True)
+        flat = [part.reshape(-1, part.shape[-1]) for part in given]
+        found = flat[0].new_zeros(len(which))
+        for kind, model in enumerate(self._models(kinds)):
+            rows = which == kind
+            found[rows] = self.reward_in(model)(*(part[rows] for part in flat))
+        return found.reshape(batch)
 
     def history(self) -> dict[str, Any]:
         """Return what leads to the present state of a world that keeps it to itself: nothing."""

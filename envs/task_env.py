@@ -150,9 +150,10 @@ class TaskSimulation(nn.Module, PhasedSimulation):
         self, mission: TensorDictBase, dtype: torch.dtype, rows: Tensor | None = None
     ) -> dict[str, Tensor]:
         """Return the state at the beginning of missions; only ``rows`` are asked for."""
+        physics = self.regime.physics_of(mission["parameters"][..., 0, :])
         first = {
             name: value.to(self.low.device, dtype if value.is_floating_point() else value.dtype)
-            for name, value in self.task.begin(mission["seed"], rows).items()
+            for name, value in self.task.begin(mission["seed"], rows, physics).items()
         }
         return self.started(first.pop("pose"), mission, len(self.low), **first)
 
@@ -172,13 +173,16 @@ class TaskSimulation(nn.Module, PhasedSimulation):
         return (state["step"] + 0.5) / self.steps
 
     def changes_at(self, mission: TensorDictBase) -> Tensor:
-        """Return the first step of the first phase that is not nominal, ``(*B)``.
+        """Return the first step of the first phase that differs from the one before, ``(*B)``.
 
-        That of the second phase where all are nominal; the episode's length if it never comes.
+        If all are alike, that of the first phase where it is not nominal, else that of the second;
+        the episode's length if it never comes.
         """
-        changed = ~self.regime.is_identity(mission["parameters"])  # (*B, P)
-        last = changed.shape[-1] - 1
-        first = torch.where(changed.any(-1), changed.int().argmax(-1), min(1, last))
+        parameters = mission["parameters"]  # (*B, P, F)
+        changed = (parameters != parameters[..., :1, :]).any(-1)
+        nominal = self.regime.is_identity(parameters[..., 0, :])
+        alike = torch.where(nominal, min(1, changed.shape[-1] - 1), 0)
+        first = torch.where(changed.any(-1), changed.int().argmax(-1), alike)
         state = {"step": torch.arange(self.steps).expand(*first.shape, -1)}
         progress, at = self.progress(mission, state), mission["at"].unsqueeze(-2)
         begun = self.schedule.phase(progress, state["step"], at)

@@ -61,7 +61,9 @@ class HostedTask(Task):
     key: NestedKey = "observation"
     hosts: dict[int, Host] = field(default_factory=dict)
 
-    def begin(self, seeds: Tensor, rows: Tensor | None = None) -> dict[str, Tensor]:
+    def begin(
+        self, seeds: Tensor, rows: Tensor | None = None, physics: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """Return first observations and ``slot`` ``(*B)``, the number of the environment."""
         poses = torch.zeros(seeds.numel(), len(self.state_names))
         rows = torch.ones_like(seeds, dtype=torch.bool) if rows is None else rows

@@ -17,6 +17,7 @@ from torch import Tensor
 from afm_rl.manifold import wrap_angle
 
 Reward = Callable[..., Tensor]
+LINK = 0.12  # m, each of the reacher's links
 HINGE = 3  # MuJoCo's number for joints that turn about an axis
 
 
@@ -56,15 +57,36 @@ def finger(state: Tensor, lengths: Sequence[float]) -> Tensor:
     return torch.stack([x, upper * first.sin() + lower * second.sin()], -1)
 
 
-def touch(state: Tensor, action: Tensor, after: Tensor, goal: Tensor, radius: float) -> Tensor:
-    """Reward of dm_control's reacher tasks: 1 where the finger touches the target."""
-    gap = (finger(after, (0.12, 0.12)) - goal).norm(dim=-1)
+def touch(
+    state: Tensor,
+    action: Tensor,
+    after: Tensor,
+    goal: Tensor,
+    radius: float,
+    link: float = LINK,
+) -> Tensor:
+    """Reward of dm_control's reacher tasks: 1 where the finger touches the target.
+
+    The goal is the target's place (m) as an arm whose links are :data:`LINK` long would see it: in
+    units of its own ``link`` (m). There it stays if the links change under way.
+    """
+    gap = link / LINK * (finger(after, (LINK, LINK)) - goal).norm(dim=-1)
     return (gap <= radius).to(after)
+
+
+def link_of(model: Any) -> float:
+    """Return how long the links of dm_control's reacher are (m)."""
+    return float(model.body("finger").pos[0])
+
+
+def seen_target(model: Any, target: Tensor) -> Tensor:
+    """Return the place of the reacher's target, see :func:`touch`."""
+    return LINK / link_of(model) * target
 
 
 def near(state: Tensor, action: Tensor, after: Tensor, goal: Tensor, radius: float) -> Tensor:
     """Return the reward of a touch, less the distance (m)."""
-    gap = (finger(after, (0.12, 0.12)) - goal).norm(dim=-1)
+    gap = (finger(after, (LINK, LINK)) - goal).norm(dim=-1)
     return (gap <= radius).to(after) - gap
 
 
@@ -178,8 +200,9 @@ def forward_upright(state: Tensor, action: Tensor, after: Tensor) -> Tensor:
     return forward(state, action, after) - upset
 
 
-def _touches(radius: float) -> Rewards:
-    return Rewards(partial(touch, radius=radius), partial(near, radius=radius))
+def _touches(model: Any, radius: float) -> Rewards:
+    reward = partial(touch, radius=radius, link=link_of(model))
+    return Rewards(reward, partial(near, radius=radius))
 
 
 def _runs(model: Any) -> Rewards:
@@ -189,7 +212,7 @@ def _runs(model: Any) -> Rewards:
 
 DM_CONTROL: dict[str, dict[str, Rewards | Callable[[Any], Rewards]]] = {
     "cartpole": {"balance": Rewards(cartpole), "swingup": Rewards(cartpole)},
-    "reacher": {"easy": _touches(0.06), "hard": _touches(0.025)},
+    "reacher": {"easy": partial(_touches, radius=0.06), "hard": partial(_touches, radius=0.025)},
     "ball_in_cup": {"catch": Rewards(catch, above)},
     "cheetah": {"run": _runs},
 }

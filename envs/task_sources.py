@@ -19,9 +19,11 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
+from afm_rl.dynamics.mujoco import Change
+from afm_rl.dynamics.mujoco_physics import changed_model
 from afm_rl.envs.task import Reward, Task
 from afm_rl.envs.task_hosts import environment_task
-from afm_rl.envs.task_rewards import DM_CONTROL, GYMNASIUM, Rewards
+from afm_rl.envs.task_rewards import DM_CONTROL, GYMNASIUM, Rewards, seen_target
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.manifold import Manifold
 
@@ -107,6 +109,7 @@ def dm_control_task(
     steps: int = 1000,
     action_low: Limits = None,
     action_high: Limits = None,
+    change: Change = changed_model,
 ) -> Task:
     """Return a task of dm_control's suite.
 
@@ -117,6 +120,7 @@ def dm_control_task(
         steps: length of an episode.
         action_low: lowest action; the task's if None.
         action_high: highest action.
+        change: see :class:`~afm_rl.dynamics.MuJoCoDynamics`.
 
     Raises:
         ConfigurationError: if there is no dm_control, no such task, or nothing is known of it.
@@ -148,9 +152,9 @@ def dm_control_task(
         goal = env.physics.named.model.geom_pos["target", :2] if targets else ()
         return _state_of(env.physics.data), torch.tensor(np.array(goal))
 
-    goals = {"goal_names": ["target_x", "target_y"]} if targets else {}
+    goals = {"goal_names": ["target_x", "target_y"], "goal_in": seen_target} if targets else {}
     limits = action_low, action_high
-    world = MuJoCoDynamics(env)
+    world = MuJoCoDynamics(env, change=change)
     return _mujoco(f"{domain}_{task}", world, start, {**known, **goals}, steps, *limits)
 
 
@@ -203,7 +207,7 @@ def mujoco_task(
 
     name = "mjcf" if str(xml).lstrip().startswith("<") else Path(xml).stem
     low, high = action_low or world.action_low.tolist(), action_high or world.action_high.tolist()
-    _trust(world, first, low, high)
+    trust(world, first, low, high)
     return _mujoco(name, world, start, {"reward": reward}, steps, low, high)
 
 
@@ -240,7 +244,7 @@ def function_task(
     world = KnownDynamics(step, Manifold(len(first), angles), len(action_low))
     return Task(
         name=getattr(step, "__name__", "function"),
-        world=_trust(world, first, action_low, action_high),
+        world=trust(world, first, action_low, action_high),
         start=begin,
         reward=reward,
         low=action_low,
@@ -310,13 +314,18 @@ def _known(
             f"{place}={name}: its reward is not known as a function of states; give "
             "robot.reward=MODULE.FUNCTION"
         )
-    found = table[name] if isinstance(table[name], Rewards) else table[name](model)
+    rewards = table[name]
+    if isinstance(rewards, Rewards):
+        found, within = rewards, {}
+    else:
+        found, within = rewards(model), {"reward_in": lambda other: rewards(other).reward}
     size = 0 if model is None else model.nq + model.nv + model.na
     features = [k for k in range(size) if k not in found.ignored] if found.ignored else []
-    return {"reward": found.reward, "plan": found.plan, "ends": found.ends, "features": features}
+    own = {"reward": found.reward, "plan": found.plan, "ends": found.ends, "features": features}
+    return {**own, **within}
 
 
-def _trust(
+def trust(
     world: KnownDynamics, state: Tensor, low: Sequence[float], high: Sequence[float]
 ) -> KnownDynamics:
     """Bound a model's noise by a share of what actions effect in a step.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ except ImportError:  # an extra
 
 STEP = 1e-4  # of finite differences, in half ranges and units of the state: far above the
 # tolerance of the contact solver, far below what bends a trajectory
+Change = Callable[[Any, tuple[float, ...]], Any]
 MOST_MODELS = 256  # with changed physics that are kept
 HUGE = 1e9  # MuJoCo resets a simulation that holds larger numbers
 
@@ -120,10 +121,13 @@ class Simulator:
         model: an ``MjModel``; not copied.
         frame_skip: simulation steps per action.
         threads: 0 for the calling thread.
+        change: see :class:`MuJoCoDynamics`.
     """
 
-    def __init__(self, model: Any, frame_skip: int, threads: int) -> None:
-        self.settings = model, frame_skip, threads
+    def __init__(
+        self, model: Any, frame_skip: int, threads: int, change: Change = changed_model
+    ) -> None:
+        self.settings = model, frame_skip, threads, change
         self.data = [mujoco.MjData(model) for _ in range(max(1, threads))]
         self.pool = mujoco_rollout.Rollout(nthread=threads)
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -142,9 +146,10 @@ class Simulator:
         """Return the model of each row of physics ``(N, P)``, made when it is first met."""
         if len(self.changed) > MOST_MODELS:
             self.changed.clear()
-        rows, model = [tuple(row) for row in physics.tolist()], self.settings[0]
+        model, _, _, change = self.settings
+        rows = [tuple(row) for row in physics.tolist()]
         for row in set(rows) - self.changed.keys():
-            self.changed[row] = model if row == Physics.identity else changed_model(model, row)
+            self.changed[row] = model if row == Physics.identity else change(model, row)
         return [self.changed[row] for row in rows]
 
     def __call__(
@@ -155,7 +160,7 @@ class Simulator:
         A row with numbers that are not finite, or huge, leads to NaN. With ``physics`` ``(N, P)``
         each row has its own, see :class:`~afm_rl.regimes.Physics`.
         """
-        model, skip, _ = self.settings
+        model, skip = self.settings[:2]
         if physics is not None:
             model = self.models(physics)
         bad = ~((np.abs(states).max(-1) < HUGE) & (np.abs(controls).max((-2, -1)) < HUGE))
@@ -188,6 +193,8 @@ class MuJoCoDynamics(KnownDynamics):
         noise_std: standard deviation of the model's own error per step: one number; two, for
             positions and activations, and for velocities; or one per tangent coordinate.
         threads: that simulate beside the calling one; 0 for none.
+        change: returns the model with other physics, of the nominal one and a row ``(P,)`` of
+            :class:`~afm_rl.regimes.Physics`.
 
     Raises:
         ConfigurationError: if there is no MuJoCo, or no such model.
@@ -211,11 +218,14 @@ class MuJoCoDynamics(KnownDynamics):
         frame_skip: int | None = None,
         noise_std: float | Sequence[float] = (0.01, 0.1),
         threads: int = 0,
+        change: Change = changed_model,
     ) -> None:
         found, skip = read_model(model)
         found.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         skip = skip if frame_skip is None else check_count("dynamics.frame_skip", frame_skip)
-        simulator: Any = Simulator(found, skip, check_count("dynamics.threads", threads, low=0))
+        simulator: Any = Simulator(
+            found, skip, check_count("dynamics.threads", threads, low=0), change
+        )
         if not isinstance(noise_std, int | float) and len(noise_std) == 2:
             position, velocity = noise_std
             noise_std = [position] * found.nv + [velocity] * found.nv + [position] * found.na

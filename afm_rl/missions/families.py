@@ -13,7 +13,7 @@ from afm_rl.errors import ConfigurationError, check_choice, check_count
 from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Compose
 
-KEYS = ("draw", "set", "ramp", "changes")
+KEYS = ("draw", "set", "ramp", "changes", "list")
 CHANGES = 0.1, 0.9  # progress between which breakpoints are drawn
 
 
@@ -64,7 +64,27 @@ class Family:
         return {**dict(zip(self.regime.names, row.tolist(), strict=True)), **self.fixed}
 
 
-def find_family(name: str, robot: Robot) -> Family:
+@dataclass(frozen=True)
+class Listed:
+    """A family of regimes that are listed: a mission's seed says which one it meets.
+
+    Args:
+        name: what it is called in configurations and tables.
+        regimes: parameters, or those of each phase.
+
+    >>> Listed("heavy", [{"mass": 1.5}, {"mass": 2.0}]).mission(seed=3)
+    {'regime': {'mass': 2.0}}
+    """
+
+    name: str
+    regimes: Sequence[Any]
+
+    def mission(self, seed: int) -> dict[str, Any]:
+        """Return the arguments of ``env.mission``."""
+        return {"regime": self.regimes[seed % len(self.regimes)]}
+
+
+def find_family(name: str, robot: Robot) -> Family | Listed:
     """Return a family of the robot's configuration.
 
     Raises:
@@ -78,6 +98,8 @@ def find_family(name: str, robot: Robot) -> Family:
         raise ConfigurationError(f"{where}={given!r}: expected a mapping of {', '.join(KEYS)}")
     for key in given:
         check_choice(f"{where}: setting", key, KEYS)
+    if "list" in given:
+        return Listed(name, given["list"])
     rows, fixed = given.get("draw", []), given.get("set", {})
     if isinstance(rows, list) and all(isinstance(entry, str) for entry in rows):
         rows = [rows]

@@ -10,11 +10,11 @@ import torch
 from tensordict import TensorDictBase
 
 from afm_rl.errors import ConfigurationError, check_choice, check_count
-from afm_rl.missions.families import Family, find_family
+from afm_rl.missions.families import Family, Listed, find_family
 from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Schedule
 
-Entry = Family | Mapping[str, Any] | Sequence[Mapping[str, float]]
+Entry = Family | Listed | Mapping[str, Any] | Sequence[Mapping[str, float]]
 MOST_SEEDS = 100_000
 PLAN = ("phases", "at", "ramp")
 
@@ -121,7 +121,7 @@ def name_regimes(
 
 def _arguments(entry: Entry, seed: int) -> dict[str, Any]:
     """Return what ``env.mission`` is told of a regime."""
-    if isinstance(entry, Family):
+    if isinstance(entry, Family | Listed):
         return entry.mission(seed)
     if isinstance(entry, Mapping) and "phases" in entry:
         return {"regime": entry["phases"], **{key: entry[key] for key in PLAN[1:] if key in entry}}
@@ -129,7 +129,7 @@ def _arguments(entry: Entry, seed: int) -> dict[str, Any]:
 
 
 def _name(entry: Entry, robot: Robot) -> str:
-    if isinstance(entry, Family):
+    if isinstance(entry, Family | Listed):
         return entry.name
     told = _arguments(entry, seed=0)
     phases = told["regime"] if isinstance(told["regime"], list) else [told["regime"]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -65,6 +65,11 @@ class TaskRobot(Robot):
         families = actuator_regimes(low, high)
         if isinstance(task.world, MuJoCoDynamics):
             families["physics"] = Physics()
+        schedule = Schedule([0.5]) if schedule is None else schedule
+        named: dict[str, dict[str, Any]] = {name: {"draw": [name]} for name in families}
+        for name, pairs in task.contexts.items():
+            rows = [_phases(before, after, schedule.phases) for before, after in pairs]
+            named[name] = {"list": rows}
         prior = [["gain"], ["bias"], ["gain", "bias"]]
         super().__init__(
             name=task.name,
@@ -78,9 +83,9 @@ class TaskRobot(Robot):
             env=partial(make, task),
             model=model,
             regime=Compose(families, prior) if regime is None else regime,
-            schedule=Schedule([0.5]) if schedule is None else schedule,
+            schedule=schedule,
             tracks=[task.name],
-            families={name: {"draw": [name]} for name in families},
+            families=named,
             score=ReturnScore(task.steps, task.goal_names),
             dt=task.dt,
             data=data,
@@ -88,3 +93,10 @@ class TaskRobot(Robot):
             reward=task.planned,
             reward_reads={"goal": len(task.goal_names)} if task.goal_names else {},
         )
+
+
+def _phases(
+    before: Mapping[str, float], after: Mapping[str, float], phases: int
+) -> Mapping[str, float] | list[Mapping[str, float]]:
+    """Return the regime after a change, or those of all phases."""
+    return after if phases == 1 else [before, *[after] * (phases - 1)]

@@ -66,7 +66,7 @@ class ICEM(SamplingPlanner):
 
     Args:
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
-        horizon: steps of a plan, H.
+        horizon: actions of a plan, H.
         population: candidates of the first iteration, N, at least 2 K.
         iterations: refinements per step.
         elites: plans that mean and standard deviation are fitted to, K.
@@ -75,8 +75,11 @@ class ICEM(SamplingPlanner):
         sigma: :math:`\sigma_0`, as a fraction of the half range of each action.
         beta: exponent of the noise's spectrum, see :func:`coloured`.
         momentum: :math:`\alpha` in [0, 1]: weight of the old mean and standard deviation.
+        hold: steps that each action of a plan lasts. A new plan is made every ``hold`` steps, and
+            looks ``H * hold`` steps ahead.
         backend: see :class:`MPPI`, also for the arguments that follow.
-        memory_key: where ``mean`` ``(*B, H, A)`` and ``elites`` ``(*B, k, H, A)`` are kept.
+        memory_key: where ``mean`` ``(*B, H, A)`` and ``elites`` ``(*B, k, H, A)`` are kept; with
+            ``hold`` above 1 also ``held`` ``(*B, A + 1)``, an action and how long it lasts.
         seed_key: entry ``(*B)`` with each mission's seed.
         action_key: where the action goes.
         seed: seed of the noise without ``seed_key``.
@@ -107,6 +110,7 @@ class ICEM(SamplingPlanner):
         sigma: float = 0.5,
         beta: float = 1.0,
         momentum: float = 0.1,
+        hold: int = 1,
         backend: str | None = None,
         memory_key: NestedKey = "icem",
         seed_key: NestedKey | None = None,
@@ -118,10 +122,14 @@ class ICEM(SamplingPlanner):
         kept = max(1, round(keep * elites))
         memory_key = as_key(memory_key)
         root = memory_key if isinstance(memory_key, tuple) else (memory_key,)
-        plan = (horizon, *action_spec_of(env).shape)
+        size = len(action_spec_of(env).space.low)
+        plan = (horizon, size)
+        memory = {(*root, "mean"): plan, (*root, "elites"): (kept, *plan)}
+        if check_count("planner.hold", hold) > 1:
+            memory[(*root, "held")] = (size + 1,)
         super().__init__(
             env,
-            {(*root, "mean"): plan, (*root, "elites"): (kept, *plan)},
+            memory,
             horizon,
             population,
             iterations,
@@ -129,6 +137,7 @@ class ICEM(SamplingPlanner):
             seed_key=seed_key,
             action_key=action_key,
             seed=seed,
+            hold=hold,
         )
         if population < 2 * elites:
             raise ConfigurationError(
@@ -155,10 +164,29 @@ class ICEM(SamplingPlanner):
         sizes = (self.population * self.decay**-i for i in range(self.iterations))
         return [max(round(size), 2 * self.elites) for size in sizes]
 
-    @torch.no_grad()
     def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
+        """Return the action and what is kept; where an action still lasts, all as it was."""
+        memory = self._recall(td)
+        if self.hold == 1:
+            return self._search(td, *memory)
+        *plans, held = memory
+        action, left = held[..., :-1], held[..., -1:]
+        due = left < 1
+        if bool(due.any()):
+            new, found = self._search(td, *plans)
+            action, left = torch.where(due, new, action), torch.where(due, self.hold, left)
+            plans = [
+                torch.where(due.reshape(*due.shape, *[1] * (old.dim() - due.dim())), now, old)
+                for now, old in zip(found, plans, strict=True)
+            ]
+        return action, [*plans, torch.cat([action, left - 1], -1)]
+
+    @torch.no_grad()
+    def _search(
+        self, td: TensorDictBase, mean: Tensor, elites: Tensor
+    ) -> tuple[Tensor, list[Tensor]]:
         """Return the action, the mean plan and the elites that are kept."""
-        mean, elites = (torch.cat([x[..., 1:, :], x[..., -1:, :]], -2) for x in self._recall(td))
+        mean, elites = (torch.cat([x[..., 1:, :], x[..., -1:, :]], -2) for x in (mean, elites))
         new = (elites == 0).flatten(-3).all(-1) & (mean == 0).flatten(-2).all(-1)
         mean = torch.where(new[..., None, None], self.middle, mean)
         space, std = self.action_spec.space, self.scale.expand_as(mean)

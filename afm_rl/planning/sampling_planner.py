@@ -31,6 +31,7 @@ class SamplingPlanner(RecedingHorizonPlanner):
             noise whoever else is in the batch. Without it noise is drawn for the batch.
         action_key: where the action goes.
         seed: seed of the noise without ``seed_key``.
+        hold: steps that each action of a plan lasts.
 
     Returns that are not finite are ignored and counted in :attr:`discarded`; where all are,
     the shifted plan stands and a warning is given.
@@ -47,8 +48,10 @@ class SamplingPlanner(RecedingHorizonPlanner):
         seed_key: NestedKey | None = None,
         action_key: NestedKey = "action",
         seed: int = 0,
+        hold: int = 1,
     ) -> None:
         super().__init__(env, memory, action_key)
+        self.hold = check_count("planner.hold", hold)
         self.horizon = check_count("planner.horizon", horizon, high=10_000)
         self.population = check_count("planner.population", population, high=1_000_000)
         self.iterations = check_count("planner.iterations", iterations, high=10_000)
@@ -80,7 +83,9 @@ class SamplingPlanner(RecedingHorizonPlanner):
         )
 
     def _returns(self, td: TensorDictBase, plans: Tensor) -> Tensor:
-        """Return the return ``(*B, N)`` of each plan ``(*B, N, H, A)``."""
+        """Return the return ``(*B, N)`` of each plan ``(*B, N, H, A)``, whose actions are held."""
+        if self.hold > 1:
+            plans = plans.repeat_interleave(self.hold, -2)
         if self.backend == "fast":
             task = [td.get(key) for key in self.env.cost.in_keys]
             returns = self.env.returns(td.get(self.env.observation_key), plans, *task)
@@ -90,7 +95,7 @@ class SamplingPlanner(RecedingHorizonPlanner):
         start = start.unsqueeze(-1).expand(batch).clone()
         steps, action_key = iter(plans.unbind(-2)), self.env.action_key
         rollout = self.env.rollout(
-            self.horizon,
+            plans.shape[-2],
             policy=lambda now: now.set(action_key, next(steps)),
             auto_reset=False,
             tensordict=start,

@@ -53,7 +53,7 @@ class TrackingCost(QuadraticCost):
         coordinates: indices of the coordinates that the reference gives, in its order.
         rest: targets of the other coordinates, one per state coordinate; zeros if None.
         angles: indices of the coordinates in rad, whose difference wraps.
-        in_keys: the reference's key.
+        in_keys: the reference's key; none without a reference.
         saturation: what should give way when an action cannot be had in full, for whoever
             executes the plan, see :class:`~afm_rl.planning.GoalDistance`.
 
@@ -84,8 +84,10 @@ class TrackingCost(QuadraticCost):
         super().__init__()
         self.saturation = check_choice("cost.saturation", saturation, SATURATIONS)
         size, self.in_keys = len(weights), as_keys(in_keys)
-        if len(self.in_keys) != 1:
-            raise ConfigurationError(f"cost.in_keys={self.in_keys}: expected one key")
+        if len(self.in_keys) != bool(coordinates):
+            raise ConfigurationError(
+                f"cost.in_keys={self.in_keys}: expected one key, or none without coordinates"
+            )
         for name, indices in (("coordinates", coordinates), ("angles", angles)):
             fits = all(isinstance(i, int) and 0 <= i < size for i in indices)
             if not fits or len(set(indices)) < len(indices):
@@ -95,7 +97,7 @@ class TrackingCost(QuadraticCost):
         rest = [0.0] * size if rest is None else list(rest)
         if len(rest) != size:
             raise ConfigurationError(f"cost.rest={rest}: expected {size} numbers")
-        self.in_sizes, self.angles = [len(coordinates)], list(angles)
+        self.in_sizes, self.angles = [len(coordinates)] * len(self.in_keys), list(angles)
         select = torch.zeros(len(coordinates), size).double()
         for row, coordinate in enumerate(coordinates):
             select[row, coordinate] = 1.0
@@ -134,9 +136,11 @@ class TrackingCost(QuadraticCost):
             action_twice * actions,
         )
 
-    def _gap(self, state: Tensor, reference: Tensor) -> Tensor:
+    def _gap(self, state: Tensor, *reference: Tensor) -> Tensor:
         """Return by how much states ``(*B, S)`` miss the targets."""
-        gap = state - (reference.to(state) @ self.select.to(state) + self.rest.to(state))
+        gap = state - self.rest.to(state)
+        for given in reference:
+            gap = gap - given.to(state) @ self.select.to(state)
         if self.angles:
             gap[..., self.angles] = wrap_angle(gap[..., self.angles])
         return gap

@@ -135,6 +135,20 @@ def test_both_backends_plan_the_same_also_alone(world):
         torch.testing.assert_close(alone, found[mission], rtol=0, atol=1e-5)
 
 
+def test_an_action_is_held_as_long_as_plans_say(world):
+    planner = ICEM(world, **SMALL, hold=3)
+    seen, env = spy(world), TransformedEnv(world, planner.make_tensordict_primer())
+    start = env.reset(situation(2).exclude("icem"))
+    actions = env.rollout(7, planner, auto_reset=False, tensordict=start)["action"]
+    assert len(seen) == 3 * SMALL["iterations"]  # plans are made at the steps 0, 3 and 6
+    assert [len(actions[0, a:b].unique(dim=0)) for a, b in ((0, 3), (3, 6), (2, 4))] == [1, 1, 2]
+    plans = seen[0][0]
+    assert plans.shape[-2] == 3 * SMALL["horizon"]
+    assert torch.equal(plans[..., ::3, :], plans[..., 2::3, :])
+    best = seen[1][1].argmax(-1)
+    assert torch.equal(actions[:, 0], seen[1][0][torch.arange(2), best, 0])
+
+
 @pytest.mark.parametrize("lost", [1, 30, 32])
 def test_returns_that_are_not_finite_are_ignored(world, lost):
     planner, td, real = ICEM(world, **{**SMALL, "iterations": 1}), situation(2), world.returns

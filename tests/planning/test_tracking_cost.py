@@ -72,6 +72,14 @@ def test_sizes_that_do_not_fit_are_told(cost):
         cost.quadratic(torch.zeros(3, 4), torch.zeros(2, 2), torch.zeros(1, 2))
 
 
+def test_without_a_reference_all_coordinates_have_targets_of_their_own():
+    cost = TrackingCost([1.0, 2.0], [0.0], coordinates=[], rest=[0.0, 1.0], in_keys=[])
+    state = torch.tensor([[3.0, 3.0], [0.0, 1.0]])
+    assert cost(state, torch.ones(2, 1), state).tolist() == [17.0, 0.0]
+    assert cost.quadratic(state, torch.ones(1, 1))[1].tolist() == [[6.0, 8.0], [0.0, 0.0]]
+    assert cost.in_sizes == []
+
+
 @pytest.mark.parametrize(
     "settings",
     [
