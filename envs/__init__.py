@@ -2,6 +2,7 @@
 
 from afm_rl.envs.actuator_inversion import actuator_inversion_task
 from afm_rl.envs.course import Course
+from afm_rl.envs.gusty_pendulum import gusty_pendulum_task
 from afm_rl.envs.mission_noise import MissionNoise
 from afm_rl.envs.missions import MissionFormat
 from afm_rl.envs.quadrotor import CrazyflieTrack
@@ -51,6 +52,7 @@ __all__ = [
     "dm_control_task",
     "environment_task",
     "find_reference",
+    "gusty_pendulum_task",
     "gymnasium_task",
     "load_reference",
     "load_track",

@@ -14,7 +14,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.planning.costs import check_arguments
 
 Reward = Callable[..., Tensor]
-Contexts = Mapping[str, Sequence[tuple[Mapping[str, float], Mapping[str, float]]]]
+Contexts = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 ENDLESS = 1e30  # what unbounded specs say
 PROBE = 2, 3  # batch in which a reward is tried
 
@@ -42,7 +42,8 @@ class Task:
         reward_in: the reward in a MuJoCo model with other physics, ``reward_in(model)``; the same
             if None.
         goal_in: the goal as the robot's sensors show it there, ``goal_in(model, goal)``.
-        contexts: regimes before and after the change, by the name of their family.
+        contexts: regimes of the phases, the last one for all that follow, by the name of their
+            family.
 
     Raises:
         ConfigurationError: for actions without limits, or a reward that cannot be used.

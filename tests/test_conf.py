@@ -58,6 +58,7 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "updater=mass": ["dynamics=oracle", "robot=quadrotor"],
     "planner=mpc": ["robot=quadrotor"],
     "planner=policy": ["robot=gymnasium", f"planner.file={POLICY}"],
+    "planner=law": ["robot=gusty_pendulum"],
     "planner=geometric": ["robot=quadrotor"],
     "method=geometric": ["robot=quadrotor"],
     "method=mass_estimator": ["robot=quadrotor"],

@@ -13,7 +13,7 @@ from afm_rl.errors import ConfigurationError, check_choice, check_count
 from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Compose
 
-KEYS = ("draw", "set", "ramp", "changes", "list")
+KEYS = ("draw", "set", "ramp", "changes")
 CHANGES = 0.1, 0.9  # progress between which breakpoints are drawn
 
 
@@ -92,14 +92,14 @@ def find_family(name: str, robot: Robot) -> Family | Listed:
     """
     given = robot.families[check_choice("regimes", name, robot.families)]
     where, regime = f"robot.families.{name}", robot.regime
+    if isinstance(given, Mapping) and "list" in given:
+        return Listed(name, given["list"])
     if not isinstance(regime, Compose):
         raise ConfigurationError(f"{where}: expected robot.regime to be a Compose, to draw from")
     if not isinstance(given, Mapping):
         raise ConfigurationError(f"{where}={given!r}: expected a mapping of {', '.join(KEYS)}")
     for key in given:
         check_choice(f"{where}: setting", key, KEYS)
-    if "list" in given:
-        return Listed(name, given["list"])
     rows, fixed = given.get("draw", []), given.get("set", {})
     if isinstance(rows, list) and all(isinstance(entry, str) for entry in rows):
         rows = [rows]

@@ -68,7 +68,7 @@ class TaskRobot(Robot):
         schedule = Schedule([0.5]) if schedule is None else schedule
         named: dict[str, dict[str, Any]] = {name: {"draw": [name]} for name in families}
         for name, pairs in task.contexts.items():
-            rows = [_phases(before, after, schedule.phases) for before, after in pairs]
+            rows = [_phases(each, schedule.phases) for each in pairs]
             named[name] = {"list": rows}
         prior = [["gain"], ["bias"], ["gain", "bias"]]
         super().__init__(
@@ -95,8 +95,8 @@ class TaskRobot(Robot):
         )
 
 
-def _phases(
-    before: Mapping[str, float], after: Mapping[str, float], phases: int
-) -> Mapping[str, float] | list[Mapping[str, float]]:
-    """Return the regime after a change, or those of all phases."""
-    return after if phases == 1 else [before, *[after] * (phases - 1)]
+def _phases(regimes: Sequence[Mapping[str, float]], phases: int) -> list[Mapping[str, float]]:
+    """Return the regime of each phase; of a single phase, the last one that is listed."""
+    if phases == 1:
+        return [regimes[-1]]
+    return [*regimes, *[regimes[-1]] * phases][:phases]

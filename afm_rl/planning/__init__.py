@@ -3,6 +3,7 @@
 from afm_rl.planning.costs import Cost, GoalDistance, KnownReward
 from afm_rl.planning.geometric import GeometricController
 from afm_rl.planning.icem import ICEM
+from afm_rl.planning.law import LawPlanner
 from afm_rl.planning.mpc import MPC
 from afm_rl.planning.mppi import MPPI
 from afm_rl.planning.planning_env import PlanningEnv
@@ -19,6 +20,7 @@ __all__ = [
     "GeometricController",
     "GoalDistance",
     "KnownReward",
+    "LawPlanner",
     "PlanningEnv",
     "PolicyPlanner",
     "QuadraticCost",

@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from afm_rl.artefacts import digest_of, read_tensors, save_tensors
-from afm_rl.dynamics import Oracle
 from afm_rl.errors import ArtefactError, ConfigurationError, check_number
+from afm_rl.planning.law import LawPlanner
 from afm_rl.planning.planning_env import PlanningEnv
 
 
@@ -94,11 +92,8 @@ def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
     return StoredPolicy(layers, tensors["low"], tensors["high"]), description
 
 
-class PolicyPlanner(TensorDictModuleBase):
+class PolicyPlanner(LawPlanner):
     """A stored policy in the place of a planner: it acts on what it sees, and plans nothing.
-
-    In an :class:`~afm_rl.dynamics.Oracle` it sends the actions whose effects, under the regime
-    that the oracle is told, are nearest to the policy's: the yardstick for corrections.
 
     Args:
         env: the planning environment: where state and action are, the action's box, and what a
@@ -114,7 +109,7 @@ class PolicyPlanner(TensorDictModuleBase):
     """
 
     def __init__(self, env: PlanningEnv, file: str | Path | None, noise: float = 0.1) -> None:
-        super().__init__()
+        super().__init__(env, self._act)
         if not isinstance(file, str | Path):
             raise ConfigurationError(
                 f"planner.file={file!r}: expected a file that save_policy wrote"
@@ -123,10 +118,7 @@ class PolicyPlanner(TensorDictModuleBase):
             self.policy, _ = load_policy(Path(file).expanduser())
         except (ConfigurationError, ArtefactError) as error:
             raise type(error)(f"planner.file: {error}") from error
-        self.env, self.noise = env, check_number("planner.noise", noise, low=0.0)
-        self.action_key = env.action_keys[0]
-        self.action_spec = env.full_action_spec[self.action_key]
-        self.in_keys, self.out_keys = [env.observation_key], [self.action_key]
+        self.noise = check_number("planner.noise", noise, low=0.0)
         box = self.action_spec.space
         state = torch.zeros(1, env.dynamics.state_size, dtype=box.low.dtype)
         wanted = self._seen(state).shape[-1], env.dynamics.action_size
@@ -142,15 +134,9 @@ class PolicyPlanner(TensorDictModuleBase):
         """What tells this policy from others."""
         return {"policy": digest_of(self.policy.state_dict())}
 
-    def _seen(self, state: Tensor) -> Tensor:
-        return state if self.env.observe is None else self.env.observe(state)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        state, box = tensordict.get(self.env.observation_key), self.action_spec.space
-        action = self.policy(self._seen(state))
-        if exploration_type() == ExplorationType.RANDOM:
-            action = action + 0.5 * self.noise * (box.high - box.low) * torch.randn_like(action)
-        if isinstance(self.env.dynamics, Oracle):
-            action = self.env.dynamics.command(state, action, box.low, box.high)
-        return tensordict.set(self.action_key, self.action_spec.project(action))
+    def _act(self, seen: Tensor) -> Tensor:
+        """Return the policy's actions, with noise while TorchRL explores."""
+        action, box = self.policy(seen), self.action_spec.space
+        if exploration_type() != ExplorationType.RANDOM:
+            return action
+        return action + 0.5 * self.noise * (box.high - box.low) * torch.randn_like(action)
