@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from afm_rl.correction.base import Correction, rows_of
+from afm_rl.correction.base import Correction, put, rows_of
 from afm_rl.correction.compiled import MachineCode, in_one_batch
 from afm_rl.correction.counterfactuals import draw_counterfactuals
 from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY, check_hypotheses, memory_of
@@ -23,6 +22,7 @@ from afm_rl.flow.prior import Drawn
 from afm_rl.flow.training import EFFECT_WEIGHT, States, flow_losses
 from afm_rl.flow.weights import load_universal
 from afm_rl.regimes import Regime
+from afm_rl.tracing import all_hold
 
 PLANS = 4  # for each window, in training
 CORRECTED = ("executed", "predicted", "spread", "bounds", "misaligned")
@@ -148,6 +148,10 @@ class ActionFlow(PairCorrector):
         """The network that answers."""
         return self.tick.network
 
+    @property
+    def _as_machine_code(self) -> bool:
+        return self.compiles and not torch.compiler.is_compiling()
+
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the hypotheses' losses and predicted effects."""
         count = len(self.hypotheses) + 1  # the identity is the last
@@ -165,14 +169,13 @@ class ActionFlow(PairCorrector):
             memory, innovation = self._look(memory, model)
             surprised = innovation > self.gate
             found = self.unchanged(planned, innovation, box)
-            if not bool(surprised.any()):
-                return self.executing(memory, planned, planned, surprised), found
+            idle = self.executing(memory, planned, planned, surprised)
+            if all_hold(~surprised):
+                return idle, found
             use = rows_of(surprised)
             answer = self._answer(memory[use], planned[use], box[use])
-            if use is not ...:
-                memory = self.executing(memory, planned, planned, surprised)
-            now = {"memory": memory, **found._asdict()}
-            now = {name: _put(now[name], use, part) for name, part in answer.items()}
+            now = {"memory": idle, **found._asdict()}
+            now = {name: put(now[name], surprised, use, part) for name, part in answer.items()}
             return now.pop("memory"), found._replace(**now)
 
     def decide(self, memory: Tensor, planned: Tensor, box: Tensor) -> tuple[Tensor, ...]:
@@ -197,7 +200,7 @@ class ActionFlow(PairCorrector):
 
     def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
         """Return the memory with the transition to ``next_state`` ``(*B, S)``."""
-        if not self.compiles:
+        if not self._as_machine_code:
             return super().observe(memory, next_state)
         return self._machine_code(PairCorrector.observe, memory, next_state)[0]
 
@@ -205,13 +208,13 @@ class ActionFlow(PairCorrector):
         # Machine code holds the model as it is now, one round of Gauss and Newton, and no
         # automatic derivative.
         derived = type(model).jacobian is DynamicsModel.jacobian
-        if not self.compiles or not model.affine or model.taught_in is not None or derived:
+        if not self._as_machine_code or not model.affine or model.taught_in is not None or derived:
             return self.look(memory, model)
         return self._machine_code(PairCorrector.look, memory, model=model)
 
     @torch.inference_mode()
     def _answer(self, *given: Tensor) -> dict[str, Tensor]:
-        if self.compiles:
+        if self._as_machine_code:
             found = self._machine_code(ActionFlow.decide, *given)
         else:
             found = in_one_batch(self.decide, *given)
@@ -263,12 +266,3 @@ class ActionFlow(PairCorrector):
             return draw_counterfactuals(
                 self, model, regime, states, size, self.saturation, generator
             )
-
-
-def _put(part: Tensor, use: Any, value: Tensor) -> Tensor:
-    """Return a part with values where ``use`` says so."""
-    if use is ...:
-        return value.to(part.dtype, copy=True) if value.is_inference() else value.to(part.dtype)
-    part = part.clone()
-    part[use] = value.to(part.dtype)
-    return part

@@ -38,10 +38,35 @@ class Correction(NamedTuple):
 def rows_of(mask: Tensor) -> Any:
     """Return an index of the missions of a mask ``(*B)``: of all of them one that copies nothing.
 
+    All of them while a function is being exported, which must not depend on how many there are.
+
     >>> rows_of(torch.tensor([True, True])), rows_of(torch.tensor([True, False]))
     (Ellipsis, tensor([ True, False]))
     """
-    return ... if bool(mask.all()) else mask
+    return ... if torch.compiler.is_compiling() or bool(mask.all()) else mask
+
+
+def put(part: Tensor, mask: Tensor, use: Any, values: Tensor) -> Tensor:
+    """Return a part ``(*B, ...)`` with values where a mask ``(*B)`` holds.
+
+    Args:
+        part: what is elsewhere.
+        mask: where.
+        use: :func:`rows_of` the mask, for which there are values.
+        values: of these missions.
+
+    >>> mask = torch.tensor([True, False])
+    >>> put(torch.zeros(2), mask, rows_of(mask), torch.ones(1))
+    tensor([1., 0.])
+    """
+    values = values.to(part.dtype, copy=values.is_inference())
+    if use is not ...:
+        part = part.clone()
+        part[use] = values
+        return part
+    if torch.compiler.is_compiling():
+        return torch.where(mask[(..., *[None] * (part.dim() - mask.dim()))], values, part)
+    return values
 
 
 class Corrector(nn.Module, ABC):

@@ -7,11 +7,12 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from afm_rl.correction.base import Correction, Corrector, rows_of
+from afm_rl.correction.base import Correction, Corrector, put, rows_of
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import check_count
 from afm_rl.flow.experts import LIMIT, Rows
+from afm_rl.tracing import all_hold
 
 
 class PairCorrector(Corrector):
@@ -120,12 +121,13 @@ class ClassicalCorrector(PairCorrector):
         parts = self.unpack(memory, model.state_size)
         found = self.unchanged(planned, innovation, box)
         misaligned = innovation > self.gate
-        if bool(misaligned.any()):
+        if not all_hold(~misaligned):
             use = rows_of(misaligned)
-            executed, predicted = planned.clone(), planned.clone()
             rows, unit = self.rows(parts["pairs"][use]), self.normalise(planned[use])
-            action, effect = self.answer(rows, unit)
-            executed[use], predicted[use] = self.denormalise(action), self.denormalise(effect)
+            executed, predicted = (
+                put(planned, misaligned, use, self.denormalise(part))
+                for part in self.answer(rows, unit)
+            )
             found = found._replace(executed=executed, predicted=predicted, misaligned=misaligned)
         parts |= {"planned": planned, "executed": found.executed, "acting": found.predicted}
         parts["misaligned"] = misaligned.unsqueeze(-1).to(planned.dtype)

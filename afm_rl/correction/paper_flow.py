@@ -20,6 +20,7 @@ from afm_rl.flow.network import mlp
 from afm_rl.flow.solver import midpoint
 from afm_rl.regimes import Regime
 from afm_rl.sampling import draw_states, uniform
+from afm_rl.tracing import all_hold
 
 
 class PaperFlow(Corrector):
@@ -166,7 +167,7 @@ class PaperFlow(Corrector):
             held = (parts["misaligned"] == 1.0) & misaligned.unsqueeze(-1)
             features = torch.where(held, parts["features"], features)
         found = self.unchanged(planned, size, box)
-        if bool(misaligned.any()):
+        if not all_hold(~misaligned):
             action = self._integrate(features.to(self.scale), planned.to(self.scale))
             action = torch.where(misaligned.unsqueeze(-1), action.to(planned), planned)
             found = found._replace(executed=action, misaligned=misaligned)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.tracing import all_hold
 
 UNSEEN = 4.0  # half ranges: standard deviation of an axis of which a transition shows nothing
 ASSUMED = 0.1  # half ranges: standard deviation where nothing needs an explanation
@@ -84,7 +85,7 @@ def effective_action(
     error = model.manifold.difference(next_state, expected) / noise
     innovation = error.abs().amax(-1)
     silent = innovation <= quiet  # false for NaN
-    if not torch.compiler.is_compiling() and bool(silent.all()):  # nothing more to compute
+    if all_hold(silent):  # nothing more to compute
         std = (ASSUMED * half_range).expand_as(action)
         return EffectiveAction(action.to(dtype), std.to(dtype), innovation.to(dtype))
     effective = action
@@ -113,7 +114,7 @@ def effective_action(
         error = torch.where(better, remaining, error)
         limit = limit * torch.where(better, 1.0, 0.25)
         going = going & ((step * slope.squeeze(-1)).sum(-1, True) > ENOUGH)
-        if last or not bool(going.any()):
+        if last or all_hold(~going):
             break
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     if not model.affine:  # what the rounds could not explain, per coordinate

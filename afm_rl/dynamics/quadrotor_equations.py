@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -12,6 +11,7 @@ from afm_rl.airframe import QuadrotorBody
 from afm_rl.dynamics.rates import HeldRate, Rate
 from afm_rl.dynamics.runge_kutta import runge_kutta_path
 from afm_rl.rotations import quaternion_normalise
+from afm_rl.tracing import cached
 
 
 class _Tables(NamedTuple):
@@ -182,7 +182,7 @@ def aligned(state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
     return state.expand(*batch, 13).to(dtype), action.expand(*batch, 4).to(dtype)
 
 
-@lru_cache(maxsize=64)
+@cached(maxsize=64)
 def _tables(body: QuadrotorBody, dtype: torch.dtype, device: torch.device) -> _Tables:
     x, y, z, w, p, q, r = range(7)  # quaternion (x, y, z, w), body rate (p, q, r)
     along_x, along_y, along_z = body.inertia

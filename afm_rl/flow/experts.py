@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from afm_rl.flow.saturation import LIMIT, saturate
+from afm_rl.tracing import cached
 
 STUCK = 5e-3  # half ranges: an action with less effect is held by friction
 PRIOR = 1e-4  # weight of the nominal map in every fit
@@ -371,7 +371,7 @@ def _solve_line(moments: Tensor) -> tuple[Tensor, Tensor]:
     return slope, (square * shift - mean * cross) / determinant
 
 
-@lru_cache(maxsize=16)
+@cached(maxsize=16)
 def _constants(rows: int, size: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Return the weights by age ``(2, K)`` and the moments of the priors.
 

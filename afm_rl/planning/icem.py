@@ -12,6 +12,7 @@ from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.keys import as_key
 from afm_rl.planning.receding import action_spec_of
 from afm_rl.planning.sampling_planner import SamplingPlanner
+from afm_rl.tracing import all_hold
 
 WITHOUT_NOISE = (
     ExplorationType.DETERMINISTIC,
@@ -202,7 +203,7 @@ class ICEM(SamplingPlanner):
             plans = torch.minimum(torch.maximum(plans, space.low), space.high)
             returns = self._returns(td, plans)
             finite = returns.isfinite()
-            if not bool(finite.all()):
+            if not all_hold(finite):
                 self._discard(finite)
             top = torch.where(finite, returns, -torch.inf).topk(self.elites, -1)
             index = top.indices[..., None, None].expand(*top.indices.shape, *plans.shape[-2:])

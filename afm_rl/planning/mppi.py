@@ -13,6 +13,7 @@ from afm_rl.errors import check_choice, check_number
 from afm_rl.keys import as_key
 from afm_rl.planning.receding import action_spec_of
 from afm_rl.planning.sampling_planner import SamplingPlanner
+from afm_rl.tracing import all_hold
 
 BOUND = 2.0  # exploration noise is truncated at two standard deviations
 
@@ -206,7 +207,7 @@ class MPPI(SamplingPlanner):
         weights = path_weights(returns, self.temperature)
         mean = (plans.flatten(-2).mT @ weights.unsqueeze(-1)).view_as(fallback)
         finite = returns.isfinite()
-        if bool(finite.all()):
+        if all_hold(finite):
             return mean
         self._discard(finite)
         return torch.where(finite.any(-1)[..., None, None], mean, fallback)

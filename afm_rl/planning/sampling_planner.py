@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -111,6 +112,8 @@ class SamplingPlanner(RecedingHorizonPlanner):
 
     def _discard(self, finite: Tensor) -> None:
         """Count the returns ``(*B, N)`` that are not finite; warn where none is."""
+        if torch.compiler.is_compiling():
+            return  # an exported planner does not count
         self.discarded += int((~finite).sum())
         lost = ~finite.any(-1)
         if bool(lost.any()):

@@ -14,6 +14,7 @@ from afm_rl.correction import ActionFlow, Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.faults import safe_action
+from afm_rl.tracing import all_hold
 
 
 def corrector_for(
@@ -116,7 +117,7 @@ def correct(
     # The last clamp depends on nothing but the spec, whatever the corrector answers.
     executed, _ = safe_action(wanted, *bounds_of(action_spec), last)
     predicted, misaligned = found.predicted, found.misaligned
-    if executed is not found.executed and not torch.equal(executed, found.executed):
+    if not all_hold(executed == found.executed):
         memory = corrector.executing(memory, planned, executed)
         touched = (executed != found.executed).any(-1, keepdim=True)
         predicted = torch.where(touched & ~misaligned.unsqueeze(-1), executed, predicted)

@@ -1,0 +1,87 @@
+"""The command ``afm-rl-export``."""
+
+from __future__ import annotations
+
+import sys
+
+from afm_rl.cli.error_messages import explain, one_line
+from afm_rl.cli.overrides import trusted_packages
+
+NAME = "afm-rl-export"
+ABOUT = """\
+Write planner and correction of a method as machine code, which runs without this library.
+
+  afm-rl-export method=afm_physics out=policy.pt2
+  afm-rl-export method=afm_physics planner.population=1000 out=policy.pt2
+  afm-rl-export method=afm_physics out=policy.pt2 planner=null   the planned action is an input
+
+The settings are those of afm-rl. The file is a function of tensors: (memory, observation, the
+task's entries such as the goal, noise) -> (memory, action). A memory of zeros begins a mission; the
+file's metadata says how many numbers each argument has. It runs where it was made: on the same kind
+of processor, with the same version of torch, from Python or C++ (examples/deploy/cpp).
+"""
+ALONE = "planner=null"
+
+
+def main() -> None:
+    """Run ``afm-rl-export``; a mistake ends in one line and exit status 2."""
+    arguments = sys.argv[1:]
+    if not arguments or {"-h", "--help"} & set(arguments):
+        print(ABOUT, end="")
+        return
+    try:
+        _run(arguments)
+    except Exception as error:
+        message = explain(error)
+        if message is None:
+            raise
+        print(f"{NAME}: {one_line(message)}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _run(arguments: list[str]) -> None:
+    from hydra import compose, initialize_config_module
+    from hydra.core.global_hydra import GlobalHydra
+    from torchrl.data import Bounded
+
+    from afm_rl.errors import ConfigurationError
+    from afm_rl.learning import Updater
+    from afm_rl.missions import build, prepare
+    from afm_rl.transforms.controller import Controller, check_exportable, export_controller
+    from afm_rl.transforms.policy import ActionFlowPolicy
+
+    out = [text.removeprefix("out=") for text in arguments if text.startswith("out=")]
+    if len(out) != 1:
+        raise ConfigurationError("out: expected one file to write, as in out=policy.pt2")
+    path, alone = check_exportable(out[0]), ALONE in arguments
+    given = [text for text in arguments if text != ALONE and not text.startswith("out=")]
+    GlobalHydra.instance().clear()
+    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+        cfg = compose("config", given)
+    agent = build(cfg, trusted_packages(given))
+    if agent.transform is None:
+        raise ConfigurationError(
+            "corrector=none: nothing to export; choose a method with a correction, such as "
+            "method=afm_physics"
+        )
+    if type(agent.updater) is not Updater or agent.model.conditioned_on is not None:
+        raise ConfigurationError(
+            "export: the model of this method changes at work, but an exported one cannot; "
+            "choose a method that does not learn, such as afm_physics or afm_frozen_pe"
+        )
+    prepare(agent, cfg.cache, progress=bool(cfg.progress))
+    transform, (low, high) = agent.transform, agent.robot.action_box
+    policy = ActionFlowPolicy(
+        agent.model,
+        Bounded(low, high, shape=low.shape, dtype=low.dtype),
+        transform.corrector,
+        transform.observation_key,
+        transform.action_key,
+        transform.prefix,
+        transform.enabled,
+        transform.extend_action_box,
+    )
+    print("exporting (a minute or two)", flush=True)
+    controller = Controller(None if alone else agent.planner, policy)
+    export_controller(controller, path)
+    print(f"wrote {path}: " + ", ".join(f"{k} ({n})" for k, n in controller.sizes.items()))

@@ -1,0 +1,225 @@
+"""Planner and correction as one function of tensors, which runs without this library."""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+import tempfile
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from afm_rl.correction.compiled import has_compiler
+from afm_rl.errors import ConfigurationError, check_instance
+from afm_rl.planning.sampling_planner import SamplingPlanner
+from afm_rl.streams import Streams
+from afm_rl.transforms.policy import ActionFlowPolicy
+
+Draw = tuple[tuple[int, ...], float | None]
+"""Shape and bound of normal numbers."""
+
+
+class Controller(nn.Module):
+    r"""A planner and its correction for one robot, as a pure function of tensors.
+
+    .. math:: (m, s, g, \epsilon) \mapsto (m', a)
+
+    All that is remembered is in m; a memory of zeros begins a mission. A planner that samples takes
+    standard normal numbers :math:`\epsilon`, fresh ones at each tick, none beyond
+    :attr:`noise_bound`. Actions are those of planner and policy, up to rounding.
+
+    Args:
+        planner: writes the planned action and, under ``next``, what it remembers. None: the
+            planned action is given in the place of the task.
+        policy: the correction.
+
+    Raises:
+        ConfigurationError: for a planner that cannot be taken.
+
+    >>> from afm_rl.dynamics import Dubins
+    >>> from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+    >>> planner = MPPI(PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5]))
+    >>> controller = Controller(planner, ActionFlowPolicy(Dubins(), planner.action_spec))
+    >>> controller.sizes
+    {'memory': 523, 'observation': 3, 'goal': 2, 'noise': 3000}
+    >>> memory, noise = torch.zeros(523), controller.draw()
+    >>> memory, action = controller(memory, torch.zeros(3), torch.ones(2), noise)
+    >>> action.shape
+    torch.Size([2])
+    """
+
+    start: Tensor
+
+    def __init__(self, planner: TensorDictModuleBase | None, policy: ActionFlowPolicy) -> None:
+        super().__init__()
+        self.policy = check_instance("controller.policy", policy, ActionFlowPolicy)
+        self.planner, self.streams = copy.copy(planner), Streams()
+        self.task: dict[NestedKey, int] = {policy.action_key: policy.action_spec.shape[-1]}
+        first = policy.make_tensordict_primer()(TensorDict())
+        if planner is not None:
+            self.task = self._task_of(planner)
+            if hasattr(planner, "make_tensordict_primer"):
+                first = planner.make_tensordict_primer()(first)
+        if isinstance(planner, SamplingPlanner):
+            self.streams = planner.streams
+        kept = [*getattr(planner, "memory", ())]
+        kept += [unravel_key((policy.prefix, name)) for name in ("effect_bounds", "memory")]
+        self.shapes = {key: first.get(key).shape for key in kept}
+        begun = torch.cat([first.get(key).flatten() for key in kept])
+        self.register_buffer("start", begun, persistent=False)
+        self.draws: list[Draw] = []
+        self._record()
+
+    def _task_of(self, planner: Any) -> dict[NestedKey, int]:
+        """Return the entries that the planner reads beside the state, and their sizes."""
+        env = getattr(planner, "env", None)
+        if env is None or tuple(planner.out_keys[:1]) != (self.policy.action_key,):
+            raise ConfigurationError(
+                f"controller.planner={type(planner).__name__}: expected a planner with an `env` "
+                f"that writes {self.policy.action_key!r}"
+            )
+        entries = env.observation_spec.items(True, True)
+        return {key: s.shape[-1] for key, s in entries if key != self.policy.observation_key}
+
+    def _record(self) -> None:
+        """Find out which noise is asked for."""
+        given = _Given(None)
+        still = [torch.zeros(size).to(self.start) for size in self.task.values()]
+        self._tick(self.start, torch.zeros(self._states).to(self.start), still, given)
+        self.draws = given.asked
+
+    @property
+    def _states(self) -> int:
+        return self.policy.model.state_size
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Names of the arguments, in their order, and how many numbers each has."""
+        names = {"-".join(k) if isinstance(k, tuple) else k: n for k, n in self.task.items()}
+        sizes = {"memory": len(self.start) + 1, "observation": self._states, **names}
+        noise = sum(math.prod(shape) for shape, _ in self.draws)
+        return sizes | ({"noise": noise} if noise else {})
+
+    @property
+    def noise_bound(self) -> float:
+        """The largest size of the noise, in standard deviations."""
+        return min((math.inf if bound is None else bound for _, bound in self.draws), default=0.0)
+
+    def draw(self) -> Tensor:
+        """Draw the noise of one tick, as the planner would."""
+        kind = self.start.dtype
+        drawn = [self.streams.normal(s, bound=bound, dtype=kind) for s, bound in self.draws]
+        return torch.cat([part.flatten() for part in drawn]) if drawn else self.start[:0]
+
+    @torch.no_grad()
+    def forward(self, memory: Tensor, observation: Tensor, *given: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the next memory, and the action to execute.
+
+        Args:
+            memory: m; zeros at first.
+            observation: the state, ``(S,)``.
+            given: the entries of the task, such as the goal, and the noise; see :attr:`sizes`.
+        """
+        task = given[: len(self.task)]
+        before = torch.where(memory[:1] == 0.0, self.start, memory[1:])
+        noise = _Given(given[-1] if self.draws else None)
+        found, action = self._tick(before, observation, task, noise)
+        return torch.cat([torch.ones_like(memory[:1]), found]), action
+
+    def _tick(
+        self, memory: Tensor, observation: Tensor, task: Sequence[Tensor], noise: _Given
+    ) -> tuple[Tensor, Tensor]:
+        td = TensorDict({self.policy.observation_key: observation})
+        td.update(dict(zip(self.task, task, strict=True)))
+        parts = memory.split([math.prod(shape) for shape in self.shapes.values()])
+        for (key, shape), part in zip(self.shapes.items(), parts, strict=True):
+            td.set(key, part.view(shape))
+        if self.planner is not None:
+            if isinstance(self.planner, SamplingPlanner):
+                self.planner.streams = noise
+            self.planner(td)
+        self.policy(td)
+        later = td.get("next")
+        return torch.cat([later.get(key).flatten() for key in self.shapes]), td.get(
+            self.policy.action_key
+        )
+
+
+class _Given(Streams):
+    """Numbers that were drawn before, in the place of a generator; notes what is asked for."""
+
+    def __init__(self, numbers: Tensor | None) -> None:
+        super().__init__()
+        self.numbers, self.asked = numbers, list[Draw]()
+
+    def normal(self, shape: tuple[int, ...], **given: Any) -> Tensor:
+        """Return the next numbers; zeros where there are none."""
+        used = sum(math.prod(size) for size, _ in self.asked)
+        self.asked.append((shape, given.get("bound")))
+        if self.numbers is None:
+            return torch.zeros(shape, dtype=given.get("dtype"))
+        return self.numbers[used : used + math.prod(shape)].view(shape).clone()
+
+
+def check_exportable(path: str | Path) -> Path:
+    """Return the file to export to.
+
+    Raises:
+        ConfigurationError: if it cannot be written, or there is no compiler.
+    """
+    path = Path(path)
+    if path.suffix != ".pt2" or not path.parent.is_dir():
+        raise ConfigurationError(f"out={path}: expected a file NAME.pt2 in a folder that exists")
+    if not has_compiler():
+        raise ConfigurationError("export: no C++ compiler was found; install one, such as g++")
+    return path
+
+
+def export_controller(controller: Controller, path: str | Path) -> Path:
+    """Write a controller as machine code (``.pt2``), which torch runs without this library.
+
+    Its metadata names the arguments and their sizes (``memory:523 observation:3 ...``) and the
+    bound of the noise. It takes a minute or two of one core, and a C++ compiler.
+
+    Args:
+        controller: what to export, with weights and settings as they are now.
+        path: the file, ``.pt2``.
+
+    Raises:
+        ConfigurationError: where there is no compiler, or a part cannot be exported.
+    """
+    path = check_exportable(path)
+    example = tuple(torch.zeros(n).to(controller.start) for n in controller.sizes.values())
+    about = {
+        "arguments": " ".join(f"{name}:{size}" for name, size in controller.sizes.items()),
+        "noise_bound": str(controller.noise_bound),
+        "dtype": str(controller.start.dtype).removeprefix("torch."),
+    }
+    with (
+        torch.no_grad(),
+        warnings.catch_warnings(),
+        tempfile.TemporaryDirectory(dir=path.parent) as folder,
+    ):
+        warnings.simplefilter("ignore")
+        try:
+            program = torch.export.export(controller, example)
+        except Exception as error:  # it says in many ways that code cannot be traced
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ConfigurationError(
+                f"export: planner, model or corrector decide by numbers or leave torch, so they "
+                f"cannot be exported: {reason}"
+            ) from error
+        made = torch._inductor.aoti_compile_and_package(
+            program,
+            package_path=str(Path(folder) / path.name),
+            inductor_configs={"aot_inductor.metadata": about},
+        )
+        os.replace(made, path)
+    return path

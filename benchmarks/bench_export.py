@@ -1,0 +1,74 @@
+"""What a tick takes: as it is, with compiled parts, and exported.
+
+    python benchmarks/bench_export.py
+
+A robot with two actions whose motors are reversed, so that the correction is at work at each tick.
+One thread. The policy is exported at first, twice, for a minute or two each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from afm_rl.correction import ActionFlow
+from afm_rl.dynamics import Dubins
+from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+from afm_rl.transforms import ActionFlowPolicy
+from afm_rl.transforms.controller import Controller, export_controller
+
+LOW, HIGH = torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57])
+
+
+def controller(planned: bool, compile: bool) -> Controller:
+    """Return the correction, with MPPI (300 candidates, horizon 5) or alone."""
+    world = PlanningEnv(Dubins(), GoalDistance(), LOW, HIGH)
+    planner = MPPI(world, box_key=("afm", "effect_bounds"))
+    flow = ActionFlow(LOW, HIGH, compile=compile)
+    policy = ActionFlowPolicy(Dubins(), planner.action_spec, flow)
+    return Controller(planner if planned else None, policy)
+
+
+def drive(tick: Callable[..., tuple[Tensor, Tensor]], owner: Controller, ticks: int) -> Tensor:
+    """Return the milliseconds of each tick of a drive around a circle, less the first tenth."""
+    state, model, spent = torch.zeros(3), Dubins(), torch.zeros(ticks)
+    memory = torch.zeros(owner.sizes["memory"])
+    for k in range(ticks):
+        angle = torch.tensor(0.05 * k)
+        target = torch.stack([angle.cos(), angle.sin()])
+        given = [3.0 * target, owner.draw()] if owner.planner is not None else [0.7 * target]
+        begun = time.perf_counter()
+        memory, action = tick(memory, state, *given)
+        spent[k] = 1e3 * (time.perf_counter() - begun)
+        state = model(state, -0.8 * action)
+    return spent[ticks // 10 :]
+
+
+@torch.inference_mode()
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--ticks", type=int, default=10_000)
+    ticks = parser.parse_args().ticks
+    torch.set_num_threads(1)
+    print(f"{'ms per tick, ' + str(ticks) + ' ticks':44}{'p50':>8}{'p99':>8}")
+    for name, planned in (("correction", False), ("MPPI and correction", True)):
+        plain, fast = controller(planned, compile=False), controller(planned, compile=True)
+        with tempfile.TemporaryDirectory() as folder, torch.inference_mode(False):
+            path = export_controller(plain, Path(folder) / "policy.pt2")
+            exported = torch._inductor.aoti_load_package(str(path))
+        ways = {"as it is": plain, "corrector.compile=true": fast, "exported": exported}
+        for way, tick in ways.items():
+            spent = drive(tick, plain if way == "exported" else tick, ticks)
+            p50, p99 = spent.quantile(torch.tensor([0.5, 0.99])).tolist()
+            print(f"{name + ', ' + way:44}{p50:8.2f}{p99:8.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,221 @@
+"""Planner and correction as one pure function, and as a file that runs without the library."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+from torchrl.envs import Compose
+from torchrl.envs.utils import step_mdp
+
+from afm_rl.correction import ActionFlow, LeastSquares
+from afm_rl.correction.compiled import has_compiler
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ConfigurationError
+from afm_rl.flow import AxisNetwork, experts
+from afm_rl.planning import ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv
+from afm_rl.transforms import ActionFlowPolicy
+from afm_rl.transforms.controller import Controller, export_controller
+
+LOW, HIGH = torch.tensor([-1.0, -1.5]).double(), torch.tensor([1.0, 1.5]).double()
+GOALS = torch.tensor([[2.0, 1.0], [-1.0, 3.0]]).double()
+PROGRAM = Path(__file__).parents[2] / "examples" / "deploy" / "cpp"
+
+
+def planner_of(kind=MPPI, **settings):
+    world = PlanningEnv(Dubins(), GoalDistance(), LOW, HIGH)
+    settings |= {"box_key": ("afm", "effect_bounds")} if kind is MPPI else {}
+    return kind(world, horizon=3, population=20, seed=5, **settings)
+
+
+def policy_of(corrector=None):
+    torch.manual_seed(0)
+    # Among samples or hypotheses that are as good, rounding would decide.
+    network = AxisNetwork(width=8, latent=8)
+    flow = ActionFlow(LOW, HIGH, ["recent"], source_std=0.0, network=network)
+    return ActionFlowPolicy(Dubins(), planner_of().action_spec, corrector or flow)
+
+
+def driven(act, ticks=16):
+    """Return states and actions of a drive in which the motors are reversed half-way."""
+    model, state, path = Dubins(), torch.zeros(3).double(), []
+    for tick in range(ticks):
+        goal = GOALS[tick * 2 // ticks]
+        action = act(state, goal)
+        path.append((state, goal, action))
+        state = model(state, action * (1.0 if tick < ticks // 2 else -0.8))
+    return path
+
+
+def as_policy(planner, policy):
+    """Return what the two do behind one another."""
+    agent = TensorDictSequential(planner, policy)
+    kept = Compose(*(part.make_tensordict_primer() for part in agent))(TensorDict())
+
+    def act(state, goal):
+        nonlocal kept
+        kept = agent(kept.update({"observation": state, "goal": goal}))
+        action, kept = kept["action"], step_mdp(kept)
+        return action
+
+    return act
+
+
+def as_function(function, controller):
+    """Return what a controller, or what was made of it, does."""
+    memory = torch.zeros(controller.sizes["memory"]).double()
+
+    def act(state, goal):
+        nonlocal memory
+        memory, action = function(memory, state, goal, controller.draw())
+        return action
+
+    return act
+
+
+def actions(path):
+    return torch.stack([action for _, _, action in path])
+
+
+@pytest.mark.parametrize("kind", [MPPI, ICEM])
+def test_a_controller_acts_as_planner_and_policy(kind):
+    expected = driven(as_policy(planner_of(kind), policy_of()))
+    controller = Controller(planner_of(kind), policy_of())
+    found = driven(as_function(controller, controller))
+    assert torch.equal(actions(found), actions(expected))
+
+
+def test_without_a_planner_the_planned_action_is_given():
+    controller = Controller(None, policy_of())
+    assert list(controller.sizes) == ["memory", "observation", "action"]
+    policy, planned = policy_of(), torch.tensor([0.4, -0.3]).double()
+    td = policy.make_tensordict_primer()(TensorDict())
+    memory, state = torch.zeros(controller.sizes["memory"]).double(), torch.zeros(3).double()
+    for _ in range(8):
+        td = policy(td.update({"observation": state, "action": planned}))
+        memory, action = controller(memory, state, planned)
+        assert torch.equal(action, td["action"])
+        state, td = Dubins()(state, -action), step_mdp(td)
+    assert not torch.equal(action, planned)
+
+
+def test_a_reading_that_is_not_finite_gives_a_sound_action():
+    controller = Controller(planner_of(), policy_of())
+    memory = torch.zeros(controller.sizes["memory"]).double()
+    for number in (0.0, torch.nan, 0.1):
+        state = torch.full((3,), number).double()
+        memory, action = controller(memory, state, GOALS[0], controller.draw())
+        assert ((LOW <= action) & (action <= HIGH)).all()
+
+
+def test_the_planner_that_is_given_stays_as_it_was():
+    planner = planner_of()
+    streams = planner.streams
+    controller = Controller(planner, policy_of())
+    assert planner.streams is streams and controller.noise_bound == 2.0
+    assert torch.equal(
+        controller.draw(),
+        planner_of().streams.normal((20, 3, 2), bound=2.0, dtype=torch.float64).flatten(),
+    )
+
+
+@pytest.mark.parametrize("kind", [ActionFlow, LeastSquares])
+def test_what_an_export_traces_says_the_same_and_spoils_nothing(kind):
+    def policy():
+        return policy_of() if kind is ActionFlow else policy_of(LeastSquares(LOW, HIGH))
+
+    experts._constants.cache_clear()
+    controller = Controller(planner_of(), policy())
+    example = tuple(torch.zeros(size).double() for size in controller.sizes.values())
+    program = torch.export.export(controller, example).module()
+    expected = driven(as_policy(planner_of(), policy()))
+    found = driven(as_function(program, controller))
+    torch.testing.assert_close(actions(found), actions(expected), atol=1e-7, rtol=0)
+
+
+def test_parts_that_cannot_be_used_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(ConfigurationError, match="controller.planner=Linear: expected a planner"):
+        Controller(torch.nn.Linear(2, 2), policy_of())
+    with pytest.raises(ConfigurationError, match="controller.policy: expected a ActionFlowPolicy"):
+        Controller(planner_of(), planner_of())
+    controller = Controller(None, policy_of())
+    for name in ("policy.txt", "nowhere/policy.pt2"):
+        with pytest.raises(ConfigurationError, match=r"out=.*: expected a file NAME.pt2"):
+            export_controller(controller, tmp_path / name)
+    monkeypatch.setattr("afm_rl.transforms.controller.has_compiler", lambda: False)
+    with pytest.raises(ConfigurationError, match="no C.. compiler was found"):
+        export_controller(controller, tmp_path / "policy.pt2")
+
+
+@pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
+def test_a_cost_that_decides_by_numbers_is_refused(tmp_path):
+    cost = KnownReward(lambda s, a, n: -n.abs().sum(-1) if bool((n < 9).all()) else n[..., 0])
+    planner = MPPI(PlanningEnv(Dubins(), cost, LOW, HIGH), horizon=2, population=4)
+    controller = Controller(planner, policy_of())
+    with pytest.raises(ConfigurationError, match="export: planner, model or corrector decide"):
+        export_controller(controller, tmp_path / "policy.pt2")
+    assert not list(tmp_path.iterdir())
+
+
+ALONE = """
+import sys, torch
+torch.set_num_threads(1)
+policy = torch._inductor.aoti_load_package(sys.argv[1])
+given = [[float(x) for x in line.split()] for line in sys.stdin]
+sizes = dict(word.rsplit(":", 1) for word in policy.loader.get_metadata()["arguments"].split())
+memory = torch.zeros(int(sizes["memory"])).double()
+for row in given:
+    row = torch.tensor(row).double()
+    memory, action = policy(memory, row[:3], row[3:])
+    print(*action.tolist())
+assert "afm_rl" not in sys.modules
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
+def test_a_file_acts_the_same_without_this_library(tmp_path):
+    """In a Python process of its own, and in the C++ program."""
+    controller = Controller(None, policy_of())
+    path = export_controller(controller, tmp_path / "policy.pt2")
+    assert [file.name for file in tmp_path.iterdir()] == ["policy.pt2"]
+    plan = torch.tensor([0.4, -0.3]).double()
+    kept = torch.zeros(controller.sizes["memory"]).double()
+
+    def act(state, goal):
+        nonlocal kept
+        kept, action = controller(kept, state, plan * goal.sign())
+        return action
+
+    path_driven = driven(act, 24)
+    expected = actions(path_driven)
+    assert (expected[-1] * plan < 0).any()  # it was corrected
+    lines = "".join(
+        " ".join(repr(x) for x in [*state.tolist(), *(plan * goal.sign()).tolist()]) + "\n"
+        for state, goal, _ in path_driven
+    )
+    runs = [[sys.executable, "-c", ALONE, str(path)]]
+    if shutil.which("cmake"):
+        build = tmp_path / "build"
+        prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
+        for step in (["-S", str(PROGRAM), "-B", str(build), prefix], ["--build", str(build)]):
+            subprocess.run(["cmake", *step], check=True, capture_output=True)
+        runs.append([str(build / "run_policy"), str(path)])
+    for run in runs:
+        out = subprocess.run(
+            run,
+            input=lines,
+            capture_output=True,
+            text=True,
+            check=True,
+            cwd=tmp_path,
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+        )
+        found = torch.tensor([[float(x) for x in line.split()] for line in out.stdout.splitlines()])
+        torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=0)
