@@ -19,7 +19,7 @@ from torch import Tensor
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.dynamics.mujoco_physics import NAMES, changed_model
 from afm_rl.envs.task import Contexts, Reward, Task
-from afm_rl.envs.task_sources import NOWHERE, Limits, dm_control_task, trust
+from afm_rl.envs.task_sources import NOWHERE, Limits, dm_control_task, quiet, trust
 from afm_rl.errors import check_choice, check_count
 from afm_rl.manifold import Manifold
 
@@ -111,9 +111,9 @@ def stretched(domain: str, model: Any, row: tuple[float, ...]) -> Any:
         numbers = [float(word) for word in element.get(attribute).split()]
         numbers[index] *= value["length"]
         element.set(attribute, " ".join(repr(number) for number in numbers))
-    found = mujoco.MjModel.from_xml_string(
-        ElementTree.tostring(root, encoding="unicode"), dict(common.ASSETS)
-    )
+    with quiet():
+        text = ElementTree.tostring(root, encoding="unicode")
+        found = mujoco.MjModel.from_xml_string(text, dict(common.ASSETS))
     found.opt.disableflags = model.opt.disableflags
     rest = tuple({**value, "length": 1.0}.values())
     return changed_model(found, rest)

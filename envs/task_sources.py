@@ -61,7 +61,7 @@ def gymnasium_task(
     import gymnasium
 
     try:
-        with _quiet():
+        with quiet():
             env = gymnasium.make(id)
     except (gymnasium.error.Error, ImportError, AttributeError) as error:
         raise ConfigurationError(f"robot.id={id!r}: {error}") from error
@@ -126,7 +126,7 @@ def dm_control_task(
         ConfigurationError: if there is no dm_control, no such task, or nothing is known of it.
     """
     draws = np.random.RandomState()
-    with _quiet():
+    with quiet():
         try:
             from dm_control import suite
 
@@ -278,7 +278,7 @@ def pendulum_observation(state: Tensor) -> Tensor:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Silence what packages say of missing screens, and of old settings in their own files."""
     try:
         from mujoco import set_mju_user_warning as say
