@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.small_matrices import invert_positive
 from afm_rl.tracing import all_hold
 
 UNSEEN = 4.0  # half ranges: standard deviation of an axis of which a transition shows nothing
@@ -94,13 +95,12 @@ def effective_action(
         there = model.manifold.difference(next_state, model(state, guess)) / noise
         better = there.square().sum(-1, True) < error.square().sum(-1, True)
         effective, error = torch.where(better, guess, action), torch.where(better, there, error)
+    prior = UNSEEN**-2 * torch.eye(len(half_range), dtype=torch.float64, device=action.device)
     limit = torch.ones_like(innovation).unsqueeze(-1)
     going, covariance = limit > 0, limit.double().unsqueeze(-1)
     for last in (False,) * (rounds - 1) + (True,):
         jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()
-        precision = jacobian.mT @ jacobian
-        precision.diagonal(dim1=-2, dim2=-1).add_(UNSEEN**-2)
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(precision).L)
+        inverse = invert_positive(jacobian.mT @ jacobian + prior)
         covariance = torch.where(going.unsqueeze(-1), inverse, covariance)
         slope = jacobian.mT @ error.unsqueeze(-1).double()
         step = (covariance @ slope).squeeze(-1)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.flow.saturation import LIMIT, saturate
+from afm_rl.small_matrices import solve_positive
 from afm_rl.tracing import cached
 
 STUCK = 5e-3  # half ranges: an action with less effect is held by friction
@@ -304,11 +305,11 @@ def fit_experts(rows: Rows) -> Experts:
     square = (outer.unsqueeze(-1) * outer.unsqueeze(-2)).flatten(-2)
     square = torch.baddbmm(nominal.flatten(), long, square).unflatten(-1, (size + 1, size + 1))
     cross = torch.baddbmm(nominal[:-1], long * e, outer)
-    solution = torch.linalg.solve_ex(square, cross).result  # (N, A, A + 1)
+    solution = solve_positive(square, cross.unsqueeze(-1)).squeeze(-1)  # (N, A, A + 1)
     solution = torch.where(*_drivers(u, e, long), solution)
     matrix, bias = solution[..., :-1], solution[..., -1:]
     ridge = torch.baddbmm(LEAST_GAIN**2 / PRIOR * nominal[:-1, :-1], matrix.mT, matrix)
-    inverse = torch.linalg.solve_ex(ridge, matrix.mT).result
+    inverse = solve_positive(ridge, matrix.mT)
     wide = (count, axes, 1)
     experts = Experts(
         gain.unflatten(0, wide[:2]).unsqueeze(-2),
