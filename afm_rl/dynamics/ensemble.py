@@ -28,6 +28,7 @@ Parameters = tuple[Iterable[Tensor], Iterable[Tensor]]  # weights and biases, la
 PROPAGATIONS = ("mean", "sample", "member")
 INITS = {"uniform": uniform_layer, "sparse": sparse_layer}
 CHUNK = 2**18  # activations per layer and chunk: 1 MiB in float32, so that they stay in cache
+STILL = 1e-6  # variation below which a coordinate never changes, as a share of its size
 
 
 class Ensemble(PerMissionModel):
@@ -140,10 +141,19 @@ class Ensemble(PerMissionModel):
                 yield self.running, name
 
     def normalise_(self, inputs: Tensor, targets: Tensor) -> None:
-        """Set the statistics of inputs ``(N, in)`` and state changes ``(N, D)``."""
+        """Set the statistics of inputs ``(N, in)`` and state changes ``(N, D)``.
+
+        A coordinate that never changes counts in its own unit, and its change begins as the mean:
+        divided by a rounding error, the smallest difference later on would be a huge one.
+        """
         for name, data in (("input", inputs), ("target", targets)):
+            std = data.std(0)
+            still = std <= STILL * data.abs().amax(0).clamp_min(1e-2)
             getattr(self, f"{name}_mean").copy_(data.mean(0))
-            getattr(self, f"{name}_std").copy_(data.std(0).clamp_min(1e-8))
+            getattr(self, f"{name}_std").copy_(std.masked_fill(still, 1.0))
+        with torch.no_grad():
+            for parameter in (self.weights[-1], self.biases[-1]):
+                parameter[..., : still.numel()].masked_fill_(still, 0.0)
         if self.running is not None:
             count = min(len(inputs), self.running_count or 0)
             self.running.start_(self.input_mean, self.input_std, count)

@@ -16,7 +16,6 @@ from afm_rl.keys import as_keys
 from afm_rl.learning.nll import gaussian_nll
 from afm_rl.progress import Bar
 
-CONSTANT = 1e-8  # standard deviation below which a coordinate counts as one that never changes
 TOLERATED = 1 / 3  # unexplained share of the variance above which there is a warning
 
 
@@ -139,9 +138,6 @@ def fit_changes(
 ) -> FitReport:
     """Fit to state changes ``(N, D)``, of which all but the first ``samples`` are held out."""
     model.normalise_(model.inputs(state, action)[:samples], change[:samples])
-    # A coordinate that never changes would be predicted to within rounding errors, and any
-    # later error would count as a huge one.
-    model.target_std.masked_fill_(model.target_std <= CONSTANT, 1.0)
     inputs = model.network_rows(state, action)
     target = model.standardise(change).to(inputs)
     optimizer = torch.optim.Adam(model.parameters(), lr=lr, fused=True)

@@ -151,6 +151,23 @@ def test_a_coordinate_that_never_changes_causes_no_surprise():
     assert surprise[:, 1].max() < 10 and noise[:, 1].min() > 1e-4
 
 
+def test_a_coordinate_that_is_always_the_same_stays_so_in_long_plans():
+    """It did explode: what the network added to it was divided by a rounding error."""
+    start = torch.randn(500, 2) * torch.tensor([1.0, 0.0]) + torch.tensor([0.0, 0.3])
+    data = TensorDict({"observation": start, "action": torch.randn(500, 1)}, [500])
+    step = torch.cat([0.1 * data["action"], torch.zeros(500, 1)], -1)
+    data["next", "observation"] = data["observation"] + step
+    model = Ensemble(Manifold(2), 1, features=[0, 1], members=2, hidden=[16])
+    fit_ensemble(model, data, epochs=30, lr=1e-2)
+    plans = torch.randn(20, 50, 1)
+    states = model.rollout(torch.tensor([0.5, 0.3]), plans)
+    torch.testing.assert_close(states[..., 1], torch.full((20, 50), 0.3))
+    torch.testing.assert_close(
+        states[..., 0], 0.5 + 0.1 * plans[..., 0].cumsum(-1), atol=0.2, rtol=0.0
+    )
+    assert (model.jacobian(start, data["action"])[:, 1] == 0).all()
+
+
 def test_keys_may_be_others(make_ensemble, observed):
     named = TensorDict(
         {
