@@ -44,6 +44,8 @@ class ActionFlow(PairCorrector):
        Each predicts the next effect; the one with the smallest discounted loss
        :math:`L \leftarrow \lambda L + \rho(\hat T(u) - u_\mathrm{eff})`,
        :math:`\rho(x) = x^2 / (x^2 + 0.25^2)`, is believed. No correction at all is one of them.
+       Pairs from before the gate opened are read by place only, and a hypothesis is forgiven its
+       first guesses once a line explains all pairs that it has read.
     4. *Experts* fit its pairs, and the network encodes both.
     5. *Flow*: straight paths :math:`x_\tau = (1-\tau)(u_0 + \sigma\epsilon) + \tau u_1` lead from
        around the plan :math:`u_0` to the inverse :math:`u_1 = T^{-1}(u_0)`.

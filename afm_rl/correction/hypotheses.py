@@ -139,10 +139,11 @@ def read_rows(pairs: Tensor, layout: Layout, size: int, away: Tensor | None) -> 
     newest, rows = pairs.shape[-2] - 1, layout.filled.shape[-2]
     effects = pairs.index_select(-2, newest - layout.effect)
     commands = pairs[..., -layout.command.shape[-1] :, :]
-    lost = 1 - commands[..., 3 * size : 3 * size + 1]
+    lost = (commands[..., 3 * size : 3 * size + 1] == 0).to(commands)
     valid = ((layout.command > 0).to(lost) @ lost == 0).to(lost)
     executed = layout.command.to(lost) @ commands[..., :size]
     effective, std, came = effects[..., size : 3 * size + 1].split([size, size, 1], -1)
+    came = (came == 1.0).to(came)  # what was sound before a change tells nothing about it
     parts = [part.unflatten(-2, (-1, rows)) for part in (executed, effective, std, valid * came)]
     if away is not None:
         near = _nearest(pairs, away, rows)
@@ -150,6 +151,7 @@ def read_rows(pairs: Tensor, layout: Layout, size: int, away: Tensor | None) -> 
         shape = (*near.shape[:-2], count, *near.shape[-2:])
         sizes = [size, size, size, 1, near.shape[-1] - 3 * size - 1]
         there = near.unsqueeze(-3).expand(shape).split(sizes, -1)
+        there = (*there[:3], (there[3] > 0).to(pairs))
         parts = [torch.cat([part, more], -3) for part, more in zip(parts, there, strict=False)]
     filled = parts[3] * layout.filled
     executed, effective, std = (part * filled for part in parts[:3])

@@ -14,6 +14,8 @@ from afm_rl.errors import check_count
 from afm_rl.flow.experts import LIMIT, Rows
 from afm_rl.tracing import all_hold
 
+OLD = 0.5  # what "valid" becomes where a change has begun since
+
 
 class PairCorrector(Corrector):
     """A corrector that remembers M pairs (executed, effective action), shares of the largest.
@@ -43,7 +45,9 @@ class PairCorrector(Corrector):
     ) -> None:
         super().__init__(action_low, action_high, gate, recent)
         self.memory = max(check_count("corrector.memory", memory), recent)
-        self.pair_size = 3 * self.action_size + 2 + place
+        self.pair_size, self.tail = 3 * self.action_size + 2 + place, 1 + place
+        is_valid = torch.arange(self.pair_size) == 3 * self.action_size
+        self.register_buffer("is_valid", is_valid, persistent=False)
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the pairs: u, its effect, std, valid, innovation, place."""
@@ -89,8 +93,11 @@ class PairCorrector(Corrector):
         )
         sound = (valid == 1.0) & rows.isfinite().all(-1, keepdim=True)
         rows = torch.where(sound, rows, 0.0)
-        parts["pairs"] = torch.cat([parts["pairs"][..., 1 : self.memory - count + 1, :], rows], -2)
-        innovation = parts["pairs"][..., -self.recent :, 3 * self.action_size + 1].amax(-1)
+        older = parts["pairs"][..., 1 : self.memory - count + 1, :]
+        begins = (parts["misaligned"] != 1.0) & (rows[..., -1:, -self.tail] > self.gate)
+        older = torch.where(self.is_valid & begins.unsqueeze(-1), OLD * older, older)
+        parts["pairs"] = torch.cat([older, rows], -2)
+        innovation = parts["pairs"][..., -self.recent :, -self.tail].amax(-1)
         return self.pack(parts), innovation
 
 
@@ -111,7 +118,7 @@ class ClassicalCorrector(PairCorrector):
         """Return pairs as rows."""
         size = self.action_size
         parts = pairs.split([size, size, size, 1, self.pair_size - 3 * size - 1], -1)
-        return Rows(*parts[:4])
+        return Rows(*parts[:3], (parts[3] > 0).to(pairs))
 
     def correct(
         self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor

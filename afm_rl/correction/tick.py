@@ -12,12 +12,13 @@ from torch import Tensor, nn
 from afm_rl.correction.choice import nearest_of, probes_of, source_points_of
 from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY, Layout, lay_out, read_rows
 from afm_rl.errors import check_choice, check_count, check_number
-from afm_rl.flow.experts import Rows, fit_experts
+from afm_rl.flow.experts import Experts, Rows, fit_experts
 from afm_rl.flow.network import AxisNetwork, Encoded
 from afm_rl.flow.saturation import DEAD, MODES, attainable, cut_off
 from afm_rl.flow.solver import midpoint
 
 TOLERANCE = 0.25  # of the largest action: at an error of this size the loss is half its maximum
+FORGIVEN = 0.02  # loss of a hypothesis that explains all that it has read
 EXCITED = 0.05  # range of the actions that show whether an axis is dead
 LEAST_WIDTH = 0.02  # of the box: effects that a planner may still ask for
 
@@ -116,9 +117,10 @@ class Tick(nn.Module):
             box: lowest and highest action, ``(B, 2, A)``.
         """
         unit, ends = planned / self.scale, box / self.scale
-        losses = self.judge(pairs, losses, forecasts, misaligned)
-        belief = (losses + self.penalty).argmin(-1)
         encoded = self.encode(pairs, place)
+        losses = self.judge(pairs, losses, forecasts, misaligned)
+        losses = self.forgive(losses, encoded.experts)
+        belief = (losses + self.penalty).argmin(-1)
         sent = pairs[..., : len(self.scale)]
         tried = sent.amax(-2) - sent.amin(-2)
         known = self.pick(encoded, belief)
@@ -155,13 +157,22 @@ class Tick(nn.Module):
         valid = newest[..., 3 * size]
         return self.forgetting * losses + valid * misaligned * share.mean(-1)
 
+    def forgive(self, losses: Tensor, experts: Experts) -> Tensor:
+        """Return losses that are small where a line explains all that a hypothesis has read.
+
+        Its first forecasts were guesses: one pair does not tell a gain from an offset.
+        """
+        explained = experts.explained().view(-1, self.count)
+        explained = torch.nn.functional.pad(explained, (0, 1))  # the identity reads nothing
+        return torch.where(explained, losses.clamp_max(FORGIVEN), losses)
+
     def encode(self, pairs: Tensor, place: Tensor) -> Encoded:
         """Return what the network reads under every hypothesis, B H sets of rows."""
         away, size = None, len(self.scale)
         if self.by_place:
             first = 3 * size + 2
             away = (pairs[..., first:] - place.unsqueeze(-2)).square().sum(-1)
-            away = torch.where(pairs[..., first - 2] == 1.0, away, torch.inf)
+            away = torch.where(pairs[..., first - 2] > 0, away, torch.inf)
         layout = Layout(*(getattr(self, f"rows_{name}") for name in Layout._fields))
         rows = read_rows(pairs, layout, size, away)
         rows = Rows(*(part.flatten(0, 1) for part in rows))

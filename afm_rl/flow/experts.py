@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -16,6 +17,7 @@ PRIOR = 1e-4  # weight of the nominal map in every fit
 LEAST_GAIN = 0.02  # smallest gain that is divided by
 NOISE = 0.1  # half ranges: a pair with this standard deviation counts half
 EXACT = 0.02  # half ranges: a fit that misses by less explains all rows
+EXPLAINED = 0.03  # of what the nominal map misses: a line that misses by less explains all rows
 LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
 LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
 NEAR = 0.15  # half ranges: a pair so far from the question counts half as much
@@ -268,6 +270,20 @@ class Experts(NamedTuple):
         exact = self.misses[..., 2].exp() < EXACT  # (N, A, 1)
         effect = self.gain[..., 2] * actions.mT.to(self.bias) + self.offset[..., 2]
         return torch.where(exact, effect, torch.nan).mT.to(actions)
+
+    def explained(self) -> Tensor:
+        """Return whether gains and offsets explain all rows, of which there are enough, ``(N,)``.
+
+        Two rows are on a line in any case, and rows that are alike are near many; a line through
+        noise misses nearly as much as the nominal map does.
+        """
+        sent, came = self.executed.squeeze(-2), self.effective.squeeze(-2)  # (N, A, K)
+        read = self.trust.squeeze(-2) > 2 * math.log(LEAST_MISS)
+        count, most = read.sum(-1), torch.where(read, sent, -torch.inf).amax(-1)
+        reach = most - torch.where(read, sent, torch.inf).amin(-1)
+        nominal = ((came - sent).square() * read).sum(-1).div(count.clamp_min(1)).sqrt()
+        line = self.misses[..., 0, 2].exp() < EXPLAINED * torch.minimum(reach, nominal)
+        return (line & (count >= LEAST_ROWS)).all(-1)
 
     def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
         """Return the log-weight of each row for ``unit`` ``(N, A, C, 1)``, ``(N, A, C, K)``."""

@@ -352,7 +352,7 @@ class CorrectionLoop:
             parts, size = self.corrector.unpack(memory[row], self.states.shape[-1]), len(self.names)
             pairs = parts["pairs"][:, : 3 * size + 1].split([size, size, size, 1], -1)
             executed, effective, std, valid = (part.numpy() for part in pairs)
-            use, step = valid[:, 0] == 1, getattr(self.model, "dt", 1.0)
+            use, step = valid[:, 0] > 0, getattr(self.model, "dt", 1.0)
             words[row] = str(explain(executed[use], effective[use], self.names, std[use], step))
         return words
 

@@ -16,6 +16,7 @@ from afm_rl.correction.hypotheses import (
     memory_of,
     read_rows,
 )
+from afm_rl.correction.pairs import OLD
 from afm_rl.errors import ConfigurationError
 from afm_rl.flow import AxisNetwork
 
@@ -96,6 +97,19 @@ def test_near_pairs_come_in_the_order_of_place_then_of_age():
     away[16] = torch.inf  # as pairs that do not count have it
     assert read(hypothesis, away=away)[0].tolist() == [8, 10, 12, 14]
     assert read(HYPOTHESES["nearest"], away=away)[0].tolist() == [0, 0, 0, 14]
+
+
+def test_effects_from_before_a_change_are_read_by_place_only():
+    valid = torch.full((MANY, 1), OLD)
+    valid[-3:] = 1.0
+    executed, effective, _, counts = read(HYPOTHESES["long"], rows=4, pairs=pairs_of(valid))
+    assert counts.tolist() == [0, 1, 1, 1] and executed.tolist() == [0, 17, 18, 19]
+    # A command from before it may act after it.
+    executed, effective, _, counts = read(HYPOTHESES["delay_2"], rows=8, pairs=pairs_of(valid))
+    assert counts[-3:].tolist() == [1, 1, 1] and counts.sum() == 3
+    assert executed[-3:].tolist() == [15, 16, 17] and effective[-3:].tolist() == [117, 118, 119]
+    near = read(HYPOTHESES["near"], rows=8, pairs=pairs_of(valid), away=torch.arange(float(MANY)))
+    assert near[3].tolist() == [0, 0, 0, 0, 1, 1, 1, 1] and near[0][-1] == 0
 
 
 def test_what_does_not_count_fills_a_row_with_nothing():

@@ -61,6 +61,18 @@ def test_faults_are_corrected_within_few_steps(line, drive, plans, name, size):
     assert foreseen < 0.12
 
 
+@pytest.mark.parametrize("size", [1, 2])
+def test_small_actions_that_look_reversed_at_first_are_understood_soon(line, drive, plans, size):
+    """One pair does not tell an offset from a reversal: the next ones count, and no old ones."""
+    planned = plans(16, 24, size, size=0.15, seed=1)
+
+    def weak_and_biased(sent):
+        return sent[-1] if len(sent) <= 10 else 0.5 * sent[-1] + 0.2
+
+    _, effects = drive(flow_of(size), line(size, noise_std=0.004), weak_and_biased, planned)
+    assert (effects - planned)[13:].abs().quantile(0.9) < 0.05
+
+
 @pytest.mark.parametrize("delay", [1, 2, 3])
 def test_late_commands_of_a_reversed_motor_are_found(line, drive, plans, delay):
     planned = plans(4, 8, 2, size=0.5).repeat_interleave(12, 0)  # steady for a while
