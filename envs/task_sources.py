@@ -30,6 +30,7 @@ from afm_rl.manifold import Manifold
 Limits = Sequence[float] | None
 NOWHERE = torch.zeros(0)  # the goal of a task without one
 FINE = 0.1  # error of a model of one's own, at most, in effects that the largest actions have
+EXACT = 0.03  # the same, of a model that is the world's simulator
 
 
 def gymnasium_task(
@@ -99,7 +100,9 @@ def gymnasium_task(
         return _state_of(inner.data), NOWHERE
 
     seen = {"observe": partial(_observation_of, inner)}
-    return _mujoco(id, MuJoCoDynamics(env), start, {**known, **seen}, steps, *limits)
+    world = MuJoCoDynamics(env)
+    trust(world, start(0)[0], world.action_low.tolist(), world.action_high.tolist(), EXACT)
+    return _mujoco(id, world, start, {**known, **seen}, steps, *limits)
 
 
 def dm_control_task(
@@ -326,7 +329,11 @@ def _known(
 
 
 def trust(
-    world: KnownDynamics, state: Tensor, low: Sequence[float], high: Sequence[float]
+    world: KnownDynamics,
+    state: Tensor,
+    low: Sequence[float],
+    high: Sequence[float],
+    share: float = FINE,
 ) -> KnownDynamics:
     """Bound a model's noise by a share of what actions effect in a step.
 
@@ -335,7 +342,7 @@ def trust(
     """
     half = (torch.tensor([list(high), list(low)]).diff(dim=0)[0] / 2).abs().nan_to_num(posinf=1.0)
     slopes = world.jacobian(state.float(), torch.zeros(len(half))).abs()
-    effect = FINE * (slopes * half).sum(-1)
+    effect = share * (slopes * half).sum(-1)
     world.noise = torch.where(effect > 0, torch.minimum(world.noise, effect), world.noise)
     return world
 
