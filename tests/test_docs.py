@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = [
     *(DOCS / "quickstart.md", DOCS / "torchrl.md", DOCS / "reliability.md"),
-    *(DOCS / "command_line.md", DOCS / "concepts.md", DOCS / "design.md"),
+    *(DOCS / "command_line.md", DOCS / "concepts.md", DOCS / "design.md", DOCS / "benchmarks.md"),
     *sorted((DOCS / "howto").glob("*.md")),
     *sorted((DOCS / "methods").glob("*.md")),
 ]
