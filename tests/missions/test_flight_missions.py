@@ -200,15 +200,15 @@ def test_robots_say_which_hypotheses_make_sense(composed):
     chosen = composed("robot=quadrotor", "method=afm_physics").corrector
     assert list(chosen.hypotheses) == ["identity", "recent", "newest", "long"]
     assert composed("robot=ugv", "method=afm_physics").corrector.hypotheses is None
+    learning = composed("robot=quadrotor", "method=afm_online_knode").corrector
+    assert list(learning.hypotheses) == ["identity", "newest"]
     own = composed("robot=quadrotor", "method=afm_physics", "corrector.hypotheses=[recent]")
     assert list(own.corrector.hypotheses) == ["recent"]
 
 
 def test_before_it_learns_a_model_shares_the_flow_of_the_physics(configure):
     methods = ("afm_physics", "afm_online_knode", "afm_rls", "afm_offline_knode")
-    train = {"corrector.train": {"iterations": 5}}
-    agents = [
-        build(configure("robot=quadrotor", f"method={method}", **train)) for method in methods
-    ]
+    same = {"corrector.train": {"iterations": 5}, "corrector.hypotheses": ["recent"]}
+    agents = [build(configure("robot=quadrotor", f"method={method}", **same)) for method in methods]
     first, *others, offline = [agent.trainings[-1].settings for agent in agents]
     assert others == [first, first] and offline != first
