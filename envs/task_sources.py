@@ -339,6 +339,13 @@ def trust(
 
     Short steps have small effects; a change of what they are would be lost in the noise of long
     ones.
+
+    Args:
+        world: the model, changed in place.
+        state: where effects are measured, ``(S,)``.
+        low: lowest action, ``(A,)``.
+        high: highest action, ``(A,)``.
+        share: of the largest actions' effect on each coordinate.
     """
     half = (torch.tensor([list(high), list(low)]).diff(dim=0)[0] / 2).abs().nan_to_num(posinf=1.0)
     slopes = world.jacobian(state.float(), torch.zeros(len(half))).abs()

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import NoReturn
 
-from afm_rl.cli.error_messages import explain, one_line
+from afm_rl.cli.error_messages import told_by
 
 NAME = "afm-rl-diagnose"
 ABOUT = """\
@@ -49,17 +48,8 @@ def main() -> None:
     add("--no-page", dest="page", action="store_false", help="write diagnosis.json only")
     options = parser.parse_args()
 
-    try:
+    with told_by(NAME):
         _run(options)
-    except BrokenPipeError:  # nobody reads on, as in `afm-rl-diagnose log.csv | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
-    except Exception as error:
-        message = explain(error)
-        if message is None:
-            raise
-        print(f"{NAME}: {one_line(message)}", file=sys.stderr)
-        sys.exit(2)
 
 
 def _run(options: argparse.Namespace) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from hydra import compose, initialize_config_module
@@ -20,6 +22,22 @@ from afm_rl.errors import AFMError
 NOISE = ("Config search path:", "Set the env", "See https://")  # of no help here
 UNKNOWN = re.compile(r"Could not override '([^']+)'")  # Hydra's words for a misspelt setting
 MEMORY = ("not enough memory", "can't allocate memory", "out of memory")  # torch's words
+
+
+@contextmanager
+def told_by(name: str) -> Iterator[None]:
+    """Let a mistake end a command in one line that begins with its name, and exit status 2."""
+    try:
+        yield
+    except BrokenPipeError:  # nobody reads on, as in `afm-rl-report study | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except Exception as error:
+        message = explain(error)
+        if message is None:
+            raise
+        print(f"{name}: {one_line(message)}", file=sys.stderr)
+        sys.exit(2)
 
 
 def explain(error: BaseException) -> str | None:

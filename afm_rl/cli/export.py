@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from afm_rl.cli.error_messages import explain, one_line
+from afm_rl.cli.error_messages import told_by
 from afm_rl.cli.overrides import trusted_packages
 
 NAME = "afm-rl-export"
@@ -29,14 +29,8 @@ def main() -> None:
     if not arguments or {"-h", "--help"} & set(arguments):
         print(ABOUT, end="")
         return
-    try:
+    with told_by(NAME):
         _run(arguments)
-    except Exception as error:
-        message = explain(error)
-        if message is None:
-            raise
-        print(f"{NAME}: {one_line(message)}", file=sys.stderr)
-        sys.exit(2)
 
 
 def _run(arguments: list[str]) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from pathlib import Path
 from typing import NoReturn
 
-from afm_rl.cli.error_messages import explain, one_line
+from afm_rl.cli.error_messages import told_by
 
 NAME = "afm-rl-report"
 ABOUT = """\
@@ -61,17 +60,8 @@ def main() -> None:
 
     out = options.out or options.folders[0] / "report"
     chosen = {"baselines": options.baselines, "oracle": options.oracle, "figures": options.figures}
-    try:
+    with told_by(NAME):
         if form := check_video(options.video or False):
             film_results(options.folders, out / "video", form, load_track)
         else:
             write_report(options.folders, out, **chosen, load_track=load_track)
-    except BrokenPipeError:  # nobody reads on, as in `afm-rl-report study | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
-    except Exception as error:
-        message = explain(error)
-        if message is None:
-            raise
-        print(f"{NAME}: {one_line(message)}", file=sys.stderr)
-        sys.exit(2)

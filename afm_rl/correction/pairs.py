@@ -22,7 +22,8 @@ class PairCorrector(Corrector):
 
     The model counts as misaligned while the largest normalised innovation of the newest
     transitions exceeds ``gate`` standard deviations of the model's own noise. While it is
-    aligned, an executed action counts as its own effect, and nothing more is computed.
+    aligned, an executed action counts as its own effect, and nothing more is computed. When the
+    gate opens, the pairs from before are marked as old: "valid" is halved.
 
     Args:
         action_low: lowest action, ``(A,)``.
