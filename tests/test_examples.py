@@ -1,4 +1,4 @@
-"""The examples run, by the line on top of each file, with less to do."""
+"""The examples run, by the line on top of each file, with less to do; deploy: test_deploy.py."""
 
 import re
 import runpy
@@ -13,7 +13,6 @@ LESS = {
     "plan": "--steps 20",
     "learn": "--batches 2 --samples 512",
     "compare": "--methods physics oracle --budget 10",
-    "deploy": "--steps 20",
     "policies": "--steps 40 --at 20",
 }
 OF_FILES = {  # where the examples of a folder differ
@@ -29,7 +28,7 @@ def lines_on_top(path):
 
 def test_every_example_says_how_to_run_it():
     found = [path for path in (ROOT / "examples").glob("*/*.py") if lines_on_top(path)]
-    assert {path.parent.name for path in found} >= {*LESS, "explain_afm"}
+    assert {path.parent.name for path in found} >= {*LESS, "deploy", "explain_afm"}
     for path in found:
         (line,) = lines_on_top(path)
         assert ROOT / shlex.split(line)[1] == path
