@@ -105,13 +105,28 @@ def test_transitions_count_if_the_robot_obeyed_the_last_action():
         readings.append(reading[0].item())
         return memory, goal
 
-    agent = controller.Agent(policy, {"memory": 1}, 0.0)
+    agent = controller.Agent(policy, {"memory": 1}, 0.0, torch.float32)
     given = [(1, 0), (2, 1), (3, 2), (5, 3), (6, 3), (7, 5)]  # state 4 lost, action 4 not obeyed
     for sent, (number, answers) in enumerate(given, 1):
         assert agent.act(state(number, answers, numbers=(number, 0, 0)), [0.5, 0.5]) == [0.5, 0.5]
         agent.sent = sent
     unknown = [k for k, reading in enumerate(readings) if math.isnan(reading)]
     assert [readings[k + 1] for k in unknown] == [1, 5, 6]
+
+
+def test_a_file_says_what_it_takes(monkeypatch):
+    def policy(memory, reading, goal, noise):
+        assert {memory.dtype, reading.dtype, goal.dtype, noise.dtype} == {torch.float64}
+        assert noise.shape == (1000,) and 1.0 < noise.abs().max() <= 1.5
+        return memory + 1.0, goal
+
+    sizes = "memory:4 observation:3 goal:2 noise:1000"
+    about = {"arguments": sizes, "noise_bound": "1.5", "dtype": "float64"}
+    policy.loader = types.SimpleNamespace(get_metadata=lambda: about)
+    monkeypatch.setattr(torch._inductor, "aoti_load_package", {"policy.pt2": policy}.get)
+    agent = controller.load("policy.pt2")
+    assert agent.act(state(), [0.25, 0.5]) == [0.25, 0.5]
+    assert agent.memory.tolist() == [2.0] * 4  # a state that follows nothing, and this one
 
 
 class Bench:
@@ -279,7 +294,7 @@ def test_the_ros_2_node_acts_on_odometry_and_stops_without(ros2_node):
         given.append(reading.tolist())
         return memory, 0.1 * goal
 
-    agent = controller.Agent(policy, {"memory": 1}, 0.0)
+    agent = controller.Agent(policy, {"memory": 1}, 0.0, torch.float32)
     node, stand_in = ros2_node.ActionFlowNode(agent, 0.2), ros2_node.Odometry
 
     def tick(x=None):

@@ -39,11 +39,14 @@ class Agent:
         policy: (memory, state, goal, noise) -> (memory, action).
         sizes: how many numbers each of these has.
         noise_bound: the largest noise, in standard deviations.
+        kind: of all its numbers.
     """
 
-    def __init__(self, policy: Policy, sizes: dict[str, int], noise_bound: float) -> None:
-        self.policy, self.sizes, self.bound = policy, sizes, noise_bound
-        self.memory = torch.zeros(sizes["memory"])  # a memory of zeros begins a mission
+    def __init__(
+        self, policy: Policy, sizes: dict[str, int], noise_bound: float, kind: torch.dtype
+    ) -> None:
+        self.policy, self.sizes, self.bound, self.kind = policy, sizes, noise_bound, kind
+        self.memory = torch.zeros(sizes["memory"], dtype=kind)  # a memory of zeros begins a mission
         self.seen, self.sent = 0, -1  # numbers of the last state, and of its answer
 
     def act(self, state: Message, goal: list[float]) -> list[float]:
@@ -55,9 +58,9 @@ class Agent:
 
     @torch.no_grad()
     def _tick(self, state: list[float], goal: list[float]) -> list[float]:
-        given = [torch.tensor(state), torch.tensor(goal)]
+        given = [torch.tensor(numbers, dtype=self.kind) for numbers in (state, goal)]
         if "noise" in self.sizes:
-            noise = torch.empty(self.sizes["noise"])
+            noise = torch.empty(self.sizes["noise"], dtype=self.kind)
             given.append(torch.nn.init.trunc_normal_(noise, a=-self.bound, b=self.bound))
         self.memory, action = self.policy(self.memory, *given)
         return action.tolist()
@@ -68,7 +71,7 @@ def load(path: str) -> Agent:
     policy = torch._inductor.aoti_load_package(path)
     about = policy.loader.get_metadata()
     sizes = {name: int(n) for name, n in (s.rsplit(":", 1) for s in about["arguments"].split())}
-    return Agent(policy, sizes, float(about["noise_bound"]))
+    return Agent(policy, sizes, float(about["noise_bound"]), getattr(torch, about["dtype"]))
 
 
 def make() -> Agent:
@@ -84,7 +87,7 @@ def make() -> Agent:
     world = PlanningEnv(model, GoalDistance(), low, high)
     planner = MPPI(world, box_key=("afm", "effect_bounds"))
     controller = Controller(planner, ActionFlowPolicy(model, planner.action_spec))
-    return Agent(controller, controller.sizes, controller.noise_bound)
+    return Agent(controller, controller.sizes, controller.noise_bound, torch.float32)
 
 
 def goal_at(number: int) -> list[float]:
