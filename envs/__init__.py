@@ -1,6 +1,7 @@
 """Environments: robots whose dynamics change under way."""
 
 from afm_rl.envs.actuator_inversion import actuator_inversion_task
+from afm_rl.envs.arm import arm_task
 from afm_rl.envs.course import Course
 from afm_rl.envs.gusty_pendulum import gusty_pendulum_task
 from afm_rl.envs.mission_noise import MissionNoise
@@ -19,6 +20,7 @@ from afm_rl.envs.references import (
 )
 from afm_rl.envs.rendering import TrackCanvas
 from afm_rl.envs.settings import schedule_in_seconds
+from afm_rl.envs.skid_steer import WheelPhysics, skid_steer
 from afm_rl.envs.task import Task
 from afm_rl.envs.task_env import TaskEnv
 from afm_rl.envs.task_hosts import environment_task
@@ -48,7 +50,9 @@ __all__ = [
     "UGVTrackGym",
     "UGVTrackVectorEnv",
     "Waypoints",
+    "WheelPhysics",
     "actuator_inversion_task",
+    "arm_task",
     "dm_control_task",
     "environment_task",
     "find_reference",
@@ -59,4 +63,5 @@ __all__ = [
     "mujoco_task",
     "function_task",
     "schedule_in_seconds",
+    "skid_steer",
 ]

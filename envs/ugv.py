@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from afm_rl.dynamics import Dubins, DynamicsModel
 from afm_rl.envs.course import Course
 from afm_rl.envs.mission_env import MissionEnv
 from afm_rl.envs.mission_noise import MissionNoise
@@ -32,14 +33,16 @@ class UGVTrack(MissionEnv):
               \quad \epsilon_t \sim N(0, I)
 
     with the pose :math:`s = (x, y, \theta)` in m and rad, the action :math:`a = (v, \omega)` in
-    m/s and rad/s, Dubins dynamics :math:`f`, and a regime :math:`g` whose parameters
+    m/s and rad/s, dynamics :math:`f` (Dubins, or a ``world`` whose states begin with the pose and
+    have more coordinates), and a regime :math:`g` whose parameters
     :math:`\rho_t` follow the mission's progress (paper, section V-B). The next target becomes
     the goal once the robot is nearer than ``reach``, at most one per step. The reward is the
     distance gained on the current target in metres, plus 1 for a target reached. An episode
     terminates with the last target and is truncated after ``max_steps``.
 
     ================= ============== ====================================================
-    ``observation``   ``(*B, 3)``    the pose, for policies: x, y (m), theta (rad)
+    ``observation``   ``(*B, 3)``    the pose, for policies: x, y (m), theta (rad); or as many
+                                     of the state's coordinates as are ``observed``
     ``goal``          ``(*B, 2)``    current target (m)
     ``reached``       ``(*B)``       number of targets reached
     ``step``          ``(*B)``       number of steps taken
@@ -70,7 +73,7 @@ class UGVTrack(MissionEnv):
         schedule: when regimes change; by default at 0.15 and 0.80 of the targets.
         process_noise: standard deviation per step of each pose component (m, m, rad).
         start_noise: the same for the start pose.
-        dt: time step (s).
+        dt: time step of Dubins dynamics (s).
         reach: distance at which a target counts as reached (m).
         max_steps: steps after which an episode is truncated.
         action_low: lower bounds of v (m/s) and omega (rad/s).
@@ -81,6 +84,8 @@ class UGVTrack(MissionEnv):
         missions: what missions are unless ``reset`` is given others: a tensordict that
             broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
         dtype: floating-point type, torch's default if None.
+        world: how the robot moves; Dubins if None.
+        observed: how many of the state's coordinates are observed; all if None.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -114,6 +119,8 @@ class UGVTrack(MissionEnv):
         missions: TensorDictBase | Mapping[str, Any] | None = None,
         *,
         dtype: torch.dtype | None = None,
+        world: DynamicsModel | None = None,
+        observed: int | None = None,
     ) -> None:
         super().__init__(batch_size, seed, start_noise, device, dtype)
         if isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable):
@@ -125,13 +132,15 @@ class UGVTrack(MissionEnv):
         self.noise = MissionNoise()
         bounds = check_bounds(action_low, action_high, ACTIONS)
         schedule = Schedule() if schedule is None else schedule
+        world = Dubins(check_number("dt", dt, low=0.0, open_low=True)) if world is None else world
         self.simulation = UGVSimulation(
             Course(self.tracks, self.dtype),
-            check_regime(regime, lambda: ActionGain(["v_gain", "omega_gain"]), 3, 2),
+            check_regime(regime, lambda: ActionGain(["v_gain", "omega_gain"]), world.state_size, 2),
             check_instance("schedule", schedule, Schedule),
             low=bounds[0].to(self.dtype),
             high=bounds[1].to(self.dtype),
-            dt=check_number("dt", dt, low=0.0, open_low=True),
+            world=world,
+            observed=world.state_size if observed is None else check_count("observed", observed),
             reach=check_number("reach", reach, low=0.0, open_low=True),
             steps=check_count("max_steps", max_steps),
         ).to(self.device)

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from afm_rl.dynamics import dubins_step
+from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
 from afm_rl.envs.course import Course
 from afm_rl.envs.phases import PhasedSimulation
 from afm_rl.manifold import wrap_angle
@@ -16,13 +16,14 @@ from afm_rl.regimes import Regime, Schedule
 
 
 class UGVSimulation(nn.Module, PhasedSimulation):
-    r"""Dubins robots under regimes, without any state or random numbers of its own.
+    r"""Ground robots under regimes, without any state or random numbers of its own.
 
     .. math:: s_{t+1} = f(s_t, g(\mathrm{clamp}(a_t); \rho_t)) + \epsilon_t
 
     The regime acts after the clamp, and its result is not clamped again. It may depend on the
-    clamped actions before, and on noise. Arguments are those of
-    :class:`~afm_rl.envs.UGVTrack`, with the bounds ``low`` and ``high`` as tensors ``(2,)``.
+    clamped actions before, and on noise. A state begins with the pose x, y, theta, the only part
+    with noise; the others begin at zero. Arguments are those of :class:`~afm_rl.envs.UGVTrack`,
+    with the bounds ``low`` and ``high`` as tensors ``(2,)``.
     """
 
     low: Tensor
@@ -35,7 +36,8 @@ class UGVSimulation(nn.Module, PhasedSimulation):
         schedule: Schedule,
         low: Tensor,
         high: Tensor,
-        dt: float,
+        world: DynamicsModel,
+        observed: int,
         reach: float,
         steps: int,
     ) -> None:
@@ -45,16 +47,17 @@ class UGVSimulation(nn.Module, PhasedSimulation):
         self.schedule = schedule
         self.register_buffer("low", low, persistent=False)
         self.register_buffer("high", high, persistent=False)
-        self.dt = dt
+        self.world = world
+        self.observed = observed
         self.reach = reach
         self.steps = steps
 
     def begin(self, mission: TensorDictBase, dtype: torch.dtype) -> dict[str, Tensor]:
-        pose = _wrapped(self.course.starts[mission["track"]].to(dtype))
+        pose = self._whole(_wrapped(self.course.starts[mission["track"]].to(dtype)))
         return self.started(pose, mission, 2, reached=torch.zeros_like(mission["track"]))
 
     def displaced(self, pose: Tensor, noise: Tensor) -> Tensor:
-        return _wrapped(pose + noise)
+        return _wrapped(pose + self._whole(noise))
 
     def progress(self, mission: TensorDictBase, state: Any) -> Tensor:
         return self.course.progress(mission["track"], state["reached"])
@@ -75,7 +78,10 @@ class UGVSimulation(nn.Module, PhasedSimulation):
         past = data["past"] if self.regime.history else None
         parameters = self.regime_now(mission, data)
         effective = self.regime.apply(action, parameters, pose, past, actuator)
-        moved = _wrapped(dubins_step(pose, effective, self.dt) + noise)
+        physics = self.regime.physics_of(parameters)
+        if physics is not None and isinstance(self.world, MuJoCoDynamics):
+            self.world.set_physics(physics)
+        moved = _wrapped(self.world(pose, effective) + self._whole(noise))
 
         track = mission["track"]
         goal = self.course.goal(track, before)
@@ -92,8 +98,13 @@ class UGVSimulation(nn.Module, PhasedSimulation):
 
     def describe(self, mission: TensorDictBase, state: dict[str, Tensor]) -> TensorDict:
         goal = self.course.goal(mission["track"], state["reached"])
-        return self.described(mission, state, observation=state["pose"].clone(), goal=goal)
+        seen = state["pose"][..., : self.observed].clone()
+        return self.described(mission, state, observation=seen, goal=goal)
+
+    def _whole(self, pose: Tensor) -> Tensor:
+        """Put zeros after the pose ``(*B, 3)``."""
+        return nn.functional.pad(pose, (0, self.world.state_size - pose.shape[-1]))
 
 
 def _wrapped(pose: Tensor) -> Tensor:
-    return torch.cat([pose[..., :2], wrap_angle(pose[..., 2:])], -1)
+    return torch.cat([pose[..., :2], wrap_angle(pose[..., 2:3]), pose[..., 3:]], -1)

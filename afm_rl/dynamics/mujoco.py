@@ -122,12 +122,18 @@ class Simulator:
         frame_skip: simulation steps per action.
         threads: 0 for the calling thread.
         change: see :class:`MuJoCoDynamics`.
+        nominal: see :class:`MuJoCoDynamics`.
     """
 
     def __init__(
-        self, model: Any, frame_skip: int, threads: int, change: Change = changed_model
+        self,
+        model: Any,
+        frame_skip: int,
+        threads: int,
+        change: Change = changed_model,
+        nominal: Sequence[float] = Physics.identity,
     ) -> None:
-        self.settings = model, frame_skip, threads, change
+        self.settings = model, frame_skip, threads, change, nominal
         self.data = [mujoco.MjData(model) for _ in range(max(1, threads))]
         self.pool = mujoco_rollout.Rollout(nthread=threads)
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -146,10 +152,10 @@ class Simulator:
         """Return the model of each row of physics ``(N, P)``, made when it is first met."""
         if len(self.changed) > MOST_MODELS:
             self.changed.clear()
-        model, _, _, change = self.settings
+        model, _, _, change, nominal = self.settings
         rows = [tuple(row) for row in physics.tolist()]
         for row in set(rows) - self.changed.keys():
-            self.changed[row] = model if row == Physics.identity else change(model, row)
+            self.changed[row] = model if row == nominal else change(model, row)
         return [self.changed[row] for row in rows]
 
     def __call__(
@@ -195,6 +201,9 @@ class MuJoCoDynamics(KnownDynamics):
         threads: that simulate beside the calling one; 0 for none.
         change: returns the model with other physics, of the nominal one and a row ``(P,)`` of
             :class:`~afm_rl.regimes.Physics`.
+        nominal: the row of physics that changes nothing.
+        mix: controls per action ``(U, A)``, of a robot whose actions are not those of single
+            actuators: the controls are ``mix @ action``.
 
     Raises:
         ConfigurationError: if there is no MuJoCo, or no such model.
@@ -211,6 +220,7 @@ class MuJoCoDynamics(KnownDynamics):
     extrapolates = True
     stiff = True
     physics_now: Tensor
+    mix: Tensor | None
 
     def __init__(
         self,
@@ -219,26 +229,34 @@ class MuJoCoDynamics(KnownDynamics):
         noise_std: float | Sequence[float] = (0.01, 0.1),
         threads: int = 0,
         change: Change = changed_model,
+        nominal: Sequence[float] = Physics.identity,
+        mix: Sequence[Sequence[float]] | None = None,
     ) -> None:
         found, skip = read_model(model)
         found.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         skip = skip if frame_skip is None else check_count("dynamics.frame_skip", frame_skip)
         simulator: Any = Simulator(
-            found, skip, check_count("dynamics.threads", threads, low=0), change
+            found, skip, check_count("dynamics.threads", threads, low=0), change, tuple(nominal)
         )
         if not isinstance(noise_std, int | float) and len(noise_std) == 2:
             position, velocity = noise_std
             noise_std = [position] * found.nv + [velocity] * found.nv + [position] * found.na
-        super().__init__(simulator, space_of(found), found.nu, noise_std)
+        size = found.nu if mix is None else len(mix[0])
+        super().__init__(simulator, space_of(found), size, noise_std)
+        controls = None if mix is None else torch.tensor(mix, dtype=torch.float64)
+        self.register_buffer("mix", controls, persistent=False)
         self.register_buffer("physics_now", torch.zeros(0), persistent=False)
         self.mjcf = found
         self.dt = skip * float(found.opt.timestep)
         low, high = torch.as_tensor(found.actuator_ctrlrange).unbind(-1)
         limited = torch.as_tensor(found.actuator_ctrllimited).bool()
+        if mix is not None:  # no single actuator limits an action
+            low = high = torch.zeros(self.action_size, dtype=torch.float64)
+            limited = low.bool()
         self.action_low = torch.where(limited, low, -torch.inf)
         self.action_high = torch.where(limited, high, torch.inf)
         half = torch.where(limited, (high - low) / 2, 1.0)
-        self.action_steps = STEP * torch.cat([torch.zeros(1, found.nu), half.diag()])
+        self.action_steps = STEP * torch.cat([torch.zeros(1, len(half)), half.diag()])
 
     @property
     def names(self) -> tuple[list[str], list[str]]:
@@ -250,7 +268,8 @@ class MuJoCoDynamics(KnownDynamics):
 
         See :class:`~afm_rl.regimes.Physics`.
         """
-        nominal = physics == torch.tensor(Physics.identity).to(physics)
+        step: Any = self.step
+        nominal = physics == torch.tensor(step.settings[-1]).to(physics)
         self.physics_now = physics.new_zeros(0) if bool(nominal.all()) else physics.detach()
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
@@ -281,6 +300,8 @@ class MuJoCoDynamics(KnownDynamics):
 
     def _simulate(self, state: Tensor, actions: Tensor) -> Tensor:
         """Return the states ``(*B, H, S)`` after actions ``(*B, H, A)`` from ``(*B, S)``."""
+        if self.mix is not None:
+            actions = actions @ self.mix.to(actions).mT
         batch = torch.broadcast_shapes(state.shape[:-1], actions.shape[:-2])
         rows = state.expand(*batch, -1).reshape(-1, state.shape[-1])
         plans = actions.expand(*batch, -1, -1).reshape(-1, *actions.shape[-2:])
