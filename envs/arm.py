@@ -36,7 +36,7 @@ def tip_of(angles: Tensor, offsets: Tensor, axes: Tensor) -> Tensor:
 
     >>> offsets, axes = torch.tensor([[0.0, 0, 1], [1, 0, 0]]), torch.tensor([[0.0, 0, 1]])
     >>> tip_of(torch.tensor([torch.pi / 2]), offsets, axes).round(decimals=4)
-    tensor([-0.0000, 1.0000, 1.0000])
+    tensor([0., 1., 1.])
     """
     turned = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(angles)
     place = offsets[0].to(angles)
