@@ -24,7 +24,7 @@ import controller  # noqa: E402
 import robot  # noqa: E402
 from link import SAFE, WATCHDOG, Inbox, Link, Message, spread  # noqa: E402
 
-TICK = 0.1
+TICK = 0.15  # s; on a busy machine planner and correction may take most of 0.1
 
 
 def state(number=1, answers=0, stamp=None, numbers=(1.0, 2.0, 3.0)):
@@ -199,10 +199,10 @@ def bench(tmp_path):
 @pytest.mark.timeout(240)
 def test_robot_and_controller_in_two_processes(bench):
     # Reversed motors are corrected: the robot follows the goal again.
-    assert all(action.answers for action in bench.actions(20))
+    assert all(action.answers for action in bench.actions(12))
     bench.robot.send_signal(signal.SIGUSR1)
     before = len(bench.raw)
-    bench.actions(30)
+    bench.actions(25)
     bench.follows(10)
 
     # What is not sound reaches neither planner nor motors.
