@@ -27,8 +27,6 @@ from torch import Tensor
 
 STATES = 3  # x (m), y (m), heading (rad)
 COLUMNS = "number,missed,safe,interval,age,computing,answered,distance,v,omega".split(",")
-
-
 Policy = Callable[..., tuple[Tensor, Tensor]]
 
 
@@ -115,28 +113,30 @@ def main() -> None:
     print("ready", flush=True)
 
     rows, before = [], 0.0
-    while not ended.is_set():
-        state = inbox.get(patience)
-        begun, now = time.perf_counter(), time.time()
-        if state is None:
-            link.send(SAFE)
-            agent.sent = -1  # whatever comes next does not follow from an action of the agent
-            inbox.forget()
-            if rows:
-                rows.append([0, 0, 1, now - before, "", "", "", "", *SAFE])
+    try:
+        while not ended.is_set():
+            state = inbox.get(patience)
+            begun, now = time.perf_counter(), time.time()
+            if state is None:
+                link.send(SAFE)
+                agent.sent = -1  # whatever comes next does not follow from an action of the agent
+                inbox.forget()
+                if rows:
+                    rows.append([0, 0, 1, now - before, "", "", "", "", *SAFE])
+                before = now
+                continue
+            missed = max(0, state.number - agent.seen - 1) if rows else 0
+            goal = goal_at(state.number)
+            action = agent.act(state, goal)
+            computing = time.perf_counter() - begun
+            agent.sent = link.send(action, state.number, state.stamp)
+            distance = math.dist(state.numbers[:2], goal)
+            took = [now - before, now - state.stamp, computing, time.time() - state.stamp]
+            rows.append([state.number, missed, 0, *took, distance, *action])
             before = now
-            continue
-        missed = max(0, state.number - agent.seen - 1) if rows else 0
-        goal = goal_at(state.number)
-        action = agent.act(state, goal)
-        computing = time.perf_counter() - begun
-        agent.sent = link.send(action, state.number, state.stamp)
-        distance = math.dist(state.numbers[:2], goal)
-        took = [now - before, now - state.stamp, computing, time.time() - state.stamp]
-        rows.append([state.number, missed, 0, *took, distance, *action])
-        before = now
-    link.send(SAFE)
-    link.session.close()
+    finally:  # also where the policy raises
+        link.send(SAFE)
+        link.session.close()
     write(Path(asked.out), rows)
     report(rows, inbox)
 
