@@ -78,10 +78,7 @@ class UGVSimulation(nn.Module, PhasedSimulation):
         past = data["past"] if self.regime.history else None
         parameters = self.regime_now(mission, data)
         effective = self.regime.apply(action, parameters, pose, past, actuator)
-        physics = self.regime.physics_of(parameters)
-        if physics is not None and isinstance(self.world, MuJoCoDynamics):
-            self.world.set_physics(physics)
-        moved = _wrapped(self.world(pose, effective) + self._whole(noise))
+        moved = _wrapped(self._ahead(pose, effective, parameters) + self._whole(noise))
 
         track = mission["track"]
         goal = self.course.goal(track, before)
@@ -100,6 +97,16 @@ class UGVSimulation(nn.Module, PhasedSimulation):
         goal = self.course.goal(mission["track"], state["reached"])
         seen = state["pose"][..., : self.observed].clone()
         return self.described(mission, state, observation=seen, goal=goal)
+
+    def _ahead(self, pose: Tensor, effective: Tensor, parameters: Tensor) -> Tensor:
+        """Return the next states; nothing of the missions' physics stays in the world."""
+        physics = self.regime.physics_of(parameters)
+        if physics is None or not isinstance(self.world, MuJoCoDynamics):
+            return self.world(pose, effective)
+        self.world.set_physics(physics)
+        ahead = self.world(pose, effective)
+        self.world.set_physics(None)
+        return ahead
 
     def _whole(self, pose: Tensor) -> Tensor:
         """Put zeros after the pose ``(*B, 3)``."""

@@ -263,11 +263,14 @@ class MuJoCoDynamics(KnownDynamics):
         """Names of the state coordinates, ``q_JOINT``, ``v_JOINT``, ``w_...``, and of actions."""
         return state_names(self.mjcf), actuator_names(self.mjcf)
 
-    def set_physics(self, physics: Tensor) -> None:
+    def set_physics(self, physics: Tensor | None) -> None:
         """Change the physics from now on: rows ``(P,)``, or ``(*L, P)`` for leading dimensions.
 
-        See :class:`~afm_rl.regimes.Physics`.
+        See :class:`~afm_rl.regimes.Physics`; None for the nominal ones.
         """
+        if physics is None:
+            self.physics_now = self.physics_now.new_zeros(0)
+            return
         step: Any = self.step
         nominal = physics == torch.tensor(step.settings[-1]).to(physics)
         self.physics_now = physics.new_zeros(0) if bool(nominal.all()) else physics.detach()

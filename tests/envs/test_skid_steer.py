@@ -66,7 +66,7 @@ def test_nominal_physics_are_the_model_itself(robot):
 def test_actions_are_mixed_into_controls(robot):
     wheels = MuJoCoDynamics(robot.mjcf, 20)
     state, action = torch.zeros(20).double(), torch.tensor([0.5, 0.3]).double()
-    robot.set_physics(torch.tensor(WheelPhysics.identity))
+    robot.set_physics(None)
     torch.testing.assert_close(robot(state, action), wheels(state, robot.mix @ action))
     assert robot.jacobian(state, action).shape == (20, 2)
     assert robot.linearise(state, action)[2].shape == (20, 2)
@@ -87,6 +87,7 @@ def test_missions_have_physics_of_their_own_and_show_as_much_as_is_observed():
             data["action"] = torch.tensor([1.0, 0.0]).expand(len(kinds), 2)
             data = env.step(data)["next"]
         assert data["observation"].shape == (len(kinds), 3)
+        assert env.simulation.world.physics_now.numel() == 0  # nothing stays in the environment
         return (data["pose"] - start)[:, 0]
 
     together = run(kinds)
