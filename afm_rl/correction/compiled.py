@@ -110,7 +110,9 @@ def compile_module(
         path = Path(cache).expanduser() / "compiled" / f"{digest}.pt2"
         if not path.exists():
             _compile(module, inputs, program, path)
-        return torch._inductor.aoti_load_package(str(path))
+        # What is loaded could be called, but would read its description anew each time.
+        run = torch._inductor.aoti_load_package(str(path)).loader.boxed_run
+        return lambda *given: run(list(given))
     except Exception as error:  # compilers fail in many ways
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         warnings.warn(f"compile=true: goes on uncompiled: {reason}", stacklevel=2)

@@ -19,6 +19,7 @@ from afm_rl.flow.solver import midpoint
 
 TOLERANCE = 0.25  # of the largest action: at an error of this size the loss is half its maximum
 FORGIVEN = 0.02  # loss of a hypothesis that explains all that it has read
+LATE = -0.01  # of one that finds nothing but a delay, with its penalty
 EXCITED = 0.05  # range of the actions that show whether an axis is dead
 LEAST_WIDTH = 0.02  # of the box: effects that a planner may still ask for
 
@@ -56,6 +57,7 @@ class Tick(nn.Module):
     source_points: Tensor
     probes: Tensor
     penalty: Tensor
+    late: Tensor
     rows_acting: Tensor
 
     def __init__(
@@ -90,6 +92,7 @@ class Tick(nn.Module):
             "source_points": source_points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "penalty": torch.tensor(penalty),
+            "late": torch.tensor([float(h.delay + h.lag) for h in chosen]),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
         for name, value in fixed.items():
@@ -160,11 +163,15 @@ class Tick(nn.Module):
     def forgive(self, losses: Tensor, experts: Experts) -> Tensor:
         """Return losses that are small where a line explains all that a hypothesis has read.
 
-        Its first forecasts were guesses: one pair does not tell a gain from an offset.
+        Its first forecasts were guesses: one pair does not tell a gain from an offset. Where
+        actions have their nominal effect, only late, that is believed before any line: of plans
+        that change slowly, a late one looks like an offset.
         """
-        explained = experts.explained().view(-1, self.count)
-        explained = torch.nn.functional.pad(explained, (0, 1))  # the identity reads nothing
-        return torch.where(explained, losses.clamp_max(FORGIVEN), losses)
+        line, nominal = (part.view(-1, self.count) for part in experts.explained())
+        read, identity = losses.split([self.count, 1], -1)  # the identity reads nothing
+        read = torch.where(line, read.clamp_max(FORGIVEN), read)
+        late = nominal & (self.late > 0)
+        return torch.cat([torch.where(late, LATE - self.penalty[:-1], read), identity], -1)
 
     def encode(self, pairs: Tensor, place: Tensor) -> Encoded:
         """Return what the network reads under every hypothesis, B H sets of rows."""

@@ -271,19 +271,23 @@ class Experts(NamedTuple):
         effect = self.gain[..., 2] * actions.mT.to(self.bias) + self.offset[..., 2]
         return torch.where(exact, effect, torch.nan).mT.to(actions)
 
-    def explained(self) -> Tensor:
-        """Return whether gains and offsets explain all rows, of which there are enough, ``(N,)``.
+    def explained(self) -> tuple[Tensor, Tensor]:
+        """Return which rows, of which there are enough, one line explains, or none is needed.
 
         Two rows are on a line in any case, and rows that are alike are near many; a line through
         noise misses nearly as much as the nominal map does.
+
+        Returns:
+            Whether gains and offsets explain all rows, and whether the nominal map, ``(N,)`` each.
         """
         sent, came = self.executed.squeeze(-2), self.effective.squeeze(-2)  # (N, A, K)
         read = self.trust.squeeze(-2) > 2 * math.log(LEAST_MISS)
         count, most = read.sum(-1), torch.where(read, sent, -torch.inf).amax(-1)
         reach = most - torch.where(read, sent, torch.inf).amin(-1)
         nominal = ((came - sent).square() * read).sum(-1).div(count.clamp_min(1)).sqrt()
-        line = self.misses[..., 0, 2].exp() < EXPLAINED * torch.minimum(reach, nominal)
-        return (line & (count >= LEAST_ROWS)).all(-1)
+        line, enough = self.misses[..., 0, 2].exp(), count >= LEAST_ROWS
+        line = enough & (line < EXPLAINED * torch.minimum(reach, nominal))
+        return line.all(-1), (enough & (nominal < EXPLAINED * reach)).all(-1)
 
     def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
         """Return the log-weight of each row for ``unit`` ``(N, A, C, 1)``, ``(N, A, C, K)``."""

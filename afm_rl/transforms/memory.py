@@ -111,13 +111,15 @@ def correct(
     """
     planned = planned.to(memory.dtype)
     box = box_of(action_spec, planned)
-    _, _, last = corrector.latest(memory)
+    before = memory
     memory, found = corrector.correct(memory, planned, model, box)
     wanted = found.executed if enabled else planned
     # The last clamp depends on nothing but the spec, whatever the corrector answers.
-    executed, _ = safe_action(wanted, *bounds_of(action_spec), last)
+    low, high = bounds_of(action_spec)
+    executed = wanted.clamp(low, high).to(memory.dtype)
     predicted, misaligned = found.predicted, found.misaligned
-    if not all_hold(executed == found.executed):
+    if not all_hold(executed == found.executed):  # what is no number equals nothing
+        executed, _ = safe_action(wanted, low, high, corrector.latest(before)[2])
         memory = corrector.executing(memory, planned, executed)
         touched = (executed != found.executed).any(-1, keepdim=True)
         predicted = torch.where(touched & ~misaligned.unsqueeze(-1), executed, predicted)

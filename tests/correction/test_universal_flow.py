@@ -73,6 +73,18 @@ def test_small_actions_that_look_reversed_at_first_are_understood_soon(line, dri
     assert (effects - planned)[13:].abs().quantile(0.9) < 0.05
 
 
+@pytest.mark.parametrize("delay", [1, 2, 4])
+def test_late_commands_of_a_slow_plan_are_no_offset(line, drive, delay):
+    time, phase = torch.arange(40.0)[:, None, None], torch.linspace(0, 6, 16)[:, None]
+    planned, begins = 0.8 * torch.sin(6.28 * time / 80 + phase), 10
+
+    def late(sent):
+        return sent[-1 - (delay if len(sent) > begins else 0)]
+
+    found, _ = drive(ActionFlow(-torch.ones(1), torch.ones(1)), line(1), late, planned)
+    assert ((found[0] - planned)[begins + 5 :].abs() < 0.01).all()
+
+
 @pytest.mark.parametrize("delay", [1, 2, 3])
 def test_late_commands_of_a_reversed_motor_are_found(line, drive, plans, delay):
     planned = plans(4, 8, 2, size=0.5).repeat_interleave(12, 0)  # steady for a while

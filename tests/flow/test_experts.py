@@ -107,7 +107,17 @@ def test_a_line_explains_rows_if_they_are_several_different_and_exact(
     effective = gain * executed + offset + noise * torch.randn(1, 12, 2)
     valid = (torch.arange(12) >= 12 - count).float().reshape(1, 12, 1)
     rows = Rows(executed * valid, effective * valid, torch.zeros(1, 12, 2), valid)
-    assert fit_experts(rows).explained().tolist() == [explained]
+    line, nominal = fit_experts(rows).explained()
+    assert line.tolist() == [explained] and nominal.tolist() == [False]
+
+
+@pytest.mark.parametrize(("count", "nominal"), [(3, True), (2, False)])
+def test_rows_with_their_nominal_effect_need_no_line(count, nominal):
+    executed = torch.linspace(-1, 1, 12).reshape(1, 12, 1).expand(1, 12, 2)
+    valid = (torch.arange(12) >= 12 - count).float().reshape(1, 12, 1)
+    executed = executed * valid
+    rows = Rows(executed, executed, torch.zeros(1, 12, 2), valid)
+    assert [part.item() for part in fit_experts(rows).explained()] == [False, nominal]
 
 
 def test_the_fits_are_those_of_the_single_functions():
