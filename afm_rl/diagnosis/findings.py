@@ -42,8 +42,12 @@ class Actuator:
     """Half of the play, in units of the command; 0: none was seen."""
     stick: float = 0.0
     """Change of the command up to which nothing moves, and then all at once; 0: none was seen."""
+    rate: float | None = None
+    """Largest change per second, in units of the command; None: none was seen."""
+    every: int = 1
+    """Every how many rows a command is taken over."""
     delay_s: float = 0.0
-    """d (s)."""
+    """d (s); below 0 where the response comes before its command in the log."""
     lag_s: float = 0.0
     """Time constant of the lag (s)."""
     driven_by: str | None = None
@@ -52,12 +56,18 @@ class Actuator:
     """Response per command of other actuators."""
     quantum: float = 0.0
     """Size of the steps in which the response moves, in its units; 0: none were seen."""
+    turn: float = 0.0
+    """By how much the response jumps, an angle that is not unwrapped; 0: it does not."""
     lost: float = 0.0
     """Share of the rows in which the response does not follow, now and then: they are left out."""
     noise: float = math.nan
     """Standard deviation of what the fit leaves, in units of the response."""
     unexplained: float = math.nan
     """Share of the response's variance that the fit leaves."""
+    pattern: str = ""
+    """What this share depends on, in words; empty if it looks like noise."""
+    misfit: float = 0.0
+    """Share of the response's variance that depends on it: what is wrong with the fit itself."""
     command_range: Interval = (math.nan, math.nan)
     """The commands between which 98 % of the rows are."""
     unit: float = 1.0

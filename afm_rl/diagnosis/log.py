@@ -24,6 +24,7 @@ class Log:
         t: times of the rows (s), ascending within each episode; None: one second per row.
         episode: number of the episode of each row, ``(N,)``; None: one episode.
         usual_delay: delay and lag of the healthy robot (s).
+        row: number of each row, ``(N,)``, where rows of a longer log are left out.
         notes: what a reader must know.
 
     Raises:
@@ -37,6 +38,7 @@ class Log:
     t: np.ndarray | None = None
     episode: np.ndarray | None = None
     usual_delay: float = 0.0
+    row: np.ndarray | None = None
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -94,6 +96,7 @@ class Log:
             command=self.command[index],
             response=self.response[index],
             t=self.seconds[index],
+            row=index if self.row is None else self.row[index],
             episode=np.cumsum(apart | (np.diff(kept, prepend=kept[:1]) != 0)),
         )
 
@@ -113,23 +116,32 @@ class Clock:
     Args:
         time: of each row, in steps, ``(N,)``.
         start: first row of each row's episode, ``(N,)``.
+        row: number of each row in the whole log, ``(N,)``.
         hold: a command holds until the next one; otherwise it moves there in a straight line.
     """
 
     time: np.ndarray
     start: np.ndarray
+    row: np.ndarray
     hold: bool = False
 
-    def places(self, delay: float) -> np.ndarray:
-        """Return at which row, with fractions, the time was ``delay`` steps ago, ``(N,)``."""
+    def places(self, delay: float, every: int = 1, phase: int = 0) -> np.ndarray:
+        """Return at which row, with fractions, the time was ``delay`` steps ago, ``(N,)``.
+
+        With ``every`` above 1 that is ``delay`` steps before the last row whose number is
+        ``phase`` modulo ``every``.
+        """
         rows = np.arange(len(self.time), dtype=float)
-        if self.even:
+        if every > 1:
+            rows -= (self.row - phase) % every
+            place = np.maximum(rows, 0) - delay
+        elif self.even:
             place = rows - delay
         else:
             place = np.interp(self.time - delay, self.time, rows)
             if self.hold:
                 place = np.floor(place + 1e-9)
-        return np.maximum(place, self.start)
+        return np.clip(place, self.start, len(rows) - 1)
 
     @property
     def even(self) -> bool:
@@ -148,8 +160,9 @@ def clocks_of(log: Log) -> list[Clock]:
     start = np.maximum.accumulate(np.where(begins, rows, 0))
     steps = np.diff(log.seconds, prepend=log.seconds[0] - log.step) / log.step
     steps[begins] = 1.0
-    even = Clock(rows.astype(float), start)
+    row = rows if log.row is None else log.row
+    even = Clock(rows.astype(float), start, row)
     if np.abs(steps - 1.0).max() < EVEN:
         return [even]
     time = np.cumsum(steps)
-    return [Clock(time, start), Clock(time, start, hold=True), even]
+    return [Clock(time, start, row), Clock(time, start, row, hold=True), even]

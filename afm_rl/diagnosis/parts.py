@@ -7,22 +7,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from afm_rl.diagnosis.fit import (
-    FLOOR,
-    PENALTY,
+from afm_rl.diagnosis.fit import FLOOR, PENALTY, fit_response, larger
+from afm_rl.diagnosis.intervals import half_widths, independence
+from afm_rl.diagnosis.log import Log
+from afm_rl.diagnosis.model import (
     Model,
     Problem,
-    fit_response,
     interval_widths,
-    larger,
     mean_cost,
     refine,
     scale_of,
     values_of,
     weight_of,
 )
-from afm_rl.diagnosis.intervals import half_widths, independence
-from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.response import Shape, lagging, look_back
 from afm_rl.diagnosis.search import Lead, find_leads
 from afm_rl.diagnosis.words import MATTERS, SURE
@@ -33,7 +30,7 @@ SHORTEST = 40  # rows of a part
 PARTS = 6  # at most
 PLAUSIBLE = 4.0  # twice the logarithm of the likelihood that another explanation may lack
 DOUBTFUL = 6.0  # less for each number more
-UNCLEAR = 0.1  # share of the variance: a model that leaves more may mix several
+UNCLEAR = 0.03  # share of the variance: a model that leaves more may mix several
 STEADY = 1.05  # times the squared residual of a sudden change: a drift explains it as well
 
 
@@ -66,7 +63,7 @@ class Part:
 def problem_of(log: Log, j: int, lead: Lead) -> Problem:
     """Return the problem of one response; rows at the begin of an episode do not count."""
     clock = lead.clock_of(log)
-    warm = lead.delay + 1
+    warm = abs(lead.delay) + 1
     if lead.keep:
         warm += min(3 / -math.log(lead.keep), 0.05 * len(log.command))
     use = np.arange(len(log.command)) - clock.start >= warm
@@ -136,12 +133,14 @@ def _likely_change(log: Log, j: int, part: Part) -> int | None:
     rows = slice(part.first, part.last)
     shape, u = part.model.shape, log.command
     slow = lagging(problem.clock, u, shape.keep) if shape.keep else u
-    late = [look_back(problem.clock, slow, shape.delay)[rows]]
+    linear = shape.linear
+    late = [look_back(problem.clock, slow, linear)[rows]]
     own = part.model.driver
     if part.model.cost > UNCLEAR:  # a delay that is that of no part
         late.append(u[rows, own, None])
     for more in (1, 3, 8) if part.rows > 400 else ():
-        late.append(look_back(problem.clock, slow[:, own], shape.delay + more)[rows, None])
+        later = linear._replace(delay=linear.delay + more)
+        late.append(look_back(problem.clock, slow[:, own], later)[rows, None])
     late.append(part.model.parts(problem)[0][rows, None])
     if part.rows > 200 + 40 * u.shape[1]:
         design = np.column_stack(late)

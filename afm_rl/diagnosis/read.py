@@ -252,9 +252,11 @@ def _lerobot(folder: Path) -> Columns:
 
 
 def _feature_names(feature: Any) -> list[str]:
-    """Return the names of a feature: a list, or one under some heading."""
+    """Return the names of a feature: a list, one under a heading, or places by names."""
     names = feature.get("names")
-    if isinstance(names, dict):
+    if isinstance(names, dict) and all(isinstance(place, int) for place in names.values()):
+        names = sorted(names, key=names.__getitem__)
+    elif isinstance(names, dict):
         (names,) = names.values()
     if not names:
         return [str(k) for k in range(feature["shape"][0])]

@@ -25,8 +25,21 @@ class Shape(NamedTuple):
     """Highest command that is followed."""
     play: float = 0.0
     """Half width of the backlash."""
+    jump: float = 0.0
+    """Size of commands up to which nothing happens; larger ones act in full."""
     stick: float = 0.0
     """Change of the command up to which nothing moves; then the command is reached at once."""
+    rate: float = np.inf
+    """Largest change per step."""
+    hold: int = 1
+    """Rows between two commands that are taken over."""
+    phase: int = 0
+    """First of the rows that are taken over."""
+
+    @property
+    def linear(self) -> Shape:
+        """Return the shape as other commands have it: delay, lag and hold."""
+        return Shape(self.delay, self.keep, hold=self.hold, phase=self.phase)
 
 
 def respond(clock: Clock, command: np.ndarray, shape: Shape) -> np.ndarray:
@@ -37,35 +50,35 @@ def respond(clock: Clock, command: np.ndarray, shape: Shape) -> np.ndarray:
 
     with the play p, the cut, and the dead zone :math:`z(u) = \mathrm{sign}(u)\max(|u| - z, 0)`.
 
-    >>> clock = Clock(np.arange(4.0), np.zeros(4, dtype=int))
+    >>> clock = Clock(np.arange(4.0), np.zeros(4, dtype=int), np.arange(4))
     >>> respond(clock, np.array([0.0, 1.0, 0.2, 0.2]), Shape(delay=1.0, dead_zone=0.5))
     array([0. , 0. , 0.5, 0. ])
     """
     return lagging(clock, shaped(clock, command, shape), shape.keep)
 
 
-def shaped(clock: Clock, command: np.ndarray, shape: Shape, jump: bool = False) -> np.ndarray:
-    """Return the response ``(N,)`` before the lag; with a jump commands beyond z act in full."""
-    if shape.delay:
-        command = look_back(clock, command, shape.delay)
-    if jump:
-        command = np.where(np.abs(command) > shape.dead_zone, command, 0.0)
+def shaped(clock: Clock, command: np.ndarray, shape: Shape) -> np.ndarray:
+    """Return the response ``(N,)`` before the lag."""
+    if shape.delay or shape.hold > 1:
+        command = look_back(clock, command, shape)
+    if shape.jump:
+        command = np.where(np.abs(command) > shape.jump, command, 0.0)
     if shape.play:
         command = follow_with_play(command, shape.play, clock.start)
-    if shape.stick:
-        command = follow_sticking(command, shape.stick, clock.start)
+    if shape.stick or shape.rate < np.inf:
+        command = follow_step_by_step(command, shape.stick, shape.rate, clock.start)
     if shape.low > -np.inf or shape.high < np.inf:
         command = np.clip(command, shape.low, shape.high)
-    if shape.dead_zone and not jump:
+    if shape.dead_zone:
         command = command - np.clip(command, -shape.dead_zone, shape.dead_zone)
     return command
 
 
-def look_back(clock: Clock, values: np.ndarray, delay: float) -> np.ndarray:
+def look_back(clock: Clock, values: np.ndarray, shape: Shape) -> np.ndarray:
     """Return values ``(N, ...)`` as they were some steps ago; at the start, the first one."""
-    place = clock.places(delay)
+    place = clock.places(shape.delay, shape.hold, shape.phase)
     row = place.astype(int)
-    if clock.even and delay == int(delay):
+    if clock.even and shape.delay == int(shape.delay):
         return values[row]
     share = place - row
     after = np.minimum(row + 1, len(values) - 1)
@@ -112,15 +125,25 @@ def follow_with_play(command: np.ndarray, width: float, start: np.ndarray) -> np
     return low
 
 
-def follow_sticking(command: np.ndarray, width: float, start: np.ndarray) -> np.ndarray:
-    """Return what sticks to its place until the command is farther away than ``width``.
+def follow_step_by_step(
+    command: np.ndarray, stick: float, rate: float, start: np.ndarray
+) -> np.ndarray:
+    """Return what stays where it is until the command is farther away than ``stick``.
 
-    >>> follow_sticking(np.array([0.0, 0.1, 0.3, 0.2]), 0.2, np.zeros(4, dtype=int))
+    Then it moves there, by at most ``rate`` per row.
+
+    >>> one = np.zeros(4, dtype=int)
+    >>> follow_step_by_step(np.array([0.0, 0.1, 0.3, 0.2]), 0.2, np.inf, one)
     array([0. , 0. , 0.3, 0.3])
+    >>> follow_step_by_step(np.array([0.0, 1.0, 1.0, 0.0]), 0.0, 0.5, one)
+    array([0. , 0.5, 1. , 0.5])
     """
     place, places = 0.0, []
     for row, (value, first) in enumerate(zip(command.tolist(), start.tolist(), strict=True)):
-        if first == row or abs(value - place) > width:
+        way = value - place
+        if first == row or stick < abs(way) <= rate:
             place = value
+        elif abs(way) > stick:
+            place += rate if way > 0 else -rate
         places.append(place)
     return np.array(places)

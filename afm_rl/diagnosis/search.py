@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from afm_rl.diagnosis.log import Clock, Log, clocks_of
-from afm_rl.diagnosis.response import lagging, look_back
+from afm_rl.diagnosis.response import Shape, lagging, look_back
 
 LONGEST = 40  # steps of delay
+EARLIEST = 5  # steps by which a response may come before its command in the log
 LAGS = (0.0, 1.0, 2.5, 6.0, 15.0)  # steps
 OTHERS = 0.5  # share of the squared residual that another command may leave, to be the driver
 RIDGE = 1e-9
@@ -73,8 +74,8 @@ def _scan(log: Log, clock: Clock, response: np.ndarray) -> tuple[np.ndarray, ...
     for lag in (lag for lag in LAGS if lag * 10 < len(u)):
         keep = math.exp(-1 / lag) if lag else 0.0
         slow = lagging(clock, u, keep) if keep else u
-        for delay in range(longest + 1 if not keep else longest // 2 + 1):
-            x = look_back(clock, slow, delay)[inside]
+        for delay in range(0 if keep else -EARLIEST, (longest // 2 if keep else longest) + 1):
+            x = look_back(clock, slow, Shape(delay))[inside]
             x = x - x.mean(0)
             gram, cross = x.T @ x, x.T @ y
             own = np.maximum(gram.diagonal(), 1e-300)

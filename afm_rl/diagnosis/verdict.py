@@ -9,12 +9,14 @@ from dataclasses import replace
 import numpy as np
 
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
-from afm_rl.diagnosis.fit import DOWN
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.lost import without_lost
+from afm_rl.diagnosis.model import DOWN
 from afm_rl.diagnosis.parts import SEARCHED, Part, find_parts, predict, settle
+from afm_rl.diagnosis.pattern import find_pattern
 from afm_rl.diagnosis.search import Lead, find_leads
-from afm_rl.diagnosis.words import UNITS, judge
+from afm_rl.diagnosis.words import MISFIT, UNITS, judge
+from afm_rl.diagnosis.wrap import unwrapped
 
 ALIKE = 0.1  # deviation of the median gain of all actuators from such a gain
 FEW = 0.1  # share of the rows: a response with more values moves freely
@@ -38,18 +40,16 @@ def diagnose(log: Log) -> Diagnosis:
     shoulder: healthy
     elbow: reversed, 50 % of the command
     """
-    reach, moved, spread = (
-        _reach(log.command),
-        np.ptp(log.command, axis=0) > 0,
-        _spread(log.response),
-    )
+    read, (log, turns) = log, unwrapped(log, SEARCHED)
+    reach, spread = _reach(log.command), _spread(log.response)
+    moved = np.ptp(log.command, axis=0) > 0
     scaled = replace(log, command=log.command / reach, response=log.response / spread)
     leads = find_leads(scaled.thinned(SEARCHED), range(len(log.names)))
     summed = _summed(scaled, leads)
     lost = [0.0] * len(leads)
-    for j, lead in enumerate(leads):
-        scaled, lost[j] = without_lost(scaled, j, lead)
     quanta = [_quantum(response) for response in log.response.T]
+    for j, lead in enumerate(leads):
+        scaled, lost[j] = without_lost(scaled, j, lead, repeats=not quanta[j])
     parts = [find_parts(scaled, j, lead) for j, lead in enumerate(leads)]
     fitted = np.empty_like(scaled.response)
     found: list[list[Actuator]] = []
@@ -63,12 +63,14 @@ def diagnose(log: Log) -> Diagnosis:
     for j, numbers in enumerate(found):
         how = (log.step, log.usual_delay, _doubt(scaled, j, moved, summed))
         whole = [
-            replace(actuator, unit=unit, lost=lost[j], quantum=quanta[j]) for actuator in numbers
+            replace(a, unit=unit, lost=lost[j], quantum=quanta[j], turn=turns.get(j, 0.0))
+            for a in numbers
         ]
         said = [judge(actuator, *how) for actuator in whole]
         changes = tuple(
             Change(t=float(since[part.first]), before=before, after=after)
             for part, before, after in zip(parts[j][1:], said[:-1], said[1:], strict=True)
+            if before.sentence != after.sentence  # otherwise too small to be told
         )
         actuators.append(judge(replace(said[-1], changes=changes), *how))
     return Diagnosis(
@@ -76,7 +78,7 @@ def diagnose(log: Log) -> Diagnosis:
         step_s=log.step,
         rows=len(log.command),
         notes=log.notes,
-        fitted=fitted * spread,
+        fitted=fitted * spread + read.response - log.response,
     )
 
 
@@ -152,6 +154,8 @@ def _report(
     y = problem.y[problem.use]
     residual = y - model.predict(problem)[problem.use]
     total = float(y.var())
+    left = min(float(residual.var()) / total, 1.0) if total > 0 else 0.0
+    pattern, share = find_pattern(problem, model) if left > MISFIT else ("", 0.0)
     rows = slice(part.first, part.last)
     low, high = np.quantile(log.command[rows, model.driver], [0.01, 0.99])
     coupling = {
@@ -176,16 +180,20 @@ def _report(
         reversed=bool(gains[1] < 0 and (not down or model.gain + down[0] < 0)),
         offset=float(offset),
         offset_interval=(float(offsets[0]), float(offsets[1])),
-        dead_zone=float(shape.dead_zone * unit),
+        dead_zone=float((shape.dead_zone or shape.jump) * unit),
         saturation=float(np.mean(ends)) if ends else None,
         backlash=float(shape.play * unit),
         stick=float(shape.stick * unit),
+        rate=float(shape.rate * unit / log.step) if shape.rate < math.inf else None,
+        every=shape.hold,
         delay_s=shape.delay * log.step,
         lag_s=-log.step / math.log(shape.keep) if shape.keep > 1e-6 else 0.0,
         driven_by=log.names[model.driver] if model.driver != j else largest,
         coupling=coupling,
         noise=float(residual.std() * spread[j]),
-        unexplained=float(min(residual.var() / total, 1.0)) if total > 0 else 0.0,
+        unexplained=left,
+        pattern=pattern,
+        misfit=share * left,
         command_range=(float(low), float(high)),
         drift=drift,
         rows=part.rows,

@@ -33,7 +33,7 @@ CAPTION = (
 )
 NOTE = (
     "95 % intervals in brackets. Gain: response per command. Offset, noise: in units of the "
-    "response. Dead zone, saturation, backlash: in units of the command."
+    "response. Dead zone, saturation, backlash, rate: in units of the command."
 )
 KEPT = ("actuator", "status", "gain", "offset", "delay (s)", "noise", "unexplained (%)")
 
@@ -78,6 +78,7 @@ def _table(diagnosis: Diagnosis) -> pd.DataFrame:
             "dead zone": _text(a.dead_zone or None),
             "saturation": _text(a.saturation),
             "backlash": _text(a.backlash or None),
+            "rate (1/s)": _text(a.rate),
             "delay (s)": _text(a.delay_s),
             "lag (s)": _text(a.lag_s or None),
             "driven by": a.driven_by or "-",

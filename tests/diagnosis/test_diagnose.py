@@ -11,7 +11,7 @@ from simulate import Fault, commands, noise, respond
 from afm_rl.diagnosis import Log, diagnose
 from afm_rl.errors import ConfigurationError
 
-NAMES = ("base", "shoulder", "elbow", "wrist", "roll", "gripper", "finger", "h", "i", "j")
+NAMES = ("base", "shoulder", "elbow", "wrist", "roll", "gripper", "finger", *"hijklmn")
 
 
 def log_of(faults, rows=1500, kind="smooth", scale=0.02, sort="gauss", seed=0, later=None, **how):
@@ -149,6 +149,18 @@ def stick(u, rng):
     return np.array(places)
 
 
+def limit_rate(u, rng):
+    """Return what moves by at most 0.1 per row."""
+    places = [u[0]]
+    for value in u[1:]:
+        places.append(places[-1] + np.clip(value - places[-1], -0.1, 0.1))
+    return np.array(places)
+
+
+def wrap(y, turn):
+    return (y + turn / 2) % turn - turn / 2
+
+
 ODD = {
     r"sticks for changes below (0.19\d*|0.2|0.20\d*)": stick,
     "100 % of positive commands, 50 % of negative ones": lambda u, rng: np.where(u > 0, u, u / 2),
@@ -158,6 +170,13 @@ ODD = {
     r"gain drifts from (1|0.99\d?|1.0\d?) to (0.5|0.49\d?|0.50\d?)": (
         lambda u, rng: u * np.linspace(1, 0.5, len(u))
     ),
+    r"no faster than (0\.1|0\.09\d+|0\.10\d+) per second": limit_rate,
+    "takes over one of 4 commands only": lambda u, rng: u[np.arange(len(u)) // 4 * 4],
+    "answers 3 steps before its command in the log": lambda u, rng: np.roll(u, -3),
+    r"reversed, offset \+2\.[789]\d*, jumps by 6\.283: an angle that is not unwrapped": (
+        lambda u, rng: wrap(2.8 - u, 2 * np.pi)
+    ),
+    "switches between two responses, whatever the size of its command": lambda u, rng: np.sign(u),
     r"changed at (597|598|599|600|601|602|603) s: healthy, then reversed": (
         lambda u, rng: u * np.where(np.arange(len(u)) < 600, 1, -1)
     ),
@@ -176,6 +195,48 @@ def test_faults_that_are_no_number_of_the_model_have_words(kind):
     for words, actuator in zip(ODD, found, strict=True):
         assert re.fullmatch(words, actuator.sentence.partition(": ")[2]), actuator.sentence
     assert last.status == "healthy"
+
+
+UNKNOWN = {
+    "it depends on other commands": lambda u, rng: u[:, 0] * u[:, 1],
+    "it depends on earlier commands": lambda u, rng: np.diff(u[:, 0], prepend=0),
+    "as if its gain varied": lambda u, rng: u[:, 0] * rng.choice([-1, 1], len(u)),
+}
+
+
+@pytest.mark.parametrize("kind", ["white", "walk"])
+def test_a_fault_that_is_not_known_is_called_so(kind):
+    log = log_of([Fault()] * 5, 1200, kind, seed=5)
+    y = log.response.copy()
+    for j, make in enumerate(UNKNOWN.values()):
+        y[:, j] = make(log.command[:, [j, 4]], np.random.default_rng(5))
+    found = diagnose(replace(log, response=y)).actuators
+    for words, actuator in zip(UNKNOWN, found, strict=False):
+        if kind == "walk" or "earlier" not in words:  # of white noise half of that is the command
+            assert "no known fault: " in actuator.sentence and words in actuator.sentence
+            assert actuator.unexplained > 0.5
+    assert [a.status for a in found] == ["changed"] * 3 + ["healthy"] * 2
+
+
+def test_what_the_numbers_leave_is_told():
+    log, rng = log_of([Fault()] * 4, 1200, "smooth"), np.random.default_rng(0)
+    u, y, rows = log.command, log.response.copy(), np.arange(1200)
+    y[:, 0] = np.interp(rows - rng.uniform(0, 8, 1200), rows, u[:, 0])
+    y[:, 1] += 0.2 * np.sin(2 * np.pi * rows / 400)
+    y[:, 2] += 0.3 * rng.standard_normal(1200)
+    late, wandering, noisy, quiet = diagnose(replace(log, response=y)).actuators
+    assert late.sentence.endswith("as if its delay varied)") and late.delay_s + late.lag_s > 1.5
+    assert wandering.status == "changed" and "depends on the time" in wandering.sentence
+    assert re.fullmatch(r"elbow: healthy, 2\d % of its motion unexplained", noisy.sentence)
+    assert quiet.sentence == "wrist: healthy"
+
+
+def test_joints_that_turn_all_round_are_healthy():
+    log = log_of([Fault()] * 2, 1200, "walk")
+    turn = np.cumsum(0.1 + 0.2 * log.command[:, 0])
+    u, y = log.command.copy(), log.response.copy()
+    u[:, 0], y[:, 0] = wrap(40 * turn, 360.0), wrap(40 * turn + 0.2 * y[:, 1], 360.0)
+    assert diagnose(replace(log, command=u, response=y)).healthy
 
 
 def test_a_coarse_sensor_has_no_dead_zone():

@@ -18,23 +18,35 @@ def table():
     return pd.DataFrame(columns | {"response.b": -u[:, 1], "response.a": u[:, 0]})
 
 
-@pytest.fixture
-def lerobot(tmp_path):
-    """Two episodes in two files, as LeRobot writes them; the second motor is reversed."""
+NAMES = ["pan.pos", "lift.pos"]
+
+
+@pytest.fixture(params=["v2.1", "v3.0"])
+def lerobot(tmp_path, request):
+    """Two episodes as LeRobot writes them, a file each or in one; the second motor is reversed."""
     rng = np.random.default_rng(0)
-    names = ["pan.pos", "lift.pos"]
+    names = {"v2.1": NAMES, "v3.0": {"lift.pos": 1, "pan.pos": 0}}[request.param]
     feature = {"dtype": "float32", "shape": [2], "names": names}
-    info = {"fps": 30, "features": {"action": feature, "observation.state": feature}}
+    info = {
+        "codebase_version": request.param,
+        "fps": 30,
+        "features": {"action": feature, "observation.state": feature},
+    }
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
+    folder, episodes = tmp_path / "data" / "chunk-000", []
+    folder.mkdir(parents=True)
     for episode in range(2):
         u = rng.uniform(-1, 1, (100, 2)).astype(np.float32)
         y = np.concatenate([u[:1], u[:-1]]) * np.array([1, -1], dtype=np.float32)
-        file = tmp_path / "data" / f"chunk-00{episode}" / "episode.parquet"
-        file.parent.mkdir(parents=True)
         columns = {"action": list(u), "observation.state": list(y), "episode_index": episode}
         columns |= {"timestamp": (np.arange(100) / 30).astype(np.float32)}
-        pd.DataFrame(columns).to_parquet(file)
+        episodes.append(pd.DataFrame(columns))
+    if request.param == "v2.1":
+        for k, episode in enumerate(episodes):
+            episode.to_parquet(folder / f"episode_00000{k}.parquet")
+    else:
+        pd.concat(episodes).to_parquet(folder / "file-000.parquet")
     return tmp_path
 
 

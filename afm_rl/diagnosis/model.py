@@ -1,0 +1,252 @@
+"""A model of a response, and the best numbers for it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from afm_rl.diagnosis.intervals import CHOSEN, half_widths, independence
+from afm_rl.diagnosis.log import Clock
+from afm_rl.diagnosis.response import Shape, lagging, respond, shaped
+
+ROBUST = 2.0  # standard deviations: larger residuals count less
+LARGEST = {"delay": 60.0, "keep": 0.99}
+STEPS = {"delay": 0.05, "keep": 0.01, "rate": 0.003}  # of numeric derivatives, otherwise 0.01
+STEPPED = ("jump", "stick", "hold", "phase")  # the response changes by jumps with these
+CURVED = ("dead_zone", "low", "high", "play", "jump", "stick", "rate")
+LEAST_WEIGHT = 0.05  # independent rows that a row counts as
+DOWN = -1  # among the others: the driver's own command where it is negative
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One response and all commands, in units of their spread.
+
+    Args:
+        clock: of the rows.
+        u: commands ``(N, A)``, in half ranges.
+        y: response ``(N,)``, in standard deviations.
+        use: which rows count, ``(N,)``.
+    """
+
+    clock: Clock
+    u: np.ndarray
+    y: np.ndarray
+    use: np.ndarray
+
+
+@dataclass(frozen=True)
+class Model:
+    """What explains a response: gain, offset, a shape, and other commands."""
+
+    driver: int
+    shape: Shape
+    active: tuple[str, ...] = ()
+    """Which numbers of the shape are estimated."""
+    gain: float = 0.0
+    offset: float = 0.0
+    others: tuple[int, ...] = ()
+    gains: tuple[float, ...] = ()
+    """Of the others."""
+    cost: float = math.inf
+
+    @property
+    def size(self) -> int:
+        """Count the numbers that are estimated."""
+        return len(self.active) + len(self.others)
+
+    @property
+    def smooth(self) -> tuple[str, ...]:
+        """Of the active numbers, those by which the response has derivatives."""
+        return tuple(name for name in self.active if name not in STEPPED)
+
+    def parts(self, problem: Problem) -> list[np.ndarray]:
+        """Return the responses at gain 1 to the driver and to the others, ``(N,)`` each."""
+        linear, clock = self.shape.linear, problem.clock
+        own = shaped(clock, problem.u[:, self.driver], self.shape)
+        others = (
+            lagging(clock, np.minimum(own, 0.0), self.shape.keep)
+            if i == DOWN
+            else respond(clock, problem.u[:, i], linear)
+            for i in self.others
+        )
+        return [lagging(clock, own, self.shape.keep), *others]
+
+    def led_by(self, own: int) -> Model:
+        """Return the model with another of its commands as the driver, where both act alike."""
+        if own not in self.others or DOWN in self.others or {*CURVED} & {*self.active}:
+            return self
+        gains = {self.driver: self.gain, **dict(zip(self.others, self.gains, strict=True))}
+        gain = gains.pop(own)
+        return replace(
+            self, driver=own, gain=gain, others=tuple(gains), gains=tuple(gains.values())
+        )
+
+    def predict(self, problem: Problem) -> np.ndarray:
+        """Return the response ``(N,)``."""
+        parts = self.parts(problem)
+        gains = (self.gain, *self.gains)
+        return self.offset + np.sum([g * x for g, x in zip(gains, parts, strict=True)], 0)
+
+
+def weight_of(problem: Problem, model: Model) -> float:
+    """Return how many independent rows a row counts as, by what a model leaves."""
+    residual = (problem.y - model.predict(problem))[problem.use]
+    return max(independence(cut(residual)), LEAST_WEIGHT)
+
+
+def cut(residual: np.ndarray) -> np.ndarray:
+    """Return residuals, large ones made smaller."""
+    scale = 4 * scale_of(residual)
+    return np.clip(residual, -scale, scale) if scale > 0 else residual
+
+
+def scale_of(residual: np.ndarray) -> float:
+    """Return the standard deviation of residuals, whatever the outliers."""
+    return float(np.median(np.abs(residual))) / 0.6745
+
+
+def mean_cost(residual: np.ndarray, scale: float | None = None) -> float:
+    """Return the robust mean square: residuals far beyond the scale count as their size."""
+    scale = ROBUST * (scale_of(residual) if scale is None else scale)
+    if not scale > 1e-9:
+        return float((residual**2).mean())
+    return float((2 * scale**2 * (np.sqrt(1 + (residual / scale) ** 2) - 1)).mean())
+
+
+def fit_lines(problem: Problem, model: Model, rounds: int = 0) -> Model:
+    """Return the model with the best gains and offset for its shape.
+
+    Each round takes weight from residuals that are large.
+    """
+    use = problem.use
+    design = np.column_stack([*(x[use] for x in model.parts(problem)), np.ones(use.sum())])
+    y = problem.y[use]
+    gram = design.T @ design
+    gram += 1e-12 * gram.trace() * np.eye(len(gram))
+    solution = np.linalg.solve(gram, design.T @ y)
+    for _ in range(rounds):
+        residual = y - design @ solution
+        scale = ROBUST * scale_of(residual)
+        if not scale > 1e-9:
+            break
+        weight = 1 / np.sqrt(1 + (residual / scale) ** 2)
+        heavy = design * weight[:, None]
+        gram = heavy.T @ design
+        gram += 1e-12 * gram.trace() * np.eye(len(gram))
+        solution = np.linalg.solve(gram, heavy.T @ y)
+    gains = tuple(float(g) for g in solution[1:-1])
+    cost = mean_cost(y - design @ solution)
+    return replace(
+        model, gain=float(solution[0]), offset=float(solution[-1]), gains=gains, cost=cost
+    )
+
+
+def refine(problem: Problem, model: Model) -> Model:
+    """Return the model with the best numbers near those that it has."""
+    model = fit_lines(problem, model, 2)
+    if not model.smooth:
+        return model
+    use = problem.use
+    own = problem.u[:, model.driver]
+    most = max(float(np.abs(own).max()), 1e-6)
+    residual = (problem.y - model.predict(problem))[use]
+    scale = max(ROBUST * scale_of(residual), 1e-4)
+    limits = {"dead_zone": (0.0, most), "play": (0.0, most), "low": (-most, most)}
+    limits |= {"high": (-most, most), "rate": (1e-3, 2 * most)}
+    limits |= {name: (0.0, top) for name, top in LARGEST.items()}
+    if model.shape.delay < 0:
+        limits["delay"] = (-LARGEST["delay"], 0.0)
+    ends = np.array([limits[name] for name in model.smooth]).T
+    wide = np.full(2 + len(model.others), np.inf)
+    low, high = np.concatenate([-wide, ends[0]]), np.concatenate([wide, ends[1]])
+
+    def miss(values: np.ndarray) -> np.ndarray:
+        return (_with_values(model, values).predict(problem) - problem.y)[use]
+
+    def slope(values: np.ndarray) -> np.ndarray:
+        return slopes(problem, _with_values(model, values))[use]
+
+    begin = np.clip(values_of(model), low + 1e-9, high - 1e-9)
+    found = least_squares(
+        miss,
+        begin,
+        slope,
+        bounds=(low, high),
+        loss="soft_l1",
+        f_scale=scale,
+        max_nfev=12,
+        ftol=1e-6,
+        xtol=1e-6,
+    )
+    better = fit_lines(problem, _with_values(model, found.x), 2)
+    return better if better.cost < model.cost else model
+
+
+def values_of(model: Model) -> np.ndarray:
+    """Return gain, offset, the others' gains, and the smooth numbers of the shape."""
+    shape = [getattr(model.shape, name) for name in model.smooth]
+    return np.array([model.gain, model.offset, *model.gains, *shape])
+
+
+def _with_values(model: Model, values: np.ndarray) -> Model:
+    count = 2 + len(model.others)
+    numbers = [float(x) for x in values]
+    shape: dict[str, Any] = dict(zip(model.smooth, numbers[count:], strict=True))
+    return replace(
+        model,
+        gain=numbers[0],
+        offset=numbers[1],
+        gains=tuple(numbers[2:count]),
+        shape=model.shape._replace(**shape),
+    )
+
+
+def slopes(problem: Problem, model: Model) -> np.ndarray:
+    """Return derivatives of the prediction by :func:`values_of`, ``(N, P)``."""
+    parts = model.parts(problem)
+    columns = [parts[0], np.ones(len(problem.y)), *parts[1:]]
+    here = values_of(model)
+    first = len(here) - len(model.smooth)
+    for place, name in enumerate(model.smooth, first):
+        width = STEPS.get(name, 0.01)
+        up, down = here.copy(), here.copy()
+        up[place] += width
+        down[place] -= width
+        if name not in ("low", "high") and here[place] >= 0:
+            down[place] = max(down[place], 0.0)
+        if name == "keep":
+            up[place] = min(up[place], 0.995)
+        ends = [_with_values(model, x).predict(problem) for x in (up, down)]
+        columns.append((ends[0] - ends[1]) / (up[place] - down[place]))
+    return np.column_stack(columns)
+
+
+def interval_widths(problem: Problem, model: Model) -> np.ndarray:
+    """Return half widths of the 95 % intervals of :func:`values_of`, ``(P,)``.
+
+    The uncertainty of a delay that was found to be none counts, too.
+    """
+    count = len(values_of(model))
+    if not {"delay", "keep"} & set(model.active):
+        model = replace(model, active=(*model.active, "delay"))
+    use = problem.use
+    columns = slopes(problem, model)[use]
+    residual = (problem.y - model.predict(problem))[use]
+    scale = ROBUST * scale_of(residual)
+    share = (residual / max(scale, 1e-9)) ** 2
+    pull = residual / np.sqrt(1 + share)
+    stiff = ((1 + share) ** -1.5).mean()
+    gram = columns.T @ columns * stiff
+    size = np.sqrt(np.maximum(gram.diagonal(), 1e-100))
+    unit = gram / np.outer(size, size)
+    values, vectors = np.linalg.eigh(unit)
+    values = np.maximum(values, 1e-10)
+    inverse = (vectors / values) @ vectors.T / size
+    freedom = math.sqrt(len(residual) / max(len(residual) - len(size), 1))
+    widths = half_widths((columns / size * pull[:, None]) @ inverse) * freedom
+    return CHOSEN * widths[:count]
