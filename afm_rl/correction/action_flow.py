@@ -168,10 +168,9 @@ class ActionFlow(PairCorrector):
     ) -> tuple[Tensor, Correction]:
         """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
         with torch.no_grad():
-            memory, innovation = self._look(memory, model)
+            memory, innovation, idle = self._watch(memory, planned, model)
             surprised = innovation > self.gate
             found = self.unchanged(planned, innovation, box)
-            idle = self.executing(memory, planned, planned, surprised)
             if all_hold(~surprised):
                 return idle, found
             use = rows_of(surprised)
@@ -200,19 +199,31 @@ class ActionFlow(PairCorrector):
         parts |= {"planned": planned, **{name: part.to(memory) for name, part in changed.items()}}
         return (self.pack(parts), *(getattr(answer, name) for name in CORRECTED))
 
+    def watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> tuple[Tensor, ...]:
+        """Return memory and innovation of :meth:`look`, and the memory if nothing is corrected.
+
+        Args:
+            memory: ``(*B, P)``.
+            planned: ``(*B, A)``.
+            model: as it is now.
+        """
+        memory, innovation = self.look(memory, model)
+        idle = self.executing(memory, planned, planned, innovation > self.gate)
+        return memory, innovation, idle
+
     def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
         """Return the memory with the transition to ``next_state`` ``(*B, S)``."""
         if not self._as_machine_code:
             return super().observe(memory, next_state)
         return self._machine_code(PairCorrector.observe, memory, next_state)[0]
 
-    def _look(self, memory: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
+    def _watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
         # Machine code holds the model as it is now, one round of Gauss and Newton, and no
         # automatic derivative.
         derived = type(model).jacobian is DynamicsModel.jacobian
         if not self._as_machine_code or not model.affine or model.taught_in is not None or derived:
-            return self.look(memory, model)
-        return self._machine_code(PairCorrector.look, memory, model=model)
+            return self.watch(memory, planned, model)
+        return self._machine_code(ActionFlow.watch, memory, planned, model=model)
 
     @torch.inference_mode()
     def _answer(self, *given: Tensor) -> dict[str, Tensor]:
