@@ -140,10 +140,10 @@ def _bases(model: Model, names: str) -> Iterator[Model]:
     if names.split()[0] not in QUICK or len(rest) == len(model.active):
         return
     yield replace(model, active=rest, shape=model.shape._replace(delay=0.0, keep=0.0))
-    if names == "hold phase":
-        for late in range(max(int(model.shape.delay) - 2, 1), int(model.shape.delay) + 1):
-            shape = model.shape._replace(delay=float(late), keep=0.0)
-            yield replace(model, active=(*rest, "delay"), shape=shape)
+    delay = round(model.shape.delay)
+    for late in range(max(delay - 2, 1) if names == "hold phase" else max(delay, 1), delay + 1):
+        shape = model.shape._replace(delay=float(late), keep=0.0)
+        yield replace(model, active=(*rest, "delay"), shape=shape)
 
 
 def _best(problem: Problem, model: Model, options: Sequence[dict[str, Any]]) -> Model:

@@ -23,6 +23,8 @@ FEW = 0.1  # share of the rows: a response with more values moves freely
 EXACT = 0.01  # of a step, by which steps may differ
 LOOSE = 0.1  # share of the variance: a response of which less is left follows its command
 CLOSE = 0.3  # times what is left of the response: rates of change of which less is left follow
+ENDLESS = 0.985  # share of the way that is left after a step: no lag, but a sum
+CREEPS = 0.003  # half ranges per step: what is no faster never arrives
 COPY = 0.999  # correlation of two commands that cannot be told apart
 
 
@@ -61,7 +63,9 @@ def diagnose(log: Log) -> Diagnosis:
     unit, since = _unit([own[-1] for own in found]), log.since
     actuators = []
     for j, numbers in enumerate(found):
-        how = (log.step, log.usual_delay, _doubt(scaled, j, moved, summed))
+        shape = parts[j][-1].model.shape
+        endless = {j} if shape.keep > ENDLESS or shape.rate < CREEPS else set()
+        how = (log.step, log.usual_delay, _doubt(scaled, j, moved, summed | endless))
         whole = [
             replace(a, unit=unit, lost=lost[j], quantum=quanta[j], turn=turns.get(j, 0.0))
             for a in numbers
@@ -123,7 +127,7 @@ def _doubt(log: Log, j: int, moved: np.ndarray, summed: set[int]) -> str:
     if not moved[j]:
         return "its command does not change"
     if j in summed:
-        return "its response adds up its command; log its rate of change"
+        return "its response moves as if it added up its command; log its rate of change"
     u = log.command - log.command.mean(0)
     power = np.sqrt((u**2).sum(0))
     alike = np.abs(u.T @ u[:, j]) / np.maximum(power * power[j], 1e-300)

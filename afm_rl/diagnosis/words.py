@@ -20,7 +20,7 @@ UNITS = {
 """Gain of a healthy actuator whose response is in another unit than its command."""
 MATTERS = 0.05
 """Share of the gain, or of half the range of commands: smaller deviations are no fault."""
-SWITCH = 0.12
+SWITCH = 0.2
 """Share of half the range of commands: what saturates below switches."""
 DEAD = 0.1
 """Share of the usual gain: an actuator whose whole interval is below does not answer."""
@@ -35,7 +35,10 @@ LEFT = 0.05
 MISFIT = 0.005
 """Share of the variance: what is unexplained and no noise is told if it is more than that."""
 UNKNOWN = 0.1, 0.3
-"""Share of the variance that is predicted, or only scatters as predicted: no known fault fits."""
+"""Share of the variance that is predicted, or unexplained: no known fault fits."""
+MOVES = 0.9
+"""Share of the variance: a response of which more is unexplained has another cause."""
+NO_FAULT, FEW = "no known fault", 3  # parts of a log
 SURE = 1.45
 """Times the 95 % interval: what a fault has to exceed, so that few are false (99.95 %)."""
 
@@ -71,10 +74,11 @@ def judge(
     if doubt:
         status, faults = "cannot tell", [f"cannot tell: {doubt}"]
     elif actuator.misfit > UNKNOWN[0] or noticed and actuator.unexplained > UNKNOWN[1]:
-        closest = f"; closest: {', '.join(faults)}" if faults and not unclear else ""
-        status, faults = "changed", [f"no known fault: {_rest(actuator)}{closest}"]
+        closest = "" if unclear else _closest(faults)
+        status, faults = "changed", [f"{NO_FAULT}: {_rest(actuator)}{closest}"]
     elif (
-        max(-low, high) < (VAGUE if unclear else DEAD) * actuator.unit
+        max(-low, high)
+        < (VAGUE if unclear or actuator.unexplained > MOVES else DEAD) * actuator.unit
         and actuator.driven_by is None
         and actuator.gain_down is None
         and not (outside(widened((low, high))) and actuator.unexplained < FOLLOWS)
@@ -85,13 +89,18 @@ def judge(
         status, faults = "cannot tell", [f"cannot tell: {_reason(actuator)}"]
     else:
         status = "changed" if faults or noticed else "healthy"
-        if noticed or actuator.unexplained > LEFT:
+        if faults and actuator.unexplained > UNKNOWN[1]:
+            faults = [_rest(actuator) + _closest(faults)]
+        elif noticed or actuator.unexplained > LEFT:
             faults = [*(faults or [f"{'nearly ' if noticed else ''}healthy"]), _rest(actuator)]
     if actuator.changes:
         now = ", ".join(faults) or "healthy"
         first, *more = actuator.changes
         story = f"changed at {first.t:.4g} s: {_said(first.before)}, then "
         story += "".join(f"{_said(c.before)}; at {c.t:.4g} s " for c in more)
+        parts = [now, *(_said(c.before) for c in actuator.changes)]
+        if len(parts) > FEW and any(NO_FAULT in part for part in parts):
+            story, now = f"{NO_FAULT}: ", f"no explanation holds longer than a part of {len(parts)}"
         faults = [story + now]
         status = "dead" if status == "dead" else "changed"
     sentence = f"{actuator.name}: {', '.join(faults) or 'healthy'}"
@@ -100,6 +109,10 @@ def judge(
 
 def _said(actuator: Actuator) -> str:
     return actuator.sentence.partition(": ")[2] or actuator.status
+
+
+def _closest(faults: list[str]) -> str:
+    return f"; closest: {', '.join(faults)}" if faults else ""
 
 
 def _rest(actuator: Actuator) -> str:

@@ -121,7 +121,9 @@ def test_positions_that_answer_to_speeds():
     y = log.response.copy()
     y[:, 0] = np.cumsum(0.02 * y[:, 0])
     base, shoulder = diagnose(replace(log, response=y)).actuators
-    assert base.sentence.endswith("its response adds up its command; log its rate of change")
+    assert base.sentence.endswith(
+        "its response moves as if it added up its command; log its rate of change"
+    )
     assert shoulder.status == "healthy"
 
 
