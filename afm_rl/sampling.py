@@ -12,7 +12,8 @@ def uniform(low: Tensor, high: Tensor, count: int, generator: torch.Generator) -
     >>> uniform(torch.zeros(2), torch.ones(2), 5, torch.Generator()).shape
     torch.Size([5, 2])
     """
-    return low + (high - low) * torch.rand(count, len(low), generator=generator)
+    share = torch.rand(count, len(low), generator=generator)  # the same on every device
+    return low + (high - low) * share.to(low.device)
 
 
 def draw_states(
@@ -29,5 +30,5 @@ def draw_states(
     [[7.0, 8.0], [7.0, 8.0]]
     """
     if isinstance(states, Tensor):
-        return states[torch.randint(len(states), (count,), generator=generator)]
+        return states[torch.randint(len(states), (count,), generator=generator).to(states.device)]
     return uniform(*states, count, generator)

@@ -16,7 +16,8 @@ class Streams:
     Missions that carry the same seed get the same numbers, and a mission gets the same
     numbers alone as among hundreds, also after others have left the batch. That makes
     comparisons between methods paired, and costs one draw per seed instead of one per
-    mission. The global torch generator is never touched.
+    mission. They are drawn on the CPU whatever the device, so missions meet the same noise on all.
+    The global torch generator is never touched.
 
     Args:
         salt: tells the streams of different users (planner, environment) apart.
@@ -31,22 +32,22 @@ class Streams:
     def __init__(self, salt: int = 0, seed: int = 0) -> None:
         self.salt = salt
         self.seed = seed
-        self._generators: dict[tuple[int, str], torch.Generator] = {}
+        self._generators: dict[int, torch.Generator] = {}
+        self._asked: tuple[Tensor | None, int] = None, 0
+        self._seeds: list[int] = []
 
     def manual_seed(self, seed: int) -> None:
         """Start every stream afresh, the default one from ``seed``."""
         self.seed = seed
         self._generators.clear()
 
-    def generator(self, seed: int | None = None, device: torch.device | str = "cpu"):
-        """Return the generator of one seed on one device."""
+    def generator(self, seed: int | None = None) -> torch.Generator:
+        """Return the generator of one seed."""
         seed = self.seed if seed is None else seed
-        key = (seed, str(device))
-        if key not in self._generators:
+        if seed not in self._generators:
             mixed = (seed * 2 + 1) * _MIX + self.salt * 0x632BE59BD9B4E019
-            generator = torch.Generator(device=device)
-            self._generators[key] = generator.manual_seed(mixed & (2**63 - 1))
-        return self._generators[key]
+            self._generators[seed] = torch.Generator().manual_seed(mixed & (2**63 - 1))
+        return self._generators[seed]
 
     def normal(
         self,
@@ -64,31 +65,35 @@ class Streams:
             shape: shape of one mission's numbers.
             batch: batch shape, drawn independently when there are no ``seeds``.
             seeds: integer seeds ``(*B)``; the result is ``(*B, *shape)``.
+            device: where the numbers are moved to.
+            dtype: floating-point type.
         """
 
         def draw(size, generator):
             if bound is None:
-                return torch.randn(size, generator=generator, device=device, dtype=dtype)
+                return torch.randn(size, generator=generator, dtype=dtype)
             edge = math.erf(bound / math.sqrt(2))
-            noise = torch.empty(size, device=device, dtype=dtype)
+            noise = torch.empty(size, dtype=dtype)
             noise.uniform_(-edge, edge, generator=generator)
             return noise.erfinv_().mul_(math.sqrt(2)).clamp_(-bound, bound)
 
         if seeds is None:
-            return draw((*batch, *shape), self.generator(None, device))
+            return draw((*batch, *shape), self.generator()).to(device)
         if seeds.numel() == 0:
             return torch.empty((*seeds.shape, *shape), device=device, dtype=dtype)
-        distinct, index = torch.unique(seeds, return_inverse=True)
-        drawn = [draw(shape, self.generator(int(seed), device)) for seed in distinct.tolist()]
-        return torch.stack([drawn[k] for k in index.flatten().tolist()]).view(*seeds.shape, *shape)
+        if self._asked[0] is not seeds or self._asked[1] != seeds._version:
+            self._asked = seeds, seeds._version  # a look waits for the device
+            self._seeds = seeds.flatten().tolist()
+        drawn = {seed: draw(shape, self.generator(seed)) for seed in dict.fromkeys(self._seeds)}
+        whole = torch.stack([drawn[seed] for seed in self._seeds]).to(device)
+        return whole.view(*seeds.shape, *shape)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return every generator's state, keyed ``seed@device``, and the default ``seed``."""
-        states = {f"{s}@{d}": g.get_state() for (s, d), g in self._generators.items()}
+        """Return every generator's state, keyed by its seed, and the default ``seed``."""
+        states = {str(seed): one.get_state() for seed, one in self._generators.items()}
         return {"seed": torch.tensor(self.seed), **states}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self.manual_seed(int(state["seed"]))
         for key in state.keys() - {"seed"}:
-            seed, device = key.split("@")
-            self.generator(int(seed), device).set_state(state[key])
+            self.generator(int(key)).set_state(state[key])

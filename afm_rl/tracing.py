@@ -1,4 +1,4 @@
-"""Shortcuts that cannot be taken while a function is being exported."""
+"""Shortcuts that cannot be taken while a function is exported, or on a GPU."""
 
 from __future__ import annotations
 
@@ -12,15 +12,27 @@ from torch import Tensor
 Result = TypeVar("Result")
 
 
+def may_look(values: Tensor) -> bool:
+    """Return whether what follows may depend on numbers.
+
+    Not while a function is being exported; and on a GPU it would have to be waited for, which takes
+    longer than the work that is saved.
+
+    >>> may_look(torch.zeros(3)), may_look(torch.zeros(3, device="meta"))
+    (True, False)
+    """
+    return values.is_cpu and not torch.compiler.is_compiling()
+
+
 def all_hold(mask: Tensor) -> bool:
-    """Return whether a mask is true everywhere; False while a function is being exported.
+    """Return whether a mask is true everywhere; False where it :func:`may not be seen <may_look>`.
 
     For shortcuts only: what follows must be right whatever this returns.
 
     >>> all_hold(torch.tensor([True, True])), all_hold(torch.tensor([True, False]))
     (True, False)
     """
-    return not torch.compiler.is_compiling() and bool(mask.all())
+    return may_look(mask) and bool(mask.all())
 
 
 def cached(maxsize: int) -> Callable[[Callable[..., Result]], Callable[..., Result]]:

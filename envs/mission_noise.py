@@ -48,13 +48,11 @@ class MissionNoise:
             rows: missions that draw, booleans ``(*B)``; the others get zeros. All if None.
             dtype: floating-point type.
         """
-        size = self.sizes[event]
-        noise = torch.zeros(*seeds.shape, size, device=seeds.device, dtype=dtype)
-        rows = torch.ones_like(seeds, dtype=torch.bool) if rows is None else rows
-        if rows.any():
-            noise[rows] = self.streams[event].normal(
-                (size,), seeds=seeds[rows], device=seeds.device, dtype=dtype
-            )
+        size, stream = (self.sizes[event],), self.streams[event]
+        if rows is None:
+            return stream.normal(size, seeds=seeds, device=seeds.device, dtype=dtype)
+        noise = torch.zeros(*seeds.shape, *size, device=seeds.device, dtype=dtype)
+        noise[rows] = stream.normal(size, seeds=seeds[rows], device=seeds.device, dtype=dtype)
         return noise
 
     def restart(self) -> None:

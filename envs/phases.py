@@ -78,6 +78,6 @@ class PhasedSimulation(ABC):
     ) -> TensorDict:
         """Return the state, the mission, the regime (hidden truth) and what is ``seen``."""
         parameters = self.regime_now(mission, state)
-        entries = {**state, "mission": mission.clone(), **seen, "regime": parameters}
+        entries = {**state, "mission": mission.clone(recurse=False), **seen, "regime": parameters}
         entries["regime_active"] = ~self.regime.is_identity(parameters)
         return TensorDict(entries, mission.batch_size, device=mission.device)

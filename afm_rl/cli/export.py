@@ -34,6 +34,7 @@ def main() -> None:
 
 
 def _run(arguments: list[str]) -> None:
+    import torch
     from hydra import compose, initialize_config_module
     from hydra.core.global_hydra import GlobalHydra
     from torchrl.data import Bounded
@@ -64,6 +65,7 @@ def _run(arguments: list[str]) -> None:
             "choose a method that does not learn, such as afm_physics or afm_frozen_pe"
         )
     prepare(agent, cfg.cache, progress=bool(cfg.progress))
+    agent.to(torch.device("cpu"))  # what is exported is for the processor
     transform, (low, high) = agent.transform, agent.robot.action_box
     policy = ActionFlowPolicy(
         agent.model,

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.faults import count_repeats, trusted
+from afm_rl.tracing import may_look
 
 Fields = dict[str, Tensor]
 """The parts of a memory, by name."""
@@ -38,12 +39,12 @@ class Correction(NamedTuple):
 def rows_of(mask: Tensor) -> Any:
     """Return an index of the missions of a mask ``(*B)``: of all of them one that copies nothing.
 
-    All of them while a function is being exported, which must not depend on how many there are.
+    All of them where :func:`nothing may depend on numbers <afm_rl.tracing.may_look>`.
 
     >>> rows_of(torch.tensor([True, True])), rows_of(torch.tensor([True, False]))
     (Ellipsis, tensor([ True, False]))
     """
-    return ... if torch.compiler.is_compiling() or bool(mask.all()) else mask
+    return mask if may_look(mask) and not bool(mask.all()) else ...
 
 
 def put(part: Tensor, mask: Tensor, use: Any, values: Tensor) -> Tensor:
@@ -64,7 +65,7 @@ def put(part: Tensor, mask: Tensor, use: Any, values: Tensor) -> Tensor:
         part = part.clone()
         part[use] = values
         return part
-    if torch.compiler.is_compiling():
+    if not may_look(mask):
         return torch.where(mask[(..., *[None] * (part.dim() - mask.dim()))], values, part)
     return values
 

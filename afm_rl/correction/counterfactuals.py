@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.correction.base import Corrector
+from afm_rl.devices import device_of
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.flow.experts import LIMIT, Rows
@@ -40,13 +41,14 @@ def draw_counterfactuals(
         generator: of all that is drawn.
     """
     count, rows, plans = size
-    draw, axes = Draw(generator), corrector.action_size
-    now, before = regime.sample((2, count), generator)
-    fresh, valid = draw_masks(count, rows, draw)
+    draw, axes, device = Draw(generator), corrector.action_size, device_of(model)
+    now, before = regime.sample((2, count), generator).to(device)
+    fresh, valid = (part.to(device) for part in draw_masks(count, rows, draw))
     parameters = torch.where(fresh == 1.0, now.unsqueeze(1), before.unsqueeze(1))
     state = draw_states(states, count * rows, generator).view(count, rows, -1)
     state = model.manifold.project(state)
-    executed = corrector.denormalise(corrector.within(draw_actions(count, rows, axes, draw)))
+    executed = draw_actions(count, rows, axes, draw).to(device)
+    executed = corrector.denormalise(corrector.within(executed))
     low, high = (corrector.denormalise(end) for end in (corrector.lowest, corrector.highest))
     effect = regime.apply(executed, parameters, state)
     reached = imagine(model, state, effect, low, high, generator)
@@ -60,9 +62,10 @@ def draw_counterfactuals(
     many = (count, plans, axes)
     here, ruled = state[:, -1:].expand(-1, plans, -1), now.unsqueeze(1).expand(-1, plans, -1)
     anywhere, other, probe = (
-        corrector.denormalise(corrector.within(draw.uniform(-1.0, 1.0, *many))) for _ in range(3)
+        corrector.denormalise(corrector.within(draw.uniform(-1.0, 1.0, *many).to(device)))
+        for _ in range(3)
     )
-    inside = draw.chance(0.5, count, plans, 1)
+    inside = draw.chance(0.5, count, plans, 1).to(device)
     planned = torch.where(inside, anywhere, regime.apply(other, ruled, here))
     intended = intend(regime, planned, ruled, here, low, high, mode)
     answers = planned, intended, probe, regime.apply(probe, ruled, here)
@@ -86,7 +89,7 @@ def imagine(
     """
     inside = torch.minimum(torch.maximum(effect, low), high)
     expected, noise = model.forecast(state, inside)
-    change = noise * torch.randn(noise.shape, generator=generator)
+    change = noise * torch.randn(noise.shape, generator=generator).to(noise)
     out = (effect != inside).any(-1)  # derivatives are dear, and few effects are beyond the box
     slope = model.jacobian(state[out], inside[out])
     change[out] += (slope @ (effect - inside)[out].unsqueeze(-1)).squeeze(-1)

@@ -113,7 +113,7 @@ class PaperFlow(Corrector):
     ) -> Tensor:
         """Return the loss of ``count`` transitions of one action registered as another's."""
         features, start, end = self._examples(model, states, count, generator)
-        tau = torch.rand(count, 1, generator=generator)
+        tau = torch.rand(count, 1, generator=generator).to(start)
         velocity = self(features, tau, torch.lerp(start, end, tau))
         return (velocity - (end - start)).square().mean()
 

@@ -10,6 +10,7 @@ from afm_rl.dynamics.derivatives import linearised
 from afm_rl.dynamics.hammerstein import PLAIN, shaped, shaped_slope
 from afm_rl.dynamics.per_mission import PerMissionModel
 from afm_rl.errors import ConfigurationError
+from afm_rl.tracing import may_look
 
 CALIBRATION = ("matrix", "bias", "shape", "offset")
 
@@ -165,5 +166,5 @@ class Calibrated(PerMissionModel):
 
 
 def _any(part: Tensor) -> bool:
-    """Is any number not 0? Where that cannot be known, yes."""
-    return part.is_meta or bool(part.any())
+    """Is any number not 0? Where that may not be looked at, yes."""
+    return not (may_look(part) and not bool(part.any()))

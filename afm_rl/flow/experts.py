@@ -304,7 +304,7 @@ def fit_experts(rows: Rows) -> Experts:
     inputs, valid = rows.executed.double(), rows.valid.double().mT
     u, e = inputs.mT, rows.effective.double().mT  # (N, A, K)
     size, (count, axes, length) = u.shape[-2], u.shape
-    ages, prior, nominal = _constants(length, size, u.device)
+    ages, prior, nominal, lines, places = _constants(length, size, u.device)
     weights = ages * (valid * confidence(rows.std.double().mT)).unsqueeze(-2)  # (N, A, 2, K)
     long = weights[..., 1, :]
     moved = (long * (e.abs() > STUCK)).unsqueeze(-2)
@@ -314,10 +314,10 @@ def fit_experts(rows: Rows) -> Experts:
     flat = torch.cat([weights, moved], -2).flatten(0, 1)  # (N A, 3, K)
     moments = torch.baddbmm(prior, flat, terms)
     gains = moments[:, :2, 3] / moments[:, :2, 0]
-    slopes, offsets = _solve_line(moments[:, PLACES[0], PLACES[1]])  # with offset, with friction
+    slopes, offsets = _solve_line(moments[:, lines, places])  # with offset, with friction
     miss = e.flatten(0, 1) - torch.addcmul(offsets[:, :1], slopes[:, :1], u.flatten(0, 1))
     robust = flat[:, 1] / (1 + (miss / OUTLIER).square())
-    robust = torch.baddbmm(prior[1:2], robust.unsqueeze(1), terms)[:, 0, PLACES[1][0]]
+    robust = torch.baddbmm(prior[1:2], robust.unsqueeze(1), terms)[:, 0, places[0]]
     slope, offset = _solve_line(robust.unsqueeze(1))
     gain = _not_zero(torch.cat([gains, slope, slopes[:, 1:]], -1))
     offset = torch.cat([torch.zeros_like(gains), offset, offsets[:, 1:]], -1)
@@ -380,10 +380,6 @@ def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return explained, torch.cat([chosen, offset.gather(-1, driver)], -1)
 
 
-PLACES = torch.tensor([[1], [2]]), torch.tensor([[0, 1, 7, 3, 4], [0, 5, 2, 3, 6]])
-"""Rows and columns of the moments of the two lines that are fitted with an offset."""
-
-
 def _solve_line(moments: Tensor) -> tuple[Tensor, Tensor]:
     """Return slope and offset ``(*B)`` of weighted least squares, given its moments ``(*B, 5)``."""
     square, mean, mass, cross, shift = moments.unbind(-1)
@@ -393,14 +389,17 @@ def _solve_line(moments: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @cached(maxsize=16)
-def _constants(rows: int, size: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the weights by age ``(2, K)`` and the moments of the priors.
+def _constants(rows: int, size: int, device: torch.device) -> tuple[Tensor, ...]:
+    """Return the weights by age ``(2, K)``, the moments of the priors, and indices.
 
-    Those of the lines are ``(3, 8)``, those of the affine map ``(A + 1, A + 1)``.
+    The moments of the lines are ``(3, 8)``, those of the affine map ``(A + 1, A + 1)``. The indices
+    are rows and columns of the moments of the two lines that are fitted with an offset.
     """
     kind: dict[str, Any] = {"dtype": torch.float64, "device": device}
     age = torch.arange(rows - 1, -1, -1, **kind)
     prior = torch.zeros(3, 8, **kind)
     prior[:, [0, 3]], prior[:, [2, 7]] = PRIOR, 10 * PRIOR
     nominal = PRIOR * torch.eye(size + 1, **kind)
-    return torch.stack([SHORT**age, LONG**age]), prior, nominal
+    lines = torch.tensor([[1], [2]], device=device)
+    places = torch.tensor([[0, 1, 7, 3, 4], [0, 5, 2, 3, 6]], device=device)
+    return torch.stack([SHORT**age, LONG**age]), prior, nominal, lines, places

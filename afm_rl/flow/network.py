@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from afm_rl.flow.experts import ANSWERS, EXPERTS, LEAST_MISS, MISSES, Experts, Rows
 from afm_rl.flow.saturation import LIMIT, MODES
+from afm_rl.tracing import may_look
 
 SHARPNESS = 5.0  # of the logits of a mixture: shares of all or nothing are soon learnt
 LEAST_TIME = 0.1  # of the path that is left, in the velocity towards an expert's answer
@@ -49,7 +50,7 @@ class Encoded(NamedTuple):
 
     def pick(self, which: Tensor) -> Encoded:
         """Return the sets of rows with the indices ``which`` ``(M,)``."""
-        if not torch.compiler.is_compiling() and len(which) == 1:
+        if may_look(which) and len(which) == 1:
             at = int(which)  # a view, where gathering would copy
             parts = [part[at : at + 1] for part in (*self.experts, *self[1:])]
         else:

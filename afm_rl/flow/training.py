@@ -11,6 +11,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor, nn
 
+from afm_rl.devices import device_of
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import (
     ConfigurationError,
@@ -186,7 +187,9 @@ def train_flow(
     check_number("corrector.train.lr", lr, low=0.0, open_low=True)
     check_states(states, model)
     generator = torch.Generator().manual_seed(seed)
-    world = model, regime, states
+    device = device_of(model)
+    on_device = tuple(part.to(device) for part in states) if isinstance(states, tuple) else None
+    world = model, regime, on_device or states.to(device)
 
     def loss() -> Tensor:
         return flow.training_loss(*world, batch_size, generator)

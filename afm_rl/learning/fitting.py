@@ -10,6 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from afm_rl.devices import device_of
 from afm_rl.dynamics import Ensemble
 from afm_rl.errors import NonFiniteError, check_count, check_number
 from afm_rl.keys import as_keys
@@ -96,12 +97,13 @@ def fit_ensemble(
     True
     """
     check_number("held_out", held_out, low=0.0, high=0.5, open_low=True)
+    transitions = transitions.to(device_of(model))
     state, action, after = (transitions.get(key).flatten(0, -2) for key in as_keys(keys))
     for key, value in zip(keys, (state, action, after), strict=True):
         if not bool(value.isfinite().all()):
             raise NonFiniteError(f"transitions: {key!r} holds numbers that are not finite")
     generator = torch.Generator().manual_seed(seed)
-    order = torch.randperm(len(state), generator=generator)
+    order = torch.randperm(len(state), generator=generator).to(state.device)
     state, action, after = state[order], action[order], after[order]
     change = model.manifold.difference(after, state)
     samples = check_count("transitions", len(state), low=2) - max(1, round(held_out * len(state)))
@@ -148,6 +150,7 @@ def fit_changes(
     with bar, torch.enable_grad():
         for _ in range(epochs):
             order = torch.rand(model.members, samples, generator=generator).argsort(-1)
+            order = order.to(inputs.device)
             for rows in order[:, : steps * batch_size].split(batch_size, -1):
                 mean, log_variance = model.member_moments(inputs[rows])
                 loss = gaussian_nll(mean, log_variance, target[rows]).mean((-2, -1)).sum()
@@ -157,7 +160,7 @@ def fit_changes(
                 cycle.step()
                 bar.update()
             error = held_out_error(model, inputs[samples:], target[samples:])
-            bar.set_postfix_str(f"held-out error {error.mean().sqrt():.4f}", refresh=False)
+            bar.set_postfix_str(f"held-out error {float(error.mean().sqrt()):.4f}", refresh=False)
             if error.mean() < best_error.mean():
                 best = {name: value.clone() for name, value in model.state_dict().items()}
                 best_error = error

@@ -63,15 +63,16 @@ class Learner(Updater, ABC):
         sound = self._sound(tensordict)
         with torch.set_grad_enabled(self.by_gradient):
             found = self._measure(self._without(kept, sound))
-            if not bool(found["loss"].isfinite().all()):  # sound entries may still overflow
-                sound = sound & found["loss"].isfinite()
-                kept = self._without(kept, sound)
-                found = self._measure(kept)
+            fine = sound & found["loss"].isfinite()
+            if not bool(fine.all()):
+                self.refused += int((~fine).sum())
+                if not torch.equal(fine, sound):  # sound entries may still overflow
+                    sound = fine
+                    found = self._measure(self._without(kept, sound))
             learn = sound
             if self.mask_key is not None:
                 learn = sound & tensordict.get(self.mask_key).reshape(batch)
             self._learn(found, tensordict, learn)
-        self.refused += int((~sound).sum())
         return TensorDict({"loss": torch.where(sound, found["loss"].detach(), torch.nan)}, batch)
 
     def _sound(self, tensordict: TensorDictBase) -> Tensor:

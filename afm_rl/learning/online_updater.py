@@ -55,7 +55,7 @@ class OnlineUpdater(Learner):
         """Forget the missions that have left the model, in the optimiser too."""
         known, left = self.readings.missions, getattr(self.loss.model, "missions", None)
         super().follow()
-        if left is None or not known.dim() or torch.equal(known, left):
+        if left is None or not known.dim() or self.readings.missions is known:
             return
         index = (left.unsqueeze(-1) == known).int().argmax(-1)
         for parameter, state in self.optimizer.state.items():

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from afm_rl.devices import device_of
 from afm_rl.dynamics import DynamicsModel, Ensemble
 from afm_rl.errors import check_count, check_number
 from afm_rl.learning.fitting import FitReport, fit_changes
@@ -56,11 +57,13 @@ def pretrain_ensemble(
     check_count("dynamics.pretrain.epochs", epochs)
     check_number("dynamics.pretrain.lr", lr, low=0.0, open_low=True)
     check_number("dynamics.pretrain.action_noise", action_noise, low=0.0)
-    generator = torch.Generator().manual_seed(seed)
+    generator, device = torch.Generator().manual_seed(seed), device_of(model)
     total = samples + samples // 10
-    state = teacher.manifold.project(uniform(*state_box, total, generator))
-    action = uniform(*action_box, total, generator)
+    (low, high), box = ([end.to(device) for end in ends] for ends in (state_box, action_box))
+    state = teacher.manifold.project(uniform(low, high, total, generator))
+    action = uniform(*box, total, generator)
     factor = 1 + action_noise * (2 * torch.rand(action.shape, generator=generator) - 1)
+    factor = factor.to(device)
     with torch.no_grad():
         change = teacher.manifold.difference(teacher(state, action * factor), state)
     return fit_changes(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from afm_rl.devices import device_of
 from afm_rl.dynamics import DynamicsModel, Oracle
 from afm_rl.dynamics.knode import KNODE
 from afm_rl.errors import ConfigurationError, check_count, check_number
@@ -73,21 +74,22 @@ def pretrain_knode(
     check_number("dynamics.pretrain.lr", lr, low=0.0, open_low=True)
     check_number("dynamics.pretrain.noise", noise, low=0.0)
     check_count("dynamics.pretrain.seed", seed, low=0)
-    generator = torch.Generator().manual_seed(seed)
+    generator, device = torch.Generator().manual_seed(seed), device_of(model)
     space, total = model.manifold, flights + -(-flights // 10)
-    state = space.project(uniform(*state_box, total, generator))
+    (low, high), box = ([end.to(device) for end in ends] for ends in (state_box, action_box))
+    state = space.project(uniform(low, high, total, generator))
     if regime is not None:
         teacher = Oracle(teacher, regime)
-        teacher.set_regime(regime.sample((total,), generator))
-    path, actions = [state], uniform(*action_box, ticks * total, generator).split(total)
+        teacher.set_regime(regime.sample((total,), generator).to(device))
+    path, actions = [state], uniform(*box, ticks * total, generator).split(total)
     with torch.no_grad():
         for action in actions:
             path.append(teacher(path[-1], action))
         seen = torch.stack(path)
         shaken = torch.randn(*seen.shape[:2], space.tangent_size, generator=generator)
-        seen = space.add(seen, noise * shaken)
+        seen = space.add(seen, noise * shaken.to(seen))
     numbers = torch.randn(model.numbers, generator=generator)
-    model.push_(model.draw(numbers))
+    model.push_(model.draw(numbers.to(device)))
     held = torch.stack(actions)
 
     def miss(part: slice) -> Tensor:

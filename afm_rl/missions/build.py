@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
+import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
+from afm_rl.devices import check_device
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
 from afm_rl.learning import GaussianNLLLoss, Updater
@@ -32,7 +35,10 @@ from afm_rl.transforms import ActionFlowTransform, Guard
 
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
 MOST_STEPS, MOST_MISSIONS = 10_000_000, 1_000_000
-DEFAULTS = {"seeds": 1, "budget": 5000, "label": None, "faults": "hold", "false_alarms": 0.01}
+DEFAULTS = {
+    **{"seeds": 1, "budget": 5000, "label": None, "faults": "hold", "false_alarms": 0.01},
+    "device": "cpu",
+}
 """Settings that a configuration may leave out."""
 
 
@@ -60,6 +66,31 @@ class Agent:
     settings: Mapping[str, Any]
     """The resolved configuration."""
 
+    def to(self, device: torch.device) -> Agent:
+        """Move everything to a device, in place.
+
+        Raises:
+            ConfigurationError: for ``mps``, which has no double precision, if a part needs it.
+        """
+        parts = (self.robot.model, self.model, self.env, self.planner, self.updater)
+        if device.type == "mps":
+            tensors = chain(*(chain(part.parameters(), part.buffers()) for part in parts))
+            double = any(tensor.dtype is torch.float64 for tensor in tensors)
+            if double or self.transform is not None or self.updater.sets == "calibration":
+                raise ConfigurationError(
+                    "device=mps: it has no double precision, in which corrections, calibrations "
+                    "and tracking are computed; choose device=cpu, or a method without them"
+                )
+        self.missions = self.missions.to(device)
+        for part in parts:
+            part.to(device)
+        return self
+
+    @property
+    def device(self) -> torch.device:
+        """Where its tensors are."""
+        return self.missions.device or torch.device("cpu")
+
     @property
     def base_env(self) -> EnvBase:
         """The robot's environment without transforms."""
@@ -85,6 +116,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
             raise ConfigurationError(f"{name}: expected a setting; build needs {', '.join(GROUPS)}")
     check_targets(settings, trust)
     label = check_label(settings["label"])
+    device = check_device("device", settings["device"])
     with blaming("robot"):
         robot: Robot = instantiate(settings["robot"], _convert_="all")
         tracks = select_tracks(settings["tracks"], robot)
@@ -150,7 +182,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     if transform is not None:
         check_keys("planner", planner, whole, ["box_key"])
     check_keys("updater", updater, whole)
-    return Agent(
+    agent = Agent(
         label=label or "unnamed",
         robot=robot,
         env=whole,
@@ -165,3 +197,4 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
         faults=faults,
         settings=settings,
     )
+    return agent.to(device)

@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, TransformedEnv
 
+from afm_rl.devices import device_of
 from afm_rl.dynamics import Ensemble
 from afm_rl.errors import ConfigurationError, check_count, check_counts
 from afm_rl.learning import collect, fit_ensemble
@@ -66,6 +67,7 @@ def transitions(
         batch_size=[EPISODES],
         seed=10_000 * (seed + 1),  # missions are counted from 0
     )
+    env = env.to(device_of(robot.model))
     if planner is not None and hasattr(planner, "make_tensordict_primer"):
         env = TransformedEnv(env, Compose(planner.make_tensordict_primer()))
     logger = logging.getLogger("torchrl")  # tells of every buffer

@@ -37,8 +37,11 @@ def fit_agents_gate(agent: Agent) -> float | None:
         healthy = transitions(agent.robot, EPISODE, agent.robot.data.seed + 1000, agent.planner)
         return fit_gate(transform.corrector, agent.model, healthy, rate)
     robot, generator = agent.robot, torch.Generator().manual_seed(1)
-    state = robot.model.manifold.project(uniform(*robot.state_box, TRANSITIONS, generator))
-    action = uniform(*robot.action_box, TRANSITIONS, generator)
+    state, action = (
+        uniform(*box, TRANSITIONS, generator).to(agent.device)
+        for box in (robot.state_box, robot.action_box)
+    )
+    state = robot.model.manifold.project(state)
     healthy = TensorDict({"observation": state, "action": action}, [TRANSITIONS])
     healthy.set(("next", "observation"), robot.model(state, action))
     return fit_gate(transform.corrector, agent.model, healthy, rate)

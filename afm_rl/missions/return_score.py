@@ -70,7 +70,7 @@ class ReturnScore(Score):
         self, env: EnvBase, missions: TensorDictBase, sums: dict[str, Tensor]
     ) -> dict[str, Any]:
         steps = env.simulation.steps
-        rewards = sums["rewards"][:, :steps].double()
+        rewards = sums["rewards"][:, :steps].cpu().double()
         parts = zip(rewards, env.simulation.changes_at(missions["mission"]).tolist(), strict=True)
         rows = torch.tensor([_measured(row, at) for row, at in parts], dtype=torch.float64)
         names = ("before", "at", "after", "recovery_steps")

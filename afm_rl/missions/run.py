@@ -128,9 +128,10 @@ def _start(agent: Agent) -> Loop:
     agent.updater.start(td)
     ends = {name: torch.zeros(total) for name in ("steps", "seconds", "faults")}
     ends |= agent.robot.metrics.start(agent.missions)
+    ends = {name: part.to(agent.device) for name, part in ends.items()}
     whole = ["misaligned", "regime_active", "fault", *agent.robot.metrics.whole]
     log = StepLog(_columns(agent), whole)
-    return Loop(td, torch.arange(total), ends, log, unsaved=unsaved(agent))
+    return Loop(td, torch.arange(total, device=agent.device), ends, log, unsaved=unsaved(agent))
 
 
 def _advance(agent: Agent, loop: Loop) -> None:
@@ -216,7 +217,7 @@ def _missions(agent: Agent, ends: dict[str, Tensor]) -> pd.DataFrame:
     frame: dict[str, Any] = {
         "mission": range(len(agent.missions)),
         "method": agent.label,
-        "track": [tracks[int(index)] for index in mission["track"]],
+        "track": [tracks[index] for index in mission["track"].tolist()],
     }
     frame.update({name: changed[:, k] for k, name in enumerate(agent.robot.regime.names)})
     frame.update(seed=mission["seed"])
@@ -235,8 +236,8 @@ def _changed(agent: Agent, parameters: Tensor) -> Tensor:
     """Return the first row ``(B, F)`` of each mission's phases that is not nominal."""
     changed = ~agent.robot.regime.is_identity(parameters)
     first = changed.int().argmax(-1)
-    return parameters[torch.arange(len(parameters)), first]
+    return parameters[torch.arange(len(parameters), device=first.device), first]
 
 
 def _plain(value):
-    return value.numpy() if isinstance(value, Tensor) else value
+    return value.cpu().numpy() if isinstance(value, Tensor) else value

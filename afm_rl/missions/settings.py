@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 WITHOUT_INFLUENCE = (
-    *("progress", "figures", "video", "tensorboard", "overwrite", "cache", "threads"),
+    *("progress", "figures", "video", "tensorboard", "overwrite", "cache", "threads", "device"),
     *("compare", "study", "label", "trust", "checkpoints"),
 )
 """Settings that change how a run is done, shown or called, but not its results."""

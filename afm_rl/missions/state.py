@@ -91,10 +91,10 @@ def restore(agent: Agent, loop: Loop, state: dict[str, Any]) -> None:
     modules, parameters = dict(whole.named_modules()), dict(whole.named_parameters())
     for name, value in state["tensors"].items():
         if name in parameters:  # the optimiser knows the parameter: only its data may change
-            parameters[name].data = value
+            parameters[name].data = value.to(agent.device)
         else:
             owner, _, leaf = name.rpartition(".")
-            modules[owner]._buffers[leaf] = value
+            modules[owner]._buffers[leaf] = value.to(agent.device)
     for name, holder in _holders(whole):
         holder.write(state["held"][name])
     for name, module, leaf in list(_plain(whole)):
@@ -102,7 +102,8 @@ def restore(agent: Agent, loop: Loop, state: dict[str, Any]) -> None:
             setattr(module, leaf, state["plain"][name])
     torch.random.set_rng_state(state["global"])
     loop.log.load_state_dict(state["log"])
-    loop.ids, loop.ends, loop.step = state["ids"], state["ends"], state["step"]
+    loop.ids, loop.step = state["ids"].to(agent.device), state["step"]
+    loop.ends = {name: part.to(agent.device) for name, part in state["ends"].items()}
     loop.td = TensorDict(state["td"], loop.ids.shape, device=loop.td.device)
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import ModelBasedEnvBase
 
+from afm_rl.devices import device_of, moved
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.keys import as_key
@@ -51,7 +52,8 @@ class PlanningEnv(ModelBasedEnvBase):
     ) -> None:
         check_instance("planner.env: dynamics", dynamics, DynamicsModel)
         check_instance("planner.env: cost", cost, Cost)
-        super().__init__(dynamics, batch_size=torch.Size([]))
+        device = device_of(dynamics)  # the base class would move the model to the CPU
+        super().__init__(dynamics, device=device, batch_size=torch.Size([]))
         self.dynamics = dynamics
         self.cost = cost
         self.observe = observe
@@ -67,16 +69,25 @@ class PlanningEnv(ModelBasedEnvBase):
             raise ConfigurationError(
                 f"cost.in_keys={cost.in_keys}: {self.observation_key!r} holds the state already"
             )
+        low, high = low.to(device), high.to(device)
         sizes = {self.observation_key: dynamics.state_size}
         sizes.update(zip(cost.in_keys, cost.in_sizes, strict=True))
         self.observation_spec = Composite()
         self.state_spec = Composite()
         for key, size in sizes.items():
-            self.observation_spec[key] = Unbounded((size,), dtype=low.dtype)
-            self.state_spec[key] = Unbounded((size,), dtype=low.dtype)
+            self.observation_spec[key] = Unbounded((size,), dtype=low.dtype, device=device)
+            self.state_spec[key] = Unbounded((size,), dtype=low.dtype, device=device)
         spec = Bounded(low, high, shape=low.shape, dtype=low.dtype)
         self.full_action_spec = Composite({as_key(action_key): spec})
-        self.reward_spec = Unbounded((1,), dtype=low.dtype)
+        self.reward_spec = Unbounded((1,), dtype=low.dtype, device=device)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PlanningEnv:
+        """Move the specs too: a planner that is moved moves its modules only."""
+        for name in ("_input_spec", "_output_spec"):
+            self.__dict__[name] = moved(self.__dict__[name], fn)
+        self.empty_cache()
+        self._device = self.full_action_spec.device
+        return super()._apply(fn, recurse)
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
         batch = tensordict.batch_size if tensordict is not None else self.batch_size

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import warnings
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.modules.planners.common import MPCPlannerBase
 
+from afm_rl.devices import moved
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.keys import as_key
 from afm_rl.planning.primer import ZeroPrimer
@@ -58,6 +59,13 @@ class RecedingHorizonPlanner(MPCPlannerBase):
         self.out_keys = [self.action_key, *self.next_memory]
         self._told = False
 
+    def _apply(
+        self, fn: Callable[[Tensor], Tensor], recurse: bool = True
+    ) -> RecedingHorizonPlanner:
+        """Move the spec too."""
+        self.action_spec = moved(self.action_spec, fn)
+        return super()._apply(fn, recurse)
+
     @abstractmethod
     def _plan(self, td: TensorDictBase) -> tuple[Tensor, Sequence[Tensor]]:
         """Return the action ``(*B, A)`` and the new memory, each entry ``(*B, *shape)``."""
@@ -83,7 +91,9 @@ class RecedingHorizonPlanner(MPCPlannerBase):
 
     def _allowed(self, action: Tensor, td: TensorDictBase) -> Tensor:
         """Return the nearest action that may be planned."""
-        return self.action_spec.project(action)
+        if not isinstance(self.action_spec, Bounded):
+            return self.action_spec.project(action)
+        return action.clamp(self.action_spec.space.low, self.action_spec.space.high)
 
     def planning(self, td: TensorDictBase) -> Tensor:
         """Return the action ``(*B, A)`` without writing anything."""

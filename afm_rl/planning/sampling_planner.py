@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 
-import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -15,6 +14,7 @@ from afm_rl.errors import ConfigurationError, check_choice, check_count
 from afm_rl.keys import as_key
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.streams import Streams
+from afm_rl.tracing import may_look
 
 
 class SamplingPlanner(RecedingHorizonPlanner):
@@ -112,8 +112,8 @@ class SamplingPlanner(RecedingHorizonPlanner):
 
     def _discard(self, finite: Tensor) -> None:
         """Count the returns ``(*B, N)`` that are not finite; warn where none is."""
-        if torch.compiler.is_compiling():
-            return  # an exported planner does not count
+        if not may_look(finite):
+            return  # an exported planner does not count, nor does one on a GPU
         self.discarded += int((~finite).sum())
         lost = ~finite.any(-1)
         if bool(lost.any()):

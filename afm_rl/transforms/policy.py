@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 
 from afm_rl.correction import Corrector
+from afm_rl.devices import moved
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.keys import as_key
@@ -83,6 +87,11 @@ class ActionFlowPolicy(TensorDictModuleBase):
         kept = [unravel_key((self.prefix, name)) for name in self._spec.keys(True, True)]
         self.in_keys = [self.observation_key, self.action_key, unravel_key((self.prefix, "memory"))]
         self.out_keys = [self.action_key, *(unravel_key(("next", key)) for key in kept)]
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> ActionFlowPolicy:
+        """Move the spec too."""
+        self.action_spec = moved(self.action_spec, fn)
+        return super()._apply(fn, recurse)
 
     @property
     def _spec(self) -> Composite:

@@ -43,23 +43,6 @@ def test_the_state_dict_holds_all_that_was_learnt(case):
     same(case.say(other, (4,), dtype=torch.float32), case.say(module, (4,), dtype=torch.float32))
 
 
-def test_nothing_is_left_on_another_device(blind_case):
-    make, say = blind_case
-    said = say(make().to("meta"), (2, 3), device="meta")  # mixing devices would be an error
-    assert all(part.is_meta and part.shape[:2] == (2, 3) for part in said)
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_it_says_the_same_on_a_gpu(movable_case):
-    make, say = movable_case
-    expected = say(make(), (4,), device="cpu")
-    found = say(make().to("cuda"), (4,), device="cuda")
-    assert all(part.is_cuda for part in found)
-    for one, other in zip(found, expected, strict=True):
-        torch.testing.assert_close(one.cpu(), other, rtol=1e-3, atol=1e-4)
-
-
 def test_it_says_the_same_compiled(compiled_case):
     make, say = compiled_case
     expected = say(make(), (4,), dtype=torch.float32)

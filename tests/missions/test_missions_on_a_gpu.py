@@ -1,0 +1,49 @@
+"""Missions and training of every kind of method on a GPU that need not be there."""
+
+import sys
+from unittest import mock
+
+import pytest
+import torch
+from fake_gpu import DEVICE, FakeGPU
+
+from afm_rl.missions.run import _advance, _start
+
+RUN = sys.modules["afm_rl.missions.run"]
+ALWAYS = {  # what a step waits for, whatever the method
+    "mission_env._checked",  # is an action not finite?
+    "compose._active",  # which families of regimes are there?
+    "log.add",  # the log is kept on the CPU
+    "run._advance",  # has a mission ended?
+}
+LEARNING = {"learner.forward"}
+METHODS = {
+    "physics": set(),
+    "oracle": set(),
+    "afm_physics": set(),
+    "afm_paper": LEARNING,
+    "l1": set(),
+    "adaptive_gain": set(),
+    "online_pe": LEARNING,
+    "afm_stream_x_pe": LEARNING,
+    "rls": LEARNING | {"matched_fit._look"},
+}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_training_and_missions_stay_on_their_device(make_agent, monkeypatch, method):
+    agent = make_agent(f"method={method}", "seeds=2", "budget=50")
+    for numbers in ("envs.missions.MissionFormat._check_values", "flow.training.check_states"):
+        monkeypatch.setattr(f"afm_rl.{numbers}", lambda *_: None)
+    with FakeGPU(answer=False) as gpu, torch.no_grad():
+        gpu.move(agent)
+        for part in agent.trainings:
+            part.train(False)
+        with mock.patch.object(RUN, "unsaved", return_value={}):
+            loop = _start(agent)
+        _advance(agent, loop)  # at first it looks at who is there
+        gpu.waits.clear()
+        _advance(agent, loop)
+        for entry in loop.td.values(True, True):
+            assert entry.device == DEVICE
+        assert set(gpu.waits) == ALWAYS | METHODS[method]
