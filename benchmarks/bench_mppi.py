@@ -132,7 +132,9 @@ def main() -> None:
     torch.manual_seed(0)
     kinds: dict[str, Callable[[int], Callable[[Tensor], Tensor]]] = {
         "afm-rl": lambda samples: ours(samples, beta=1.0),
+        "afm-rl, compiled": lambda samples: ours(samples, beta=1.0, compile=True),
         "afm-rl, smoothed plans": ours,
+        "the same, compiled": lambda samples: ours(samples, compile=True),
         "TorchRL": torchrl,
     }
     if Peer is None:

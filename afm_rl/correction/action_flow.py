@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from afm_rl.correction.base import Correction, put, rows_of
-from afm_rl.correction.compiled import MachineCode, in_one_batch
 from afm_rl.correction.counterfactuals import draw_counterfactuals
 from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY, check_hypotheses, memory_of
 from afm_rl.correction.pairs import PairCorrector
@@ -21,6 +20,7 @@ from afm_rl.flow.network import AxisNetwork
 from afm_rl.flow.prior import Drawn
 from afm_rl.flow.training import EFFECT_WEIGHT, States, flow_losses
 from afm_rl.flow.weights import load_universal
+from afm_rl.machine_code import MachineCode, in_one_batch
 from afm_rl.regimes import Regime
 from afm_rl.tracing import all_hold
 

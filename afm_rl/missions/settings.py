@@ -7,7 +7,17 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 WITHOUT_INFLUENCE = (
-    *("progress", "figures", "video", "tensorboard", "overwrite", "cache", "threads", "device"),
+    *(
+        "progress",
+        "figures",
+        "video",
+        "tensorboard",
+        "overwrite",
+        "cache",
+        "threads",
+        "device",
+        "compile",
+    ),
     *("compare", "study", "label", "trust", "checkpoints"),
 )
 """Settings that change how a run is done, shown or called, but not its results."""
@@ -20,7 +30,14 @@ def influential(settings: Mapping[str, Any]) -> dict[str, Any]:
     {'budget': 5}
     """
     kept = {name: value for name, value in settings.items() if name not in WITHOUT_INFLUENCE}
-    return json.loads(json.dumps(kept))
+    return json.loads(json.dumps(_without(kept, ("cache", "compile"))))
+
+
+def _without(value: Any, names: tuple[str, ...]) -> Any:
+    """Leave out entries of nested mappings."""
+    if not isinstance(value, Mapping):
+        return value
+    return {key: _without(part, names) for key, part in value.items() if key not in names}
 
 
 def differences(old: Any, new: Any) -> list[str]:

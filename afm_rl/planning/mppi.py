@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from afm_rl.errors import check_choice, check_number
+from afm_rl.errors import check_choice, check_flag, check_number
 from afm_rl.keys import as_key
+from afm_rl.machine_code import MachineCode
 from afm_rl.planning.receding import action_spec_of
 from afm_rl.planning.sampling_planner import SamplingPlanner
 from afm_rl.tracing import all_hold
@@ -112,6 +115,10 @@ class MPPI(SamplingPlanner):
             bounds, with a warning, where there is none.
         action_key: where the action goes.
         seed: seed of the noise without ``seed_key``.
+        compile: roll out and weigh as machine code, if the model is made of equations and stays
+            as it is. It is compiled once and kept in the cache. Where there is no compiler, the
+            planner works as without, with a warning.
+        cache: folder of compiled functions.
 
     Returns that are not finite are ignored and counted in :attr:`discarded`; where all are,
     the shifted plan stands and a warning is given.
@@ -143,6 +150,8 @@ class MPPI(SamplingPlanner):
         box_key: NestedKey | None = None,
         action_key: NestedKey = "action",
         seed: int = 0,
+        compile: bool = False,
+        cache: str | Path = "~/.cache/afm_rl",
     ) -> None:
         super().__init__(
             env,
@@ -163,6 +172,8 @@ class MPPI(SamplingPlanner):
         self.box_key = None if box_key is None else as_key(box_key)
         if self.box_key is not None:
             self.in_keys.append(self.box_key)
+        self.compiles = check_flag("planner.compile", compile)
+        self.__dict__["_machine_code"] = MachineCode(self, cache)
         space = self.action_spec.space
         half = (space.high - space.low) / 2
         self.register_buffer("scale", sigma * half if noise == "scaled" else torch.ones_like(half))
@@ -179,7 +190,13 @@ class MPPI(SamplingPlanner):
             eps = self._noise(td, mean, self.population, BOUND)
             raw = eps.mul_(rows_like(scale, eps)).add_(best.unsqueeze(-3))
             plans = smooth(raw, past.unsqueeze(-2), self.beta, low, high)
-            best = self._blend(self._returns(td, plans), plans, best)
+            if self._as_machine_code:
+                task = [td.get(key) for key in self.env.cost.in_keys]
+                given = td.get(self.env.observation_key), plans, *task
+                found, finite = self._machine_code(MPPI.improved, *given, model=self.env.dynamics)
+                best = self._sound(finite, found, best)
+            else:
+                best = self._blend(self._returns(td, plans), plans, best)
         return best[..., 0, :], [best]
 
     def _box(self, td: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
@@ -202,11 +219,39 @@ class MPPI(SamplingPlanner):
         wide = action.unsqueeze(-2)
         return torch.minimum(torch.maximum(wide, low), high).squeeze(-2)
 
+    @property
+    def _as_machine_code(self) -> bool:
+        # Machine code holds the model as it is now. Networks gain nothing: their products are fast.
+        if not self.compiles or torch.compiler.is_compiling() or self.backend != "fast":
+            return False
+        model = self.env.dynamics
+        learned = any(True for _ in model.parameters())
+        return not learned and model.taught_in is None and model.conditioned_on is None
+
+    def improved(self, state: Tensor, plans: Tensor, *more: Any) -> tuple[Tensor, Tensor]:
+        """Return the weighted mean of plans, for machine code.
+
+        Args:
+            state: ``(B, S)``.
+            plans: ``(B, N, H, A)``.
+            more: the cost's task entries ``(B, size)``, and the model.
+
+        Returns:
+            The mean ``(B, H, A)``, and which returns are finite, ``(B, N)``.
+        """
+        returns = self.env.returns(state, plans, *more[:-1]).to(plans)
+        return self._mean(returns, plans), returns.isfinite()
+
+    def _mean(self, returns: Tensor, plans: Tensor) -> Tensor:
+        weights = path_weights(returns, self.temperature).unsqueeze(-1)
+        return (plans.flatten(-2).mT @ weights).squeeze(-1).unflatten(-1, plans.shape[-2:])
+
     def _blend(self, returns: Tensor, plans: Tensor, fallback: Tensor) -> Tensor:
         """Return the weighted mean plan, or ``fallback`` where no return is finite."""
-        weights = path_weights(returns, self.temperature)
-        mean = (plans.flatten(-2).mT @ weights.unsqueeze(-1)).view_as(fallback)
-        finite = returns.isfinite()
+        return self._sound(returns.isfinite(), self._mean(returns, plans), fallback)
+
+    def _sound(self, finite: Tensor, mean: Tensor, fallback: Tensor) -> Tensor:
+        """Return the mean, or ``fallback`` where no return is finite; count those."""
         if all_hold(finite):
             return mean
         self._discard(finite)

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from afm_rl.correction import ActionFlow, compiled
+from afm_rl import machine_code
+from afm_rl.correction import ActionFlow
 from afm_rl.correction.hypotheses import HYPOTHESES
 from afm_rl.flow import AxisNetwork
 
@@ -26,7 +27,7 @@ def reversed_drive(sent):
 def test_machine_code_says_the_same_for_any_number_of_missions(
     line, drive, plans, tmp_path, monkeypatch
 ):
-    if not compiled.has_compiler():
+    if not machine_code.has_compiler():
         pytest.skip("no C++ compiler")
     code = flow_of(tmp_path, compile=True)
     for batch in [(), (3,), (2, 2)]:
@@ -41,12 +42,12 @@ def test_machine_code_says_the_same_for_any_number_of_missions(
     def refuse(*_):
         raise AssertionError("it was compiled again")
 
-    monkeypatch.setattr(compiled, "_compile", refuse)
+    monkeypatch.setattr(machine_code, "_compile", refuse)
     drive(flow_of(tmp_path, compile=True), line(1), reversed_drive, plans(4, 1))
 
 
 def test_without_a_compiler_the_tick_runs_as_it_is(line, drive, plans, tmp_path, monkeypatch):
-    monkeypatch.setattr(compiled, "has_compiler", lambda: False)
+    monkeypatch.setattr(machine_code, "has_compiler", lambda: False)
     planned = plans(4, 1)
     with pytest.warns(UserWarning, match="compile=true: goes on uncompiled: no C.. compiler"):
         found, _ = drive(flow_of(tmp_path, compile=True), line(1), reversed_drive, planned)

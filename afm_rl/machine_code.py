@@ -43,15 +43,17 @@ class MachineCode:
             given: its tensors.
             model: what it takes after them.
         """
-        key = (function.__name__, model, given[0].dtype, given[0].shape[-1])
+        like = given[0]
+        key = (function.__name__, model, like.dtype, like.device, like.shape[-1])
         code = self.codes.get(key)
         if code is None:
             code = Method(self.owner, function, model)
-            two = [part.reshape(-1, *part.shape[given[0].dim() - 1 :])[:1] for part in given]
+            two = [part.reshape(-1, *part.shape[like.dim() - 1 :])[:1] for part in given]
             two = [part.repeat(2, *[1] * (part.dim() - 1)) for part in two]
-            code = compile_module(code, two, self.cache, traced=model is not None) or code
+            if like.is_cpu:  # machine code is for the processor
+                code = compile_module(code, two, self.cache, traced=model is not None) or code
             self.codes[key] = code
-        return in_one_batch(code, *given)
+        return in_one_batch(code, *(part.contiguous() for part in given))  # as it was compiled for
 
 
 class Method(nn.Module):
@@ -140,7 +142,7 @@ def _compile(
 ) -> None:
     if not has_compiler():
         raise RuntimeError("no C++ compiler was found")
-    print("compiling the correction, once for this robot (about half a minute)", flush=True)
+    print("compiling, once for this robot (a minute or so)", flush=True)
     program = _export(module, inputs) if program is None else program
     path.parent.mkdir(parents=True, exist_ok=True)
     with torch.no_grad(), warnings.catch_warnings():
