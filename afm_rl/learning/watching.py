@@ -63,11 +63,11 @@ class Watching:
     model: Mapping[str, Any] = field(default_factory=lambda: {"hidden": [200, 200]})
     manifold: Manifold | None = None
     seed: int = 0
-    fitted: Ensemble | None = field(default=None, init=False)
+    fitted: Ensemble | None = field(default=None, init=False, repr=False)
     """The model, once it is good enough."""
     report: FitReport | None = field(default=None, init=False)
     """Of the newest fit."""
-    _seen: list[list[Tensor]] = field(default_factory=list, init=False)
+    _seen: list[list[Tensor]] = field(default_factory=list, init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check numbers."""

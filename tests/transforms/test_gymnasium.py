@@ -250,6 +250,7 @@ def test_models_are_learned_from_healthy_steps():
     env = ActionFlowWrapper(Puck(ends=50), Watching(**SMALL))
     told = play(env, 50, hold=1.0)[-1][-1]["afm"]
     assert env.watching.count == 50 and not told["learned"] and env.watching.report is None
+    assert "tensor" not in repr(env.watching)  # of thousands of transitions
     assert (told["planned"] != told["executed"]).any()  # noise, so that actions tell something
     for episode in range(16):
         play(env, 50, episode, hold=1.0)
