@@ -169,7 +169,14 @@ def _report(
     }
     down = [g for i, g in zip(model.others, model.gains, strict=True) if i == DOWN]
     largest = max(coupling, key=lambda name: abs(coupling[name]), default=None)
-    ends = [abs(end) * unit for end in (shape.low, shape.high) if math.isfinite(end)]
+    dead_zone = shape.dead_zone or shape.jump
+    for end, beyond, sign in ((shape.low, low, 1), (-shape.high, -high, -1)):
+        if math.isfinite(end) and 0 < end and -0.1 * end * unit < beyond:
+            # One direction only: what is not followed are the small commands.
+            shift = sign * gain * end * unit
+            dead_zone, offset, offsets = end, offset + shift, offsets + shift
+    limits = [end for end in (shape.low, shape.high) if math.isfinite(end)]
+    ends = [abs(end) * unit for end in limits if abs(end) != dead_zone]
     drift = {}
     for name, value, change in zip(
         ("gain", "offset"), (gain, offset), np.multiply(part.drift, (scale, spread[j])), strict=True
@@ -184,7 +191,7 @@ def _report(
         reversed=bool(gains[1] < 0 and (not down or model.gain + down[0] < 0)),
         offset=float(offset),
         offset_interval=(float(offsets[0]), float(offsets[1])),
-        dead_zone=float((shape.dead_zone or shape.jump) * unit),
+        dead_zone=float(dead_zone * unit),
         saturation=float(np.mean(ends)) if ends else None,
         backlash=float(shape.play * unit),
         stick=float(shape.stick * unit),

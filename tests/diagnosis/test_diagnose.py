@@ -241,6 +241,17 @@ def test_joints_that_turn_all_round_are_healthy():
     assert diagnose(replace(log, command=u, response=y)).healthy
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_commands_of_one_direction_have_a_dead_zone(side):
+    log = log_of([Fault()] * 2, 600, "walk")
+    u = side * np.abs(log.command)
+    y = u + 0.01 * np.random.default_rng(0).standard_normal(u.shape)
+    y[:, 0] -= np.clip(u[:, 0], -0.2, 0.2)
+    sticky, free = diagnose(replace(log, command=u, response=y)).actuators
+    assert re.fullmatch(r"base: no motion for commands below 0\.(2|19\d*|20\d*)", sticky.sentence)
+    assert sticky.saturation is None and free.status == "healthy"
+
+
 def test_a_coarse_sensor_has_no_dead_zone():
     log = log_of([Fault(), Fault()])
     y = log.response.copy()
