@@ -202,7 +202,7 @@ def test_missions_that_end_take_their_rows_along():
 @pytest.mark.parametrize("stop", [2, 3, 5])
 def test_a_snapshot_goes_on_to_the_bit(stop):
     def agent(model, updater):
-        parts = {"env": nn.Module(), "planner": nn.Module()}
+        parts = {"env": nn.Module(), "planner": nn.Module(), "device": torch.device("cpu")}
         return SimpleNamespace(model=model, updater=updater, **parts)
 
     ticks, left = stream(8), torch.tensor([2, 0])
