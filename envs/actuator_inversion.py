@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 from xml.etree import ElementTree
 
 import numpy as np
@@ -245,7 +245,7 @@ def actuator_inversion_task(
         domain, name, nominal, spans = BODIES[task]
         change = partial(stretched, domain) if domain in EDITS else changed_model
         found = dm_control_task(domain, name, change=change)
-        trust(found.world, found.start(0)[0], found.low, found.high)
+        trust(cast(KnownDynamics, found.world), found.start(0)[0], found.low, found.high)
         signs = (1.0, -1.0) if domain in EDITS else (1.0,)
         regime = partial(body_regime, len(found.low), **nominal)
         found = replace(found, contexts=contexts_of(spans, regime, signs, contexts))

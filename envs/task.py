@@ -146,7 +146,8 @@ class Task:
 
     def _models(self, physics: Tensor) -> list[Any]:
         """Return the MuJoCo model of each row ``(N, P)``."""
-        return self.world.step.models(physics.cpu().double().numpy())
+        world: Any = self.world
+        return world.step.models(physics.cpu().double().numpy())
 
     def _rewards(self, physics: Tensor | None, *given: Tensor) -> Tensor:
         """Return the rewards ``(*B)`` in the worlds that there are."""

@@ -35,6 +35,8 @@ class PairCorrector(Corrector):
         place: number of state coordinates that are remembered with a pair.
     """
 
+    is_valid: Tensor
+
     def __init__(
         self,
         action_low: Tensor,
@@ -118,8 +120,9 @@ class ClassicalCorrector(PairCorrector):
     def rows(self, pairs: Tensor) -> Rows:
         """Return pairs as rows."""
         size = self.action_size
-        parts = pairs.split([size, size, size, 1, self.pair_size - 3 * size - 1], -1)
-        return Rows(*parts[:3], (parts[3] > 0).to(pairs))
+        sizes = [size, size, size, 1, self.pair_size - 3 * size - 1]
+        executed, effective, std, valid, _ = pairs.split(sizes, -1)
+        return Rows(executed, effective, std, (valid > 0).to(pairs))
 
     def correct(
         self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor

@@ -188,14 +188,16 @@ def train_flow(
     check_states(states, model)
     generator = torch.Generator().manual_seed(seed)
     device = device_of(model)
-    on_device = tuple(part.to(device) for part in states) if isinstance(states, tuple) else None
-    world = model, regime, on_device or states.to(device)
+    if isinstance(states, tuple):
+        states = states[0].to(device), states[1].to(device)
+    else:
+        states = states.to(device)
 
     def loss() -> Tensor:
-        return flow.training_loss(*world, batch_size, generator)
+        return flow.training_loss(model, regime, states, batch_size, generator)
 
     optimise(list(flow.parameters()), loss, iterations, lr, progress)
-    return flow.held_out_error(*world, 2048, generator)
+    return flow.held_out_error(model, regime, states, 2048, generator)
 
 
 def check_states(states: States, model: DynamicsModel) -> None:

@@ -59,9 +59,9 @@ def pretrain_ensemble(
     check_number("dynamics.pretrain.action_noise", action_noise, low=0.0)
     generator, device = torch.Generator().manual_seed(seed), device_of(model)
     total = samples + samples // 10
-    (low, high), box = ([end.to(device) for end in ends] for ends in (state_box, action_box))
+    low, high, lowest, highest = (end.to(device) for end in (*state_box, *action_box))
     state = teacher.manifold.project(uniform(low, high, total, generator))
-    action = uniform(*box, total, generator)
+    action = uniform(lowest, highest, total, generator)
     factor = 1 + action_noise * (2 * torch.rand(action.shape, generator=generator) - 1)
     factor = factor.to(device)
     with torch.no_grad():

@@ -76,12 +76,13 @@ def pretrain_knode(
     check_count("dynamics.pretrain.seed", seed, low=0)
     generator, device = torch.Generator().manual_seed(seed), device_of(model)
     space, total = model.manifold, flights + -(-flights // 10)
-    (low, high), box = ([end.to(device) for end in ends] for ends in (state_box, action_box))
+    low, high, lowest, highest = (end.to(device) for end in (*state_box, *action_box))
     state = space.project(uniform(low, high, total, generator))
     if regime is not None:
         teacher = Oracle(teacher, regime)
         teacher.set_regime(regime.sample((total,), generator).to(device))
-    path, actions = [state], uniform(*box, ticks * total, generator).split(total)
+    path = [state]
+    actions = uniform(lowest, highest, ticks * total, generator).split(total)
     with torch.no_grad():
         for action in actions:
             path.append(teacher(path[-1], action))
