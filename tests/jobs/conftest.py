@@ -1,4 +1,4 @@
-"""Small configurations, and jobs that are forked from the process of the tests."""
+"""Small configurations."""
 
 import copy
 import functools
@@ -7,8 +7,6 @@ import math
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-
-from afm_rl.jobs import process
 
 
 @functools.cache
@@ -45,9 +43,3 @@ def configure(ring, cache):
         return cfg
 
     return make
-
-
-@pytest.fixture
-def forked(monkeypatch):
-    """Fork jobs, which saves them the imports; the tests of the command line start them anew."""
-    monkeypatch.setattr(process, "START", "fork")

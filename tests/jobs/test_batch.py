@@ -1,5 +1,6 @@
 """Batches: killed at any moment, run again, extended, and with jobs that fail."""
 
+import faulthandler
 import io
 import json
 import multiprocessing
@@ -27,7 +28,6 @@ from afm_rl.jobs.progress import Board
 from afm_rl.jobs.tables import read_missions, read_steps
 from afm_rl.manifest import check_manifest
 
-pytestmark = pytest.mark.usefixtures("forked")
 QUIET = {"echo": lambda line: None}
 SAME = ("missions.csv", "steps.parquet")
 
@@ -104,6 +104,7 @@ def test_folders_that_are_taken(jobs, tmp_path):
 
 
 def test_jobs_that_fail_do_not_take_the_others_down(jobs, tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "START", "fork")  # jobs inherit what is patched
     real = process._finish
 
     def fragile(folder):
@@ -144,6 +145,13 @@ def alive(pid):
     return stat.exists() and stat.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
+def forking_batch(folder, jobs, stacks):
+    """Run a batch that forks its jobs, from a process that has one thread only."""
+    process.START = "fork"
+    faulthandler.register(signal.SIGUSR1, stacks.open("a"))
+    run_batch(folder, jobs, LocalPool(2), **QUIET)
+
+
 @pytest.mark.timeout(600)
 def test_a_batch_killed_twenty_times_gives_the_same_bytes(jobs, tmp_path):
     """Real processes, real SIGKILLs of all of them, at random moments, also inside a save."""
@@ -158,10 +166,10 @@ def test_a_batch_killed_twenty_times_gives_the_same_bytes(jobs, tmp_path):
         assert (whole / "missions.csv").read_bytes() == (broken / "missions.csv").read_bytes()
         assert not [path for path in broken.rglob(".*") if path.name != ".lock"]  # no litter
 
-    context = multiprocessing.get_context("fork")
+    context, stacks = multiprocessing.get_context("forkserver"), tmp_path / "stacks.txt"
     kills = 0
     while kills < 20:
-        batch = context.Process(target=run_batch, args=(broken, two, LocalPool(2)), kwargs=QUIET)
+        batch = context.Process(target=forking_batch, args=(broken, two, stacks))
         batch.start()
         batch.join(chance.uniform(0.2, 0.5))
         if batch.exitcode is not None:  # it came to its end: once more from the beginning
@@ -175,8 +183,11 @@ def test_a_batch_killed_twenty_times_gives_the_same_bytes(jobs, tmp_path):
         batch.join()
         kills += 1
         latest = time.monotonic() + 120  # it may still be starting, on a slow machine
-        while any(map(alive, orphans)):
-            assert time.monotonic() < latest, "an orphan went on"
+        while left := [orphan for orphan in orphans if alive(orphan)]:
+            if time.monotonic() > latest:
+                os.kill(left[0], signal.SIGUSR1)
+                time.sleep(1.0)
+                pytest.fail(f"an orphan went on:\n{stacks.read_text()}")
             time.sleep(0.02)
     assert run_batch(broken, two, LocalPool(2), **QUIET) == {}
     compare()

@@ -22,7 +22,6 @@ SMALL = {
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("forked")
 def test_two_processes_give_the_same_bytes(configure, tmp_path):
     """The first one trains the parts, the second one finds them in the cache."""
     jobs = {}
