@@ -3,8 +3,12 @@
     python examples/policies/tables.py outputs/policies/reacher* --measure return
 
 One line per change, one column per method and kind of training. Means over policies and episodes,
-with 95 % intervals that draw the policies anew, and of each the episodes (hierarchical bootstrap,
-Davison and Hinkley 1997, section 3.8).
+with 95 % intervals that draw policies and episodes anew; all policies fly the same episodes, so
+that those drawn are the same for all (pigeonhole bootstrap, Owen 2007, arXiv 0712.1111).
+
+`--measure recovered`: medians of the steps from the change until the mean reward of 20 steps is
+for good at most a tenth below that of the same policy alone, in the same episode and steps, while
+nothing changes; a tenth of the size of that policy's mean reward in the episode. ∞: never.
 """
 
 from __future__ import annotations
@@ -15,8 +19,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import yaml
+from numpy.lib.stride_tricks import sliding_window_view
 
-DRAWS = 4000
+DRAWS, WINDOW, MISSING = 4000, 20, 0.1
 COLUMNS = {
     "alone": ("physics", False),
     "randomised": ("physics", True),
@@ -35,37 +40,70 @@ def read(folders: list[Path]) -> pd.DataFrame:
         for file in sorted(folder.rglob("config.yaml")):
             if (missions := file.with_name("missions.csv")).is_file():
                 policy = Path(yaml.safe_load(file.read_text())["planner"]["file"]).stem
-                kind = {"policy": policy, "randomised": "randomised" in policy}
-                tables.append(pd.read_csv(missions).assign(**kind))
+                about = {"policy": policy, "randomised": "randomised" in policy, "in": file.parent}
+                tables.append(pd.read_csv(missions).assign(**about))
     return pd.concat(tables).drop_duplicates(["policy", "method", "regime", "seed"], keep="last")
 
 
-def interval(groups: list[np.ndarray]) -> tuple[float, float]:
-    """Return the 95 % interval of the mean over groups of episodes, one group per policy."""
-    rng = np.random.default_rng(0)
-    means = np.stack([rng.choice(g, (DRAWS, len(g))).mean(1) for g in groups], 1)
-    drawn = rng.integers(len(groups), size=(DRAWS, len(groups)))
-    low, high = np.quantile(np.take_along_axis(means, drawn, 1).mean(1), [0.025, 0.975])
-    return float(low), float(high)
+def add_recovered(missions: pd.DataFrame) -> pd.DataFrame:
+    """Return the missions in which something changes, with the steps until they recovered."""
+    flown = {where: pd.read_parquet(where / "steps.parquet") for where in missions["in"].unique()}
+    flown = {where: dict(list(steps.groupby("mission"))) for where, steps in flown.items()}
+    alone = missions[(missions["method"] == "physics") & (missions["regime"] == "nominal")]
+    healthy = {
+        (row["policy"], row["seed"]): flown[row["in"]][row["mission"]]["reward"].to_numpy()
+        for _, row in alone.iterrows()
+    }
+    changed = missions[missions["regime"] != "nominal"]
+    found = [
+        recovered(flown[row["in"]][row["mission"]], healthy[row["policy"], row["seed"]])
+        for _, row in changed.iterrows()
+    ]
+    return changed.assign(recovered=found)
+
+
+def recovered(steps: pd.DataFrame, healthy: np.ndarray) -> float:
+    """Return the steps from the change until the rewards stay near those of a healthy episode."""
+    change = int(np.flatnonzero(np.diff(steps["regime_active"]))[0]) + 1
+    missing = sliding_window_view(healthy - steps["reward"].to_numpy(), WINDOW)[change:].mean(-1)
+    bad = np.flatnonzero(missing > MISSING * abs(healthy.mean()))
+    start = int(bad[-1]) + 1 if len(bad) else 0
+    return float(start) if start < len(missing) else np.inf
+
+
+def middle(values: np.ndarray, measure: str) -> np.ndarray:
+    """Return means over the last two axes, medians of what may be infinite."""
+    if measure != "recovered":
+        return values.mean((-2, -1))
+    return np.quantile(values.reshape(*values.shape[:-2], -1), 0.5, axis=-1, method="lower")
 
 
 def cell(rows: pd.DataFrame, measure: str, digits: int) -> str:
-    groups = [group.dropna().to_numpy() for _, group in rows.groupby("policy")[measure]]
-    groups = [group for group in groups if len(group)]
-    if not groups:
+    """Return the mean and its interval; ``rows`` are those of one change and column."""
+    if rows[measure].isna().all():
         return "–"
-    low, high = interval(groups)
-    mean = np.mean([group.mean() for group in groups])
-    return f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    values = rows.pivot(index="policy", columns="seed", values=measure).dropna(axis=1).to_numpy()
+    rng, (policies, episodes) = np.random.default_rng(0), values.shape
+    drawn = values[
+        rng.integers(policies, size=(DRAWS, policies, 1)),
+        rng.integers(episodes, size=(DRAWS, 1, episodes)),
+    ]
+    ends = np.quantile(middle(drawn, measure), [0.025, 0.975], method="nearest")
+    mean, low, high = (
+        f"{value:.{digits}f}".replace("inf", "∞") for value in (middle(values, measure), *ends)
+    )
+    return f"{mean} [{low}, {high}]"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", type=Path, nargs="+", help="results of afm-rl")
-    parser.add_argument("--measure", default="return", help="return, before, after, ...")
+    parser.add_argument("--measure", default="return", help="return, after, recovered, ...")
     parser.add_argument("--digits", type=int, default=1)
     args = parser.parse_args()
     missions = read(args.folders)
+    if args.measure == "recovered":
+        missions = add_recovered(missions)
     shown = {
         name: missions[(missions["method"] == method) & (missions["randomised"] == randomised)]
         for name, (method, randomised) in COLUMNS.items()
