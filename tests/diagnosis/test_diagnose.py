@@ -59,6 +59,7 @@ def test_healthy_logs_raise_no_alarm(kind):
         assert not [a for a in diagnose(log).actuators if a.status in ("changed", "dead")]
 
 
+@pytest.mark.slow
 def test_gain_intervals_hold_what_they_promise():
     """95 % of 200 logs: with a chance of 95 % each, fewer than 181 have a chance of 0.1 %."""
     inside = 0
@@ -184,6 +185,7 @@ ODD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["white", "walk"])
 def test_faults_that_are_no_number_of_the_model_have_words(kind):
     log = log_of([Fault()] * (1 + len(ODD)), 1200, kind, 0.0, seed=5)
