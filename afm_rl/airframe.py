@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
 
@@ -13,11 +15,12 @@ from afm_rl.errors import ConfigurationError, check_number
 
 @dataclass(frozen=True)
 class QuadrotorBody:
-    r"""A quadrotor in plus configuration; by default a Crazyflie 2.
+    r"""A quadrotor; by default a Crazyflie 2 in plus configuration.
 
     Actions are a wrench :math:`u = (T, M_x, M_y, M_z)` in N and N m, in the body frame. Motors 1
-    to 4 stand on the axes +x, +y, -x, -y at the distance ``arm`` and push with
-    :math:`F_i = k_t \Omega_i^2`; the drag :math:`k_d \Omega_i^2` of neighbours turns opposite ways.
+    to 4 stand at the distance ``arm`` from the centre and push with
+    :math:`F_i = k_t \Omega_i^2`; the drag :math:`k_d \Omega_i^2` of motors 1 and 3 turns the body
+    about +z, that of motors 2 and 4 about -z.
 
     Args:
         mass: mass (kg).
@@ -27,6 +30,7 @@ class QuadrotorBody:
         k_d: drag coefficient (N m s^2/rad^2).
         rotor_speed: highest speed of a rotor (rad/s).
         gravity: acceleration of free fall (m/s^2).
+        motors: direction :math:`\theta_i` of each motor from the centre (degrees), from +x to +y.
 
     Raises:
         ConfigurationError: for a value that cannot be used.
@@ -42,26 +46,28 @@ class QuadrotorBody:
     k_d: float = 7.8e-11
     rotor_speed: float = 2500.0
     gravity: float = 9.81
+    motors: tuple[float, float, float, float] = (0.0, 90.0, 180.0, 270.0)
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name == "inertia":
-                self._check_inertia()
+                row = _row("inertia", value, "three moments of inertia (kg m^2)", 3, low=0.0)
+                object.__setattr__(self, "inertia", row)
+            elif field.name == "motors":
+                row = _row("motors", value, "the directions of four motors (degrees)", 4)
+                object.__setattr__(self, "motors", row)
             else:
                 above = field.name != "gravity"
                 check_number(f"body.{field.name}", value, low=0.0, open_low=above)
 
-    def _check_inertia(self) -> None:
-        given = list(self.inertia) if isinstance(self.inertia, (tuple, list)) else []
-        if len(given) != 3:
-            raise ConfigurationError(
-                f"body.inertia={self.inertia!r}: expected three moments of inertia (kg m^2)"
-            )
-        for value in given:
-            check_number("body.inertia", value, low=0.0, open_low=True)
-        # A tuple, whatever sequence was given: bodies are keys of caches.
-        object.__setattr__(self, "inertia", tuple(float(value) for value in given))
+    @property
+    def levers(self) -> tuple[list[float], list[float]]:
+        """Moments about x and about y (N m) of a thrust of 1 N of each motor."""
+        angles = [math.radians(angle) for angle in self.motors]
+        # Rounded: the sine of 180 degrees is zero.
+        about_x = [self.arm * round(math.sin(angle), 15) for angle in angles]
+        return about_x, [-self.arm * round(math.cos(angle), 15) for angle in angles]
 
     @property
     def max_force(self) -> float:
@@ -81,14 +87,30 @@ class QuadrotorBody:
     @property
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Lowest and highest value of each action component; not all of them go together."""
-        roll, yaw = self.arm * self.max_force, 2 * self.k_d / self.k_t * self.max_force
-        return (0.0, -roll, -roll, -yaw), (self.max_thrust, roll, roll, yaw)
+        yaw = 2 * self.k_d / self.k_t * self.max_force
+        low, high = (
+            [sum(clip(lever, 0.0) for lever in row) * self.max_force for row in self.levers]
+            for clip in (min, max)
+        )
+        return (0.0, *low, -yaw), (self.max_thrust, *high, yaw)
+
+
+def _row(
+    name: str, given: Sequence[float], expected: str, size: int, low: float = -math.inf
+) -> tuple[float, ...]:
+    """Return numbers as a tuple, whatever sequence was given: bodies are keys of caches."""
+    if not isinstance(given, (tuple, list)) or len(given) != size:
+        raise ConfigurationError(f"body.{name}={given!r}: expected {expected}")
+    return tuple(
+        float(check_number(f"body.{name}", value, low=low, open_low=True)) for value in given
+    )
 
 
 def mix(forces: Tensor, body: QuadrotorBody) -> Tensor:
     r"""Return the wrench ``(*B, 4)`` of motor forces ``(*B, 4)`` in N.
 
-    .. math:: T = \sum_i F_i,\quad M_x = L (F_2 - F_4),\quad M_y = L (F_3 - F_1),\quad
+    .. math:: T = \sum_i F_i,\quad M_x = L \sum_i F_i \sin \theta_i,\quad
+              M_y = -L \sum_i F_i \cos \theta_i,\quad
               M_z = \tfrac{k_d}{k_t} (F_1 - F_2 + F_3 - F_4)
 
     >>> mix(torch.tensor([0.1, 0.2, 0.1, 0.0]), QuadrotorBody()).round(decimals=4)
@@ -128,8 +150,8 @@ def _through(matrix: Tensor, vector: Tensor) -> Tensor:
 @lru_cache(maxsize=64)
 def _mixers(body: QuadrotorBody, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return the mixer and its inverse, ``(4, 4)`` each."""
-    arm, drag = body.arm, body.k_d / body.k_t
-    rows = [[1.0] * 4, [0.0, arm, 0.0, -arm], [-arm, 0.0, arm, 0.0], [drag, -drag, drag, -drag]]
+    drag = body.k_d / body.k_t
+    rows = [[1.0] * 4, *body.levers, [drag, -drag, drag, -drag]]
     with torch.inference_mode(False):  # what is cached must also serve training
         mixer = torch.tensor(rows, dtype=torch.float64, device="cpu")
         return mixer.to(device, dtype), mixer.inverse().to(device, dtype)

@@ -8,6 +8,7 @@ from afm_rl.envs.mission_noise import MissionNoise
 from afm_rl.envs.missions import MissionFormat
 from afm_rl.envs.quadrotor import CrazyflieTrack
 from afm_rl.envs.quadrotor_gym import CrazyflieTrackGym
+from afm_rl.envs.quadrotor_rotorpy import RotorPyTrack, rotorpy_crazyflie
 from afm_rl.envs.references import (
     Circle,
     FigureEight,
@@ -41,6 +42,7 @@ __all__ = [
     "MissionFormat",
     "MissionNoise",
     "Reference",
+    "RotorPyTrack",
     "Table",
     "Task",
     "TaskEnv",
@@ -62,6 +64,7 @@ __all__ = [
     "load_track",
     "mujoco_task",
     "function_task",
+    "rotorpy_crazyflie",
     "schedule_in_seconds",
     "skid_steer",
 ]

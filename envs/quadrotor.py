@@ -112,6 +112,7 @@ class CrazyflieTrack(MissionEnv):
     """
 
     simulation: QuadrotorSimulation
+    plant: type[QuadrotorSimulation] = QuadrotorSimulation
 
     def __init__(
         self,
@@ -157,7 +158,7 @@ class CrazyflieTrack(MissionEnv):
         preview = check_flag("preview", preview)
         if start is None:
             start = "moving" if preview else "rest"
-        self.simulation = QuadrotorSimulation(
+        self.simulation = self.plant(
             references=self.references,
             regime=check_regime(regime, lambda: flight_regimes(self.body), 13, 4),
             schedule=schedule,

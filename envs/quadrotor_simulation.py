@@ -79,12 +79,8 @@ class QuadrotorSimulation(PhasedSimulation):
             actuator: standard normal numbers for a noisy regime, ``(*B, 4)``.
         """
         mission, pose, step = data["mission"], data["pose"], data["step"]
-        past = data["past"] if self.regime.history else None
         action = saturate(data["action"].to(pose.dtype), self.body)
-        parameters = self.regime_now(mission, data)
-        effective = self.regime.apply(action, parameters, pose, past, actuator)
-        wind = wind_of(self.regime, parameters)
-        path = quadrotor_path(pose, effective, self.dt, self.substeps, self.body, wind)
+        path, plant = self.flown(data, action, self.regime_now(mission, data), actuator)
 
         # The published metric compares with the reference one plant step ahead of the state.
         ahead = torch.arange(2, self.substeps + 2, device=pose.device) * (self.dt / self.substeps)
@@ -95,7 +91,9 @@ class QuadrotorSimulation(PhasedSimulation):
         frozen = lost.unsqueeze(-1)
         miss = torch.where(frozen.unsqueeze(-1), wanted - pose[..., None, :3], miss)
 
-        state = {"pose": torch.where(frozen, pose, path[-1]), "step": step + 1, "lost": lost}
+        moved = {"pose": path[-1], **plant}
+        state = {name: torch.where(frozen, data[name], value) for name, value in moved.items()}
+        state.update(step=step + 1, lost=lost)
         state = self.followed(mission, data, state, action)
         out = self.describe(mission, state, sensor)
         if self.trace:
@@ -109,6 +107,22 @@ class QuadrotorSimulation(PhasedSimulation):
         out["truncated"] = (state["step"] >= self.steps).unsqueeze(-1)
         out["done"] = out["terminated"] | out["truncated"]
         return out
+
+    def flown(
+        self, data: TensorDictBase, action: Tensor, parameters: Tensor, noise: Tensor | None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the state after each plant step, and what the plant remembers beside it.
+
+        Args:
+            data: as for :meth:`advance`.
+            action: wrench that the motors are asked for, ``(*B, 4)``.
+            parameters: of the regime, ``(*B, F)``.
+            noise: standard normal numbers for a noisy regime, ``(*B, 4)``.
+        """
+        pose, past = data["pose"], data["past"] if self.regime.history else None
+        effective = self.regime.apply(action, parameters, pose, past, noise)
+        wind = wind_of(self.regime, parameters)
+        return quadrotor_path(pose, effective, self.dt, self.substeps, self.body, wind), {}
 
     def describe(
         self, mission: TensorDictBase, state: dict[str, Tensor], sensor: Tensor | None = None

@@ -137,6 +137,8 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
             action_low=robot.action_low,
             action_high=robot.action_high,
         )
+    if robot.reported is not None:
+        check_choice("robot.reported", robot.reported, env.full_observation_spec.keys())
     robot.metrics.check(env, robot.goal_names)
     missions = build_missions(env, tracks, regimes, seeds)
 
@@ -164,7 +166,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     if hasattr(planner, "signature"):  # a file: its name does not tell what it holds
         trainings = [t._replace(settings=[*t.settings, planner.signature]) for t in trainings]
     guard = Guard()
-    executed_key = ("next", guard.key("executed_action"))
+    executed_key = ("next", robot.reported or guard.key("executed_action"))
     loss = GaussianNLLLoss(model)
     loss.set_keys(action=executed_key)
     given = settings["updater"]

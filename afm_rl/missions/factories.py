@@ -182,10 +182,10 @@ def afm(
     place, scale = list(robot.place), robot.place_scale
     flow = ActionFlow(*robot.action_box, place=place, place_scale=scale, **settings)
     if train is None and checkpoint is None:
-        return Part(_transform(dynamics, flow, enabled, extend_action_box))
+        return Part(_transform(robot, dynamics, flow, enabled, extend_action_box))
     own: dict[str, Any] = {k: v for k, v in settings.items() if k in ("hypotheses", "rows")}
     training = _training(flow, robot, dynamics, train or {}, checkpoint, own, FLOW_UNIT)
-    return Part(_transform(dynamics, flow, enabled, extend_action_box), training)
+    return Part(_transform(robot, dynamics, flow, enabled, extend_action_box), training)
 
 
 def paper_flow(
@@ -211,7 +211,7 @@ def paper_flow(
     flow = PaperFlow(*robot.action_box, features=features, state_size=size, **settings)
     own = _without(settings, "gate", "steps", "error_action", "wrap", "latch")
     training = _training(flow, robot, dynamics, train, checkpoint, own, "action units")
-    return Part(_transform(dynamics, flow, enabled, extend_action_box), training)
+    return Part(_transform(robot, dynamics, flow, enabled, extend_action_box), training)
 
 
 def least_squares(
@@ -223,7 +223,7 @@ def least_squares(
 ) -> Part:
     """Return the transform with least squares with forgetting, which need no training."""
     corrector = LeastSquares(*robot.action_box, **settings)
-    return Part(_transform(dynamics, corrector, enabled, extend_action_box))
+    return Part(_transform(robot, dynamics, corrector, enabled, extend_action_box))
 
 
 def l1(
@@ -236,14 +236,18 @@ def l1(
     """Return the transform with L1 adaptive augmentation, which needs no training."""
     settings["dt"] = robot.dt if settings.get("dt") is None else settings["dt"]
     corrector = L1Augmentation(*robot.action_box, **settings)
-    return Part(_transform(dynamics, corrector, enabled, extend_action_box))
+    return Part(_transform(robot, dynamics, corrector, enabled, extend_action_box))
 
 
 def _transform(
-    dynamics: Part, corrector: Corrector, enabled: bool, extend_action_box: bool
+    robot: Robot, dynamics: Part, corrector: Corrector, enabled: bool, extend_action_box: bool
 ) -> ActionFlowTransform:
     return ActionFlowTransform(
-        dynamics.module, corrector, enabled=enabled, extend_action_box=extend_action_box
+        dynamics.module,
+        corrector,
+        enabled=enabled,
+        extend_action_box=extend_action_box,
+        reported_key=robot.reported,
     )
 
 

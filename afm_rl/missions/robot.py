@@ -62,6 +62,8 @@ class Robot:
         reward_reads: entries of the environment that it reads after the states, with their sizes.
         observe: what a policy sees of states ``(*B, S)``, ``(*B, O)``; the states if None.
         dt: time of an action (s), for correctors that are not told.
+        reported: entry of the environment with the action that its actuators gave in a step, if
+            that is not what they were sent; what learns and corrects then reads this one.
         data: how transitions are collected from which models are learned; None where these are
             drawn from the nominal physics, in the boxes above.
     """
@@ -92,6 +94,7 @@ class Robot:
     reward_reads: Mapping[str, int] = field(default_factory=dict)
     observe: Callable[[Tensor], Tensor] | None = None
     dt: float | None = None
+    reported: str | None = None
     data: Collection | None = None
 
     def __post_init__(self) -> None:

@@ -55,6 +55,8 @@ class ActionFlowTransform(Transform):
         enabled: False to watch only.
         extend_action_box: let planners know of effects beyond the action box, if the model can
             predict them.
+        reported_key: where the environment reports the action ``(*B, A)`` that its actuators gave
+            in a step, if that is known and not what they were sent: motors that lag.
 
     Raises:
         ConfigurationError: for parts that do not fit each other, also when it is put around an
@@ -80,6 +82,7 @@ class ActionFlowTransform(Transform):
         prefix: NestedKey = "afm",
         enabled: bool = True,
         extend_action_box: bool = True,
+        reported_key: NestedKey | None = None,
     ) -> None:
         states = _one_key("in_keys", ["observation"] if in_keys is None else in_keys)
         actions = _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv)
@@ -91,6 +94,7 @@ class ActionFlowTransform(Transform):
         self.prefix = as_key(prefix)
         self.enabled = check_flag("transform.enabled", enabled)
         self.extend_action_box = check_flag("transform.extend_action_box", extend_action_box)
+        self.reported_key = None if reported_key is None else as_key(reported_key)
 
     @property
     def observation_key(self) -> NestedKey:
@@ -155,8 +159,13 @@ class ActionFlowTransform(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         entries = dict(tensordict.get(self.prefix).items())
-        state = next_tensordict.get(self.observation_key).to(entries["memory"].dtype)
-        entries["memory"] = self.corrector.observe(entries["memory"], state)
+        memory = entries["memory"]
+        if self.reported_key is not None:
+            _, planned, _ = self.corrector.latest(memory)
+            reported = next_tensordict.get(self.reported_key).to(memory.dtype)
+            memory = self.corrector.executing(memory, planned, reported)
+        state = next_tensordict.get(self.observation_key).to(memory.dtype)
+        entries["memory"] = self.corrector.observe(memory, state)
         # Of the device that the next tensordict names: else every entry is moved to where it is.
         device, batch = next_tensordict.device, next_tensordict.batch_size
         return next_tensordict.set(self.prefix, TensorDict(entries, batch, device=device))

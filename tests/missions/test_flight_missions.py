@@ -212,3 +212,21 @@ def test_before_it_learns_a_model_shares_the_flow_of_the_physics(configure):
     agents = [build(configure("robot=quadrotor", f"method={method}", **same)) for method in methods]
     first, *others, offline = [agent.trainings[-1].settings for agent in agents]
     assert others == [first, first] and offline != first
+
+
+def test_correctors_learn_from_what_the_motors_gave(drive):
+    pytest.importorskip("rotorpy")
+    settings = {"robot.schedule.times": [0.1], "robot.env.substeps": 1, "budget": 8}
+    regimes = [{"mass": 0.5}]
+    flown = drive("robot=quadrotor_rotorpy", "method=afm_physics", regimes=regimes, **settings)
+    assert flown.agent.executed_key == ("next", "wrench")
+    assert flown.missions["steps"].eq(7).all()
+    # A lag: sent is what is planned, and given is less of each change.
+    thrust = flown.steps[["planned_thrust", "executed_thrust"]].to_numpy()
+    assert thrust[4:, 0].min() < thrust[4:, 1].min()
+
+
+def test_what_is_reported_must_be_an_entry(drive):
+    pytest.importorskip("rotorpy")
+    with pytest.raises(ConfigurationError, match="robot.reported='speeds': expected one of"):
+        drive("robot=quadrotor_rotorpy", "method=afm_physics", **{"robot.reported": "speeds"})
