@@ -82,6 +82,7 @@ class ICEM(SamplingPlanner):
         memory_key: where ``mean`` ``(*B, H, A)`` and ``elites`` ``(*B, k, H, A)`` are kept; with
             ``hold`` above 1 also ``held`` ``(*B, A + 1)``, an action and how long it lasts.
         seed_key: entry ``(*B)`` with each mission's seed.
+        box_key: entry with the lowest and highest action to plan with.
         action_key: where the action goes.
         seed: seed of the noise without ``seed_key``.
 
@@ -95,9 +96,6 @@ class ICEM(SamplingPlanner):
     >>> env.rollout(3, planner)["action"].shape
     torch.Size([3, 2])
     """
-
-    scale: Tensor
-    middle: Tensor
 
     def __init__(
         self,
@@ -115,6 +113,7 @@ class ICEM(SamplingPlanner):
         backend: str | None = None,
         memory_key: NestedKey = "icem",
         seed_key: NestedKey | None = None,
+        box_key: NestedKey | None = None,
         action_key: NestedKey = "action",
         seed: int = 0,
     ) -> None:
@@ -136,6 +135,7 @@ class ICEM(SamplingPlanner):
             iterations,
             backend=backend,
             seed_key=seed_key,
+            box_key=box_key,
             action_key=action_key,
             seed=seed,
             hold=hold,
@@ -151,7 +151,6 @@ class ICEM(SamplingPlanner):
         self.momentum = check_number("planner.momentum", momentum, low=0.0, high=1.0)
         space = self.action_spec.space
         self.register_buffer("scale", self.sigma * (space.high - space.low) / 2)
-        self.register_buffer("middle", (space.low + space.high) / 2)
 
     @property
     def counts(self) -> list[int]:
@@ -189,8 +188,9 @@ class ICEM(SamplingPlanner):
         """Return the action, the mean plan and the elites that are kept."""
         mean, elites = (torch.cat([x[..., 1:, :], x[..., -1:, :]], -2) for x in (mean, elites))
         new = (elites == 0).flatten(-3).all(-1) & (mean == 0).flatten(-2).all(-1)
-        mean = torch.where(new[..., None, None], self.middle, mean)
-        space, std = self.action_spec.space, self.scale.expand_as(mean)
+        low, high, scale = self._box(td)
+        mean = torch.where(new[..., None, None], (low + high) / 2, mean)
+        std = scale.expand_as(mean)
         best, found = mean, ~new  # which missions have elites
         for i, count in enumerate(self.counts):
             noise = coloured(self._noise(td, mean, count), self.beta)
@@ -200,7 +200,7 @@ class ICEM(SamplingPlanner):
             )
             if i == self.iterations - 1:
                 plans[..., self.kept, :, :] = mean
-            plans = torch.minimum(torch.maximum(plans, space.low), space.high)
+            plans = torch.minimum(torch.maximum(plans, low.unsqueeze(-2)), high.unsqueeze(-2))
             returns = self._returns(td, plans)
             finite = returns.isfinite()
             if not all_hold(finite):

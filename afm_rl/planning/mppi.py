@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +160,7 @@ class MPPI(SamplingPlanner):
             iterations,
             backend=backend,
             seed_key=seed_key,
+            box_key=box_key,
             action_key=action_key,
             seed=seed,
         )
@@ -169,9 +169,6 @@ class MPPI(SamplingPlanner):
         self.beta = check_number("planner.beta", beta, low=0.0, high=1.0, open_low=True)
         self.noise = check_choice("planner.noise", noise, ("scaled", "unit"))
         self.past = check_choice("planner.past", past, ("previous", "shifted"))
-        self.box_key = None if box_key is None else as_key(box_key)
-        if self.box_key is not None:
-            self.in_keys.append(self.box_key)
         self.compiles = check_flag("planner.compile", compile)
         self.__dict__["_machine_code"] = MachineCode(self, cache)
         space = self.action_spec.space
@@ -198,26 +195,6 @@ class MPPI(SamplingPlanner):
             else:
                 best = self._blend(self._returns(td, plans), plans, best)
         return best[..., 0, :], [best]
-
-    def _box(self, td: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
-        """Return lowest and highest action and the noise's size, ``(*B, 1, A)`` or ``(A,)``."""
-        space = self.action_spec.space
-        box = None if self.box_key is None else td.get(self.box_key, None)
-        if box is None:
-            if self.box_key is not None:
-                warnings.warn(
-                    f"planner.box_key={self.box_key!r}: the tensordict has no such entry, so plans "
-                    "keep to the action's own bounds",
-                    stacklevel=2,
-                )
-            return space.low, space.high, self.scale
-        low, high = box.unsqueeze(-3).unbind(-2)
-        return low, high, self.scale * (high - low) / (space.high - space.low)
-
-    def _allowed(self, action: Tensor, td: TensorDictBase) -> Tensor:
-        low, high, _ = self._box(td)
-        wide = action.unsqueeze(-2)
-        return torch.minimum(torch.maximum(wide, low), high).squeeze(-2)
 
     @property
     def _as_machine_code(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -30,6 +31,9 @@ class SamplingPlanner(RecedingHorizonPlanner):
             takes the fast way where there is one. Both give the same plans.
         seed_key: entry ``(*B)`` with each mission's seed: missions of one seed share their
             noise whoever else is in the batch. Without it noise is drawn for the batch.
+        box_key: entry ``(*B, 2, A)`` with the lowest and highest action to plan with, such as the
+            ``effect_bounds`` of :class:`~afm_rl.transforms.ActionFlowTransform`; the action's own
+            bounds, with a warning, where there is none.
         action_key: where the action goes.
         seed: seed of the noise without ``seed_key``.
         hold: steps that each action of a plan lasts.
@@ -37,6 +41,8 @@ class SamplingPlanner(RecedingHorizonPlanner):
     Returns that are not finite are ignored and counted in :attr:`discarded`; where all are,
     the shifted plan stands and a warning is given.
     """
+
+    scale: Tensor  # standard deviation of the first noise, per action
 
     def __init__(
         self,
@@ -47,6 +53,7 @@ class SamplingPlanner(RecedingHorizonPlanner):
         iterations: int,
         backend: str | None = None,
         seed_key: NestedKey | None = None,
+        box_key: NestedKey | None = None,
         action_key: NestedKey = "action",
         seed: int = 0,
         hold: int = 1,
@@ -67,6 +74,9 @@ class SamplingPlanner(RecedingHorizonPlanner):
         self.in_keys = [*env.observation_spec.keys(True, True), *self.memory]
         if self.seed_key is not None:
             self.in_keys.append(self.seed_key)
+        self.box_key = None if box_key is None else as_key(box_key)
+        if self.box_key is not None:
+            self.in_keys.append(self.box_key)
         self.streams = Streams(salt=1, seed=check_count("planner.seed", seed, low=0))
         self.discarded = 0
 
@@ -82,6 +92,26 @@ class SamplingPlanner(RecedingHorizonPlanner):
             device=like.device,
             dtype=like.dtype,
         )
+
+    def _box(self, td: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        """Return lowest and highest action and the noise's size, ``(*B, 1, A)`` or ``(A,)``."""
+        space = self.action_spec.space
+        box = None if self.box_key is None else td.get(self.box_key, None)
+        if box is None:
+            if self.box_key is not None:
+                warnings.warn(
+                    f"planner.box_key={self.box_key!r}: the tensordict has no such entry, so plans "
+                    "keep to the action's own bounds",
+                    stacklevel=2,
+                )
+            return space.low, space.high, self.scale
+        low, high = box.unsqueeze(-3).unbind(-2)
+        return low, high, self.scale * (high - low) / (space.high - space.low)
+
+    def _allowed(self, action: Tensor, td: TensorDictBase) -> Tensor:
+        low, high, _ = self._box(td)
+        wide = action.unsqueeze(-2)
+        return torch.minimum(torch.maximum(wide, low), high).squeeze(-2)
 
     def _returns(self, td: TensorDictBase, plans: Tensor) -> Tensor:
         """Return the return ``(*B, N)`` of each plan ``(*B, N, H, A)``, whose actions are held."""
