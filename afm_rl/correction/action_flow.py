@@ -211,6 +211,12 @@ class ActionFlow(PairCorrector):
         idle = self.executing(memory, planned, planned, innovation > self.gate)
         return memory, innovation, idle
 
+    def reported(self, memory: Tensor, given: Tensor) -> Tensor:
+        """Return the memory with forecasts moved by what was given more than sent."""
+        parts = self.unpack(super().reported(memory, given), self.states_in(memory))
+        more = self.normalise(given - self.latest(memory)[2])
+        return self.pack({**parts, "forecasts": parts["forecasts"] + more.unsqueeze(-2)})
+
     def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
         """Return the memory with the transition to ``next_state`` ``(*B, S)``."""
         if not self._as_machine_code:

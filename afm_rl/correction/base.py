@@ -196,6 +196,11 @@ class Corrector(nn.Module, ABC):
             first += 1
         return torch.cat([*parts, memory[..., first:]], -1)
 
+    def reported(self, memory: Tensor, given: Tensor) -> Tensor:
+        """Return the memory if actuators gave ``given`` ``(*B, A)`` of what they were sent."""
+        _, planned, _ = self.latest(memory)
+        return self.executing(memory, planned, given)
+
     def unpack(self, memory: Tensor, state_size: int) -> Fields:
         """Return the parts of a memory."""
         names, sizes, shapes = self._layout(state_size)

@@ -7,6 +7,7 @@ from afm_rl.planning.law import LawPlanner
 from afm_rl.planning.mpc import MPC
 from afm_rl.planning.mppi import MPPI
 from afm_rl.planning.planning_env import PlanningEnv
+from afm_rl.planning.raptor import Raptor
 from afm_rl.planning.shooting import CEM, TorchRLMPPI
 from afm_rl.planning.stored_policy import PolicyPlanner, StoredPolicy, load_policy, save_policy
 from afm_rl.planning.tracking import QuadraticCost, TrackingCost
@@ -24,6 +25,7 @@ __all__ = [
     "PlanningEnv",
     "PolicyPlanner",
     "QuadraticCost",
+    "Raptor",
     "StoredPolicy",
     "TorchRLMPPI",
     "TrackingCost",

@@ -161,9 +161,8 @@ class ActionFlowTransform(Transform):
         entries = dict(tensordict.get(self.prefix).items())
         memory = entries["memory"]
         if self.reported_key is not None:
-            _, planned, _ = self.corrector.latest(memory)
-            reported = next_tensordict.get(self.reported_key).to(memory.dtype)
-            memory = self.corrector.executing(memory, planned, reported)
+            given = next_tensordict.get(self.reported_key).to(memory.dtype)
+            memory = self.corrector.reported(memory, given)
         state = next_tensordict.get(self.observation_key).to(memory.dtype)
         entries["memory"] = self.corrector.observe(memory, state)
         # Of the device that the next tensordict names: else every entry is moved to where it is.

@@ -1,0 +1,84 @@
+"""RAPTOR, a published policy for any quadrotor, in the place of a planner."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from afm_rl.airframe import QuadrotorBody, mix
+from afm_rl.dynamics.quadrotor import check_body
+from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.planning.planning_env import PlanningEnv
+from afm_rl.planning.receding import RecedingHorizonPlanner
+from afm_rl.rotations import quaternion_conjugate, rotate
+
+HIDDEN = 16  # numbers of its recurrent layer
+MOTORS = (-45.0, -135.0, 135.0, 45.0)  # directions of its motors, degrees
+
+
+class Raptor(RecedingHorizonPlanner):
+    """RAPTOR (Eschmann et al. 2026): 2084 weights that adapt to a quadrotor while they fly it.
+
+    It knows no model. It sees the errors of position and velocity, the attitude, the body rate
+    and its last action, and sets the speeds of four motors between none and the highest; the
+    action is what a healthy body makes of these. It was trained with ticks of 10 ms.
+
+    Args:
+        env: the planning environment: where state and action are, the action's box.
+        body: the quadrotor whose motors are asked, in cross configuration.
+        horizon: ticks N by which the reference looks ahead; RAPTOR sees the present alone.
+        reference_key: position and velocity to have, now first, ``(*B, N + 1, 6)``.
+        prefix: where its memory is kept.
+
+    Raises:
+        ConfigurationError: for another body, or if the package foundation-policy is missing.
+    """
+
+    def __init__(
+        self,
+        env: PlanningEnv,
+        body: QuadrotorBody | None = None,
+        horizon: int = 1,
+        reference_key: NestedKey = "reference",
+        prefix: NestedKey = "raptor",
+    ) -> None:
+        super().__init__(env, {(prefix, "hidden"): (HIDDEN,), (prefix, "last"): (4,)})
+        try:
+            from foundation_policy import Raptor as published
+        except ImportError as error:
+            raise ConfigurationError(
+                "planner=raptor: the package foundation-policy is missing; install afm-rl[rotorpy]"
+            ) from error
+        self.body, self.reference_key = check_body(body), reference_key
+        if sorted(self.body.motors) != sorted(MOTORS):
+            raise ConfigurationError(
+                f"planner.body: motors at {list(self.body.motors)} degrees: expected "
+                f"{list(MOTORS)}, in any order; choose robot=quadrotor_rotorpy"
+            )
+        self.stages = check_count("planner.horizon", horizon) + 1
+        self.order = [MOTORS.index(angle) for angle in self.body.motors]
+        self.observation_key = env.observation_key
+        self.in_keys = [self.observation_key, self.reference_key, *self.memory]
+        self.policy = published()
+        self.policy.reset()
+
+    def _plan(self, td: TensorDictBase) -> tuple[Tensor, Sequence[Tensor]]:
+        state, wanted = td.get(self.observation_key), td.get(self.reference_key)
+        hidden, last = self._recall(td)
+        miss = state[..., :6] - wanted.reshape(*td.batch_size, -1, 6)[..., 0, :]
+        # Rows of R' are the world's axes seen by the body: its columns are R's rows.
+        axes = torch.eye(3, dtype=state.dtype, device=state.device)
+        seen = rotate(quaternion_conjugate(state[..., 6:10]).unsqueeze(-2), axes)
+        parts = [miss[..., :3], seen.flatten(-2), miss[..., 3:], state[..., 10:], last]
+        numbers = torch.cat(parts, -1).reshape(-1, 22).cpu().numpy()
+        recurrent = self.policy.layers[1]
+        recurrent.state = hidden.reshape(-1, HIDDEN).cpu().numpy()
+        asked = torch.from_numpy(self.policy.evaluate_step(numbers)).to(last)
+        asked = asked.clamp(-1.0, 1.0).reshape(last.shape)
+        hidden = torch.from_numpy(recurrent.state).to(hidden).reshape(hidden.shape)
+        self.policy.reset()  # what it remembers is in the tensordict alone
+        speeds = self.body.rotor_speed * (asked[..., self.order] + 1) / 2
+        return mix(self.body.k_t * speeds.square(), self.body), [hidden, asked]
