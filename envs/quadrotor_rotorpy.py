@@ -134,7 +134,8 @@ class RotorPyTrack(CrazyflieTrack):
 
     Its Crazyflie has motors that lag by 72 ms, rotors with drag, and wind that acts through that
     drag: ``wind_x``, ``wind_y`` and ``wind_z`` are its speed (m/s) here. Masses, loads, moments of
-    inertia and motors change in RotorPy's vehicle itself. RotorPy computes on the CPU. Observation and action are those of :class:`CrazyflieTrack`. Two entries more:
+    inertia and motors change in RotorPy's vehicle itself. RotorPy computes on the CPU. Observation
+    and action are those of :class:`CrazyflieTrack`. Two entries more:
 
     ========== ============ =================================================================
     ``wrench`` ``(*B, 4)``  what healthy motors give at the speeds that the rotors had in the

@@ -61,8 +61,8 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "planner=law": ["robot=gusty_pendulum"],
     "planner=geometric": ["robot=quadrotor"],
     "planner=geometric_soft": ["robot=quadrotor"],
-    "planner=raptor": ["robot=quadrotor_rotorpy"],
-    "method=raptor": ["robot=quadrotor_rotorpy"],
+    "planner=raptor": ["robot=quadrotor_rotorpy_10ms"],
+    "method=raptor": ["robot=quadrotor_rotorpy_10ms"],
     "method=geometric": ["robot=quadrotor"],
     "method=mass_estimator": ["robot=quadrotor"],
     "method=offline_knode": ["robot=quadrotor"],
@@ -157,7 +157,8 @@ def test_a_method_chooses_three_parts_and_nothing_else(method):
     loaded = OmegaConf.create(text)
     assert list(loaded) == ["defaults"]
     parts = [next(iter(entry)).removeprefix("override /") for entry in loaded.defaults]
-    planner = ["planner"] if method == "geometric" else []  # which is a planner of its own
+    own = method in ("geometric", "raptor")  # which are planners of their own
+    planner = ["planner"] if own else []
     assert parts == ["dynamics", "updater", "corrector", *planner]
 
 

@@ -25,16 +25,18 @@ LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 @pytest.mark.parametrize("method", METHODS)
 def test_planner_transform_and_updater_share_one_model(configure, no_training, method):
     flies = ["robot=quadrotor"] if "knode" in method or method in FLIERS else []
-    cfg = configure(f"method={method}", *flies)
+    reports = method == "raptor"  # of a robot that tells what its motors gave
+    cfg = configure(f"method={method}", *(["robot=quadrotor_rotorpy_10ms"] if reports else flies))
     agent = build(cfg)
     assert agent.label == method
-    if method != "geometric":  # which has no use for a model
+    if method not in ("geometric", "raptor"):  # which have no use for a model
         assert agent.planner.env.dynamics is agent.model
     assert agent.updater.loss.model is agent.model
     assert (agent.transform is None) == cfg.corrector._target_.endswith("no_correction")
     if agent.transform is not None:
         assert agent.transform.model is agent.model
-    assert unravel_key(agent.executed_key) == ("next", "guard", "executed_action")
+    executed = ("wrench",) if reports else ("guard", "executed_action")
+    assert unravel_key(agent.executed_key) == ("next", *executed)
     models = [part.module for part in agent.trainings if part.title in ("ensemble", "KNODE")]
     calibrated = "base" in cfg.dynamics
     trained, settings = (

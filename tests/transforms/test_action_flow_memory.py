@@ -5,7 +5,8 @@ import warnings
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import Compose, SerialEnv, StepCounter, TransformedEnv
+from torchrl.data import Unbounded
+from torchrl.envs import Compose, SerialEnv, StepCounter, Transform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from afm_rl.dynamics import Dubins
@@ -76,6 +77,39 @@ def test_it_holds_the_latest_transitions_oldest_first(make, remembered):
         torch.testing.assert_close(now["planned"][:, -held:], past["action"])
         executed = past["next", "afm", "executed_action"]
         torch.testing.assert_close(now["executed"][:, -held:], executed)
+
+
+class Reports(Transform):
+    """Actuators that gave other actions than they were sent, and say so."""
+
+    def _step(self, tensordict, next_tensordict):
+        return next_tensordict.set("given", torch.full_like(tensordict["action"], 0.3))
+
+    def _reset(self, tensordict, tensordict_reset):
+        return tensordict_reset.set("given", torch.zeros(*tensordict_reset.batch_size, 2))
+
+    def transform_observation_spec(self, observation_spec):
+        observation_spec["given"] = Unbounded((*observation_spec.shape, 2))
+        return observation_spec
+
+
+def test_it_remembers_what_actuators_report(small_flow, remembered):
+    """And forecasts of what was sent count as forecasts of what was given."""
+    flow, base = small_flow(hypotheses=HYPOTHESES), UGVTrack(batch_size=[4])
+    transform = ActionFlowTransform(Dubins(), flow, reported_key="given")
+    env = TransformedEnv(base, Compose(Reports(), transform))
+    td = env.reset()
+    td["action"] = torch.full((4, 2), 0.5)
+    now = env.step(td)["next"]
+    held = remembered(flow, now["afm"])["executed"][:, -1]
+    torch.testing.assert_close(held, torch.full((4, 2), 0.3))
+    assert torch.equal(now["afm", "executed_action"], torch.full((4, 2), 0.5))
+
+    sent = flow.executing(td["afm", "memory"], td["action"], td["action"])
+    moved = flow.unpack(flow.reported(sent, held), 3)["forecasts"]
+    more = flow.normalise(held - td["action"]).unsqueeze(-2)
+    before = flow.unpack(sent, 3)["forecasts"]
+    torch.testing.assert_close(moved - before, more.expand_as(moved))
 
 
 def test_the_gate_opens_after_the_first_surprise(make):
