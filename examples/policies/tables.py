@@ -9,6 +9,8 @@ that those drawn are the same for all (pigeonhole bootstrap, Owen 2007, arXiv 07
 `--measure recovered`: medians of the steps from the change until the mean reward of 20 steps is
 for good at most a tenth below that of the same policy alone, in the same episode and steps, while
 nothing changes; a tenth of the size of that policy's mean reward in the episode. ∞: never.
+`--measure recovery_steps`: medians of what `afm-rl` writes, to the first 20 steps that reach the
+reward before the change less a tenth.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import yaml
 from numpy.lib.stride_tricks import sliding_window_view
 
 DRAWS, WINDOW, MISSING = 4000, 20, 0.1
+MEDIANS = ("recovered", "recovery_steps")
 COLUMNS = {
     "alone": ("physics", False),
     "randomised": ("physics", True),
@@ -73,7 +76,7 @@ def recovered(steps: pd.DataFrame, healthy: np.ndarray) -> float:
 
 def middle(values: np.ndarray, measure: str) -> np.ndarray:
     """Return means over the last two axes, medians of what may be infinite."""
-    if measure != "recovered":
+    if measure not in MEDIANS:
         return values.mean((-2, -1))
     return np.quantile(values.reshape(*values.shape[:-2], -1), 0.5, axis=-1, method="lower")
 
@@ -102,6 +105,8 @@ def main() -> None:
     parser.add_argument("--digits", type=int, default=1)
     args = parser.parse_args()
     missions = read(args.folders)
+    if args.measure == "recovery_steps":
+        missions = missions.fillna({"recovery_steps": np.inf})
     if args.measure == "recovered":
         missions = add_recovered(missions)
     shown = {
