@@ -1,8 +1,8 @@
 """Hypotheses: which remembered pairs tell what an action does now.
 
-The newest pairs tell it, unless commands act late or the ground changes from place to place. Each
-hypothesis reads the memory in its own way; what it would have predicted decides whether it is
-believed.
+The newest pairs tell it, unless commands act late, the ground changes from place to place, or the
+newest commands were all alike. Each hypothesis reads the memory in its own way; what it would have
+predicted decides whether it is believed.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from afm_rl.flow.experts import Rows
 IDENTITY = "identity"  # actions have the effect that the model predicts
 FILTER = 6  # commands that a lag looks back on
 AGE = 20.0  # steps that separate two pairs as much as one unit of place does
+FAR = 1e3  # squared distance beyond all
+OLDER = 1e-6  # squared distance that a pair is worth less, times its squared age
 
 
 class Hypothesis(NamedTuple):
@@ -33,6 +35,8 @@ class Hypothesis(NamedTuple):
     """Time constant with which effects follow commands, in steps."""
     near: bool = False
     """Whether it reads the pairs nearest in place instead of in time."""
+    varied: bool = False
+    """Whether it reads pairs whose commands differ as much as possible."""
     penalty: float = 0.0
     """How much worse than the first it must be expected to predict."""
 
@@ -41,7 +45,7 @@ HYPOTHESES = {
     IDENTITY: Hypothesis(penalty=0.02),  # reads nothing
     "recent": Hypothesis(),
     "newest": Hypothesis(share=1 / 6, penalty=0.02),  # right after a change
-    "long": Hypothesis(share=1.0),
+    "varied": Hypothesis(share=1.0, varied=True, penalty=-0.01),  # also when it was at rest of late
     **{f"delay_{k}": Hypothesis(delay=k, penalty=0.05) for k in range(1, 9)},
     **{f"lag_{k}": Hypothesis(lag=k, penalty=0.05) for k in range(1, 4)},
     "near": Hypothesis(near=True, penalty=0.03),
@@ -51,7 +55,10 @@ HYPOTHESES = {
 
 
 class Layout(NamedTuple):
-    """How H hypotheses fill K rows, those by place last; ages count from the newest pair, 0."""
+    """How H hypotheses fill K rows, in the order of :func:`check_hypotheses`.
+
+    Ages count from the newest pair, 0.
+    """
 
     command: Tensor
     """What the commands of the hypotheses by time weigh, by age, the oldest first, ``(T K, L)``."""
@@ -71,7 +78,7 @@ def lay_out(hypotheses: Sequence[Hypothesis], rows: int) -> Layout:
             [0., 1., 0.]])
     """
     age = torch.arange(rows - 1, -1, -1)
-    timed = [h for h in hypotheses if not h.near]
+    timed = [h for h in hypotheses if not (h.near or h.varied)]
     length = memory_of(hypotheses, rows)
     acting = torch.stack([_weights(h, length) for h in hypotheses])
     command = torch.stack([w.roll(-int(k)) for w in acting[: len(timed)] for k in age])
@@ -96,7 +103,9 @@ def memory_of(hypotheses: Sequence[Hypothesis], rows: int) -> int:
 
 
 def check_hypotheses(names: Sequence[str], by_place: bool) -> list[str]:
-    """Return the names without the identity, those by place last, or dropped without a place.
+    """Return the names without the identity: those by time, by variety, by place.
+
+    Those by place are dropped without a place.
 
     Raises:
         ConfigurationError: if it is no list of hypotheses, or none is left.
@@ -110,15 +119,20 @@ def check_hypotheses(names: Sequence[str], by_place: bool) -> list[str]:
         )
     for name in names:
         check_choice("corrector.hypotheses", name, HYPOTHESES)
-    timed = [name for name in names if name != IDENTITY and not HYPOTHESES[name].near]
+    read = [name for name in names if name != IDENTITY]
+    near = [name for name in read if HYPOTHESES[name].near]
+    varied = [name for name in read if HYPOTHESES[name].varied]
+    timed = [name for name in read if name not in near + varied]
     if not timed:
         raise ConfigurationError(
             f"corrector.hypotheses={list(names)!r}: expected one by time, such as recent"
         )
-    return timed + [name for name in names if HYPOTHESES[name].near and by_place]
+    return timed + varied + (near if by_place else [])
 
 
-def read_rows(pairs: Tensor, layout: Layout, size: int, away: Tensor | None) -> Rows:
+def read_rows(
+    pairs: Tensor, layout: Layout, size: int, away: Tensor | None, varied: int = 0
+) -> Rows:
     """Return the rows that each hypothesis reads, ``(*B, H, K, A)``.
 
     Args:
@@ -128,6 +142,7 @@ def read_rows(pairs: Tensor, layout: Layout, size: int, away: Tensor | None) -> 
         size: number of actions, A.
         away: squared distance in place of each pair from here, ``(*B, M)``; None without
             hypotheses by place.
+        varied: number of hypotheses by variety.
 
     >>> u = torch.tensor([[0.1], [0.2], [0.3]])
     >>> pairs = torch.cat([u, 10 * u, 0 * u, torch.ones(3, 1)], -1)
@@ -145,14 +160,16 @@ def read_rows(pairs: Tensor, layout: Layout, size: int, away: Tensor | None) -> 
     effective, std, came = effects[..., size : 3 * size + 1].split([size, size, 1], -1)
     came = (came == 1.0).to(came)  # what was sound before a change tells nothing about it
     parts = [part.unflatten(-2, (-1, rows)) for part in (executed, effective, std, valid * came)]
+    by_time = parts[0].shape[-3]
+    found = [(_varied(pairs, size, rows), varied)] if varied else []
     if away is not None:
-        near = _nearest(pairs, away, rows)
-        count = len(layout.filled) - parts[0].shape[-3]
-        shape = (*near.shape[:-2], count, *near.shape[-2:])
-        sizes = [size, size, size, 1, near.shape[-1] - 3 * size - 1]
-        there = near.unsqueeze(-3).expand(shape).split(sizes, -1)
-        there = (*there[:3], (there[3] > 0).to(pairs))
-        parts = [torch.cat([part, more], -3) for part, more in zip(parts, there, strict=False)]
+        found.append((_nearest(pairs, away, rows), len(layout.filled) - by_time - varied))
+    for read, count in found:
+        shape = (*read.shape[:-2], count, *read.shape[-2:])
+        sizes = [size, size, size, 1, read.shape[-1] - 3 * size - 1]
+        more = read.unsqueeze(-3).expand(shape).split(sizes, -1)
+        more = (*more[:3], (more[3] > 0).to(pairs))
+        parts = [torch.cat([part, new], -3) for part, new in zip(parts, more, strict=False)]
     filled = parts[3] * layout.filled
     executed, effective, std = (part * filled for part in parts[:3])
     return Rows(executed, effective, std, filled)
@@ -163,3 +180,25 @@ def _nearest(pairs: Tensor, away: Tensor, rows: int) -> Tensor:
     age = torch.arange(away.shape[-1] - 1, -1, -1, device=away.device) / AGE
     nearest = (away + age.square()).topk(rows, -1, largest=False).indices.flip(-1)
     return pairs.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, pairs.shape[-1]))
+
+
+def _varied(pairs: Tensor, size: int, rows: int) -> Tensor:
+    """Return the newest pair, and each time the one whose command is farthest from all of them.
+
+    Farthest-point sampling (Gonzalez 1985) of the pairs since the last change, ``(*B, K, D)``,
+    oldest first. Where there are fewer, rows are not valid.
+    """
+    sent, sound = pairs[..., :size], pairs[..., 3 * size] == 1.0
+    apart = (sent.unsqueeze(-2) - sent.unsqueeze(-3)).square().sum(-1)
+    age = torch.arange(pairs.shape[-2] - 1, -1, -1, device=pairs.device)
+    old = OLDER * age.square()
+    nearest, picks = torch.where(sound, FAR - age, -torch.inf), []  # the newest first
+    for _ in range(rows):
+        worth, pick = nearest.max(-1, keepdim=True)
+        picks.append(torch.where(worth > -torch.inf, pick, -1))
+        row = pick.unsqueeze(-1).expand(*pick.shape, apart.shape[-1])
+        nearest = torch.minimum(nearest, apart.gather(-2, row).squeeze(-2) - old)
+        nearest = nearest.scatter(-1, pick, -torch.inf)
+    chosen = torch.cat(picks, -1).sort(-1).values
+    row = chosen.clamp_min(0).unsqueeze(-1).expand(*chosen.shape, pairs.shape[-1])
+    return pairs.gather(-2, row) * (chosen >= 0).unsqueeze(-1)

@@ -85,6 +85,7 @@ class Tick(nn.Module):
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
         chosen = [HYPOTHESES[name] for name in hypotheses]
         self.by_place = any(h.near for h in chosen)
+        self.varied = sum(h.varied for h in chosen)
         never = 0.0 if identity else torch.inf
         penalty = [h.penalty for h in chosen] + [HYPOTHESES[IDENTITY].penalty + never]
         fixed = {
@@ -181,7 +182,7 @@ class Tick(nn.Module):
             away = (pairs[..., first:] - place.unsqueeze(-2)).square().sum(-1)
             away = torch.where(pairs[..., first - 2] > 0, away, torch.inf)
         layout = Layout(*(getattr(self, f"rows_{name}") for name in Layout._fields))
-        rows = read_rows(pairs, layout, size, away)
+        rows = read_rows(pairs, layout, size, away, self.varied)
         rows = Rows(*(part.flatten(0, 1) for part in rows))
         return self.network.encode(rows, fit_experts(rows))
 

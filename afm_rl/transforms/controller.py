@@ -17,7 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.machine_code import has_compiler
+from afm_rl.machine_code import has_compiler, settings_for
 from afm_rl.planning.sampling_planner import SamplingPlanner
 from afm_rl.streams import Streams
 from afm_rl.transforms.policy import ActionFlowPolicy
@@ -219,7 +219,10 @@ def export_controller(controller: Controller, path: str | Path) -> Path:
         made = torch._inductor.aoti_compile_and_package(
             program,
             package_path=str(Path(folder) / path.name),
-            inductor_configs={"aot_inductor.metadata": about},
+            inductor_configs={
+                "aot_inductor.metadata": about,
+                **settings_for([controller.policy.action_spec.zero()]),
+            },
         )
         os.replace(made, path)
     return path

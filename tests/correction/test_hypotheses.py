@@ -24,6 +24,7 @@ MANY = 20
 AGES = torch.arange(float(MANY)).unsqueeze(-1)
 PLACE = torch.zeros(MANY, 2)
 DELAYS = range(1, 9)
+LONG = Hypothesis(share=1.0)
 
 
 def pairs_of(valid=None):
@@ -34,9 +35,11 @@ def pairs_of(valid=None):
 
 def read(hypothesis, rows=4, pairs=None, away=None):
     """Return executed, effective, std and valid of what one hypothesis reads, ``(K,)`` each."""
-    timed = [] if not hypothesis.near else [HYPOTHESES["recent"]]
+    timed = [HYPOTHESES["recent"]] if hypothesis.near or hypothesis.varied else []
     layout = lay_out([*timed, hypothesis], rows)
-    found = read_rows(pairs_of() if pairs is None else pairs, layout, 1, away)
+    found = read_rows(
+        pairs_of() if pairs is None else pairs, layout, 1, away, int(hypothesis.varied)
+    )
     return [part[-1, :, 0] for part in found]
 
 
@@ -55,7 +58,7 @@ def test_recent_pairs_are_the_newest_and_fill_half():
 
 @pytest.mark.parametrize(
     ("name", "filled"),
-    [("newest", 2), ("recent", 6), ("long", 12), ("here", 1), ("nearest", 2), ("near", 6)],
+    [("newest", 2), ("recent", 6), ("varied", 12), ("here", 1), ("nearest", 2), ("near", 6)],
 )
 def test_each_fills_its_share_and_one_row_at_least(name, filled):
     away = torch.zeros(MANY)
@@ -102,7 +105,7 @@ def test_near_pairs_come_in_the_order_of_place_then_of_age():
 def test_effects_from_before_a_change_are_read_by_place_only():
     valid = torch.full((MANY, 1), OLD)
     valid[-3:] = 1.0
-    executed, effective, _, counts = read(HYPOTHESES["long"], rows=4, pairs=pairs_of(valid))
+    executed, effective, _, counts = read(LONG, rows=4, pairs=pairs_of(valid))
     assert counts.tolist() == [0, 1, 1, 1] and executed.tolist() == [0, 17, 18, 19]
     # A command from before it may act after it.
     executed, effective, _, counts = read(HYPOTHESES["delay_2"], rows=8, pairs=pairs_of(valid))
@@ -114,8 +117,7 @@ def test_effects_from_before_a_change_are_read_by_place_only():
 
 def test_what_does_not_count_fills_a_row_with_nothing():
     few = pairs_of((AGES > MANY - 2).float())
-    for name in ("long", "near"):
-        hypothesis = HYPOTHESES[name]._replace(share=1.0)
+    for hypothesis in (LONG, HYPOTHESES["near"]._replace(share=1.0), HYPOTHESES["varied"]):
         executed, effective, _, valid = read(hypothesis, pairs=few, away=torch.zeros(MANY))
         assert valid.tolist() == [0, 0, 0, 1] == (executed > 0).tolist() == (effective > 0).tolist()
 
@@ -144,8 +146,8 @@ def test_batches_are_read_one_by_one(axes):
 
 
 def test_the_identity_reads_nothing_and_those_by_place_are_last():
-    names = check_hypotheses(["near", IDENTITY, "recent", "here", "delay_3"], by_place=True)
-    assert names == ["recent", "delay_3", "near", "here"]
+    mixed = ["near", IDENTITY, "varied", "recent", "here", "delay_3"]
+    assert check_hypotheses(mixed, by_place=True) == ["recent", "delay_3", "varied", "near", "here"]
     assert check_hypotheses(["near", "recent"], by_place=False) == ["recent"]
 
 
@@ -163,6 +165,21 @@ def test_the_identity_reads_nothing_and_those_by_place_are_last():
 def test_a_list_that_cannot_be_used_is_refused(names, complaint):
     with pytest.raises(ConfigurationError, match=f"corrector.hypotheses=.*{complaint}"):
         check_hypotheses(names, by_place=True)
+
+
+def test_varied_pairs_are_the_newest_and_those_farthest_from_all_of_them():
+    pairs = pairs_of()
+    pairs[:, 0] = torch.tensor([5.0, 0.0] + [1.0] * 15 + [-2.0] + [1.0] * 2)
+    assert read(HYPOTHESES["varied"], pairs=pairs)[0].tolist() == [5, 0, -2, 1]
+    pairs[:, 0] = 1.0  # all alike: the newest
+    assert read(HYPOTHESES["varied"], pairs=pairs)[1].tolist() == [116, 117, 118, 119]
+
+
+def test_varied_pairs_are_from_after_the_change_and_none_counts_twice():
+    pairs = pairs_of()
+    pairs[:-2, 3] = OLD
+    executed, _, _, valid = read(HYPOTHESES["varied"], pairs=pairs)
+    assert sorted(executed.tolist()) == [0, 0, 18, 19] and valid.sum() == 2
 
 
 def late(delay):
@@ -187,7 +204,7 @@ def test_the_hypothesis_that_a_delay_needs_is_believed(line, drive, plans, delay
     losses = flow.unpack(memory, 2)["losses"] + flow.tick.penalty
     names = [*flow.hypotheses, IDENTITY]
     believed = {names[int(k)] for k in losses.argmin(-1)}
-    assert believed <= ({f"delay_{delay}"} if delay else {"recent", "newest", "long"})
+    assert believed <= ({f"delay_{delay}"} if delay else {"recent", "newest", "varied"})
 
 
 class Experienced(AxisNetwork):

@@ -85,6 +85,23 @@ def test_late_commands_of_a_slow_plan_are_no_offset(line, drive, delay):
     assert ((found[0] - planned)[begins + 5 :].abs() < 0.01).all()
 
 
+@pytest.mark.parametrize("size", [2, 6])
+def test_what_was_learnt_before_a_rest_is_known_after_it(line, drive, plans, size):
+    moving, rest = (
+        plans(16, 24, size, size=0.6),
+        torch.linspace(-0.3, 0.3, size).expand(20, 24, size),
+    )
+
+    generator = torch.Generator().manual_seed(0)
+
+    def swapped(sent):
+        return sent[-1].roll(1, -1) + 0.01 * torch.randn(sent[-1].shape, generator=generator)
+
+    planned = torch.cat([moving, rest, moving[:1]])
+    _, effects = drive(flow_of(size), line(size), swapped, planned)
+    assert (effects - planned)[-1].abs().median() < 0.05
+
+
 @pytest.mark.parametrize("delay", [1, 2, 3])
 def test_late_commands_of_a_reversed_motor_are_found(line, drive, plans, delay):
     planned = plans(4, 8, 2, size=0.5).repeat_interleave(12, 0)  # steady for a while
