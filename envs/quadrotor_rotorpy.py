@@ -43,6 +43,7 @@ def rotorpy_crazyflie() -> QuadrotorBody:
     """
     known = _parameters()
     arms = list(known["rotor_pos"].values())
+    one, two, three, four = (math.degrees(math.atan2(y, x)) for x, y, _ in arms)
     return QuadrotorBody(
         mass=known["mass"],
         inertia=(known["Ixx"], known["Iyy"], known["Izz"]),
@@ -50,7 +51,7 @@ def rotorpy_crazyflie() -> QuadrotorBody:
         k_t=known["k_eta"],
         k_d=known["k_m"],
         rotor_speed=known["rotor_speed_max"],
-        motors=tuple(math.degrees(math.atan2(y, x)) for x, y, _ in arms),
+        motors=(one, two, three, four),
     )
 
 
