@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 
@@ -21,6 +21,21 @@ class ArtefactError(AFMError, ValueError):
 
 class NonFiniteError(AFMError, ValueError):
     """NaN or infinity where a finite number is needed."""
+
+
+def causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error and what led to it, the latest first, each once: omegaconf makes rings.
+
+    >>> first, second = ValueError("first"), KeyError("second")
+    >>> first.__cause__, second.__cause__ = second, first
+    >>> list(causes(first))
+    [ValueError('first'), KeyError('second')]
+    """
+    met: list[BaseException] = []
+    while error is not None and not any(error is one for one in met):
+        met.append(error)
+        yield error
+        error = error.__cause__ or error.__context__
 
 
 def check_number(

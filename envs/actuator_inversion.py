@@ -6,90 +6,22 @@ Shifts", arXiv 2602.06550.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, cast
 from xml.etree import ElementTree
 
-import numpy as np
-import torch
-from torch import Tensor
-
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.dynamics.mujoco_physics import NAMES, changed_model
-from afm_rl.envs.task import Contexts, Reward, Task
-from afm_rl.envs.task_sources import NOWHERE, Limits, dm_control_task, quiet, trust
+from afm_rl.envs.inversion_contexts import Span, body_regime, contexts_of
+from afm_rl.envs.inversion_toys import SIGNS, TOYS
+from afm_rl.envs.task import Reward, Task
+from afm_rl.envs.task_sources import Limits, dm_control_task, quiet, trust
 from afm_rl.errors import check_choice, check_count
-from afm_rl.manifold import Manifold
 
-VALUES = 50  # of a parameter, in each split
 LEGS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
 LOWER = ("bshin", "bfoot", "fshin", "ffoot")
-STEP = 0.1  # s, of the double integrator
-Span = tuple[float, float]
-
-
-def spread(inner: Span, outer: Span) -> dict[str, np.ndarray]:
-    """Return 50 values of a parameter for each split, from its training and its whole range.
-
-    >>> {name: values[[0, -1]].round(3).tolist() for name, values in spread((1, 2), (0, 4)).items()}
-    {'train': [1.0, 2.0], 'in': [1.01, 1.99], 'out': [0.0, 4.0]}
-    """
-    low, high = inner
-    margin, half = 0.01 * (high - low), VALUES // 2
-    below = np.linspace(outer[0], low, half, endpoint=False)
-    above = np.linspace(outer[1], high, half, endpoint=False)[::-1]
-    return {
-        "train": np.linspace(low, high, VALUES),
-        "in": np.linspace(low + margin, high - margin, VALUES),
-        "out": np.concatenate([below, above]),
-    }
-
-
-def contexts_of(
-    spans: Mapping[str, tuple[Span, Span]],
-    regime: Callable[..., Mapping[str, float]],
-    signs: Sequence[float],
-    count: int,
-) -> Contexts:
-    """Return pairs of regimes, before and after a change, of each split.
-
-    The values of all parameters are crossed, with the signs too, sorted, and ``count`` of them
-    taken at equal distances. ``train``, ``in`` and ``out`` are as published, with both signs;
-    ``train_reversed`` and so on have the reversed one alone; ``nominal`` and ``reversed`` are the
-    nominal body.
-
-    Args:
-        spans: training and whole range of each parameter.
-        regime: ``regime(sign, *values)``; without values that of the nominal body.
-        signs: of the actions.
-        count: contexts of a split.
-    """
-    found: dict[str, list] = {"nominal": [({}, {})], "reversed": [({}, regime(-1.0))]}
-    splits = [spread(*span) for span in spans.values()]
-    for name in splits[0]:
-        values = np.meshgrid(*(split[name] for split in splits), indexing="ij")
-        grid = np.stack([part.ravel() for part in values], -1)
-        for suffix, own in (("", signs), ("_reversed", (-1.0,))):
-            rows = [(*row, sign) for row in grid.tolist() for sign in sorted(own)]
-            chosen = np.linspace(0, len(rows) - 1, count).round().astype(int)
-            found[name + suffix] = [
-                (regime(1.0, *row), regime(sign, *row))
-                for *row, sign in (rows[index] for index in chosen)
-            ]
-    return found
-
-
-def body_regime(size: int, sign: float, *values: float, **units: float) -> dict[str, float]:
-    """Return the regime of a body with A = ``size`` actuators; ``units`` are nominal values.
-
-    >>> body_regime(1, -1.0, 0.75, length=0.5)
-    {'length': 1.5, 'gain_0': -1.0}
-    """
-    pairs = zip(values, units.items(), strict=False)  # no values: the nominal ones
-    factors = {name: value / unit for value, (name, unit) in pairs}
-    return factors | ({} if sign == 1 else {f"gain_{axis}": sign for axis in range(size)})
 
 
 def stretched(domain: str, model: Any, row: tuple[float, ...]) -> Any:
@@ -161,53 +93,6 @@ BODIES: dict[str, tuple[str, str, dict[str, float], dict[str, tuple[Span, Span]]
 """Domain and task of dm_control, the nominal values, and their ranges: training, and whole."""
 
 
-def glide(state: Tensor, action: Tensor) -> Tensor:
-    """Step of the double integrator: places, then speeds; a unit mass, forces up to 1.
-
-    >>> glide(torch.tensor([0.5, 0.0, 1.0, 0.0]), torch.tensor([0.0, 0.5]))
-    tensor([0.6000, 0.0000, 1.0000, 0.0500])
-    """
-    place, speed = state.chunk(2, -1)
-    return torch.cat([place + STEP * speed, speed + STEP * action], -1).clamp(-1.0, 1.0)
-
-
-def at_origin(state: Tensor, action: Tensor, after: Tensor) -> Tensor:
-    """Reward of the double integrator: 1 within 0.1 of the origin."""
-    return (after[..., :2].norm(dim=-1) <= 0.1).to(after)
-
-
-def corner(seed: int) -> tuple[Tensor, Tensor]:
-    """Return a start of the double integrator: both places beyond 0.8, speeds anything."""
-    drawn = 2 * torch.rand(6, generator=torch.Generator().manual_seed(seed)) - 1
-    places = drawn[:2].sign() * (0.8 + 0.2 * drawn[2:4].abs())
-    return torch.cat([places, drawn[4:]]), NOWHERE
-
-
-def integrator_regime(sign: float, mass: float = 1.0) -> dict[str, float]:
-    """Return the regime of a mass: what a force does is divided by it."""
-    gain = sign / mass
-    return {} if gain == 1 else {"gain_0": gain, "gain_1": gain}
-
-
-def integrator(contexts: int) -> Task:
-    """Return the double integrator."""
-    return Task(
-        name="double_integrator",
-        world=KnownDynamics(glide, Manifold(4), 2, affine=True),
-        start=corner,
-        reward=at_origin,
-        low=[-1.0, -1.0],
-        high=[1.0, 1.0],
-        dt=STEP,
-        steps=100,
-        state_names=["x", "y", "v_x", "v_y"],
-        action_names=["f_x", "f_y"],
-        contexts=contexts_of(
-            {"mass": ((0.5, 1.5), (0.1, 2.0))}, integrator_regime, (1.0, -1.0), contexts
-        ),
-    )
-
-
 def actuator_inversion_task(
     task: str = "cartpole",
     contexts: int = 20,
@@ -223,7 +108,7 @@ def actuator_inversion_task(
 
     Args:
         task: ``cartpole``, ``reacher_easy``, ``reacher_hard``, ``cheetah``, ``ball_in_cup``, which
-            need dm_control, or ``double_integrator``.
+            need dm_control, or ``double_integrator``, ``double_integrator_friction``, ``ode``.
         contexts: of each split.
         steps: length of an episode; as published if None.
         reward: to plan with; the task's own if None.
@@ -237,16 +122,16 @@ def actuator_inversion_task(
     >>> task.contexts["out_reversed"][0]
     ({'gain_0': 10.0, 'gain_1': 10.0}, {'gain_0': -10.0, 'gain_1': -10.0})
     """
-    check_choice("robot.task", task, (*BODIES, "double_integrator"))
+    check_choice("robot.task", task, (*BODIES, *TOYS))
     check_count("robot.contexts", contexts)
-    if task == "double_integrator":
-        found = integrator(contexts)
+    if task in TOYS:
+        found = TOYS[task](contexts)
     else:
         domain, name, nominal, spans = BODIES[task]
         change = partial(stretched, domain) if domain in EDITS else changed_model
         found = dm_control_task(domain, name, change=change)
         trust(cast(KnownDynamics, found.world), found.start(0)[0], found.low, found.high)
-        signs = (1.0, -1.0) if domain in EDITS else (1.0,)
+        signs = SIGNS if domain in EDITS else SIGNS[:1]
         regime = partial(body_regime, len(found.low), **nominal)
         found = replace(found, contexts=contexts_of(spans, regime, signs, contexts))
     return replace(

@@ -49,7 +49,7 @@ def skid_steer(
         noise_std,
         threads,
         changed_wheels,
-        WheelPhysics.identity,
+        dict(zip(WheelPhysics.names, WheelPhysics.identity, strict=True)),
         mix,
     )
 

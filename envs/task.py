@@ -12,6 +12,7 @@ from torch import Tensor
 from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning.costs import check_arguments
+from afm_rl.regimes import Regime
 
 Reward = Callable[..., Tensor]
 Contexts = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
@@ -44,6 +45,8 @@ class Task:
         goal_in: the goal as the robot's sensors show it there, ``goal_in(model, goal)``.
         contexts: regimes of the phases, the last one for all that follow, by the name of their
             family.
+        changes: what can happen to it beside changes of its actuators, by the name of the family;
+            it acts after those.
 
     Raises:
         ConfigurationError: for actions without limits, or a reward that cannot be used.
@@ -67,6 +70,7 @@ class Task:
     reward_in: Callable[[Any], Reward] | None = None
     goal_in: Callable[[Any, Tensor], Tensor] | None = None
     contexts: Contexts = field(default_factory=dict)
+    changes: Mapping[str, Regime] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check limits and rewards."""

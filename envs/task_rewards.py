@@ -101,10 +101,15 @@ def catch(state: Tensor, action: Tensor, after: Tensor) -> Tensor:
 
 
 def above(state: Tensor, action: Tensor, after: Tensor) -> Tensor:
-    """Return the reward of a catch, less the ball's distance (m) from the cup, or from above it."""
+    """Return the reward of a catch, less the ball's distance (m) from the cup, or from above it.
+
+    >>> below = torch.tensor([0.0, 0.0, 0.0, 0.1])  # it hangs under the cup
+    >>> above(below, below[:2], below)
+    tensor(-0.3750)
+    """
     x, z = cup_gap(after).unbind(-1)
     outside = (x.abs() - 0.025).clamp_min(0.0)
-    low = (0.1 - z).clamp_min(0.0) * (outside > 0)  # first over the rim
+    low = (0.1 - z).clamp_min(0.0) * ((outside > 0) | (z < -0.025))  # first over the rim
     return catch(state, action, after) - outside - low - 0.1 * z.abs()
 
 

@@ -44,6 +44,7 @@ OWN = [f"robot.xml={ASSETS / 'inverted_pendulum.xml'}"]
 OWN += ["robot.reward=afm_rl.envs.task_rewards.upright"]
 PARTNERS = {  # what else must be chosen for a choice to make sense
     "dynamics=oracle": ["updater=oracle"],
+    "dynamics=oracle_pe": ["updater=oracle"],
     "dynamics=knode": ["robot=quadrotor"],
     "dynamics=knode_offline": ["robot=quadrotor"],
     "updater=oracle": ["dynamics=oracle"],
@@ -55,6 +56,9 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "updater=stream_x_literal": ["dynamics=pe_stream_x"],
     "updater=stream_x_unmatched": ["dynamics=pe_stream_x"],
     "updater=knode": ["dynamics=knode", "robot=quadrotor"],
+    "updater=sysid": ["robot=inversion_cartpole"],
+    "method=sysid": ["robot=inversion_cartpole"],
+    "method=afm_sysid": ["robot=inversion_cartpole"],
     "updater=mass": ["dynamics=oracle", "robot=quadrotor"],
     "planner=mpc": ["robot=quadrotor"],
     "planner=policy": ["robot=gymnasium", f"planner.file={POLICY}"],

@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from afm_rl.errors import AFMError
+from afm_rl.errors import AFMError, causes
 
 NOISE = ("Config search path:", "Set the env", "See https://")  # of no help here
 UNKNOWN = re.compile(r"Could not override '([^']+)'")  # Hydra's words for a misspelt setting
@@ -48,7 +48,7 @@ def explain(error: BaseException) -> str | None:
     >>> explain(RuntimeError("a bug")) is None
     True
     """
-    chain = list(_causes(error))
+    chain = list(causes(error))
     for cause in chain:
         if isinstance(cause, AFMError):
             return one_line(str(cause))
@@ -111,12 +111,6 @@ def _paths(settings: Any, place: str) -> Iterator[str]:
     if isinstance(settings, Mapping):
         for key, value in settings.items():
             yield from _paths(value, f"{place}.{key}" if place else str(key))
-
-
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
 
 
 def one_line(text: str) -> str:

@@ -45,6 +45,7 @@ HYPOTHESES = {
     IDENTITY: Hypothesis(penalty=0.02),  # reads nothing
     "recent": Hypothesis(),
     "newest": Hypothesis(share=1 / 6, penalty=0.02),  # right after a change
+    "long": Hypothesis(share=1.0),
     "varied": Hypothesis(share=1.0, varied=True, penalty=-0.01),  # also when it was at rest of late
     **{f"delay_{k}": Hypothesis(delay=k, penalty=0.05) for k in range(1, 9)},
     **{f"lag_{k}": Hypothesis(lag=k, penalty=0.05) for k in range(1, 4)},

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.mujoco_physics import changed_model
 from afm_rl.dynamics.mujoco_space import MuJoCoSpace
+from afm_rl.dynamics.per_mission import PerMissionModel
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.regimes import Physics
 
@@ -26,7 +28,8 @@ except ImportError:  # an extra
 STEP = 1e-4  # of finite differences, in half ranges and units of the state: far above the
 # tolerance of the contact solver, far below what bends a trajectory
 Change = Callable[[Any, tuple[float, ...]], Any]
-MOST_MODELS = 256  # with changed physics that are kept
+NOMINAL = dict(zip(Physics.names, Physics.identity, strict=True))
+MOST_MODELS = 1024  # with changed physics that are kept
 HUGE = 1e9  # MuJoCo resets a simulation that holds larger numbers
 
 
@@ -122,7 +125,7 @@ class Simulator:
         frame_skip: simulation steps per action.
         threads: 0 for the calling thread.
         change: see :class:`MuJoCoDynamics`.
-        nominal: see :class:`MuJoCoDynamics`.
+        nominal: the row of physics that changes nothing.
     """
 
     def __init__(
@@ -131,7 +134,7 @@ class Simulator:
         frame_skip: int,
         threads: int,
         change: Change = changed_model,
-        nominal: Sequence[float] = Physics.identity,
+        nominal: tuple[float, ...] = Physics.identity,
     ) -> None:
         self.settings = model, frame_skip, threads, change, nominal
         self.data = [mujoco.MjData(model) for _ in range(max(1, threads))]
@@ -167,6 +170,8 @@ class Simulator:
         each row has its own, see :class:`~afm_rl.regimes.Physics`.
         """
         model, skip = self.settings[:2]
+        if len(states) == 0:  # MuJoCo would crash
+            return np.empty((0, controls.shape[1], states.shape[1]))
         if physics is not None:
             model = self.models(physics)
         bad = ~((np.abs(states).max(-1) < HUGE) & (np.abs(controls).max((-2, -1)) < HUGE))
@@ -182,7 +187,7 @@ class Simulator:
         return after
 
 
-class MuJoCoDynamics(KnownDynamics):
+class MuJoCoDynamics(KnownDynamics, PerMissionModel):
     r"""Any MuJoCo model: its own simulation, as robot or as the nominal model of one.
 
     States are :math:`(q, \dot q, w)`: positions, velocities and the actuators' activations;
@@ -201,7 +206,8 @@ class MuJoCoDynamics(KnownDynamics):
         threads: that simulate beside the calling one; 0 for none.
         change: returns the model with other physics, of the nominal one and a row ``(P,)`` of
             :class:`~afm_rl.regimes.Physics`.
-        nominal: the row of physics that changes nothing.
+        physics: names of what may change about the body, with the values that change nothing;
+            those of :class:`~afm_rl.regimes.Physics` if not told otherwise.
         mix: controls per action ``(U, A)``, of a robot whose actions are not those of single
             actuators: the controls are ``mix @ action``.
 
@@ -219,6 +225,7 @@ class MuJoCoDynamics(KnownDynamics):
 
     extrapolates = True
     stiff = True
+    nominal: Tensor
     physics_now: Tensor
     mix: Tensor | None
 
@@ -229,14 +236,15 @@ class MuJoCoDynamics(KnownDynamics):
         noise_std: float | Sequence[float] = (0.01, 0.1),
         threads: int = 0,
         change: Change = changed_model,
-        nominal: Sequence[float] = Physics.identity,
+        physics: Mapping[str, float] = NOMINAL,
         mix: Sequence[Sequence[float]] | None = None,
     ) -> None:
         found, skip = read_model(model)
         found.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         skip = skip if frame_skip is None else check_count("dynamics.frame_skip", frame_skip)
+        nominal = tuple(physics.values())
         simulator: Any = Simulator(
-            found, skip, check_count("dynamics.threads", threads, low=0), change, tuple(nominal)
+            found, skip, check_count("dynamics.threads", threads, low=0), change, nominal
         )
         if not isinstance(noise_std, int | float) and len(noise_std) == 2:
             position, velocity = noise_std
@@ -245,7 +253,9 @@ class MuJoCoDynamics(KnownDynamics):
         super().__init__(simulator, space_of(found), size, noise_std)
         controls = None if mix is None else torch.tensor(mix, dtype=torch.float64)
         self.register_buffer("mix", controls, persistent=False)
-        self.register_buffer("physics_now", torch.zeros(0), persistent=False)
+        self.physics_names = tuple(physics)
+        self.register_buffer("nominal", torch.tensor(nominal), persistent=False)
+        self.register_buffer("physics_now", self.nominal, persistent=False)
         self.mjcf = found
         self.dt = skip * float(found.opt.timestep)
         low, high = torch.as_tensor(found.actuator_ctrlrange).unbind(-1)
@@ -268,12 +278,20 @@ class MuJoCoDynamics(KnownDynamics):
 
         See :class:`~afm_rl.regimes.Physics`; None for the nominal ones.
         """
-        if physics is None:
-            self.physics_now = self.physics_now.new_zeros(0)
-            return
-        step: Any = self.step
-        nominal = physics == torch.tensor(step.settings[-1]).to(physics)
-        self.physics_now = physics.new_zeros(0) if bool(nominal.all()) else physics.detach()
+        self.physics_now = self.nominal if physics is None else physics.detach()
+
+    @contextmanager
+    def assuming(self, physics: Tensor) -> Iterator[None]:
+        """Predict with other physics ``(*L, P)`` within a ``with`` block."""
+        now = self.physics_now
+        self.set_physics(physics)
+        try:
+            yield
+        finally:
+            self.physics_now = now
+
+    def _owned(self) -> list[tuple[nn.Module, str]]:
+        return [(self, "physics_now")]
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the next state ``(*B, S)``."""
@@ -310,9 +328,9 @@ class MuJoCoDynamics(KnownDynamics):
         plans = actions.expand(*batch, -1, -1).reshape(-1, *actions.shape[-2:])
         step: Any = self.step  # of plans, in numpy
         numbers = [rows, plans]
-        if len(self.physics_now):
-            told = self.physics_now
+        told = self.physics_now
+        if not torch.equal(told, self.nominal.to(told).expand_as(told)):
             told = told.reshape(*told.shape[:-1], *[1] * (len(batch) + 1 - told.dim()), -1)
-            numbers.append(told.expand(*batch, -1).reshape(len(rows), -1))
+            numbers.append(told.expand(*batch, -1).reshape(len(rows), told.shape[-1]))
         after = step(*(x.detach().cpu().double().numpy() for x in numbers))
         return torch.from_numpy(after).to(state).reshape(*batch, *after.shape[1:])

@@ -43,19 +43,17 @@ class Encoded(NamedTuple):
 
     experts: Experts
     """The experts' fits."""
-    plan: Tensor
-    """The code's part in the first layer of the velocity, ``(N, A, 1, W)``."""
-    effect: Tensor
-    """The code's part in the first layer of the effect, ``(N, A, 1, W)``."""
+    code: Tensor
+    """A code per axis, ``(N, A, 1, L)``."""
 
     def pick(self, which: Tensor) -> Encoded:
         """Return the sets of rows with the indices ``which`` ``(M,)``."""
         if may_look(which) and len(which) == 1:
             at = int(which)  # a view, where gathering would copy
-            parts = [part[at : at + 1] for part in (*self.experts, *self[1:])]
+            parts = [part[at : at + 1] for part in (*self.experts, self.code)]
         else:
-            parts = [part.index_select(0, which) for part in (*self.experts, *self[1:])]
-        return Encoded(Experts(*parts[:-2]), *parts[-2:])
+            parts = [part.index_select(0, which) for part in (*self.experts, self.code)]
+        return Encoded(Experts(*parts[:-1]), parts[-1])
 
 
 class Asked(NamedTuple):
@@ -136,8 +134,7 @@ class AxisNetwork(nn.Module):
         if self.across:
             others = torch.cat([code.mean(-2, keepdim=True), code.amax(-2, keepdim=True)], -1)
             code = code + self.mixed(torch.cat([code, others.expand(*code.shape[:-1], -1)], -1))
-        code = code.unsqueeze(-2)
-        return Encoded(experts, self.plan_code(code), self.effect_code(code))
+        return Encoded(experts, code.unsqueeze(-2))
 
     def ask(self, encoded: Encoded, planned: Tensor, mode: str) -> Asked:
         """Read plans ``(N, C, A)``; ``mode`` says how those that cannot be had are saturated."""
@@ -146,7 +143,8 @@ class AxisNetwork(nn.Module):
         given = [planned.mT.unsqueeze(-1), answers, encoded.experts.misses.to(planned), which]
         shape = (*answers.shape[:-1], -1)
         asked = torch.cat([part.expand(shape) for part in given], -1)
-        return Asked(encoded.plan + self.plan_query(asked), answers[..., :EXPERTS])
+        hidden = self.plan_code(encoded.code) + self.plan_query(asked)
+        return Asked(hidden, answers[..., :EXPERTS])
 
     def velocity(self, asked: Asked, tau: Tensor | float, point: Tensor) -> Tensor:
         """Return the velocity at points ``(N, C, A)`` of the path, the same shape.
@@ -172,7 +170,7 @@ class AxisNetwork(nn.Module):
         answers = encoded.experts.effect(executed)
         misses = encoded.experts.misses.to(executed).expand(*answers.shape[:-1], -1)
         asked = torch.cat([executed.mT.unsqueeze(-1), answers, misses], -1)
-        hidden = (encoded.effect + self.effect_query(asked)).relu()
+        hidden = (self.effect_code(encoded.code) + self.effect_query(asked)).relu()
         return self._blend(self.effect_head(hidden), answers[..., :EXPERTS])
 
     def _blend(self, output: Tensor, answers: Tensor) -> Tensor:

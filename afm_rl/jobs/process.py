@@ -20,7 +20,7 @@ from multiprocessing.context import ForkServerProcess, SpawnProcess
 from pathlib import Path
 from typing import Any
 
-from afm_rl.errors import AFMError
+from afm_rl.errors import AFMError, causes
 from afm_rl.files import locked
 from afm_rl.jobs.layout import LOG, UNFINISHED, is_finished
 from afm_rl.targets import TRUST
@@ -158,9 +158,7 @@ def explain(error: BaseException) -> str:
     >>> explain(ZeroDivisionError("division by zero"))
     'ZeroDivisionError: division by zero'
     """
-    cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, AFMError):
-        cause = cause.__cause__ or cause.__context__
+    cause = next((part for part in causes(error) if isinstance(part, AFMError)), None)
     if cause is None:
         return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
     text = " ".join(str(cause).split())  # may end in what a MemoryError says: nothing

@@ -11,6 +11,7 @@ from afm_rl.learning.mass_estimator import MassEstimator
 from afm_rl.learning.nll import GaussianNLLLoss, gaussian_nll
 from afm_rl.learning.obgd import ObGD
 from afm_rl.learning.online_updater import OnlineUpdater
+from afm_rl.learning.physics_identifier import PhysicsIdentifier
 from afm_rl.learning.pretrain import pretrain_ensemble
 from afm_rl.learning.pretrain_knode import pretrain_knode
 from afm_rl.learning.reset_adam import ResetAdam
@@ -30,6 +31,7 @@ __all__ = [
     "ObGD",
     "OnlineUpdater",
     "OracleUpdater",
+    "PhysicsIdentifier",
     "RLSUpdater",
     "StreamXUpdater",
     "UnmatchedUpdater",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
+from afm_rl.errors import ConfigurationError
 
 
 class ErrorParts(NamedTuple):
@@ -24,6 +26,24 @@ class ErrorParts(NamedTuple):
     """Onto what no action reaches, ``(*B, D, D)``."""
     noise: Tensor
     """The model's standard deviation, ``(*B, D)``."""
+
+
+def check_half_range(scale: Sequence[float] | Tensor, size: int) -> Tensor:
+    """Return the half ranges of ``size`` actions, an updater's ``scale``, as a tensor ``(A,)``.
+
+    Raises:
+        ConfigurationError: unless there is a positive number for each.
+
+    >>> check_half_range([1.0, 1.5], 2)
+    tensor([1.0000, 1.5000])
+    """
+    values = torch.as_tensor(scale, dtype=torch.get_default_dtype())
+    if values.shape != (size,) or not bool(((values > 0) & values.isfinite()).all()):
+        raise ConfigurationError(
+            f"updater.scale={values.tolist()}: expected {size} positive numbers, the half "
+            "range of each action"
+        )
+    return values
 
 
 def decompose_error(

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_instance, check_number
-from afm_rl.learning.error_decomposition import decompose_error
+from afm_rl.learning.error_decomposition import check_half_range, decompose_error
 from afm_rl.learning.nll import GaussianNLLLoss
 from afm_rl.learning.online_updater import OnlineUpdater
 from afm_rl.learning.updater import Updater
@@ -72,14 +72,9 @@ class UnmatchedUpdater(Updater):
                 "learn is decided here, by updater.gate"
             )
         self.updater.mask_key = MASK
-        values = torch.as_tensor(scale, dtype=torch.get_default_dtype())
-        size = loss.model.action_size
-        if values.shape != (size,) or not bool(((values > 0) & values.isfinite()).all()):
-            raise ConfigurationError(
-                f"updater.scale={values.tolist()}: expected {size} positive numbers, the half "
-                "range of each action"
-            )
-        self.register_buffer("scale", values, persistent=False)
+        self.register_buffer(
+            "scale", check_half_range(scale, loss.model.action_size), persistent=False
+        )
         self.gate = check_number("updater.gate", gate, low=0.0)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

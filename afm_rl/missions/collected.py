@@ -6,6 +6,8 @@ import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
+from itertools import cycle, islice
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,8 +19,9 @@ from afm_rl.devices import device_of
 from afm_rl.dynamics import Ensemble
 from afm_rl.errors import ConfigurationError, check_count, check_counts
 from afm_rl.learning import collect, fit_ensemble
-from afm_rl.planning import PlanningEnv
+from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.planning.costs import KnownReward
+from afm_rl.regimes import Schedule
 
 if TYPE_CHECKING:
     from afm_rl.missions.robot import Robot
@@ -28,19 +31,24 @@ EPISODES = 8  # at a time
 
 @dataclass(frozen=True, kw_only=True)
 class Collection:
-    """How transitions are collected, with nominal dynamics.
+    """How transitions are collected, with nominal dynamics if not told otherwise.
 
     Args:
         planner: makes a planner from a :class:`~afm_rl.planning.PlanningEnv`.
         rounds: transitions of each round: random actions first, then those of the planner, in the
             model that was learned from all rounds before.
+        cost: to plan with, or what makes it from the robot; the robot's reward if None.
         fit: settings of :func:`~afm_rl.learning.fit_ensemble`.
+        regimes: one for each episode of a round, by turns, from its first step on: domain
+            randomisation. Parameters that are not named are nominal.
         seed: of the episodes.
     """
 
     planner: Callable[[PlanningEnv], TensorDictModuleBase]
     rounds: Sequence[int] = (2000, 1000)
+    cost: Cost | Callable[[Robot], Cost] | None = None
     fit: Mapping[str, Any] = field(default_factory=dict)
+    regimes: Sequence[Mapping[str, float]] = ()
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -54,19 +62,28 @@ class Collection:
 
 
 def transitions(
-    robot: Robot, frames: int, seed: int, planner: TensorDictModuleBase | None = None
+    robot: Robot,
+    frames: int,
+    seed: int,
+    planner: TensorDictModuleBase | None = None,
+    regimes: Sequence[Mapping[str, float]] = (),
 ) -> TensorDictBase:
-    """Return transitions of the nominal robot, by a planner or by random actions."""
-    env = robot.env(
+    """Return transitions by a planner or by random actions, under ``regimes`` by turns."""
+    make = partial(
+        robot.env,
         tracks=list(robot.tracks)[:1],
         regime=robot.regime,
-        schedule=robot.schedule,
+        schedule=Schedule([]),  # one phase
         max_steps=frames,
         action_low=robot.action_low,
         action_high=robot.action_high,
         batch_size=[EPISODES],
         seed=10_000 * (seed + 1),  # missions are counted from 0
     )
+    env = make()
+    if regimes:
+        turns = islice(cycle(regimes), EPISODES)
+        env = make(missions=torch.stack([env.mission(regime=regime) for regime in turns]))
     env = env.to(device_of(robot.model))
     if planner is not None and hasattr(planner, "make_tensordict_primer"):
         env = TransformedEnv(env, Compose(planner.make_tensordict_primer()))
@@ -86,13 +103,12 @@ def fit_collected(model: Ensemble, robot: Robot, how: Collection, progress: bool
         The last :class:`~afm_rl.learning.FitReport`, by name, and ``rewards``, the mean reward per
         step of each round.
     """
-    if robot.reward is None:
-        raise ConfigurationError(f"robot.data: {robot.name} has no reward to plan with")
-    cost = KnownReward(robot.reward, list(robot.reward_reads), list(robot.reward_reads.values()))
+    cost = _cost(robot, how)
     first, parts, planner = copy.deepcopy(model.state_dict()), [], None
     for number, frames in enumerate(how.rounds):
         with torch.no_grad():
-            parts.append(transitions(robot, frames, how.seed + number, planner))
+            seed = how.seed + number
+            parts.append(transitions(robot, frames, seed, planner, how.regimes))
         model.load_state_dict(first)
         settings = {"seed": how.seed, **how.fit, "progress": progress}
         report = fit_ensemble(model, torch.cat(parts), names=robot.state_names, **settings)
@@ -101,3 +117,14 @@ def fit_collected(model: Ensemble, robot: Robot, how: Collection, progress: bool
             planner.box_key = None  # there is no correction that tells bounds
     rewards = [float(part["next", "reward"].mean()) for part in parts]
     return {**asdict(report), "rewards": rewards}
+
+
+def _cost(robot: Robot, how: Collection) -> Cost:
+    """Return what data are planned with."""
+    if isinstance(how.cost, Cost):
+        return how.cost
+    if how.cost is not None:
+        return how.cost(robot)
+    if robot.reward is None:
+        raise ConfigurationError(f"robot.data: {robot.name} has no reward to plan with")
+    return KnownReward(robot.reward, list(robot.reward_reads), list(robot.reward_reads.values()))

@@ -68,9 +68,16 @@ def physics(robot: Robot) -> Part:
     return Part(_known(robot))
 
 
-def oracle(robot: Robot) -> Part:
-    """Return the nominal physics seen through the true regime."""
-    return Part(Oracle(_known(robot), robot.regime), settings={"model": "oracle"})
+def oracle(robot: Robot, base: Callable[[Robot], Part]) -> Part:
+    """Return another model seen through the true regime.
+
+    Args:
+        robot: whose regime it is.
+        base: makes the model.
+    """
+    part = base(robot)
+    settings = {"model": "oracle", **(part.settings or {})}
+    return part._replace(module=Oracle(part.module, robot.regime), settings=settings)
 
 
 def calibrated(robot: Robot, base: Callable[[Robot], Part]) -> Part:

@@ -19,9 +19,9 @@ from afm_rl.targets import CODE, find_code
 class TaskRobot(Robot):
     """A robot of which a task says everything.
 
-    Regimes are those of :func:`~afm_rl.regimes.actuator_regimes` and, in MuJoCo,
-    :class:`~afm_rl.regimes.Physics`; each of these families can be asked for by its name. The
-    nominal model is the task's own world, if not told otherwise.
+    Regimes are those of :func:`~afm_rl.regimes.actuator_regimes`, the task's own ``changes`` and,
+    in MuJoCo, :class:`~afm_rl.regimes.Physics`; each of these families can be asked for by its
+    name. The nominal model is the task's own world, if not told otherwise.
 
     Args:
         source: makes the task, an :class:`afm_rl.envs.Task`, from the ``settings``.
@@ -29,6 +29,8 @@ class TaskRobot(Robot):
         model: another nominal model.
         regime: what else can happen to actions, instead.
         schedule: when it does.
+        physics: what may differ about the body, lowest and highest value by name: the family
+            ``physics`` draws one of these; of all of them if none.
         features: state coordinates that the dynamics depend on; those the task names if None.
         data: how transitions are collected for models that are learned; from the boxes of states
             and actions and the nominal model if None.
@@ -45,6 +47,7 @@ class TaskRobot(Robot):
         model: DynamicsModel | None = None,
         regime: Regime | None = None,
         schedule: Schedule | None = None,
+        physics: Mapping[str, Sequence[float]] | None = None,
         features: Sequence[int] | None = None,
         data: Collection | None = None,
         **settings: Any,
@@ -62,9 +65,9 @@ class TaskRobot(Robot):
                 f"{', '.join((*task.state_names, *task.action_names))}"
             )
         low, high, first = list(task.low), list(task.high), task.start(0)[0].tolist()
-        families = actuator_regimes(low, high)
+        families = {**actuator_regimes(low, high), **task.changes}
         if isinstance(task.world, MuJoCoDynamics):
-            families["physics"] = Physics()
+            families["physics"] = Physics(physics)
         schedule = Schedule([0.5]) if schedule is None else schedule
         named: dict[str, dict[str, Any]] = {name: {"draw": [name]} for name in families}
         for name, pairs in task.contexts.items():

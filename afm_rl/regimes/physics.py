@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
+from afm_rl.errors import ConfigurationError
 from afm_rl.regimes.base import StaticRegime
 
 FACTORS: Mapping[str, tuple[float, float]] = {
@@ -33,6 +34,12 @@ class Physics(StaticRegime):
     are); ``payload``, a share of the whole mass; ``wind_x`` and ``wind_y``, steady accelerations
     (m/s^2).
 
+    Args:
+        ranges: of the parameters that are drawn, lowest and highest value by name; of all if none.
+
+    Raises:
+        ConfigurationError: for a name that there is not, or what is no range.
+
     >>> heavy = Physics().encode({"mass": 2.0})
     >>> Physics().physics_of(heavy)[0]
     tensor(2.)
@@ -46,6 +53,17 @@ class Physics(StaticRegime):
         "payload": (0.0, 100.0),
     }
 
+    def __init__(self, ranges: Mapping[str, Sequence[float]] | None = None) -> None:
+        super().__init__()
+        found = dict(ranges) if ranges else {**FACTORS, **ADDED}
+        unknown = sorted(found.keys() - set(self.names))
+        bad = [name for name, span in found.items() if len(span) != 2 or not span[0] <= span[1]]
+        if unknown or bad:
+            raise ConfigurationError(
+                f"robot.physics={found}: expected [low, high] of any of {', '.join(self.names)}"
+            )
+        self.ranges = found
+
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         return action.expand(*torch.broadcast_shapes(action.shape[:-1], parameters.shape[:-1]), -1)
 
@@ -54,11 +72,12 @@ class Physics(StaticRegime):
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw one parameter each, uniform in its range; the others stay nominal."""
-        low, high = torch.tensor([*FACTORS.values(), *ADDED.values()]).unbind(-1)
+        low, high = torch.tensor(list(self.ranges.values())).unbind(-1)
         drawn = low + (high - low) * torch.rand(*shape, len(low), generator=generator)
         chosen = torch.randint(len(low), (*shape, 1), generator=generator)
-        mine = torch.arange(len(low)) == chosen
-        return torch.where(mine, drawn, torch.tensor(self.identity))
+        nominal = torch.tensor(self.identity).repeat(*shape, 1)
+        column = torch.tensor([self.names.index(name) for name in self.ranges])[chosen]
+        return nominal.scatter(-1, column, drawn.gather(-1, chosen))
 
     def physics_of(self, parameters: Tensor) -> Tensor:
         return parameters

@@ -48,8 +48,8 @@ class Controller(nn.Module):
     >>> planner = MPPI(PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5]))
     >>> controller = Controller(planner, ActionFlowPolicy(Dubins(), planner.action_spec))
     >>> controller.sizes
-    {'memory': 523, 'observation': 3, 'goal': 2, 'noise': 3000}
-    >>> memory, noise = torch.zeros(523), controller.draw()
+    {'memory': 526, 'observation': 3, 'goal': 2, 'noise': 3000}
+    >>> memory, noise = torch.zeros(526), controller.draw()
     >>> memory, action = controller(memory, torch.zeros(3), torch.ones(2), noise)
     >>> action.shape
     torch.Size([2])
@@ -185,7 +185,7 @@ def check_exportable(path: str | Path) -> Path:
 def export_controller(controller: Controller, path: str | Path) -> Path:
     """Write a controller as machine code (``.pt2``), which torch runs without this library.
 
-    Its metadata names the arguments and their sizes (``memory:523 observation:3 ...``) and the
+    Its metadata names the arguments and their sizes (``memory:526 observation:3 ...``) and the
     bound of the noise. It takes a minute or two of one core, and a C++ compiler.
 
     Args:

@@ -12,7 +12,7 @@ from afm_rl.flow import AxisNetwork
 def flow_of(cache, **settings):
     network = AxisNetwork(width=8, latent=8)
     # Among samples or hypotheses that are as good, rounding would decide.
-    distinct = [name for name in HYPOTHESES if name != "nearest"]
+    distinct = [name for name in HYPOTHESES if name not in ("long", "nearest")]
     settings |= {"source_std": 0.0, "hypotheses": distinct, "place": [0]}
     flow = ActionFlow(-torch.ones(1), torch.ones(1), network=network, cache=cache, **settings)
     return flow.double()

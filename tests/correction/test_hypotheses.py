@@ -24,7 +24,7 @@ MANY = 20
 AGES = torch.arange(float(MANY)).unsqueeze(-1)
 PLACE = torch.zeros(MANY, 2)
 DELAYS = range(1, 9)
-LONG = Hypothesis(share=1.0)
+LONG = HYPOTHESES["long"]
 
 
 def pairs_of(valid=None):
@@ -58,7 +58,15 @@ def test_recent_pairs_are_the_newest_and_fill_half():
 
 @pytest.mark.parametrize(
     ("name", "filled"),
-    [("newest", 2), ("recent", 6), ("varied", 12), ("here", 1), ("nearest", 2), ("near", 6)],
+    [
+        ("newest", 2),
+        ("recent", 6),
+        ("long", 12),
+        ("varied", 12),
+        ("here", 1),
+        ("nearest", 2),
+        ("near", 6),
+    ],
 )
 def test_each_fills_its_share_and_one_row_at_least(name, filled):
     away = torch.zeros(MANY)
@@ -204,7 +212,7 @@ def test_the_hypothesis_that_a_delay_needs_is_believed(line, drive, plans, delay
     losses = flow.unpack(memory, 2)["losses"] + flow.tick.penalty
     names = [*flow.hypotheses, IDENTITY]
     believed = {names[int(k)] for k in losses.argmin(-1)}
-    assert believed <= ({f"delay_{delay}"} if delay else {"recent", "newest", "varied"})
+    assert believed <= ({f"delay_{delay}"} if delay else {"recent", "newest", "long", "varied"})
 
 
 class Experienced(AxisNetwork):

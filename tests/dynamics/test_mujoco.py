@@ -190,6 +190,13 @@ def test_other_physics_are_what_their_names_say():
     assert (1 - model(moving, none)[2]) / lost == pytest.approx(2.0, rel=0.05)
 
 
+def test_no_plans_lead_nowhere():
+    model = MuJoCoDynamics(POLE)
+    assert model.rollout(torch.zeros(0, 4), torch.zeros(0, 5, 7, 1)).shape == (0, 5, 7, 4)
+    model.set_physics(Physics().encode({"mass": 2.0}))
+    assert model(torch.zeros(0, 4), torch.zeros(0, 1)).shape == (0, 4)
+
+
 def test_each_mission_has_physics_of_its_own():
     model, physics = MuJoCoDynamics(POLE), Physics()
     rows = torch.stack([physics.encode({}), physics.encode({"mass": 3.0})])

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from afm_rl.envs import TaskEnv, actuator_inversion_task
+from afm_rl.envs.inversion_toys import COEFFICIENT, MASS, Coefficients, Sled
 from afm_rl.missions.task_robot import TaskRobot
 from afm_rl.regimes import Physics, Schedule
 
@@ -122,3 +123,72 @@ def test_the_double_integrator_starts_in_a_corner_and_pays_at_the_origin():
     assert starts[:, 0].sign().unique().tolist() == [-1, 1]
     near = torch.tensor([[0.06, 0.06, 1.0, 0.0], [0.08, 0.08, 0.0, 0.0]])
     assert task.reward(near, near[:, :2], near).tolist() == [1.0, 0.0]
+
+
+def simulation(task, *chosen):
+    robot = TaskRobot(lambda: task, TaskEnv, schedule=Schedule([]))
+    env = robot.env(regime=robot.regime, schedule=robot.schedule)
+    rows = torch.stack([env.mission(seed=seed, regime=regime) for seed, regime in chosen])
+    return env, env.reset(rows, set_state=False)
+
+
+def test_mass_and_friction_are_those_of_the_published_equations():
+    task = actuator_inversion_task("double_integrator_friction")
+    regimes = [{}, {"mass": 0.5, "friction": 2.0}, {"mass": 2.0, "gain_0": -1.0, "gain_1": -1.0}]
+    env, td = simulation(task, *enumerate(regimes))
+    force, start = torch.tensor([0.3, -0.4]), td["observation"]
+    places, speeds = start.chunk(2, -1)
+    after = env.step(td.set("action", force.expand(3, 2)))["next", "observation"]
+    for row, regime in enumerate(regimes):
+        mass, friction = regime.get("mass", 1.0), regime.get("friction", 1.0)
+        pushed = regime.get("gain_0", 1.0) * force
+        faster = speeds[row] * (1 - 0.1 * friction / mass) + pushed / mass * 0.1
+        wanted = torch.cat([places[row] + 0.1 * speeds[row], faster]).clamp(-1, 1)
+        torch.testing.assert_close(after[row], wanted)
+
+
+def test_forces_that_undo_mass_and_friction():
+    sled, state = Sled(), torch.tensor([0.2, 0.0, 0.5, -0.8])
+    row, wanted = sled.encode({"mass": 0.7, "friction": 1.8}), torch.tensor([0.1, -0.3])
+    force = sled.inverse(wanted, row, state, torch.tensor([-9.0]), torch.tensor([9.0]))
+    torch.testing.assert_close(sled.apply(force, row, state), wanted)
+
+
+def test_coefficients_are_those_of_the_published_equation():
+    task = actuator_inversion_task("ode")
+    generator = torch.Generator().manual_seed(3)
+    actions = 2 * torch.rand(200, 2, generator=generator) - 1
+    values = 20 * torch.rand(200, 2, generator=generator) - 10
+    values[:3] = torch.tensor([[2.5, 2.5], [0.0, 0.0], [-10.0, 10.0]])
+    regimes = [dict(zip(("c0", "c1"), row, strict=True)) for row in values.tolist()]
+    env, td = simulation(task, *((seed, regime) for seed, regime in enumerate(regimes)))
+    number = torch.complex(*actions.unbind(-1))
+    rate = (values[:, 0] * number + values[:, 1] * number**2).real
+    after = env.step(td.set("action", actions))["next", "observation"]
+    wanted = td["observation"] + 0.01 * rate.unsqueeze(-1)
+    torch.testing.assert_close(after, wanted, atol=1e-5, rtol=1e-5)
+    same = Coefficients().apply(actions, torch.tensor([2.5, 2.5]), td["observation"])
+    assert torch.equal(same, actions)
+
+
+def test_contexts_of_the_toys_without_a_flip():
+    for name, (inner, outer) in (("double_integrator_friction", MASS), ("ode", COEFFICIENT)):
+        task = actuator_inversion_task(name)
+        (family,) = task.changes.values()
+        for split, beyond in (("in", False), ("out", True)):
+            rows = [[after[key] for key in family.names] for _, after in task.contexts[split]]
+            values = np.array(rows)
+            inside = (values > inner[0]) & (values < inner[1])
+            assert values.shape == (20, 2) and (inside != beyond).all()
+            assert values.min() >= outer[0] and values.max() <= outer[1]
+        before, after = task.contexts["in_reversed"][5]
+        assert after == before | {"gain_0": -1.0, "gain_1": -1.0}
+
+
+def test_the_ode_starts_in_the_unit_interval_and_pays_by_distance():
+    task = actuator_inversion_task("ode")
+    starts = torch.stack([task.start(seed)[0] for seed in range(50)])
+    assert starts.min() < -0.8 and starts.max() > 0.8 and starts.abs().max() <= 1
+    place = torch.tensor([[0.04], [-0.06], [0.15], [-0.3], [1.0], [2.1]])
+    paid = task.reward(place, place, place)
+    torch.testing.assert_close(paid, torch.tensor([1, 1 / 2, 1 / 3, 1 / 4, 0.05, 0]))

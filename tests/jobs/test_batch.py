@@ -135,6 +135,16 @@ def test_jobs_that_fail_do_not_take_the_others_down(jobs, tmp_path, monkeypatch)
     assert len(pd.read_csv(tmp_path / "missions.csv")) == 6
 
 
+@pytest.mark.timeout(10)
+def test_errors_that_name_each_other_as_their_cause_are_explained():
+    one, other = KeyError("one"), ConfigurationError("seeds=0: expected more")
+    one.__cause__, other.__context__ = other, one  # omegaconf raises such rings
+    assert process.explain(one) == "seeds=0: expected more"
+    bug = RuntimeError("a bug")
+    bug.__context__ = bug
+    assert process.explain(bug) == "RuntimeError: a bug"
+
+
 def children(pid):
     text = Path(f"/proc/{pid}/task/{pid}/children")
     return [int(child) for child in text.read_text().split()] if text.exists() else []

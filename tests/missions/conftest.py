@@ -21,6 +21,10 @@ SMALL = {  # settings that are there are made small
     "dynamics.pretrain.samples": 512,
     "dynamics.pretrain.epochs": 1,
     "dynamics.pretrain.flights": 4,
+    "dynamics.base.members": 2,
+    "dynamics.base.hidden": [16, 16],
+    "dynamics.base.pretrain.samples": 512,
+    "dynamics.base.pretrain.epochs": 1,
     "corrector.width": 8,
     "corrector.train.iterations": 20,
 }

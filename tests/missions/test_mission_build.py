@@ -17,16 +17,19 @@ from afm_rl.flow import AxisNetwork
 from afm_rl.missions import build, prepare
 from afm_rl.missions.checks import blaming, check_training
 
-FLIERS = ("geometric", "mass_estimator")  # need a quadrotor
+ROBOTS = {  # of methods that the ground robot has no use for
+    "raptor": "quadrotor_rotorpy_10ms",  # which tells what its motors gave
+    **dict.fromkeys(("geometric", "mass_estimator"), "quadrotor"),
+    **dict.fromkeys(("sysid", "afm_sysid"), "inversion_cartpole"),
+}
 METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_planner_transform_and_updater_share_one_model(configure, no_training, method):
-    flies = ["robot=quadrotor"] if "knode" in method or method in FLIERS else []
-    reports = method == "raptor"  # of a robot that tells what its motors gave
-    cfg = configure(f"method={method}", *(["robot=quadrotor_rotorpy_10ms"] if reports else flies))
+    robot = ROBOTS.get(method, "quadrotor" if "knode" in method else "ugv")
+    cfg = configure(f"method={method}", f"robot={robot}")
     agent = build(cfg)
     assert agent.label == method
     if method not in ("geometric", "raptor"):  # which have no use for a model
@@ -35,7 +38,7 @@ def test_planner_transform_and_updater_share_one_model(configure, no_training, m
     assert (agent.transform is None) == cfg.corrector._target_.endswith("no_correction")
     if agent.transform is not None:
         assert agent.transform.model is agent.model
-    executed = ("wrench",) if reports else ("guard", "executed_action")
+    executed = ("wrench",) if method == "raptor" else ("guard", "executed_action")
     assert unravel_key(agent.executed_key) == ("next", *executed)
     models = [part.module for part in agent.trainings if part.title in ("ensemble", "KNODE")]
     calibrated = "base" in cfg.dynamics

@@ -1,0 +1,196 @@
+"""System identification: which physics of a body explain what its actions cannot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, cast
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.learning.error_decomposition import check_half_range, decompose_error
+from afm_rl.learning.learner import Learner
+from afm_rl.learning.nll import GaussianNLLLoss
+from afm_rl.mission_state import MissionState
+
+MOST_CANDIDATES = 1000
+LOST = 20.0  # nats that a candidate loses whose simulation breaks off
+MARGIN = 3.0  # nats by which another candidate must be better than the one that is believed
+
+
+class Belief(NamedTuple):
+    """What is known of the body of each mission."""
+
+    misfit: Tensor
+    """Of each candidate, in nats: the lower, the better it explains; ``(l, K)``."""
+    chosen: Tensor
+    """The candidate that is believed, ``(l)``."""
+
+
+class PhysicsIdentifier(Learner):
+    r"""Finds mass, lengths, ... of a body in MuJoCo, among candidates, per mission, at every step.
+
+    A body of another length is not what an action could undo; a reversed motor is. So each
+    candidate :math:`\theta` is judged by what *no action explains* under it
+    (:func:`~afm_rl.learning.error_decomposition.decompose_error`), whatever actuators do:
+
+    .. math:: r_\theta = (I - J_\theta J_\theta^+)\,N^{-1}\,
+        (s_{t+1} \ominus f_\theta(s_t, v_\theta)),\qquad
+        c_\theta \leftarrow \lambda c_\theta + \log(1 + \|r_\theta\|^2)
+
+    with :math:`v_\theta` the action that explains the transition best. The logarithm forgives
+    outliers. The candidate with the least :math:`c_\theta` becomes the model's physics once it is
+    better by three nats. Transitions that the present physics explain to within the gate teach
+    nothing and cost the search for that one action, so a nominal body stays nominal, to the bit.
+
+    Beside an action flow transform it learns what the transform cannot undo. A mass that acts on
+    nothing but the actuated axes looks like weak actuators, and is left to these.
+
+    Args:
+        loss: a loss over a :class:`~afm_rl.dynamics.MuJoCoDynamics`, whose keys are read.
+        ranges: lowest and highest value of each parameter that may differ, by its name in
+            :attr:`MuJoCoDynamics.physics_names <afm_rl.dynamics.MuJoCoDynamics>`.
+        count: candidates per parameter, at equal distances; the nominal physics come on top. All
+            combinations are tried, at most 1000. What too coarse a grid leaves over looks like
+            actuators.
+        scale: half range of each action, ``(A,)``.
+        gate: standard deviations of the model that an error which no action explains must exceed.
+        forgetting: weight of a transition relative to the next one, in (0, 1].
+        mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
+
+    Raises:
+        ConfigurationError: for a setting out of range, or a model that is not MuJoCo's.
+
+    >>> from tensordict import TensorDict
+    >>> pole = '''<mujoco><worldbody><body><joint type="slide" axis="1 0 0" name="x"/>
+    ... <geom size=".1"/><body><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 1"
+    ... size=".05"/></body></body></worldbody><actuator><motor joint="x"/></actuator></mujoco>'''
+    >>> model = MuJoCoDynamics(pole, frame_skip=10, noise_std=1e-3)
+    >>> updater = PhysicsIdentifier(GaussianNLLLoss(model), {"length": [0.5, 1.5]}, [1.0], 11)
+    >>> state, long = torch.tensor([0.0, 0.3, 0.0, 0.0]), model.nominal.clone()
+    >>> long[model.physics_names.index("length")] = 1.3
+    >>> for _ in range(5):  # and its motor runs backwards
+    ...     with model.assuming(long):
+    ...         after = model(state, torch.tensor([-1.0]))
+    ...     td = TensorDict({"observation": state, "action": torch.ones(1)})
+    ...     _ = updater(td.set(("next", "observation"), after))
+    ...     state = after
+    >>> updater.physics["length"]
+    tensor(1.3000)
+    """
+
+    candidates: Tensor
+    scale: Tensor
+
+    def __init__(
+        self,
+        loss: GaussianNLLLoss,
+        ranges: Mapping[str, Sequence[float]],
+        scale: Sequence[float] | Tensor,
+        count: int = 97,
+        gate: float = 3.0,
+        forgetting: float = 0.95,
+        mask_key: NestedKey | None = None,
+    ) -> None:
+        super().__init__(loss, mask_key)
+        model = loss.model
+        if not isinstance(model, MuJoCoDynamics):
+            raise ConfigurationError(
+                f"updater: PhysicsIdentifier needs MuJoCoDynamics, got {type(model).__name__}; "
+                "choose dynamics=physics with a robot in MuJoCo, or updater=rls"
+            )
+        self.register_buffer("candidates", _candidates(model, ranges, count), persistent=False)
+        self.register_buffer(
+            "scale", check_half_range(scale, loss.model.action_size), persistent=False
+        )
+        self.gate = check_number("updater.gate", gate, low=0.0)
+        self.forgetting = check_number(
+            "updater.forgetting", forgetting, low=0.0, high=1.0, open_low=True
+        )
+        self.belief = MissionState(self._nothing(1))
+
+    @property
+    def model(self) -> MuJoCoDynamics:
+        """The model whose physics are set."""
+        return cast(MuJoCoDynamics, self.loss.model)
+
+    @property
+    def physics(self) -> dict[str, Tensor]:
+        """What is believed now, by the name of each parameter; ``(*L)``."""
+        values = self.candidates[self.belief.parts.chosen].reshape(*self.model.lead, -1)
+        return dict(zip(self.model.physics_names, values.unbind(-1), strict=True))
+
+    def start(self, tensordict: TensorDictBase | None = None) -> None:
+        """Believe in the nominal physics."""
+        super().start(tensordict)
+        self.belief.keep(self._nothing(math.prod(self.model.lead)))
+        self._tell()
+
+    def _nothing(self, missions: int) -> Belief:
+        zeros = self.candidates.new_zeros(missions, len(self.candidates))
+        return Belief(zeros, zeros[:, 0].long())
+
+    def _tell(self) -> None:
+        chosen = self.candidates[self.belief.parts.chosen]
+        self.model.set_physics(chosen.reshape(*self.model.lead, -1))
+
+    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+        """Judge the candidates by the transitions that the present physics do not explain."""
+        misfit, chosen = self.belief.parts
+        rows = learn.flatten().nonzero().squeeze(-1)
+        mission = rows // (learn.numel() // len(chosen))
+        given = (transitions.get(key) for key in self.loss.in_keys)
+        flat = [part.reshape(-1, part.shape[-1])[rows] for part in given]
+        unexplained = self._unmatched(flat, self.candidates[chosen[mission]])
+        odd = (unexplained.abs() > self.gate).any(-1)  # false for NaN
+        if not bool(odd.any()):
+            return
+        mission, count = mission[odd], len(self.candidates)
+        states, actions, afters = (part[odd].unsqueeze(1).expand(-1, count, -1) for part in flat)
+        rest = self._unmatched(
+            [states, actions, afters], self.candidates.expand(len(states), -1, -1)
+        )
+        new = rest.square().sum(-1).log1p().nan_to_num(nan=LOST, posinf=LOST).to(misfit)
+        decayed = misfit.clone()
+        decayed[mission] = self.forgetting * misfit[mission]
+        misfit = decayed.index_add(0, mission, new)
+        best = misfit.argmin(-1)
+        least, now = (misfit.gather(1, k.unsqueeze(1)).squeeze(1) for k in (best, chosen))
+        self.belief.keep(Belief(misfit, torch.where(least + MARGIN < now, best, chosen)))
+        self._tell()
+
+    def _unmatched(self, transitions: Sequence[Tensor], physics: Tensor) -> Tensor:
+        state, action, after = transitions
+        with self.model.assuming(physics):
+            return decompose_error(self.model, state, action, after, self.scale).unmatched
+
+
+def _candidates(model: MuJoCoDynamics, ranges: Mapping[str, Sequence[float]], count: int) -> Tensor:
+    """Return rows of physics ``(K, P)``; the first is the nominal one."""
+    names, count = model.physics_names, check_count("updater.count", count, low=2)
+    if not isinstance(ranges, Mapping) or not ranges or not set(ranges) <= set(names):
+        raise ConfigurationError(
+            f"updater.ranges={ranges!r}: expected what may differ about the body, such as "
+            f"{{mass: [0.5, 2.0]}}; names are {', '.join(names)}"
+        )
+    total = count ** len(ranges)
+    if total > MOST_CANDIDATES:
+        raise ConfigurationError(
+            f"updater.count={count}: {total} combinations of {len(ranges)} parameters, expected at "
+            f"most {MOST_CANDIDATES}; choose a lower count or fewer ranges"
+        )
+    axes = []
+    for name, span in ranges.items():
+        if len(span) != 2:
+            raise ConfigurationError(f"updater.ranges.{name}={span}: expected [low, high]")
+        low = check_number(f"updater.ranges.{name}: low", span[0])
+        high = check_number(f"updater.ranges.{name}: high", span[1], low=low, open_low=True)
+        axes.append(torch.linspace(low, high, count))
+    rows = model.nominal.repeat(total + 1, 1)
+    columns = [names.index(name) for name in ranges]
+    rows[1:, columns] = torch.cartesian_prod(*axes).reshape(total, -1).to(rows)
+    return rows
