@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import coverage
 import pandas as pd
 import pytest
 import yaml
@@ -157,6 +158,8 @@ def alive(pid):
 
 def forking_batch(folder, jobs, stacks):
     """Run a batch that forks its jobs, from a process that has one thread only."""
+    if measured := coverage.Coverage.current():
+        measured.stop()  # a signal inside coverage's lock leaves it locked, for ever
     process.START = "fork"
     faulthandler.register(signal.SIGUSR1, stacks.open("a"))
     run_batch(folder, jobs, LocalPool(2), **QUIET)
