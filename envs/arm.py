@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.envs.task import Reward, Task
-from afm_rl.envs.task_sources import EXACT, Limits, trust
+from afm_rl.envs.task import Reward, Task, trust
+from afm_rl.envs.task_sources import EXACT, Limits
 from afm_rl.errors import check_count
 from afm_rl.rotations import quaternion_exp, quaternion_multiply, rotate
 

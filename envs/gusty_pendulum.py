@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.envs.task import Reward, Task
-from afm_rl.envs.task_sources import NOWHERE, Limits
+from afm_rl.envs.task import NOWHERE, Reward, Task
+from afm_rl.envs.task_sources import Limits
 from afm_rl.errors import check_count
 from afm_rl.manifold import Manifold
 from afm_rl.regimes import Regime

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.envs.inversion_contexts import body_regime, contexts_of
-from afm_rl.envs.task import Task
-from afm_rl.envs.task_sources import NOWHERE
+from afm_rl.envs.task import NOWHERE, Task
 from afm_rl.manifold import Manifold
 from afm_rl.regimes import Regime
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
+from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning.costs import check_arguments
 from afm_rl.regimes import Regime
@@ -18,6 +18,8 @@ Reward = Callable[..., Tensor]
 Contexts = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 ENDLESS = 1e30  # what unbounded specs say
 PROBE = 2, 3  # batch in which a reward is tried
+NOWHERE = torch.zeros(0)  # the goal of a task without one
+FINE = 0.1  # error of a model of one's own, at most, in effects that the largest actions have
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,3 +174,29 @@ class Task:
 
     def replay(self, history: Mapping[str, Any]) -> None:
         """Bring such a world into the state that a history led to."""
+
+
+def trust(
+    world: KnownDynamics,
+    state: Tensor,
+    low: Sequence[float],
+    high: Sequence[float],
+    share: float = FINE,
+) -> KnownDynamics:
+    """Bound a model's noise by a share of what actions effect in a step.
+
+    Short steps have small effects; a change of what they are would be lost in the noise of long
+    ones.
+
+    Args:
+        world: the model, changed in place.
+        state: where effects are measured, ``(S,)``.
+        low: lowest action, ``(A,)``.
+        high: highest action, ``(A,)``.
+        share: of the largest actions' effect on each coordinate.
+    """
+    half = (torch.tensor([list(high), list(low)]).diff(dim=0)[0] / 2).abs().nan_to_num(posinf=1.0)
+    slopes = world.jacobian(state.float(), torch.zeros(len(half))).abs()
+    effect = share * (slopes * half).sum(-1)
+    world.noise = torch.where(effect > 0, torch.minimum(world.noise, effect), world.noise)
+    return world

@@ -21,15 +21,14 @@ from torch import Tensor
 from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
 from afm_rl.dynamics.mujoco import Change
 from afm_rl.dynamics.mujoco_physics import changed_model
-from afm_rl.envs.task import Reward, Task
+from afm_rl.envs.pendulum import pendulum_observation, pendulum_step
+from afm_rl.envs.task import NOWHERE, Reward, Task, trust
 from afm_rl.envs.task_hosts import environment_task
 from afm_rl.envs.task_rewards import DM_CONTROL, GYMNASIUM, Rewards, seen_target
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.manifold import Manifold
 
 Limits = Sequence[float] | None
-NOWHERE = torch.zeros(0)  # the goal of a task without one
-FINE = 0.1  # error of a model of one's own, at most, in effects that the largest actions have
 EXACT = 0.03  # the same, of a model that is the world's simulator
 
 
@@ -259,27 +258,6 @@ def function_task(
     )
 
 
-def pendulum_step(state: Tensor, action: Tensor) -> Tensor:
-    """Step of gymnasium's Pendulum-v1; the state is angle (rad, 0 is up) and speed (rad/s).
-
-    >>> pendulum_step(torch.zeros(2), torch.tensor([2.0]))
-    tensor([0.0150, 0.3000])
-    """
-    angle, speed = state.unbind(-1)
-    speed = (speed + 0.05 * (15 * angle.sin() + 3 * action[..., 0])).clamp(-8.0, 8.0)
-    return torch.stack([angle + 0.05 * speed, speed], -1)
-
-
-def pendulum_observation(state: Tensor) -> Tensor:
-    """Return what gymnasium's Pendulum-v1 shows: cosine and sine of the angle, and the speed.
-
-    >>> pendulum_observation(torch.tensor([0.0, 3.0]))
-    tensor([1., 0., 3.])
-    """
-    angle, speed = state.unbind(-1)
-    return torch.stack([angle.cos(), angle.sin(), speed], -1)
-
-
 @contextmanager
 def quiet() -> Iterator[None]:
     """Silence what packages say of missing screens, and of old settings in their own files."""
@@ -326,32 +304,6 @@ def _known(
     features = [k for k in range(size) if k not in found.ignored] if found.ignored else []
     own = {"reward": found.reward, "plan": found.plan, "ends": found.ends, "features": features}
     return {**own, **within}
-
-
-def trust(
-    world: KnownDynamics,
-    state: Tensor,
-    low: Sequence[float],
-    high: Sequence[float],
-    share: float = FINE,
-) -> KnownDynamics:
-    """Bound a model's noise by a share of what actions effect in a step.
-
-    Short steps have small effects; a change of what they are would be lost in the noise of long
-    ones.
-
-    Args:
-        world: the model, changed in place.
-        state: where effects are measured, ``(S,)``.
-        low: lowest action, ``(A,)``.
-        high: highest action, ``(A,)``.
-        share: of the largest actions' effect on each coordinate.
-    """
-    half = (torch.tensor([list(high), list(low)]).diff(dim=0)[0] / 2).abs().nan_to_num(posinf=1.0)
-    slopes = world.jacobian(state.float(), torch.zeros(len(half))).abs()
-    effect = share * (slopes * half).sum(-1)
-    world.noise = torch.where(effect > 0, torch.minimum(world.noise, effect), world.noise)
-    return world
 
 
 def _mujoco(

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from afm_rl.correction.pairs import ClassicalCorrector
 from afm_rl.errors import check_choice, check_number
-from afm_rl.flow.experts import Rows, weigh
+from afm_rl.flow.experts import Rows
+from afm_rl.flow.fits import weigh
 from afm_rl.flow.saturation import MODES, saturate
 
 

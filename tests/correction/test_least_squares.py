@@ -5,7 +5,7 @@ import torch
 
 from afm_rl.correction import LeastSquares
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow.experts import fit_affine, fit_gain, weigh
+from afm_rl.flow.fits import fit_affine, fit_gain, weigh
 from afm_rl.flow.saturation import MODES
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])

@@ -11,6 +11,8 @@ from afm_rl.flow.experts import (
     MISSES,
     NEAR,
     SHORT,
+)
+from afm_rl.flow.fits import (
     apply_friction,
     confidence,
     fit_affine,

@@ -24,7 +24,7 @@ from afm_rl.learning.watching import Watching
 from afm_rl.manifold import Manifold
 from afm_rl.planning import KnownReward, PlanningEnv
 from afm_rl.transforms import ActionFlowTransform
-from afm_rl.transforms.gymnasium import CorrectionLoop
+from afm_rl.transforms.correction_loop import CorrectionLoop
 
 SMALL = {
     "transitions": 800,
@@ -128,7 +128,7 @@ def test_a_diagnosis_is_made_when_it_is_asked_for(monkeypatch):
         asked.append(args)
         return "reversed"
 
-    monkeypatch.setattr("afm_rl.transforms.gymnasium.explain", explain)
+    monkeypatch.setattr("afm_rl.transforms.correction_loop.explain", explain)
     *_, last = [info["afm"] for *_, info in play(ActionFlowWrapper(Puck(gain=-1.0), push), 20)]
     kept = copy.deepcopy(last)
     assert not asked and "diagnosis" not in kept

@@ -1,0 +1,256 @@
+"""The tick of the correction for environments that speak numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box
+from gymnasium.vector import VectorEnv
+from torch import Tensor
+from torchrl.data import Bounded
+
+from afm_rl.correction import Corrector
+from afm_rl.correction.pairs import PairCorrector
+from afm_rl.diagnosis import explain
+from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
+from afm_rl.errors import ConfigurationError, check_flag
+from afm_rl.learning.watching import Watching
+from afm_rl.manifold import Manifold
+from afm_rl.transforms.memory import begin, correct, corrector_for
+
+Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str
+State = Callable[[Any, Any], Any]
+AS_EXPECTED = "as the model expects"
+ENDS = {"planned": "action", "executed": "action", "predicted": "effect"}
+
+
+class Told(dict[str, Any]):
+    """What is known of a step; its ``diagnosis``, some milliseconds, is made when it is asked for.
+
+    >>> told = Told({"corrects": False}, lambda: "healthy")
+    >>> told["diagnosis"], told["corrects"]
+    ('healthy', False)
+    """
+
+    def __init__(self, known: Mapping[str, Any], diagnose: Callable[[], Any]) -> None:
+        super().__init__(known)
+        self._diagnose = diagnose
+
+    def __missing__(self, key: str) -> Any:
+        if key != "diagnosis":
+            raise KeyError(key)
+        self[key] = self._diagnose()
+        return self[key]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Told:
+        return Told(deepcopy(dict(self), memo), self._diagnose)
+
+    def __reduce__(self) -> Any:
+        return dict, ({**self, "diagnosis": self["diagnosis"]},)
+
+
+class CorrectionLoop:
+    """The tick of :mod:`~afm_rl.transforms.memory` for N environments that speak numpy.
+
+    Args:
+        observations: space of one observation.
+        actions: space of one action.
+        model: see :class:`ActionFlowWrapper`, as further arguments.
+        state: reads the state.
+        corrector: the correction.
+        enabled: False to watch only.
+        source: environment, or vector of environments, that may have a simulation.
+    """
+
+    def __init__(
+        self,
+        observations: gymnasium.Space,
+        actions: gymnasium.Space,
+        model: Model,
+        state: State | None = None,
+        corrector: Corrector | None = None,
+        enabled: bool = True,
+        source: Any = None,
+    ) -> None:
+        if not isinstance(actions, Box) or len(actions.shape) != 1 or actions.dtype.kind != "f":
+            raise ConfigurationError(
+                f"ActionFlowWrapper: action_space={actions}: expected a Box of one vector of real "
+                "numbers"
+            )
+        self.space, self.enabled = actions, check_flag("wrapper.enabled", enabled)
+        self.watching = Watching() if isinstance(model, str) and model == "learn" else None
+        if isinstance(model, Watching):
+            self.watching = deepcopy(model)
+        self.model: Any = None if self.watching else model
+        if isinstance(model, str) and model == "mujoco":
+            self.model = _simulation(source)
+        elif isinstance(model, str) and model != "learn" or not callable(self.model or len):
+            raise ConfigurationError(
+                f"ActionFlowWrapper: model={model!r}: expected 'mujoco', 'learn', a step function "
+                "or a DynamicsModel"
+            )
+        self.corrector: Any = corrector
+        if state is None and isinstance(self.model, MuJoCoDynamics):
+            state = _vector_state if isinstance(source, VectorEnv) else _env_state
+        if state is None and not (isinstance(observations, Box) and len(observations.shape) == 1):
+            raise ConfigurationError(
+                f"ActionFlowWrapper: observation_space={observations}: expected a Box of one "
+                "vector; say what the state is by state=lambda env, observation: ..."
+            )
+        self.state: State = _observed if state is None else state
+        names = self.model.names[1] if isinstance(self.model, MuJoCoDynamics) else None
+        self.names = names or [f"actuator {k}" for k in range(actions.shape[0])]
+        self.entries: Any = None  # a tensordict, from the first reset on
+        self.told: Told = Told({}, lambda: AS_EXPECTED)
+        self.random = np.random.default_rng(0)
+
+    @property
+    def learning(self) -> bool:
+        """Is there no model yet?"""
+        return self.watching is not None and self.watching.fitted is None
+
+    @torch.no_grad()
+    def begin(self, states: Any, rows: np.ndarray | None = None, seed: int | None = None) -> None:
+        """Begin episodes in ``states`` ``(N, S)``; only in ``rows`` ``(N,)``, if given."""
+        states = _tensor(states)
+        if seed is not None:
+            self.random = np.random.default_rng(seed)
+        if self.entries is None:
+            self._complete(states)
+        if self.watching and self.learning and self.watching.due:
+            self.watching.learn(self.corrector)
+            self.model, rows = self.watching.fitted or self.model, None
+        fresh = begin(self.corrector, states, self.spec)
+        if rows is None or self.entries is None:
+            self.entries, self.states = fresh, states
+            self.shown, self.odd = fresh.get("memory"), np.zeros(len(states), dtype=bool)
+        else:
+            mask = torch.from_numpy(rows)
+            self.entries = torch.where(mask, fresh, self.entries)
+            self.states = torch.where(mask.unsqueeze(-1), states, self.states)
+            self.odd = self.odd & ~rows
+        self.told = self._tell()
+
+    def _complete(self, states: Tensor) -> None:
+        """Build what depends on size and precision of the state."""
+        size, count = states.shape[-1], self.space.shape[0]
+        if self.model is None:
+            self.model = UnknownDynamics(Manifold(size), count)
+        elif not isinstance(self.model, DynamicsModel):
+            self.model = KnownDynamics(self.model, Manifold(size), count)
+        if states.dim() != 2 or size != self.model.state_size:
+            raise ConfigurationError(
+                f"ActionFlowWrapper: the state has {tuple(states.shape[1:])} numbers, that of the "
+                f"model {self.model.state_size}; say what it is by "
+                "state=lambda env, observation: ..."
+            )
+        low, high = (torch.as_tensor(x).to(states) for x in (self.space.low, self.space.high))
+        self.spec = Bounded(low, high, low.shape, dtype=low.dtype)
+        self.corrector = corrector_for("ActionFlowWrapper", self.model, self.corrector, self.spec)
+        self.corrector.to(states.dtype)
+
+    @torch.no_grad()
+    def act(self, planned: np.ndarray) -> np.ndarray:
+        """Return what to execute instead of ``planned`` ``(N, A)``."""
+        if self.entries is None:
+            raise ResetNeeded("call reset() before step()")
+        wanted = torch.as_tensor(planned).to(self.states)
+        if self.watching and self.learning:
+            low, high = self.spec.space.low, self.spec.space.high
+            noise = self.random.standard_normal(wanted.shape) * self.watching.noise
+            executed = wanted + torch.from_numpy(noise).to(wanted) * (high - low) / 2
+            executed = executed.clamp(low, high)
+            found = {"planned": wanted, "executed": executed, "predicted": executed}
+            self.entries.update({f"{name}_{ENDS[name]}": value for name, value in found.items()})
+        else:
+            memory, how = self.entries.get("memory"), (self.spec, self.enabled)
+            self.entries = correct(memory, wanted, self.model, self.corrector, *how)
+            self._remember()
+        self.told = self._tell()
+        return self.told["executed"].astype(self.space.dtype)
+
+    @torch.no_grad()
+    def observe(self, states: Any, fresh: np.ndarray | None = None) -> None:
+        """Add what the actions led to, ``(N, S)``; where ``fresh`` ``(N,)``, an episode began."""
+        states, entries = _tensor(states), self.entries
+        fresh = np.zeros(len(states), dtype=bool) if fresh is None else fresh
+        if self.watching and self.learning:
+            executed, valid = entries.get("executed_action"), torch.from_numpy(~fresh)
+            self.watching.add(self.states, executed, states, valid)
+        else:
+            entries.set("memory", self.corrector.observe(entries.get("memory"), states))
+        self.states, told = states, self.told
+        if fresh.any():
+            self.begin(states, fresh)
+            self.told = told
+
+    def _remember(self) -> None:
+        """Keep the pairs of where actions are corrected, for a diagnosis."""
+        misaligned, memory = self.entries.get("misaligned"), self.entries.get("memory")
+        if bool(misaligned.any()) and isinstance(self.corrector, PairCorrector):
+            self.shown = torch.where(misaligned.unsqueeze(-1), memory, self.shown)
+            self.odd = self.odd | misaligned.numpy()
+
+    def _diagnosis(self, memory: Tensor, odd: np.ndarray) -> np.ndarray:
+        """Say in words what the pairs of a memory ``(N, P)`` show, of ``odd`` rows ``(N,)``."""
+        words = np.full(len(odd), AS_EXPECTED, dtype=object)
+        for row in odd.nonzero()[0]:
+            parts, size = self.corrector.unpack(memory[row], self.states.shape[-1]), len(self.names)
+            pairs = parts["pairs"][:, : 3 * size + 1].split([size, size, size, 1], -1)
+            executed, effective, std, valid = (part.numpy() for part in pairs)
+            use, step = valid[:, 0] > 0, getattr(self.model, "dt", 1.0)
+            words[row] = str(explain(executed[use], effective[use], self.names, std[use], step))
+        return words
+
+    def _tell(self) -> Told:
+        """Return what is known of the newest step, ``(N, ...)`` each."""
+        told: dict[str, Any] = {
+            name: self.entries.get(f"{name}_{end}").numpy().copy() for name, end in ENDS.items()
+        }
+        corrects = self.entries.get("misaligned").numpy() & self.enabled
+        told |= {"corrects": corrects, "innovation": self.entries.get("innovation").numpy().copy()}
+        if self.watching:
+            told["learned"] = np.full(len(corrects), not self.learning)
+        shown, odd = self.shown, self.odd
+        return Told(told, lambda: self._diagnosis(shown, odd))
+
+
+def _tensor(states: Any) -> Tensor:
+    """Return states as a tensor of real numbers, a copy."""
+    found = torch.tensor(np.asarray(states))
+    return found if found.is_floating_point() else found.to(torch.get_default_dtype())
+
+
+def _observed(env: Any, observation: Any) -> Any:
+    return observation
+
+
+def _env_state(env: Any, observation: Any) -> np.ndarray:
+    """Return positions, velocities and activations of a simulation."""
+    data = env.unwrapped.data
+    return np.concatenate([data.qpos, data.qvel, data.act])
+
+
+def _vector_state(env: Any, observations: Any) -> np.ndarray:
+    """Return positions and velocities of each simulation."""
+    return np.stack(env.unwrapped.call("state_vector"))
+
+
+def _simulation(source: Any) -> MuJoCoDynamics:
+    """Return the MuJoCo model of an environment, or of the first of a vector of them."""
+    try:
+        inner: Any = source.unwrapped
+        if not isinstance(source, VectorEnv):
+            return MuJoCoDynamics(inner)
+        return MuJoCoDynamics(inner.get_attr("model")[0], inner.get_attr("frame_skip")[0])
+    except (ConfigurationError, AttributeError) as error:
+        raise ConfigurationError(
+            f"ActionFlowWrapper: model='mujoco', but {source} has no MuJoCo model ({error}); give "
+            "a step function, a DynamicsModel, or 'learn'"
+        ) from error
