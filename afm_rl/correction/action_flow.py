@@ -49,8 +49,8 @@ class ActionFlow(PairCorrector):
     4. *Experts* fit its pairs, and the network encodes both.
     5. *Flow*: straight paths :math:`x_\tau = (1-\tau)(u_0 + \sigma\epsilon) + \tau u_1` lead from
        around the plan :math:`u_0` to the inverse :math:`u_1 = T^{-1}(u_0)`.
-    6. *Choice*: the sample, or their mean, whose predicted effect is nearest to the achievable part
-       of the plan is executed.
+    6. *Choice*: the sample, their mean, or the answer of an expert that explains all pairs, whose
+       predicted effect is nearest to the achievable part of the plan is executed.
 
     Args:
         action_low: lowest action, ``(A,)``.

@@ -213,11 +213,16 @@ class Tick(nn.Module):
             # Of an action that never changed it is not known what another one would do.
             dead = small & (tried > EXCITED).unsqueeze(-2)
             plans = torch.where(dead, line.mean(-2, keepdim=True), plans)
-        velocity = partial(self.network.velocity, self.network.ask(known, plans, self.saturation))
+        asked = self.network.ask(known, plans, self.saturation)
+        velocity = partial(self.network.velocity, asked)
         start = plans + self.source_std * self.source_points
         ends = midpoint(velocity, start, self.steps)
         mean, spread = ends.mean(-2, keepdim=True), ends.std(-2, correction=0)
-        proposals = mean if self.choose == "mean" else torch.cat([mean, ends], -2)
+        proposals = mean
+        if self.choose == "best":
+            sure = known.experts.sure().unsqueeze(-1)
+            exact = torch.where(sure, asked.answers[..., 0, :-1].mT, mean)
+            proposals = torch.cat([mean, ends, exact], -2)
         least, most = box.split(1, -2)
         proposals = torch.minimum(torch.maximum(proposals, least), most)
         count = proposals.shape[-2]

@@ -125,6 +125,10 @@ class Experts(NamedTuple):
         effect = self.gain[..., 2] * actions.mT.to(self.bias) + self.offset[..., 2]
         return torch.where(exact, effect, torch.nan).mT.to(actions)
 
+    def sure(self) -> Tensor:
+        """Return which of the five fits explain all rows on all axes, ``(N, 5)``."""
+        return (self.misses.squeeze(-2).exp() < EXACT).all(-2)
+
     def explained(self) -> tuple[Tensor, Tensor]:
         """Return which rows, of which there are enough, one line explains, or none is needed.
 

@@ -61,6 +61,13 @@ def test_faults_are_corrected_within_few_steps(line, drive, plans, name, size):
     assert foreseen < 0.12
 
 
+@pytest.mark.parametrize("name", ["bias", "two swapped"])
+def test_what_one_map_explains_is_undone_exactly(line, drive, plans, name):
+    planned = plans(STEPS, 8, 3, size=0.5)
+    _, effects = drive(flow_of(3), line(3), REGIMES[name], planned)
+    assert miss_of(effects, planned, 16).max() < 5e-4
+
+
 @pytest.mark.parametrize("size", [1, 2])
 def test_small_actions_that_look_reversed_at_first_are_understood_soon(line, drive, plans, size):
     """One pair does not tell an offset from a reversal: the next ones count, and no old ones."""
