@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 
 import afm_rl.conf
 from afm_rl.missions import build, prepare, run
+from afm_rl.report import write_run
 
 CONF = Path(afm_rl.conf.__file__).parent
 FILES = sorted(CONF.glob("*/*.yaml"))
@@ -119,7 +120,7 @@ def composed(*overrides):
 
 
 @pytest.mark.parametrize("overrides", [*PAIRS, *SINGLES], ids=" ".join)
-def test_every_choice_runs(overrides, cache):
+def test_every_choice_runs(overrides, cache, tmp_path):
     cfg = copy.deepcopy(composed(*overrides))
     for key, value in SMALL.items():
         if OmegaConf.select(cfg, key) is not None:
@@ -130,6 +131,10 @@ def test_every_choice_runs(overrides, cache):
     assert results.steps["t"].tolist() == [0, 1, 2, 3, 4] * len(results.missions)
     assert np.isfinite(results.steps.to_numpy(dtype=float)).all()
     assert results.missions["steps"].eq(4).all()
+    if overrides[0].startswith("robot="):  # of each robot everything can be drawn
+        parts = results.missions, results.steps, results.measures
+        roads = getattr(agent.base_env, "tracks", ())
+        write_run(tmp_path, *parts, roads, echo=lambda line: None)
 
 
 def comments(path):

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from afm_rl.measures import Measures
 from afm_rl.report import style
-from afm_rl.report.frames import first_missions, left_out, steps_of
+from afm_rl.report.frames import first_missions, left_out, outcome, steps_of
 from afm_rl.report.track_plot import MARGIN, Box, DrawableTrack, distance_to, draw_road, view
 
 PANELS = 12
@@ -64,7 +64,9 @@ def draw_trajectories(
         track = known.get(mission["track"])
         if track is not None:
             draw_road(axes, track)
-        draw_path(axes, paths[mission["mission"]], bool(mission["finished"]), track)
+        ended = outcome(mission)
+        finished = bool(mission[ended]) == (ended == "finished")
+        draw_path(axes, paths[mission["mission"]], finished, track)
         _title(axes, mission, measures)
     title = style.literal(cells[0]) if len(cells) == 1 else None
     style.legend_above(figure, *_legend(), title)
