@@ -198,7 +198,7 @@ def test_a_network_may_be_trained_before_the_flight(make_agent, randomised):
 
 def test_robots_say_which_hypotheses_make_sense(composed):
     chosen = composed("robot=quadrotor", "method=afm_physics").corrector
-    assert list(chosen.hypotheses) == ["identity", "recent", "newest"]
+    assert list(chosen.hypotheses) == ["identity", "recent", "newest", "varied"]
     assert composed("robot=ugv", "method=afm_physics").corrector.hypotheses is None
     learning = composed("robot=quadrotor", "method=afm_online_knode").corrector
     assert list(learning.hypotheses) == ["identity", "newest"]
