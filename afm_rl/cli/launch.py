@@ -125,7 +125,7 @@ def run_together(
     """
     command = shlex.join(["afm-rl", *overrides])
     how = {"command": command, "overwrite": cfg.overwrite, "progress": cfg.progress}
-    with _interruptible(folder), _like_ctrl_c(signal.SIGTERM):
+    with _interruptible(folder), _ended_by(signal.SIGINT, signal.SIGTERM):
         found = run_batch(folder, jobs, pool, **how)
     failures = {**(failures or {}), **found}
     for name, reason in failures.items():
@@ -210,10 +210,14 @@ def _interruptible(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _like_ctrl_c(number: signal.Signals) -> Iterator[None]:
-    """Treat a signal like Ctrl-C: batch systems send it before they kill."""
-    before = signal.signal(number, signal.default_int_handler)
+def _ended_by(*numbers: signal.Signals) -> Iterator[None]:
+    """End by signals, as by Ctrl-C: batch systems send them before they kill.
+
+    Also by SIGINT where that is ignored, as a shell's script has it for what it runs behind itself.
+    """
+    before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(number, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -83,7 +83,7 @@ def test_ctrl_c_keeps_what_was_done(process, program, tmp_path, kind):
             time.sleep(0.02)
         running.send_signal(signal.SIGINT)
         said = running.stderr.read().splitlines()
-    assert running.returncode == 130
+    assert running.returncode == 130, said
     assert said[-1].startswith("afm-rl: interrupted; what was done is in")
     assert list(folder.rglob("checkpoint-*")) and not list(folder.rglob("missions.csv"))
     done = process(sys.executable, "-m", "afm_rl.cli", *settings)
