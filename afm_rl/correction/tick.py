@@ -219,7 +219,7 @@ class Tick(nn.Module):
         ends = midpoint(velocity, start, self.steps)
         mean, spread = ends.mean(-2, keepdim=True), ends.std(-2, correction=0)
         proposals = mean
-        if self.choose == "best":
+        if self.choose == "best":  # mixtures come near; an expert that explains all is exact
             sure = known.experts.sure().unsqueeze(-1)
             exact = torch.where(sure, asked.answers[..., 0, :-1].mT, mean)
             proposals = torch.cat([mean, ends, exact], -2)
