@@ -22,7 +22,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY
+from afm_rl.correction.readings import HYPOTHESES, IDENTITY
 from afm_rl.dynamics import Dubins, DynamicsModel, Ensemble, KnownDynamics
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 from afm_rl.manifold import Manifold

@@ -7,11 +7,11 @@ import pytest
 import torch
 from hypothesis import settings
 
-import afm_rl.flow
+import afm_rl.correction.training
 import afm_rl.learning
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, Ensemble
-from afm_rl.flow import AxisNetwork
+from afm_rl.correction.network import AxisNetwork
 from afm_rl.learning import pretrain_ensemble
 from afm_rl.manifold import Manifold
 from afm_rl.regimes import ActionGain
@@ -132,7 +132,7 @@ def remembered():
 def short_trainings(monkeypatch):
     """Cut every training short."""
     for module, name, small in (
-        (afm_rl.flow, "train_flow", {"iterations": 5}),
+        (afm_rl.correction.training, "train_flow", {"iterations": 5}),
         (afm_rl.learning, "pretrain_ensemble", {"samples": 512, "epochs": 1}),
     ):
         whole = getattr(module, name)

@@ -9,17 +9,17 @@ import torch
 from torch import Tensor
 
 from afm_rl.correction.base import Correction, put, rows_of
-from afm_rl.correction.counterfactuals import draw_counterfactuals
-from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY, check_hypotheses, memory_of
+from afm_rl.correction.training.counterfactuals import draw_counterfactuals
+from afm_rl.correction.readings import HYPOTHESES, IDENTITY, check_hypotheses, memory_of
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.tick import Tick
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_flag, check_number
-from afm_rl.flow.experts import fit_experts
-from afm_rl.flow.network import AxisNetwork
-from afm_rl.flow.prior import Drawn
-from afm_rl.flow.training import EFFECT_WEIGHT, States, flow_losses
-from afm_rl.flow.weights import load_universal
+from afm_rl.correction.experts import fit_experts
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.training.prior import Drawn
+from afm_rl.correction.training.refine import EFFECT_WEIGHT, States, flow_losses
+from afm_rl.correction.weights import load_universal
 from afm_rl.machine_code import MachineCode, in_one_batch
 from afm_rl.regimes import Regime
 from afm_rl.tracing import all_hold
@@ -34,13 +34,13 @@ class ActionFlow(PairCorrector):
 
     A regime is described by pairs (executed, effective action), which mean the same for every
     model and robot (:func:`~afm_rl.dynamics.inverse.effective_action`). One network, trained once
-    on regimes without any robot (:mod:`~afm_rl.flow.prior`), answers for any number of actions.
+    on regimes without any robot (:mod:`~afm_rl.correction.training.prior`), answers for any number of actions.
     At every tick (:meth:`correct`):
 
     1. *Innovation and effective action*: what did the last transition show?
     2. *Gate*: while no innovation exceeds ``gate`` standard deviations of the model's noise, the
        planned action is executed.
-    3. *Hypotheses*: the memory is read in several ways (:mod:`~afm_rl.correction.hypotheses`).
+    3. *Hypotheses*: the memory is read in several ways (:mod:`~afm_rl.correction.readings`).
        Each predicts the next effect; the one with the smallest discounted loss
        :math:`L \leftarrow \lambda L + \rho(\hat T(u) - u_\mathrm{eff})`,
        :math:`\rho(x) = x^2 / (x^2 + 0.25^2)`, is believed. No correction at all is one of them.
@@ -55,7 +55,7 @@ class ActionFlow(PairCorrector):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        hypotheses: names of :data:`~afm_rl.correction.hypotheses.HYPOTHESES`; all if None.
+        hypotheses: names of :data:`~afm_rl.correction.readings.HYPOTHESES`; all if None.
         rows: pairs that a hypothesis reads, K; None: 12, or more for more than eight actions.
         memory: pairs that are remembered, M.
         place: coordinates of the state in which the ground may differ; hypotheses by place are
@@ -68,7 +68,7 @@ class ActionFlow(PairCorrector):
         steps: midpoint steps.
         choose: the ``"best"`` sample by its predicted effect, or always their ``"mean"``.
         saturation: what gives way when a plan is not achievable in full, see
-            :func:`~afm_rl.flow.saturation.saturate`.
+            :func:`~afm_rl.correction.achievable.saturate`.
         compile: run the tick as machine code, which is faster for a single
             mission; it is compiled once and kept in the cache. Where there is no compiler, the
             tick runs as it is. Results agree to rounding.

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from afm_rl.correction.pairs import ClassicalCorrector
 from afm_rl.errors import check_choice, check_number
-from afm_rl.flow.experts import Rows
-from afm_rl.flow.fits import weigh
-from afm_rl.flow.saturation import MODES, saturate
+from afm_rl.correction.experts import Rows
+from afm_rl.correction.fits import weigh
+from afm_rl.correction.achievable import MODES, saturate
 
 
 def low_pass(signal: Tensor, valid: Tensor, bandwidth: float, dt: float) -> Tensor:

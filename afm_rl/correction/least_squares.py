@@ -7,8 +7,8 @@ from torch import Tensor
 
 from afm_rl.correction.pairs import ClassicalCorrector
 from afm_rl.errors import check_choice, check_number
-from afm_rl.flow.experts import Rows
-from afm_rl.flow.fits import (
+from afm_rl.correction.experts import Rows
+from afm_rl.correction.fits import (
     confidence,
     fit_affine,
     fit_gain,
@@ -16,7 +16,7 @@ from afm_rl.flow.fits import (
     invert_affine,
     weigh,
 )
-from afm_rl.flow.saturation import MODES, saturate
+from afm_rl.correction.achievable import MODES, saturate
 
 FORMS = ("gain", "gain_offset", "affine")
 
@@ -25,7 +25,7 @@ class LeastSquares(ClassicalCorrector):
     r"""Certainty-equivalent adaptive control: fit the regime, execute the inverse.
 
     Executes :math:`g^{-1} u_0` (``form="gain"``), :math:`g^{-1} (u_0 - b)` with a robust fit
-    (``"gain_offset"``, :func:`~afm_rl.flow.fits.fit_gain_offset`) or :math:`D^{-1} (u_0 - b)`
+    (``"gain_offset"``, :func:`~afm_rl.correction.fits.fit_gain_offset`) or :math:`D^{-1} (u_0 - b)`
     (``"affine"``), saturated. Pairs count by their age and, all but ``"affine"``, by their noise.
     Nothing is trained; any control engineer's first answer, and the bar for a learned flow.
 

@@ -11,7 +11,7 @@ from afm_rl.correction.base import Correction, Corrector, put, rows_of
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import check_count
-from afm_rl.flow.experts import LIMIT, Rows
+from afm_rl.correction.experts import LIMIT, Rows
 from afm_rl.tracing import all_hold
 
 OLD = 0.5  # what "valid" becomes where a change has begun since

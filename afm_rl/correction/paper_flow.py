@@ -16,8 +16,8 @@ from afm_rl.errors import (
     check_counts,
     check_flag,
 )
-from afm_rl.flow.network import mlp
-from afm_rl.flow.solver import midpoint
+from afm_rl.correction.network import mlp
+from afm_rl.correction.solver import midpoint
 from afm_rl.regimes import Regime
 from afm_rl.sampling import draw_states, uniform
 from afm_rl.tracing import all_hold

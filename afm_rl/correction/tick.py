@@ -10,12 +10,12 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.correction.choice import nearest_of, probes_of, source_points_of
-from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY, Layout, lay_out, read_rows
+from afm_rl.correction.readings import HYPOTHESES, IDENTITY, Layout, lay_out, read_rows
 from afm_rl.errors import check_choice, check_count, check_number
-from afm_rl.flow.experts import Experts, Rows, fit_experts
-from afm_rl.flow.network import AxisNetwork, Encoded
-from afm_rl.flow.saturation import DEAD, MODES, attainable, cut_off
-from afm_rl.flow.solver import midpoint
+from afm_rl.correction.experts import Experts, Rows, fit_experts
+from afm_rl.correction.network import AxisNetwork, Encoded
+from afm_rl.correction.achievable import DEAD, MODES, attainable, cut_off
+from afm_rl.correction.solver import midpoint
 
 TOLERANCE = 0.25  # of the largest action: at an error of this size the loss is half its maximum
 FORGIVEN = 0.02  # loss of a hypothesis that explains all that it has read

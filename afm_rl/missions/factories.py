@@ -27,7 +27,7 @@ from afm_rl.dynamics import (
     UnknownDynamics,
 )
 from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_flag
-from afm_rl.flow import train_flow
+from afm_rl.correction.training import train_flow
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
 from afm_rl.missions.collected import fit_collected

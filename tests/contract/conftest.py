@@ -19,7 +19,8 @@ from afm_rl.dynamics import (
     Oracle,
     Quadrotor,
 )
-from afm_rl.flow import AxisNetwork, CFMLoss
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.training import CFMLoss
 from afm_rl.learning import (
     GaussianNLLLoss,
     OnlineUpdater,

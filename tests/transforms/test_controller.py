@@ -16,7 +16,8 @@ from torchrl.envs.utils import step_mdp
 from afm_rl.correction import ActionFlow, LeastSquares
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import AxisNetwork, experts
+from afm_rl.correction import experts
+from afm_rl.correction.network import AxisNetwork
 from afm_rl.machine_code import has_compiler
 from afm_rl.planning import ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv
 from afm_rl.transforms import ActionFlowPolicy

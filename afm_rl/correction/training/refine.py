@@ -20,10 +20,10 @@ from afm_rl.errors import (
     check_instance,
     check_number,
 )
-from afm_rl.flow.experts import Rows, fit_experts
-from afm_rl.flow.network import AxisNetwork
-from afm_rl.flow.prior import Drawn
-from afm_rl.flow.saturation import MODES
+from afm_rl.correction.experts import Rows, fit_experts
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.training.prior import Drawn
+from afm_rl.correction.achievable import MODES
 from afm_rl.learning import InPlaceLoss
 from afm_rl.progress import Bar
 from afm_rl.regimes import Regime

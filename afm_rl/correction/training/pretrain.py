@@ -1,4 +1,4 @@
-"""Training of the universal flow: ``python -m afm_rl.flow.pretrain --out universal.safetensors``.
+"""Training of the universal flow: ``python -m afm_rl.correction.training.pretrain --out universal.safetensors``.
 
 ``--evaluate`` prints the held-out errors of the weights of the package, by kind of regime and
 number of actions, as they stand in the model card; a training ends with the same table.
@@ -16,13 +16,13 @@ from safetensors.torch import save
 from torch import Tensor
 
 from afm_rl.files import write_whole
-from afm_rl.flow.experts import Rows, fit_experts
-from afm_rl.flow.network import AxisNetwork
-from afm_rl.flow.prior import KINDS, MIXES, Drawn, draw_examples
-from afm_rl.flow.saturation import MODES
-from afm_rl.flow.solver import midpoint
-from afm_rl.flow.training import EFFECT_WEIGHT, flow_losses
-from afm_rl.flow.weights import load_universal
+from afm_rl.correction.experts import Rows, fit_experts
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.training.prior import KINDS, MIXES, Drawn, draw_examples
+from afm_rl.correction.achievable import MODES
+from afm_rl.correction.solver import midpoint
+from afm_rl.correction.training.refine import EFFECT_WEIGHT, flow_losses
+from afm_rl.correction.weights import load_universal
 
 SIZES = {1: 0.12, 2: 0.45, 3: 0.15, 4: 0.08, 6: 0.15, 9: 0.05}  # share of numbers of actions
 SHARES = {"mixed": 0.5, "clip": 0.3, "direction": 0.2}  # share of saturation modes
@@ -119,7 +119,7 @@ def _error(network, count, size, shares, generator) -> tuple[float, float]:
 
 def main() -> None:
     """Train, or evaluate."""
-    parser = argparse.ArgumentParser(prog="python -m afm_rl.flow.pretrain", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m afm_rl.correction.training.pretrain", description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("universal.safetensors"))
     parser.add_argument("--iterations", type=int, default=40_000)
     parser.add_argument("--seed", type=int, default=0)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from afm_rl.flow.fits import (
+from afm_rl.correction.fits import (
     LEAST_GAIN,
     OUTLIER,
     PRIOR,
@@ -18,7 +18,7 @@ from afm_rl.flow.fits import (
     invert_friction,
     not_zero,
 )
-from afm_rl.flow.saturation import LIMIT, saturate
+from afm_rl.correction.achievable import LIMIT, saturate
 from afm_rl.small_matrices import solve_positive
 from afm_rl.tracing import cached
 
@@ -157,7 +157,7 @@ def fit_experts(rows: Rows) -> Experts:
 
     In double precision: where all actions are alike, gain and friction can hardly be told apart.
     The fits per axis share one product of weights and terms; they are those of
-    :mod:`~afm_rl.flow.fits`, the robust one with one round.
+    :mod:`~afm_rl.correction.fits`, the robust one with one round.
     """
     inputs, valid = rows.executed.double(), rows.valid.double().mT
     u, e = inputs.mT, rows.effective.double().mT  # (N, A, K)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.hypotheses import (
+from afm_rl.correction.readings import (
     FILTER,
     HYPOTHESES,
     IDENTITY,
@@ -18,7 +18,7 @@ from afm_rl.correction.hypotheses import (
 )
 from afm_rl.correction.pairs import OLD
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import AxisNetwork
+from afm_rl.correction.network import AxisNetwork
 
 MANY = 20
 AGES = torch.arange(float(MANY)).unsqueeze(-1)

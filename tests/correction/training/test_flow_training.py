@@ -11,13 +11,15 @@ import torch
 from safetensors.torch import load
 from tensordict import TensorDict
 
-import afm_rl.flow.weights
+import afm_rl.correction.weights
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.flow import AxisNetwork, CFMLoss, draw_examples, load_universal, train_flow
-from afm_rl.flow.experts import fit_experts
-from afm_rl.flow.pretrain import pretrain
-from afm_rl.flow.training import EFFECT_WEIGHT, PRECISION, flow_losses
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.training import CFMLoss, draw_examples, train_flow
+from afm_rl.correction.weights import load_universal
+from afm_rl.correction.experts import fit_experts
+from afm_rl.correction.training.pretrain import pretrain
+from afm_rl.correction.training.refine import EFFECT_WEIGHT, PRECISION, flow_losses
 
 KEYS = ["executed", "effective", "std", "valid", "planned", "intended", "probe", "effect"]
 
@@ -182,7 +184,7 @@ def test_impossible_settings_are_refused(train, settings):
 
 
 def test_the_weights_of_the_package_are_small_sound_and_frozen():
-    data = files("afm_rl.flow").joinpath("universal.safetensors").read_bytes()
+    data = files("afm_rl.correction").joinpath("universal.safetensors").read_bytes()
     assert len(data) < 2 * 2**20
     net = load_universal()
     stored = load(data)
@@ -193,14 +195,14 @@ def test_the_weights_of_the_package_are_small_sound_and_frozen():
 
 @pytest.mark.parametrize("place", [100, -5])
 def test_a_flipped_bit_in_the_weights_is_refused(place, tmp_path, monkeypatch):
-    folder = files("afm_rl.flow")
+    folder = files("afm_rl.correction")
     data = bytearray(folder.joinpath("universal.safetensors").read_bytes())
     data[place] ^= 1
     (tmp_path / "universal.safetensors").write_bytes(data)
     said = folder.joinpath("universal.safetensors.sha256").read_text()
     (tmp_path / "universal.safetensors.sha256").write_text(said)
     assert hashlib.sha256(data).hexdigest() not in said
-    monkeypatch.setattr(afm_rl.flow.weights, "files", lambda package: tmp_path)
+    monkeypatch.setattr(afm_rl.correction.weights, "files", lambda package: tmp_path)
     with pytest.raises(ArtefactError, match="universal.safetensors: damaged"):
         load_universal()
 

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from afm_rl.flow.experts import Rows
-from afm_rl.flow.saturation import LEAST, LIMIT
+from afm_rl.correction.experts import Rows
+from afm_rl.correction.achievable import LEAST, LIMIT
 
 GRID = 257  # points of a tabulated map
 EDGE = 1.6  # centres of narrow windows are drawn in this box and cut: many actions saturate
@@ -68,7 +68,7 @@ class Maps(NamedTuple):
     def inverse(self, planned: Tensor, mode: str) -> Tensor:
         """Return the actions ``(N, C, A)`` in [-1, 1] for planned effects ``(N, C, A)``.
 
-        What cannot be had is saturated as :func:`~afm_rl.flow.saturation.intend` does: as much of
+        What cannot be had is saturated as :func:`~afm_rl.correction.achievable.intend` does: as much of
         its direction as there is (``"direction"``), every axis as far as it goes (``"clip"``), or
         the first of both only where less than 30 % can be had (``"mixed"``).
         """
@@ -241,12 +241,14 @@ def draw_examples(
     generator: torch.Generator,
     kinds: Mapping[str, float] = KINDS,
     mixes: Mapping[str, float] = MIXES,
+    drifting: float = 0.2,
 ) -> Drawn:
     """Draw regimes, the windows that a robot would have seen under them, plans and answers.
 
     Half of the windows hold an older regime as well. Actions fill the box, keep near one action,
-    or follow a plan, as a corrected robot's do. Effects are noisy by a known amount, some are
-    outliers, and some axes of some rows tell nothing.
+    stay at a limit, or do not change at all. Effects are noisy by an amount that is known, under-
+    or overstated; some are outliers, some axes of some rows tell nothing, and in some windows a
+    force adds to them that drifts.
 
     Args:
         count: windows, N.
@@ -257,15 +259,18 @@ def draw_examples(
         generator: of all that is drawn.
         kinds: shares of the kinds of scalar maps of the present regimes.
         mixes: shares of their kinds of mixing matrices.
+        drifting: share of the windows with a force that drifts.
     """
     draw = Draw(generator)
     now, before = draw_maps(count, axes, draw, kinds, mixes), draw_maps(count, axes, draw)
     executed = draw_actions(count, rows, axes, draw)
     fresh, valid = draw_masks(count, rows, draw)
-    effective = torch.where(fresh == 1.0, now.effect(executed), before.effect(executed))
+    now, earlier = _disturb(now, executed, drifting, draw)
+    effective = now.effect(executed) + earlier
+    effective = torch.where(fresh == 1.0, effective, before.effect(executed))
     flicker = draw.uniform(0.1, 0.5, count, 1, 1) * draw.chance(0.06, count, 1, 1)
     effective = effective * (1 + flicker * draw.normal(count, rows, axes))
-    std = draw.log_uniform(1e-5, 0.1, count, 1, 1) * draw.log_uniform(0.3, 3.0, count, 1, axes)
+    std = draw.log_uniform(1e-5, 0.3, count, 1, 1) * draw.log_uniform(0.3, 3.0, count, 1, axes)
     mute = draw.chance(0.2, count, 1, 1) & draw.chance(0.3, count, rows, axes)
     std = torch.where(mute, draw.log_uniform(0.3, LIMIT, count, rows, axes), std)
     noise = std * draw.normal(count, rows, axes)
@@ -274,9 +279,11 @@ def draw_examples(
     # A transition that shows nothing leaves the action where it was.
     effective = torch.where(mute, torch.lerp(effective, executed, 0.5), effective) + noise
     told = std * draw.log_uniform(0.5, 2.0, count, 1, 1)
-    # Models are trusted less than they deserve: their noise is often an upper bound.
-    modest = draw.log_uniform(1.0, 100.0, count, 1, 1) * draw.chance(0.5, count, 1, 1)
-    told = (told * modest.clamp_min(1.0)).clamp_max(LIMIT)
+    # What a model states of its noise is often an upper bound, and as often far too little.
+    modest, bold = draw.chance(0.35, count, 1, 1), draw.chance(0.5, count, 1, 1)
+    told = told * torch.where(modest, draw.log_uniform(1.0, 100.0, count, 1, 1), 1.0)
+    told = told * torch.where(bold & ~modest, draw.log_uniform(0.02, 1.0, count, 1, 1), 1.0)
+    told = told.clamp_max(LIMIT)
     seen = Rows(executed, effective.clamp(-LIMIT, LIMIT), told, valid)
     planned = _draw_plans(now, executed[:, -1:], plans, draw)
     probe = draw.uniform(-1.0, 1.0, count, plans, axes)
@@ -289,12 +296,46 @@ def draw_examples(
     )
 
 
+def _disturb(now: Maps, executed: Tensor, share: float, draw: Draw) -> tuple[Maps, Tensor]:
+    """Add forces that drift to a share of the windows: gravity, wind, gusts, friction.
+
+    A force that grows with the speed follows the commands as a low-pass filter does. Where there is
+    one, the actuators are mostly healthy.
+
+    Returns:
+        The regimes with the newest force as their bias, and how much the force of every row was
+        above that, ``(N, K, A)``.
+    """
+    count, rows, axes = executed.shape
+    age = torch.arange(rows - 1, -1, -1.0).view(1, -1, 1)
+    steps = draw.normal(count, rows, axes) / math.sqrt(rows)
+    drift = draw.normal(count, 1, axes) + draw.normal(count, 1, axes) * age / rows
+    drift = draw.log_uniform(0.03, 1.0, count, 1, 1) * (drift + 0.5 * steps.cumsum(-2))
+    keep = (-1 / draw.log_uniform(0.7, 8.0, count, 1, 1)).exp()
+    past = (age.squeeze(-1) - age.squeeze(-1).mT).neg()  # (1, K, K): rows before a row
+    weights = torch.where(past >= 0, keep ** past.clamp_min(0) * (1 - keep), 0.0)
+    speed = weights @ executed + keep ** (rows - age) * executed[:, :1]
+    friction = -draw.uniform(0.0, 1.3, count, 1, axes) * speed
+    force = torch.where(draw.chance(0.4, count, 1, 1), friction, drift)
+    force = force * (draw.chance(share, count, 1, 1) & draw.chance(0.7, count, 1, axes))
+    moved = (force != 0.0).any(-2).any(-1).view(-1, 1, 1) & draw.chance(0.75, count, 1, 1)
+    grid, eye = torch.linspace(-1.0, 1.0, GRID), torch.eye(axes)
+    bias = torch.where(moved.squeeze(-1), 0.0, now.bias) + force[:, -1]
+    table, matrix = torch.where(moved, grid, now.table), torch.where(moved, eye, now.matrix)
+    return Maps(table, matrix, bias), force - force[:, -1:]
+
+
 def draw_actions(count: int, rows: int, axes: int, draw: Draw) -> Tensor:
-    """Draw executed actions ``(N, K, A)``: two windows of five keep near one action."""
+    """Draw executed actions ``(N, K, A)``.
+
+    Two windows of five keep near one action, one of ten does not change it at all, and one of
+    twelve jumps between the limits.
+    """
     wide = draw.uniform(-1.0, 1.0, count, rows, axes)
     around = EDGE * draw.uniform(-1.0, 1.0, count, 1, axes)
-    spread = draw.log_uniform(0.01, 0.6, count, 1, axes)
-    return torch.where(draw.chance(0.6, count, 1, 1), wide, (around + spread * wide).clamp(-1, 1))
+    spread = draw.log_uniform(0.01, 0.6, count, 1, axes) * draw.chance(0.8, count, 1, 1)
+    wide = torch.where(draw.chance(1 / 12, count, 1, 1), wide.sign(), wide)
+    return torch.where(draw.chance(0.55, count, 1, 1), wide, (around + spread * wide).clamp(-1, 1))
 
 
 def draw_masks(count: int, rows: int, draw: Draw) -> tuple[Tensor, Tensor]:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_choice
-from afm_rl.flow.experts import Rows
+from afm_rl.correction.experts import Rows
 
 IDENTITY = "identity"  # actions have the effect that the model predicts
 FILTER = 6  # commands that a lag looks back on

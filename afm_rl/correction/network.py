@@ -9,8 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from afm_rl.flow.experts import ANSWERS, EXPERTS, LEAST_MISS, MISSES, Experts, Rows
-from afm_rl.flow.saturation import LIMIT, MODES
+from afm_rl.correction.experts import ANSWERS, EXPERTS, LEAST_MISS, MISSES, Experts, Rows
+from afm_rl.correction.achievable import LIMIT, MODES
 from afm_rl.tracing import may_look
 
 SHARPNESS = 5.0  # of the logits of a mixture: shares of all or nothing are soon learnt
@@ -86,7 +86,7 @@ class AxisNetwork(nn.Module):
         noise: False hides the standard deviations of the pairs (a lesion).
         seed: of the initial weights.
 
-    >>> from afm_rl.flow.experts import fit_experts
+    >>> from afm_rl.correction.experts import fit_experts
     >>> u = torch.rand(1, 12, 3)
     >>> rows = Rows(u, -u, torch.zeros(1, 12, 3), torch.ones(1, 12, 1))
     >>> network = AxisNetwork()

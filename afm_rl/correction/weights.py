@@ -8,7 +8,7 @@ from importlib.resources import files
 from safetensors.torch import load
 
 from afm_rl.errors import ArtefactError
-from afm_rl.flow.network import AxisNetwork
+from afm_rl.correction.network import AxisNetwork
 
 FILE = "universal.safetensors"
 
@@ -19,7 +19,7 @@ def load_universal() -> AxisNetwork:
     Raises:
         ArtefactError: if the file does not have the checksum that is written beside it.
     """
-    folder = files("afm_rl.flow")
+    folder = files("afm_rl.correction")
     data = folder.joinpath(FILE).read_bytes()
     expected = folder.joinpath(f"{FILE}.sha256").read_text().split()[0]
     if hashlib.sha256(data).hexdigest() != expected:

@@ -3,9 +3,11 @@
 import pytest
 import torch
 
-from afm_rl.flow import AxisNetwork, Rows, fit_experts
-from afm_rl.flow.experts import EXPERTS
-from afm_rl.flow.saturation import MODES
+from afm_rl.correction.experts import Rows, fit_experts
+
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.experts import EXPERTS
+from afm_rl.correction.achievable import MODES
 
 
 def drawn(*shape, seed=0):

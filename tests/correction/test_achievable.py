@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afm_rl.flow.saturation import MODES, ROUNDS, TOLERANCE, attainable, intend, saturate
+from afm_rl.correction.achievable import MODES, ROUNDS, TOLERANCE, attainable, intend, saturate
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import midpoint
+from afm_rl.correction.solver import midpoint
 
 ONE = torch.ones(1, dtype=torch.float64)
 

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from afm_rl.flow import Rows, fit_experts
-from afm_rl.flow.experts import (
+from afm_rl.correction.experts import Rows, fit_experts
+from afm_rl.correction.experts import (
     ANSWERS,
     LIMIT,
     LONG,
@@ -12,7 +12,7 @@ from afm_rl.flow.experts import (
     NEAR,
     SHORT,
 )
-from afm_rl.flow.fits import (
+from afm_rl.correction.fits import (
     apply_friction,
     confidence,
     fit_affine,
@@ -23,7 +23,7 @@ from afm_rl.flow.fits import (
     invert_friction,
     weigh,
 )
-from afm_rl.flow.saturation import MODES
+from afm_rl.correction.achievable import MODES
 
 AXIS = torch.linspace(-1, 1, 5)
 ASKED = torch.cartesian_prod(AXIS, AXIS).unsqueeze(0)

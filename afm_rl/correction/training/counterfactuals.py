@@ -9,9 +9,9 @@ from afm_rl.correction.base import Corrector
 from afm_rl.devices import device_of
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
-from afm_rl.flow.experts import LIMIT, Rows
-from afm_rl.flow.prior import Draw, Drawn, draw_actions, draw_masks
-from afm_rl.flow.saturation import intend
+from afm_rl.correction.experts import LIMIT, Rows
+from afm_rl.correction.training.prior import Draw, Drawn, draw_actions, draw_masks
+from afm_rl.correction.achievable import intend
 from afm_rl.regimes import Regime
 from afm_rl.sampling import draw_states
 
@@ -37,7 +37,7 @@ def draw_counterfactuals(
         regime: the prior.
         states: lowest and highest state, or a pool of them, ``(P, S)``.
         size: windows, their rows and plans for each, (N, K, C).
-        mode: of plans that are not achievable, see :func:`~afm_rl.flow.saturation.saturate`.
+        mode: of plans that are not achievable, see :func:`~afm_rl.correction.achievable.saturate`.
         generator: of all that is drawn.
     """
     count, rows, plans = size
