@@ -10,8 +10,8 @@ from hypothesis import settings
 import afm_rl.correction.training
 import afm_rl.learning
 from afm_rl.correction import ActionFlow
-from afm_rl.dynamics import Dubins, Ensemble
 from afm_rl.correction.network import AxisNetwork
+from afm_rl.dynamics import Dubins, Ensemble
 from afm_rl.learning import pretrain_ensemble
 from afm_rl.manifold import Manifold
 from afm_rl.regimes import ActionGain

@@ -2,6 +2,7 @@
 
 from afm_rl.correction.action_flow import ActionFlow
 from afm_rl.correction.base import Correction, Corrector
+from afm_rl.correction.classical import ClassicalCorrector
 from afm_rl.correction.l1 import L1Augmentation
 from afm_rl.correction.least_squares import LeastSquares
 from afm_rl.correction.network import AxisNetwork
@@ -12,6 +13,7 @@ from afm_rl.correction.weights import load_universal
 __all__ = [
     "ActionFlow",
     "AxisNetwork",
+    "ClassicalCorrector",
     "Correction",
     "Corrector",
     "L1Augmentation",

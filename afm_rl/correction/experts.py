@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from afm_rl.correction.achievable import LIMIT, saturate
 from afm_rl.correction.fits import (
     LEAST_GAIN,
     OUTLIER,
@@ -18,17 +18,17 @@ from afm_rl.correction.fits import (
     invert_friction,
     not_zero,
 )
-from afm_rl.correction.achievable import LIMIT, saturate
 from afm_rl.small_matrices import solve_positive
 from afm_rl.tracing import cached
 
 EXACT = 0.02  # half ranges: a fit that misses by less explains all rows
-EXPLAINED = 0.03  # of what the nominal map misses: a line that misses by less explains all rows
 LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
 LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
 NEAR = 0.15  # half ranges: a pair so far from the question counts half as much
 SHORT, LONG = 0.5, 0.9  # forgetting per row
 EXPERTS = 6
+HEADS = ("network", "quick", "gain", "line", "friction", "affine", "offset", "nominal")
+"""What may answer of a reading: the network, its five fits, a mere offset, or nothing changed."""
 ANSWERS = EXPERTS + 1  # the experts' answers, and the effect or nearness of the nearest pairs
 MISSES = EXPERTS - 1  # the nearest pairs have no residual of their own
 
@@ -71,6 +71,8 @@ class Experts(NamedTuple):
     """Its regularised inverse, ``(N, A, A)``."""
     bias: Tensor
     """Of the affine map, ``(N, A, 1)``."""
+    shift: Tensor
+    """Offset at a gain of one, ``(N, A, 1)``."""
     residuals: Tensor
     """What each fit leaves of each row, ``(N, A, K, 5)``."""
     misses: Tensor
@@ -119,34 +121,6 @@ class Experts(NamedTuple):
         rubbed = apply_friction(self.gain[..., 3:], self.offset[..., 3:], unit)
         return linear, rubbed, (self.matrix @ actions + self.bias).unsqueeze(-1)
 
-    def lines(self, actions: Tensor) -> Tensor:
-        """Return the effects ``(N, C, A)`` of actions by gain and offset, NaN where these miss."""
-        exact = self.misses[..., 2].exp() < EXACT  # (N, A, 1)
-        effect = self.gain[..., 2] * actions.mT.to(self.bias) + self.offset[..., 2]
-        return torch.where(exact, effect, torch.nan).mT.to(actions)
-
-    def sure(self) -> Tensor:
-        """Return which of the five fits explain all rows on all axes, ``(N, 5)``."""
-        return (self.misses.squeeze(-2).exp() < EXACT).all(-2)
-
-    def explained(self) -> tuple[Tensor, Tensor]:
-        """Return which rows, of which there are enough, one line explains, or none is needed.
-
-        Two rows are on a line in any case, and rows that are alike are near many; a line through
-        noise misses nearly as much as the nominal map does.
-
-        Returns:
-            Whether gains and offsets explain all rows, and whether the nominal map, ``(N,)`` each.
-        """
-        sent, came = self.executed.squeeze(-2), self.effective.squeeze(-2)  # (N, A, K)
-        read = self.trust.squeeze(-2) > 2 * math.log(LEAST_MISS)
-        count, most = read.sum(-1), torch.where(read, sent, -torch.inf).amax(-1)
-        reach = most - torch.where(read, sent, torch.inf).amin(-1)
-        nominal = ((came - sent).square() * read).sum(-1).div(count.clamp_min(1)).sqrt()
-        line, enough = self.misses[..., 0, 2].exp(), count >= LEAST_ROWS
-        line = enough & (line < EXPLAINED * torch.minimum(reach, nominal))
-        return line.all(-1), (enough & (nominal < EXPLAINED * reach)).all(-1)
-
     def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
         """Return the log-weight of each row for ``unit`` ``(N, A, C, 1)``, ``(N, A, C, K)``."""
         return self.trust - ((among - unit) / NEAR).square()
@@ -186,8 +160,7 @@ def fit_experts(rows: Rows) -> Experts:
     solution = solve_positive(square, cross.unsqueeze(-1)).squeeze(-1)  # (N, A, A + 1)
     solution = torch.where(*_drivers(u, e, long), solution)
     matrix, bias = solution[..., :-1], solution[..., -1:]
-    ridge = torch.baddbmm(LEAST_GAIN**2 / PRIOR * nominal[:-1, :-1], matrix.mT, matrix)
-    inverse = solve_positive(ridge, matrix.mT)
+    inverse = invert_matrix(matrix)
     wide = (count, axes, 1)
     experts = Experts(
         gain.unflatten(0, wide[:2]).unsqueeze(-2),
@@ -195,6 +168,7 @@ def fit_experts(rows: Rows) -> Experts:
         matrix,
         inverse,
         bias,
+        _shift(u, e, weights[..., :1, :]),
         bias,  # until the residuals are known
         bias,
         u.unsqueeze(-2),
@@ -206,6 +180,12 @@ def fit_experts(rows: Rows) -> Experts:
     left = weights @ residuals.square() / mass
     left = torch.cat([left[..., :1, :1], left[..., 1:, 1:]], -1)
     return experts._replace(residuals=residuals, misses=(left.sqrt() + LEAST_MISS).log())
+
+
+def invert_matrix(matrix: Tensor) -> Tensor:
+    """Return the inverse of matrices ``(*B, A, A)``, regularised by the least gain there is."""
+    ridge = LEAST_GAIN**2 * torch.eye(matrix.shape[-1], device=matrix.device, dtype=matrix.dtype)
+    return solve_positive(ridge + matrix.mT @ matrix, matrix.mT)
 
 
 def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -236,6 +216,12 @@ def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     explained = (left < limit) & (mass > LEAST_ROWS)
     chosen = torch.zeros_like(slope).scatter(-1, driver, slope.gather(-1, driver))
     return explained, torch.cat([chosen, offset.gather(-1, driver)], -1)
+
+
+def _shift(u: Tensor, e: Tensor, weight: Tensor) -> Tensor:
+    """Return the mean of what effects ``(N, A, K)`` exceed their actions by, ``(N, A, 1)``."""
+    mass = weight.sum(-1) + 10 * PRIOR
+    return (weight.squeeze(-2) * (e - u)).sum(-1, keepdim=True) / mass
 
 
 def _solve_line(moments: Tensor) -> tuple[Tensor, Tensor]:

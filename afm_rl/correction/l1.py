@@ -7,11 +7,11 @@ import math
 import torch  # noqa: F401, for the examples
 from torch import Tensor
 
-from afm_rl.correction.pairs import ClassicalCorrector
-from afm_rl.errors import check_choice, check_number
+from afm_rl.correction.achievable import MODES, saturate
+from afm_rl.correction.classical import ClassicalCorrector
 from afm_rl.correction.experts import Rows
 from afm_rl.correction.fits import weigh
-from afm_rl.correction.achievable import MODES, saturate
+from afm_rl.errors import check_choice, check_number
 
 
 def low_pass(signal: Tensor, valid: Tensor, bandwidth: float, dt: float) -> Tensor:
@@ -49,7 +49,7 @@ class L1Augmentation(ClassicalCorrector):
     each tick, the limit :math:`A_s \to 0`, and that disturbance is read from the model's
     one-tick error (:func:`~afm_rl.dynamics.inverse.effective_action`): any model and robot will
     do, and what no action can do (the unmatched part) is left out. Unlike in the literature
-    there is a gate, and the filter remembers K ticks only: :math:`e^{-K \omega \Delta t}` of a
+    it acts only while it is believed, and the filter remembers K ticks only: :math:`e^{-K \omega \Delta t}` of a
     lasting disturbance is missed.
 
     A gain g is a disturbance :math:`(g - 1) u`, which is countered as long as
@@ -64,8 +64,8 @@ class L1Augmentation(ClassicalCorrector):
         dt: control tick (s).
         bandwidth: of the low-pass, :math:`\omega` (rad/s).
         window: transitions that can be remembered, K.
-        gate: in standard deviations of the model.
         saturation: ``"clip"``, as is customary, ``"direction"`` or ``"mixed"``.
+        rules: of the belief, see :class:`~afm_rl.correction.PairCorrector`.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -81,16 +81,21 @@ class L1Augmentation(ClassicalCorrector):
         dt: float,
         bandwidth: float = 5.0,
         window: int = 24,
-        gate: float = 5.0,
         saturation: str = "clip",
+        **rules: float,
     ) -> None:
-        super().__init__(action_low, action_high, gate, window)
+        super().__init__(action_low, action_high, window, **rules)
         self.dt = check_number("corrector.dt", dt, low=0.0, open_low=True)
         self.bandwidth = check_number("corrector.bandwidth", bandwidth, low=0.0, open_low=True)
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
 
-    def answer(self, rows: Rows, planned: Tensor) -> tuple[Tensor, Tensor]:
+    def inverse(self, rows: Rows, planned: Tensor) -> Tensor:
         """Take the disturbance off."""
-        found = low_pass(rows.effective - rows.executed, rows.valid, self.bandwidth, self.dt)
-        executed = saturate(planned - found, self.saturation)
-        return executed, executed + found
+        return saturate(planned - self._disturbance(rows), self.saturation)
+
+    def effect(self, rows: Rows, executed: Tensor) -> Tensor:
+        """Add the disturbance."""
+        return executed + self._disturbance(rows)
+
+    def _disturbance(self, rows: Rows) -> Tensor:
+        return low_pass(rows.effective - rows.executed, rows.valid, self.bandwidth, self.dt)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from afm_rl.correction.pairs import ClassicalCorrector
-from afm_rl.errors import check_choice, check_number
+from afm_rl.correction.achievable import MODES, saturate
+from afm_rl.correction.classical import ClassicalCorrector
 from afm_rl.correction.experts import Rows
 from afm_rl.correction.fits import (
     confidence,
@@ -16,7 +16,7 @@ from afm_rl.correction.fits import (
     invert_affine,
     weigh,
 )
-from afm_rl.correction.achievable import MODES, saturate
+from afm_rl.errors import check_choice, check_number
 
 FORMS = ("gain", "gain_offset", "affine")
 
@@ -35,8 +35,8 @@ class LeastSquares(ClassicalCorrector):
         form: ``"gain"`` or ``"gain_offset"``, each axis for itself, or ``"affine"``.
         window: transitions that are remembered, K.
         forgetting: weight of a transition relative to the next one, in (0, 1].
-        gate: in standard deviations of the model.
         saturation: ``"clip"``, as is customary, ``"direction"`` or ``"mixed"``.
+        rules: of the belief, see :class:`~afm_rl.correction.PairCorrector`.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -52,28 +52,38 @@ class LeastSquares(ClassicalCorrector):
         form: str = "gain",
         window: int = 24,
         forgetting: float = 0.8,
-        gate: float = 5.0,
         saturation: str = "clip",
+        **rules: float,
     ) -> None:
-        super().__init__(action_low, action_high, gate, window)
+        super().__init__(action_low, action_high, window, **rules)
         self.form = check_choice("corrector.form", form, FORMS)
         self.forgetting = check_number(
             "corrector.forgetting", forgetting, low=0.0, high=1.0, open_low=True
         )
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
 
-    def answer(self, rows: Rows, planned: Tensor) -> tuple[Tensor, Tensor]:
-        """Invert the fit, which also predicts the effect."""
+    def inverse(self, rows: Rows, planned: Tensor) -> Tensor:
+        """Invert the fit."""
+        matrix, offset = self._fit(rows)
+        if self.form == "affine":
+            return saturate(invert_affine(matrix, offset, planned), self.saturation)
+        return saturate((planned - offset) / matrix, self.saturation)
+
+    def effect(self, rows: Rows, executed: Tensor) -> Tensor:
+        """Apply the fit."""
+        matrix, offset = self._fit(rows)
+        if self.form == "affine":
+            return (matrix @ executed.unsqueeze(-1)).squeeze(-1) + offset
+        return matrix * executed + offset
+
+    def _fit(self, rows: Rows) -> tuple[Tensor, Tensor]:
+        """Return matrix or gains, and offset."""
         executed, effective, std, valid = rows
         weight = weigh(valid, self.forgetting)
         if self.form == "affine":
-            matrix, bias = fit_affine(executed, effective, weight)
-            found = saturate(invert_affine(matrix, bias, planned), self.saturation)
-            return found, (matrix @ found.unsqueeze(-1)).squeeze(-1) + bias
+            return fit_affine(executed, effective, weight)
         weight = weight * confidence(std)
         if self.form == "gain":
-            gain, offset = fit_gain(executed, effective, weight), torch.zeros_like(planned)
-        else:
-            gain, offset = fit_gain_offset(executed, effective, weight)
-        found = saturate((planned - offset) / gain, self.saturation)
-        return found, gain * found + offset
+            gain = fit_gain(executed, effective, weight)
+            return gain, torch.zeros_like(gain)
+        return fit_gain_offset(executed, effective, weight)

@@ -9,9 +9,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from afm_rl.correction.experts import ANSWERS, EXPERTS, LEAST_MISS, MISSES, Experts, Rows
 from afm_rl.correction.achievable import LIMIT, MODES
-from afm_rl.tracing import may_look
+from afm_rl.correction.experts import (
+    ANSWERS,
+    EXPERTS,
+    LEAST_MISS,
+    MISSES,
+    Experts,
+    Rows,
+    invert_matrix,
+)
 
 SHARPNESS = 5.0  # of the logits of a mixture: shares of all or nothing are soon learnt
 LEAST_TIME = 0.1  # of the path that is left, in the velocity towards an expert's answer
@@ -46,14 +53,22 @@ class Encoded(NamedTuple):
     code: Tensor
     """A code per axis, ``(N, A, 1, L)``."""
 
-    def pick(self, which: Tensor) -> Encoded:
-        """Return the sets of rows with the indices ``which`` ``(M,)``."""
-        if may_look(which) and len(which) == 1:
-            at = int(which)  # a view, where gathering would copy
-            parts = [part[at : at + 1] for part in (*self.experts, self.code)]
-        else:
-            parts = [part.index_select(0, which) for part in (*self.experts, self.code)]
-        return Encoded(Experts(*parts[:-1]), parts[-1])
+    def choose(self, which: Tensor) -> Encoded:
+        """Compose models axis by axis from the R sets of rows that each of B missions has.
+
+        Args:
+            which: the set that an axis of each of K models reads, ``(B, K, A)``; N is B R.
+
+        Returns:
+            B K sets.
+        """
+        count, models, axes = which.shape
+        row = torch.arange(count, device=which.device).view(-1, 1, 1)
+        at = (row * (len(self.code) // count) + which).flatten(0, 1)
+        axis = torch.arange(axes, device=which.device)
+        parts = {name: part[at, axis] for name, part in self.experts._asdict().items()}
+        parts["inverse"] = invert_matrix(parts["matrix"])
+        return Encoded(Experts(**parts), self.code[at, axis])
 
 
 class Asked(NamedTuple):
@@ -63,6 +78,10 @@ class Asked(NamedTuple):
     """Their part in the first layer, ``(N, A, C, W)``."""
     answers: Tensor
     """The experts' answers, ``(N, A, C, 6)``."""
+
+    def pick(self, which: Tensor) -> Asked:
+        """Return those of some sets of rows."""
+        return Asked(self.hidden.index_select(0, which), self.answers.index_select(0, which))
 
 
 class AxisNetwork(nn.Module):
@@ -167,11 +186,18 @@ class AxisNetwork(nn.Module):
 
     def effect(self, encoded: Encoded, executed: Tensor) -> Tensor:
         """Return the effects ``(N, C, A)`` that actions ``(N, C, A)`` are predicted to have."""
+        return self.effects(encoded, executed)[..., 0].mT
+
+    def effects(self, encoded: Encoded, executed: Tensor) -> Tensor:
+        """Return what each of the :data:`heads <HEADS>` expects, ``(N, A, C, 8)``."""
         answers = encoded.experts.effect(executed)
         misses = encoded.experts.misses.to(executed).expand(*answers.shape[:-1], -1)
         asked = torch.cat([executed.mT.unsqueeze(-1), answers, misses], -1)
         hidden = (self.effect_code(encoded.code) + self.effect_query(asked)).relu()
-        return self._blend(self.effect_head(hidden), answers[..., :EXPERTS])
+        mixed = self._blend(self.effect_head(hidden), answers[..., :EXPERTS]).mT.unsqueeze(-1)
+        unit = executed.mT.unsqueeze(-1)
+        shifted = unit + encoded.experts.shift.unsqueeze(-1).to(unit)
+        return torch.cat([mixed, answers[..., :MISSES], shifted, unit], -1)
 
     def _blend(self, output: Tensor, answers: Tensor) -> Tensor:
         """Return the mixture of the own answer and the experts', ``(N, C, A)``."""

@@ -1,93 +1,151 @@
-"""Transitions as pairs of executed and effective action."""
+"""Transitions as pairs of executed and effective action, and what is believed of them."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from afm_rl.correction.base import Correction, Corrector, put, rows_of
+from afm_rl.correction.base import Correction, Corrector, Fields, put, rows_of
+from afm_rl.correction.belief import Belief, mean_and_std
+from afm_rl.correction.experts import LIMIT
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
-from afm_rl.errors import check_count
-from afm_rl.correction.experts import LIMIT, Rows
+from afm_rl.errors import check_count, check_number
 from afm_rl.tracing import all_hold
 
 OLD = 0.5  # what "valid" becomes where a change has begun since
 
 
-class PairCorrector(Corrector):
-    """A corrector that remembers M pairs (executed, effective action), shares of the largest.
+class Answer(NamedTuple):
+    """What the models make of plans, in units of the action."""
 
-    The model counts as misaligned while the largest normalised innovation of the newest
-    transitions exceeds ``gate`` standard deviations of the model's own noise. While it is
-    aligned, an executed action counts as its own effect, and nothing more is computed. When the
-    gate opens, the pairs from before are marked as old: "valid" is halved.
+    executed: Tensor
+    """The action, ``(B, A)``."""
+    predicted: Tensor
+    """The effect that is expected of it, ``(B, A)``."""
+    spread: Tensor
+    """Standard deviation of the proposals, ``(B, A)``."""
+    bounds: Tensor
+    """Lowest and highest effect that an action may have, ``(B, 2, A)``."""
+    corrects: Tensor
+    """Is any model believed more than that nothing has changed? ``(B)``."""
+    forecasts: Tensor
+    """The effects that the models expect of what acts now, shares of the largest action,
+    ``(B, M, A)``; the first is that of *nothing has changed*."""
+
+
+class PairCorrector(Corrector):
+    r"""A corrector that believes in models of the actuators as far as they predict.
+
+    It remembers pairs (executed, effective action), shares of the largest action, and holds a
+    :class:`~afm_rl.correction.belief.Belief` over M models of them; the first is *nothing has
+    changed*. No loss is negative, so while that model's own loss is below its ``odds`` no other one
+    can outweigh it: then the planned action is executed, and nothing more is computed. When it
+    is exceeded, the pairs from before are marked as old: "valid" is halved.
 
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        gate: in standard deviations of the model.
-        recent: newest transitions, R: the gate looks at these, and a model that learns is asked
-            about them again at every step.
-        memory: pairs that are remembered, M.
+        recent: newest transitions, R: a model that learns is asked about them again at every step.
+        memory: pairs that are remembered.
+        models: names of the models but the first.
         place: number of state coordinates that are remembered with a pair.
+        odds: prior log-odds of *nothing has changed* against all other models together: one
+            surprise that its Student-t distribution gives e^-odds is no reason to act.
+        discount: of the losses; .9 looks back on ten steps.
+        noise: standard deviation that no model explains, at first, a share of the largest action.
+        noise_rate: share of its square that is renewed at every step.
+        least_noise: its floor: effects nearer than that are all the same.
+        quiet: normalised innovation up to which a transition needs no explanation.
     """
 
     is_valid: Tensor
+    prior: Tensor
 
     def __init__(
         self,
         action_low: Tensor,
         action_high: Tensor,
-        gate: float,
         recent: int,
         memory: int,
+        models: Sequence[str],
         place: int = 0,
+        odds: float = 2.0,
+        discount: float = 0.9,
+        noise: float = 0.1,
+        noise_rate: float = 0.1,
+        least_noise: float = 0.02,
+        quiet: float = 1.0,
     ) -> None:
-        super().__init__(action_low, action_high, gate, recent)
+        super().__init__(action_low, action_high, recent)
         self.memory = max(check_count("corrector.memory", memory), recent)
+        self.models = ("nothing has changed", *models)
+        self.odds = check_number("corrector.odds", odds, low=0.0)
+        self.discount = check_number("corrector.discount", discount, low=0.0, high=1.0)
+        self.noise_rate = check_number("corrector.noise_rate", noise_rate, low=0.0, high=1.0)
+        self.least_noise = check_number(
+            "corrector.least_noise", least_noise, low=0.0, open_low=True
+        )
+        self.noise = check_number("corrector.noise", noise, low=self.least_noise)
+        self.quiet = check_number("corrector.quiet", quiet, low=0.0)
         self.pair_size, self.tail = 3 * self.action_size + 2 + place, 1 + place
         is_valid = torch.arange(self.pair_size) == 3 * self.action_size
         self.register_buffer("is_valid", is_valid, persistent=False)
+        prior = torch.full((len(self.models), 1), 1 / len(models)).log()
+        prior[0] = self.odds
+        self.register_buffer("prior", prior, persistent=False)
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the pairs: u, its effect, std, valid, innovation, place."""
+        size, count = self.action_size, len(self.models)
         return {
             **super().shapes(state_size),
             "pairs": (self.memory, self.pair_size),
-            "acting": (self.action_size,),
+            "acting": (size,),
+            "losses": (count, size),
+            "forecasts": (count, size),
+            "noise": (size,),
         }
+
+    def begin(self, state: Tensor) -> Tensor:
+        """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
+        parts = self.unpack(super().begin(state), state.shape[-1])
+        return self.pack({**parts, "noise": torch.full_like(parts["noise"], self.noise)})
 
     def place_of(self, state: Tensor) -> Tensor:
         """Return the coordinates of states that are remembered with pairs; none by default."""
         return state[..., :0]
 
-    def look(self, memory: Tensor, model: DynamicsModel) -> tuple[Tensor, Tensor]:
-        """Return the memory with the newest transitions as pairs, and the innovation ``(*B)``.
+    def belief(self, parts: Fields) -> Belief:
+        """Return the belief in the parts of a memory."""
+        return Belief(parts["losses"], parts["forecasts"], parts["noise"])
+
+    def look(self, memory: Tensor, model: DynamicsModel) -> Fields:
+        """Return the parts of the memory with the newest pairs and the belief after them.
 
         A model that stays as it is needs to be asked about the newest transition only, one that
         learns about all R.
         """
         parts = self.unpack(memory, model.state_size)
-        count = 1 if model.taught_in is None else self.recent
+        count, size = 1 if model.taught_in is None else self.recent, self.action_size
         rows = parts["transitions"][..., -count:, :]
         state, _, executed, reached, valid = self.split_transitions(rows, model.state_size)
         # What acted last was predicted to have an effect; older ones were asked about before.
-        before = parts["pairs"][..., self.memory - count + 1 :, self.action_size :]
-        guess = self.denormalise(before[..., : self.action_size])
-        guess = torch.cat([guess, parts["acting"].unsqueeze(-2)], -2)
-        quiet = torch.where(parts["misaligned"] == 1.0, 0.0, self.gate)
+        before = parts["pairs"][..., self.memory - count + 1 :, size : 2 * size]
+        guess = torch.cat([self.denormalise(before), parts["acting"].unsqueeze(-2)], -2)
+        quiet = torch.where(parts["misaligned"] == 1.0, 0.0, self.quiet)
         seen = effective_action(
             model, state, executed, reached, self.scale, quiet=quiet, guess=guess
         )
-        std = (seen.std / self.scale).clamp_max(LIMIT)
         rows = torch.cat(
             [
                 self.normalise(executed),
                 self.normalise(seen.action).clamp(-LIMIT, LIMIT),
-                std,
+                (seen.std / self.scale).clamp_max(LIMIT),
                 valid,
                 seen.innovation.unsqueeze(-1),
                 self.place_of(state),
@@ -96,54 +154,142 @@ class PairCorrector(Corrector):
         )
         sound = (valid == 1.0) & rows.isfinite().all(-1, keepdim=True)
         rows = torch.where(sound, rows, 0.0)
+        _, effect, std, came, _ = rows[..., -1, :].split(
+            [size, size, size, 1, self.pair_size - 3 * size - 1], -1
+        )
+        rules = (self.prior.to(rows), self.discount, self.noise_rate, self.least_noise)
+        belief = self.belief(parts).update(effect, std, came, *rules)
+        awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
+        begins = (parts["misaligned"] != 1.0) & awake
         older = parts["pairs"][..., 1 : self.memory - count + 1, :]
-        begins = (parts["misaligned"] != 1.0) & (rows[..., -1:, -self.tail] > self.gate)
         older = torch.where(self.is_valid & begins.unsqueeze(-1), OLD * older, older)
         parts["pairs"] = torch.cat([older, rows], -2)
-        innovation = parts["pairs"][..., -self.recent :, -self.tail].amax(-1)
-        return self.pack(parts), innovation
+        parts["misaligned"] = awake.to(rows)
+        return parts | belief._asdict()
 
+    def asleep(self, parts: Fields, action: Tensor) -> Fields:
+        """Return the parts if ``action`` ``(*B, A)`` is executed, and nothing has changed.
 
-class ClassicalCorrector(PairCorrector):
-    """A corrector that answers a plan from all pairs that it remembers, at once.
+        All models predict its effect alike, and are believed alike.
+        """
+        losses = parts["losses"][..., :1, :].expand_as(parts["losses"])
+        forecasts = self.normalise(action).unsqueeze(-2).expand_as(losses)
+        alike = {"planned": action, "executed": action, "acting": action}
+        return {**parts, **alike, "losses": losses, "forecasts": forecasts}
 
-    Args:
-        action_low: lowest action, ``(A,)``.
-        action_high: highest action, ``(A,)``.
-        gate: in standard deviations of the model.
-        window: transitions that are remembered, K.
-    """
+    def watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> tuple[Tensor, ...]:
+        """Return the memory with the newest pair, and what it is if the plan is executed.
 
-    def __init__(self, action_low: Tensor, action_high: Tensor, gate: float, window: int) -> None:
-        super().__init__(action_low, action_high, gate, window, window)
+        Returns:
+            Both, is any other model to be asked? ``(*B)``, and the innovation ``(*B)``.
+        """
+        parts = self.look(memory, model)
+        innovation = parts["pairs"][..., -1, -self.tail]
+        awake = parts["misaligned"].squeeze(-1) == 1.0
+        return self.pack(parts), self.pack(self.asleep(parts, planned)), awake, innovation
 
-    def rows(self, pairs: Tensor) -> Rows:
-        """Return pairs as rows."""
-        size = self.action_size
-        sizes = [size, size, size, 1, self.pair_size - 3 * size - 1]
-        executed, effective, std, valid, _ = pairs.split(sizes, -1)
-        return Rows(executed, effective, std, (valid > 0).to(pairs))
+    def decide(self, memory: Tensor, planned: Tensor, box: Tensor) -> tuple[Tensor, ...]:
+        """Return the next memories, and what to execute, of B missions with a surprise.
+
+        Args:
+            memory: with the newest pair, ``(B, P)``.
+            planned: ``(B, A)``.
+            box: lowest and highest action, ``(B, 2, A)``.
+
+        Returns:
+            The next memory, and the parts of an :class:`Answer` but the forecasts.
+        """
+        parts = self.unpack(memory, self.states_in(memory))
+        answer = self.answer(parts, planned, box)
+        weights = self.belief(parts).weights(self.prior.to(memory))
+        acting = self.denormalise((weights * answer.forecasts.to(memory)).sum(-2))
+        parts |= {"planned": planned, "executed": answer.executed.to(memory), "acting": acting}
+        parts["forecasts"] = answer.forecasts.to(memory)
+        return (self.pack(parts), *answer[:-1])
 
     def correct(
         self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
     ) -> tuple[Tensor, Correction]:
-        """Answer where the model is misaligned."""
-        memory, innovation = self.look(memory, model)
-        parts = self.unpack(memory, model.state_size)
-        found = self.unchanged(planned, innovation, box)
-        misaligned = innovation > self.gate
-        if not all_hold(~misaligned):
-            use = rows_of(misaligned)
-            rows, unit = self.rows(parts["pairs"][use]), self.normalise(planned[use])
-            executed, predicted = (
-                put(planned, misaligned, use, self.denormalise(part))
-                for part in self.answer(rows, unit)
-            )
-            found = found._replace(executed=executed, predicted=predicted, misaligned=misaligned)
-        parts |= {"planned": planned, "executed": found.executed, "acting": found.predicted}
-        parts["misaligned"] = misaligned.unsqueeze(-1).to(planned.dtype)
-        return self.pack(parts), found
+        """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
+        with torch.no_grad():
+            memory, idle, awake, innovation = self._watch(memory, planned, model)
+            found = self.unchanged(planned, innovation, box)
+            found = found._replace(noise=self.noise_in(memory))
+            if all_hold(~awake):
+                return idle, found
+            use = rows_of(awake)
+            after, *answer = self._decide(memory[use], planned[use], box[use])
+            given = dict(zip(Answer._fields[:-1], answer, strict=True))
+            given["misaligned"] = given.pop("corrects")
+            now = found._asdict()
+            changed = {name: put(now[name], awake, use, part) for name, part in given.items()}
+            return put(idle, awake, use, after), found._replace(**changed)
+
+    def noise_in(self, memory: Tensor) -> Tensor:
+        """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
+        return self.denormalise(memory[..., -self.action_size :])
+
+    def believed(self, memory: Tensor) -> Tensor:
+        """Return how probable the :attr:`models` are, by axis, ``(*B, M, A)``."""
+        parts = self.unpack(memory, self.states_in(memory))
+        return self.belief(parts).weights(self.prior.to(memory))
+
+    def predict(
+        self, memory: Tensor, action: Tensor, model: DynamicsModel
+    ) -> tuple[Tensor, Tensor]:
+        """Return the effect that an action ``(*B, A)`` will have, and its standard deviation.
+
+        Both in units of the action, ``(*B, A)``: what the model would have to be given, so that it
+        expects what the robot will do. With a delay it is what acts now, of earlier commands.
+
+        Args:
+            memory: up to the present state, ``(*B, P)``; it is not changed.
+            action: what would be executed.
+            model: the dynamics model as it is now.
+        """
+        with torch.no_grad():
+            parts = self.asleep(self.look(memory, model), action)
+            awake = parts["misaligned"].squeeze(-1) == 1.0
+            if not all_hold(~awake):
+                parts = self.unpack(self._foresee(self.pack(parts), action), model.state_size)
+            weights = self.belief(parts).weights(self.prior.to(memory))
+            mean, std = mean_and_std(parts["forecasts"], weights)
+            return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))
+
+    def executing(
+        self, memory: Tensor, planned: Tensor, executed: Tensor, misaligned: Tensor | None = None
+    ) -> Tensor:
+        """Return the memory with the actions that are planned and executed now, ``(*B, A)``."""
+        return self._foresee(super().executing(memory, planned, executed, misaligned), executed)
+
+    def reported(self, memory: Tensor, given: Tensor) -> Tensor:
+        """Return the memory with forecasts moved by what was given more than sent."""
+        _, planned, sent = self.latest(memory)
+        parts = self.unpack(super().executing(memory, planned, given), self.states_in(memory))
+        more = self.normalise(given - sent).unsqueeze(-2)
+        return self.pack({**parts, "forecasts": parts["forecasts"] + more})
+
+    def _foresee(self, memory: Tensor, executed: Tensor) -> Tensor:
+        """Return the memory with forecasts of what is executed, where models are to be asked."""
+        parts = self.unpack(memory, self.states_in(memory))
+        awake = parts["misaligned"].squeeze(-1) == 1.0
+        calm = self.asleep(parts, executed)["forecasts"]
+        if not all_hold(~awake):
+            use = rows_of(awake)
+            asked = {name: part[use] for name, part in parts.items()}
+            calm = put(calm, awake, use, self.foresee(asked, executed[use]))
+        return self.pack({**parts, "forecasts": calm})
+
+    def _watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
+        return self.watch(memory, planned, model)
+
+    def _decide(self, *given: Tensor) -> Sequence[Tensor]:
+        return self.decide(*given)
 
     @abstractmethod
-    def answer(self, rows: Rows, planned: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the action to execute for a plan ``(*B, A)`` in u, and its predicted effect."""
+    def answer(self, parts: Fields, planned: Tensor, box: Tensor) -> Answer:
+        """Return what to execute for plans ``(*B, A)``, given the parts of memories."""
+
+    @abstractmethod
+    def foresee(self, parts: Fields, executed: Tensor) -> Tensor:
+        """Return the forecasts ``(*B, M, A)`` of what acts now if ``executed`` is executed."""

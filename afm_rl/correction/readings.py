@@ -1,8 +1,8 @@
-"""Hypotheses: which remembered pairs tell what an action does now.
+"""The models of a belief: how each reads the memory, and what it makes of what it has read.
 
-The newest pairs tell it, unless commands act late, the ground changes from place to place, or the
-newest commands were all alike. Each hypothesis reads the memory in its own way; what it would have
-predicted decides whether it is believed.
+The newest pairs tell what an action does now, unless commands act late, the ground changes from
+place to place, or the newest commands were all alike. So there are several readings, and for each
+a head that answers: the network, or one of the least-squares fits that it is given.
 """
 
 from __future__ import annotations
@@ -14,17 +14,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from afm_rl.correction.experts import HEADS, Rows
 from afm_rl.errors import ConfigurationError, check_choice
-from afm_rl.correction.experts import Rows
 
-IDENTITY = "identity"  # actions have the effect that the model predicts
 FILTER = 6  # commands that a lag looks back on
 AGE = 20.0  # steps that separate two pairs as much as one unit of place does
 FAR = 1e3  # squared distance beyond all
 OLDER = 1e-6  # squared distance that a pair is worth less, times its squared age
 
 
-class Hypothesis(NamedTuple):
+class Reading(NamedTuple):
     """One way of reading the memory."""
 
     share: float = 0.5
@@ -37,32 +36,42 @@ class Hypothesis(NamedTuple):
     """Whether it reads the pairs nearest in place instead of in time."""
     varied: bool = False
     """Whether it reads pairs whose commands differ as much as possible."""
-    penalty: float = 0.0
-    """How much worse than the first it must be expected to predict."""
+    heads: tuple[str, ...] = ("network",)
+    """What answers; names of :data:`~afm_rl.correction.experts.HEADS`."""
 
 
-HYPOTHESES = {
-    IDENTITY: Hypothesis(penalty=0.02),  # reads nothing
-    "recent": Hypothesis(),
-    "newest": Hypothesis(share=1 / 6, penalty=0.02),  # right after a change
-    "long": Hypothesis(share=1.0),
-    "varied": Hypothesis(share=1.0, varied=True, penalty=-0.01),  # also when it was at rest of late
-    **{f"delay_{k}": Hypothesis(delay=k, penalty=0.05) for k in range(1, 9)},
-    **{f"lag_{k}": Hypothesis(lag=k, penalty=0.05) for k in range(1, 4)},
-    "near": Hypothesis(near=True, penalty=0.03),
-    "nearest": Hypothesis(share=1 / 6, near=True),
-    "here": Hypothesis(share=1 / 12, near=True, penalty=0.01),  # at the edge of two grounds
+LATE = ("network", "nominal")
+READINGS = {
+    "recent": Reading(),
+    "newest": Reading(share=1 / 6, heads=("network", "gain", "offset")),  # right after a change
+    "long": Reading(share=1.0, heads=("network", "gain", "line", "affine")),
+    "varied": Reading(share=1.0, varied=True),  # also when it was at rest of late
+    **{f"delay_{k}": Reading(delay=k, heads=LATE) for k in range(1, 9)},
+    **{f"lag_{k}": Reading(lag=k, heads=LATE) for k in range(1, 4)},
+    "near": Reading(near=True),
+    "nearest": Reading(share=1 / 6, near=True),
+    "here": Reading(share=1 / 12, near=True),  # at the edge of two grounds
 }
 
 
+def models_of(readings: Sequence[Reading]) -> tuple[list[int], list[int]]:
+    """Return reading and head of every model but *nothing has changed*, as numbers.
+
+    >>> models_of([READINGS["recent"], READINGS["delay_1"]])
+    ([0, 1, 1], [0, 0, 7])
+    """
+    both = [(k, HEADS.index(head)) for k, r in enumerate(readings) for head in r.heads]
+    return [reading for reading, _ in both], [head for _, head in both]
+
+
 class Layout(NamedTuple):
-    """How H hypotheses fill K rows, in the order of :func:`check_hypotheses`.
+    """How H readings fill K rows, in the order of :func:`check_readings`.
 
     Ages count from the newest pair, 0.
     """
 
     command: Tensor
-    """What the commands of the hypotheses by time weigh, by age, the oldest first, ``(T K, L)``."""
+    """What the commands of the readings by time weigh, by age, the oldest first, ``(T K, L)``."""
     effect: Tensor
     """Ages of their effects, ``(T K,)``."""
     filled: Tensor
@@ -71,62 +80,61 @@ class Layout(NamedTuple):
     """What commands weigh in what acts now, by age, the oldest first, ``(H, L)``."""
 
 
-def lay_out(hypotheses: Sequence[Hypothesis], rows: int) -> Layout:
+def lay_out(readings: Sequence[Reading], rows: int) -> Layout:
     """Return the layout of K ``rows``.
 
-    >>> lay_out([Hypothesis(share=1.0, delay=1)], rows=2).command
+    >>> lay_out([Reading(share=1.0, delay=1)], rows=2).command
     tensor([[1., 0., 0.],
             [0., 1., 0.]])
     """
     age = torch.arange(rows - 1, -1, -1)
-    timed = [h for h in hypotheses if not (h.near or h.varied)]
-    length = memory_of(hypotheses, rows)
-    acting = torch.stack([_weights(h, length) for h in hypotheses])
+    timed = [h for h in readings if not (h.near or h.varied)]
+    length = memory_of(readings, rows)
+    acting = torch.stack([_weights(h, length) for h in readings])
     command = torch.stack([w.roll(-int(k)) for w in acting[: len(timed)] for k in age])
-    count = torch.tensor([max(1, round(h.share * rows)) for h in hypotheses])
+    count = torch.tensor([max(1, round(h.share * rows)) for h in readings])
     filled = (age < count.unsqueeze(-1)).unsqueeze(-1).float()
     return Layout(command, age.repeat(len(timed)), filled, acting)
 
 
-def _weights(hypothesis: Hypothesis, length: int) -> Tensor:
+def _weights(reading: Reading, length: int) -> Tensor:
     """Return what the newest commands weigh in what acts now, the oldest first, ``(length,)``."""
     newest = torch.zeros(length)
-    count, keep = (FILTER, math.exp(-1 / hypothesis.lag)) if hypothesis.lag else (1, 0.0)
+    count, keep = (FILTER, math.exp(-1 / reading.lag)) if reading.lag else (1, 0.0)
     for k in range(count):
         share = 1.0 if k == count - 1 else 1 - keep  # the oldest stands for those before it
-        newest[hypothesis.delay + k] = share * keep**k
+        newest[reading.delay + k] = share * keep**k
     return newest.flip(0)
 
 
-def memory_of(hypotheses: Sequence[Hypothesis], rows: int) -> int:
-    """Return how many pairs the hypotheses of K ``rows`` read at most."""
-    return rows + max(h.delay + (FILTER - 1 if h.lag else 0) for h in hypotheses)
+def memory_of(readings: Sequence[Reading], rows: int) -> int:
+    """Return how many pairs the readings of K ``rows`` read at most."""
+    return rows + max(h.delay + (FILTER - 1 if h.lag else 0) for h in readings)
 
 
-def check_hypotheses(names: Sequence[str], by_place: bool) -> list[str]:
-    """Return the names without the identity: those by time, by variety, by place.
+def check_readings(names: Sequence[str], by_place: bool) -> list[str]:
+    """Return the names in the order of :func:`read_rows`: by time, by variety, by place.
 
     Those by place are dropped without a place.
 
     Raises:
-        ConfigurationError: if it is no list of hypotheses, or none is left.
+        ConfigurationError: if it is no list of readings, or none by time is left.
 
-    >>> check_hypotheses(["identity", "near", "recent"], by_place=True)
+    >>> check_readings(["near", "recent"], by_place=True)
     ['recent', 'near']
     """
     if isinstance(names, str) or not isinstance(names, Sequence) or not names:
         raise ConfigurationError(
-            f"corrector.hypotheses={names!r}: expected a list of {', '.join(HYPOTHESES)}"
+            f"corrector.readings={names!r}: expected a list of {', '.join(READINGS)}"
         )
     for name in names:
-        check_choice("corrector.hypotheses", name, HYPOTHESES)
-    read = [name for name in names if name != IDENTITY]
-    near = [name for name in read if HYPOTHESES[name].near]
-    varied = [name for name in read if HYPOTHESES[name].varied]
-    timed = [name for name in read if name not in near + varied]
+        check_choice("corrector.readings", name, READINGS)
+    near = [name for name in names if READINGS[name].near]
+    varied = [name for name in names if READINGS[name].varied]
+    timed = [name for name in names if name not in near + varied]
     if not timed:
         raise ConfigurationError(
-            f"corrector.hypotheses={list(names)!r}: expected one by time, such as recent"
+            f"corrector.readings={list(names)!r}: expected one by time, such as recent"
         )
     return timed + varied + (near if by_place else [])
 
@@ -134,20 +142,20 @@ def check_hypotheses(names: Sequence[str], by_place: bool) -> list[str]:
 def read_rows(
     pairs: Tensor, layout: Layout, size: int, away: Tensor | None, varied: int = 0
 ) -> Rows:
-    """Return the rows that each hypothesis reads, ``(*B, H, K, A)``.
+    """Return the rows of each reading, ``(*B, H, K, A)``.
 
     Args:
         pairs: the memory, oldest first: executed, effective, standard deviation, valid, and what
             else there is, ``(*B, M, D)``.
-        layout: of the hypotheses.
+        layout: of the readings.
         size: number of actions, A.
         away: squared distance in place of each pair from here, ``(*B, M)``; None without
-            hypotheses by place.
-        varied: number of hypotheses by variety.
+            readings by place.
+        varied: number of readings by variety.
 
     >>> u = torch.tensor([[0.1], [0.2], [0.3]])
     >>> pairs = torch.cat([u, 10 * u, 0 * u, torch.ones(3, 1)], -1)
-    >>> late = lay_out([Hypothesis(share=1.0, delay=1)], rows=2)
+    >>> late = lay_out([Reading(share=1.0, delay=1)], rows=2)
     >>> rows = read_rows(pairs, late, 1, None)
     >>> rows.executed.flatten(), rows.effective.flatten()
     (tensor([0.1000, 0.2000]), tensor([2., 3.]))

@@ -7,8 +7,8 @@ from importlib.resources import files
 
 from safetensors.torch import load
 
-from afm_rl.errors import ArtefactError
 from afm_rl.correction.network import AxisNetwork
+from afm_rl.errors import ArtefactError
 
 FILE = "universal.safetensors"
 

@@ -17,6 +17,7 @@ from torch import nn
 
 from afm_rl.artefacts import load_artefact
 from afm_rl.correction import ActionFlow, Corrector, L1Augmentation, LeastSquares, PaperFlow
+from afm_rl.correction.training import train_flow
 from afm_rl.dynamics import (
     KNODE,
     Calibrated,
@@ -27,7 +28,6 @@ from afm_rl.dynamics import (
     UnknownDynamics,
 )
 from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_flag
-from afm_rl.correction.training import train_flow
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
 from afm_rl.missions.collected import fit_collected

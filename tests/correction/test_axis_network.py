@@ -3,11 +3,9 @@
 import pytest
 import torch
 
-from afm_rl.correction.experts import Rows, fit_experts
-
-from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.experts import EXPERTS
 from afm_rl.correction.achievable import MODES
+from afm_rl.correction.experts import EXPERTS, Rows, fit_experts
+from afm_rl.correction.network import AxisNetwork
 
 
 def drawn(*shape, seed=0):

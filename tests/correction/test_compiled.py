@@ -5,8 +5,8 @@ import torch
 
 from afm_rl import machine_code
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.readings import HYPOTHESES
 from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.readings import HYPOTHESES
 
 
 def flow_of(cache, **settings):

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from afm_rl.correction.experts import Rows, fit_experts
+from afm_rl.correction.achievable import MODES
 from afm_rl.correction.experts import (
     ANSWERS,
     LIMIT,
@@ -11,6 +11,8 @@ from afm_rl.correction.experts import (
     MISSES,
     NEAR,
     SHORT,
+    Rows,
+    fit_experts,
 )
 from afm_rl.correction.fits import (
     apply_friction,
@@ -23,7 +25,6 @@ from afm_rl.correction.fits import (
     invert_friction,
     weigh,
 )
-from afm_rl.correction.achievable import MODES
 
 AXIS = torch.linspace(-1, 1, 5)
 ASKED = torch.cartesian_prod(AXIS, AXIS).unsqueeze(0)

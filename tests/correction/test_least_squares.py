@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from afm_rl.correction import LeastSquares
-from afm_rl.errors import ConfigurationError
-from afm_rl.correction.fits import fit_affine, fit_gain, weigh
 from afm_rl.correction.achievable import MODES
+from afm_rl.correction.fits import fit_affine, fit_gain, weigh
+from afm_rl.errors import ConfigurationError
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 TURN = torch.tensor([[0.6, -0.8], [0.8, 0.6]])

@@ -6,6 +6,8 @@ import pytest
 import torch
 
 from afm_rl.correction import ActionFlow
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.pairs import OLD
 from afm_rl.correction.readings import (
     FILTER,
     HYPOTHESES,
@@ -16,9 +18,7 @@ from afm_rl.correction.readings import (
     memory_of,
     read_rows,
 )
-from afm_rl.correction.pairs import OLD
 from afm_rl.errors import ConfigurationError
-from afm_rl.correction.network import AxisNetwork
 
 MANY = 20
 AGES = torch.arange(float(MANY)).unsqueeze(-1)

@@ -12,8 +12,8 @@ from torch import nn
 import afm_rl.conf
 from afm_rl.artefacts import save_artefact
 from afm_rl.correction import ActionFlow, PaperFlow
-from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.correction.network import AxisNetwork
+from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.missions import build, prepare
 from afm_rl.missions.checks import blaming, check_training
 

@@ -15,14 +15,14 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from afm_rl.files import write_whole
+from afm_rl.correction.achievable import MODES
 from afm_rl.correction.experts import Rows, fit_experts
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.training.prior import KINDS, MIXES, Drawn, draw_examples
-from afm_rl.correction.achievable import MODES
 from afm_rl.correction.solver import midpoint
+from afm_rl.correction.training.prior import KINDS, MIXES, Drawn, draw_examples
 from afm_rl.correction.training.refine import EFFECT_WEIGHT, flow_losses
 from afm_rl.correction.weights import load_universal
+from afm_rl.files import write_whole
 
 SIZES = {1: 0.12, 2: 0.45, 3: 0.15, 4: 0.08, 6: 0.15, 9: 0.05}  # share of numbers of actions
 SHARES = {"mixed": 0.5, "clip": 0.3, "direction": 0.2}  # share of saturation modes
@@ -119,7 +119,9 @@ def _error(network, count, size, shares, generator) -> tuple[float, float]:
 
 def main() -> None:
     """Train, or evaluate."""
-    parser = argparse.ArgumentParser(prog="python -m afm_rl.correction.training.pretrain", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m afm_rl.correction.training.pretrain", description=__doc__
+    )
     parser.add_argument("--out", type=Path, default=Path("universal.safetensors"))
     parser.add_argument("--iterations", type=int, default=40_000)
     parser.add_argument("--seed", type=int, default=0)

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from afm_rl.correction.experts import Rows
 from afm_rl.correction.achievable import LEAST, LIMIT
+from afm_rl.correction.experts import Rows
 
 GRID = 257  # points of a tabulated map
 EDGE = 1.6  # centres of narrow windows are drawn in this box and cut: many actions saturate

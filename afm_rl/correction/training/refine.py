@@ -11,6 +11,10 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor, nn
 
+from afm_rl.correction.achievable import MODES
+from afm_rl.correction.experts import Rows, fit_experts
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.training.prior import Drawn
 from afm_rl.devices import device_of
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import (
@@ -20,10 +24,6 @@ from afm_rl.errors import (
     check_instance,
     check_number,
 )
-from afm_rl.correction.experts import Rows, fit_experts
-from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.training.prior import Drawn
-from afm_rl.correction.achievable import MODES
 from afm_rl.learning import InPlaceLoss
 from afm_rl.progress import Bar
 from afm_rl.regimes import Regime

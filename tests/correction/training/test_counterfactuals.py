@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from afm_rl.correction import ActionFlow, PaperFlow
+from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.training.counterfactuals import draw_counterfactuals, imagine
 from afm_rl.dynamics import Dubins, Quadrotor
-from afm_rl.correction.network import AxisNetwork
 from afm_rl.regimes import ActionGain, MassFactor
 
 

@@ -12,14 +12,14 @@ from safetensors.torch import load
 from tensordict import TensorDict
 
 import afm_rl.correction.weights
-from afm_rl.dynamics import Dubins
-from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.correction.experts import fit_experts
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.training import CFMLoss, draw_examples, train_flow
-from afm_rl.correction.weights import load_universal
-from afm_rl.correction.experts import fit_experts
 from afm_rl.correction.training.pretrain import pretrain
 from afm_rl.correction.training.refine import EFFECT_WEIGHT, PRECISION, flow_losses
+from afm_rl.correction.weights import load_universal
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ArtefactError, ConfigurationError
 
 KEYS = ["executed", "effective", "std", "valid", "planned", "intended", "probe", "effect"]
 

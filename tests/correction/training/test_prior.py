@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from afm_rl.correction.achievable import LEAST, LIMIT, MODES
 from afm_rl.correction.training import draw_examples
 from afm_rl.correction.training.prior import GRID, Draw, Maps, draw_actions, draw_maps, draw_masks
-from afm_rl.correction.achievable import LEAST, LIMIT, MODES
 
 SIZES = [1, 2, 3, 6, 17]
 
