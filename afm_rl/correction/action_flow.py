@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.correction.base import Fields
 from afm_rl.correction.experts import HEADS
 from afm_rl.correction.network import AxisNetwork
@@ -17,7 +18,6 @@ from afm_rl.correction.tick import Tick
 from afm_rl.correction.weights import load_universal
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_flag, check_number
-from afm_rl.machine_code import MachineCode, in_one_batch
 
 
 class ActionFlow(PairCorrector):

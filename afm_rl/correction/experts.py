@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from afm_rl.compiling.tracing import cached
 from afm_rl.correction.achievable import LIMIT, saturate
 from afm_rl.correction.fits import (
     LEAST_GAIN,
@@ -18,8 +19,7 @@ from afm_rl.correction.fits import (
     invert_friction,
     not_zero,
 )
-from afm_rl.small_matrices import solve_positive
-from afm_rl.tracing import cached
+from afm_rl.spaces.small_matrices import solve_positive
 
 EXACT = 0.02  # half ranges: a fit that misses by less explains all rows
 LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis

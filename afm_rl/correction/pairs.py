@@ -9,13 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.base import Correction, Corrector, Fields, put, rows_of
 from afm_rl.correction.belief import Belief, mean_and_std
 from afm_rl.correction.experts import LIMIT
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import check_count, check_number
-from afm_rl.tracing import all_hold
 
 OLD = 0.5  # what "valid" becomes where a change has begun since
 

@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from afm_rl.artefacts import load_artefact, save_artefact
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
 from afm_rl.correction.achievable import MODES
 from afm_rl.correction.choice import nearest_of, probes_of, source_points_of
@@ -11,6 +10,7 @@ from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.training import train_flow
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.storage.artefacts import load_artefact, save_artefact
 
 SIZES = [1, 2, 6, 17]
 

@@ -11,11 +11,11 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor, nn
 
+from afm_rl.compiling.devices import device_of
 from afm_rl.correction.achievable import MODES
 from afm_rl.correction.experts import Rows, fit_experts
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.training.prior import Drawn
-from afm_rl.devices import device_of
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import (
     ConfigurationError,
