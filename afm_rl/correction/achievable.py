@@ -56,18 +56,24 @@ def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
     return unit * share if mode == "direction" else torch.where(share < LEAST, unit * share, unit)
 
 
-def cut_off(share: Tensor, mode: str) -> Tensor:
-    """Where is a plan cut, and not done slower, if only this share of the box can be had?
+def extend(reach: Tensor, box: Tensor, mode: str) -> Tensor:
+    """Return the bounds ``(*B, 2, A)`` that plans should keep, given what can be reached.
 
-    No slowness helps where nothing can be had at all.
+    All of the box where a plan is not cut but done slower: there it may ask for more. No slowness
+    helps where nothing can be had at all.
 
-    >>> cut_off(torch.tensor([0.01, 0.2, 0.5]), "mixed")
-    tensor([ True, False,  True])
+    >>> box = torch.tensor([[-1.0], [1.0]])
+    >>> [extend(share * box, box, "mixed")[1].item() for share in (0.01, 0.25, 0.5)]
+    [0.009999999776482582, 1.0, 0.5]
     """
     if mode == "clip":
-        return torch.ones_like(share, dtype=torch.bool)
-    dead = share < DEAD
-    return dead if mode == "direction" else dead | (share > LEAST)
+        return reach
+    share = reach.diff(dim=-2) / box.diff(dim=-2)
+    slower = (share > DEAD) & (torch.tensor(mode == "direction") | (share < LEAST))
+    widest = torch.stack(
+        [reach[..., 0, :].fmin(box[..., 0, :]), reach[..., 1, :].fmax(box[..., 1, :])], -2
+    )
+    return torch.where(slower, widest, reach)
 
 
 def intend(

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.correction.base import Fields
-from afm_rl.correction.experts import HEADS
+from afm_rl.correction.linear import LINEAR
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.pairs import Answer, PairCorrector
-from afm_rl.correction.readings import READINGS, check_readings, memory_of, models_of
+from afm_rl.correction.readings import READINGS, check_readings, late_ones, memory_of
 from afm_rl.correction.tick import Tick
 from afm_rl.correction.weights import load_universal
 from afm_rl.dynamics import DynamicsModel
@@ -100,7 +100,7 @@ class ActionFlow(PairCorrector):
         rows = max(12, size + 4) if rows is None else check_count("corrector.rows", rows)
         names = check_readings(list(READINGS) if readings is None else readings, bool(place))
         chosen = [READINGS[name] for name in names]
-        models = [f"{names[k]}: {HEADS[head]}" for k, head in zip(*models_of(chosen), strict=True)]
+        models = [*names, *LINEAR, *(f"only {name}" for name in late_ones(names))]
         super().__init__(action_low, action_high, rows, memory, models, len(place), **rules)
         self.readings, self.place = names, place
         self.place_scale = check_number(
@@ -151,7 +151,7 @@ class ActionFlow(PairCorrector):
         lead = pairs.shape[:-2]
         flat = [part.reshape(-1, *part.shape[len(lead) :]) for part in (pairs, noise, place)]
         unit = self.normalise(executed).to(pairs).reshape(-1, self.action_size)
-        forecasts = self.tick.forecast(self.tick.encode(*flat), flat[0], unit)
+        forecasts = self.tick.forecast(*self.tick.read(*flat), flat[0], unit)
         return forecasts.view(*lead, *forecasts.shape[1:]).to(executed)
 
     def _read(self, parts: Fields) -> list[Tensor]:

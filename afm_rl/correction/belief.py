@@ -31,6 +31,7 @@ class Belief(NamedTuple):
         discount: float,
         rate: float,
         floor: float,
+        tails: float,
     ) -> Belief:
         r"""Return the belief after an effect was seen.
 
@@ -52,11 +53,12 @@ class Belief(NamedTuple):
             discount: :math:`\alpha`.
             rate: :math:`\beta`.
             floor: least noise.
+            tails: degrees of freedom of the Student-t distribution.
         """
         variance, stated = self.noise.square(), std.square()
         miss = (self.forecasts - effect.unsqueeze(-2)).square()
         scaled = miss / (variance + stated).unsqueeze(-2)
-        losses = discount * self.losses + scaled.log1p()
+        losses = discount * self.losses + 0.5 * (tails + 1) * (scaled / tails).log1p()
         losses = torch.where(valid.unsqueeze(-2) > 0, losses, self.losses)
         best = (losses - prior).argmin(-2, keepdim=True)
         excess = miss.gather(-2, best).squeeze(-2) - stated

@@ -27,8 +27,6 @@ LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
 NEAR = 0.15  # half ranges: a pair so far from the question counts half as much
 SHORT, LONG = 0.5, 0.9  # forgetting per row
 EXPERTS = 6
-HEADS = ("network", "quick", "gain", "line", "friction", "affine", "offset", "nominal")
-"""What may answer of a reading: the network, its five fits, a mere offset, or nothing changed."""
 ANSWERS = EXPERTS + 1  # the experts' answers, and the effect or nearness of the nearest pairs
 MISSES = EXPERTS - 1  # the nearest pairs have no residual of their own
 
@@ -71,8 +69,6 @@ class Experts(NamedTuple):
     """Its regularised inverse, ``(N, A, A)``."""
     bias: Tensor
     """Of the affine map, ``(N, A, 1)``."""
-    shift: Tensor
-    """Offset at a gain of one, ``(N, A, 1)``."""
     residuals: Tensor
     """What each fit leaves of each row, ``(N, A, K, 5)``."""
     misses: Tensor
@@ -168,7 +164,6 @@ def fit_experts(rows: Rows) -> Experts:
         matrix,
         inverse,
         bias,
-        _shift(u, e, weights[..., :1, :]),
         bias,  # until the residuals are known
         bias,
         u.unsqueeze(-2),
@@ -216,12 +211,6 @@ def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     explained = (left < limit) & (mass > LEAST_ROWS)
     chosen = torch.zeros_like(slope).scatter(-1, driver, slope.gather(-1, driver))
     return explained, torch.cat([chosen, offset.gather(-1, driver)], -1)
-
-
-def _shift(u: Tensor, e: Tensor, weight: Tensor) -> Tensor:
-    """Return the mean of what effects ``(N, A, K)`` exceed their actions by, ``(N, A, 1)``."""
-    mass = weight.sum(-1) + 10 * PRIOR
-    return (weight.squeeze(-2) * (e - u)).sum(-1, keepdim=True) / mass
 
 
 def _solve_line(moments: Tensor) -> tuple[Tensor, Tensor]:

@@ -186,18 +186,11 @@ class AxisNetwork(nn.Module):
 
     def effect(self, encoded: Encoded, executed: Tensor) -> Tensor:
         """Return the effects ``(N, C, A)`` that actions ``(N, C, A)`` are predicted to have."""
-        return self.effects(encoded, executed)[..., 0].mT
-
-    def effects(self, encoded: Encoded, executed: Tensor) -> Tensor:
-        """Return what each of the :data:`heads <HEADS>` expects, ``(N, A, C, 8)``."""
         answers = encoded.experts.effect(executed)
         misses = encoded.experts.misses.to(executed).expand(*answers.shape[:-1], -1)
         asked = torch.cat([executed.mT.unsqueeze(-1), answers, misses], -1)
         hidden = (self.effect_code(encoded.code) + self.effect_query(asked)).relu()
-        mixed = self._blend(self.effect_head(hidden), answers[..., :EXPERTS]).mT.unsqueeze(-1)
-        unit = executed.mT.unsqueeze(-1)
-        shifted = unit + encoded.experts.shift.unsqueeze(-1).to(unit)
-        return torch.cat([mixed, answers[..., :MISSES], shifted, unit], -1)
+        return self._blend(self.effect_head(hidden), answers[..., :EXPERTS])
 
     def _blend(self, output: Tensor, answers: Tensor) -> Tensor:
         """Return the mixture of the own answer and the experts', ``(N, C, A)``."""

@@ -80,6 +80,7 @@ class PairCorrector(Corrector):
         noise_rate: float = 0.1,
         least_noise: float = 0.02,
         quiet: float = 1.0,
+        tails: float = 1.0,
     ) -> None:
         super().__init__(action_low, action_high, recent)
         self.memory = max(check_count("corrector.memory", memory), recent)
@@ -91,6 +92,7 @@ class PairCorrector(Corrector):
             "corrector.least_noise", least_noise, low=0.0, open_low=True
         )
         self.noise = check_number("corrector.noise", noise, low=self.least_noise)
+        self.tails = check_number("corrector.tails", tails, low=0.0, open_low=True)
         self.quiet = check_number("corrector.quiet", quiet, low=0.0)
         self.pair_size, self.tail = 3 * self.action_size + 2 + place, 1 + place
         is_valid = torch.arange(self.pair_size) == 3 * self.action_size
@@ -157,7 +159,7 @@ class PairCorrector(Corrector):
         _, effect, std, came, _ = rows[..., -1, :].split(
             [size, size, size, 1, self.pair_size - 3 * size - 1], -1
         )
-        rules = (self.prior.to(rows), self.discount, self.noise_rate, self.least_noise)
+        rules = (self.prior.to(rows), self.discount, self.noise_rate, self.least_noise, self.tails)
         belief = self.belief(parts).update(effect, std, came, *rules)
         awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
         begins = (parts["misaligned"] != 1.0) & awake

@@ -1,8 +1,7 @@
-"""The models of a belief: how each reads the memory, and what it makes of what it has read.
+"""Readings: which remembered pairs tell what an action does now.
 
-The newest pairs tell what an action does now, unless commands act late, the ground changes from
-place to place, or the newest commands were all alike. So there are several readings, and for each
-a head that answers: the network, or one of the least-squares fits that it is given.
+The newest pairs tell it, unless commands act late, the ground changes from place to place, or the
+newest commands were all alike. Each reading is a model of the belief, by what the network answers.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from afm_rl.correction.experts import HEADS, Rows
+from afm_rl.correction.experts import Rows
 from afm_rl.errors import ConfigurationError, check_choice
 
 FILTER = 6  # commands that a lag looks back on
@@ -36,32 +35,19 @@ class Reading(NamedTuple):
     """Whether it reads the pairs nearest in place instead of in time."""
     varied: bool = False
     """Whether it reads pairs whose commands differ as much as possible."""
-    heads: tuple[str, ...] = ("network",)
-    """What answers; names of :data:`~afm_rl.correction.experts.HEADS`."""
 
 
-LATE = ("network", "nominal")
 READINGS = {
     "recent": Reading(),
-    "newest": Reading(share=1 / 6, heads=("network", "gain", "offset")),  # right after a change
-    "long": Reading(share=1.0, heads=("network", "gain", "line", "affine")),
+    "newest": Reading(share=1 / 6),  # right after a change
+    "long": Reading(share=1.0),
     "varied": Reading(share=1.0, varied=True),  # also when it was at rest of late
-    **{f"delay_{k}": Reading(delay=k, heads=LATE) for k in range(1, 9)},
-    **{f"lag_{k}": Reading(lag=k, heads=LATE) for k in range(1, 4)},
+    **{f"delay_{k}": Reading(delay=k) for k in range(1, 9)},
+    **{f"lag_{k}": Reading(lag=k) for k in range(1, 4)},
     "near": Reading(near=True),
     "nearest": Reading(share=1 / 6, near=True),
     "here": Reading(share=1 / 12, near=True),  # at the edge of two grounds
 }
-
-
-def models_of(readings: Sequence[Reading]) -> tuple[list[int], list[int]]:
-    """Return reading and head of every model but *nothing has changed*, as numbers.
-
-    >>> models_of([READINGS["recent"], READINGS["delay_1"]])
-    ([0, 1, 1], [0, 0, 7])
-    """
-    both = [(k, HEADS.index(head)) for k, r in enumerate(readings) for head in r.heads]
-    return [reading for reading, _ in both], [head for _, head in both]
 
 
 class Layout(NamedTuple):
@@ -110,6 +96,15 @@ def _weights(reading: Reading, length: int) -> Tensor:
 def memory_of(readings: Sequence[Reading], rows: int) -> int:
     """Return how many pairs the readings of K ``rows`` read at most."""
     return rows + max(h.delay + (FILTER - 1 if h.lag else 0) for h in readings)
+
+
+def late_ones(names: Sequence[str]) -> list[str]:
+    """Return the readings by which actions act late, or slowly.
+
+    >>> late_ones(["recent", "delay_2", "lag_1"])
+    ['delay_2', 'lag_1']
+    """
+    return [name for name in names if READINGS[name].delay or READINGS[name].lag]
 
 
 def check_readings(names: Sequence[str], by_place: bool) -> list[str]:

@@ -9,25 +9,27 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from afm_rl.correction.achievable import MODES, attainable
+from afm_rl.correction.achievable import MODES, attainable, extend
 from afm_rl.correction.belief import Belief, mean_and_std
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
+from afm_rl.correction.linear import LINEAR, Lines, fit_lines
 from afm_rl.correction.network import AxisNetwork, Encoded
 from afm_rl.correction.pairs import Answer
-from afm_rl.correction.readings import READINGS, Layout, lay_out, models_of, read_rows
+from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows
 from afm_rl.correction.solver import midpoint
 from afm_rl.errors import check_choice, check_count, check_number
 
 
-class Likely(NamedTuple):
-    """The K most likely models of every axis, and *nothing has changed*."""
+class Models(NamedTuple):
+    """What is believed of the next action: the models, or the most likely of them."""
 
     encoded: Encoded
-    """What they read, B K sets."""
-    head: Tensor
-    """Which of the heads answers, ``(B, K, A)``."""
+    """What the K most likely readings of every axis have read, B K sets."""
+    lines: Lines
+    """The linear models."""
     weights: Tensor
-    """Their probabilities, the first that of *nothing has changed*, ``(B, K + 1, A)``."""
+    """Probabilities ``(B, 1 + K + L, A)``: that actions have their nominal effect, now or late;
+    of the readings; of the linear models."""
 
 
 class Tick(nn.Module):
@@ -42,8 +44,7 @@ class Tick(nn.Module):
     points: Tensor
     probes: Tensor
     prior: Tensor
-    reading: Tensor
-    head: Tensor
+    late: Tensor
     rows_acting: Tensor
 
     def __init__(
@@ -67,15 +68,15 @@ class Tick(nn.Module):
         chosen = [READINGS[name] for name in readings]
         self.by_place = any(r.near for r in chosen)
         self.varied = sum(r.varied for r in chosen)
-        reading, head = models_of(chosen)
-        self.likely = min(check_count("corrector.likely", likely), len(head))
+        self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings))]
+        self.likely = min(check_count("corrector.likely", likely), len(chosen))
+        late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "prior": prior,
-            "reading": torch.tensor(reading),
-            "head": torch.tensor(head),
+            "late": torch.tensor(late, dtype=torch.long),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
         for name, value in fixed.items():
@@ -101,19 +102,20 @@ class Tick(nn.Module):
             box: lowest and highest action, ``(B, 2, A)``.
         """
         unit, ends = planned / self.scale, box / self.scale
+        encoded, lines = self.read(pairs, noise, place)
         weights = Belief(losses, losses, noise).weights(self.prior)
-        encoded = self.encode(pairs, noise, place)
-        models = self.most_likely(encoded, weights)
+        models = self.most_likely(encoded, lines, weights)
         proposals, spread = self.propose(models, unit, ends)
         probes = torch.lerp(ends[:, :1], ends[:, 1:], 0.5 * (self.probes + 1))
         expected = self.expect(models, torch.cat([proposals, probes], 1))
         known, foreseen = expected.split([proposals.shape[1], probes.shape[1]], 2)
-        bounds = self.reach(models, foreseen)
-        wanted = attainable(unit, *bounds.unbind(-2), self.saturation)
+        reach = self.reach(models, foreseen)
+        wanted = attainable(unit, *reach.unbind(-2), self.saturation)
+        bounds = extend(reach, ends, self.saturation)
         action = self.decide(models, proposals, known, wanted)
         action = torch.where(action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
-        forecasts = self.forecast(encoded, pairs, action)
+        forecasts = self.forecast(encoded, lines, pairs, action)
         return Answer(
             action * self.scale,
             predicted * self.scale,
@@ -123,8 +125,8 @@ class Tick(nn.Module):
             forecasts,
         )
 
-    def encode(self, pairs: Tensor, noise: Tensor, place: Tensor) -> Encoded:
-        """Return what is read in every reading, B R sets of rows."""
+    def read(self, pairs: Tensor, noise: Tensor, place: Tensor) -> tuple[Encoded, Lines]:
+        """Return what is read in every reading, B R sets of rows, and the linear models."""
         away, size = None, len(self.scale)
         if self.by_place:
             first = 3 * size + 2
@@ -134,49 +136,51 @@ class Tick(nn.Module):
         rows = read_rows(pairs, layout, size, away, self.varied)
         loud = torch.hypot(rows.std, noise[:, None, None]) * rows.valid
         rows = Rows(*(part.flatten(0, 1) for part in rows._replace(std=loud)))
-        return self.network.encode(rows, fit_experts(rows))
+        sent, came, std, valid = pairs[..., : 3 * size + 1].split([size, size, size, 1], -1)
+        sound = (valid == 1.0).to(pairs)
+        lines = fit_lines(sent, came, torch.hypot(std, noise.unsqueeze(1)), sound)
+        return self.network.encode(rows, fit_experts(rows)), lines
 
-    def most_likely(self, encoded: Encoded, weights: Tensor) -> Likely:
+    def most_likely(self, encoded: Encoded, lines: Lines, weights: Tensor) -> Models:
         """Return the most likely models of every axis."""
-        best = weights[:, 1:].topk(self.likely, 1)
-        which = encoded.choose(self.reading[best.indices])
-        weights = torch.cat([weights[:, :1], best.values], 1)
-        return Likely(which, self.head[best.indices], weights / weights.sum(1, keepdim=True))
+        still, read, linear, late = weights.split(self.counts, 1)
+        best = read.topk(self.likely, 1)
+        which = encoded.choose(best.indices)
+        share = best.values / best.values.sum(1, keepdim=True).clamp_min(1e-30)
+        share = read.sum(1, keepdim=True) * share
+        still = still + late.sum(1, keepdim=True)
+        return Models(which, lines, torch.cat([still, share, linear], 1))
 
-    def propose(self, models: Likely, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
+    def propose(self, models: Models, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions ``(B, C, A)``, the first the planned one, and the samples' deviation.
 
-        The flow's samples of the most likely model, and the exact answers of all fits.
+        The flow's samples of the most likely reading, and the exact answers of all fits.
         """
-        count, likely, size = models.head.shape
-        plans = planned.unsqueeze(1).repeat_interleave(likely, 0)
+        count, size = planned.shape
+        plans = planned.repeat_interleave(self.likely, 0).unsqueeze(1)
         asked = self.network.ask(models.encoded, plans, self.saturation)
-        first = asked.pick(torch.arange(count, device=planned.device) * likely)
+        first = asked.pick(torch.arange(count, device=planned.device) * self.likely)
         plan = planned.unsqueeze(1)
         start = plan + self.source_std * self.points
         ends = midpoint(partial(self.network.velocity, first), start, self.steps)
         mean, spread = ends.mean(1, keepdim=True), ends.std(1, correction=0)
-        shift = models.encoded.experts.shift.mT.to(plans)
-        exact = torch.cat([asked.answers[..., 0, :MISSES].mT, plans - shift], 1)
-        found = [plan, mean, ends, exact.view(count, -1, size)]
+        exact = asked.answers[..., 0, :MISSES].mT.reshape(count, -1, size)
+        found = [plan, mean, ends, exact, models.lines.invert(planned)]
         least, most = box.split(1, 1)
         return torch.cat(found, 1).clamp(least, most), spread
 
-    def expect(self, models: Likely, actions: Tensor) -> Tensor:
-        """Return the effects ``(B, K + 1, C, A)`` of actions ``(B, C, A)`` by every model."""
-        count, likely, size = models.head.shape
-        each = actions.repeat_interleave(likely, 0)
-        heads = self.network.effects(models.encoded, each)  # (B K, A, C, 8)
-        which = models.head.view(-1, size, 1, 1).expand(*heads.shape[:-1], 1)
-        effects = heads.gather(-1, which).squeeze(-1).mT.unflatten(0, (count, likely))
-        return torch.cat([actions.unsqueeze(1), effects], 1)
+    def expect(self, models: Models, actions: Tensor) -> Tensor:
+        """Return the effects ``(B, 1 + K + L, C, A)`` of actions ``(B, C, A)`` by every model."""
+        each = actions.repeat_interleave(self.likely, 0)
+        read = self.network.effect(models.encoded, each).unflatten(0, (-1, self.likely))
+        return torch.cat([actions.unsqueeze(1), read, models.lines.effect(actions)], 1)
 
-    def mean(self, models: Likely, expected: Tensor) -> tuple[Tensor, Tensor]:
+    def mean(self, models: Models, expected: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation of effects over the models, ``(B, C, A)`` each."""
         weights = models.weights.unsqueeze(2)
         return mean_and_std(expected.transpose(1, 2), weights.transpose(1, 2))
 
-    def reach(self, models: Likely, foreseen: Tensor) -> Tensor:
+    def reach(self, models: Models, foreseen: Tensor) -> Tensor:
         """Return the lowest and highest effects that actions may have, ``(B, 2, A)``.
 
         As far as the models differ, the best is hoped for: a planner that may try learns more.
@@ -184,7 +188,7 @@ class Tick(nn.Module):
         mean, std = self.mean(models, foreseen)
         return torch.stack([(mean - std).amin(1), (mean + std).amax(1)], 1)
 
-    def decide(self, models: Likely, proposals: Tensor, expected: Tensor, wanted: Tensor) -> Tensor:
+    def decide(self, models: Models, proposals: Tensor, expected: Tensor, wanted: Tensor) -> Tensor:
         r"""Return the actions ``(B, A)`` with the least expected squared miss.
 
         .. math:: u_a = \operatorname{argmin}_u \sum_h w_{ha} (T_{ha}(u) - u^*_a)^2
@@ -203,15 +207,14 @@ class Tick(nn.Module):
         better = worth <= cost.gather(1, joint).sum(-1, keepdim=True) + 1e-9
         return torch.where(better, mixed, whole).squeeze(1)
 
-    def forecast(self, encoded: Encoded, pairs: Tensor, executed: Tensor) -> Tensor:
+    def forecast(self, encoded: Encoded, lines: Lines, pairs: Tensor, executed: Tensor) -> Tensor:
         """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now."""
-        size = len(self.scale)
-        sent = torch.cat([pairs[..., :size], executed.unsqueeze(-2)], -2)
+        size, now = len(self.scale), executed.unsqueeze(1)
+        sent = torch.cat([pairs[..., :size], now], -2)
         acted = self.rows_acting @ sent[:, -self.rows_acting.shape[-1] :]  # (B, R, A)
-        heads = self.network.effects(encoded, acted.reshape(-1, 1, size)).squeeze(2)
-        heads = heads.unflatten(0, acted.shape[:2])  # (B, R, A, 8)
-        effects = heads[:, self.reading, :, self.head].movedim(0, 1)
-        return torch.cat([executed.unsqueeze(1), effects], 1)
+        read = self.network.effect(encoded, acted.reshape(-1, 1, size)).view_as(acted)
+        linear = lines.effect(now).squeeze(2)
+        return torch.cat([now, read, linear, acted[:, self.late]], 1)
 
 
 def points_of(count: int, size: int) -> Tensor:

@@ -16,7 +16,7 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from afm_rl.compiling.devices import check_device
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_choice, check_count
 from afm_rl.learning import GaussianNLLLoss, Updater
 from afm_rl.missions.checks import blaming, check_cost, check_keys, check_label, check_updater
 from afm_rl.missions.factories import Training
@@ -36,7 +36,7 @@ from afm_rl.trust import check_targets
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
 MOST_STEPS, MOST_MISSIONS = 10_000_000, 1_000_000
 DEFAULTS = {
-    **{"seeds": 1, "budget": 5000, "label": None, "faults": "hold", "false_alarms": 0.01},
+    **{"seeds": 1, "budget": 5000, "label": None, "faults": "hold"},
     "device": "cpu",
 }
 """Settings that a configuration may leave out."""
@@ -125,8 +125,6 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     budget = check_count("budget", settings["budget"], high=MOST_STEPS)
     total = len(tracks) * len(regimes) * len(seeds)
     check_count("seeds: missions, for all tracks and regimes", total, high=MOST_MISSIONS)
-    if settings["false_alarms"] is not None:
-        check_number("false_alarms", settings["false_alarms"], low=0.0, high=0.5, open_low=True)
     faults = check_choice("faults", settings["faults"], ("hold", "skip", "raise"))
     with blaming("robot.env"):
         env = robot.env(

@@ -26,12 +26,12 @@ from afm_rl.dynamics import (
     Quadrotor,
     UnknownDynamics,
 )
-from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_flag
+from afm_rl.errors import AFMError, ConfigurationError, check_flag
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
 from afm_rl.missions.collected import fit_collected
 from afm_rl.missions.robot import Robot
-from afm_rl.planning.costs import SATURATIONS, KnownReward
+from afm_rl.planning.costs import KnownReward
 from afm_rl.storage.artefacts import load_artefact
 from afm_rl.transforms import ActionFlowTransform
 
@@ -155,19 +155,17 @@ def knode(
     return Part(model, Training("KNODE", model, train, unit, [shape]), shape)
 
 
-def reward(robot: Robot, saturation: str = "clip") -> KnownReward:
+def reward(robot: Robot) -> KnownReward:
     """Return the cost that is the negative reward of the robot's task.
 
     Args:
         robot: one with a reward.
-        saturation: see :class:`~afm_rl.planning.GoalDistance`.
     """
     if robot.reward is None:
         raise ConfigurationError(
             f"cost=reward: robot={robot.name} has no reward; choose cost=goal_position, or a "
             "robot with a task: gymnasium, dm_control or mujoco"
         )
-    check_choice("cost.saturation", saturation, SATURATIONS)
     return KnownReward(robot.reward, list(robot.reward_reads), list(robot.reward_reads.values()))
 
 
@@ -190,7 +188,7 @@ def afm(
     flow = ActionFlow(*robot.action_box, place=place, place_scale=scale, **settings)
     if train is None and checkpoint is None:
         return Part(_transform(robot, dynamics, flow, enabled, extend_action_box))
-    own: dict[str, Any] = {k: v for k, v in settings.items() if k in ("hypotheses", "rows")}
+    own: dict[str, Any] = {k: v for k, v in settings.items() if k in ("readings", "rows")}
     training = _training(flow, robot, dynamics, train or {}, checkpoint, own, FLOW_UNIT)
     return Part(_transform(robot, dynamics, flow, enabled, extend_action_box), training)
 

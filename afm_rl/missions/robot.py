@@ -53,7 +53,7 @@ class Robot:
         usual_low: lowest corner of the box that actions mostly keep to, the unit of calibrations
             and the box in which residual networks are trained; the action box if None.
         usual_high: its highest corner.
-        hypotheses: those of :data:`~afm_rl.correction.readings.HYPOTHESES` that make sense for
+        readings: those of :data:`~afm_rl.correction.readings.READINGS` that make sense for
             the robot; all if None.
         place: indices of the state coordinates in which the ground may differ, if any.
         place_scale: distance at which ground counts as other ground, in their unit.
@@ -87,7 +87,7 @@ class Robot:
     score: Score | None = None
     usual_low: Sequence[float] | None = None
     usual_high: Sequence[float] | None = None
-    hypotheses: Sequence[str] | None = None
+    readings: Sequence[str] | None = None
     place: Sequence[int] = ()
     place_scale: float = 1.0
     reward: Callable[..., Tensor] | None = None

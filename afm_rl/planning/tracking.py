@@ -10,8 +10,8 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_choice, check_number
-from afm_rl.planning.costs import SATURATIONS, Cost
+from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.planning.costs import Cost
 from afm_rl.spaces.keys import as_keys
 from afm_rl.spaces.manifold import wrap_angle
 
@@ -54,8 +54,6 @@ class TrackingCost(QuadraticCost):
         rest: targets of the other coordinates, one per state coordinate; zeros if None.
         angles: indices of the coordinates in rad, whose difference wraps.
         in_keys: the reference's key; none without a reference.
-        saturation: what should give way when an action cannot be had in full, for whoever
-            executes the plan, see :class:`~afm_rl.planning.GoalDistance`.
 
     Raises:
         ConfigurationError: for settings that do not fit together.
@@ -79,10 +77,8 @@ class TrackingCost(QuadraticCost):
         rest: Sequence[float] | None = None,
         angles: Sequence[int] = (),
         in_keys: Sequence[NestedKey] = ("reference",),
-        saturation: str = "clip",
     ) -> None:
         super().__init__()
-        self.saturation = check_choice("cost.saturation", saturation, SATURATIONS)
         size, self.in_keys = len(weights), as_keys(in_keys)
         if len(self.in_keys) != bool(coordinates):
             raise ConfigurationError(
