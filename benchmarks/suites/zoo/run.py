@@ -32,6 +32,7 @@ def main() -> None:
     parser.add_argument("--faults", nargs="*", help="default: all")
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
     parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--steps", type=int, help="cut episodes (use another --out); the change stays")
     parser.add_argument("--side-by-side", type=int, default=64, help="episodes in one batch")
     parser.add_argument("--folder", type=Path, default=POLICIES, help="where the policies are")
     parser.add_argument("--out", type=Path, default=Path("outputs/zoo"))
@@ -61,23 +62,23 @@ def complete(task: Task, method: str, faults: list[str], args: argparse.Namespac
     missing = [pair for pair in wanted if pair not in done]
     for first in range(0, len(missing), args.side_by_side):
         start, pairs = time.perf_counter(), missing[first : first + args.side_by_side]
-        rows += play(task, method, pairs)
+        rows += play(task, method, pairs, args.steps or task.steps)
         args.out.mkdir(parents=True, exist_ok=True)
         write_whole(file, pd.DataFrame(rows).to_csv(index=False).encode())
         spent = time.perf_counter() - start
         print(f"{task.name}, {method}: {len(pairs)} episodes in {spent:.0f} s", flush=True)
 
 
-def play(task: Task, method: str, pairs: list[tuple[str, int]]) -> list[dict]:
+def play(task: Task, method: str, pairs: list[tuple[str, int]], steps: int) -> list[dict]:
     """Play faults and episodes side by side; return a row of results for each."""
     torch.manual_seed(0)
     rows = torch.stack([task.regime.encode(task.faults[fault]) for fault, _ in pairs])
     inner = FaultyVector(task.vector(len(pairs)), task.regime, rows, task.at)
     envs, act = METHODS[method](task, inner)
     observations, _ = envs.reset(seed=[episode for _, episode in pairs])
-    rewards, alive = np.zeros((task.steps, len(pairs))), np.ones(len(pairs), dtype=bool)
+    rewards, alive = np.zeros((steps, len(pairs))), np.ones(len(pairs), dtype=bool)
     lasted = np.zeros(len(pairs), dtype=int)
-    for step in range(task.steps):
+    for step in range(steps):
         observations, reward, terminated, truncated, _ = envs.step(act(observations))
         rewards[step] = np.where(alive, reward, 0.0)
         lasted += alive
@@ -93,7 +94,7 @@ def play(task: Task, method: str, pairs: list[tuple[str, int]]) -> list[dict]:
             "episode": episode,
             "before": mine[: task.at].sum(),
             "after": mine[task.at :].sum(),
-            "survived": bool(last == task.steps),
+            "survived": bool(last == steps),
             "recovered": recovered(mine, task.at),
         }
         for (fault, episode), mine, last in zip(pairs, rewards.T, lasted, strict=True)
