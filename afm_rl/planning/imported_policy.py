@@ -19,7 +19,7 @@ from torch import Tensor
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.planning.stored_policy import StoredPolicy
 
-# What the weights of an actor are called, hidden layers and last one; then its usual activation, and
+# How the weights of an actor are called, hidden layers and last one; its usual activation; and
 # whether a tanh ends it.
 ACTORS = (
     (("actor.latent_pi.", "actor.mu."), ("actor.mu.",), "relu", True),  # SAC, TQC, TD3, DDPG
@@ -153,16 +153,17 @@ def _read_weights(content: bytes, file: Path) -> Mapping[str, Tensor]:
 def _policy(
     state: Mapping[str, Tensor], low: Tensor, high: Tensor, about: dict[str, Any], file: Path
 ) -> StoredPolicy:
-    names = [name for name in state if name.endswith(".weight")]
-    for hidden, last, activation, squash in ACTORS:
-        own = [name for name in names if name.startswith(hidden + last)]
-        if own and own[-1].startswith(last):
+    names, own = [name for name in state if name.endswith(".weight")], []
+    for hidden, last, *usual in ACTORS:
+        if any(name.startswith(last) for name in names):
+            own = [name for name in names if name.startswith(hidden + last)]
+            about = {**dict(zip(("activation", "squash"), usual, strict=True)), **about}
             break
-    else:
+    if not own:
         raise ArtefactError(
             f"{file}: no actor of a known kind among {sorted(names)[:8]}; expected feed-forward "
             "PPO, A2C, TRPO, SAC, TQC, TD3, DDPG or ARS over a vector of numbers"
         )
     nothing = {name: state[name].new_zeros(len(state[name])) for name in own}  # without biases
     layers = [(state[x], state.get(x.replace(".weight", ".bias"), nothing[x])) for x in own]
-    return StoredPolicy(layers, low, high, **{"activation": activation, "squash": squash, **about})
+    return StoredPolicy(layers, low, high, **about)

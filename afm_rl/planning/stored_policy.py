@@ -16,7 +16,6 @@ from afm_rl.errors import ArtefactError, ConfigurationError, check_choice, check
 from afm_rl.planning.law import LawPlanner
 from afm_rl.planning.planning_env import PlanningEnv
 
-
 ACTIVATIONS = {
     "relu": nn.functional.relu,
     "tanh": torch.tanh,

@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--faults", nargs="*", help="default: all")
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
     parser.add_argument("--episodes", type=int, default=10)
-    parser.add_argument("--steps", type=int, help="cut episodes (use another --out); the change stays")
+    parser.add_argument("--steps", type=int, help="cut episodes (use another --out)")
     parser.add_argument("--side-by-side", type=int, default=64, help="episodes in one batch")
     parser.add_argument("--folder", type=Path, default=POLICIES, help="where the policies are")
     parser.add_argument("--out", type=Path, default=Path("outputs/zoo"))

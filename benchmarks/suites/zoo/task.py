@@ -21,7 +21,7 @@ class Task:
     """A stored policy and the environment that it was trained for.
 
     Args:
-        file: written by ``save_policy``, with the task's ``id`` and ``settings`` in its description.
+        file: written by ``save_policy``; its description has the task's ``id`` and ``settings``.
     """
 
     def __init__(self, file: Path) -> None:

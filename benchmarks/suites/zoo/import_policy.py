@@ -1,7 +1,7 @@
 """Make small files of policies that others trained, out of a copy of their repository.
 
-    git clone https://github.com/DLR-RM/rl-trained-agents
-    python examples/policies/import_zoo.py rl-trained-agents/trpo/Hopper-v3_1 --out hopper.safetensors
+    git clone https://github.com/DLR-RM/rl-trained-agents zoo
+    python benchmarks/suites/zoo/import_policy.py zoo/trpo/Hopper-v3_1 --out hopper.safetensors
 
 Each is then played in the present version of its task, and its return printed. The models are made
 as `policy_from_sb3` makes one of a model of your own.
@@ -28,8 +28,8 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     name = args.folder.name.rsplit("_", 1)[0]
-    normaliser = args.folder / name / "vecnormalize.pkl"
-    policy = policy_from_sb3(args.folder / f"{name}.zip", normaliser if normaliser.is_file() else None)
+    seen = args.folder / name / "vecnormalize.pkl"
+    policy = policy_from_sb3(args.folder / f"{name}.zip", seen if seen.is_file() else None)
     task = next((name.replace(*pair) for pair in VERSIONS.items() if pair[0] in name), name)
     # Contact forces were all zero in the simulator of that time: these Ants do not see them.
     settings = {"include_cfrc_ext_in_observation": False} if task.startswith("Ant") else {}
@@ -44,15 +44,23 @@ def main() -> None:
 
 
 def first_numbers(policy: StoredPolicy, count: int) -> StoredPolicy:
-    """Return the policy of the first ``count`` numbers of an observation; the rest is zero."""
+    """Return the policy of the first ``count`` numbers of an observation.
+
+    What follows were contact forces, which were always zero, and at an odd place at the end the
+    share of the episode that is left, here as at its beginning.
+    """
     layers = list(zip(policy.weights, policy.biases, strict=True))
-    (weight, bias), normaliser = layers[0], policy.normaliser
-    if policy.normaliser is not None:
-        mean, std = policy.normaliser
-        clip = policy.form["clip"]
-        bias = bias + weight[:, count:] @ (-mean / std).clamp(-clip, clip)[count:]
-        normaliser = policy.normaliser[:, :count]
-    layers[0] = weight[:, :count], bias
+    (weight, bias), normaliser, clip = layers[0], policy.normaliser, policy.form["clip"]
+    rest = torch.zeros(policy.observation_size - count)
+    if len(rest) % 2:
+        rest[-1] = 1.0
+    if normaliser is not None:
+        mean, std = normaliser
+        rest, normaliser = (
+            ((rest - mean[count:]) / std[count:]).clamp(-clip, clip),
+            normaliser[:, :count],
+        )
+    layers[0] = weight[:, :count], bias + weight[:, count:] @ rest
     return StoredPolicy(layers, policy.low, policy.high, normaliser=normaliser, **policy.form)
 
 
