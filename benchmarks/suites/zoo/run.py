@@ -20,7 +20,7 @@ from methods import METHODS
 from show import draw, print_tables
 from task import Task
 
-from afm_rl.files import write_whole
+from afm_rl.storage.files import write_whole
 
 POLICIES = Path(__file__).parents[3] / "examples" / "policies" / "zoo"
 WINDOW, MISSING = 100, 0.1  # recovered: no 100 steps lose more than a tenth of the healthy reward
