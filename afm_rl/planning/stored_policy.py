@@ -11,12 +11,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-<<<<<<< HEAD
-from afm_rl.storage.artefacts import digest_of, read_tensors, save_tensors
 from afm_rl.errors import ArtefactError, ConfigurationError, check_choice, check_number
-=======
-from afm_rl.errors import ArtefactError, ConfigurationError, check_number
->>>>>>> main
 from afm_rl.planning.law import LawPlanner
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.storage.artefacts import digest_of, read_tensors, save_tensors

@@ -12,12 +12,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from afm_rl.envs import gymnasium_task
 from afm_rl.errors import AFMError
 from afm_rl.missions import build, run
-<<<<<<< HEAD
 from afm_rl.planning import StoredPolicy, load_policy, save_policy
-=======
-from afm_rl.planning import load_policy, save_policy
 from afm_rl.storage.artefacts import save_tensors
->>>>>>> main
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 CHEETAH, PENDULUM = (POLICIES / f"{name}_sac.safetensors" for name in ("half_cheetah", "pendulum"))
