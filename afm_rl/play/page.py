@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from afm_rl.play.scene import COLOURS, figure_of
 from afm_rl.play.world import SIDES, World
 
 FRAME, WORDS = 0.04, 0.25  # seconds between two pictures, and between two texts
+PLOT: Any = {"aspect": 2.0, "scales": {"x": uplot.Scale(time=False)}}
 STROKES = {name: f"rgb{colour}" for name, colour in COLOURS.items()}
 
 
@@ -29,13 +32,18 @@ class Page:
 
     def __init__(self, world: World, title: str, port: int) -> None:
         self.world, self.title = world, title
-        self.server = viser.ViserServer("127.0.0.1", port, label=title, verbose=False)
+        with redirect_stdout(io.StringIO()):  # the command says where the page is
+            self.server = viser.ViserServer("127.0.0.1", port, label=title, verbose=False)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.scene.set_up_direction("+z")
-        self.server.initial_camera.position = (0.5, -9.0, 4.0)
-        self.server.initial_camera.look_at = (0.0, 0.0, 0.5)
+        self.server.initial_camera.position = (1.0, -6.0, 3.0)
+        self.server.initial_camera.look_at = (1.0, 0.0, 0.0)  # left of the controls
         sides = world.sides.items()
         self.figures = {name: figure_of(self.server, name, side.inner) for name, side in sides}
+        self.labels = {
+            name: self.server.scene.add_label(f"/label/{name}", name, anchor="bottom-center")
+            for name in self.figures
+        }
         self.sliders: dict[str, Any] = {}
         self.setting = False  # several sliders at once
         self._controls()
@@ -44,7 +52,7 @@ class Page:
     def _controls(self) -> None:
         gui, names = self.server.gui, self.world.robot.names
         self.presets = presets(len(names))
-        choice = gui.add_dropdown("What fails", list(self.presets))
+        choice = gui.add_dropdown("What fails", list(self.presets), order=-2.0)
         choice.on_update(lambda _: self.choose(choice.value))
         with gui.add_folder("Run"):
             self.speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
@@ -98,13 +106,13 @@ class Page:
             self.words = gui.add_markdown("")
             lines = [uplot.Series(label=name, stroke=STROKES[name], width=2) for name in SIDES]
             series = (uplot.Series(label="step"), *lines)
-            self.rewards = gui.add_uplot((empty, empty, empty), series, title="Reward", aspect=2.0)
+            self.rewards = gui.add_uplot((empty,) * 3, series, title="Reward", **PLOT)
         with gui.add_folder("Commands of AFM", order=100.0):
             self.shown = gui.add_dropdown("Actuator", self.world.robot.names)
             looks = {"planned": "gray", "executed": STROKES["AFM"], "effect": STROKES["alone"]}
             lines = [uplot.Series(label=name, stroke=x, width=2) for name, x in looks.items()]
             series, data = (uplot.Series(label="step"), *lines), (empty,) * 4
-            self.commands = gui.add_uplot(data, series, title="Command", aspect=2.0)
+            self.commands = gui.add_uplot(data, series, title="Command", **PLOT)
 
     def run(self, seconds: float = float("inf")) -> None:
         """Let the world go on and draw it, until interrupted."""
@@ -127,8 +135,9 @@ class Page:
     def draw(self) -> None:
         """Draw both robots."""
         with self.world.lock, self.server.atomic():
-            for figure in self.figures.values():
+            for name, figure in self.figures.items():
                 figure.draw()
+                self.labels[name].position = figure.label
 
     def say(self) -> None:
         """Renew words and curves."""
@@ -156,7 +165,10 @@ class Page:
         state = "**corrects**" if afm["corrects"] else "does nothing"
         lines = [f"AFM {state}; innovation {afm['innovation']:.2f}"]
         lines += [f"{name}: {afm[name]}" for name in ("belief", "noise", "delay") if name in afm]
-        words = str(afm["diagnosis"]).replace("\n", "  \n")
+        words = str(afm["diagnosis"])
+        for k, name in enumerate(self.world.robot.names):
+            words = words.replace(f"actuator {k}:", f"{name}:").replace(f"a_{k}:", f"{name}:")
+        words = words.replace("\n", "  \n")
         return "\n".join([*rows, "", "  \n".join(lines), "", words])
 
 

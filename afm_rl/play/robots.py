@@ -81,8 +81,9 @@ def _gymnasium(task: str, policy: Callable[[], Acting], settings: dict[str, Any]
 
     inner: Any = make().unwrapped
     if hasattr(inner, "model"):
-        names = MuJoCoDynamics(inner).names[1]
-        return Robot(make, policy, {"model": "mujoco"}, _push_root, inner.dt, names)
+        found = inner.model
+        joints = [found.joint(joint).name for joint in found.actuator_trnid[:, 0]]
+        return Robot(make, policy, {"model": "mujoco"}, _push_root, inner.dt, joints)
     model = {"model": pendulum_step, "state": lambda env, seen: env.unwrapped.state}
     return Robot(make, policy, model, _push_pendulum, inner.dt, ["joint"])
 

@@ -25,6 +25,7 @@ class MuJoCoFigure:
 
     def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
         self.inner, self.place, model = inner, place, inner.model
+        self.label = place + [0.0, 0.0, 1.8]
         self.root = server.scene.add_frame(f"/{name}", show_axes=False, position=place)
         solid = np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
         self.bodies = {
@@ -36,10 +37,7 @@ class MuJoCoFigure:
             look = {"color": COLOURS[name], "wxyz": model.geom_quat[geom]}
             spot = model.geom_pos[geom]
             server.scene.add_mesh_simple(own, shape.vertices, shape.faces, position=spot, **look)
-        first = {int(kind) for kind in model.jnt_type[:1]}
-        self.runs = mujoco.mjtJoint.mjJNT_FREE in first or model.joint(0).name == "rootx"
-        free = mujoco.mjtJoint.mjJNT_FREE in first or model.joint(1).name == "slider2"
-        self.axes = [0, 1] if free else [0]
+        self.axes = ways_of(model)
         floor = (place[0], place[1], self._lowest())
         size = {"width": 12.0, "height": 2 * LANE - 0.2, "cell_size": 0.5, "section_size": 1.0}
         self.floor = server.scene.add_grid(
@@ -51,21 +49,12 @@ class MuJoCoFigure:
         planes = self.inner.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         return float(self.inner.data.geom_xpos[planes, 2].min()) if planes.any() else -0.7
 
-    @property
-    def distance(self) -> float:
-        """How far the robot is from where it began (m)."""
-        return float(self.inner.data.qpos[0])
-
     def draw(self) -> None:
         """Put all bodies where they are."""
-        data = self.inner.data
-        shift = np.zeros(3)
-        if self.runs:
-            shift[self.axes] = data.qpos[self.axes]
-            moved = np.zeros(3)
-            moved[0] = shift[0] % 1.0
-            x, y, z = self.floor.position
-            self.floor.position = (self.place[0] - moved[0], y, z)
+        data, shift = self.inner.data, np.zeros(3)
+        shift[self.axes] = data.qpos[self.axes]
+        _, y, z = self.floor.position
+        self.floor.position = (self.place[0] - shift[0] % 1.0, y, z)
         self.root.position = self.place - shift
         for body, frame in self.bodies.items():
             frame.position, frame.wxyz = data.xpos[body], data.xquat[body]
@@ -76,12 +65,12 @@ class PendulumFigure:
 
     def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
         self.inner, height = inner, np.array([0.0, 0.0, 1.2])
+        self.label = place + 2.5 * height
         self.root = server.scene.add_frame(f"/{name}", show_axes=False, position=place + height)
         rod = trimesh.creation.capsule(height=1.0, radius=0.08)
         rod.apply_translation([0.0, 0.0, 0.5 - rod.bounds.mean(0)[2]])
         server.scene.add_mesh_simple(f"/{name}/rod", rod.vertices, rod.faces, color=COLOURS[name])
         server.scene.add_icosphere(f"/{name}/hinge", radius=0.1, color=LINE)
-        self.distance = 0.0
 
     def draw(self) -> None:
         """Turn the rod."""
@@ -96,32 +85,34 @@ class GroundFigure:
         self.inner, track = inner, inner.native.tracks[0]
         line = track.centerline.numpy()
         self.middle = np.append(line.mean(0), 0.0)
-        self.scale = 6.0 / np.ptp(line, axis=0).max()
-        ring = np.c_[line, np.zeros(len(line))]
-        ring = (np.r_[ring, ring[:1]] - self.middle) * self.scale
-        server.scene.add_line_segments(
-            "/track", np.stack([ring[:-1], ring[1:]], 1), TRACK, thickness=track.width * self.scale
-        )
-        cone = trimesh.creation.cone(radius=0.16, height=0.5)
-        cone.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
-        server.scene.add_mesh_simple(f"/{name}", cone.vertices, cone.faces, color=COLOURS[name])
+        self.scale = 8.0 / np.ptp(line, axis=0).max()
+        along = np.roll(line, -1, 0) - np.roll(line, 1, 0)
+        across = np.c_[-along[:, 1], along[:, 0]] / np.linalg.norm(along, axis=1, keepdims=True)
+        edges = [line + sign * across * track.width / 2 for sign in (-1, 1)]
+        points = self._place(np.concatenate(edges))
+        here = np.arange(len(line))
+        after, other = np.roll(here, -1), here + len(line)
+        faces = np.r_[np.c_[here, after, other], np.c_[after, np.roll(other, -1), other]]
+        server.scene.add_mesh_simple("/track", points, faces, color=TRACK, side="double")
         self.root = server.scene.add_frame(f"/{name}", show_axes=False)
-        server.scene.add_mesh_simple(
-            f"/{name}/robot", cone.vertices, cone.faces, color=COLOURS[name]
-        )
-        self.goal = server.scene.add_icosphere(
-            f"/goal/{name}", radius=0.12, color=COLOURS[name], opacity=0.5
-        )
-        self.distance = 0.0
+        cone = trimesh.creation.cone(radius=0.15, height=0.5)
+        cone.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+        look = {"color": COLOURS[name]}
+        server.scene.add_mesh_simple(f"/{name}/robot", cone.vertices, cone.faces, **look)
+        self.goal = server.scene.add_icosphere(f"/goal/{name}", 0.12, opacity=0.5, **look)
+
+    def _place(self, points: np.ndarray) -> np.ndarray:
+        """Return where points of the track ``(..., 2)`` are in the scene."""
+        return (np.append(points, 0 * points[..., :1], -1) - self.middle) * self.scale
 
     def draw(self) -> None:
         """Put the robot and its target where they are."""
         data = self.inner._data
-        x, y, theta = data["pose"].tolist()
-        self.root.position = (np.array([x, y, 0.0]) - self.middle) * self.scale + [0, 0, 0.16]
+        *spot, theta = data["pose"].tolist()
+        self.root.position = self._place(np.array(spot)) + [0, 0, 0.16]
         self.root.wxyz = (np.cos(theta / 2), 0.0, 0.0, np.sin(theta / 2))
-        goal = np.append(data["goal"].numpy(), 0.0)
-        self.goal.position = (goal - self.middle) * self.scale
+        self.goal.position = self._place(data["goal"].numpy())
+        self.label = self.root.position + [0, 0, 0.4]
 
 
 def figure_of(server: Any, name: str, inner: Any) -> Any:
@@ -131,6 +122,14 @@ def figure_of(server: Any, name: str, inner: Any) -> Any:
         return MuJoCoFigure(server, name, inner, place)
     kind = GroundFigure if hasattr(inner, "native") else PendulumFigure
     return kind(server, name, inner, place)
+
+
+def ways_of(model: Any) -> list[int]:
+    """Return which of x and y a robot can go along without a limit: 0, 1, both or none."""
+    if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE:
+        return [0, 1]
+    slides = (model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & ~model.jnt_limited.astype(bool)
+    return [k for k in (0, 1) if slides[k : k + 1].any() and model.jnt_axis[k].argmax() == k]
 
 
 def shape_of(model: Any, geom: int) -> trimesh.Trimesh:
