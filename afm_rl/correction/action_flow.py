@@ -47,6 +47,8 @@ class ActionFlow(PairCorrector):
         place: coordinates of the state in which the ground may differ; readings by place are
             left out if there are none.
         place_scale: distance at which ground counts as other ground, in their unit.
+        plain: prior log-odds of a linear model against a reading: a line that predicts what is done
+            now knows nothing of other actions.
         likely: models of an axis that are asked, of which the first proposes.
         samples: starting points of the flow.
         source_std: :math:`\sigma`, a share of the largest action.
@@ -86,6 +88,7 @@ class ActionFlow(PairCorrector):
         memory: int = 40,
         place: Sequence[int] = (),
         place_scale: float = 0.5,
+        plain: float = -6.0,
         likely: int = 3,
         samples: int = 16,
         source_std: float = 0.3,
@@ -101,7 +104,9 @@ class ActionFlow(PairCorrector):
         names = check_readings(list(READINGS) if readings is None else readings, bool(place))
         chosen = [READINGS[name] for name in names]
         models = [*names, *LINEAR, *(f"only {name}" for name in late_ones(names))]
-        super().__init__(action_low, action_high, rows, memory, models, len(place), **rules)
+        late = late_ones(names)
+        worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * len(late)
+        super().__init__(action_low, action_high, rows, memory, models, len(place), worth, **rules)
         self.readings, self.place = names, place
         self.place_scale = check_number(
             "corrector.place_scale", place_scale, low=0.0, open_low=True

@@ -54,9 +54,10 @@ class PairCorrector(Corrector):
         memory: pairs that are remembered.
         models: names of the models but the first.
         place: number of state coordinates that are remembered with a pair.
+        worth: prior log-odds of these models among themselves; all alike if None.
         odds: prior log-odds of *nothing has changed* against all other models together: one
             surprise that its Student-t distribution gives e^-odds is no reason to act.
-        discount: of the losses; .9 looks back on ten steps.
+        discount: of the losses; .95 looks back on twenty steps.
         noise: standard deviation that no model explains, at first, a share of the largest action.
         noise_rate: share of its square that is renewed at every step.
         least_noise: its floor: effects nearer than that are all the same.
@@ -74,11 +75,12 @@ class PairCorrector(Corrector):
         memory: int,
         models: Sequence[str],
         place: int = 0,
-        odds: float = 2.0,
-        discount: float = 0.9,
+        worth: Sequence[float] | None = None,
+        odds: float = 3.0,
+        discount: float = 0.95,
         noise: float = 0.1,
         noise_rate: float = 0.1,
-        least_noise: float = 0.02,
+        least_noise: float = 0.05,
         quiet: float = 1.0,
         tails: float = 1.0,
     ) -> None:
@@ -97,8 +99,8 @@ class PairCorrector(Corrector):
         self.pair_size, self.tail = 3 * self.action_size + 2 + place, 1 + place
         is_valid = torch.arange(self.pair_size) == 3 * self.action_size
         self.register_buffer("is_valid", is_valid, persistent=False)
-        prior = torch.full((len(self.models), 1), 1 / len(models)).log()
-        prior[0] = self.odds
+        among = torch.zeros(len(models)) if worth is None else torch.tensor(worth)
+        prior = torch.cat([torch.tensor([self.odds]), among.log_softmax(0)]).unsqueeze(-1)
         self.register_buffer("prior", prior, persistent=False)
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:

@@ -106,13 +106,11 @@ class Tick(nn.Module):
         weights = Belief(losses, losses, noise).weights(self.prior)
         models = self.most_likely(encoded, lines, weights)
         proposals, spread = self.propose(models, unit, ends)
-        probes = torch.lerp(ends[:, :1], ends[:, 1:], 0.5 * (self.probes + 1))
-        expected = self.expect(models, torch.cat([proposals, probes], 1))
-        known, foreseen = expected.split([proposals.shape[1], probes.shape[1]], 2)
-        reach = self.reach(models, foreseen)
+        expected = self.expect(models, proposals)
+        reach = self.reach(models, expected)
         wanted = attainable(unit, *reach.unbind(-2), self.saturation)
         bounds = extend(reach, ends, self.saturation)
-        action = self.decide(models, proposals, known, wanted)
+        action = self.decide(models, proposals, expected, wanted)
         action = torch.where(action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
         forecasts = self.forecast(encoded, lines, pairs, action)
@@ -154,7 +152,8 @@ class Tick(nn.Module):
     def propose(self, models: Models, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions ``(B, C, A)``, the first the planned one, and the samples' deviation.
 
-        The flow's samples of the most likely reading, and the exact answers of all fits.
+        The flow's samples of the most likely reading, the exact answers of all fits, and a few
+        actions from all over the box.
         """
         count, size = planned.shape
         plans = planned.repeat_interleave(self.likely, 0).unsqueeze(1)
@@ -165,8 +164,9 @@ class Tick(nn.Module):
         ends = midpoint(partial(self.network.velocity, first), start, self.steps)
         mean, spread = ends.mean(1, keepdim=True), ends.std(1, correction=0)
         exact = asked.answers[..., 0, :MISSES].mT.reshape(count, -1, size)
-        found = [plan, mean, ends, exact, models.lines.invert(planned)]
         least, most = box.split(1, 1)
+        probes = torch.lerp(least, most, 0.5 * (self.probes + 1))
+        found = [plan, mean, ends, exact, models.lines.invert(planned), probes]
         return torch.cat(found, 1).clamp(least, most), spread
 
     def expect(self, models: Models, actions: Tensor) -> Tensor:
