@@ -18,7 +18,9 @@ class Believer(Protocol):
     def begin(self, state: Tensor) -> Tensor:
         """Return the memory of missions that begin in ``state``."""
 
-    def predict(self, memory: Tensor, action: Tensor, model: DynamicsModel) -> tuple[Tensor, Tensor]:
+    def predict(
+        self, memory: Tensor, action: Tensor, model: DynamicsModel
+    ) -> tuple[Tensor, Tensor]:
         """Return the effect that ``action`` would have, and its standard deviation, ``(*B, A)``."""
 
     def correct(
@@ -39,7 +41,9 @@ def identity(size: int) -> KnownDynamics:
     >>> identity(2)(torch.zeros(2), torch.tensor([0.1, 0.2]))
     tensor([0.1000, 0.2000])
     """
-    return KnownDynamics(lambda state, action: action + 0 * state, Manifold(size), size, affine=True)
+    return KnownDynamics(
+        lambda state, action: action + 0 * state, Manifold(size), size, affine=True
+    )
 
 
 @torch.no_grad()
