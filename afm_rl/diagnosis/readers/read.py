@@ -96,6 +96,8 @@ def read_log(
             t=found.t,
             episode=found.episode,
             usual_delay=found.frame,
+            row=found.row if found.read_from > len(found.first) else None,
+            read_from=found.read_from,
             notes=found.notes,
         )
 
@@ -196,7 +198,7 @@ def _complete(
     if lost:
         notes += (f"{lost} of {len(sound)} rows were dropped: numbers are missing or infinite",)
     rows = np.flatnonzero(sound)
-    number = number[rows]
+    total, number = int(number[-1]) + 1, number[rows]
     if t is None:
         notes += ("no column t: times are in rows",)
     time = number.astype(float) if t is None else t[rows]
@@ -217,4 +219,5 @@ def _complete(
             f"{source.episode}: {border[-1] + 1} episodes in {len(rows)} rows: expected some of "
             "several rows; leave the column out, or see --episode"
         )
-    return Columns(names, first[rows], second[rows], time, border, source.frame, notes)
+    kept = first[rows], second[rows], time, border, number, total
+    return Columns(names, *kept, source.frame, notes)

@@ -85,6 +85,8 @@ class Columns:
         second: responses or states, ``(N, S)``.
         t: times (s), ``(N,)``.
         episode: numbers of episodes, ``(N,)``.
+        row: numbers of the rows in the file, ``(N,)``.
+        read_from: rows of the file.
         frame: time between command and response of a healthy robot (s).
         notes: what a reader must know.
     """
@@ -94,6 +96,8 @@ class Columns:
     second: np.ndarray
     t: np.ndarray
     episode: np.ndarray
+    row: np.ndarray
+    read_from: int
     frame: float = 0.0
     notes: tuple[str, ...] = ()
 

@@ -46,13 +46,13 @@ def errors(data: Path, predict: Predictor) -> pd.Series:
 
     Args:
         data: the folder.
-        predict: ``predict(command, response) -> prediction``, arrays ``(N, 2)``; that of a row may
-            depend on its command and on earlier rows.
+        predict: ``predict(command, response, begins) -> prediction``, arrays ``(N, 2)``; that of a
+            row may depend on its command and on earlier rows.
     """
     found = {}
     for ground in (*GROUNDS, TRACKS):
         log = windows_of(data / f"{ground}.parquet")
-        miss = np.abs(predict(log.command, log.response) - log.response)
+        miss = np.abs(predict(log.command, log.response, log.begins) - log.response)
         for name, column in zip(NAMES, miss.T, strict=True):
             for share in SHARES:
                 found[ground.partition("_")[2], name, share] = float(np.quantile(column, share))
@@ -62,7 +62,7 @@ def errors(data: Path, predict: Predictor) -> pd.Series:
 def by(corrector: Believer) -> Predictor:
     """Return what a corrector of two actions in [-1, 1] predicts."""
 
-    def predict(command: np.ndarray, response: np.ndarray) -> np.ndarray:
+    def predict(command: np.ndarray, response: np.ndarray, begins: np.ndarray) -> np.ndarray:
         unit = np.abs(command).max(0)
         return unit * believe(corrector, command / unit, response / unit)[0]
 
