@@ -64,7 +64,8 @@ def by(corrector: Believer) -> Predictor:
 
     def predict(command: np.ndarray, response: np.ndarray, begins: np.ndarray) -> np.ndarray:
         unit = np.abs(command).max(0)
-        return unit * believe(corrector, command / unit, response / unit)[0]
+        found, _ = believe(corrector, (command / unit)[:, None], (response / unit)[:, None])
+        return unit * found[:, 0]
 
     return predict
 
