@@ -10,6 +10,7 @@ from typing import NoReturn
 from afm_rl.cli.error_messages import told_by
 
 NAME = "afm-rl-diagnose"
+PATIENCE = 3.0  # s: shorter work shows no progress
 KINDS = ".csv, .parquet, .ulg, .mcap, .db3, .bag, or a folder of LeRobot or ROS"
 ABOUT = """\
 Say what the actuators of a robot do, from what it logged.
@@ -67,7 +68,7 @@ def _run(options: argparse.Namespace) -> None:
     from dataclasses import replace
 
     from afm_rl.diagnosis import diagnose
-    from afm_rl.diagnosis.readers import Unchosen, read_log
+    from afm_rl.diagnosis.readers import Unchosen, printable, read_log
     from afm_rl.errors import check_number
     from afm_rl.report.diagnosis import print_diagnosis, write_diagnosis
 
@@ -88,8 +89,20 @@ def _run(options: argparse.Namespace) -> None:
     if options.delay is not None:
         log = replace(log, usual_delay=check_number("--delay", options.delay, low=0.0))
     found = diagnose(log)
+    replayed = None
+    if options.replay is not None:
+        from afm_rl.diagnosis.replay import replay
+        from afm_rl.report.replay import print_replay, write_replay
+        from afm_rl.progress import Bar
+
+        with Bar(total=1.0, desc="replaying", delay=PATIENCE) as bar:
+            replayed = replay(log, lambda share: bar.update(share - bar.n))
     file = options.file.resolve()
     out = options.out or file.with_name(f"{file.stem}_diagnosis")
     print_diagnosis(found)
-    for path in write_diagnosis(found, log, out, str(options.file), page=options.page):
+    if replayed is not None:
+        print_replay(replayed)
+        print(f"wrote {write_replay(replayed, options.replay)}")
+    source, page = printable(str(options.file)), options.page
+    for path in write_diagnosis(found, log, out, source, page, replayed):
         print(f"wrote {path}")

@@ -31,12 +31,12 @@ def running_gain(
     r"""Return :math:`g_k u_k` with :math:`g_k = \sum u y / \sum u^2` over the last rows.
 
     >>> u = np.array([[1.0], [2.0], [3.0]])
-    >>> running_gain(u, -u, np.zeros(3, bool)).tolist()  # reversed, which the first row cannot know
+    >>> running_gain(u, -u, np.zeros(3, bool)).round(6).tolist()  # reversed: row 0 cannot know
     [[1.0], [-2.0], [-3.0]]
     """
     window = np.r_[0.0, np.ones(rows)]
     # Until something was commanded, the gain is 1.
-    small = 1e-6 * np.maximum.accumulate(np.square(command).clip(1e-30))
+    small = 1e-12 * np.maximum.accumulate(np.square(command).clip(1e-30))
     both = lfilter(window, 1.0, command * response, axis=0) + small
     return command * both / (lfilter(window, 1.0, np.square(command), axis=0) + small)
 
