@@ -3,41 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from afm_rl.correction import ActionFlow
+from afm_rl.correction.belief import mean_and_std
+from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics
 from afm_rl.spaces.manifold import Manifold
 
 
 BLANK = 8  # the longest delay that the correction knows, in rows
-
-
-class Believer(Protocol):
-    """What a corrector must do to be replayed; all pure functions of a memory ``(*B, P)``."""
-
-    def begin(self, state: Tensor) -> Tensor:
-        """Return the memory of missions that begin in ``state``."""
-
-    def predict(
-        self, memory: Tensor, action: Tensor, model: DynamicsModel
-    ) -> tuple[Tensor, Tensor]:
-        """Return the effect that ``action`` would have, and its standard deviation, ``(*B, A)``."""
-
-    def correct(
-        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
-    ) -> tuple[Tensor, object]:
-        """Return the memory in which a plan is decided."""
-
-    def executing(self, memory: Tensor, planned: Tensor, executed: Tensor) -> Tensor:
-        """Return the memory in which ``executed`` was executed."""
-
-    def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
-        """Return the memory with the transition to ``next_state``."""
 
 
 def watcher(size: int) -> ActionFlow:
@@ -54,9 +32,25 @@ def identity(size: int) -> KnownDynamics:
     return KnownDynamics(lambda state, action: action + 0 * state, Manifold(size), size, affine=True)
 
 
+def follow(
+    corrector: PairCorrector, memory: Tensor, action: Tensor, model: DynamicsModel
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the memory when somebody else sends ``action`` ``(*B, A)``, its effect, and the std.
+
+    What :meth:`~afm_rl.correction.PairCorrector.predict` says, and the memory as if the action had
+    been corrected to itself, for the price of one of them.
+    """
+    seen, idle, awake, _ = corrector.watch(memory, action, model)
+    memory = corrector.executing(torch.where(awake.unsqueeze(-1), seen, idle), action, action)
+    parts = corrector.unpack(memory, model.state_size)
+    effect, std = mean_and_std(parts["forecasts"], corrector.believed(memory))
+    std = torch.hypot(std, parts["noise"])
+    return memory, corrector.denormalise(effect), corrector.denormalise(std)
+
+
 @torch.no_grad()
 def believe(
-    corrector: Believer,
+    corrector: PairCorrector,
     command: np.ndarray,
     response: np.ndarray,
     seen: Callable[[int], object] = lambda row: None,
@@ -73,24 +67,23 @@ def believe(
     """
     sent, felt = (torch.as_tensor(part, dtype=torch.float32) for part in (command, response))
     model = identity(sent.shape[-1])
-    box = torch.stack([-torch.ones_like(sent[0]), torch.ones_like(sent[0])], -2)
     memory, found = corrector.begin(torch.zeros_like(felt[0])), []
     for row, (action, state) in enumerate(zip(sent, felt, strict=True)):
-        found.append(torch.stack(corrector.predict(memory, action, model)))
-        memory, _ = corrector.correct(memory, action, model, box)
-        memory = corrector.observe(corrector.executing(memory, action, action), state)
+        memory, effect, std = follow(corrector, memory, action, model)
+        found.append(torch.stack([effect, std]))
+        memory = corrector.observe(memory, state)
         seen(row)
-    effect, std = torch.stack(found, 1).numpy().astype(float)
-    return effect, std
+    effects, stds = torch.stack(found, 1).numpy().astype(float)
+    return effects, stds
 
 
 def believe_log(
-    corrector: Believer,
+    corrector: PairCorrector,
     command: np.ndarray,
     response: np.ndarray,
     missing: np.ndarray,
     seen: Callable[[float], object] = lambda share: None,
-    length: int = 512,
+    length: int = 1024,
     warm: int = 256,
     grown: float = 1.5,
     blank: int = BLANK,

@@ -111,7 +111,7 @@ def _least_squares(
     found = np.empty_like(command)
     for j, x in enumerate(columns):
         mean = np.square(x).cumsum(0) / np.arange(1, len(x) + 1)[:, None]  # of rows so far
-        weight = ridge * (mean + 1e-12 * mean.max(-1, keepdims=True)).clip(1e-30)
+        weight = ridge * mean.clip(1e-100)
         told = x if skipped is None else x * ~skipped[:, None]
         gram = earlier(told[:, :, None] * told[:, None, :])
         gram += weight[:, :, None] * np.eye(x.shape[1])

@@ -18,8 +18,9 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as parquet
 
+from afm_rl.correction.pairs import PairCorrector
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.replay.belief import Believer, believe
+from afm_rl.diagnosis.replay.belief import believe
 from afm_rl.diagnosis.replay.simple import SIMPLE, Predictor
 
 GROUNDS = ("warthog_asphalt", "warthog_gravel", "warthog_ice")
@@ -59,7 +60,7 @@ def errors(data: Path, predict: Predictor) -> pd.Series:
     return pd.Series(found)
 
 
-def by(corrector: Believer) -> Predictor:
+def by(corrector: PairCorrector) -> Predictor:
     """Return what a corrector of two actions in [-1, 1] predicts."""
 
     def predict(command: np.ndarray, response: np.ndarray, begins: np.ndarray) -> np.ndarray:
@@ -75,7 +76,7 @@ def compare(data: Path, **others: Predictor) -> pd.DataFrame:
     return pd.DataFrame({name: errors(data, p) for name, p in (SIMPLE | others).items()})
 
 
-def twelve(data: Path, corrector: Believer) -> tuple[pd.DataFrame, int]:
+def twelve(data: Path, corrector: PairCorrector) -> tuple[pd.DataFrame, int]:
     """Return the table with a column ``AFM``, and in how many of the twelve it is within 10 %."""
     table = compare(data, AFM=by(corrector))
     return table, within(table, "AFM")
