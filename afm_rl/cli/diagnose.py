@@ -68,8 +68,8 @@ def _run(options: argparse.Namespace) -> None:
     from dataclasses import replace
 
     from afm_rl.diagnosis import diagnose
-    from afm_rl.diagnosis.readers import Unchosen, printable, read_log
-    from afm_rl.errors import check_number
+    from afm_rl.diagnosis.readers import Unchosen, read_log
+    from afm_rl.errors import check_number, printable
     from afm_rl.report.diagnosis import print_diagnosis, write_diagnosis
 
     if options.model is None:
@@ -92,8 +92,8 @@ def _run(options: argparse.Namespace) -> None:
     replayed = None
     if options.replay is not None:
         from afm_rl.diagnosis.replay import replay
-        from afm_rl.report.replay import print_replay, write_replay
         from afm_rl.progress import Bar
+        from afm_rl.report.replay import print_replay, write_replay
 
         with Bar(total=1.0, desc="replaying", delay=PATIENCE) as bar:
             replayed = replay(log, lambda share: bar.update(share - bar.n))

@@ -43,7 +43,7 @@ def print_replay(replayed: Replayed, file: IO[str] | None = None) -> None:
     >>> table = Replayed(log, found, 0 * u, errors_of(log, found), ("all",))
     >>> print_replay(table)  # doctest: +NORMALIZE_WHITESPACE
     <BLANKLINE>
-     actuator  error   as commanded       AFM               
+     actuator  error   as commanded       AFM
      ──────────────────────────────────────────────────────
      pan       median  0.26 [0.01, 0.50]  0.00 [0.00, 0.00]
      pan       p90     0.45 [0.37, 0.50]  0.00 [0.00, 0.00]

@@ -99,7 +99,11 @@ def test_each_row_of_the_file_has_a_row(tmp_path):
     kept.loc[[5, 38, 39], "response.arm"] = np.nan
     kept.to_csv(tmp_path / "log.csv", index=False)
     rows = replay(read_log(tmp_path / "log.csv")).rows()
-    assert len(rows) == 40 and rows["arm.afm"].isna().to_numpy().nonzero()[0].tolist() == [5, 38, 39]
+    assert len(rows) == 40 and rows["arm.afm"].isna().to_numpy().nonzero()[0].tolist() == [
+        5,
+        38,
+        39,
+    ]
 
 
 COLUMNS = ("command", "response", "afm", "std")

@@ -6,6 +6,6 @@ chosen afterwards, the same way for all formats.
 """
 
 from afm_rl.diagnosis.readers.read import PAIRS, TRANSITIONS, read_columns, read_log
-from afm_rl.diagnosis.readers.source import Columns, Unchosen, printable
+from afm_rl.diagnosis.readers.source import Columns, Unchosen
 
-__all__ = ["PAIRS", "TRANSITIONS", "Columns", "Unchosen", "printable", "read_columns", "read_log"]
+__all__ = ["PAIRS", "TRANSITIONS", "Columns", "Unchosen", "read_columns", "read_log"]

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from afm_rl.diagnosis.readers.messages import Field, fields_of, series_of
-from afm_rl.diagnosis.readers.source import Series, Source, check_regular, printable
-from afm_rl.errors import ConfigurationError
+from afm_rl.diagnosis.readers.source import Series, Source, check_regular
+from afm_rl.errors import ConfigurationError, printable
 
 LOOKED_AT = 20  # messages of a topic that show its fields: joints may come in turns
 MISSING = "needs {}: pip install 'afm-rl[logs]'"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 
-from afm_rl.diagnosis.readers.source import SHOWN, Source, Unchosen, printable
-from afm_rl.errors import ConfigurationError
+from afm_rl.diagnosis.readers.source import SHOWN, Source, Unchosen
+from afm_rl.errors import ConfigurationError, printable
 
 Pairs = tuple[list[str], list[str]]
 """Names of the first and of the second group."""

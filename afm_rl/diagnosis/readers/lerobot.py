@@ -13,8 +13,8 @@ import numpy as np
 
 from afm_rl.diagnosis.readers.choose import ACTIONS, STATES
 from afm_rl.diagnosis.readers.parquet import columns_of, source_of, width_of
-from afm_rl.diagnosis.readers.source import Series, Source, check_regular, printable
-from afm_rl.errors import ConfigurationError
+from afm_rl.diagnosis.readers.source import Series, Source, check_regular
+from afm_rl.errors import ConfigurationError, printable
 
 INFO = "meta/info.json"
 FASTEST, SLOWEST = 1e6, 1e-3  # rates (1/s) that a robot may have

@@ -11,10 +11,10 @@ import pyarrow as arrow
 import pyarrow.compute as compute
 import pyarrow.parquet as parquet
 
-from afm_rl.diagnosis.readers.source import Series, Source, printable
+from afm_rl.diagnosis.readers.source import Series, Source
 from afm_rl.diagnosis.readers.tables import EPISODE, TIME
 from afm_rl.diagnosis.readers.thin import blocks_of, thinned_note
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, printable
 
 STAMP, FLOATS = "timestamp", ("float", "double")
 LISTS = (arrow.types.is_list, arrow.types.is_large_list, arrow.types.is_fixed_size_list)

@@ -12,8 +12,8 @@ import numpy as np
 from afm_rl.diagnosis.log import FEWEST, Log
 from afm_rl.diagnosis.readers import bags, lerobot, parquet, tables, ulog
 from afm_rl.diagnosis.readers.choose import choose
-from afm_rl.diagnosis.readers.source import Columns, Series, Source, check_regular, printable
-from afm_rl.errors import ConfigurationError
+from afm_rl.diagnosis.readers.source import Columns, Series, Source, check_regular
+from afm_rl.errors import ConfigurationError, printable
 
 PAIRS = ("command", "response")
 TRANSITIONS = ("action", "state")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, printable
 
 SHOWN = 8  # names in a message
 
@@ -113,16 +113,6 @@ class Unchosen(ConfigurationError):
     def __init__(self, message: str, listing: Sequence[str]) -> None:
         super().__init__(message)
         self.listing = list(listing)
-
-
-def printable(name: str, longest: int = 80) -> str:
-    r"""Return a name that no terminal takes for an order, and that fits on a line.
-
-    >>> printable("pan\x1b[31m"), printable("x" * 100)[-4:]
-    ('pan?[31m', 'x...')
-    """
-    clean = "".join(letter if letter.isprintable() else "?" for letter in name[: 2 * longest])
-    return clean if len(clean) <= longest else f"{clean[: longest - 3]}..."
 
 
 def check_regular(path: Path) -> Path:

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from afm_rl.diagnosis.readers.source import Series, Source, printable
+from afm_rl.diagnosis.readers.source import Series, Source
 from afm_rl.diagnosis.readers.thin import blocks_of, thinned_note
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, printable
 
 TIME, EPISODE = "t", "episode_index"
 LARGE = 1 << 25  # bytes: of smaller files all rows are read

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from afm_rl.diagnosis.readers.messages import sorted_series
-from afm_rl.diagnosis.readers.source import Series, Source, printable
-from afm_rl.errors import ConfigurationError
+from afm_rl.diagnosis.readers.source import Series, Source
+from afm_rl.errors import ConfigurationError, printable
 
 TIME = "timestamp"  # in microseconds
 

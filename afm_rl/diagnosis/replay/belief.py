@@ -14,7 +14,6 @@ from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics
 from afm_rl.spaces.manifold import Manifold
 
-
 BLANK = 8  # the longest delay that the correction knows, in rows
 
 
@@ -29,7 +28,9 @@ def identity(size: int) -> KnownDynamics:
     >>> identity(2)(torch.zeros(2), torch.tensor([0.1, 0.2]))
     tensor([0.1000, 0.2000])
     """
-    return KnownDynamics(lambda state, action: action + 0 * state, Manifold(size), size, affine=True)
+    return KnownDynamics(
+        lambda state, action: action + 0 * state, Manifold(size), size, affine=True
+    )
 
 
 def follow(

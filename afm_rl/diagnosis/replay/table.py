@@ -60,9 +60,7 @@ class Table:
         return found.set_axis(log.row).reindex(range(log.read_from or int(log.row[-1]) + 1))
 
 
-def errors_of(
-    log: Log, predictions: Mapping[str, np.ndarray], stretches: int = 4
-) -> pd.DataFrame:
+def errors_of(log: Log, predictions: Mapping[str, np.ndarray], stretches: int = 4) -> pd.DataFrame:
     """Return :attr:`Table.errors`: of the whole log, and of stretches of equally many rows."""
     size, since = len(log.command), log.since
     parts = [("all", 0, size)]
