@@ -146,7 +146,8 @@ def _about(path: str | Path) -> Iterator[None]:
     try:
         yield
     except ConfigurationError as error:
-        begin, text = printable(str(path), 200), str(error).removeprefix("log: ")
+        begin, text = (printable(str(x), 4000) for x in (path, error))
+        text = text.removeprefix("log: ")
         if not text.startswith(begin):
             error.args = (f"{begin}: {text}",)
         raise
