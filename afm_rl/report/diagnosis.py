@@ -18,7 +18,7 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
-from afm_rl.diagnosis.replay import Table as Replayed
+from afm_rl.replay import Table as Replayed
 from afm_rl.report import style
 from afm_rl.report.console import WIDE
 from afm_rl.report.replay import errors_table, pictures_of

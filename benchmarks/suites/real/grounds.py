@@ -20,8 +20,8 @@ import pyarrow.parquet as parquet
 
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.replay.belief import believe
-from afm_rl.diagnosis.replay.simple import SIMPLE, Predictor
+from afm_rl.replay.belief import believe
+from afm_rl.replay.simple import SIMPLE, Predictor
 
 GROUNDS = ("warthog_asphalt", "warthog_gravel", "warthog_ice")
 TRACKS = "marmotte_boreal"

@@ -9,10 +9,10 @@ from scipy.signal import lfilter
 
 from afm_rl.diagnosis import Log
 from afm_rl.diagnosis.readers import read_log
-from afm_rl.diagnosis.replay import replay
-from afm_rl.diagnosis.replay.belief import believe, identity, watcher
-from afm_rl.diagnosis.replay.simple import affine, arx, running_gain
-from afm_rl.diagnosis.replay.table import AFM, ALONE, quantile_with_interval
+from afm_rl.replay import replay
+from afm_rl.replay.belief import believe, identity, watcher
+from afm_rl.replay.simple import affine, arx, running_gain
+from afm_rl.replay.table import AFM, ALONE, quantile_with_interval
 
 LOGS = Path(__file__).parents[2] / "examples" / "real_logs"
 
