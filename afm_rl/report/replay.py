@@ -137,7 +137,7 @@ def _running(values: np.ndarray, rows: np.ndarray, window: int) -> list[float]:
     return [float(np.median(values[max(0, row + 1 - window) : row + 1])) for row in rows]
 
 
-def pictures_of(replayed: Replayed) -> Iterator[dict[str, str]]:
+def pictures_of(replayed: Replayed) -> Iterator[dict[str, object]]:
     """Yield what a page needs of the figure: name, title, caption and the picture itself."""
     figure, caption = draw_replay(replayed)
     data = base64.b64encode(style.png_bytes(figure)).decode()
