@@ -82,13 +82,21 @@ def test_a_row_is_what_the_corrector_predicts():
     u, y = (torch.as_tensor(x / unit, dtype=torch.float32) for x in (log.command, log.response))
     effects, stds = believe(corrector, log.command / unit, log.response / unit)
     box = torch.tensor([[-1.0, -1.0], [1.0, 1.0]])
-    memory = corrector.begin(torch.zeros(2))
+    memory = corrector.begin(torch.zeros(3))
     for k in range(40):
         effect, std = corrector.predict(memory, u[k], model)
         np.testing.assert_allclose(effect, effects[k], atol=1e-5)
         np.testing.assert_allclose(std, stds[k], atol=1e-5)
         memory, _ = corrector.correct(memory, u[k], model, box)
-        memory = corrector.observe(corrector.executing(memory, u[k], u[k]), y[k])
+        state = torch.cat([y[k], torch.tensor([1.0 - k % 2])])
+        memory = corrector.observe(corrector.executing(memory, u[k], u[k]), state)
+
+
+def test_a_response_that_is_held_between_messages_counts():
+    log = make(rows=80)
+    u, y = log.command[:, :1], np.repeat(-log.command[::4, :1], 4, axis=0)  # every fourth is new
+    table = replay(Log(("arm",), np.repeat(u[::4], 4, axis=0), y))
+    assert np.median(np.abs(table.predictions[AFM] - y)[40:]) < 0.05
 
 
 def test_each_row_of_the_file_has_a_row(tmp_path):
