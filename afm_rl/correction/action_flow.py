@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -154,7 +155,7 @@ class ActionFlow(PairCorrector):
         """Return the forecasts of all models."""
         pairs, _, noise, place = self._read(parts)
         lead = pairs.shape[:-2]
-        flat = [part.reshape(-1, *part.shape[len(lead) :]) for part in (pairs, noise, place)]
+        flat = [part.reshape(math.prod(lead), *part.shape[len(lead) :]) for part in (pairs, noise, place)]
         unit = self.normalise(executed).to(pairs).reshape(-1, self.action_size)
         forecasts = self.tick.forecast(*self.tick.read(*flat), flat[0], unit)
         return forecasts.view(*lead, *forecasts.shape[1:]).to(executed)
