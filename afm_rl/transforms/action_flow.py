@@ -13,7 +13,14 @@ from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.keys import as_key, as_keys
-from afm_rl.transforms.memory import begin, correct, corrector_for, entries_spec, warn_of_old
+from afm_rl.transforms.memory import (
+    begin,
+    correct,
+    corrector_for,
+    entries_spec,
+    observe,
+    warn_of_old,
+)
 
 
 class ActionFlowTransform(Transform):
@@ -144,7 +151,7 @@ class ActionFlowTransform(Transform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.parent is None:  # inside a replay buffer: nothing to execute
             return tensordict
-        planned = tensordict.get(self.action_key)
+        planned = tensordict.get(self.action_key, None)
         entries = correct(
             self._recall(tensordict),
             planned,
@@ -153,6 +160,7 @@ class ActionFlowTransform(Transform):
             self._action_spec,
             self.enabled,
             self.extend_action_box,
+            self.action_key,
         )
         tensordict.set(self.action_key, entries.get("executed_action").to(planned.dtype))
         return tensordict.set(self.prefix, entries)
@@ -163,8 +171,8 @@ class ActionFlowTransform(Transform):
         if self.reported_key is not None:
             given = next_tensordict.get(self.reported_key).to(memory.dtype)
             memory = self.corrector.reported(memory, given)
-        state = next_tensordict.get(self.observation_key).to(memory.dtype)
-        entries["memory"] = self.corrector.observe(memory, state)
+        state = next_tensordict.get(self.observation_key, None)
+        entries["memory"] = observe(memory, state, self.model, self.corrector, self.observation_key)
         # Of the device that the next tensordict names: else every entry is moved to where it is.
         device, batch = next_tensordict.device, next_tensordict.batch_size
         return next_tensordict.set(self.prefix, TensorDict(entries, batch, device=device))

@@ -12,7 +12,14 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.faults import PATIENCE, as_reading, count_repeats, safe_action, trusted
+from afm_rl.faults import (
+    PATIENCE,
+    as_reading,
+    check_numbers,
+    count_repeats,
+    safe_action,
+    trusted,
+)
 from afm_rl.keys import as_key
 
 
@@ -86,11 +93,8 @@ class Guard(Transform):
                 f"Guard: no {self.prefix!r} in the tensordict; start from env.reset(), and carry "
                 "its entries on"
             )
-        action, last = tensordict.get(self.action_key), memory.get("executed_action")
-        if action.shape != last.shape:
-            raise ConfigurationError(
-                f"{self.action_key!r}: shape {tuple(action.shape)}, expected {tuple(last.shape)}"
-            )
+        last = memory.get("executed_action")
+        action = check_numbers(self.action_key, tensordict.get(self.action_key, None), last.shape)
         space = self._action_spec.space
         executed, held = safe_action(action, space.low, space.high, last)
         memory = memory.clone(recurse=False).set("executed_action", executed).set("held", held)
