@@ -163,7 +163,7 @@ NO_NUMBERS = {
         torch.zeros(4, 2, dtype=torch.complex64),
         "'%s': type torch.complex64, expected .*%d",
     ),
-    "text": ("left", r"'%s': str, expected real numbers \(4, %d\)"),
+    "text": ("left", r"'%s': NonTensorData, expected real numbers \(4, %d\)"),
     "missing": (None, r"'%s': NoneType, expected real numbers \(4, %d\)"),
 }
 
