@@ -22,7 +22,7 @@ from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, Unknow
 from afm_rl.errors import ConfigurationError, check_flag
 from afm_rl.faults import fault_of, safe_action
 from afm_rl.learning.watching import Watching
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms.memory import begin, computable, correct, corrector_for, observe
 
 Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str

@@ -20,7 +20,7 @@ from afm_rl.faults import (
     safe_action,
     trusted,
 )
-from afm_rl.keys import as_key
+from afm_rl.spaces.keys import as_key
 
 
 class Guard(Transform):

@@ -15,9 +15,9 @@ from afm_rl.dynamics import Calibrated, Dubins, KnownDynamics, Oracle, dubins_st
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss
-from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, GoalDistance, KnownReward, PlanningEnv
 from afm_rl.regimes import ActionGain, Schedule
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
 from afm_rl.transforms.memory import correct
 
