@@ -166,7 +166,7 @@ def test_a_cost_that_decides_by_numbers_is_refused(tmp_path):
 ALONE = """
 import sys, torch
 sys.path.insert(0, sys.argv[3])
-from controller import load
+from agent import load
 torch.set_num_threads(1)
 agent = load(sys.argv[1], sys.argv[2])
 for line in sys.stdin:
@@ -182,7 +182,6 @@ assert "afm_rl" not in sys.modules
 @pytest.mark.skipif(not has_compiler(), reason="no C++ compiler")
 def test_a_file_acts_the_same_without_this_library(tmp_path):
     """In a Python process of its own, and in the C++ program."""
-    pytest.importorskip("zenoh")  # controller.py sends over it
     # What an ActionFlow computes is traced above; a small program is compiled as fast as any.
     controller = Controller(None, policy_of(LeastSquares(LOW, HIGH)))
     path = tmp_path / "policy.pt2"
