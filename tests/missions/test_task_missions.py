@@ -54,7 +54,7 @@ def test_other_legs_are_identified_behind_reversed_motors(tmp_path):
     fast = [*planner, "updater.count=13"]
     few = [
         "robot=half_cheetah",
-        "robot.physics={length:[0.5,2.0]}",
+        "robot.physics={length:[0.4,1.6]}",
         "robot.steps=10",
         "method=afm_sysid",
         *fast,
