@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from afm_rl.cli.error_messages import told_by
-from afm_rl.cli.overrides import trusted_packages
+from afm_rl.cli.trusted import checked
 
 NAME = "afm-rl-export"
 ABOUT = """\
@@ -52,9 +52,12 @@ def _run(arguments: list[str]) -> None:
     path, alone = check_exportable(out[0]), ALONE in arguments
     given = [text for text in arguments if text != ALONE and not text.startswith("out=")]
     GlobalHydra.instance().clear()
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+    with (
+        checked(given) as packages,
+        initialize_config_module("afm_rl.conf", version_base="1.3"),
+    ):
         cfg = compose("config", given)
-    agent = build(cfg, trusted_packages(given))
+        agent = build(cfg, packages)
     if agent.transform is None:
         raise ConfigurationError(
             "corrector=none: nothing to export; choose a method with a correction, such as "
