@@ -95,9 +95,9 @@ class ActionFlowTransform(CarriedTransform):
         extend_action_box: bool = True,
         reported_key: NestedKey | None = None,
     ) -> None:
-        states = _one_key("in_keys", ["observation"] if in_keys is None else in_keys)
-        actions = _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv)
-        super().__init__(*states, *actions, prefix)
+        state = _one_key("in_keys", ["observation"] if in_keys is None else in_keys)
+        action = _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv)
+        super().__init__(state, action, prefix)
         self.__dict__["model"] = check_instance("transform.model", model, DynamicsModel)
         if corrector is not None:
             corrector = corrector_for("transform", model, corrector, None)
@@ -207,8 +207,8 @@ class ActionFlowTransform(CarriedTransform):
         return entries_spec(self.corrector, self.model.state_size, spec.shape, found.dtype)
 
 
-def _one_key(name: str, keys: Sequence[NestedKey]) -> list[NestedKey]:
+def _one_key(name: str, keys: Sequence[NestedKey]) -> NestedKey:
     found = as_keys([keys] if isinstance(keys, str) else keys)
     if len(found) != 1:
         raise ConfigurationError(f"ActionFlowTransform: {name}={keys!r}: expected one key")
-    return found
+    return found[0]
