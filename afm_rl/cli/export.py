@@ -81,7 +81,7 @@ def _run(arguments: list[str]) -> None:
         transform.enabled,
         transform.extend_action_box,
     )
-    print("exporting: tracing, then compiling, which takes about eight times as long", flush=True)
+    print("exporting: tracing, then compiling, which takes about six times as long", flush=True)
     controller = Controller(None if alone else agent.planner, policy)
     checksum = export_controller(controller, path, cfg.cache)
     print(f"wrote {path}: " + ", ".join(f"{k} ({n})" for k, n in controller.sizes.items()))

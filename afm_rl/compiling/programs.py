@@ -128,7 +128,7 @@ def trace(module: nn.Module, inputs: Sequence[Tensor], shapes: Any = None) -> Tr
 
 
 def package(
-    traced: Trace, settings: Mapping[str, Any], cache: str | Path, times: float = 8.0
+    traced: Trace, settings: Mapping[str, Any], cache: str | Path, times: float = 6.0
 ) -> bytes:
     """Return a traced function as a program; show how far it is.
 

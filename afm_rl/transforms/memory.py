@@ -101,7 +101,7 @@ def computable(plan: Tensor, low: Tensor, high: Tensor, dtype: torch.dtype) -> T
     nothing of the box: there it is brought back to this distance.
 
     >>> computable(torch.tensor([1e30, 0.5]), -torch.ones(2), torch.ones(2), torch.float32)
-    tensor([5.7938e+03, 5.0000e-01])
+    tensor([5.7936e+03, 5.0000e-01])
     """
     reach = torch.finfo(dtype).eps ** -0.5 * (high - low)
     near = torch.minimum(torch.maximum(plan, low - reach), high + reach)
