@@ -110,7 +110,7 @@ class Tick(nn.Module):
         reach = self.reach(models, expected)
         wanted = attainable(unit, *reach.unbind(-2), self.saturation)
         bounds = extend(reach, ends, self.saturation)
-        action = self.decide(models, proposals, expected, wanted)
+        action = self.decide(models, proposals, expected, wanted, noise)
         action = torch.where(action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
         forecasts = self.forecast(encoded, lines, pairs, action)
@@ -188,24 +188,31 @@ class Tick(nn.Module):
         mean, std = self.mean(models, foreseen)
         return torch.stack([(mean - std).amin(1), (mean + std).amax(1)], 1)
 
-    def decide(self, models: Models, proposals: Tensor, expected: Tensor, wanted: Tensor) -> Tensor:
-        r"""Return the actions ``(B, A)`` with the least expected squared miss.
+    def decide(
+        self, models: Models, proposals: Tensor, expected: Tensor, wanted: Tensor, noise: Tensor
+    ) -> Tensor:
+        r"""Return the actions ``(B, A)`` with the least expected loss.
 
-        .. math:: u_a = \operatorname{argmin}_u \sum_h w_{ha} (T_{ha}(u) - u^*_a)^2
+        .. math:: u_a = \operatorname{argmin}_u \sum_h w_{ha}
+                  \log\Big(1 + \frac{(T_{ha}(u) - u^*_a)^2}{s_a^2}\Big)
 
         over the proposals, axis by axis, if these actions together are no worse than the best
-        proposal as a whole, as they may be where one command moves several axes.
+        proposal as a whole, as they may be where one command moves several axes. The loss averages
+        models that differ by less than the noise s, and decides between those that differ by
+        more: half of two opposite answers would do nothing, and tell nothing.
         """
-        misses = (expected - wanted[:, None, None]).square()
-        cost = (models.weights.unsqueeze(2) * misses).sum(1)  # (B, C, A)
-        each = cost.argmin(1, keepdim=True)
-        mixed = proposals.gather(1, each)
+        cost = self.loss(models, expected, wanted, noise)  # (B, C, A)
+        mixed = proposals.gather(1, cost.argmin(1, keepdim=True))
         joint = cost.sum(-1).argmin(1)[:, None, None].expand_as(mixed)
-        whole = proposals.gather(1, joint)
-        again = (self.expect(models, mixed) - wanted[:, None, None]).square()
-        worth = (models.weights.unsqueeze(2) * again).sum(1).sum(-1, keepdim=True)
-        better = worth <= cost.gather(1, joint).sum(-1, keepdim=True) + 1e-9
-        return torch.where(better, mixed, whole).squeeze(1)
+        again = self.loss(models, self.expect(models, mixed), wanted, noise)
+        whole = cost.gather(1, joint).sum(-1, keepdim=True)
+        better = again.sum(-1, keepdim=True) <= whole + 1e-6
+        return torch.where(better, mixed, proposals.gather(1, joint)).squeeze(1)
+
+    def loss(self, models: Models, expected: Tensor, wanted: Tensor, noise: Tensor) -> Tensor:
+        """Return the expected loss ``(B, C, A)`` of effects ``(B, 1 + K + L, C, A)``."""
+        miss = (expected - wanted[:, None, None]).square() / noise[:, None, None].square()
+        return (models.weights.unsqueeze(2) * miss.log1p()).sum(1)
 
     def forecast(self, encoded: Encoded, lines: Lines, pairs: Tensor, executed: Tensor) -> Tensor:
         """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now."""
