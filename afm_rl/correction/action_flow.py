@@ -11,9 +11,10 @@ from torch import Tensor
 
 from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.correction.base import Fields
+from afm_rl.correction.believing import Answer, Believer
 from afm_rl.correction.linear import LINEAR
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.pairs import Answer, PairCorrector
+from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.readings import READINGS, check_readings, late_ones, memory_of
 from afm_rl.correction.tick import Tick
 from afm_rl.correction.weights import load_universal
@@ -21,7 +22,7 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_flag, check_number
 
 
-class ActionFlow(PairCorrector):
+class ActionFlow(Believer):
     r"""The flow from noise around the planned action to the action that has its effect.
 
     A regime is described by pairs (executed, effective action), which mean the same for every
@@ -61,7 +62,7 @@ class ActionFlow(PairCorrector):
             tick runs as it is. Results agree to rounding.
         cache: folder of compiled ticks.
         network: the network; None: the universal one that comes with the package.
-        rules: of the belief, see :class:`~afm_rl.correction.PairCorrector`.
+        rules: of the belief, see :class:`~afm_rl.correction.Believer`.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -155,7 +156,10 @@ class ActionFlow(PairCorrector):
         """Return the forecasts of all models."""
         pairs, _, noise, place = self._read(parts)
         lead = pairs.shape[:-2]
-        flat = [part.reshape(math.prod(lead), *part.shape[len(lead) :]) for part in (pairs, noise, place)]
+        flat = [
+            part.reshape(math.prod(lead), *part.shape[len(lead) :])
+            for part in (pairs, noise, place)
+        ]
         unit = self.normalise(executed).to(pairs).reshape(-1, self.action_size)
         forecasts = self.tick.forecast(*self.tick.read(*flat), flat[0], unit)
         return forecasts.view(*lead, *forecasts.shape[1:]).to(executed)

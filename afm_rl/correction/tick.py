@@ -11,10 +11,10 @@ from torch import Tensor, nn
 
 from afm_rl.correction.achievable import MODES, attainable, extend
 from afm_rl.correction.belief import Belief, mean_and_std
+from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.linear import LINEAR, Lines, fit_lines
 from afm_rl.correction.network import AxisNetwork, Encoded
-from afm_rl.correction.pairs import Answer
 from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows
 from afm_rl.correction.solver import midpoint
 from afm_rl.errors import check_choice, check_count, check_number
@@ -109,7 +109,9 @@ class Tick(nn.Module):
         expected = self.expect(models, proposals)
         reach = self.reach(models, expected)
         wanted = attainable(unit, *reach.unbind(-2), self.saturation)
-        bounds = extend(reach, ends, self.saturation)
+        sent = pairs[..., : len(self.scale)]
+        tried = sent.amax(1) - sent.amin(1)
+        bounds = extend(reach, ends, tried, self.saturation)
         action = self.decide(models, proposals, expected, wanted, noise)
         action = torch.where(action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)

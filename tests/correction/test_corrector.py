@@ -19,7 +19,7 @@ class Watching(Corrector):
     """Keeps three transitions, and corrects nothing."""
 
     def __init__(self, low=LOW, high=HIGH):
-        super().__init__(low, high, gate=1.0, recent=3)
+        super().__init__(low, high, recent=3)
 
     def correct(self, memory, planned, model, box):
         return self.executing(memory, planned, planned), self.unchanged(
@@ -151,7 +151,7 @@ def test_corrections_have_the_shapes_that_are_promised(corrector, batch, dtype):
     model, box = Dubins(), torch.stack([LOW, HIGH]).to(dtype).expand(*batch, 2, 2)
     state = torch.zeros(*batch, 3, dtype=dtype)
     memory = corrector.begin(state)
-    shapes = Correction(*[(2,)] * 3, (2, 2), (), ())
+    shapes = Correction(*[(2,)] * 3, (2, 2), (), (), (2,))
     for _ in range(3):
         plan = 0.5 * torch.ones(*batch, 2, dtype=dtype)
         memory, found = corrector.correct(memory, plan, model, box)
