@@ -87,7 +87,7 @@ class ActionFlow(Believer):
         action_high: Tensor,
         readings: Sequence[str] | None = None,
         rows: int | None = None,
-        memory: int = 40,
+        memory: int = 80,
         place: Sequence[int] = (),
         place_scale: float = 0.5,
         plain: float = -6.0,

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from afm_rl.correction.pairs import OLD
 from afm_rl.correction.readings import (
     FILTER,
     READINGS,
@@ -108,7 +107,7 @@ def test_near_pairs_come_in_the_order_of_place_then_of_age():
 
 
 def test_effects_from_before_a_change_are_read_by_place_only():
-    valid = torch.full((MANY, 1), OLD)
+    valid = torch.full((MANY, 1), 0.5)
     valid[-3:] = 1.0
     executed, effective, _, counts = read(LONG, rows=4, pairs=pairs_of(valid))
     assert counts.tolist() == [0, 1, 1, 1] and executed.tolist() == [0, 17, 18, 19]
@@ -181,6 +180,6 @@ def test_varied_pairs_are_the_newest_and_those_farthest_from_all_of_them():
 
 def test_varied_pairs_are_from_after_the_change_and_none_counts_twice():
     pairs = pairs_of()
-    pairs[:-2, 3] = OLD
+    pairs[:-2, 3] = 0.5
     executed, _, _, valid = read(READINGS["varied"], pairs=pairs)
     assert sorted(executed.tolist()) == [0, 0, 18, 19] and valid.sum() == 2
