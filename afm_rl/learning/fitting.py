@@ -31,13 +31,13 @@ class FitReport:
     names: tuple[str, ...] = ()
     """Of the coordinates."""
 
-    def warn(self, tolerated: float = 1 / 3) -> None:
-        """Warn of coordinates of which more than a share of the variance is left."""
+    def warn(self) -> None:
+        """Warn of coordinates of which more than a third of the variance is left."""
         rows = zip(self.names, self.rms, self.unexplained, strict=True)
-        bad = [f"{n} ({100 * u:.0f} %, error {e:.3g})" for n, e, u in rows if not u <= tolerated]
+        bad = [f"{n} ({100 * u:.0f} %, error {e:.3g})" for n, e, u in rows if not u <= 1 / 3]
         if bad:
             warnings.warn(
-                f"the model leaves more than {tolerated:.0%} of the variance of {', '.join(bad)} "
+                f"the model leaves more than a third of the variance of {', '.join(bad)} "
                 "unexplained: give it more or wider data, name the angles of the manifold, or add "
                 "the coordinates it depends on to features",
                 stacklevel=4,

@@ -96,20 +96,6 @@ def test_closed_forms_equal_forward_mode(settings, batch):
     torch.testing.assert_close(model.jacobian(state, action), by_action, rtol=1e-11, atol=1e-11)
 
 
-def test_closed_forms_equal_finite_differences():
-    model, (state, action) = full(), flights(4)
-    _, by_state, by_action = model.linearise(state, action)
-    for given, found, step in ((0, by_state, 1e-6), (1, by_action, 1e-9)):
-        for column in range(found.shape[-1]):
-            ends = []
-            for sign in (1, -1):
-                point = [state.clone(), action.clone()]
-                point[given][:, column] += sign * step
-                ends.append(model(*point))
-            slope = (ends[0] - ends[1]) / (2 * step)
-            torch.testing.assert_close(slope, found[..., column], rtol=1e-4, atol=2e-5)
-
-
 def test_any_rate_of_change_will_do():
     model = KNODE(Dubins(), rate=car_rate, substeps=2, units=8).push_().double()
     generator = torch.Generator().manual_seed(0)

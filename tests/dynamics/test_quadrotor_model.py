@@ -198,32 +198,16 @@ def test_states_and_actions_broadcast():
 
 
 @pytest.mark.parametrize("substeps", [1, 3])
-@pytest.mark.parametrize("batch", [(), (6,), (2, 3)])
-def test_linearisation_matches_finite_differences(batch, substeps):
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+def test_closed_forms_and_forward_differentiation_agree(batch, substeps):
     model, (state, action) = Quadrotor(substeps=substeps), flights(*batch)
     state = state + 0.01  # no unit quaternion: raw coordinates are free
-    ahead, by_state, by_action = model.linearise(state, action)
-    assert by_state.shape == (*batch, 13, 13)
-    assert by_action.shape == (*batch, 13, 4)
-    torch.testing.assert_close(ahead, model(state, action))
-    for column in range(13):
-        step = torch.zeros(13, dtype=torch.float64).index_fill(0, torch.tensor(column), 1e-6)
-        slope = (model(state + step, action) - model(state - step, action)) / 2e-6
-        torch.testing.assert_close(by_state[..., column], slope, rtol=1e-6, atol=1e-7)
-    for column in range(4):
-        step = 1e-3 * SCALE * torch.eye(4, dtype=torch.float64)[column]
-        slope = (model(state, action + step) - model(state, action - step)) / (2 * step.sum())
-        torch.testing.assert_close(by_action[..., column], slope, rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize("batch", [(), (6,), (2, 3)])
-def test_closed_form_and_forward_differentiation_agree(batch):
-    model, (state, action) = Quadrotor(substeps=2), flights(*batch)
-    for closed, automatic in zip(
-        model.linearise(state, action),
-        DynamicsModel.linearise(model, state, action),
-        strict=True,
-    ):
+    found = *model.linearise(state, action), model.jacobian(state, action)
+    wanted = (
+        *DynamicsModel.linearise(model, state, action),
+        DynamicsModel.jacobian(model, state, action),
+    )
+    for closed, automatic in zip(found, wanted, strict=True):
         torch.testing.assert_close(closed, automatic)
 
 
@@ -250,16 +234,9 @@ def test_missions_are_linearised_with_parameters_of_their_own():
         torch.testing.assert_close(by_action[row, ..., 0], nominal[..., 0] / factor)
 
 
-def test_the_jacobian_lives_on_the_tangent_space():
-    model, (state, action) = Quadrotor(), flights(5)
-    found = model.jacobian(state, action)
-    assert found.shape == (5, 12, 4)
-    for column in range(4):
-        step = 1e-3 * SCALE * torch.eye(4, dtype=torch.float64)[column]
-        ends = [model.manifold.difference(model(state, action + s * step), state) for s in (1, -1)]
-        slope = (ends[0] - ends[1]) / (2 * step.sum())
-        torch.testing.assert_close(found[..., column], slope, rtol=1e-6, atol=1e-6)
-    assert model.jacobian(level(), torch.zeros(4, dtype=torch.float64)).isfinite().all()
+def test_the_jacobian_at_rest_is_finite():
+    found = Quadrotor().jacobian(level(), torch.zeros(4, dtype=torch.float64))
+    assert found.shape == (12, 4) and found.isfinite().all()
 
 
 def test_noise_is_one_number_per_direction():

@@ -81,10 +81,10 @@ def test_regimes_are_learnt_and_left_again(regime, steps, missions):
     world = World(missions)
     world.drive(20)
     assert world.plain and not torch.stack(world.errors).any()
-    world.drive(60, **regime)
+    world.drive(30, **regime)
     assert 2 <= world.recovered(20, level=1e-4) <= steps
-    world.drive(10)
-    assert world.recovered(80, level=0.0) == 1 and world.plain
+    world.drive(5)
+    assert world.recovered(50, level=0.0) == 1 and world.plain
     world.drive(20, **regime)
     world.drive(20, matrix=-TURN)  # straight into another one
     torch.testing.assert_close(world.model.matrix, -TURN.expand_as(world.model.matrix))
@@ -124,10 +124,10 @@ def test_an_outlier_does_harm_for_a_few_steps(regime):
 
 def test_it_goes_home_once_the_nominal_model_is_as_good():
     world = World()
-    for step in range(60):  # gains that come back slowly: no surprise tells
-        share = min(1.0, step / 40)
+    for step in range(40):  # gains that come back slowly: no surprise tells
+        share = min(1.0, step / 30)
         world.drive(1, matrix=torch.lerp(GAINS.abs(), EYE, share))
-    world.drive(60)
+    world.drive(30)
     assert world.plain
 
 
@@ -136,7 +136,7 @@ def test_what_no_action_explains_becomes_the_offset():
     for part in ("unmatched", "all"):
         world = World(missions=3, part=part)
         world.drive(10)
-        world.drive(60, wind=wind)
+        world.drive(25, wind=wind)
         torch.testing.assert_close(world.model.offset, wind.expand(3, 3), atol=1e-4, rtol=0)
         assert world.errors[-1].max() < 1e-3
         world.drive(20)
@@ -276,11 +276,11 @@ def test_a_mission_alone_learns_the_same_to_the_bit():
     draw = torch.Generator().manual_seed(3)
     state, unit, matrix = (
         torch.randn(shape, generator=draw, dtype=torch.float64)
-        for shape in ((70, 7, 3), (70, 7, 2), (7, 2, 2))
+        for shape in ((40, 7, 3), (40, 7, 2), (7, 2, 2))
     )
     worth = (matrix @ unit.unsqueeze(-1)).squeeze(-1)
-    worth = torch.where((torch.arange(70) < 50)[:, None, None], worth, unit)
-    after = Dubins()(state, worth * HALF) + 1e-3 * torch.randn(70, 7, 3, generator=draw).double()
+    worth = torch.where((torch.arange(40) < 25)[:, None, None], worth, unit)
+    after = Dubins()(state, worth * HALF) + 1e-3 * torch.randn(40, 7, 3, generator=draw).double()
 
     def learnt(missions):
         world = World(len(missions))
@@ -289,5 +289,5 @@ def test_a_mission_alone_learns_the_same_to_the_bit():
         return torch.stack(world.errors)
 
     together = learnt(range(7))
-    for mission in range(7):
+    for mission in (0, 3, 6):
         assert torch.equal(learnt([mission])[:, 0], together[:, mission])
