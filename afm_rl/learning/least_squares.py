@@ -63,7 +63,9 @@ class Fit(NamedTuple):
         return (covariance @ self.moment.unsqueeze(-1)).squeeze(-1), covariance
 
 
-def nothing(missions: int, regressions: int, features: int, device: object = None) -> Fit:
+def nothing(
+    missions: int, regressions: int, features: int, device: torch.device | None = None
+) -> Fit:
     """Return what is known at first, in double precision: the nominal model holds."""
     shape = missions, regressions, features, features
     matrix = torch.zeros(shape, device=device, dtype=torch.float64)
