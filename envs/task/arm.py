@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import roma
 import torch
 from torch import Tensor
 
@@ -14,7 +15,6 @@ from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.envs.task.sources import EXACT, Limits
 from afm_rl.envs.task.task import Reward, Task, trust
 from afm_rl.errors import check_count
-from afm_rl.spaces.rotations import quaternion_exp, quaternion_multiply, rotate
 
 MODEL = Path(__file__).with_name("arm.xml")
 JOINTS = 7
@@ -38,11 +38,11 @@ def tip_of(angles: Tensor, offsets: Tensor, axes: Tensor) -> Tensor:
     >>> tip_of(torch.tensor([torch.pi / 2]), offsets, axes).round(decimals=4)
     tensor([0., 1., 1.])
     """
-    turned = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(angles)
+    turned = torch.eye(3).to(angles)
     place = offsets[0].to(angles)
     for axis, offset, angle in zip(axes, offsets[1:], angles.unbind(-1), strict=True):
-        turned = quaternion_multiply(turned, quaternion_exp(axis.to(angles) * angle.unsqueeze(-1)))
-        place = place + rotate(turned, offset.to(angles))
+        turned = turned @ roma.rotvec_to_rotmat(axis.to(angles) * angle.unsqueeze(-1))
+        place = place + turned @ offset.to(angles)
     return place
 
 

@@ -10,10 +10,10 @@ from torch import nn
 
 from afm_rl.dynamics import KNODE, Dubins, Quadrotor
 from afm_rl.dynamics.quadrotor_equations import quadrotor_path
+from afm_rl.dynamics.residual import Network
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, KNODEUpdater
-from afm_rl.learning import knode_fit as module
-from afm_rl.learning.knode_fit import fit_network
+from afm_rl.learning.knode_fit import first_order, fit_network, through_integration
 from afm_rl.missions.log import StepLog
 from afm_rl.missions.state import Loop, restore, snapshot
 from afm_rl.missions.tree import flatten, unflatten
@@ -247,13 +247,14 @@ def test_the_fast_gradient_is_the_exact_one_to_first_order(frame):
     state, after = trace[:, :-1].flatten(0, 1), trace[:, 1:].flatten(0, 1)
     action = td["action"].double().unsqueeze(1).expand(-1, 25, -1).flatten(0, 1)
     model = KNODE(Quadrotor(), frame=frame).push_().push_()
-    network = model.draw(torch.randn(1, model.numbers, dtype=torch.float64))
-    share = torch.full((1, len(state), 1), 1 / (13 * len(state)), dtype=torch.float64)
     model.double()
+    network = model.draw(torch.randn(1, model.numbers, dtype=torch.float64))
+    leaves = Network(*(part.requires_grad_() for part in network))
     found = []
-    for trainer in (module._fast, module._exact):
-        gradient = trainer(model, (state, action, after), share, 0.002)(network)
-        found.append(torch.cat([part.flatten() for part in gradient]))
+    for errors in (first_order, through_integration):
+        error = errors(model, (state, action, after), 0.002)(leaves)
+        slopes = torch.autograd.grad(error.square().sum(), leaves)
+        found.append(torch.cat([part.flatten() for part in slopes]))
     assert (found[0] - found[1]).norm() < 0.05 * found[1].norm()
 
 
