@@ -190,7 +190,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     if hasattr(planner, "make_tensordict_primer"):
         chain.append(planner.make_tensordict_primer())
     whole = TransformedEnv(env, Compose(*chain))
-    check_cost(cost, model, whole, getattr(planner, "stages", None))
+    check_cost(cost, whole, getattr(planner, "stages", None))
     check_keys("planner", planner, whole)
     if transform is not None:
         check_keys("planner", planner, whole, ["box_key"])

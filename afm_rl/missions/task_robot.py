@@ -9,7 +9,7 @@ from typing import Any
 
 from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.missions.collected import Collection
+from afm_rl.missions.collection import Collection
 from afm_rl.missions.return_score import ReturnScore
 from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Compose, Physics, Regime, Schedule, actuator_regimes

@@ -165,7 +165,8 @@ class MPC(RecedingHorizonPlanner):
     @torch.no_grad()
     def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
         """Return the action, and states ``(*B, N + 1, S)`` and actions ``(*B, N, A)``."""
-        measured, task = td.get(self.env.observation_key), self._task(td)
+        measured, *entries = self.env.entries(td)
+        task = self._task(td.batch_size, entries)
         shifted = [torch.cat([old[..., 1:, :], old[..., -1:, :]], -2) for old in self._recall(td)]
         states, actions = (old.to(measured) for old in shifted)
         new = (states == 0).flatten(-2).all(-1) & (actions == 0).flatten(-2).all(-1)
@@ -210,22 +211,19 @@ class MPC(RecedingHorizonPlanner):
         actions = torch.minimum(torch.maximum(actions + found.controls, low), high)  # rounding
         return [states + found.states, actions], found.exact
 
-    def _task(self, td: TensorDictBase) -> list[Tensor]:
+    def _task(self, batch: torch.Size, entries: Sequence[Tensor]) -> list[Tensor]:
         """Return the cost's entries, each ``(*B, N + 1, size)`` or ``(*B, 1, size)``.
 
         Raises:
             ConfigurationError: for an entry of another shape.
         """
-        cost, batch = self.env.cost, td.batch_size
-        task = []
-        for key, size in zip(cost.in_keys, cost.in_sizes, strict=True):
-            entry = td.get(key, None)
+        cost, task = self.env.cost, []
+        for key, size, entry in zip(cost.in_keys, cost.in_sizes, entries, strict=True):
             held, staged = (*batch, size), (*batch, self.horizon + 1, size)
-            if entry is None or entry.shape not in (held, staged):
-                given = "is missing" if entry is None else f"has shape {tuple(entry.shape)}"
+            if entry.shape not in (held, staged):
                 raise ConfigurationError(
-                    f"planner: {key!r} {given}; expected {held}, held over the horizon, or "
-                    f"{staged}, one per stage"
+                    f"planner: {key!r} has shape {tuple(entry.shape)}; expected {held}, held over "
+                    f"the horizon, or {staged}, one per stage"
                 )
             task.append(entry.unsqueeze(-2) if entry.shape == held else entry)
         return task

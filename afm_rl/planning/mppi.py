@@ -188,8 +188,8 @@ class MPPI(SamplingPlanner):
             raw = eps.mul_(rows_like(scale, eps)).add_(best.unsqueeze(-3))
             plans = smooth(raw, past.unsqueeze(-2), self.beta, low, high)
             if self._as_machine_code:
-                task = [td.get(key) for key in self.env.cost.in_keys]
-                given = td.get(self.env.observation_key), plans, *task
+                state, *task = self.env.entries(td)
+                given = state, plans, *task
                 found, finite = self._machine_code(MPPI.improved, *given, model=self.env.dynamics)
                 best = self._sound(finite, found, best)
             else:

@@ -11,6 +11,7 @@ from torchrl.modules import CEMPlanner, MPPIPlanner
 from torchrl.objectives.value import TDLambdaEstimator
 
 from afm_rl.errors import ConfigurationError, check_count, check_instance, check_number
+from afm_rl.planning.planning_env import raise_missing
 
 
 def _check_elites(elites: int, population: int) -> int:
@@ -59,6 +60,7 @@ class CEM(CEMPlanner):
 
     def planning(self, tensordict: TensorDictBase) -> Tensor:
         """Plan on the entries needed: the base class copies all of them per candidate."""
+        raise_missing(self.env, tensordict)
         return super().planning(tensordict.select(*self.in_keys))
 
 
@@ -100,4 +102,5 @@ class TorchRLMPPI(MPPIPlanner):
 
     def planning(self, tensordict: TensorDictBase) -> Tensor:
         """Plan on the entries needed: the base class copies all of them per candidate."""
+        raise_missing(self.env, tensordict)
         return super().planning(tensordict.select(*self.env.observation_spec.keys(True, True)))

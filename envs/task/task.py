@@ -159,11 +159,11 @@ class Task:
     def _check_finite(self, reward: Tensor, ahead: Tensor) -> None:
         """Refuse a reward that would be the best of all where others are negative."""
         if not bool(reward.isfinite().all()):
-            first = (~reward.isfinite()).flatten().nonzero()[0]
+            first = int((~reward.isfinite()).flatten().nonzero()[0])
+            where = ahead.reshape(-1, ahead.shape[-1])[first].tolist()
             raise NonFiniteError(
                 f"{self.name}: the reward is {reward.flatten()[first].item():g} in the state "
-                f"{ahead.flatten(0, -2)[first].tolist()[0]}; expected finite numbers: mend "
-                "robot.reward, or the environment that gives it"
+                f"{where}; expected a finite number: mend robot.reward, or the environment that gives it"
             )
 
     def _models(self, physics: Tensor) -> list[Any]:

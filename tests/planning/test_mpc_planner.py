@@ -319,5 +319,5 @@ def test_references_of_another_shape_are_refused(box, shape):
     td = situation(planner, 3).set("reference", torch.zeros(shape))
     with pytest.raises(ConfigurationError, match=r"expected \(3, 2\), held .* \(3, 7, 2\)"):
         planner(td)
-    with pytest.raises(ConfigurationError, match="'reference' is missing; expected"):
+    with pytest.raises(ConfigurationError, match="reads 'reference', but the environment gives"):
         planner(td.exclude("reference"))
