@@ -37,7 +37,6 @@ from afm_rl.trust import check_targets
 TRANSFORM = ("enabled", "extend_action_box")
 """Settings of whatever corrector is chosen."""
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
-MOST_STEPS, MOST_MISSIONS = 10_000_000, 1_000_000
 DEFAULTS = {
     **{"seeds": 1, "budget": 5000, "label": None, "faults": "hold", "false_alarms": 0.01},
     "device": "cpu",
@@ -125,9 +124,9 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
         tracks = select_tracks(settings["tracks"], robot)
         regimes = select_regimes(settings["regimes"], robot)
     seeds = select_seeds(settings["seeds"])
-    budget = check_count("budget", settings["budget"], high=MOST_STEPS)
+    budget = check_count("budget", settings["budget"], high=10_000_000)
     total = len(tracks) * len(regimes) * len(seeds)
-    check_count("seeds: missions, for all tracks and regimes", total, high=MOST_MISSIONS)
+    check_count("seeds: missions, for all tracks and regimes", total, high=1_000_000)
     if settings["false_alarms"] is not None:
         check_number("false_alarms", settings["false_alarms"], low=0.0, high=0.5, open_low=True)
     faults = check_choice("faults", settings["faults"], ("hold", "skip", "raise"))

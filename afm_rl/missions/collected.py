@@ -25,8 +25,6 @@ from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.planning.costs import KnownReward
 from afm_rl.regimes import Schedule
 
-EPISODES = 8  # at a time
-
 
 def transitions(
     robot: Robot,
@@ -34,8 +32,12 @@ def transitions(
     seed: int,
     planner: TensorDictModuleBase | None = None,
     regimes: Sequence[Mapping[str, float]] = (),
+    episodes: int = 8,
 ) -> TensorDictBase:
-    """Return transitions by a planner or by random actions, under ``regimes`` by turns."""
+    """Return transitions by a planner or by random actions, under ``regimes`` by turns.
+
+    ``episodes`` of them run at a time.
+    """
     make = partial(
         robot.env,
         tracks=list(robot.tracks)[:1],
@@ -44,12 +46,12 @@ def transitions(
         max_steps=frames,
         action_low=robot.action_low,
         action_high=robot.action_high,
-        batch_size=[EPISODES],
+        batch_size=[episodes],
         seed=10_000 * (seed + 1),  # missions are counted from 0
     )
     env = make()
     if regimes:
-        turns = islice(cycle(regimes), EPISODES)
+        turns = islice(cycle(regimes), episodes)
         env = make(missions=torch.stack([env.mission(regime=regime) for regime in turns]))
     env = env.to(device_of(robot.model))
     if planner is not None and hasattr(planner, "make_tensordict_primer"):

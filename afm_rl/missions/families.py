@@ -14,7 +14,6 @@ from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Compose
 
 KEYS = ("draw", "set", "ramp", "changes")
-CHANGES = 0.1, 0.9  # progress between which breakpoints are drawn
 
 
 @dataclass(frozen=True)
@@ -32,6 +31,7 @@ class Family:
         ramp: steps over which each change comes about; 0 for sudden changes.
         changes: number of changes, each to a new draw, at random progress. 0: one change, on the
             robot's schedule.
+        between: progress between which these are drawn.
 
     >>> from afm_rl.regimes import ActionGain
     >>> regime = Compose({"gain": ActionGain(["v_gain", "omega_gain"])})
@@ -46,13 +46,14 @@ class Family:
     fixed: Mapping[str, float]
     ramp: int = 0
     changes: int = 0
+    between: tuple[float, float] = (0.1, 0.9)
 
     def mission(self, seed: int) -> dict[str, Any]:
         """Return the arguments of ``env.mission``: ``regime``, ``at`` and ``ramp``."""
         generator = torch.Generator().manual_seed(_stable(self.name, seed))
         if not self.changes:
             return {"regime": self._values(generator), "ramp": self.ramp}
-        low, high = CHANGES
+        low, high = self.between
         at = low + (high - low) * torch.rand(self.changes, generator=generator)
         phases = [{}, *(self._values(generator) for _ in range(self.changes))]
         return {"regime": phases, "at": at.sort().values.tolist(), "ramp": self.ramp}

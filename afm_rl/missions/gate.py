@@ -12,16 +12,18 @@ from afm_rl.missions.build import Agent
 from afm_rl.missions.collected import transitions
 from afm_rl.spaces.sampling import uniform
 
-TRANSITIONS = 20_000
-EPISODE = 800  # transitions under the planner
-
 
 @torch.no_grad()
-def fit_agents_gate(agent: Agent) -> float | None:
+def fit_agents_gate(agent: Agent, drawn: int = 20_000, planned: int = 800) -> float | None:
     """Fit the gate to ``false_alarms`` on fresh transitions of the nominal robot; return it.
 
     States and actions are drawn from the boxes of the pre-training; a robot that collects its data
     is planned for, as in missions.
+
+    Args:
+        agent: whose corrector it is.
+        drawn: transitions from the boxes; enough for a rate of 1 %.
+        planned: transitions under the planner, which takes longer.
 
     Returns:
         The gate, or None where it stays as it was set: without a corrector, over equations, for
@@ -34,14 +36,14 @@ def fit_agents_gate(agent: Agent) -> float | None:
     if isinstance(transform.corrector, PaperFlow):
         return None
     if agent.robot.data is not None:
-        healthy = transitions(agent.robot, EPISODE, agent.robot.data.seed + 1000, agent.planner)
+        healthy = transitions(agent.robot, planned, agent.robot.data.seed + 1000, agent.planner)
         return fit_gate(transform.corrector, agent.model, healthy, rate)
     robot, generator = agent.robot, torch.Generator().manual_seed(1)
     state, action = (
-        uniform(*box, TRANSITIONS, generator).to(agent.device)
+        uniform(*box, drawn, generator).to(agent.device)
         for box in (robot.state_box, robot.action_box)
     )
     state = robot.model.manifold.project(state)
-    healthy = TensorDict({"observation": state, "action": action}, [TRANSITIONS])
+    healthy = TensorDict({"observation": state, "action": action}, [drawn])
     healthy.set(("next", "observation"), robot.model(state, action))
     return fit_gate(transform.corrector, agent.model, healthy, rate)
