@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.envs.task.sources import EXACT, Limits
+from afm_rl.envs.task.simulated import EXACT, Limits
 from afm_rl.envs.task.task import Reward, Task, trust
 from afm_rl.errors import check_count
 from afm_rl.spaces.rotations import quaternion_exp, quaternion_multiply, rotate
