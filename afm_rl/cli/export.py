@@ -18,7 +18,8 @@ Write planner and correction of a method as machine code, which runs without thi
 The settings are those of afm-rl. The file is a function of tensors: (memory, observation, the
 task's entries such as the goal, noise) -> (memory, action). A memory of zeros begins a mission; the
 file's metadata says how many numbers each argument has. It runs where it was made: on the same kind
-of processor, with the same version of torch, from Python or C++ (examples/deploy/cpp).
+of processor, with the same version of torch, from Python or C++ (examples/deploy/cpp). It is a
+program: load it only where its SHA-256 is the one that is printed.
 """
 ALONE = "planner=null"
 
@@ -80,7 +81,8 @@ def _run(arguments: list[str]) -> None:
         transform.enabled,
         transform.extend_action_box,
     )
-    print("exporting (a minute or two)", flush=True)
+    print("exporting: tracing, then compiling, which takes about six times as long", flush=True)
     controller = Controller(None if alone else agent.planner, policy)
-    export_controller(controller, path)
+    checksum = export_controller(controller, path, cfg.cache)
     print(f"wrote {path}: " + ", ".join(f"{k} ({n})" for k, n in controller.sizes.items()))
+    print(f"sha256 {checksum}: whoever loads this program should ask for it")
