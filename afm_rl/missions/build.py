@@ -31,8 +31,8 @@ from afm_rl.missions.selection import (
     select_tracks,
 )
 from afm_rl.planning import Cost, PlanningEnv
+from afm_rl.targets import check_targets
 from afm_rl.transforms import ActionFlowTransform, Guard
-from afm_rl.trust import check_targets
 
 TRANSFORM = ("enabled", "extend_action_box")
 """Settings of whatever corrector is chosen."""
