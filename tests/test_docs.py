@@ -87,10 +87,6 @@ def test_snippets_run(page, desk):
 @pytest.mark.parametrize(("page", "asked"), commands())
 def test_commands_can_be_run(page, asked, desk):
     write_files(page, desk)
-    if "--config-dir" in asked:
-        at = asked.index("--config-dir")
-        folder = desk / asked[at + 1]
-        asked = [*asked[:at], *asked[at + 2 :], f"hydra.searchpath=[file://{folder}]"]
     with checked(asked) as names, initialize_config_module("afm_rl.conf", version_base="1.3"):
         agent = build(compose("config", asked), names)
     assert len(agent.missions)

@@ -22,9 +22,6 @@ from afm_rl.missions.state import Loop, leave, unsaved
 from afm_rl.progress import Bar
 from afm_rl.storage.measures import Measures
 
-ALIGNED = 5.0  # innovation, in standard deviations, up to which a model counts as aligned
-STILL = 0.1  # innovation up to which a repeated reading shows a robot at rest, as foreseen
-
 
 @dataclass
 class Results:
@@ -134,14 +131,22 @@ def _start(agent: Agent) -> Loop:
     return Loop(td, torch.arange(total, device=agent.device), ends, log, unsaved=unsaved(agent))
 
 
-def _advance(agent: Agent, loop: Loop) -> None:
-    """Take one step with every mission that runs, in place."""
+def _advance(agent: Agent, loop: Loop, aligned: float = 5.0, still: float = 0.1) -> None:
+    """Take one step with every mission that runs, in place.
+
+    Args:
+        agent: whose missions they are.
+        loop: where they stand.
+        aligned: innovation (standard deviations) up to which a model counts as aligned, where
+            nothing corrects.
+        still: innovation up to which a repeated reading shows a robot at rest, as foreseen.
+    """
     td, ids = agent.env.step(agent.planner(loop.td)), loop.ids
     errors, innovation = _errors(agent, td)
     guard = td["next", "guard"]
-    fault = guard["held"] | ~(guard["sound"] | (innovation < STILL))
+    fault = guard["held"] | ~(guard["sound"] | (innovation < still))
     loss = agent.updater(td)["loss"]
-    loop.log.add(ids, loop.step, _row(agent, td, errors, innovation, loss, fault))
+    loop.log.add(ids, loop.step, _row(agent, td, errors, innovation > aligned, loss, fault))
     if agent.faults == "raise" and bool(fault.any()):
         raise NonFiniteError(
             f"step {loop.step}: missions {ids[fault].tolist()}: a reading or a plan is missing, "
@@ -198,10 +203,10 @@ def _columns(agent: Agent) -> list[str]:
     ]
 
 
-def _row(agent: Agent, td: TensorDictBase, errors, innovation, loss, fault) -> Tensor:
+def _row(agent: Agent, td: TensorDictBase, errors, astray, loss, fault) -> Tensor:
     """Return one step's values ``(B, C)``, in the order of :func:`_columns`."""
     transform = agent.transform
-    flag = innovation > ALIGNED if transform is None else td["next", transform.key("misaligned")]
+    flag = astray if transform is None else td["next", transform.key("misaligned")]
     figures = (*errors, flag, loss, td["regime_active"], fault)
     scalars = torch.stack([x.float() for x in figures], -1)
     score, executed = agent.robot.metrics, td.get(agent.executed_key)

@@ -6,32 +6,18 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
-from afm_rl.errors import ConfigurationError
 from afm_rl.planning.riccati import LQProblem, LQSolution
+
+casadi = pytest.importorskip("casadi")
 
 OPTIONS = {
     **{"iter_max": 100, "res_g_max": 1e-7, "res_b_max": 1e-7, "res_d_max": 1e-7},
     "res_m_max": 1e-11,  # complementarity: decides how well active bounds are met
     **{"lam_min": 1e-20, "t_min": 1e-20},  # with their default floors it stays above 1e-8
 }
-
-
-def load_casadi() -> Any:
-    """Return the module casadi, which is large and therefore an extra.
-
-    Raises:
-        ConfigurationError: if it is not installed.
-    """
-    try:
-        import casadi
-    except ImportError as error:
-        raise ConfigurationError(
-            "planner.qp='hpipm': casadi is not installed; install afm-rl[mpc] (about 280 MB), "
-            "or use planner.qp='riccati'"
-        ) from error
-    return casadi
 
 
 def solve_conic(problem: LQProblem) -> LQSolution:
@@ -42,9 +28,6 @@ def solve_conic(problem: LQProblem) -> LQSolution:
 
     Args:
         problem: what to solve.
-
-    Raises:
-        ConfigurationError: if casadi is not installed.
     """
     batch, inputs = problem.start.shape[:-1], problem.r.shape[-1]
     stages, size = problem.c.shape[-2:]
@@ -72,7 +55,6 @@ def solve_conic(problem: LQProblem) -> LQSolution:
 @lru_cache
 def _solver(stages: int, size: int, inputs: int) -> Any:
     """Return a solver for variables (x_0, u_0, x_1, ..., x_N), all blocks dense."""
-    casadi = load_casadi()
     blocks = [np.ones((n, n)) for _ in range(stages) for n in (size, inputs)]
     weight = casadi.diagcat(*map(casadi.DM, [*blocks, np.ones((size, size))]))
     move = np.zeros((stages * size, weight.shape[0]))
@@ -94,7 +76,6 @@ def _solver(stages: int, size: int, inputs: int) -> Any:
 
 def _data(problem: Any) -> dict[str, Any]:
     """Return one problem of arrays as what the solver takes."""
-    casadi = load_casadi()
     stages, size = problem.c.shape
     inputs = problem.r.shape[-1]
     pairs = [problem.Q[:-1], problem.R]
