@@ -61,17 +61,46 @@ def check_manifest(folder: str | Path) -> dict[str, str]:
         ArtefactError: if there is no manifest, or the manifest or a file that it names is damaged
             or missing; the message names the file.
     """
-    folder = Path(folder)
     files = read_manifest(folder)["files"]
     for name, expected in files.items():
-        path = folder / name
-        if not path.is_file():
-            raise ArtefactError(f"{path}: missing, although {MANIFEST} names it; {_REMEDY}")
-        if _sum(path) != expected:
-            raise ArtefactError(
-                f"{path}: damaged: its SHA-256 is not the one in {MANIFEST}; {_REMEDY}"
-            )
+        _check(Path(folder) / name, _sum(Path(folder) / name), expected)
     return files
+
+
+def read_verified(folder: str | Path, name: str) -> bytes:
+    r"""Return the content of one file, if the manifest of its folder has its SHA-256.
+
+    Args:
+        folder: the one with the manifest.
+        name: of the file, relative to ``folder``.
+
+    Raises:
+        ArtefactError: if there is no manifest, the manifest or the file is damaged, or the
+            manifest does not name the file.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = Path(folder, "missions.csv").write_text("mission,steps\n")
+    ...     write_manifest(folder)
+    ...     read_verified(folder, "missions.csv")
+    b'mission,steps\n'
+    """
+    path, expected = Path(folder) / name, read_manifest(folder)["files"].get(name)
+    if expected is None:
+        raise ArtefactError(f"{path}: {MANIFEST} does not name it; {_REMEDY}")
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ArtefactError(f"{path}: cannot be read: {error.strerror}; {_REMEDY}") from error
+    _check(path, hashlib.sha256(data).hexdigest(), expected)
+    return data
+
+
+def _check(path: Path, found: str, expected: str) -> None:
+    if found != expected:
+        raise ArtefactError(
+            f"{path}: damaged: its SHA-256 is not the one in {MANIFEST}; {_REMEDY}"
+        )
 
 
 _REMEDY = "restore it, or delete the folder and run the same command again"
@@ -122,7 +151,7 @@ def _sum(path: Path) -> str:
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise ArtefactError(f"{path}: cannot be read: {error.strerror}") from error
+        raise ArtefactError(f"{path}: cannot be read: {error.strerror}; {_REMEDY}") from error
 
 
 def _text(content: Mapping[str, Any]) -> str:
