@@ -13,17 +13,19 @@ from typing import Any, cast
 import pandas as pd
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from afm_rl.cli.launchers.base import JobLauncher, JobsFailed
+from afm_rl.cli.error_messages import explain
 from afm_rl.cli.methods import jobs_of
 from afm_rl.envs import load_track
 from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag, check_number
 from afm_rl.files import locked
-from afm_rl.jobs.batch import Pool, run_batch
+from afm_rl.jobs.batch import run_batch
+from afm_rl.jobs.executor import Executor, JobsFailed, LocalExecutor
 from afm_rl.jobs.layout import JOBS, LOG
-from afm_rl.jobs.local import LocalPool
 from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
 from afm_rl.jobs.tables import read_measures, read_missions, read_steps
 from afm_rl.manifest import extend_manifest, read_manifest, write_manifest
@@ -62,13 +64,51 @@ def launch(cfg: DictConfig) -> None:
         _run_alone(folder, next(iter(jobs.values())), next(iter(agents.values())))
         show(folder, cfg, tracks, film, robot, draw)
         return
-    chosen = instantiate(hydra.launcher)  # Hydra's own launchers only know sweeps
-    pool = chosen if isinstance(chosen, JobLauncher) else LocalPool()
-    failed = run_together(folder, jobs, pool, cfg, hydra.overrides.task)
+    launcher = instantiate(hydra.launcher)
+    executor = getattr(launcher, "executor", None) or LocalExecutor()  # Hydra's own have none
+    failed = run_together(folder, jobs, executor, cfg, hydra.overrides.task)
     if cfg.get("study") is None and not failed:
         show(folder, cfg, tracks, film, robot, draw)
     else:
         report(folder, cfg, film)
+    if failed:
+        raise failed
+
+
+def sweep(
+    cfg: DictConfig,
+    configs: Sequence[DictConfig],
+    overrides: Sequence[Sequence[str]],
+    executor: Executor,
+) -> None:
+    """Run the jobs of a sweep, and report on them.
+
+    Args:
+        cfg: the settings that all have.
+        configs: those of each combination.
+        overrides: what each was composed from.
+        executor: where they run.
+
+    Raises:
+        JobsFailed: if some have no results, once the others are done.
+    """
+    film = check_settings(cfg)
+    common = set.intersection(*map(set, overrides))
+    jobs, failures = dict[str, DictConfig](), dict[str, str]()
+    for one, given in zip(configs, overrides, strict=True):
+        swept = [text for text in given if text not in common]
+        try:
+            found = jobs_of(one, one.hydra, swept)
+            for job in found.values():
+                OmegaConf.to_container(job, resolve=True)
+            jobs |= found
+        except (AFMError, HydraException, OmegaConfBaseException) as error:
+            failures[" ".join(swept or given)] = explain(error) or str(error)
+    folder = Path(cfg.hydra.sweep.dir).absolute()
+    # As text: an override may hold an interpolation that leads nowhere.
+    asked = cast(list, OmegaConf.to_container(cfg.hydra.overrides.task, resolve=False))
+    failed = run_together(folder, jobs, executor, cfg, ["-m", *asked], failures)
+    report(folder, cfg, film)
     if failed:
         raise failed
 
@@ -105,7 +145,7 @@ def _run_alone(folder: Path, cfg: DictConfig, agent: Agent) -> None:
 def run_together(
     folder: Path,
     jobs: Mapping[str, DictConfig],
-    pool: Pool,
+    executor: Executor,
     cfg: DictConfig,
     overrides: Sequence[str],
     failures: Mapping[str, str] | None = None,
@@ -115,7 +155,7 @@ def run_together(
     Args:
         folder: of the batch.
         jobs: settings of each, by name.
-        pool: where they run.
+        executor: where they run.
         cfg: settings of the command.
         overrides: of the command, for people.
         failures: jobs that could not even be composed, with reasons.
@@ -126,7 +166,7 @@ def run_together(
     command = shlex.join(["afm-rl", *overrides])
     how = {"command": command, "overwrite": cfg.overwrite, "progress": cfg.progress}
     with _interruptible(folder), _ended_by(signal.SIGINT, signal.SIGTERM):
-        found = run_batch(folder, jobs, pool, **how)
+        found = run_batch(folder, jobs, executor, **how)
     failures = {**(failures or {}), **found}
     for name, reason in failures.items():
         print(f"afm-rl: {name}: failed: {reason}", file=sys.stderr)

@@ -5,6 +5,7 @@ Imported wherever a job is waited for, also on the nodes of a cluster: without t
 
 from __future__ import annotations
 
+import importlib
 import json
 import multiprocessing
 import os
@@ -12,17 +13,17 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.context import ForkServerProcess, SpawnProcess
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from afm_rl.errors import AFMError, causes
+from afm_rl.errors import AFMError, ConfigurationError, causes
 from afm_rl.files import locked
-from afm_rl.jobs.layout import LOG, UNFINISHED, is_finished
+from afm_rl.jobs.layout import CONFIG, LOG, UNFINISHED, is_finished
 from afm_rl.targets import TRUST
 
 START = "forkserver"  # torch is imported once, and jobs are forked from there
@@ -50,10 +51,6 @@ class Job:
         return self.name
 
 
-Ends = Generator[tuple[Job, str | None] | None, None, None]
-"""Jobs that are over, with the reason if they failed, and None from time to time."""
-
-
 def start(job: Job) -> Process:
     """Start the process of a job. It ends, with a checkpoint, when this process ends."""
     for name in (FAILURE, PROGRESS):  # of an earlier attempt
@@ -67,25 +64,23 @@ def start(job: Job) -> Process:
     return process
 
 
-def run(job: Job) -> str | None:
-    """Run a job in a process of its own, and wait for it.
-
-    Returns:
-        Why there are no results; None if there are.
-    """
+def run(job: Job) -> None:
+    """Run a job in a process of its own, and wait for it: what a node of a cluster does."""
     process = start(job)
     process.join()
-    return reason(job, process)
+    if not is_done(job) and not said(job):
+        (job.folder / UNFINISHED / FAILURE).write_text(last_words(process.exitcode or 0))
 
 
-def reason(job: Job, process: Process) -> str | None:
-    """Say why a job whose process has ended has no results; None if it has."""
-    new = job.folder / UNFINISHED
-    if process.exitcode == 0 and is_finished(job.folder) and not new.exists():
-        return None
-    if (new / FAILURE).exists():
-        return (new / FAILURE).read_text()
-    return last_words(process.exitcode or 0)
+def is_done(job: Job) -> bool:
+    """Return whether a job has its results."""
+    return is_finished(job.folder) and not (job.folder / UNFINISHED / CONFIG).exists()
+
+
+def said(job: Job) -> str:
+    """Return why a job has no results, as it said itself; "" if it could not."""
+    path = job.folder / UNFINISHED / FAILURE
+    return path.read_text() if path.exists() else ""
 
 
 def last_words(status: int) -> str:
@@ -163,3 +158,17 @@ def explain(error: BaseException) -> str:
         return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
     text = " ".join(str(cause).split())  # may end in what a MemoryError says: nothing
     return f"{text} {type(cause.__cause__).__name__}" if text.endswith(":") else text
+
+
+def needs(package: str, extra: str) -> ModuleType:
+    """Import a package that comes with one of our extras.
+
+    Raises:
+        ConfigurationError: if it is not installed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise ConfigurationError(
+            f"launcher: needs the package {package}: pip install 'afm-rl[{extra}]'"
+        ) from error
