@@ -4,8 +4,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from afm_rl.jobs.batch import run_batch
+from afm_rl.jobs.executor import LocalExecutor
 from afm_rl.jobs.layout import run_folders
-from afm_rl.jobs.local import LocalPool
 from afm_rl.manifest import check_manifest
 
 METHODS = ["physics", "online_pe", "afm_physics", "stream_x_pe", "adaptive_gain", "rls", "oracle"]
@@ -31,7 +31,7 @@ def test_two_processes_give_the_same_bytes(configure, tmp_path):
             OmegaConf.update(cfg, key, SMALL[key])
         jobs[method] = cfg
     for folder in ("one", "other"):
-        assert run_batch(tmp_path / folder, jobs, LocalPool(2), echo=lambda line: None) == {}
+        assert run_batch(tmp_path / folder, jobs, LocalExecutor(2), echo=lambda line: None) == {}
     for one, other in zip(
         *(run_folders(tmp_path / name) for name in ("one", "other")), strict=True
     ):
