@@ -12,15 +12,16 @@ from omegaconf import DictConfig
 from yaml import safe_dump
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.files import locked, remove_parts, write_whole
 from afm_rl.jobs.executor import Executor
 from afm_rl.jobs.layout import JOBS, MISSIONS, RECORD, is_batch, recorded
 from afm_rl.jobs.process import Job
 from afm_rl.jobs.progress import Board
 from afm_rl.jobs.run import begin, needs_run
 from afm_rl.jobs.tables import write_tables
-from afm_rl.manifest import MANIFEST, write_manifest
-from afm_rl.targets import trusted
+from afm_rl.missions.trust import trusted
+from afm_rl.storage.files import locked, remove_parts, write_whole
+from afm_rl.storage.manifest import MANIFEST, write_manifest
+
 
 def run_batch(
     folder: Path,
@@ -68,7 +69,10 @@ def run_batch(
         if len(waiting) < len(jobs):
             echo(f"{len(jobs) - len(waiting)} of {len(jobs)} jobs have results already")
         failures: dict[str, str] = {}
-        with Board(waiting, len(jobs), progress, echo) as board, closing(executor.run(waiting)) as ends:
+        with (
+            Board(waiting, len(jobs), progress, echo) as board,
+            closing(executor.run(waiting)) as ends,
+        ):
             for end in ends:
                 if end is not None:
                     job, failure = end

@@ -46,8 +46,9 @@ class Executor(ABC):
         """Say how a job ended that left neither results nor a reason."""
         return "it ended before its results were whole"
 
+    @abstractmethod
     def close(self, handles: Collection[Any]) -> None:
-        """Deal with jobs that still run when the command ends; called in any case."""
+        """Deal with the jobs that still run when the command ends, if any."""
 
     def run(self, jobs: Sequence[Job]) -> Ends:
         """Run jobs, in any order.

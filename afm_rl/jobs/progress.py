@@ -68,10 +68,12 @@ class Board:
                 bar = self.bars.get(job) or Bar(desc=f"  {job}", total=1.0, leave=False)
                 self.bars[job] = bar
                 bar.set_postfix_str(line, refresh=False)
-                bar.update(share - bar.n)
+                bar.n = share
+                bar.refresh()
         said = f"{self.done}/{self.count} jobs, {len(states)} at work"
         self.whole.set_postfix_str(said, refresh=False)
-        self.whole.update(sum(self.shares.values()) - self.whole.n)
+        self.whole.n = sum(self.shares.values())
+        self.whole.refresh()
 
     def _state(self, job: Job) -> tuple[str, float]:
         """Return what a job that runs says of itself; "" if it has not begun."""

@@ -29,9 +29,7 @@ class SlurmExecutor(Executor):
         ConfigurationError: for another cluster, or if submitit is not installed.
     """
 
-    def __init__(
-        self, cluster: str = "slurm", parameters: Mapping[str, Any] | None = None
-    ) -> None:
+    def __init__(self, cluster: str = "slurm", parameters: Mapping[str, Any] | None = None) -> None:
         self.cluster = check_choice("hydra.launcher.cluster", cluster, ("local", "slurm"))
         given = {key: value for key, value in (parameters or {}).items() if value is not None}
         self.parameters = {"name": "afm-rl"} | given
