@@ -26,6 +26,7 @@ def test_jobs_run_on_both_nodes_and_one_that_dies_takes_no_other_with_it(
         import time
 
         import ray
+
         from afm_rl.storage.manifest import write_manifest
 
         if "seeds=3" in job.name:
