@@ -28,9 +28,9 @@ from afm_rl.jobs.layout import JOBS, LOG
 from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
 from afm_rl.jobs.tables import read_measures, read_missions, read_steps
 from afm_rl.missions import Agent, build
-from afm_rl.missions.checkpoint import Stopped
 from afm_rl.missions.explained import explain_mission
 from afm_rl.missions.robot import Robot
+from afm_rl.missions.run import Stopped
 from afm_rl.report import (
     check_video,
     film_results,

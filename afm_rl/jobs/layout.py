@@ -35,7 +35,7 @@ from pathlib import Path
 from yaml import YAMLError, safe_load
 
 from afm_rl.errors import ArtefactError
-from afm_rl.storage.manifest import MANIFEST
+from afm_rl.storage.manifest import MANIFEST, read_verified
 
 JOBS, RECORD, UNFINISHED = "jobs", "jobs.yaml", "unfinished"
 MISSIONS, STEPS, COMPUTE = "missions.csv", "steps.parquet", "compute.csv"
@@ -58,7 +58,7 @@ def run_folders(folder: Path) -> list[Path]:
     They come in the order of ``jobs.yaml``; those that it does not name follow by name.
 
     Raises:
-        ArtefactError: if ``jobs.yaml`` cannot be read.
+        ArtefactError: if ``jobs.yaml`` is damaged.
     """
     if not is_batch(folder):
         return [folder]
@@ -71,12 +71,14 @@ def recorded(folder: Path) -> list[str]:
     """Return the names of a batch's jobs in the order of the tables, from ``jobs.yaml``.
 
     Raises:
-        ArtefactError: if it cannot be read.
+        ArtefactError: if it is damaged.
     """
     path = folder / RECORD
     if not path.exists():
         return []
+    # Without a manifest it is about to be written anew.
+    data = read_verified(folder, RECORD) if is_finished(folder) else path.read_bytes()
     try:
-        return [str(name) for name in safe_load(path.read_bytes())["jobs"]]
+        return [str(name) for name in safe_load(data)["jobs"]]
     except (YAMLError, TypeError, KeyError, UnicodeDecodeError, RecursionError):
         raise ArtefactError(f"{path}: damaged; delete it") from None

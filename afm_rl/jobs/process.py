@@ -119,7 +119,7 @@ def work(job: Job) -> None:
 
 def _finish(folder: Path) -> None:
     from afm_rl.jobs.run import Stop, finish
-    from afm_rl.missions.checkpoint import Stopped
+    from afm_rl.missions.run import Stopped
     from afm_rl.progress import Bar
 
     def report(line: str, share: float) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torchrl.envs import EnvBase
 
+from afm_rl._version import __version__
 from afm_rl.compiling.cast_cache import CastCache
 from afm_rl.errors import ConfigurationError
 from afm_rl.mission_state import MissionState
@@ -20,6 +22,7 @@ from afm_rl.missions.build import Agent
 from afm_rl.missions.log import StepLog
 from afm_rl.regimes import Regime
 from afm_rl.storage.artefacts import digest_of
+from afm_rl.storage.settings import influential
 from afm_rl.streams import Streams
 
 PLAIN = (bool, int, float, str, type(None))
@@ -55,17 +58,15 @@ class Holder(NamedTuple):
 def snapshot(agent: Agent, loop: Loop) -> dict[str, Any]:
     """Return everything that the next steps and the tables depend on.
 
-    That is the loop itself, all tensors of the agent's modules (also those that are not
-    persistent), their plain numbers and texts, whatever in them has a state of its own
-    (generators, :class:`Streams`, optimisers, an extra state as defined by ``nn.Module``), and the
-    global generator.
+    That is the loop itself, the global generator, and of each module of the agent: all tensors
+    (also those that are not persistent), plain numbers and texts, and whatever has a state of its
+    own (generators, :class:`Streams`, optimisers, an extra state as defined by ``nn.Module``).
 
     Raises:
         ConfigurationError: if something else has changed since the start, see
             :func:`check_saved`.
     """
     check_saved(agent, loop)
-    whole = _whole(agent)
     return {
         "td": loop.td.to_dict(),
         "ids": loop.ids,
@@ -73,9 +74,7 @@ def snapshot(agent: Agent, loop: Loop) -> dict[str, Any]:
         "log": loop.log.state_dict(),
         "step": loop.step,
         "global": torch.random.get_rng_state(),
-        "tensors": {**dict(whole.named_parameters()), **dict(whole.named_buffers())},
-        "held": {name: holder.read() for name, holder in _holders(whole)},
-        "plain": {name: getattr(module, leaf) for name, module, leaf in _plain(whole)},
+        "agent": {name: holder.read() for name, holder in _holders(agent)},
     }
 
 
@@ -87,24 +86,44 @@ def restore(agent: Agent, loop: Loop, state: dict[str, Any]) -> None:
         loop: at their start.
         state: the snapshot; what it holds is taken over, not copied.
     """
-    whole = _whole(agent)
-    modules, parameters = dict(whole.named_modules()), dict(whole.named_parameters())
-    for name, value in state["tensors"].items():
-        if name in parameters:  # the optimiser knows the parameter: only its data may change
-            parameters[name].data = value.to(agent.device)
-        else:
-            owner, _, leaf = name.rpartition(".")
-            modules[owner]._buffers[leaf] = value.to(agent.device)
-    for name, holder in _holders(whole):
-        holder.write(state["held"][name])
-    for name, module, leaf in list(_plain(whole)):
-        if getattr(module, leaf) != state["plain"].get(name):
-            setattr(module, leaf, state["plain"][name])
+    for name, holder in _holders(agent):
+        holder.write(state["agent"][name])
     torch.random.set_rng_state(state["global"])
     loop.log.load_state_dict(state["log"])
     loop.ids, loop.step = state["ids"].to(agent.device), state["step"]
     loop.ends = {name: part.to(agent.device) for name, part in state["ends"].items()}
     loop.td = TensorDict(state["td"], loop.ids.shape, device=loop.td.device)
+
+
+def _holders(agent: Agent) -> Iterator[tuple[str, Holder]]:
+    """Yield all of an agent that has a state, by name."""
+    device = agent.device
+    for path, module in _whole(agent).named_modules():
+        for name, tensor in module._parameters.items():
+            if tensor is not None:  # the optimiser knows the parameter: only its data may change
+                data = partial(_set, tensor, "data", device)
+                yield f"{path}.{name}", Holder(partial(getattr, tensor, "data"), data)
+        for name in module._buffers:
+            get = partial(module._buffers.__getitem__, name)
+            yield f"{path}.{name}", Holder(get, partial(_set, module, name, device))
+        if _has_extra_state(module):
+            yield path, Holder(module.get_extra_state, module.set_extra_state)
+        for name, value in list(vars(module).items()):
+            if isinstance(value, torch.Generator):
+                yield f"{path}.{name}", Holder(value.get_state, value.set_state)
+            elif isinstance(value, Streams | Optimizer):
+                yield f"{path}.{name}", Holder(value.state_dict, value.load_state_dict)
+            elif name not in TORCH and isinstance(value, PLAIN):
+                get = partial(getattr, module, name)
+                yield f"{path}.{name}", Holder(get, partial(_set, module, name, device))
+
+
+def _set(owner: Any, name: str, device: torch.device, value: Any) -> None:
+    """Set an attribute, a tensor on the agent's device."""
+    if isinstance(value, Tensor):
+        setattr(owner, name, value.to(device))
+    elif getattr(owner, name) != value:
+        setattr(owner, name, value)
 
 
 def leave(agent: Agent, loop: Loop, keep: Tensor) -> None:
@@ -178,6 +197,15 @@ def _described(value: Any, above: tuple[int, ...] = ()) -> Any:
     return repr(value)
 
 
+def owner(agent: Agent) -> dict[str, Any]:
+    """Return what tells the missions of an agent from others: version, settings and parts."""
+    return {
+        "version": __version__,
+        "settings": influential(agent.settings),
+        "parts": fingerprint(agent),
+    }
+
+
 def fingerprint(agent: Agent) -> str:
     """Return a digest of all tensors of an agent: of its models, flows and tracks."""
     whole = _whole(agent)
@@ -193,23 +221,3 @@ def _whole(agent: Agent) -> nn.ModuleDict:
 
 def _has_extra_state(module: nn.Module) -> bool:
     return type(module).get_extra_state is not nn.Module.get_extra_state
-
-
-def _plain(whole: nn.Module) -> Iterator[tuple[str, nn.Module, str]]:
-    """Yield the numbers and texts among the attributes of modules: name, module, attribute."""
-    for name, module in whole.named_modules():
-        for leaf, value in list(vars(module).items()):
-            if leaf not in TORCH and isinstance(value, PLAIN):
-                yield f"{name}.{leaf}", module, leaf
-
-
-def _holders(whole: nn.Module) -> Iterator[tuple[str, Holder]]:
-    for name, module in whole.named_modules():
-        if _has_extra_state(module):
-            yield name, Holder(module.get_extra_state, module.set_extra_state)
-        for attribute, value in list(vars(module).items()):
-            path = f"{name}.{attribute}"
-            if isinstance(value, torch.Generator):
-                yield path, Holder(value.get_state, value.set_state)
-            elif isinstance(value, Streams | Optimizer):
-                yield path, Holder(value.state_dict, value.load_state_dict)

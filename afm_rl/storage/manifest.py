@@ -98,9 +98,7 @@ def read_verified(folder: str | Path, name: str) -> bytes:
 
 def _check(path: Path, found: str, expected: str) -> None:
     if found != expected:
-        raise ArtefactError(
-            f"{path}: damaged: its SHA-256 is not the one in {MANIFEST}; {_REMEDY}"
-        )
+        raise ArtefactError(f"{path}: damaged: its SHA-256 is not the one in {MANIFEST}; {_REMEDY}")
 
 
 _REMEDY = "restore it, or delete the folder and run the same command again"

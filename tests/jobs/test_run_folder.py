@@ -13,7 +13,7 @@ import pytest
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.jobs.layout import is_finished
 from afm_rl.jobs.run import Stop, _publish, begin, finish, needs_run
-from afm_rl.missions.checkpoint import Stopped
+from afm_rl.missions.run import Stopped
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import check_manifest, extend_manifest
 
