@@ -25,6 +25,7 @@ from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag,
 from afm_rl.jobs.batch import run_batch
 from afm_rl.jobs.executor import Executor, JobsFailed, LocalExecutor
 from afm_rl.jobs.layout import JOBS, LOG
+from afm_rl.jobs.process import handled
 from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
 from afm_rl.jobs.tables import read_measures, read_missions, read_steps
 from afm_rl.missions import Agent, build
@@ -44,6 +45,9 @@ from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import extend_manifest, read_manifest, write_manifest
 
 SWITCHES = ("overwrite", "progress", "figures", "tensorboard")
+ENDS = (signal.SIGINT, signal.SIGTERM)
+"""Batch systems send the latter before they kill; a shell ignores the former for what it runs
+behind itself."""
 
 
 def launch(cfg: DictConfig) -> None:
@@ -134,7 +138,8 @@ def check_settings(cfg: DictConfig) -> str | None:
 
 def _run_alone(folder: Path, cfg: DictConfig, agent: Agent) -> None:
     """Run the missions of one method in this process."""
-    with _interruptible(folder), Stop().on(signal.SIGINT, signal.SIGTERM) as stop, locked(folder):
+    stop = Stop()
+    with _interruptible(folder), handled(stop, *ENDS), locked(folder):
         if needs_run(folder, cfg, cfg.overwrite):
             begin(folder, cfg)
             finish(folder, agent, stop, cfg.progress)
@@ -165,7 +170,7 @@ def run_together(
     """
     command = shlex.join(["afm-rl", *overrides])
     how = {"command": command, "overwrite": cfg.overwrite, "progress": cfg.progress}
-    with _interruptible(folder), _ended_by(signal.SIGINT, signal.SIGTERM):
+    with _interruptible(folder), handled(signal.default_int_handler, *ENDS):
         found = run_batch(folder, jobs, executor, **how)
     failures = {**(failures or {}), **found}
     for name, reason in failures.items():
@@ -247,17 +252,3 @@ def _interruptible(folder: Path) -> Iterator[None]:
             file=sys.stderr,
         )
         sys.exit(130)
-
-
-@contextmanager
-def _ended_by(*numbers: signal.Signals) -> Iterator[None]:
-    """End by signals, as by Ctrl-C: batch systems send them before they kill.
-
-    Also by SIGINT where that is ignored, as a shell's script has it for what it runs behind itself.
-    """
-    before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

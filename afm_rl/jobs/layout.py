@@ -52,19 +52,13 @@ def is_finished(folder: Path) -> bool:
     return (folder / MANIFEST).is_file()
 
 
-def run_folders(folder: Path) -> list[Path]:
-    """Return the folders of the runs of a batch, finished or not, or the folder of a run itself.
-
-    They come in the order of ``jobs.yaml``; those that it does not name follow by name.
+def job_folders(folder: Path) -> list[Path]:
+    """Return the folders of a batch's jobs, finished or not, in the order of ``jobs.yaml``.
 
     Raises:
-        ArtefactError: if ``jobs.yaml`` is damaged.
+        ArtefactError: if that is damaged.
     """
-    if not is_batch(folder):
-        return [folder]
-    there = sorted(path for path in (folder / JOBS).iterdir() if path.is_dir())
-    rank = {name: place for place, name in enumerate(recorded(folder))}
-    return sorted(there, key=lambda path: rank.get(path.name, len(rank)))
+    return [folder / JOBS / name for name in recorded(folder)]
 
 
 def recorded(folder: Path) -> list[str]:

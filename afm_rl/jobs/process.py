@@ -13,7 +13,8 @@ import signal
 import sys
 import threading
 import traceback
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.context import ForkServerProcess, SpawnProcess
@@ -128,8 +129,8 @@ def _finish(folder: Path) -> None:
             part.write_text(json.dumps({"line": line, "share": share}))
             os.replace(part, path)
 
-    path = folder / UNFINISHED / PROGRESS
-    with Stop().on(signal.SIGTERM) as stop, locked(folder, wait=True):
+    path, stop = folder / UNFINISHED / PROGRESS, Stop()
+    with handled(stop, signal.SIGTERM), locked(folder, wait=True):
         # The lock: an orphan of a command that was killed may be in its last step.
         threading.Thread(target=_end_with_parent, daemon=True).start()
         Bar.listener = report
@@ -138,6 +139,17 @@ def _finish(folder: Path) -> None:
             finish(folder, stop=stop)
         except Stopped:
             return
+
+
+@contextmanager
+def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
+    """Have a handler called when one of these signals arrives."""
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, former in before.items():
+            signal.signal(number, former)
 
 
 def _end_with_parent() -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import io
 import os
 import shutil
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
@@ -121,10 +119,11 @@ def finish(
     cfg = OmegaConf.create(safe_load((new / CONFIG).read_bytes()))
     agent = agent or build(cfg)
     prepare(agent, cfg.cache, progress, echo)
-    with stop.between_steps():
-        results = run(
-            agent, progress, new, cfg.checkpoints.every, cfg.checkpoints.keep, lambda _: stop.asked
-        )
+    every, keep, stop.waits = cfg.checkpoints.every, cfg.checkpoints.keep, not stop.asked
+    try:
+        results = run(agent, progress, new, every, keep, lambda loop: stop.asked)
+    finally:
+        stop.waits = False
     _publish(folder, results)
 
 
@@ -181,11 +180,15 @@ def compute(missions: pd.DataFrame) -> pd.DataFrame:
 
 
 class Stop:
-    """Ends a run when it is told to: between two steps of its missions, else at once."""
+    """Ends a run when it is told to: between two steps of its missions, else at once.
+
+    Attributes:
+        asked: whether it was told to.
+        waits: whether there is a step to wait for.
+    """
 
     def __init__(self) -> None:
-        self.asked = False
-        self._waits = False
+        self.asked, self.waits = False, False
 
     def __call__(self, number: int = 0, frame: FrameType | None = None) -> None:
         """Ask the run to end; a handler of signals.
@@ -194,24 +197,5 @@ class Stop:
             KeyboardInterrupt: if there is no step to wait for, or if asked twice.
         """
         again, self.asked = self.asked, True
-        if again or not self._waits:
+        if again or not self.waits:
             raise KeyboardInterrupt
-
-    @contextmanager
-    def between_steps(self) -> Iterator[None]:
-        """While missions run, let them complete their step."""
-        self._waits = not self.asked
-        try:
-            yield
-        finally:
-            self._waits = False
-
-    @contextmanager
-    def on(self, *numbers: signal.Signals) -> Iterator[Stop]:
-        """Ask for the end when one of these signals arrives."""
-        before = {number: signal.signal(number, self) for number in numbers}
-        try:
-            yield self
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from afm_rl.jobs.layout import COMPUTE, MISSIONS, RECORD, STEPS, is_finished, run_folders
+from afm_rl.jobs.layout import COMPUTE, MISSIONS, RECORD, STEPS, is_batch, is_finished, job_folders
 from afm_rl.jobs.run import csv_of
 from afm_rl.storage.files import write_whole
 from afm_rl.storage.manifest import MANIFEST, write_manifest
@@ -63,7 +63,8 @@ def write_tables(folder: Path) -> None:
 
 
 def _finished(folder: Path) -> list[Path]:
-    return [run for run in run_folders(folder) if is_finished(run) and (run / MISSIONS).exists()]
+    runs = job_folders(folder) if is_batch(folder) else [folder]
+    return [run for run in runs if is_finished(run) and (run / MISSIONS).exists()]
 
 
 def _missions(folder: Path) -> pd.DataFrame:

@@ -18,34 +18,16 @@ import yaml
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.jobs import process, progress
 from afm_rl.jobs.batch import file_name, run_batch
-from afm_rl.jobs.executor import Executor, LocalExecutor
-from afm_rl.jobs.layout import run_folders
+from afm_rl.jobs.executor import LocalExecutor
+from afm_rl.jobs.layout import job_folders
 from afm_rl.jobs.process import Job
 from afm_rl.jobs.progress import Board
-from afm_rl.jobs.run import finish
 from afm_rl.jobs.tables import read_missions, read_steps
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import check_manifest
 
 QUIET = {"echo": lambda line: None}
 SAME = ("missions.csv", "steps.parquet")
-
-
-class Here(Executor):
-    """Runs jobs in this process, one after the other."""
-
-    tick = 0.0
-
-    def start(self, jobs):
-        for job in jobs:
-            finish(job.folder, echo=lambda line: None)
-        return jobs
-
-    def is_over(self, handle):
-        return True
-
-    def close(self, handles):
-        pass
 
 
 @pytest.fixture
@@ -68,14 +50,14 @@ def jobs(configure):
     return make
 
 
-def test_what_a_batch_leaves_behind(jobs, tmp_path, forked):
+def test_what_a_batch_leaves_behind(jobs, tmp_path, forked, here):
     said, four = [], jobs("oracle", "physics")
     assert run_batch(tmp_path, four, LocalExecutor(2), command="afm-rl x", echo=said.append) == {}
     assert sorted(said) == sorted(f"[{k}/4] {said[k - 1].split()[1]} done" for k in range(1, 5))
     record = yaml.safe_load((tmp_path / "jobs.yaml").read_text())
     assert record == {"command": "afm-rl x", "jobs": [*four]}
     assert check_manifest(tmp_path).keys() == {"jobs.yaml", "missions.csv", "compute.csv"}
-    for run in run_folders(tmp_path):
+    for run in job_folders(tmp_path):
         assert "missions.csv" in check_manifest(run) and not (run / "unfinished").exists()
     missions = pd.read_csv(tmp_path / "missions.csv")
     assert missions["mission"].tolist() == [0, 1, 2, 3]
@@ -87,42 +69,42 @@ def test_what_a_batch_leaves_behind(jobs, tmp_path, forked):
     assert steps.groupby("mission").size().tolist() == [12] * 4
     assert read_missions(tmp_path)["seconds"].gt(0).all()
     again = []
-    run_batch(tmp_path, four, Here(), echo=again.append)
+    run_batch(tmp_path, four, here, echo=again.append)
     assert again == ["4 of 4 jobs have results already"]
 
 
-def test_more_jobs_extend_a_batch(jobs, tmp_path):
+def test_more_jobs_extend_a_batch(jobs, tmp_path, here):
     one, other = tmp_path / "one", tmp_path / "other"
-    run_batch(one, jobs("oracle", seeds=[0]), Here(), **QUIET)
-    run_batch(one, jobs("oracle", "physics"), Here(), **QUIET)
-    run_batch(other, jobs("oracle", "physics"), Here(), **QUIET)
+    run_batch(one, jobs("oracle", seeds=[0]), here, **QUIET)
+    run_batch(one, jobs("oracle", "physics"), here, **QUIET)
+    run_batch(other, jobs("oracle", "physics"), here, **QUIET)
     assert (one / "missions.csv").read_bytes() == (other / "missions.csv").read_bytes()
-    run_batch(one, jobs("physics"), Here(), **QUIET)  # the others stay, after these
+    run_batch(one, jobs("physics"), here, **QUIET)  # the others stay, after these
     assert len(pd.read_csv(one / "missions.csv")) == 4
 
 
-def test_nothing_is_changed_if_one_job_has_other_settings(jobs, tmp_path):
-    run_batch(tmp_path, jobs("physics", seeds=[0]), Here(), **QUIET)
+def test_nothing_is_changed_if_one_job_has_other_settings(jobs, tmp_path, here):
+    run_batch(tmp_path, jobs("physics", seeds=[0]), here, **QUIET)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
     with pytest.raises(ConfigurationError, match=r"budget: 12 -> 13"):
-        run_batch(tmp_path, jobs("oracle", "physics", budget=13), Here(), **QUIET)
+        run_batch(tmp_path, jobs("oracle", "physics", budget=13), here, **QUIET)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
 
 
-def test_damaged_results_stop_a_batch_and_are_named(jobs, tmp_path):
-    run_batch(tmp_path, jobs("physics", seeds=[0]), Here(), **QUIET)
+def test_damaged_results_stop_a_batch_and_are_named(jobs, tmp_path, here):
+    run_batch(tmp_path, jobs("physics", seeds=[0]), here, **QUIET)
     path = tmp_path / "jobs" / "physics+seed=0" / "missions.csv"
     path.write_bytes(path.read_bytes().replace(b"0", b"1", 1))
     with pytest.raises(ArtefactError, match=f"{path.name}: damaged"):
-        run_batch(tmp_path, jobs("physics"), Here(), **QUIET)
+        run_batch(tmp_path, jobs("physics"), here, **QUIET)
 
 
-def test_folders_that_are_taken(jobs, tmp_path):
+def test_folders_that_are_taken(jobs, tmp_path, here):
     with locked(tmp_path), pytest.raises(ConfigurationError, match="another process is at work"):
-        run_batch(tmp_path, jobs("physics"), Here(), **QUIET)
+        run_batch(tmp_path, jobs("physics"), here, **QUIET)
     (tmp_path / "missions.csv").write_text("mine\n")
     with pytest.raises(ConfigurationError, match="holds the results of a run"):
-        run_batch(tmp_path, jobs("physics"), Here(), **QUIET)
+        run_batch(tmp_path, jobs("physics"), here, **QUIET)
 
 
 @pytest.mark.timeout(10)
@@ -135,28 +117,28 @@ def test_errors_that_name_each_other_as_their_cause_are_explained():
     assert process.explain(bug) == "RuntimeError: a bug"
 
 
-def killed_batch(folder, jobs, seconds):
+def killed_batch(folder, jobs, here, seconds):
     """Run a batch in this process, which the kernel ends after some time, without a last word."""
     if measured := coverage.Coverage.current():
         measured.stop()  # a signal inside coverage's lock leaves it locked, for ever
     signal.signal(signal.SIGALRM, signal.SIG_DFL)  # pytest-timeout has a handler
     signal.setitimer(signal.ITIMER_REAL, seconds)
-    run_batch(folder, jobs, Here(), **QUIET)
+    run_batch(folder, jobs, here, **QUIET)
 
 
 @pytest.mark.timeout(600)
-def test_a_batch_killed_twenty_times_gives_the_same_bytes(jobs, tmp_path):
+def test_a_batch_killed_twenty_times_gives_the_same_bytes(jobs, tmp_path, here):
     """Killed at random moments, also inside a save: SIGALRM ends a process as SIGKILL does."""
     two = jobs("physics", "oracle", seeds=[0], budget=20, **{"checkpoints.every": 0})
     whole, broken, chance = tmp_path / "whole", tmp_path / "broken", random.Random(0)
-    run_batch(tmp_path / "first", two, Here(), **QUIET)  # what Python loads takes time once
+    run_batch(tmp_path / "first", two, here, **QUIET)  # what Python loads takes time once
     begin = time.monotonic()
-    run_batch(whole, two, Here(), **QUIET)
+    run_batch(whole, two, here, **QUIET)
     pace = time.monotonic() - begin
 
     def compare():
         for name in SAME:
-            for run, other in zip(run_folders(whole), run_folders(broken), strict=True):
+            for run, other in zip(job_folders(whole), job_folders(broken), strict=True):
                 assert (run / name).read_bytes() == (other / name).read_bytes()
         assert (whole / "missions.csv").read_bytes() == (broken / "missions.csv").read_bytes()
         assert not [path for path in broken.rglob(".*") if path.name != ".lock"]  # no litter
@@ -165,7 +147,7 @@ def test_a_batch_killed_twenty_times_gives_the_same_bytes(jobs, tmp_path):
     context, kills = multiprocessing.get_context("fork"), 0
     while kills < 20:
         batch = context.Process(
-            target=killed_batch, args=(broken, two, pace * chance.uniform(0.05, 0.5))
+            target=killed_batch, args=(broken, two, here, pace * chance.uniform(0.05, 0.5))
         )
         batch.start()
         batch.join()
@@ -175,7 +157,7 @@ def test_a_batch_killed_twenty_times_gives_the_same_bytes(jobs, tmp_path):
         else:
             assert batch.exitcode == -signal.SIGALRM
             kills += 1
-    assert run_batch(broken, two, Here(), **QUIET) == {}
+    assert run_batch(broken, two, here, **QUIET) == {}
     compare()
 
 
@@ -202,10 +184,10 @@ def test_jobs_end_with_a_command_that_is_killed(jobs, tmp_path, forked):
     assert not [*tmp_path.glob("jobs/*/manifest.json")]
 
 
-def test_an_interrupted_batch_ends_its_jobs_and_keeps_their_state(jobs, tmp_path, forked):
+def test_an_interrupted_batch_ends_its_jobs_and_keeps_their_state(jobs, tmp_path, forked, here):
     two = jobs("physics", "oracle", seeds=[0], budget=60, **{"checkpoints.every": 0})
     whole = tmp_path / "whole"
-    run_batch(whole, two, Here(), **QUIET)
+    run_batch(whole, two, here, **QUIET)
 
     class Interrupted(LocalExecutor):
         def run(self, waiting):
@@ -219,7 +201,7 @@ def test_an_interrupted_batch_ends_its_jobs_and_keeps_their_state(jobs, tmp_path
     assert multiprocessing.active_children() == []
     moved = (tmp_path / "two").rename(tmp_path / "moved")  # a folder may go on elsewhere
     assert len({path.parent for path in moved.rglob("checkpoint-*")}) == 2
-    assert run_batch(moved, two, Here(), **QUIET) == {}
+    assert run_batch(moved, two, here, **QUIET) == {}
     for path in ("missions.csv", *(f"jobs/{name}/{each}" for name in two for each in SAME)):
         assert (moved / path).read_bytes() == (whole / path).read_bytes()
 

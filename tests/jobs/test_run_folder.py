@@ -12,6 +12,7 @@ import pytest
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.jobs.layout import is_finished
+from afm_rl.jobs.process import handled
 from afm_rl.jobs.run import Stop, _publish, begin, finish, needs_run
 from afm_rl.missions.run import Stopped
 from afm_rl.storage.files import locked
@@ -256,7 +257,8 @@ def test_folders_that_cannot_be_written_are_named(tmp_path):
 
 def test_a_signal_waits_for_the_step_and_a_second_one_does_not():
     stop, before = Stop(), signal.getsignal(signal.SIGTERM)
-    with stop.on(signal.SIGTERM), stop.between_steps():
+    with handled(stop, signal.SIGTERM):
+        stop.waits = True
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.01)
         assert stop.asked
