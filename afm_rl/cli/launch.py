@@ -24,7 +24,6 @@ from afm_rl.jobs.batch import Pool, run_batch
 from afm_rl.jobs.layout import JOBS, LOG
 from afm_rl.jobs.local import LocalPool
 from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
-from afm_rl.jobs.tables import read_measures, read_missions, read_steps
 from afm_rl.missions import Agent, build
 from afm_rl.missions.checkpoint import Stopped
 from afm_rl.missions.explained import explain_mission
@@ -33,6 +32,7 @@ from afm_rl.report import (
     check_video,
     film_results,
     print_summary,
+    read_runs,
     write_films,
     write_report,
     write_run,
@@ -147,12 +147,13 @@ def show(
     draw: Any = None,
 ) -> None:
     """Draw the results of a run or a comparison, print their table, and explain a mission."""
-    missions, steps, measures = read_missions(folder), read_steps(folder), read_measures(folder)
+    runs = read_runs([folder])
+    missions, steps, measures = runs.missions, runs.steps(), runs.measures
     with locked(folder):
         # What is drawn anew leaves the manifest first, so that this may be interrupted.
         names = [*read_manifest(folder)["files"]]
         write_manifest(folder, [name for name in names if Path(name).parts[0] not in SHOWN])
-        what = {"figures": cfg.figures, "tensorboard": cfg.tensorboard, "tables": False}
+        what = {"figures": cfg.figures, "tensorboard": cfg.tensorboard}
         write_run(folder, missions, steps, measures, tracks, **what)
         if film is not None:
             try:
@@ -183,15 +184,14 @@ def _explain(
 
 def report(folder: Path, cfg: DictConfig, film: str | None) -> None:
     """Write the report on a sweep or a study, as far as there are results."""
-    missions = read_missions(folder)
-    if len(missions):
-        print_summary(missions, read_measures(folder))
-        try:
-            write_report([folder], folder / "report", figures=cfg.figures, load_track=load_track)
-            if film is not None:
-                film_results([folder], folder / "report" / "video", film, load_track)
-        except AFMError as error:  # such as jobs that cannot stand in one table
-            print(f"afm-rl: no report: {error}", file=sys.stderr)
+    try:
+        runs = read_runs([folder])
+        print_summary(runs.missions, runs.measures)
+        write_report(runs, folder / "report", figures=cfg.figures, load_track=load_track)
+        if film is not None:
+            film_results(runs, folder / "report" / "video", film, load_track)
+    except AFMError as error:  # such as jobs that cannot stand in one table
+        print(f"afm-rl: no report: {error}", file=sys.stderr)
     print(f"Results: {folder}")
 
 

@@ -1,9 +1,9 @@
-"""The figures of a report, and what they and the recovery table need of the steps."""
+"""The figures of a run and of a report, and what a report needs of the steps."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from collections.abc import Collection as AnyOf
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,14 +11,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from afm_rl.report import comparison, heatmaps, learning, shares, space_plot, style
-from afm_rl.report.collect import Collection
 from afm_rl.report.recovery import MEASURES, recovery_times
-from afm_rl.report.results_files import read_steps
+from afm_rl.report.runs import Runs
 from afm_rl.report.track_plot import DrawableTrack
+from afm_rl.report.trajectory import draw_trajectories
 from afm_rl.storage.measures import Measures
-
-CELLS = 4  # of a track: curves and maps of more say less
-POINTS = 240  # of each curve of progress
 
 
 @dataclass
@@ -41,7 +38,32 @@ class Excerpts:
     places: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
 
 
-def telling_cells(missions: pd.DataFrame, measures: Measures) -> list[str]:
+def draw_run(
+    missions: pd.DataFrame,
+    steps: pd.DataFrame,
+    measures: Measures,
+    tracks: Sequence[DrawableTrack],
+) -> dict[str, Callable[[], Figure]]:
+    """Return what there is to draw of a run, by name.
+
+    Args:
+        missions: one row per mission.
+        steps: one row per mission and step.
+        measures: what methods are compared by.
+        tracks: tracks to draw, found by name.
+    """
+    drawings: dict[str, Callable[[], Figure]] = {}
+    if set(space_plot.COLUMNS) <= set(steps):
+        drawings["space"] = lambda: space_plot.draw_space(missions, steps)
+    elif {"x", "y"} <= set(steps):
+        drawings["trajectory"] = lambda: draw_trajectories(missions, steps, measures, tracks)
+    drawings["learning"] = lambda: learning.draw_learning(missions, steps, measures.error_unit)
+    if missions["method"].duplicated().any():
+        drawings["summary"] = lambda: comparison.draw_comparison(missions, measures)
+    return drawings
+
+
+def telling_cells(missions: pd.DataFrame, measures: Measures, most: int = 4) -> list[str]:
     """Return on each track the cells in which methods differ most, by the first measure.
 
     >>> from afm_rl.storage.measures import Measure
@@ -53,7 +75,7 @@ def telling_cells(missions: pd.DataFrame, measures: Measures) -> list[str]:
     column = measures.headlines[0].column
     means = missions.groupby(["track", "cell", "method"], sort=False)[column].mean()
     spread = means.groupby(["track", "cell"], sort=False).std().fillna(0.0)
-    chosen = spread.sort_values(ascending=False, kind="stable").groupby("track").head(CELLS)
+    chosen = spread.sort_values(ascending=False, kind="stable").groupby("track").head(most)
     return [cell for track, cell in spread.index if (track, cell) in chosen.index]
 
 
@@ -70,19 +92,20 @@ def traced_missions(missions: pd.DataFrame) -> pd.DataFrame:
     return missions.merge(chosen, on=["cell", "seed"])
 
 
-def excerpts(collection: Collection, mapped: AnyOf[str]) -> Excerpts:
+def excerpts(runs: Runs, mapped: AnyOf[str], points: int = 240) -> Excerpts:
     """Read the steps of each method in turn and keep excerpts.
 
     Args:
-        collection: the results.
+        runs: the results.
         mapped: cells to keep places of.
+        points: of each curve of progress.
     """
-    known = collection.missions[collection.missions["file"] >= 0]
+    known, progress = runs.with_steps, runs.measures.progress
     last = known["steps"].max() + 1 if len(known) else 1
-    found, progress = Excerpts(np.linspace(0, last, POINTS)), collection.measures.progress
+    found = Excerpts(np.linspace(0, last, points))
     columns = [*MEASURES, "regime_active", "x", "y", *(progress or ())[:1]]
     for method, missions in known.groupby("method", sort=False):
-        steps = dict(iter(read_steps(collection.files, missions, columns).groupby("mission")))
+        steps = dict(iter(runs.steps(missions, columns).groupby("mission")))
         own = missions[missions["mission"].isin(list(steps))]
         places: dict[str, list[np.ndarray]] = {}
         for mission in own.to_dict("records"):
@@ -122,51 +145,48 @@ def share_reached(
 
 
 def draw_all(
-    missions: pd.DataFrame,
-    collection: Collection,
-    found: Excerpts,
-    tracks: list[DrawableTrack],
+    runs: Runs, missions: pd.DataFrame, found: Excerpts, tracks: Sequence[DrawableTrack]
 ) -> Iterator[tuple[str, str, str, Figure]]:
     """Yield name, title, caption and figure, in the order of the page.
 
     Where there are more than six methods, figures of lines and maps come in several pages.
 
     Args:
-        missions: one row per mission, from :func:`~afm_rl.report.summary.count_budgets`.
-        collection: the results.
+        runs: the results.
+        missions: one row per mission, from :func:`~.means.count_budgets`.
         found: from :func:`excerpts`.
         tracks: tracks to draw; a map whose track is not here has no road.
     """
-    measures, known = collection.measures, {track.name: track for track in tracks}
+    measures, known = runs.measures, {track.name: track for track in tracks}
     figure = comparison.draw_comparison(missions, measures)
     yield "summary", "All missions", comparison.CAPTION, figure
     chosen = missions[missions["cell"].isin(telling_cells(missions, measures))]
     traced = traced_missions(chosen[chosen["file"] >= 0])
-    traces = read_steps(collection.files, traced) if len(traced) else pd.DataFrame()
+    traces = runs.steps(traced) if len(traced) else pd.DataFrame()
     space = set(space_plot.COLUMNS) <= set(traces)
     for track, own in traced.groupby("track", sort=False):
-        for page, methods in _pages(
-            f"learning_{track}", f"How far plans came true on {track}", own
-        ):
+        title = f"How far plans came true on {track}"
+        for page, methods in _pages(f"learning_{track}", title, own["method"]):
             rows = own[own["method"].isin(methods)]
             figure = learning.draw_learning(rows, traces, measures.error_unit)
             yield *page, learning.CAPTION, figure
     if (spent := measures.budget) and missions["finished"].any():
         ratio, caption = shares.ratios(missions, spent), shares.PROFILE_CAPTION
-        for page, methods in _pages("profile", "Performance profile", missions):
+        for page, methods in _pages("profile", "Performance profile", missions["method"]):
             figure = shares.draw_profile(missions, ratio, spent, style.method_styles(methods))
             yield *page, caption.format(name=spent.name), figure
-    name, known_missions = measures.headlines[0].title, missions[missions["file"] >= 0]
-    for page, methods in _pages("progress", "Progress", known_missions) if found.progress else ():
+    name = measures.headlines[0].title
+    for page, methods in _pages("progress", "Progress", found.progress):
         styles = style.method_styles(methods)
         figure = shares.draw_progress(found.grid, found.progress, found.cells, styles, name)
         yield *page, shares.PROGRESS_CAPTION.format(name=name), figure
     for track, own in missions.groupby("track", sort=False):
         places = {key: found.places[key] for key in found.places if key[0] in set(own["cell"])}
-        for page, methods in _pages(f"space_{track}", f"Paths on {track}", own) if space else ():
-            rows = traced[(traced["track"] == track) & traced["method"].isin(methods)]
-            yield *page, space_plot.CAPTION, space_plot.draw_space(rows, traces)
-        if places and not space:
+        if space:
+            for page, methods in _pages(f"space_{track}", f"Paths on {track}", own["method"]):
+                rows = traced[(traced["track"] == track) & traced["method"].isin(methods)]
+                yield *page, space_plot.CAPTION, space_plot.draw_space(rows, traces)
+        elif places:
             drawn = heatmaps.draw_heatmaps(places, known.get(str(track)))
             pages = _pages(f"heat_{track}", f"Places on {track}", [m for _, m in places])
             for (page, _), figure in zip(pages, drawn, strict=True):
@@ -174,14 +194,13 @@ def draw_all(
 
 
 def _pages(
-    name: str, title: str, missions: pd.DataFrame | list[str]
+    name: str, title: str, methods: Iterable[str]
 ) -> Iterator[tuple[tuple[str, str], list[str]]]:
     """Yield name and title of each of several figures, and the methods in it.
 
     >>> list(_pages("profile", "Profile", ["a"]))
     [(('profile', 'Profile'), ['a'])]
     """
-    methods = missions["method"] if isinstance(missions, pd.DataFrame) else missions
     groups = style.groups_of_methods(methods)
     for number, group in enumerate(groups, 1):
         one = (name, title)

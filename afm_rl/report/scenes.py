@@ -14,19 +14,15 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch, Polygon
 
 from afm_rl.report import style
-from afm_rl.report.frames import action_names
-from afm_rl.report.space_plot import GOAL, POSITION, REFERENCE, dress_space, mark_regimes
+from afm_rl.report.cells import action_names
+from afm_rl.report.space_plot import GOAL, POSITION, dress_space, mark_regimes
+from afm_rl.report.style import BEFORE, CHANGED, EXECUTED, PLANNED, REFERENCE, START, TARGET
 from afm_rl.report.track_plot import DrawableTrack, draw_road, view
-from afm_rl.report.trajectory import CHANGED, NOMINAL, START, changed_stretch, positions
+from afm_rl.report.trajectory import changed_stretch, positions
 
 COLUMNS = ("x", "y", "goal_x", "goal_y", "error", "misaligned", "regime_active")  # at least
-PLANNED: dict[str, Any] = {"color": "#0072b2", "linewidth": 6.0}
-EXECUTED: dict[str, Any] = {"color": "#cc79a7", "linewidth": 2.5}
-TARGET: dict[str, Any] = {"marker": "*", "color": "#009e73", "markersize": 13, "linestyle": ""}
 BODY = np.array([[1.0, 0.0], [-0.8, 0.65], [-0.4, 0.0], [-0.8, -0.65]])  # seen from above
-SIZE, ARROW = 0.022, 0.13  # robot and longest arrow, as parts of the map
 GRID = 0.16  # inches: sides of pictures are multiples of 16 pixels, as video codecs want them
-AHEAD = 0.5  # s, how long arrows turn
 LEAST = 1e-6  # smallest distance that is told apart from none
 
 
@@ -57,19 +53,19 @@ def map_scene(
     """
     paths = {method: positions(steps) for method, steps in runs.items()}
     box = view(track, list(paths.values()))
-    tall = 5.6 * np.clip((box.top - box.bottom) / (box.right - box.left), 0.4, 1.2)
+    tall = 5.6 * np.clip(box.ratio, 0.4, 1.2)
     figure = style.new_figure(6.4, GRID * round((tall + 2.3) / GRID))
     upper, lower = figure.subplots(2, 1, height_ratios=[tall, 1.1])
-    upper.set(xlim=(box.left, box.right), ylim=(box.bottom, box.top), aspect="equal")
-    upper.set(xlabel="x (m)", ylabel="y (m)")
-    style.dress(upper)
+    upper.set(xlim=box[:2], ylim=box[2:], aspect="equal")
+    style.dress(upper, "x (m)", "y (m)", size=10.0)
     if track is not None:
         draw_road(upper, track)
     column, label = _distance(runs)
     styles, alone = style.method_styles(runs), len(runs) == 1
     span = max(box.right - box.left, box.top - box.bottom)
-    timeline = _timeline([lower], max(runs.values(), key=len), alone)
-    lower.set(yscale="log", ylabel=label)
+    longest = max(runs.values(), key=len)
+    timeline = _timeline({label: lower}, longest, alone)
+    lower.set_yscale("log")
     moving: list[Artist] = [*timeline]
     shows, handles, labels = [], [], []
     for method, steps in runs.items():
@@ -83,9 +79,8 @@ def map_scene(
         shows.append(robot.show)
         handles += robot.handles if alone else [look.handle()]
         labels += robot.labels if alone else [method]
-    style.legend_above(figure, handles, labels, style.literal(title))
+    style.legend_above(figure, handles, labels, title)
     words = _words(upper)
-    longest = max(runs.values(), key=len)
 
     def show(row: int) -> None:
         for each in shows:
@@ -118,7 +113,7 @@ class _Robot:
         self.changed = np.where(
             changed_stretch(steps["regime_active"].to_numpy())[:, None], self.path, np.nan
         )
-        (self.before,) = axes.plot([], [], **NOMINAL | {"color": color}, zorder=4)
+        (self.before,) = axes.plot([], [], **BEFORE | {"color": color}, zorder=4)
         after = CHANGED if alone else {"color": color, "linewidth": 2.4}
         (self.under,) = axes.plot([], [], **after, zorder=4)
         self.body = Polygon(BODY, facecolor=color, edgecolor="white", linewidth=0.8, zorder=7)
@@ -133,7 +128,7 @@ class _Robot:
             self.handles, self.labels = [*self.handles, self.target], [*self.labels, "target"]
             self.moving.append(self.target)
         if alone and {"v", "omega"} <= set(action_names(steps)):
-            self.courses = _courses(steps, self.heading) * ARROW * span
+            self.courses = _courses(steps, self.heading) * 0.13 * span
             self.arrows = [_arrow(axes, PLANNED), _arrow(axes, EXECUTED)]
             self.handles += [Line2D([], [], **PLANNED), Line2D([], [], **EXECUTED)]
             self.labels += ["planned action", "executed action"]
@@ -150,7 +145,7 @@ class _Robot:
         for arrow, course in zip(self.arrows, self.courses if self.arrows else (), strict=True):
             arrow.set_positions(here, here + course[row])
         cos, sin = np.cos(self.heading[row]), np.sin(self.heading[row])
-        self.body.set_xy(here + SIZE * self.span * BODY @ np.array([[cos, sin], [-sin, cos]]))
+        self.body.set_xy(here + 0.022 * self.span * BODY @ np.array([[cos, sin], [-sin, cos]]))
 
 
 def space_scene(title: str, steps: pd.DataFrame) -> Scene:
@@ -171,12 +166,10 @@ def space_scene(title: str, steps: pd.DataFrame) -> Scene:
 
     height.plot(steps["t"], steps["goal_z"], **REFERENCE)
     height.plot(steps["t"], steps["z"], color=style.NOMINAL, linewidth=1.2)
-    height.set(ylabel="height (m)")
     looks = (PLANNED | {"linewidth": 3.0}, EXECUTED | {"linewidth": 1.2})
     for kind, look in zip(("planned", "executed"), looks, strict=True):
         effort.plot(steps["t"], steps[f"{kind}_{action}"], **look)
-    effort.set(ylabel=style.literal(action))
-    cursors = _timeline([height, effort], steps, True)
+    cursors = _timeline({"height (m)": height, action: effort}, steps, True)
 
     (line,) = space.plot([], [], [], color=style.NOMINAL, linewidth=1.4)
     (robot,) = space.plot([], [], [], "o", color=style.REGIME, markersize=7)
@@ -185,7 +178,7 @@ def space_scene(title: str, steps: pd.DataFrame) -> Scene:
     handles = [Line2D([], [], **REFERENCE), line, robot, goal]
     handles += [Line2D([], [], **look) for look in looks]
     labels = ["reference", "path", "now", "set-point", f"planned {action}", f"executed {action}"]
-    style.legend_above(figure, handles, labels, style.literal(title))
+    style.legend_above(figure, handles, labels, title)
 
     def show(row: int) -> None:
         line.set_data_3d(*path[: row + 1].T)
@@ -196,34 +189,40 @@ def space_scene(title: str, steps: pd.DataFrame) -> Scene:
     return Scene(figure, [line, goal, robot, *cursors, words], show)
 
 
-def _courses(steps: pd.DataFrame, heading: np.ndarray) -> np.ndarray:
-    """Return arrows ``(2, T, 2)`` of planned and executed actions, the longest of size 1."""
+def _courses(steps: pd.DataFrame, heading: np.ndarray, ahead: float = 0.5) -> np.ndarray:
+    """Return arrows ``(2, T, 2)`` of planned and executed actions, the longest of size 1.
+
+    They turn for ``ahead`` seconds.
+    """
     kinds = ("planned", "executed")
     fast, turning = (
         np.stack([steps[f"{kind}_{name}"].to_numpy(dtype=float) for kind in kinds])
         for name in ("v", "omega")
     )
-    angle = heading + AHEAD * turning
+    angle = heading + ahead * turning
     longest = max(float(np.nanmax(np.abs(fast))), LEAST)
     return np.stack([np.cos(angle), np.sin(angle)], -1) * (fast / longest)[..., None]
 
 
-def _arrow(axes: Axes, look: dict[str, Any]) -> FancyArrowPatch:
-    head: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 9 + look["linewidth"]}
+def _arrow(axes: Axes, look: style.Look) -> FancyArrowPatch:
+    head: style.Look = {"arrowstyle": "-|>", "mutation_scale": 9 + look["linewidth"]}
     arrow = FancyArrowPatch((0, 0), (0, 0), shrinkA=0, shrinkB=0, zorder=6, **head, **look)
     axes.add_patch(arrow)
     return arrow
 
 
-def _timeline(panels: Sequence[Axes], steps: pd.DataFrame, alone: bool) -> list[Line2D]:
-    """Dress axes over time; return the lines that mark now. Methods change at different steps."""
+def _timeline(panels: Mapping[str, Axes], steps: pd.DataFrame, alone: bool) -> list[Line2D]:
+    """Dress axes over time, by their labels; return the lines that mark now.
+
+    Methods change at different steps: changes are marked of a method ``alone``.
+    """
     if alone:
-        mark_regimes(panels, steps)
-    for axes in panels:
-        style.dress(axes)
+        mark_regimes([*panels.values()], steps)
+    for label, axes in panels.items():
+        last = axes is [*panels.values()][-1]
+        style.dress(axes, "step" if last else "", label, size=10.0)
         axes.set_xlim(0, max(int(steps["t"].iloc[-1]), 1))
-    panels[-1].set_xlabel("step")
-    return [axes.axvline(0, color=style.REGIME, linewidth=1.2) for axes in panels]
+    return [axes.axvline(0, color=style.REGIME, linewidth=1.2) for axes in panels.values()]
 
 
 def _words(axes: Any) -> Any:
