@@ -18,9 +18,9 @@ from afm_rl.jobs.process import Ends, Job
 from afm_rl.jobs.progress import Board
 from afm_rl.jobs.run import begin, needs_run
 from afm_rl.jobs.tables import write_tables
-from afm_rl.missions.trust import trusted
 from afm_rl.storage.files import locked, remove_parts, write_whole
 from afm_rl.storage.manifest import MANIFEST, write_manifest
+from afm_rl.trust import trusted
 
 LONGEST = 120  # characters of the name of a job's folder
 

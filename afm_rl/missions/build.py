@@ -29,9 +29,9 @@ from afm_rl.missions.selection import (
     select_seeds,
     select_tracks,
 )
-from afm_rl.missions.trust import check_targets
 from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.transforms import ActionFlowTransform, Guard
+from afm_rl.trust import check_targets
 
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
 MOST_STEPS, MOST_MISSIONS = 10_000_000, 1_000_000

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.missions.trust import check_composed, check_targets
+from afm_rl.trust import check_composed, check_targets
 
 DANGEROUS = """
 os.system os.popen os.execv os.execvp os.spawnl os.remove os.unlink os.rename os.rmdir os.removedirs
@@ -92,5 +92,5 @@ def test_trust_covers_what_a_package_defines_and_nothing_it_imports(tmp_path, mo
 
 
 def test_names_are_checked_without_torch():
-    code = "import afm_rl.missions.trust, sys; assert 'torch' not in sys.modules"
+    code = "import afm_rl.trust, sys; assert 'torch' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
