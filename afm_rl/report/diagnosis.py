@@ -18,8 +18,9 @@ from rich.text import Text
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
 from afm_rl.report import style
 from afm_rl.report.console import terminal
+from afm_rl.report.figures import Picture
 from afm_rl.report.table import Table
-from afm_rl.report.write import Picture, render_page
+from afm_rl.report.write import render_page
 from afm_rl.storage.files import write_whole
 
 LOOKS = {"healthy": "green", "changed": "bold red", "dead": "bold red", "cannot tell": "yellow"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from textwrap import wrap
 
 import numpy as np
@@ -27,9 +26,9 @@ CAPTION = (
     "and correction together predicted it; where a plan cannot be achieved under the changed "
     "regime, this one is low and the first is not. Third: how far from what the model alone "
     "predicts of the executed action; a frozen model under a correction never improves here. Last: "
-    "the model's loss; losses of different kinds of model do not compare. Lines are moving "
-    "averages over 20 steps. Triangles mark where each method's changed regime starts and ends: "
-    "the sooner they come, the faster the method was."
+    "the model's loss; losses of different kinds of model do not compare. Triangles mark where "
+    "each method's changed regime starts and ends: the sooner they come, the faster the method "
+    "was."
 )
 
 
@@ -40,8 +39,7 @@ def draw_learning(
 
     Rows: the distance from the plan, from the prediction, the model's error and its loss, as far
     as the steps have them. One column per cell, first seed and six methods only; the footnote says
-    what is left out. Lines are moving averages over 20 steps, with the raw values faint behind
-    them if there are few. Triangles mark where each method's changed regime starts and ends. Where
+    what is left out. Triangles mark where each method's changed regime starts and ends. Where
     some missions finish, the axis ends soon after the last of them, and its label names the
     methods that go on.
 
@@ -63,9 +61,10 @@ def draw_learning(
             style.dress(panel, below, label if panel in grid[:, 0] else "", "y")
             panel.set_xlim(0, last_step(own))
             for row in own.itertuples():
-                look = styles[row.method]
-                _draw_curve(panel, curves[row.mission], name, look, raw=len(own) <= 3)
-                _mark_regime(panel, curves[row.mission], look, alone=len(own) == 1)
+                curve, look = curves[row.mission], styles[row.method]
+                values = curve[name].where(np.isfinite(curve[name]))
+                look.line(panel, curve["t"], values, gid="curve", linewidth=look.width / 2)
+                _mark_regime(panel, curve, look, alone=len(own) == 1)
         column[0].set_title(style.literal(str(cell)), fontsize=style.NORMAL, pad=8)
     for panels, name in zip(grid, rows, strict=True):
         for panel in panels:
@@ -96,19 +95,6 @@ def last_step(missions: pd.DataFrame, beyond: float = 1.15) -> float:
     return max(1.0, float(end))
 
 
-def extremes(t: np.ndarray, values: pd.Series, stride: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest of every ``stride`` values: fewer points, same look.
-
-    >>> t, values = extremes(np.arange(4), pd.Series([3.0, 1.0, 2.0, 5.0]), 2)
-    >>> t.tolist(), values.tolist()
-    ([0, 0, 2, 2], [1.0, 3.0, 2.0, 5.0])
-    """
-    if stride == 1:
-        return t, values.to_numpy()
-    bins = values.groupby(np.arange(len(values)) // stride)
-    return t[::stride].repeat(2), bins.agg(["min", "max"]).to_numpy().ravel()
-
-
 def regime_changes(steps: pd.DataFrame) -> tuple[list[int], list[int]]:
     """Return the steps at which the changed regime starts, and those at which it has ended.
 
@@ -121,20 +107,6 @@ def regime_changes(steps: pd.DataFrame) -> tuple[list[int], list[int]]:
     active = steps["regime_active"].to_numpy().astype(int)
     change, t = np.diff(active, prepend=0), steps["t"].to_numpy()
     return t[change == 1].tolist(), t[change == -1].tolist()
-
-
-def _draw_curve(
-    axes: Axes, steps: pd.DataFrame, name: str, look: style.Style, raw: bool, most: int = 800
-) -> None:
-    """Draw a column's moving average, of ``most`` points, and its raw values faint behind it."""
-    shown = steps[steps["t"] <= axes.get_xlim()[1]]
-    values = shown[name].where(np.isfinite(shown[name]))
-    t, stride = shown["t"].to_numpy(), max(1, math.ceil(len(shown) / most))
-    if raw:
-        faint: style.Look = {"linewidth": 0.5, "alpha": 0.25, "zorder": 1.5, "gid": "raw"}
-        axes.plot(*extremes(t, values, stride), color=look.color, **faint)
-    mean = values.rolling(20, min_periods=1).mean()
-    look.line(axes, t[::stride], mean[::stride], gid="mean")
 
 
 def _mark_regime(axes: Axes, steps: pd.DataFrame, look: style.Style, alone: bool) -> None:

@@ -130,8 +130,8 @@ def aggregate(missions: pd.DataFrame, measures: Measures, oracle: str) -> pd.Dat
                 found = estimate(name, logs, chosen["cell"])
                 row |= {key: float(np.exp(value)) for key, value in found.items()}
                 row[f"{name}_pairs"] = len(chosen)
-        counted = own["seconds"].count() if "seconds" in own else 0
-        row["per_hour"] = 3600 * counted / row["seconds"] if counted else math.nan
+        counted, seconds = own.get("seconds", pd.Series()).count(), row.pop("seconds", 0.0)
+        row["per_hour"] = 3600 * counted / seconds if seconds else math.nan
     return pd.DataFrame(rows)
 
 

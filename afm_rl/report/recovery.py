@@ -43,8 +43,8 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
     >>> recovery_times(steps).to_dict("records")
     [{'of': 'model', 'change': 1, 'first': 7.0, 'time': 7.0}]
     """
-    changes = np.flatnonzero(np.diff(steps["regime_active"].to_numpy())) + 1
-    rows = []
+    active = steps["regime_active"].to_numpy() if len(steps) else []
+    changes, rows = np.flatnonzero(np.diff(active)) + 1, []
     for column, of in MEASURES.items():
         if len(changes) and column in steps and steps[column].notna().all():
             times = _times(steps[column].to_numpy(dtype=float), changes)

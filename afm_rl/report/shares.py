@@ -75,19 +75,13 @@ def draw_profile(
 
 
 def draw_progress(
-    grid: np.ndarray,
-    shares: Mapping[str, np.ndarray],
-    cells: Mapping[str, pd.Series],
-    styles: Mapping[str, style.Style],
-    name: str,
-    resamples: int = 500,
+    progress: pd.DataFrame, styles: Mapping[str, style.Style], name: str, resamples: int = 500
 ) -> Figure:
     """Return a figure of the mean share of what was reached against the number of steps.
 
     Args:
-        grid: numbers of steps ``(G,)``.
-        shares: per method, ``(B, G)``, one row per mission.
-        cells: per method, the cell of each mission, ``(B,)``.
+        progress: shares, one row per ``method`` and ``cell`` of a mission (the index), one column
+            per number of steps.
         styles: the methods to draw, and how.
         name: what is reached.
         resamples: draws of the bootstrap; the band is as wide as a line, no need for more.
@@ -96,12 +90,15 @@ def draw_progress(
     def mean(samples: list[np.ndarray]) -> np.ndarray:
         return np.concatenate(samples, -1).mean(-1)
 
-    means = {method: shares[method].mean(0) for method in styles}
-    counts = {method: len(shares[method]) for method in styles}
+    grid = progress.columns.to_numpy(dtype=float)
+    own = {method: progress.loc[[method]] for method in styles}
+    means = {method: rows.to_numpy().mean(0) for method, rows in own.items()}
+    counts = {method: len(rows) for method, rows in own.items()}
     figure = _draw(grid, means, counts, styles, {"gid": "progress"})
     (axes,) = figure.axes
     for method, look in styles.items():
-        low, high = resampled_bounds(split(shares[method], cells[method]), mean, resamples)
+        samples = split(own[method].to_numpy(), own[method].index.get_level_values("cell"))
+        low, high = resampled_bounds(samples, mean, resamples)
         band: style.Look = {"color": look.color, "alpha": 0.15, "linewidth": 0}
         axes.fill_between(grid, 100 * low, 100 * high, **band)
     axes.set_xlim(0, grid[-1])

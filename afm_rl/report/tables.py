@@ -109,8 +109,10 @@ def comparison_tables(numbers: pd.DataFrame, measures: Measures) -> list[Table]:
 
 def cell_table(missions: pd.DataFrame, measures: Measures) -> Table:
     """Return the means of each method (a column) in each cell (a row), by the headline measures."""
-    numbers, methods = summarise(missions, measures, ["cell", "method"]), missions["method"]
-    heads, rows, bold, short = ["cell", *methods.unique()], [], set(), measures.headlines
+    timeless = missions.drop(columns="seconds", errors="ignore")  # the same file for the same runs
+    numbers = summarise(timeless, measures, ["cell", "method"])
+    heads, rows, bold = ["cell", *missions["method"].unique()], [], set()
+    short = measures.headlines
     for place, (cell, group) in enumerate(numbers.groupby("cell", sort=False)):
         texts, rank = dict.fromkeys(heads, "-") | {"cell": cell}, {}
         for row in group.to_dict("records"):

@@ -22,9 +22,14 @@ class Box(NamedTuple):
     top: float
 
     @property
+    def span(self) -> tuple[float, float]:
+        """Width and height."""
+        return self.right - self.left, self.top - self.bottom
+
+    @property
     def ratio(self) -> float:
         """Height over width."""
-        return (self.top - self.bottom) / (self.right - self.left)
+        return self.span[1] / self.span[0]
 
 
 class DrawableTrack(Protocol):

@@ -18,13 +18,19 @@ from afm_rl.report.cells import outcome, steps_of
 from afm_rl.report.track_plot import Box, DrawableTrack, distance_to, draw_road, view
 from afm_rl.storage.measures import Measures
 
+CAPTION = (
+    "One seed: the line that each robot drove, methods side by side, cells below each other, and "
+    "its measures. The stretch under the changed regime is broad. A robot that leaves the road is "
+    "followed a little way only."
+)
+
 
 def draw_trajectories(
     missions: pd.DataFrame,
     steps: pd.DataFrame,
     measures: Measures,
     tracks: Sequence[DrawableTrack] = (),
-    panels: int = 12,
+    panels: int = 24,
 ) -> Figure:
     """Return a figure of driven lines, methods side by side, cells below each other.
 

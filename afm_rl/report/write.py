@@ -6,15 +6,13 @@ import base64
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.report import style
 from afm_rl.report.events import folder_names, write_events
-from afm_rl.report.figures import draw_all, draw_run, excerpts, telling_cells
+from afm_rl.report.figures import Picture, draw_report, draw_run, read_excerpts
 from afm_rl.report.means import aggregate, budget_notes, compare, count_budgets
 from afm_rl.report.recovery import recovery_table
 from afm_rl.report.runs import Runs
@@ -40,15 +38,6 @@ REFERENCES = (
     "E. D. Dolan, J. J. Moré: Benchmarking optimization software with performance profiles. "
     "Mathematical Programming 91, 2002.",
 )
-
-
-class Picture(NamedTuple):
-    """A figure of a page."""
-
-    name: str
-    title: str
-    caption: str
-    png: bytes
 
 
 def write_run(
@@ -96,11 +85,10 @@ def write_run(
     if tensorboard:
         written += write_events(folder / "tensorboard", missions, steps, measures)
         echo(f"wrote {folder / 'tensorboard'} (tensorboard --logdir {folder / 'tensorboard'})")
-    for name, draw in draw_run(missions, steps, measures, tracks).items() if figures else ():
-        path = folder / "figures" / f"{name}.png"
-        write_whole(path, style.png_bytes(draw()))
-        written.append(path)
-        echo(f"wrote {path}")
+    for picture in draw_run(missions, steps, measures, tracks) if figures else ():
+        written.append(folder / "figures" / f"{picture.name}.png")
+        write_whole(written[-1], picture.png)
+        echo(f"wrote {written[-1]}")
     return written
 
 
@@ -160,11 +148,11 @@ def write_report(
     for line in (summary, *notes, *(line for table in lost for line in missing_lines(table))):
         echo(line)
 
-    found = excerpts(runs, telling_cells(missions, measures) if figures else [])
+    recovery, progress = read_excerpts(runs)
     tables = [
         summary_table(aggregate(missions, measures, oracle), measures, oracle),
         *comparison_tables(compare(missions, measures, baselines), measures),
-        *([recovery_table(pd.concat(found.recovery))] if sum(map(len, found.recovery)) else []),
+        *([recovery_table(recovery)] if len(recovery) else []),
         cell_table(missions, measures),
         *lost,
     ]
@@ -177,10 +165,10 @@ def write_report(
     pictures = []
     if figures:
         tracks = load_tracks(missions["track"].unique(), load_track)
-        for name, title, caption, figure in draw_all(runs, missions, found, tracks):
-            pictures.append(Picture(name, title, caption, style.png_bytes(figure)))
-            path = out / "figures" / f"{folder_names([name])[0]}.png"
-            write_whole(path, pictures[-1].png)
+        for picture in draw_report(runs, missions, progress, tracks):
+            pictures.append(picture)
+            path = out / "figures" / f"{folder_names([picture.name])[0]}.png"
+            write_whole(path, picture.png)
         echo(f"wrote {len(pictures)} figures: {out / 'figures'}")
     title = f"Results: {len(runs.methods)} methods, {cells} cells"
     page = render_page(title, summary, notes, pictures, tables, REFERENCES)
