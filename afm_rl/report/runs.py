@@ -90,7 +90,7 @@ class Runs:
         names = None if columns is None else list(dict.fromkeys(["mission", "t", *columns]))
         parts = []
         for place, own in rows.groupby("file"):
-            number = own.set_index("own")["mission"]
+            number = own.set_index("own")["mission"].astype("int32")
             part = read_numbers(self.files[place], number.index.tolist(), names)
             parts.append(part.assign(mission=part["mission"].map(number)))
         joined = pd.concat(parts) if parts else pd.DataFrame(columns=names or ["mission", "t"])
@@ -126,11 +126,13 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
             for name in gone
         ]
         for run in runs:
-            plan += _plan(run)
-            if not _has_results(run):
+            if _has_results(run):
+                check_manifest(run)
+                plan += _plan(run)
+            else:
+                plan += _plan(run)
                 notes.append(f"{run} has no results yet.")
                 continue
-            check_manifest(run)
             declared = _read_measures(run / FILE)
             if declared != (measures or declared):
                 raise ConfigurationError(

@@ -66,27 +66,13 @@ def load_tracks(names: Iterable[str], load_track: LoadTrack | None) -> list[Draw
     return tracks
 
 
-def resample(points: np.ndarray, spacing: float) -> np.ndarray:
-    """Return points ``(N, 2)`` along a closed line ``(M, 2)``, at most ``spacing`` apart.
-
-    >>> square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    >>> resample(square, 0.5).tolist()[:3]
-    [[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]]
-    """
-    closed = np.concatenate([points, points[:1]])
-    station = np.concatenate([[0.0], np.hypot(*np.diff(closed, axis=0).T).cumsum()])
-    count = max(2, int(np.ceil(station[-1] / spacing)))
-    wanted = np.arange(count) * (station[-1] / count)
-    return np.stack([np.interp(wanted, station, closed[:, k]) for k in range(2)], -1)
-
-
 def draw_road(axes: Axes, track: DrawableTrack) -> None:
     """Draw the road as a ribbon, with its waypoints.
 
-    The ribbon is a row of discs, 16 in a road's width: it is as wide as the track says whatever
-    the size of the axes, and sharp corners come out right.
+    The ribbon is a row of discs: it is as wide as the track says whatever the size of the axes, and
+    sharp corners come out right.
     """
-    middle = resample(np.asarray(track.centerline, dtype=float), track.width / 16)
+    middle = np.asarray(track.centerline, dtype=float)
     size = np.full(len(middle), float(track.width))
     discs = EllipseCollection(
         size, size, np.zeros(len(middle)), units="xy", offsets=middle, facecolors=ROAD, linewidths=0

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.report import check_video, film_results, write_films, write_run
+from afm_rl.report import check_video, film_results, read_runs, write_films
 from afm_rl.report.film import ENCODERS, FRAMES, LAST, frames
 from afm_rl.report.scenes import map_scene, space_scene
 from afm_rl.storage.manifest import write_manifest
@@ -155,10 +155,10 @@ def test_a_film_moves_and_its_background_does_not(drive, ring):
 
 @pytest.mark.parametrize(("length", "expected"), [(1, 1), (2, 2), (FRAMES + 70, FRAMES)])
 def test_long_missions_are_shown_in_strides(length, expected):
-    scene = space_scene("title", fly(length)[1])
-    rows = []
-    watched = scene._replace(show=lambda row: (rows.append(row), scene.show(row)))
-    assert len(list(frames(watched, length))) == expected
+    scene, rows = space_scene("title", fly(length)[1]), []
+    watched = {part: lambda row, move=move: move(row) for part, move in scene.moving.items()}
+    watched[next(iter(watched))] = rows.append
+    assert len(list(frames(scene._replace(moving=watched), length))) == expected
     assert rows[1] == 0 and rows[-1] == length - 1
 
 
@@ -182,31 +182,27 @@ def test_one_film_per_method_and_one_of_all(tmp_path, make_results, ring):
         assert path.stat().st_size < 500_000
 
 
-def test_films_are_made_from_a_folder_alone(tmp_path, make_results, laps, ring):
+def test_films_are_made_from_a_folder_alone(tmp_path, store, make_results, ring):
     missions, steps = make_results(methods=("oracle",))
     steps = steps[steps["t"] < 5]
-    write_run(tmp_path, missions, steps, laps, figures=False, tensorboard=False, echo=quiet)
-    write_manifest(tmp_path)
+    runs = read_runs([store("run", missions, steps)])
     direct = write_films(tmp_path / "one", missions, steps, [ring], echo=quiet)
-    stored = film_results([tmp_path], tmp_path / "two", load_track=lambda name: ring, echo=quiet)
+    stored = film_results(runs, tmp_path / "two", load_track=lambda name: ring, echo=quiet)
     assert [path.read_bytes() for path in stored] == [path.read_bytes() for path in direct]
 
 
-def test_films_of_flights_from_a_folder(tmp_path):
-    missions, steps = fly(6)
-    write_run(tmp_path, missions, steps, MSE, figures=False, tensorboard=False, echo=quiet)
-    write_manifest(tmp_path)
-    (path,) = film_results([tmp_path], tmp_path / "films", echo=quiet)
+def test_films_of_flights_from_a_folder(tmp_path, store):
+    runs = read_runs([store("run", *fly(6), MSE)])
+    (path,) = film_results(runs, tmp_path / "films", echo=quiet)
     assert len(pictures(path.read_bytes())[0]) == 6
 
 
-def test_a_folder_without_steps_is_refused(tmp_path):
-    missions, steps = fly(6)
-    write_run(tmp_path, missions, steps, MSE, figures=False, tensorboard=False, echo=quiet)
-    (tmp_path / "steps.parquet").unlink()
-    write_manifest(tmp_path)
+def test_a_folder_without_steps_is_refused(tmp_path, store):
+    folder = store("run", *fly(6), MSE)
+    (folder / "steps.parquet").unlink()
+    write_manifest(folder)
     with pytest.raises(ConfigurationError, match=r"no steps\.parquet; films"):
-        film_results([tmp_path], tmp_path / "films", echo=quiet)
+        film_results(read_runs([folder]), tmp_path / "films", echo=quiet)
 
 
 @pytest.mark.parametrize("lost", ["x", "regime_active", "goal_x"])
