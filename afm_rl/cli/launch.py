@@ -30,7 +30,7 @@ from afm_rl.missions.explained import explain_mission
 from afm_rl.missions.robot import Robot
 from afm_rl.report import (
     check_video,
-    film_results,
+    load_tracks,
     print_summary,
     read_runs,
     write_films,
@@ -157,7 +157,7 @@ def show(
         write_run(folder, missions, steps, measures, tracks, **what)
         if film is not None:
             try:
-                write_films(folder / "video", missions, steps, tracks, film, draw=draw)
+                write_films(folder / "video", runs, tracks, film, draw=draw)
             except ConfigurationError as error:  # such as a robot that cannot be drawn
                 print(f"afm-rl: no film: {error}", file=sys.stderr)
         explained = _explain(folder, cfg.figures, missions, steps, robot)
@@ -187,9 +187,10 @@ def report(folder: Path, cfg: DictConfig, film: str | None) -> None:
     try:
         runs = read_runs([folder])
         print_summary(runs.missions, runs.measures)
-        write_report(runs, folder / "report", figures=cfg.figures, load_track=load_track)
+        tracks = load_tracks(runs.missions["track"].unique(), load_track)
+        write_report(runs, folder / "report", tracks, figures=cfg.figures)
         if film is not None:
-            film_results(runs, folder / "report" / "video", film, load_track)
+            write_films(folder / "report" / "video", runs, tracks, film)
     except AFMError as error:  # such as jobs that cannot stand in one table
         print(f"afm-rl: no report: {error}", file=sys.stderr)
     print(f"Results: {folder}")

@@ -56,15 +56,16 @@ def main() -> None:
     options = parser.parse_args()
 
     from afm_rl.envs import load_track  # torch takes seconds: `--help` need not wait
-    from afm_rl.report import check_video, film_results, read_runs, write_report
+    from afm_rl.report import check_video, load_tracks, read_runs, write_films, write_report
 
     out = options.out or options.folders[0] / "report"
     chosen = {"baselines": options.baselines, "oracle": options.oracle, "figures": options.figures}
     with told_by(NAME):
         form, runs = check_video(options.video or False), read_runs(options.folders)
+        tracks = load_tracks(runs.missions["track"].unique(), load_track)
         if form:
-            film_results(runs, out / "video", form, load_track)
+            write_films(out / "video", runs, tracks, form)
         else:
-            write_report(runs, out, **chosen, load_track=load_track)
+            write_report(runs, out, tracks, **chosen)
         if runs.lost:
             raise ArtefactError("; ".join(runs.lost))

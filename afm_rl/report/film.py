@@ -14,13 +14,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.report.cells import first_missions, steps_of
+from afm_rl.report.cells import steps_of
 from afm_rl.report.events import folder_names
 from afm_rl.report.learning import last_step
 from afm_rl.report.runs import Runs
 from afm_rl.report.scenes import COLUMNS, Scene, map_scene, space_scene
 from afm_rl.report.style import FEW
-from afm_rl.report.track_plot import DrawableTrack, LoadTrack, load_tracks
+from afm_rl.report.track_plot import DrawableTrack
 from afm_rl.storage.files import write_whole
 
 FRAMES, RATE = 150, 15  # at most; per second
@@ -52,8 +52,7 @@ def check_video(video: bool | str) -> str | None:
 
 def write_films(
     folder: Path,
-    missions: pd.DataFrame,
-    steps: pd.DataFrame,
+    runs: Runs,
     tracks: Sequence[DrawableTrack] = (),
     form: str = "gif",
     echo: Callable[[str], object] = print,
@@ -68,8 +67,7 @@ def write_films(
 
     Args:
         folder: where to; made if it is not there.
-        missions: one row per mission.
-        steps: one row per mission and step; see :data:`~.scenes.COLUMNS`.
+        runs: the results; see :data:`~.scenes.COLUMNS` for what their steps must have.
         tracks: tracks to draw, found by name.
         form: ``"gif"`` or ``"mp4"``.
         echo: receives one line per film.
@@ -79,27 +77,32 @@ def write_films(
         The files written.
 
     Raises:
-        ConfigurationError: if a column is missing, or the folder cannot be written.
+        ConfigurationError: if there are no steps, a column is missing, or the folder cannot be
+            written.
     """
-    first, written = first_missions(missions).drop_duplicates("method"), []
-    together, *names = folder_names(["all_methods", *first["method"]])
-    rows, roads = steps_of(steps, first["mission"]), {track.name: track for track in tracks}
+    first = runs.with_steps.drop_duplicates("method")
+    if first.empty:
+        names = ", ".join(map(str, runs.folders))
+        raise ConfigurationError(f"{names}: no steps.parquet; films are drawn from it")
+    steps, roads = runs.steps(first), {track.name: track for track in tracks}
+    rows = steps_of(steps, first["mission"])
     space = {"z", "goal_z"} <= set(steps.dropna(axis=1, how="all"))
+    together, *names = folder_names(["all_methods", *first["method"]])
+    written: list[Path] = []
 
     def write(name: str, pictures: Iterable[np.ndarray]) -> None:
-        path = folder / f"{name}.{form}"
-        write_whole(path, ENCODERS[form](pictures))
-        written.append(path)
-        echo(f"wrote {path}")
+        written.append(folder / f"{name}.{form}")
+        write_whole(written[-1], ENCODERS[form](pictures))
+        echo(f"wrote {written[-1]}")
 
     cell = first["cell"].iloc[0]
     beside = first[first["cell"] == cell][:FEW]
     if draw is None and len(beside) > 1 and not space:
         end = last_step(beside)
-        runs = {m.method: _checked(rows, m.mission, steps) for m in beside.itertuples()}
-        runs = {name: own[own["t"] <= end] for name, own in runs.items()}
-        scene = map_scene(cell, runs, roads.get(beside["track"].iloc[0]))
-        write(together, frames(scene, max(map(len, runs.values()))))
+        parts = {m.method: _checked(rows, m.mission, steps) for m in beside.itertuples()}
+        parts = {name: own[own["t"] <= end] for name, own in parts.items()}
+        scene = map_scene(cell, parts, roads.get(beside["track"].iloc[0]))
+        write(together, frames(scene, max(map(len, parts.values()))))
     for mission, name in zip(first.itertuples(), names, strict=True):
         if draw is not None:
             own = rows[mission.mission]
@@ -110,33 +113,6 @@ def write_films(
         scene = space_scene(title, own) if space else map_scene(title, {mission.method: own}, road)
         write(name, frames(scene, len(own)))
     return written
-
-
-def film_results(
-    runs: Runs,
-    out: Path,
-    form: str = "gif",
-    load_track: LoadTrack | None = None,
-    echo: Callable[[str], object] = print,
-) -> list[Path]:
-    """Write films of results on disk, see :func:`write_films`.
-
-    Args:
-        runs: from :func:`~.runs.read_runs`.
-        out: where to.
-        form: ``"gif"`` or ``"mp4"``.
-        load_track: returns a track by name, to draw roads; may raise a ConfigurationError.
-        echo: receives one line per film.
-
-    Raises:
-        ConfigurationError: if there are no steps, or they cannot be filmed.
-    """
-    first = runs.with_steps.drop_duplicates("method")
-    if first.empty:
-        names = ", ".join(map(str, runs.folders))
-        raise ConfigurationError(f"{names}: no steps.parquet; films are drawn from it")
-    tracks = load_tracks(first["track"].unique(), load_track)
-    return write_films(out, first, runs.steps(first), tracks, form, echo)
 
 
 def frames(scene: Scene, count: int, dpi: int = 100) -> Iterator[np.ndarray]:

@@ -111,14 +111,14 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
     """
     if not folders:
         raise ConfigurationError("folders=[]: expected at least one folder of results")
-    folders, names = [Path(folder) for folder in folders], ", ".join(map(str, folders))
+    paths, names = [Path(folder) for folder in folders], ", ".join(map(str, folders))
     files: list[Path] = []
     tables: list[pd.DataFrame] = []
     plan: Plan = []
     notes: list[str] = []
     lost: list[str] = []
     measures: Measures | None = None
-    for place, folder in enumerate(folders):
+    for place, folder in enumerate(paths):
         runs, gone = _run_folders(folder, notes)
         lost += [
             f"{folder / 'jobs' / name}: missing, although {RECORD} names it; the command that made "
@@ -156,7 +156,7 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
     missions = pd.concat(tables, ignore_index=True)
     twice = missions[missions.duplicated(KEY, keep="last")]
     notes += [
-        f"{method}: {len(rows)} missions of {folders[place]} stand twice; "
+        f"{method}: {len(rows)} missions of {paths[place]} stand twice; "
         "the ones that were read last count."
         for (place, method), rows in twice.groupby(["folder", "method"], sort=False)
     ]
@@ -172,7 +172,7 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
             f"{without} of {len(missions)} missions have no {STEPS}: curves, maps and "
             "recovery times leave them out."
         )
-    return Runs(folders, missions, measures, files, plan, notes, lost)
+    return Runs(paths, missions, measures, files, plan, notes, lost)
 
 
 def _has_results(folder: Path) -> bool:

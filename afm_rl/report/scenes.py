@@ -206,8 +206,12 @@ def _cursors(panels: Mapping[str, Axes], steps: pd.DataFrame, alone: bool) -> Mo
         style.dress(axes, "step" if label == lowest else "", label, size=style.LARGE)
         axes.set_xlim(0, max(int(t[-1]), 1))
         line = axes.axvline(0, color=style.REGIME, linewidth=1.2)
-        moving[line] = lambda row, line=line: line.set_xdata([t[row]] * 2)
+        moving[line] = partial(_mark, line, t)
     return moving
+
+
+def _mark(line: Line2D, t: np.ndarray, row: int) -> None:
+    line.set_xdata([t[row]] * 2)
 
 
 def _words(axes: Any, steps: pd.DataFrame, alone: bool) -> Moves:

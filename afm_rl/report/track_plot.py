@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -52,17 +53,14 @@ class DrawableTrack(Protocol):
         """Width of the road."""
 
 
-LoadTrack = Callable[[str], DrawableTrack]
-
-
-def load_tracks(names: Iterable[str], load_track: LoadTrack | None) -> list[DrawableTrack]:
-    """Return the tracks that can be loaded; a map without its road is a map."""
+def load_tracks(
+    names: Iterable[str], load_track: Callable[[str], DrawableTrack]
+) -> list[DrawableTrack]:
+    """Return the tracks that can be loaded by name; a map without its road is a map."""
     tracks = []
-    for name in names if load_track else ():
-        try:
-            tracks.append(load_track(str(name)))  # type: ignore[misc]
-        except ConfigurationError:
-            continue
+    for name in names:
+        with suppress(ConfigurationError):
+            tracks.append(load_track(str(name)))
     return tracks
 
 

@@ -25,7 +25,7 @@ from afm_rl.report.tables import (
     missing_table,
     summary_table,
 )
-from afm_rl.report.track_plot import DrawableTrack, LoadTrack, load_tracks
+from afm_rl.report.track_plot import DrawableTrack
 from afm_rl.storage.csv_text import csv_text
 from afm_rl.storage.files import write_whole
 from afm_rl.storage.measures import Measures
@@ -95,12 +95,12 @@ def write_run(
 def write_report(
     runs: Runs,
     out: str | Path,
+    tracks: Sequence[DrawableTrack] = (),
     *,
     baselines: Sequence[str] | None = None,
     usual: Sequence[str] = ("online_pe", "adaptive_affine"),
     oracle: str = "oracle",
     figures: bool = True,
-    load_track: LoadTrack | None = None,
     echo: Callable[[str], object] = print,
 ) -> Path:
     """Write tables, figures and ``index.html`` of the results of runs and studies.
@@ -113,12 +113,12 @@ def write_report(
     Args:
         runs: from :func:`~.runs.read_runs`.
         out: where to; made if it is not there.
+        tracks: tracks to draw, found by name; a map whose track is not here has no road.
         baselines: methods that the others are compared with. None: those of ``usual`` that there
             are, or else the first method.
         usual: see ``baselines``.
         oracle: the method that knows the regime.
         figures: draw figures.
-        load_track: returns a track by name, to draw roads; may raise a ConfigurationError.
         echo: receives one line per thing to know.
 
     Returns:
@@ -164,7 +164,6 @@ def write_report(
     echo(f"wrote {len(tables)} tables: {out / 'tables'}")
     pictures = []
     if figures:
-        tracks = load_tracks(missions["track"].unique(), load_track)
         for picture in draw_report(runs, missions, progress, tracks):
             pictures.append(picture)
             path = out / "figures" / f"{folder_names([picture.name])[0]}.png"
