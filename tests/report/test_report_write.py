@@ -1,6 +1,7 @@
 """The whole report: files, page, LaTeX."""
 
 import base64
+import os
 import re
 from html.parser import HTMLParser
 
@@ -9,6 +10,7 @@ import pytest
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.report import read_runs, write_report, write_run
+from afm_rl.report.events import FILE
 from afm_rl.report.table import Table
 from afm_rl.storage.manifest import write_manifest
 from afm_rl.storage.measures import Measure, Measures
