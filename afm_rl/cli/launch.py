@@ -27,15 +27,15 @@ from afm_rl.jobs.executor import Executor, JobsFailed, LocalExecutor
 from afm_rl.jobs.layout import JOBS, LOG
 from afm_rl.jobs.process import handled
 from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
-from afm_rl.jobs.tables import read_measures, read_missions, read_steps
 from afm_rl.missions import Agent, build
 from afm_rl.missions.explained import explain_mission
 from afm_rl.missions.robot import Robot
 from afm_rl.missions.run import Stopped
 from afm_rl.report import (
     check_video,
-    film_results,
+    load_tracks,
     print_summary,
+    read_runs,
     write_films,
     write_report,
     write_run,
@@ -192,16 +192,17 @@ def show(
     draw: Any = None,
 ) -> None:
     """Draw the results of a run or a comparison, print their table, and explain a mission."""
-    missions, steps, measures = read_missions(folder), read_steps(folder), read_measures(folder)
+    runs = read_runs([folder])
+    missions, steps, measures = runs.missions, runs.steps(), runs.measures
     with locked(folder):
         # What is drawn anew leaves the manifest first, so that this may be interrupted.
         names = [*read_manifest(folder)["files"]]
         write_manifest(folder, [name for name in names if Path(name).parts[0] not in SHOWN])
-        what = {"figures": cfg.figures, "tensorboard": cfg.tensorboard, "tables": False}
+        what = {"figures": cfg.figures, "tensorboard": cfg.tensorboard}
         write_run(folder, missions, steps, measures, tracks, **what)
         if film is not None:
             try:
-                write_films(folder / "video", missions, steps, tracks, film, draw=draw)
+                write_films(folder / "video", runs, tracks, film, draw=draw)
             except ConfigurationError as error:  # such as a robot that cannot be drawn
                 print(f"afm-rl: no film: {error}", file=sys.stderr)
         explained = _explain(folder, cfg.figures, missions, steps, robot)
@@ -228,15 +229,15 @@ def _explain(
 
 def report(folder: Path, cfg: DictConfig, film: str | None) -> None:
     """Write the report on a sweep or a study, as far as there are results."""
-    missions = read_missions(folder)
-    if len(missions):
-        print_summary(missions, read_measures(folder))
-        try:
-            write_report([folder], folder / "report", figures=cfg.figures, load_track=load_track)
-            if film is not None:
-                film_results([folder], folder / "report" / "video", film, load_track)
-        except AFMError as error:  # such as jobs that cannot stand in one table
-            print(f"afm-rl: no report: {error}", file=sys.stderr)
+    try:
+        runs = read_runs([folder])
+        print_summary(runs.missions, runs.measures)
+        tracks = load_tracks(runs.missions["track"].unique(), load_track)
+        write_report(runs, folder / "report", tracks, figures=cfg.figures)
+        if film is not None:
+            write_films(folder / "report" / "video", runs, tracks, film)
+    except AFMError as error:  # such as jobs that cannot stand in one table
+        print(f"afm-rl: no report: {error}", file=sys.stderr)
     print(f"Results: {folder}")
 
 

@@ -98,7 +98,7 @@ def _run(
     total, clock, budget = len(agent.missions), time.perf_counter(), agent.settings["budget"]
     most = min(budget, getattr(agent.base_env, "max_steps", budget))
     with Bar(
-        total=total * most, initial=_done(loop, most), desc=agent.label, shown=progress
+        total=total * most, initial=_done(loop, most), desc=agent.label, shown=progress, main=True
     ) as bar:
         while len(loop.ids):
             ids = loop.ids

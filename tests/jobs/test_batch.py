@@ -22,7 +22,7 @@ from afm_rl.jobs.executor import LocalExecutor
 from afm_rl.jobs.layout import job_folders
 from afm_rl.jobs.process import Job
 from afm_rl.jobs.progress import Board
-from afm_rl.jobs.tables import read_missions, read_steps
+from afm_rl.report import read_runs
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import check_manifest
 
@@ -65,9 +65,11 @@ def test_what_a_batch_leaves_behind(jobs, tmp_path, forked, here):
     assert missions["seed"].tolist() == [0, 1] * 2 and "seconds" not in missions
     compute = pd.read_csv(tmp_path / "compute.csv")
     assert compute["missions"].tolist() == [2, 2] and compute["steps"].tolist() == [24, 24]
-    steps = read_steps(tmp_path)
-    assert steps.groupby("mission").size().tolist() == [12] * 4
-    assert read_missions(tmp_path)["seconds"].gt(0).all()
+    runs = read_runs([tmp_path])
+    assert runs.steps().groupby("mission").size().tolist() == [12] * 4
+    assert runs.missions["seconds"].gt(0).all() and runs.missions["method"].equals(
+        missions["method"]
+    )
     again = []
     run_batch(tmp_path, four, here, echo=again.append)
     assert again == ["4 of 4 jobs have results already"]
