@@ -8,9 +8,8 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
-import pandas as pd
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
@@ -20,29 +19,17 @@ from omegaconf.errors import OmegaConfBaseException
 
 from afm_rl.cli.error_messages import explain
 from afm_rl.cli.methods import jobs_of
-from afm_rl.envs import load_track
+from afm_rl.cli.show import report, show
 from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag, check_number
 from afm_rl.jobs.batch import run_batch
 from afm_rl.jobs.executor import Executor, JobsFailed, LocalExecutor
 from afm_rl.jobs.layout import JOBS, LOG
 from afm_rl.jobs.process import handled
-from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
+from afm_rl.jobs.run import Stop, begin, finish, needs_run
 from afm_rl.missions import Agent, build
-from afm_rl.missions.explained import explain_mission
-from afm_rl.missions.robot import Robot
 from afm_rl.missions.run import Stopped
-from afm_rl.report import (
-    check_video,
-    load_tracks,
-    print_summary,
-    read_runs,
-    write_films,
-    write_report,
-    write_run,
-)
-from afm_rl.report.diagnosis import write_diagnosis
+from afm_rl.report import check_video
 from afm_rl.storage.files import locked
-from afm_rl.storage.manifest import extend_manifest, read_manifest, write_manifest
 
 SWITCHES = ("overwrite", "progress", "figures", "tensorboard")
 ENDS = (signal.SIGINT, signal.SIGTERM)
@@ -59,20 +46,16 @@ def launch(cfg: DictConfig) -> None:
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
     jobs = jobs_of(cfg, cast(DictConfig, hydra))
-    agents = {job.label: build(job) for job in {job.label: job for job in jobs.values()}.values()}
-    roads = [getattr(agent.base_env, "tracks", ()) for agent in agents.values()]  # flights: none
-    tracks = list({track.name: track for some in roads for track in some}.values())
-    robot = next(iter(agents.values())).robot
-    draw = next((getattr(agent.base_env, "draw", None) for agent in agents.values()), None)
+    agents = [build(job) for job in {job.label: job for job in jobs.values()}.values()]
     if cfg.get("study") is None and len(jobs) == 1:
-        _run_alone(folder, next(iter(jobs.values())), next(iter(agents.values())))
-        show(folder, cfg, tracks, film, robot, draw)
+        _run_alone(folder, *jobs.values(), *agents)
+        show(folder, cfg, agents, film)
         return
     launcher = instantiate(hydra.launcher)
     executor = getattr(launcher, "executor", None) or LocalExecutor()  # Hydra's own have none
     failed = run_together(folder, jobs, executor, cfg, hydra.overrides.task)
     if cfg.get("study") is None and not failed:
-        show(folder, cfg, tracks, film, robot, draw)
+        show(folder, cfg, agents, film)
     else:
         report(folder, cfg, film)
     if failed:
@@ -181,64 +164,6 @@ def run_together(
         f"{len(failures)} of {len(failures.keys() | jobs.keys())} jobs failed "
         f"({folder / JOBS}/*/{LOG}); the same command tries them again"
     )
-
-
-def show(
-    folder: Path,
-    cfg: DictConfig,
-    tracks: Sequence[Any],
-    film: str | None,
-    robot: Robot,
-    draw: Any = None,
-) -> None:
-    """Draw the results of a run or a comparison, print their table, and explain a mission."""
-    runs = read_runs([folder])
-    missions, steps, measures = runs.missions, runs.steps(), runs.measures
-    with locked(folder):
-        # What is drawn anew leaves the manifest first, so that this may be interrupted.
-        names = [*read_manifest(folder)["files"]]
-        write_manifest(folder, [name for name in names if Path(name).parts[0] not in SHOWN])
-        what = {"figures": cfg.figures, "tensorboard": cfg.tensorboard}
-        write_run(folder, missions, steps, measures, tracks, **what)
-        if film is not None:
-            try:
-                write_films(folder / "video", runs, tracks, film, draw=draw)
-            except ConfigurationError as error:  # such as a robot that cannot be drawn
-                print(f"afm-rl: no film: {error}", file=sys.stderr)
-        explained = _explain(folder, cfg.figures, missions, steps, robot)
-        extend_manifest(folder, [name for name in SHOWN if (folder / name).is_dir()])
-    print_summary(missions, measures)
-    print(explained, end="")
-    print(f"Results: {folder}")
-
-
-def _explain(
-    folder: Path, page: bool, missions: pd.DataFrame, steps: pd.DataFrame, robot: Robot
-) -> str:
-    """Return what the first mission shows of the actuators, one line each; write the page."""
-    first = missions.iloc[0]
-    try:
-        found, log = explain_mission(robot, steps[steps["mission"] == first["mission"]])
-    except AFMError:  # such as a mission of a few steps
-        return ""
-    which = f"{first['method']}, {first['track']}, seed {first['seed']}"
-    if page:
-        list(write_diagnosis(found, log, folder / "diagnosis", which))
-    return f"Actuators, by the steps of {which}:\n{found}\n"
-
-
-def report(folder: Path, cfg: DictConfig, film: str | None) -> None:
-    """Write the report on a sweep or a study, as far as there are results."""
-    try:
-        runs = read_runs([folder])
-        print_summary(runs.missions, runs.measures)
-        tracks = load_tracks(runs.missions["track"].unique(), load_track)
-        write_report(runs, folder / "report", tracks, figures=cfg.figures)
-        if film is not None:
-            write_films(folder / "report" / "video", runs, tracks, film)
-    except AFMError as error:  # such as jobs that cannot stand in one table
-        print(f"afm-rl: no report: {error}", file=sys.stderr)
-    print(f"Results: {folder}")
 
 
 @contextmanager
