@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim import Optimizer
-from torchrl.envs import EnvBase
 
 from afm_rl._version import __version__
-from afm_rl.compiling.cast_cache import CastCache
-from afm_rl.errors import ConfigurationError
-from afm_rl.mission_state import MissionState
 from afm_rl.missions.build import Agent
 from afm_rl.missions.log import StepLog
-from afm_rl.regimes import Regime
+from afm_rl.missions.unsaved import PLAIN, TORCH, check_saved, has_extra_state, whole
 from afm_rl.storage.artefacts import digest_of
 from afm_rl.storage.settings import influential
 from afm_rl.streams import Streams
-
-PLAIN = (bool, int, float, str, type(None))
-LIBRARIES = ("torch", "torchrl", "tensordict")  # their modules fill caches of their own
-TORCH = frozenset(vars(nn.Module()))  # attributes that every module has
 
 
 @dataclass
@@ -48,13 +39,6 @@ class Loop:
     """What :func:`unsaved` found at the start: it must not change."""
 
 
-class Holder(NamedTuple):
-    """Something with a state of its own."""
-
-    read: Callable[[], Any]
-    write: Callable[[Any], Any]
-
-
 def snapshot(agent: Agent, loop: Loop) -> dict[str, Any]:
     """Return everything that the next steps and the tables depend on.
 
@@ -66,7 +50,7 @@ def snapshot(agent: Agent, loop: Loop) -> dict[str, Any]:
         ConfigurationError: if something else has changed since the start, see
             :func:`check_saved`.
     """
-    check_saved(agent, loop)
+    check_saved(agent, loop.unsaved)
     return {
         "td": loop.td.to_dict(),
         "ids": loop.ids,
@@ -74,7 +58,7 @@ def snapshot(agent: Agent, loop: Loop) -> dict[str, Any]:
         "log": loop.log.state_dict(),
         "step": loop.step,
         "global": torch.random.get_rng_state(),
-        "agent": {name: holder.read() for name, holder in _holders(agent)},
+        "agent": {name: read() for name, read, _ in _holders(agent)},
     }
 
 
@@ -86,8 +70,8 @@ def restore(agent: Agent, loop: Loop, state: dict[str, Any]) -> None:
         loop: at their start.
         state: the snapshot; what it holds is taken over, not copied.
     """
-    for name, holder in _holders(agent):
-        holder.write(state["agent"][name])
+    for name, _, write in _holders(agent):
+        write(state["agent"][name])
     torch.random.set_rng_state(state["global"])
     loop.log.load_state_dict(state["log"])
     loop.ids, loop.step = state["ids"].to(agent.device), state["step"]
@@ -95,30 +79,29 @@ def restore(agent: Agent, loop: Loop, state: dict[str, Any]) -> None:
     loop.td = TensorDict(state["td"], loop.ids.shape, device=loop.td.device)
 
 
-def _holders(agent: Agent) -> Iterator[tuple[str, Holder]]:
-    """Yield all of an agent that has a state, by name."""
-    device = agent.device
-    for path, module in _whole(agent).named_modules():
-        for name, tensor in module._parameters.items():
-            if tensor is not None:  # the optimiser knows the parameter: only its data may change
-                data = partial(_set, tensor, "data", device)
-                yield f"{path}.{name}", Holder(partial(getattr, tensor, "data"), data)
-        for name in module._buffers:
-            get = partial(module._buffers.__getitem__, name)
-            yield f"{path}.{name}", Holder(get, partial(_set, module, name, device))
-        if _has_extra_state(module):
-            yield path, Holder(module.get_extra_state, module.set_extra_state)
-        for name, value in list(vars(module).items()):
+def _holders(agent: Agent) -> Iterator[tuple[str, Callable[[], Any], Callable[[Any], Any]]]:
+    """Yield all of an agent that has a state: its name, how it is read, and how it is written."""
+    for path, module in whole(agent).named_modules():
+        own = [(name, value) for name, value in vars(module).items() if name not in TORCH]
+        # An optimiser knows the parameters: only their data may change.
+        places: list[tuple[str, Any, str]] = [
+            *((name, p, "data") for name, p in module._parameters.items() if p is not None),
+            *((name, module, name) for name in module._buffers),
+            *((name, module, name) for name, value in own if isinstance(value, PLAIN)),
+        ]
+        for name, owner, leaf in places:
+            write = partial(_set, agent.device, owner, leaf)
+            yield f"{path}.{name}", partial(getattr, owner, leaf), write
+        if has_extra_state(module):
+            yield path, module.get_extra_state, module.set_extra_state
+        for name, value in own:
             if isinstance(value, torch.Generator):
-                yield f"{path}.{name}", Holder(value.get_state, value.set_state)
+                yield f"{path}.{name}", value.get_state, value.set_state
             elif isinstance(value, Streams | Optimizer):
-                yield f"{path}.{name}", Holder(value.state_dict, value.load_state_dict)
-            elif name not in TORCH and isinstance(value, PLAIN):
-                get = partial(getattr, module, name)
-                yield f"{path}.{name}", Holder(get, partial(_set, module, name, device))
+                yield f"{path}.{name}", value.state_dict, value.load_state_dict
 
 
-def _set(owner: Any, name: str, device: torch.device, value: Any) -> None:
+def _set(device: torch.device, owner: Any, name: str, value: Any) -> None:
     """Set an attribute, a tensor on the agent's device."""
     if isinstance(value, Tensor):
         setattr(owner, name, value.to(device))
@@ -135,66 +118,7 @@ def leave(agent: Agent, loop: Loop, keep: Tensor) -> None:
     loop.ids, loop.td = loop.ids[keep], loop.td[keep]
     agent.model.select_(keep)
     agent.updater.follow()
-    check_saved(agent, loop)
-
-
-def check_saved(agent: Agent, loop: Loop) -> None:
-    """Check that nothing changes which is neither saved in checkpoints nor cut with the missions.
-
-    Raises:
-        ConfigurationError: naming the attribute.
-    """
-    now = unsaved(agent)
-    changed = sorted(name for name in now if now[name] != loop.unsaved.get(name, now[name]))
-    changed += sorted(now.keys() - loop.unsaved.keys() if loop.unsaved else ())
-    if changed:
-        raise ConfigurationError(
-            f"{changed[0]} changes during missions, but is neither saved in checkpoints nor cut "
-            "when missions finish; keep what belongs to single missions in an "
-            "afm_rl.mission_state.MissionState, and give the rest out by get_extra_state"
-        )
-
-
-def unsaved(agent: Agent) -> dict[str, Any]:
-    """Return a description of what :func:`snapshot` does not save or no one cuts, by name.
-
-    These are attributes that are not plain, and buffers outside the model that belong to no
-    :class:`~afm_rl.mission_state.MissionState`. Environments keep their state in the tensordict.
-    """
-    found = {}
-    for name, module in _whole(agent).named_modules():
-        if isinstance(module, MissionState | EnvBase) or _has_extra_state(module):
-            continue
-        if type(module).__module__.partition(".")[0] in LIBRARIES:
-            continue
-        for leaf, value in vars(module).items():
-            if leaf not in TORCH and not isinstance(value, PLAIN):
-                found[f"{name}.{leaf}"] = _described(value)
-        if not name.startswith("model"):
-            for leaf, buffer in module.named_buffers(recurse=False):
-                found[f"{name}.{leaf}"] = _described(buffer)
-    return found
-
-
-def _described(value: Any, above: tuple[int, ...] = ()) -> Any:
-    """Return what can be compared with the same a while later."""
-    if isinstance(value, PLAIN):
-        return value
-    if isinstance(value, Tensor):
-        return digest_of({"": value.detach().contiguous()})
-    kinds = nn.Module | torch.Generator | Streams | Optimizer | Regime | CastCache
-    if isinstance(value, kinds) or callable(value):
-        return None  # saved by themselves, or without a state that matters
-    if id(value) in above:
-        return None
-    above = (*above, id(value))
-    if isinstance(value, Mapping):
-        return [(repr(key), _described(part, above)) for key, part in value.items()]
-    if isinstance(value, list | tuple | deque):
-        return [_described(part, above) for part in value]
-    if hasattr(value, "__dict__"):
-        return _described(vars(value), above)
-    return repr(value)
+    check_saved(agent, loop.unsaved)
 
 
 def owner(agent: Agent) -> dict[str, Any]:
@@ -208,16 +132,6 @@ def owner(agent: Agent) -> dict[str, Any]:
 
 def fingerprint(agent: Agent) -> str:
     """Return a digest of all tensors of an agent: of its models, flows and tracks."""
-    whole = _whole(agent)
-    tensors = {**dict(whole.named_parameters()), **dict(whole.named_buffers())}
+    both = whole(agent)
+    tensors = {**dict(both.named_parameters()), **dict(both.named_buffers())}
     return digest_of({name: value.detach().contiguous() for name, value in tensors.items()})
-
-
-def _whole(agent: Agent) -> nn.ModuleDict:
-    """Return all modules of an agent as one; a module that is shared has one name."""
-    parts = {"model": agent.model, "env": agent.env}
-    return nn.ModuleDict({**parts, "planner": agent.planner, "updater": agent.updater})
-
-
-def _has_extra_state(module: nn.Module) -> bool:
-    return type(module).get_extra_state is not nn.Module.get_extra_state
