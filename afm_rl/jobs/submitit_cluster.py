@@ -12,7 +12,7 @@ from afm_rl.jobs.executor import Executor
 from afm_rl.jobs.process import Job, needs, run
 
 
-class SlurmExecutor(Executor):
+class SubmititExecutor(Executor):
     """Submits jobs to SLURM as one array, or runs them as if, with submitit.
 
     submitit hands a job to its node as a pickle. It is in a new folder that only the user can
