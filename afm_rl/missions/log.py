@@ -15,7 +15,7 @@ class StepLog:
     Args:
         columns: names of the values.
         whole: the columns that hold whole numbers.
-        rows: for which there is room at first.
+        room: rows that there is room for at first.
 
     >>> log = StepLog(["x", "reached"], whole=["reached"])
     >>> log.add(torch.tensor([4, 7]), 0, torch.tensor([[0.5, 1.0], [0.6, 2.0]]))
@@ -23,12 +23,12 @@ class StepLog:
     [[4.0, 0.0, 0.5, 1.0], [7.0, 0.0, 0.6000000238418579, 2.0]]
     """
 
-    def __init__(self, columns: Sequence[str], whole: Sequence[str] = (), rows: int = 4096) -> None:
+    def __init__(self, columns: Sequence[str], whole: Sequence[str] = (), room: int = 4096) -> None:
         self.columns = list(columns)
         self.whole = list(whole)
-        self._count, self._rows = 0, rows
-        self._values = torch.empty(rows, len(self.columns))
-        self._keys = torch.empty(rows, 2, dtype=torch.int64)  # mission, step
+        self._count = 0
+        self._values = torch.empty(room, len(self.columns))
+        self._keys = torch.empty(room, 2, dtype=torch.int64)  # mission, step
 
     def __len__(self) -> int:
         return self._count
@@ -61,7 +61,7 @@ class StepLog:
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         self._count = len(state["keys"])
-        spare = max(self._count, self._rows)
+        spare = max(self._count, len(self._keys))
         self._values, self._keys = (
             torch.cat([rows, rows.new_empty(spare, rows.shape[-1])])
             for rows in (state["values"], state["keys"])

@@ -1,0 +1,261 @@
+"""Folders of results become one table, :class:`Runs`; all that a report shows is a view of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.report.cells import cell_names, outcome
+from afm_rl.report.stranger import read_numbers, read_settings, read_table, read_text
+from afm_rl.storage.manifest import MANIFEST, check_manifest
+from afm_rl.storage.measures import FILE, Measures
+
+KEY = ["method", "cell", "seed"]
+MISSIONS, STEPS, COMPUTE, RECORD = "missions.csv", "steps.parquet", "compute.csv", "jobs.yaml"
+MOST_SEEDS = 100_000  # of a method
+Plan = list[tuple[str, list[int]]]
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What one folder of results holds, or several together.
+
+    Attributes:
+        folders: where they were read.
+        missions: one row per mission, numbered through. Beside the columns of the files there are
+            ``cell`` (track and regime in words), ``seconds`` (the time of its run in equal
+            shares, where it was counted), ``file`` (place of its steps in ``files``, -1 if there
+            are none) and ``own`` (its number in that file).
+        measures: what methods are compared by.
+        files: the files of steps.
+        plan: methods, each with seeds that it was to have, in every cell.
+        notes: what a reader must know of the data, one sentence each.
+        lost: what is said of each job that ``jobs.yaml`` names and that is not there.
+    """
+
+    folders: list[Path]
+    missions: pd.DataFrame
+    measures: Measures
+    files: list[Path]
+    plan: Plan
+    notes: list[str]
+    lost: list[str]
+
+    @property
+    def methods(self) -> list[str]:
+        """Names of the methods, in the order in which they first occur."""
+        return list(self.missions["method"].unique())
+
+    @property
+    def with_steps(self) -> pd.DataFrame:
+        """The missions whose steps are there."""
+        return self.missions[self.missions["file"] >= 0]
+
+    @property
+    def missing(self) -> pd.DataFrame:
+        """What is missing, one row per ``method``, ``cell`` and ``seed``.
+
+        Every method is to have each cell and seed that any method has or was to have.
+        """
+        there = self.missions[KEY]
+        planned = pd.DataFrame(
+            [(method, seed) for method, seeds in self.plan for seed in seeds],
+            columns=["method", "seed"],
+        )
+        cells = there[["cell"]].drop_duplicates()
+        wanted = pd.concat([there, planned.merge(cells, how="cross")]) if len(planned) else there
+        places = wanted[["cell", "seed"]].drop_duplicates()
+        every = wanted[["method"]].drop_duplicates().merge(places, how="cross")
+        both = every.merge(there, how="left", on=KEY, indicator=True)
+        return both.loc[both["_merge"] == "left_only", KEY].reset_index(drop=True)
+
+    def steps(
+        self, missions: pd.DataFrame | None = None, columns: Sequence[str] | None = None
+    ) -> pd.DataFrame:
+        """Return steps, one row per mission and step, in their order.
+
+        Args:
+            missions: rows of the table of missions; None: all.
+            columns: what to read beside ``mission`` and ``t``; a column that a file lacks is NaN.
+                None: all.
+
+        Raises:
+            ConfigurationError: if a file cannot be read, or holds something else than numbers.
+        """
+        rows = self.with_steps if missions is None else missions[missions["file"] >= 0]
+        names = None if columns is None else list(dict.fromkeys(["mission", "t", *columns]))
+        parts = []
+        for place, own in rows.groupby("file"):
+            number = own.set_index("own")["mission"].astype("int32")
+            part = read_numbers(self.files[place], number.index.tolist(), names)
+            parts.append(part.assign(mission=part["mission"].map(number)))
+        joined = pd.concat(parts) if parts else pd.DataFrame(columns=names or ["mission", "t"])
+        ordered = joined.reindex(columns=names or list(joined))
+        return ordered.sort_values(["mission", "t"], ignore_index=True)
+
+
+def read_runs(folders: Sequence[str | Path]) -> Runs:
+    """Read the folders of runs, comparisons, sweeps and studies, and join them.
+
+    Files that a manifest names are checked against it first. Where two folders hold the same
+    mission (method, cell and seed), the later one counts; ``notes`` says so.
+
+    Raises:
+        ConfigurationError: if there is no folder, a folder holds no results or results of another
+            kind of mission, or a file cannot be used.
+        ArtefactError: if a file is damaged.
+    """
+    if not folders:
+        raise ConfigurationError("folders=[]: expected at least one folder of results")
+    paths, names = [Path(folder) for folder in folders], ", ".join(map(str, folders))
+    files: list[Path] = []
+    tables: list[pd.DataFrame] = []
+    plan: Plan = []
+    notes: list[str] = []
+    lost: list[str] = []
+    measures: Measures | None = None
+    for place, folder in enumerate(paths):
+        runs, gone = _run_folders(folder, notes)
+        lost += [
+            f"{folder / 'jobs' / name}: missing, although {RECORD} names it; the command that made "
+            "the folder runs it again"
+            for name in gone
+        ]
+        for run in runs:
+            if _has_results(run):
+                check_manifest(run)
+                plan += _plan(run)
+            else:
+                plan += _plan(run)
+                notes.append(f"{run} has no results yet.")
+                continue
+            declared = _read_measures(run / FILE)
+            if declared != (measures or declared):
+                raise ConfigurationError(
+                    f"{names}: hold missions of different kinds; report on each alone"
+                )
+            measures, missions = declared, _read_missions(run, declared)
+            missions = missions.assign(own=missions["mission"], file=-1, folder=place)
+            if (run / STEPS).is_file():
+                missions["file"] = len(files)
+                files.append(run / STEPS)
+            tables.append(missions)
+        if gone and (folder / MISSIONS).is_file():
+            asked = read_table(folder / MISSIONS, ["seed"], ["method"])
+            plan += [(name, seeds.tolist()) for name, seeds in asked.groupby("method")["seed"]]
+    tables = [table for table in tables if len(table)]
+    if measures is None or not tables:
+        said = f" ({'; '.join(lost)})" if lost else ""
+        raise ConfigurationError(
+            f"{names}: no mission is finished yet; expected at least one{said}"
+        )
+    missions = pd.concat(tables, ignore_index=True)
+    twice = missions[missions.duplicated(KEY, keep="last")]
+    notes += [
+        f"{method}: {len(rows)} missions of {paths[place]} stand twice; "
+        "the ones that were read last count."
+        for (place, method), rows in twice.groupby(["folder", "method"], sort=False)
+    ]
+    missions = missions.drop_duplicates(KEY, keep="last")
+    order = {name: place for place, name in enumerate(missions["method"].unique())}
+    missions = missions.assign(rank=missions["method"].map(order))
+    # Seeds side by side, also where each is a job of its own.
+    missions = missions.sort_values(["rank", "folder", "own", "seed"], kind="stable")
+    missions = missions.assign(mission=range(len(missions))).reset_index(drop=True)
+    missions = missions.drop(columns=["folder", "rank"])
+    if without := int((missions["file"] < 0).sum()):
+        notes.append(
+            f"{without} of {len(missions)} missions have no {STEPS}: curves, maps and "
+            "recovery times leave them out."
+        )
+    return Runs(paths, missions, measures, files, plan, notes, lost)
+
+
+def _has_results(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in (MISSIONS, MANIFEST))
+
+
+def _run_folders(folder: Path, notes: list[str]) -> tuple[list[Path], list[str]]:
+    """Return the folders of the runs in a folder, in the order of its record, and lost jobs.
+
+    Raises:
+        ConfigurationError: if there are none.
+        ArtefactError: if the record is damaged.
+    """
+    jobs = {path.name: path for path in sorted((folder / "jobs").glob("*")) if path.is_dir()}
+    if not jobs and not (folder / RECORD).is_file():
+        if not _has_results(folder):
+            what = f"holds no {MISSIONS}" if folder.is_dir() else "no such folder"
+            raise ConfigurationError(
+                f"{folder}: {what}; expected the folder of a run, or of several"
+            )
+        return [folder], []
+    if (folder / MANIFEST).is_file():
+        check_manifest(folder)
+    else:
+        notes.append(f"{folder} has no {MANIFEST}: whether a job is missing cannot be known.")
+    named = read_settings(folder / RECORD).get("jobs") if (folder / RECORD).is_file() else []
+    if not isinstance(named, list):
+        raise ConfigurationError(f"{folder / RECORD}: damaged; expected a list of jobs")
+    names = [*map(str, named)]
+    there = [name for name in dict.fromkeys([*names, *jobs]) if name in jobs]
+    return [jobs[name] for name in there], [name for name in names if name not in jobs]
+
+
+def _plan(run: Path) -> Plan:
+    """Return the method and the seeds that a run was to have, as its settings say."""
+    paths = [run / "config.yaml", run / "unfinished" / "config.yaml"]
+    for path in (path for path in paths if path.is_file()):
+        settings = read_settings(path)
+        seeds = settings.get("seeds", [])
+        numbers = range(seeds) if type(seeds) is int else seeds
+        if not isinstance(numbers, (list, range)) or len(numbers) > MOST_SEEDS:
+            raise ConfigurationError(
+                f"{path}: seeds={str(seeds)[:80]}: expected a count or a list, {MOST_SEEDS} at most"
+            )
+        whole = [seed for seed in numbers if type(seed) is int]
+        return [(str(settings["label"]), whole)] if "label" in settings else []
+    return []
+
+
+def _read_measures(path: Path) -> Measures:
+    try:
+        return Measures.from_json(read_text(path))
+    except ArtefactError as error:
+        raise ArtefactError(f"{path}: {error}") from error
+
+
+def _read_missions(run: Path, measures: Measures) -> pd.DataFrame:
+    """Return the missions of a run, checked, with ``cell``, and ``seconds`` if they were counted.
+
+    Raises:
+        ConfigurationError: if a file cannot be read, a column is missing, or a value cannot be.
+    """
+    path, whole = run / MISSIONS, ["seed", "steps", "mission"]
+    numbers = list(dict.fromkeys([*whole, *measures.columns]))
+    missions = read_table(path, numbers, ["method", "track"])
+    if not len(missions):
+        return missions
+    for name in whole:
+        if missions[name].isna().any() or (missions[name] % 1 != 0).any():
+            raise ConfigurationError(f"{path}: {name}: expected a whole number in each row")
+    ended = outcome(missions)
+    if ended not in missions or missions[ended].dtype != bool:
+        raise ConfigurationError(f"{path}: {ended}: expected True or False in each row")
+    if missions["mission"].duplicated().any():
+        raise ConfigurationError(f"{path}: mission: expected another number in each row")
+    # Single precision as text has seven digits: 6/34 is the same number in all files again.
+    reals = [m.column for m in measures if pd.api.types.is_float_dtype(missions[m.column])]
+    missions = missions.drop(columns="seconds", errors="ignore").assign(
+        **{name: missions[name].map("{:.6g}".format).astype(float) for name in reals},
+        cell=cell_names(missions),
+    )
+    if (run / COMPUTE).is_file():
+        spent = read_table(run / COMPUTE, ["seconds", "missions"], ["method"])
+        each = spent.groupby("method")[["seconds", "missions"]].sum()
+        missions["seconds"] = missions["method"].map(each["seconds"] / each["missions"])
+    return missions
