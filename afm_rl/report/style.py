@@ -149,8 +149,9 @@ def dress(axes: Any, x: str = "", y: str = "", grid: str = "", size: float = SMA
     axes.tick_params(which="minor", length=1.5)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(FAINT)
-    axes.set_xlabel(literal(x), fontsize=size)
-    axes.set_ylabel(literal(y), fontsize=size)
+    for label, write in ((x, axes.set_xlabel), (y, axes.set_ylabel)):
+        if label:
+            write(literal(label), fontsize=size)
     if grid:
         axes.grid(axis=grid, color="#eeeeee", linewidth=0.6)
         axes.set_axisbelow(True)
