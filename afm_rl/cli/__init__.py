@@ -17,9 +17,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from afm_rl._version import __version__
 from afm_rl.cli.error_messages import explain, one_line
-from afm_rl.cli.launchers import register
-from afm_rl.cli.launchers.base import JobsFailed
+from afm_rl.cli.launcher import register
 from afm_rl.cli.overrides import relaxed, trusted_packages, with_sweep_folder
+from afm_rl.jobs.executor import JobsFailed
 from afm_rl.trust import TRUST, check_composed, trusted
 
 _launched: list[bool] = []

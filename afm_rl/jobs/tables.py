@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from afm_rl.jobs.layout import COMPUTE, MISSIONS, RECORD, is_finished, run_folders
+from afm_rl.jobs.layout import COMPUTE, MISSIONS, RECORD, is_finished, job_folders
 from afm_rl.jobs.run import csv_of
 from afm_rl.storage.files import write_whole
 from afm_rl.storage.manifest import MANIFEST, write_manifest
@@ -20,7 +20,7 @@ def write_tables(folder: Path) -> None:
     often the batch was interrupted.
     """
     (folder / MANIFEST).unlink(missing_ok=True)
-    runs = [run for run in run_folders(folder) if is_finished(run) and (run / MISSIONS).exists()]
+    runs = [run for run in job_folders(folder) if is_finished(run) and (run / MISSIONS).exists()]
     if runs:
         # As text, so that numbers come out as they went in.
         texts = [pd.read_csv(run / MISSIONS, dtype=str, keep_default_na=False) for run in runs]

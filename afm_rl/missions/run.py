@@ -14,16 +14,21 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
-from afm_rl.errors import NonFiniteError
+from afm_rl.errors import AFMError, NonFiniteError
 from afm_rl.missions.build import Agent
-from afm_rl.missions.checkpoint import Checkpoints, Stopped
 from afm_rl.missions.log import StepLog
-from afm_rl.missions.state import Loop, leave, unsaved
+from afm_rl.missions.state import Loop, leave, owner, restore, snapshot
+from afm_rl.missions.unsaved import unsaved
 from afm_rl.progress import Bar
+from afm_rl.storage.checkpoints import Checkpoints
 from afm_rl.storage.measures import Measures
 
 ALIGNED = 5.0  # innovation, in standard deviations, up to which a model counts as aligned
 STILL = 0.1  # innovation up to which a repeated reading shows a robot at rest, as foreseen
+
+
+class Stopped(AFMError):
+    """Missions were told to stop before their end."""
 
 
 @dataclass
@@ -77,7 +82,7 @@ def run(
     """
     with torch.random.fork_rng(devices=[]):  # TorchRL's own planners draw from the global one
         torch.manual_seed(0)
-        kept = None if checkpoint is None else Checkpoints(checkpoint, agent, every, keep)
+        kept = None if checkpoint is None else Checkpoints(checkpoint, owner(agent), every, keep)
         return _run(agent, progress, kept, stopped)
 
 
@@ -89,8 +94,8 @@ def _run(
 ) -> Results:
     state = None if checkpoints is None else checkpoints.read()  # before the agent is changed
     loop = _start(agent)
-    if checkpoints is not None and state is not None:
-        checkpoints.resume(loop, state)
+    if state is not None:
+        restore(agent, loop, state)
     total, clock, budget = len(agent.missions), time.perf_counter(), agent.settings["budget"]
     most = min(budget, getattr(agent.base_env, "max_steps", budget))
     with Bar(
@@ -106,8 +111,8 @@ def _run(
             bar.set_postfix_str(ended, refresh=False)
             bar.update(_done(loop, most) - bar.n)
             stop = stopped is not None and stopped(loop)
-            if checkpoints is not None:
-                checkpoints.write(loop) if stop else checkpoints.write_if_due(loop)
+            if checkpoints is not None and (stop or checkpoints.due):
+                checkpoints.write(loop.step, snapshot(agent, loop))
             if stop:
                 raise Stopped(f"stopped before step {loop.step}")
     return Results(_missions(agent, loop.ends), loop.log.table(), agent.robot.metrics.measures)

@@ -24,16 +24,16 @@ def methods(jobs):
 
 
 @pytest.mark.parametrize(
-    ("study", "budget", "count", "last"),
+    ("study", "more", "budget", "count", "last"),
     [
-        ("ugv", 5000, 13, "oracle"),
-        ("ugv_paper", 5000, 5, "afm_paper"),
-        ("ugv_families", 3000, 13, "oracle"),
+        ("ugv", [], 5000, 13, "oracle"),
+        ("ugv_paper", [], 5000, 5, "afm_paper"),
+        ("ugv_families", ["compare=[physics,oracle]"], 3000, 2, "oracle"),
     ],
 )
-def test_the_studies(afm_rl, asked, study, budget, count, last, monkeypatch, tmp_path):
+def test_the_studies(afm_rl, asked, study, more, budget, count, last, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    done = afm_rl(f"study={study}", "planner.population=77")
+    done = afm_rl(f"study={study}", *more, "planner.population=77")
     assert done.status == 0, done.err
     ((folder, jobs, _, how),) = asked
     assert folder == tmp_path / "outputs" / "study" / study

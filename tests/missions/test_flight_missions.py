@@ -9,7 +9,7 @@ import torch
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, run
-from afm_rl.missions.checkpoint import Stopped
+from afm_rl.missions.run import Stopped
 
 QUICK = {"robot.schedule.times": [0.1, 0.3], "budget": 12}
 
