@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 from collections.abc import Iterator
@@ -12,17 +13,19 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from rich import box
+from rich.console import Console
 from rich.table import Table as Grid
 from rich.text import Text
 
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
 from afm_rl.report import style
-from afm_rl.report.console import terminal
-from afm_rl.report.figures import Picture
+from afm_rl.report.console import WIDE
 from afm_rl.report.table import Table
 from afm_rl.report.write import render_page
 from afm_rl.storage.files import write_whole
 
+SHOWN = 300  # rows of the first panel
+POINTS = 3000  # of the others
 LOOKS = {"healthy": "green", "changed": "bold red", "dead": "bold red", "cannot tell": "yellow"}
 CAPTION = (
     "Left: an excerpt of command, response and fit. Middle: response against command; the line is "
@@ -48,7 +51,7 @@ def print_diagnosis(diagnosis: Diagnosis, file: IO[str] | None = None) -> None:
     <BLANKLINE>
     wrist: healthy
     """
-    console = terminal(file)
+    console = Console(file=file, width=WIDE, highlight=False)
     grid = Grid(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     shown = _table(diagnosis)
     shown = shown.loc[:, [name for name in shown if name in KEPT or (shown[name] != "-").any()]]
@@ -134,28 +137,23 @@ def write_diagnosis(
 def _page(diagnosis: Diagnosis, log: Log, source: str) -> str:
     shown = _table(diagnosis)
     table = Table("actuators", "All actuators", NOTE, shown, shown)
-    figures = (
-        Picture(
-            str(place),
-            actuator.sentence,
-            CAPTION,
-            style.png_bytes(draw_actuator(diagnosis, log, place)),
-        )
-        for place, actuator in enumerate(diagnosis.actuators)
-    )
+    figures = []
+    for place, actuator in enumerate(diagnosis.actuators):
+        png = style.png_bytes(draw_actuator(diagnosis, log, place))
+        data = base64.b64encode(png).decode()
+        sentence = actuator.sentence
+        figures.append({"name": place, "title": sentence, "caption": CAPTION, "data": data})
     summary = (
         f"{diagnosis.rows} rows of {len(diagnosis.actuators)} actuators, a row every "
         f"{diagnosis.step_s:.4g} s, from {source}."
     )
     notes = [*diagnosis.notes, *(actuator.sentence for actuator in diagnosis.actuators)]
-    return render_page("Diagnosis of the actuators", summary, notes, figures, [table])
+    content = {"title": "Diagnosis of the actuators", "summary": summary, "notes": notes}
+    return render_page(**content, figures=figures, tables=[table], references=[])
 
 
-def draw_actuator(diagnosis: Diagnosis, log: Log, place: int, points: int = 3000) -> Figure:
-    """Return the figure of one actuator: an excerpt, response against command, and residual.
-
-    The latter two have ``points`` dots at most.
-    """
+def draw_actuator(diagnosis: Diagnosis, log: Log, place: int) -> Figure:
+    """Return the figure of one actuator: an excerpt, response against command, and residual."""
     actuator = diagnosis.actuators[place]
     driver = _driver(actuator, log, place)
     u, y = log.command[:, driver], log.response[:, place]
@@ -169,7 +167,7 @@ def draw_actuator(diagnosis: Diagnosis, log: Log, place: int, points: int = 3000
     left.plot(t[rows], y[rows], color=style.COLOURS[0], linewidth=1.4, label="response")
     fitted = {"color": style.REGIME, "linewidth": 1.1, "linestyle": (0, (4, 1.5))}
     left.plot(t[rows], fit[rows], label="fit", **fitted)
-    some = np.unique(np.linspace(0, len(t) - 1, min(points, len(t))).astype(int))
+    some = np.unique(np.linspace(0, len(t) - 1, min(POINTS, len(t))).astype(int))
     dots = {"s": 3, "linewidths": 0, "rasterized": True}
     middle.scatter(u[some], y[some], color=style.COLOURS[0], alpha=0.35, **dots)
     ends = np.array(actuator.command_range)
@@ -180,8 +178,11 @@ def draw_actuator(diagnosis: Diagnosis, log: Log, place: int, points: int = 3000
             if axes is right or t[rows][0] <= change.t <= t[rows][-1]:
                 axes.axvline(change.t, color=style.REGIME, linewidth=1.0, linestyle=":")
     labels = (("t (s)", ""), ("command", "response"), ("t (s)", "residual"))
-    for axes, (below, beside) in zip((left, middle, right), labels, strict=True):
-        style.dress(axes, below, beside, "both")
+    for axes, (x_label, y_label) in zip((left, middle, right), labels, strict=True):
+        axes.set_xlabel(x_label, fontsize=style.SMALL)
+        axes.set_ylabel(y_label, fontsize=style.SMALL)
+        style.dress(axes)
+        style.grid(axes)
     style.legend_above(figure, *left.get_legend_handles_labels())
     return figure
 
@@ -192,8 +193,8 @@ def _driver(actuator: Actuator, log: Log, place: int) -> int:
     return place if other is None or other in actuator.coupling else log.names.index(other)
 
 
-def _excerpt(actuator: Actuator, t: np.ndarray, most: int = 300) -> slice:
+def _excerpt(actuator: Actuator, t: np.ndarray) -> slice:
     """Return rows around the last change, or the first ones."""
     middle = int(np.searchsorted(t, actuator.changes[-1].t)) if actuator.changes else 0
-    first = max(0, min(middle - most // 2, len(t) - most))
-    return slice(first, first + most)
+    first = max(0, min(middle - SHOWN // 2, len(t) - SHOWN))
+    return slice(first, first + SHOWN)
