@@ -3,8 +3,9 @@
 import multiprocessing
 import os
 import signal
+import time
 
-from afm_rl.progress import Bar
+from afm_rl.progress import Bar, waiting
 
 
 def show_one():
@@ -38,3 +39,10 @@ def test_a_training_before_the_work_is_no_share_of_it(monkeypatch):
     shares = [share for _, share in heard]
     assert shares == sorted(shares) and shares[-1] == 1.0
     assert {share for line, share in heard if line.startswith("training")} == {0.0}
+
+
+def test_what_takes_longer_than_expected_is_nearly_done():
+    with waiting("compiling", expected=0.03, every=0.01) as bar:
+        while bar.n < 0.1:
+            time.sleep(0.01)
+    assert 0.03 < bar.n < bar.total < 1.2 * bar.n
