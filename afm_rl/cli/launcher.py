@@ -18,17 +18,17 @@ from omegaconf import DictConfig
 from afm_rl.errors import check_choice
 from afm_rl.jobs.executor import LocalExecutor
 from afm_rl.jobs.ray_cluster import RayExecutor
-from afm_rl.jobs.slurm import SlurmExecutor
+from afm_rl.jobs.submitit_cluster import SubmititExecutor
 
 NAMESPACE = "hydra_plugins"
-EXECUTORS = {"local": LocalExecutor, "slurm": SlurmExecutor, "ray": RayExecutor}
+EXECUTORS = {"local": LocalExecutor, "submitit": SubmititExecutor, "ray": RayExecutor}
 
 
 class JobLauncher(Launcher):
     """Runs jobs, those of a sweep as well as those of a comparison or a study.
 
     Args:
-        executor: ``local``, ``slurm`` or ``ray``.
+        executor: ``local``, ``submitit`` or ``ray``.
         **settings: of the :class:`~afm_rl.jobs.executor.Executor`.
 
     Raises:

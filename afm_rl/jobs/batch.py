@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -68,18 +67,8 @@ def run_batch(
             begin(job.folder, configs[job.name])
         if len(waiting) < len(jobs):
             echo(f"{len(jobs) - len(waiting)} of {len(jobs)} jobs have results already")
-        failures: dict[str, str] = {}
-        with (
-            Board(waiting, len(jobs), progress, echo) as board,
-            closing(executor.run(waiting)) as ends,
-        ):
-            for end in ends:
-                if end is not None:
-                    job, failure = end
-                    board.end(job, failure)
-                    if failure:
-                        failures[job.name] = failure
-                board.look()
+        with Board(waiting, len(jobs), progress, echo) as board:
+            failures = executor.run(waiting, board)
         write_tables(folder)
         return failures
 

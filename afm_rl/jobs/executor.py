@@ -7,14 +7,12 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Collection, Generator, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from afm_rl.errors import AFMError, ConfigurationError
 from afm_rl.jobs.process import Job, is_done, last_words, said, start
-
-Ends = Generator[tuple[Job, str | None] | None, None, None]
-"""Jobs that are over, with the reason if they failed, and None after each look at them."""
+from afm_rl.jobs.progress import Board
 
 
 class JobsFailed(AFMError):
@@ -50,13 +48,14 @@ class Executor(ABC):
     def close(self, handles: Collection[Any]) -> None:
         """Deal with the jobs that still run when the command ends, if any."""
 
-    def run(self, jobs: Sequence[Job]) -> Ends:
-        """Run jobs, in any order.
+    def run(self, jobs: Sequence[Job], board: Board) -> dict[str, str]:
+        """Run jobs, in any order; return why some have no results, by name.
 
-        Yields:
-            Each job that is over, with the reason if it failed; None after each look at them.
+        Args:
+            jobs: what to run.
+            board: is told of each job that is over, and looks at the others now and then.
         """
-        waiting, running = deque(jobs), dict[Job, Any]()
+        waiting, running, failures = deque(jobs), dict[Job, Any](), dict[str, str]()
         try:
             while waiting or running:
                 room = min(self.size - len(running), len(waiting))
@@ -64,11 +63,14 @@ class Executor(ABC):
                 running.update(zip(chosen, self.start(chosen) if chosen else (), strict=True))
                 for job in [job for job, handle in running.items() if self.is_over(handle)]:
                     handle = running.pop(job)
-                    yield job, None if is_done(job) else said(job) or self.last_words(handle)
-                yield None
+                    if not is_done(job):
+                        failures[job.name] = said(job) or self.last_words(handle)
+                    board.end(job, failures.get(job.name))
+                board.look()
                 time.sleep(self.tick if running else 0.0)
         finally:
             self.close(running.values())
+        return failures
 
 
 class LocalExecutor(Executor):

@@ -119,17 +119,6 @@ def test_mistakes_are_one_line(afm_rl, tmp_path, settings, named):
     assert not any((tmp_path / "run").glob("*"))
 
 
-def test_jobs_that_failed_are_listed(afm_rl, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "afm_rl.cli.launch.run_batch", lambda *args, **how: {"oracle+seed=3": "out of luck"}
-    )
-    done = afm_rl(*TINY, f"hydra.run.dir={tmp_path}")
-    assert done.status == 1
-    assert f"Results: {tmp_path}" in done.out
-    assert "afm-rl: oracle+seed=3: failed: out of luck\n" in done.err
-    assert "afm-rl: 1 of 10 jobs failed" in done.err
-
-
 def test_damaged_files_are_one_line(afm_rl, tmp_path, monkeypatch):
     def damaged(*args, **how):
         raise ArtefactError("jobs.yaml: damaged")

@@ -50,11 +50,3 @@ def test_jobs_run_on_both_nodes_and_one_that_dies_takes_no_other_with_it(
 def known_nodes(address):
     with ray.init(address):
         return ray.nodes()
-
-
-def test_a_cluster_of_this_machine_for_the_time_of_the_sweep(afm_rl, tmp_path, quick):
-    command = ["method=physics", "budget=2", *quick, f"hydra.sweep.dir={tmp_path}"]
-    done = afm_rl("-m", *command, "launcher=ray")
-    assert (done.status, done.err) == (0, "")
-    assert (tmp_path / "missions.csv").is_file()
-    assert not ray.is_initialized()

@@ -12,7 +12,7 @@ from afm_rl.jobs.executor import Executor
 from afm_rl.jobs.process import Job, needs, run
 
 
-class SlurmExecutor(Executor):
+class SubmititExecutor(Executor):
     """Submits jobs to SLURM as one array, or runs them as if, with submitit.
 
     submitit hands a job to its node as a pickle. It is in a new folder that only the user can
@@ -37,15 +37,13 @@ class SlurmExecutor(Executor):
         self.private = ""
 
     def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
-        private = tempfile.mkdtemp(prefix=".submitit-", dir=jobs[0].folder.parent.parent)
+        self.private = tempfile.mkdtemp(prefix=".submitit-", dir=jobs[0].folder.parent.parent)
         try:
-            executor = self.submitit.AutoExecutor(private, cluster=self.cluster)
+            executor = self.submitit.AutoExecutor(self.private, cluster=self.cluster)
             executor.update_parameters(**self.parameters)
+            return executor.map_array(run, jobs)
         except (RuntimeError, NameError, TypeError) as error:  # no cluster, no such parameter
-            shutil.rmtree(private)
-            raise ConfigurationError(f"hydra.launcher: {error}") from error
-        self.private = private
-        return executor.map_array(run, jobs)
+            raise ConfigurationError(f"hydra.launcher: {' '.join(str(error).split())}") from error
 
     def is_over(self, handle: Any) -> bool:
         return handle.done()
