@@ -29,8 +29,8 @@ class Board:
         self.told: set[str] = set()
         self.bars: dict[Job, Bar] = {}
         self.shares = {job: self._state(job)[1] for job in jobs}
-        begun = {"initial": sum(self.shares.values()), "total": len(jobs)}
-        self.whole = Bar(desc="jobs", shown=shown, leave=False, **begun)
+        begun, total = sum(self.shares.values()), len(jobs)
+        self.whole = Bar(desc="jobs", shown=shown, leave=False, initial=begun, total=total)
         self.looked = time.monotonic()
 
     def __enter__(self) -> Board:
@@ -63,7 +63,7 @@ class Board:
         self.looked = now
         states = {job: state for job in self.jobs if (state := self._state(job))[0]}
         for job, (line, share) in states.items():
-            self.shares[job] = share
+            self.shares[job] = max(share, self.shares[job])  # one that goes on from a checkpoint
             if self.whole.live:
                 bar = self.bars.get(job) or Bar(desc=f"  {job}", total=1.0, leave=False)
                 self.bars[job] = bar

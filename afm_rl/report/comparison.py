@@ -54,7 +54,7 @@ def draw_comparison(missions: pd.DataFrame, measures: Measures, panels: int = 3)
         axes.set_xlim(*_limits(measure, counted[name]))
         axes.xaxis.set_major_locator(MaxNLocator(5))
         label = f"{measure.label}\n{measure.better} is better"
-        style.dress(axes, label, grid="x", size=style.NORMAL)
+        style.dress(axes, label, lines="x", size=style.NORMAL)
     names = [style.literal(f"{row.method} (n = {row.missions})") for row in means.itertuples()]
     grid[0].set_yticks(range(len(means)), names, fontsize=style.NORMAL)
     grid[0].set_ylim(len(means) - 0.5, -0.5)

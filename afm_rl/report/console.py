@@ -11,10 +11,7 @@ from afm_rl.report.means import summarise
 from afm_rl.report.tables import cell_table, summary_table
 from afm_rl.storage.measures import Measures
 
-
-def terminal(file: IO[str] | None = None) -> Console:
-    """Return where tables are printed: numbers that are cut off are worse than lines that wrap."""
-    return Console(file=file, width=1000, highlight=False)
+WIDE = 1000  # columns: numbers that are cut off are worse than lines that wrap
 
 
 def print_summary(
@@ -41,7 +38,7 @@ def print_summary(
      physics         1           100    300
     <BLANKLINE>
     """
-    console = terminal(file)
+    console = Console(file=file, width=WIDE, highlight=False)
     table = summary_table(summarise(missions, measures), measures)
     some = table.shown.apply(lambda texts: texts.str.contains("[", regex=False)).any(axis=None)
     caption = "mean [95 % interval, seeds drawn anew within cells]" if some else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -22,6 +23,11 @@ class Picture(NamedTuple):
     title: str
     caption: str
     png: bytes
+
+    @property
+    def data(self) -> str:
+        """The file as text, for a page."""
+        return base64.b64encode(self.png).decode()
 
 
 def draw_run(

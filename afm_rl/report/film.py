@@ -82,8 +82,8 @@ def write_films(
     """
     first = runs.with_steps.drop_duplicates("method")
     if first.empty:
-        names = ", ".join(map(str, runs.folders))
-        raise ConfigurationError(f"{names}: no steps.parquet; films are drawn from it")
+        where = ", ".join(map(str, runs.folders))
+        raise ConfigurationError(f"{where}: no steps.parquet; films are drawn from it")
     steps, roads = runs.steps(first), {track.name: track for track in tracks}
     rows = steps_of(steps, first["mission"])
     space = {"z", "goal_z"} <= set(steps.dropna(axis=1, how="all"))

@@ -8,16 +8,23 @@ from pathlib import Path
 
 import pandas as pd
 
-from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.report.cells import cell_names, outcome
-from afm_rl.report.stranger import read_numbers, read_settings, read_table, read_text
+from afm_rl.errors import ConfigurationError
+from afm_rl.report.folders import (
+    RECORD,
+    STEPS,
+    Plan,
+    has_results,
+    read_joined_plan,
+    read_measures,
+    read_missions,
+    read_plan,
+    run_folders,
+)
+from afm_rl.report.stranger import read_numbers
 from afm_rl.storage.manifest import MANIFEST, check_manifest
-from afm_rl.storage.measures import FILE, Measures
+from afm_rl.storage.measures import Measures
 
 KEY = ["method", "cell", "seed"]
-MISSIONS, STEPS, COMPUTE, RECORD = "missions.csv", "steps.parquet", "compute.csv", "jobs.yaml"
-MOST_SEEDS = 100_000  # of a method
-Plan = list[tuple[str, list[int]]]
 
 
 @dataclass(frozen=True)
@@ -119,34 +126,32 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
     lost: list[str] = []
     measures: Measures | None = None
     for place, folder in enumerate(paths):
-        runs, gone = _run_folders(folder, notes)
-        lost += [
-            f"{folder / 'jobs' / name}: missing, although {RECORD} names it; the command that made "
-            "the folder runs it again"
-            for name in gone
-        ]
+        runs, gone = run_folders(folder)
+        if runs != [folder] and not (folder / MANIFEST).is_file():
+            notes.append(f"{folder} has no {MANIFEST}: whether a job is missing cannot be known.")
+        again = (
+            f"missing, although {RECORD} names it; the command that made the folder runs it again"
+        )
+        lost += [f"{job}: {again}" for job in gone]
+        plan += read_joined_plan(folder) if gone else []
         for run in runs:
-            if _has_results(run):
-                check_manifest(run)
-                plan += _plan(run)
-            else:
-                plan += _plan(run)
+            if not has_results(run):
+                plan += read_plan(run)
                 notes.append(f"{run} has no results yet.")
                 continue
-            declared = _read_measures(run / FILE)
+            check_manifest(run)
+            plan += read_plan(run)
+            declared = read_measures(run)
             if declared != (measures or declared):
                 raise ConfigurationError(
                     f"{names}: hold missions of different kinds; report on each alone"
                 )
-            measures, missions = declared, _read_missions(run, declared)
+            measures, missions = declared, read_missions(run, declared)
             missions = missions.assign(own=missions["mission"], file=-1, folder=place)
             if (run / STEPS).is_file():
                 missions["file"] = len(files)
                 files.append(run / STEPS)
             tables.append(missions)
-        if gone and (folder / MISSIONS).is_file():
-            asked = read_table(folder / MISSIONS, ["seed"], ["method"])
-            plan += [(name, seeds.tolist()) for name, seeds in asked.groupby("method")["seed"]]
     tables = [table for table in tables if len(table)]
     if measures is None or not tables:
         said = f" ({'; '.join(lost)})" if lost else ""
@@ -173,89 +178,3 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
             "recovery times leave them out."
         )
     return Runs(paths, missions, measures, files, plan, notes, lost)
-
-
-def _has_results(folder: Path) -> bool:
-    return any((folder / name).is_file() for name in (MISSIONS, MANIFEST))
-
-
-def _run_folders(folder: Path, notes: list[str]) -> tuple[list[Path], list[str]]:
-    """Return the folders of the runs in a folder, in the order of its record, and lost jobs.
-
-    Raises:
-        ConfigurationError: if there are none.
-        ArtefactError: if the record is damaged.
-    """
-    jobs = {path.name: path for path in sorted((folder / "jobs").glob("*")) if path.is_dir()}
-    if not jobs and not (folder / RECORD).is_file():
-        if not _has_results(folder):
-            what = f"holds no {MISSIONS}" if folder.is_dir() else "no such folder"
-            raise ConfigurationError(
-                f"{folder}: {what}; expected the folder of a run, or of several"
-            )
-        return [folder], []
-    if (folder / MANIFEST).is_file():
-        check_manifest(folder)
-    else:
-        notes.append(f"{folder} has no {MANIFEST}: whether a job is missing cannot be known.")
-    named = read_settings(folder / RECORD).get("jobs") if (folder / RECORD).is_file() else []
-    if not isinstance(named, list):
-        raise ConfigurationError(f"{folder / RECORD}: damaged; expected a list of jobs")
-    names = [*map(str, named)]
-    there = [name for name in dict.fromkeys([*names, *jobs]) if name in jobs]
-    return [jobs[name] for name in there], [name for name in names if name not in jobs]
-
-
-def _plan(run: Path) -> Plan:
-    """Return the method and the seeds that a run was to have, as its settings say."""
-    paths = [run / "config.yaml", run / "unfinished" / "config.yaml"]
-    for path in (path for path in paths if path.is_file()):
-        settings = read_settings(path)
-        seeds = settings.get("seeds", [])
-        numbers = range(seeds) if type(seeds) is int else seeds
-        if not isinstance(numbers, (list, range)) or len(numbers) > MOST_SEEDS:
-            raise ConfigurationError(
-                f"{path}: seeds={str(seeds)[:80]}: expected a count or a list, {MOST_SEEDS} at most"
-            )
-        whole = [seed for seed in numbers if type(seed) is int]
-        return [(str(settings["label"]), whole)] if "label" in settings else []
-    return []
-
-
-def _read_measures(path: Path) -> Measures:
-    try:
-        return Measures.from_json(read_text(path))
-    except ArtefactError as error:
-        raise ArtefactError(f"{path}: {error}") from error
-
-
-def _read_missions(run: Path, measures: Measures) -> pd.DataFrame:
-    """Return the missions of a run, checked, with ``cell``, and ``seconds`` if they were counted.
-
-    Raises:
-        ConfigurationError: if a file cannot be read, a column is missing, or a value cannot be.
-    """
-    path, whole = run / MISSIONS, ["seed", "steps", "mission"]
-    numbers = list(dict.fromkeys([*whole, *measures.columns]))
-    missions = read_table(path, numbers, ["method", "track"])
-    if not len(missions):
-        return missions
-    for name in whole:
-        if missions[name].isna().any() or (missions[name] % 1 != 0).any():
-            raise ConfigurationError(f"{path}: {name}: expected a whole number in each row")
-    ended = outcome(missions)
-    if ended not in missions or missions[ended].dtype != bool:
-        raise ConfigurationError(f"{path}: {ended}: expected True or False in each row")
-    if missions["mission"].duplicated().any():
-        raise ConfigurationError(f"{path}: mission: expected another number in each row")
-    # Single precision as text has seven digits: 6/34 is the same number in all files again.
-    reals = [m.column for m in measures if pd.api.types.is_float_dtype(missions[m.column])]
-    missions = missions.drop(columns="seconds", errors="ignore").assign(
-        **{name: missions[name].map("{:.6g}".format).astype(float) for name in reals},
-        cell=cell_names(missions),
-    )
-    if (run / COMPUTE).is_file():
-        spent = read_table(run / COMPUTE, ["seconds", "missions"], ["method"])
-        each = spent.groupby("method")[["seconds", "missions"]].sum()
-        missions["seconds"] = missions["method"].map(each["seconds"] / each["missions"])
-    return missions

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import pandas as pd
 from matplotlib.axes import Axes
@@ -135,25 +135,31 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def dress(axes: Any, x: str = "", y: str = "", grid: str = "", size: float = SMALL) -> None:
+def grid(axes: Axes, axis: Literal["both", "x", "y"] = "both") -> None:
+    """Draw faint lines behind everything."""
+    axes.grid(axis=axis, color="#eeeeee", linewidth=0.6)
+    axes.set_axisbelow(True)
+
+
+def dress(axes: Any, x: str = "", y: str = "", lines: Any = None, size: float = SMALL) -> None:
     """Give axes the common look: small ticks, a light frame, labels, faint lines behind all.
 
     Args:
         axes: to be dressed.
         x: label.
         y: label.
-        grid: ``"x"``, ``"y"``, ``"both"``, or nothing for no lines.
+        lines: ``"x"``, ``"y"``, ``"both"``, or None for no lines.
         size: of the labels (pt).
     """
     axes.tick_params(which="both", labelsize=SMALL, length=2.5, color=FAINT)
     axes.tick_params(which="minor", length=1.5)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(FAINT)
-    axes.set_xlabel(literal(x), fontsize=size)
-    axes.set_ylabel(literal(y), fontsize=size)
-    if grid:
-        axes.grid(axis=grid, color="#eeeeee", linewidth=0.6)
-        axes.set_axisbelow(True)
+    for label, write in ((x, axes.set_xlabel), (y, axes.set_ylabel)):
+        if label:
+            write(literal(label), fontsize=size)
+    if lines:
+        grid(axes, lines)
 
 
 def legend_above(

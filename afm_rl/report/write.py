@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import base64
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.report.events import folder_names, write_events
-from afm_rl.report.figures import Picture, draw_report, draw_run, read_excerpts
+from afm_rl.report.figures import draw_report, draw_run, read_excerpts
 from afm_rl.report.means import aggregate, budget_notes, compare, count_budgets
 from afm_rl.report.recovery import recovery_table
 from afm_rl.report.runs import Runs
 from afm_rl.report.stranger import LONGEST, read_text
-from afm_rl.report.table import Table
 from afm_rl.report.tables import (
     cell_table,
     comparison_tables,
@@ -170,7 +169,8 @@ def write_report(
             write_whole(path, picture.png)
         echo(f"wrote {len(pictures)} figures: {out / 'figures'}")
     title = f"Results: {len(runs.methods)} methods, {cells} cells"
-    page = render_page(title, summary, notes, pictures, tables, REFERENCES)
+    content = {"title": title, "summary": summary, "notes": notes, "tables": tables}
+    page = render_page(**content, figures=pictures, references=REFERENCES)
     write_whole(out / "index.html", page.encode())
     echo(f"Report: {out / 'index.html'}")
     return out / "index.html"
@@ -186,17 +186,11 @@ def _found(folder: Path) -> Iterator[str]:
         raise ArtefactError(f"{path}: damaged; delete it") from error
 
 
-def render_page(
-    title: str,
-    summary: str,
-    notes: Sequence[str],
-    pictures: Iterable[Picture],
-    tables: Iterable[Table],
-    references: Sequence[str] = (),
-) -> str:
-    """Return a page that needs no other file."""
+def render_page(**content: Any) -> str:
+    """Return a page that needs no other file: title, summary, notes, figures, tables, references.
+
+    Figures have the attributes or entries ``name``, ``title``, ``caption`` and ``data``, the PNG
+    file in base 64.
+    """
     environment = Environment(autoescape=True, undefined=StrictUndefined)
-    environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
-    content = {"title": title, "summary": summary, "notes": notes, "figures": [*pictures]}
-    template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
-    return template.render(**content, tables=[*tables], references=references)
+    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(**content)
