@@ -11,77 +11,114 @@ from typing import Any
 import numpy as np
 
 from afm_rl.diagnosis.intervals import half_widths
-from afm_rl.diagnosis.model import DOWN, Model, Problem, cut, fit_lines, refine, weight_of
+from afm_rl.diagnosis.model import (
+    DOWN,
+    GAIN_DRIFT,
+    OFFSET_DRIFT,
+    Model,
+    Problem,
+    costs,
+    cut,
+    fit_lines,
+    refine,
+    scale_of,
+    weight_of,
+)
 from afm_rl.diagnosis.response import Shape, respond
+from afm_rl.diagnosis.settings import Settings
 
-PENALTY = 10.0  # per number: twice the logarithm of the likelihood that it has to win
-VISIBLE = 0.02  # standard deviations of the response: what changes it less is left out
 FLOOR = 1e-7  # share of the variance: better fits are all the same
-MOST = 6  # numbers beside delay and lag
-REFINED = 3  # models with another number, of which the best numbers are looked for
-CLEAR = 4.5  # standard errors by which another command has to show
-COUPLED = 0.05  # share of the driver's influence
 QUICK = ("play", "stick", "rate", "hold")  # may be mistaken for delay and lag
-HOLDS = (2, 3, 4, 5, 6, 8, 10)  # rows
+DYNAMICS = ("delay", "keep", "rate")
 COST = attrgetter("cost")
 NONE = Shape._field_defaults
 
 
-def fit_response(problem: Problem, driver: int, starts: Sequence[Shape]) -> Model:
+def fit_response(
+    problem: Problem, large: Problem, driver: int, starts: Sequence[Shape], settings: Settings
+) -> Model:
     """Return the simplest model that is not clearly worse than a more complicated one.
 
-    Forward: delay and lag, then the other numbers of a shape and other commands, whichever improves
-    the fit most, as long as it improves it clearly. Backward: what is no longer needed is left out.
+    Delay, lag and rate limit together first; then forward, whichever of the other numbers and
+    commands improves the fit most, as long as it improves it clearly; then backward, what is no
+    longer needed.
 
     Args:
-        problem: response and commands.
+        problem: response and commands, by which numbers are proposed.
+        large: by which they are found and judged, the same or more rows of it.
         driver: the command that is followed.
-        starts: delays and lags to begin with.
+        starts: delays, lags and rate limits to begin with.
+        settings: how clear it must be.
     """
-    model = _dynamics(problem, driver, starts)
-    for added in range(MOST):
-        found = [refine(problem, candidate) for candidate in larger(problem, model)]
+    model = _dynamics(problem, large, driver, starts, settings)
+    added = 0
+    while added < settings.most:
+        found = [refine(large, candidate) for candidate in larger(problem, model, settings)]
         better = min(found, key=COST, default=model)
-        if not (_needed(problem, better, model) and _visible(problem, better, model)):
-            return _smaller(problem, model) if added else model
-        model = better
-    return _smaller(problem, model)
+        if not (
+            needed(large, better, model, settings) and _visible(large, better, model, settings)
+        ):
+            break
+        model, added = better, added + 1
+    return _smaller(large, model, settings) if added else model
 
 
-def _dynamics(problem: Problem, driver: int, starts: Sequence[Shape]) -> Model:
-    """Return the simplest of no delay, a delay, a lag, and both that is needed."""
-    options = []
+def _dynamics(
+    problem: Problem, large: Problem, driver: int, starts: Sequence[Shape], settings: Settings
+) -> Model:
+    """Return the simplest of a delay, a lag, a rate limit, and any of them together."""
+    options = {}
     for start in starts:
-        options.append(Model(driver, start._replace(keep=0.0), ("delay",)))
-        if start.keep:
-            options.append(Model(driver, start, ("delay", "keep")))
-            options.append(Model(driver, start._replace(delay=0.0), ("keep",)))
-    model = refine(problem, Model(driver, Shape()))
-    for size in (1, 2):
-        some = [refine(problem, option) for option in options if option.size == size]
+        names = tuple(name for name in DYNAMICS if getattr(start, name) != NONE[name])
+        wanted = [names, ("delay", *(n for n in names if n != "delay")), ("delay",)]
+        if len(names) > 1:
+            wanted.append(tuple(name for name in names if name != "delay"))
+        for some in wanted:
+            shape = Shape(**{name: getattr(start, name) for name in some})
+            options[shape, some] = Model(driver, shape, some)
+    found: dict[tuple[str, ...], Model] = {}
+    for option in options.values():
+        refined = refine(problem, option)
+        if refined.cost < found.get(option.active, option).cost:
+            found[option.active] = refined
+    model = refine(large, Model(driver, Shape()))
+    for size in (1, 2, 3):
+        some = [refine(large, other) for other in found.values() if other.size == size]
         better = min(some, key=COST, default=model)
-        if better.size > model.size and _needed(problem, better, model):
+        if better.size > model.size and needed(large, better, model, settings):
             model = better
     return model
 
 
-def _needed(problem: Problem, larger: Model, smaller: Model) -> bool:
+def needed(problem: Problem, more: Model, less: Model, settings: Settings) -> bool:
     """Return whether a model wins enough likelihood by the numbers that it has more.
 
-    Neighbouring residuals that are alike count as fewer rows.
+    Neighbouring residuals that are alike count as fewer rows; and the model has to be better all
+    over the log, not in one place.
     """
-    rows = problem.use.sum() * weight_of(problem, larger)
-    won = rows * math.log((smaller.cost + FLOOR) / (larger.cost + FLOOR))
-    return won > PENALTY * (larger.size - smaller.size)
+    y, use = problem.y, problem.use
+    residual = (y - more.predict(problem))[use]
+    scale = scale_of(residual)
+    gain = costs((y - less.predict(problem))[use], scale) - costs(residual, scale)
+    rows = use.sum() * weight_of(problem, more)
+    won = rows * math.log((less.cost + FLOOR) / (more.cost + FLOOR))
+    return won > settings.penalty * (more.size - less.size) and consistent(gain, settings)
 
 
-def _visible(problem: Problem, one: Model, other: Model) -> bool:
+def consistent(gain: np.ndarray, settings: Settings) -> bool:
+    """Return whether what rows gain is above 0 in most blocks of a log."""
+    blocks = np.array([block.mean() for block in np.array_split(gain, settings.blocks)])
+    error = blocks.std(ddof=1) / math.sqrt(len(blocks))
+    return bool(blocks.mean() > settings.consistent * error)
+
+
+def _visible(problem: Problem, one: Model, other: Model, settings: Settings) -> bool:
     apart = (one.predict(problem) - other.predict(problem))[problem.use]
-    return bool(apart.std() > VISIBLE)
+    return bool(apart.std() > settings.visible)
 
 
-def larger(problem: Problem, model: Model) -> Iterator[Model]:
-    """Yield models with one number more, each with a good beginning for it."""
+def larger(problem: Problem, model: Model, settings: Settings, tried: int = 3) -> Iterator[Model]:
+    """Yield the best models with one number more, each with a good beginning for it."""
     own, shape = problem.u[:, model.driver], model.shape
     found = []
     for names, options in _beginnings(own, shape).items():
@@ -92,10 +129,11 @@ def larger(problem: Problem, model: Model) -> Iterator[Model]:
                 near = getattr(best.shape, names) * np.linspace(1 - width, 1 + width, 9)
                 best = min(best, _best(problem, best, [{names: float(x)} for x in near]), key=COST)
             found.append(best)
-    if own.min() < 0 < own.max() and DOWN not in model.others:
-        sides = replace(model, others=(*model.others, DOWN), gains=(*model.gains, 0.0))
-        found.append(fit_lines(problem, sides))
-    yield from sorted(found, key=COST)[:REFINED]
+    extra = [GAIN_DRIFT, OFFSET_DRIFT, *((DOWN,) if own.min() < 0 < own.max() else ())]
+    for kind in (kind for kind in extra if kind not in model.others):
+        some = replace(model, others=(*model.others, kind), gains=(*model.gains, 0.0))
+        found.append(fit_lines(problem, some))
+    yield from sorted(found, key=COST)[:tried]
     yield from _with_another(problem, model)
 
 
@@ -106,10 +144,11 @@ def _beginnings(own: np.ndarray, shape: Shape) -> dict[str, list[dict[str, Any]]
     grids: dict[str, Any] = {
         "delay": (0.5, 1.0, 2.0, 4.0),
         "keep": (0.4, 0.65, 0.85),
+        "cut": np.quantile(sizes, 0.98) * np.array([0.03, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9]),
         "low": low + (high - low) * np.array([0.08, 0.16, 0.25, 0.35, 0.45]),
         "high": high - (high - low) * np.array([0.08, 0.16, 0.25, 0.35, 0.45]),
         "play": (high - low) * np.array([0.02, 0.05, 0.1, 0.18, 0.28]),
-        "stick": float(sizes.max()) * np.geomspace(0.03, 0.8, 18),
+        "stick": float(sizes.max()) * np.geomspace(0.03, 0.8, 14),
         "rate": np.geomspace(0.01, 1.0, 10),
     }
     if low < 0 < high and not shape.dead_zone and not shape.jump:
@@ -121,15 +160,18 @@ def _beginnings(own: np.ndarray, shape: Shape) -> dict[str, list[dict[str, Any]]
         for name, values in grids.items()
         if name not in taken
     }
-    if not {"low", "high"} & taken:
+    if taken & {"low", "high"}:
+        found.pop("cut", None)
+    if "cut" in taken:
+        found = {name: options for name, options in found.items() if name not in ("low", "high")}
+    elif not {"low", "high"} & taken:
         found["low high"] = [
             {"low": float(a), "high": float(b)}
             for a, b in zip(grids["low"], grids["high"], strict=True)
         ]
-        if low < 0 < high:  # a switch
-            found["low high"].append({"low": 0.03 * low, "high": 0.03 * high})
     if "hold" not in taken:
-        found["hold phase"] = [{"hold": n, "phase": k} for n in HOLDS for k in range(n)]
+        holds = (2, 3, 4, 5, 6, 8, 10)  # rows
+        found["hold phase"] = [{"hold": n, "phase": k} for n in holds for k in range(n)]
     return found
 
 
@@ -151,8 +193,17 @@ def _best(problem: Problem, model: Model, options: Sequence[dict[str, Any]]) -> 
     return min((fit_lines(problem, replace(model, shape=shape)) for shape in shapes), key=COST)
 
 
-def _with_another(problem: Problem, model: Model) -> Iterator[Model]:
-    """Yield the model with the other command that shows best in what is left."""
+def _with_another(
+    problem: Problem, model: Model, clear: float = 4.5, coupled: float = 0.05
+) -> Iterator[Model]:
+    """Yield the model with the other command that shows best in what is left.
+
+    Args:
+        problem: response and commands.
+        model: what is known.
+        clear: standard errors by which the other command has to show: it is the best of several.
+        coupled: share of the driver's influence that matters.
+    """
     linear = model.shape.linear
     rest = [i for i in range(problem.u.shape[1]) if i not in (model.driver, *model.others)]
     rest = [i for i in rest if problem.u[:, i].std() > 0]
@@ -173,8 +224,8 @@ def _with_another(problem: Problem, model: Model) -> Iterator[Model]:
     influence = np.abs(slope) * spread
     main = abs(model.gain) * parts[0].std()
     left = residual[:, None] - slope * others  # of each, were it the one
-    error = half_widths(left * others / np.maximum(power, 1e-300)) / 1.96
-    good = kept & (np.abs(slope) > CLEAR * error) & (influence > COUPLED * main)
+    error = half_widths(left * others / np.maximum(power, 1e-300), chosen=1.0) / 1.96
+    good = kept & (np.abs(slope) > clear * error) & (influence > coupled * main)
     if good.any():
         best = int(np.argmax(np.where(good, slope**2 * power, -1.0)))
         yield replace(
@@ -184,7 +235,7 @@ def _with_another(problem: Problem, model: Model) -> Iterator[Model]:
         )
 
 
-def _smaller(problem: Problem, model: Model) -> Model:
+def _smaller(problem: Problem, model: Model, settings: Settings) -> Model:
     """Leave out numbers that are not needed any more, one at a time."""
     while True:
         options = [
@@ -197,7 +248,7 @@ def _smaller(problem: Problem, model: Model) -> Model:
         ]
         found = [refine(problem, option) for option in options]
         better = min(found, key=COST, default=model)
-        if better is model or _needed(problem, model, better):
+        if better is model or needed(problem, model, better, settings):
             return model
         model = better
 

@@ -1,0 +1,74 @@
+"""What actuators have in common: the unit of their responses, and the delay of the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from afm_rl.diagnosis.findings import Actuator
+from afm_rl.diagnosis.log import Log
+from afm_rl.diagnosis.settings import Settings
+from afm_rl.diagnosis.words import UNITS
+
+
+def unit_of(found: Sequence[Sequence[Actuator]]) -> list[list[Actuator]]:
+    """Return the parts of all actuators with the gain of a healthy one.
+
+    That is 1, or that of two known units if most have it.
+    """
+    last = [parts[-1] for parts in found]
+    gains = np.array([abs(a.gain) for a in last])
+    clear = [a.gain_interval[0] * a.gain_interval[1] > 0 and abs(a.gain) > 1e-4 for a in last]
+    unit = 1.0
+    if any(clear):
+        middle = float(np.median(gains[clear]))
+        unit = next((gain for gain in UNITS.values() if abs(middle / gain - 1) < 0.1), 1.0)
+    return [[_in_unit(part, unit) for part in parts] for parts in found]
+
+
+def _in_unit(actuator: Actuator, unit: float) -> Actuator:
+    """Return the actuator with its healthy gain, and the offset from a healthy response."""
+    usual = unit * actuator.centre
+    low, high = actuator.offset_interval
+    return replace(
+        actuator,
+        unit=unit,
+        offset=actuator.offset - usual,
+        offset_interval=(low - usual, high - usual),
+        drift={
+            name: (a - usual, b - usual) if name == "offset" else (a, b)
+            for name, (a, b) in actuator.drift.items()
+        },
+    )
+
+
+def shared_delay(
+    actuators: Sequence[Actuator], log: Log, settings: Settings
+) -> tuple[list[float], tuple[str, ...]]:
+    """Return delay and lag that are no fault of each actuator (s), and what to say of the loop.
+
+    Where all that are known are late by about the same time, that is the loop's: bus, controller,
+    logger. Of many, a few may stand out; their own fault is what is more than the others have.
+    """
+    known = [a for a in actuators if a.gain_interval[0] * a.gain_interval[1] > 0]
+    times = np.array([max(a.delay_s, 0.0) + a.lag_s for a in known])
+    usual = [log.usual_delay] * len(actuators)
+    if len(times) < 2:
+        return usual, ()
+    middle, late = float(np.median(times)), log.usual_delay + settings.late * log.step
+    scatter = 1.5 * float(np.median(np.abs(times - middle)))
+    reach = max(settings.shared * middle, log.step, 3 * scatter if len(times) > 4 else 0.0)
+    near = times[np.abs(times - middle) <= reach]
+    alike = len(near) == len(times) if len(times) < 5 else len(near) >= 0.8 * len(times)
+    if not alike or near.min() < late:
+        return usual, ()
+    steps = [f"{time / log.step:.2g}" for time in (near.min(), near.max())]
+    span = steps[0] if steps[0] == steps[1] else " to ".join(steps)
+    seconds = f" ({near.min():.2g} to {near.max():.2g} s)" if log.t is not None else ""
+    note = (
+        f"all actuators are {span} steps{seconds} behind their commands, delay and lag together: "
+        "that is the loop's, and no fault of one of them"
+    )
+    return [max(middle + reach, near.max())] * len(actuators), (note,)
