@@ -17,12 +17,12 @@ __all__ = ["ActionFlowVectorWrapper", "ActionFlowWrapper", "__version__"]
 if "afm_rl/UGVTrack-v0" not in gymnasium.registry:  # strings only: nothing heavy is imported
     gymnasium.register(
         id="afm_rl/UGVTrack-v0",
-        entry_point="afm_rl.envs.ugv_gym:UGVTrackGym",
-        vector_entry_point="afm_rl.envs.ugv_vector:UGVTrackVectorEnv",
+        entry_point="afm_rl.envs.ugv.gym:UGVTrackGym",
+        vector_entry_point="afm_rl.envs.ugv.vector:UGVTrackVectorEnv",
         max_episode_steps=5000,
     )
     gymnasium.register(
-        id="afm_rl/CrazyflieTrack-v0", entry_point="afm_rl.envs.quadrotor_gym:CrazyflieTrackGym"
+        id="afm_rl/CrazyflieTrack-v0", entry_point="afm_rl.envs.quadrotor.gym:CrazyflieTrackGym"
     )
 
 

@@ -25,8 +25,8 @@ from afm_rl.correction import ActionFlow
 from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY
 from afm_rl.dynamics import Dubins, DynamicsModel, Ensemble, KnownDynamics
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
-from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform
 
 POPULATION, HORIZON, HIDDEN, ROUNDS = 1000, 5, (200, 200, 200), 40

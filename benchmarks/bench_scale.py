@@ -26,10 +26,10 @@ from torchrl.envs.utils import step_mdp
 
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, Ensemble
-from afm_rl.files import write_whole
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
-from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+from afm_rl.spaces.manifold import Manifold
+from afm_rl.storage.files import write_whole
 from afm_rl.transforms import ActionFlowPolicy
 
 LOW, HIGH, HIDDEN = torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57]), (200, 200, 200)

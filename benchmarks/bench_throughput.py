@@ -26,8 +26,8 @@ from timing import timed
 
 from afm_rl.dynamics import Dubins, Ensemble
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
-from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+from afm_rl.spaces.manifold import Manifold
 
 LOW, HIGH, HIDDEN = torch.tensor([-1.0, -1.57]), torch.tensor([1.0, 1.57]), (200, 200, 200)
 CUSTOMARY = "customary"

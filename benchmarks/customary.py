@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.dynamics import Dubins
-from afm_rl.manifold import wrap_angle
+from afm_rl.spaces.manifold import wrap_angle
 
 TEMPERATURE, BETA = 0.001, 0.6
 

@@ -1,15 +1,8 @@
 """Environments: robots whose dynamics change under way."""
 
 from afm_rl.envs.actuator_inversion import actuator_inversion_task
-from afm_rl.envs.arm import arm_task
-from afm_rl.envs.course import Course
-from afm_rl.envs.gusty_pendulum import gusty_pendulum_task
-from afm_rl.envs.mission_noise import MissionNoise
-from afm_rl.envs.missions import MissionFormat
-from afm_rl.envs.quadrotor import CrazyflieTrack
-from afm_rl.envs.quadrotor_gym import CrazyflieTrackGym
-from afm_rl.envs.quadrotor_rotorpy import RotorPyTrack, rotorpy_crazyflie
-from afm_rl.envs.references import (
+from afm_rl.envs.courses.course import Course
+from afm_rl.envs.courses.references import (
     Circle,
     FigureEight,
     Hover,
@@ -19,18 +12,25 @@ from afm_rl.envs.references import (
     find_reference,
     load_reference,
 )
-from afm_rl.envs.rendering import TrackCanvas
-from afm_rl.envs.settings import schedule_in_seconds
-from afm_rl.envs.skid_steer import WheelPhysics, skid_steer
-from afm_rl.envs.task import Task
-from afm_rl.envs.task_env import TaskEnv
-from afm_rl.envs.task_hosts import environment_task
-from afm_rl.envs.task_sources import dm_control_task, function_task, gymnasium_task, mujoco_task
-from afm_rl.envs.track import Track
-from afm_rl.envs.tracks import load_track
-from afm_rl.envs.ugv import UGVTrack
-from afm_rl.envs.ugv_gym import UGVTrackGym
-from afm_rl.envs.ugv_vector import UGVTrackVectorEnv
+from afm_rl.envs.courses.rendering import TrackCanvas
+from afm_rl.envs.courses.track import Track
+from afm_rl.envs.courses.tracks import load_track
+from afm_rl.envs.gusty_pendulum import gusty_pendulum_task
+from afm_rl.envs.missions.format import MissionFormat
+from afm_rl.envs.missions.noise import MissionNoise
+from afm_rl.envs.missions.settings import schedule_in_seconds
+from afm_rl.envs.quadrotor.env import CrazyflieTrack
+from afm_rl.envs.quadrotor.gym import CrazyflieTrackGym
+from afm_rl.envs.quadrotor.rotorpy import RotorPyTrack, rotorpy_crazyflie
+from afm_rl.envs.task.arm import arm_task
+from afm_rl.envs.task.env import TaskEnv
+from afm_rl.envs.task.hosts import environment_task
+from afm_rl.envs.task.sources import dm_control_task, function_task, gymnasium_task, mujoco_task
+from afm_rl.envs.task.task import Task
+from afm_rl.envs.ugv.env import UGVTrack
+from afm_rl.envs.ugv.gym import UGVTrackGym
+from afm_rl.envs.ugv.skid_steer import WheelPhysics, skid_steer
+from afm_rl.envs.ugv.vector import UGVTrackVectorEnv
 
 __all__ = [
     "Circle",

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.envs.task import NOWHERE, Reward, Task
-from afm_rl.envs.task_sources import Limits
+from afm_rl.envs.task.sources import Limits
+from afm_rl.envs.task.task import NOWHERE, Reward, Task
 from afm_rl.errors import check_count
-from afm_rl.manifold import Manifold
 from afm_rl.regimes import Regime
+from afm_rl.spaces.manifold import Manifold
 
 MASS, LENGTH, GRAVITY, BELIEVED = 1.0, 0.5, 9.81, 9.0  # kg, m, m/s^2, m/s^2
 DRAG, DAMPING, NOISE = 0.5, 1.0, 0.1  # of air; N m s; N m

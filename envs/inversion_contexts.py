@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from afm_rl.envs.task import Contexts
+from afm_rl.envs.task.task import Contexts
 
 VALUES = 50  # of a parameter, in each split
 Span = tuple[float, float]

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.envs.inversion_contexts import body_regime, contexts_of
-from afm_rl.envs.task import NOWHERE, Task
-from afm_rl.manifold import Manifold
+from afm_rl.envs.task.task import NOWHERE, Task
 from afm_rl.regimes import Regime
+from afm_rl.spaces.manifold import Manifold
 
 STEP, SMALL_STEP = 0.1, 0.01  # s, of the double integrators and of the ODE
 MASS = (0.5, 1.5), (0.1, 2.0)  # ranges: training, and whole; also of the friction

@@ -13,8 +13,8 @@ from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, Ensemble
 from afm_rl.flow import AxisNetwork
 from afm_rl.learning import pretrain_ensemble
-from afm_rl.manifold import Manifold
 from afm_rl.regimes import ActionGain
+from afm_rl.spaces.manifold import Manifold
 
 torch.set_num_threads(1)
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=50)

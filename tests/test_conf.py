@@ -42,7 +42,7 @@ SMALL = {  # settings that are there are made small
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 POLICY = Path(__file__).parents[1] / "examples" / "policies" / "pendulum_sac.safetensors"
 OWN = [f"robot.xml={ASSETS / 'inverted_pendulum.xml'}"]
-OWN += ["robot.reward=afm_rl.envs.task_rewards.upright"]
+OWN += ["robot.reward=afm_rl.envs.task.rewards.upright"]
 PARTNERS = {  # what else must be chosen for a choice to make sense
     "dynamics=oracle": ["updater=oracle"],
     "dynamics=oracle_pe": ["updater=oracle"],

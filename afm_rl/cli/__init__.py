@@ -20,7 +20,7 @@ from afm_rl.cli.error_messages import explain, one_line
 from afm_rl.cli.launchers import register
 from afm_rl.cli.launchers.base import JobsFailed
 from afm_rl.cli.overrides import relaxed, trusted_packages, with_sweep_folder
-from afm_rl.targets import TRUST, check_composed, trusted
+from afm_rl.trust import TRUST, check_composed, trusted
 
 _launched: list[bool] = []
 """Whether Hydra is done with the settings."""

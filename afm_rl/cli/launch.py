@@ -20,13 +20,11 @@ from afm_rl.cli.launchers.base import JobLauncher, JobsFailed
 from afm_rl.cli.methods import jobs_of
 from afm_rl.envs import load_track
 from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag, check_number
-from afm_rl.files import locked
 from afm_rl.jobs.batch import Pool, run_batch
 from afm_rl.jobs.layout import JOBS, LOG
 from afm_rl.jobs.local import LocalPool
 from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
 from afm_rl.jobs.tables import read_measures, read_missions, read_steps
-from afm_rl.manifest import extend_manifest, read_manifest, write_manifest
 from afm_rl.missions import Agent, build
 from afm_rl.missions.checkpoint import Stopped
 from afm_rl.missions.explained import explain_mission
@@ -40,6 +38,8 @@ from afm_rl.report import (
     write_run,
 )
 from afm_rl.report.diagnosis import write_diagnosis
+from afm_rl.storage.files import locked
+from afm_rl.storage.manifest import extend_manifest, read_manifest, write_manifest
 
 SWITCHES = ("overwrite", "progress", "figures", "tensorboard")
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from afm_rl.compiling.machine_code import MachineCode, in_one_batch
+from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.base import Correction, put, rows_of
 from afm_rl.correction.counterfactuals import draw_counterfactuals
 from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY, check_hypotheses, memory_of
@@ -20,9 +22,7 @@ from afm_rl.flow.network import AxisNetwork
 from afm_rl.flow.prior import Drawn
 from afm_rl.flow.training import EFFECT_WEIGHT, States, flow_losses
 from afm_rl.flow.weights import load_universal
-from afm_rl.machine_code import MachineCode, in_one_batch
 from afm_rl.regimes import Regime
-from afm_rl.tracing import all_hold
 
 PLANS = 4  # for each window, in training
 CORRECTED = ("executed", "predicted", "spread", "bounds", "misaligned")

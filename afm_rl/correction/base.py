@@ -10,10 +10,10 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor, nn
 
+from afm_rl.compiling.tracing import may_look
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.faults import count_repeats, trusted
-from afm_rl.tracing import may_look
 
 Fields = dict[str, Tensor]
 """The parts of a memory, by name."""
@@ -39,7 +39,7 @@ class Correction(NamedTuple):
 def rows_of(mask: Tensor) -> Any:
     """Return an index of the missions of a mask ``(*B)``: of all of them one that copies nothing.
 
-    All of them where :func:`nothing may depend on numbers <afm_rl.tracing.may_look>`.
+    All of them where :func:`nothing may depend on numbers <afm_rl.compiling.tracing.may_look>`.
 
     >>> rows_of(torch.tensor([True, True])), rows_of(torch.tensor([True, False]))
     (Ellipsis, tensor([ True, False]))

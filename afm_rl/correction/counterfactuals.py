@@ -5,15 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from afm_rl.compiling.devices import device_of
 from afm_rl.correction.base import Corrector
-from afm_rl.devices import device_of
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.flow.experts import LIMIT, Rows
 from afm_rl.flow.prior import Draw, Drawn, draw_actions, draw_masks
 from afm_rl.flow.saturation import intend
 from afm_rl.regimes import Regime
-from afm_rl.sampling import draw_states
+from afm_rl.spaces.sampling import draw_states
 
 
 def draw_counterfactuals(

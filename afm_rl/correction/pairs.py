@@ -7,12 +7,12 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
+from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.base import Correction, Corrector, put, rows_of
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import check_count
 from afm_rl.flow.experts import LIMIT, Rows
-from afm_rl.tracing import all_hold
 
 OLD = 0.5  # what "valid" becomes where a change has begun since
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.base import Correction, Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import (
@@ -19,8 +20,7 @@ from afm_rl.errors import (
 from afm_rl.flow.network import mlp
 from afm_rl.flow.solver import midpoint
 from afm_rl.regimes import Regime
-from afm_rl.sampling import draw_states, uniform
-from afm_rl.tracing import all_hold
+from afm_rl.spaces.sampling import draw_states, uniform
 
 
 class PaperFlow(Corrector):

@@ -49,7 +49,7 @@ class Tick(nn.Module):
     """Hypotheses, experts, flow and choice as one function of tensors, for B missions.
 
     A function of its arguments alone, so that it can run as machine code
-    (:mod:`~afm_rl.machine_code`). The arguments are settings of
+    (:mod:`~afm_rl.compiling.machine_code`). The arguments are settings of
     :class:`~afm_rl.correction.ActionFlow`.
     """
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from afm_rl.dynamics.derivatives import derivative, linearised
 from afm_rl.errors import check_count
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 
 
 class DynamicsModel(nn.Module, ABC):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from afm_rl.rotations import rotate, rotate_slope
+from afm_rl.spaces.rotations import rotate, rotate_slope
 
 VELOCITY, ATTITUDE = slice(3, 6), slice(6, 10)  # of a state, see RigidBodySpace
 

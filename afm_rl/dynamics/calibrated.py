@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from afm_rl.compiling.tracing import may_look
 from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.dynamics.derivatives import linearised
 from afm_rl.dynamics.hammerstein import PLAIN, shaped, shaped_slope
 from afm_rl.dynamics.per_mission import PerMissionModel
 from afm_rl.errors import ConfigurationError
-from afm_rl.tracing import may_look
 
 CALIBRATION = ("matrix", "bias", "shape", "offset")
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.errors import check_number
-from afm_rl.manifold import Manifold, wrap_angle
+from afm_rl.spaces.manifold import Manifold, wrap_angle
 
 
 def dubins_step(state: Tensor, action: Tensor, dt: float) -> Tensor:

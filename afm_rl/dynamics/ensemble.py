@@ -9,8 +9,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from afm_rl.dynamics.cast_cache import CastCache
+from afm_rl.compiling.cast_cache import CastCache
 from afm_rl.dynamics.per_mission import PerMissionModel
+from afm_rl.dynamics.running_stats import RunningStats
 from afm_rl.dynamics.sparse import sparse_layer, uniform_layer
 from afm_rl.dynamics.stacked import stacked_mlp, stacked_mlp_tangent
 from afm_rl.errors import (
@@ -20,8 +21,7 @@ from afm_rl.errors import (
     check_counts,
     check_flag,
 )
-from afm_rl.manifold import Manifold
-from afm_rl.running_stats import RunningStats
+from afm_rl.spaces.manifold import Manifold
 
 Stack = Sequence[Tensor]
 Parameters = tuple[Iterable[Tensor], Iterable[Tensor]]  # weights and biases, layer by layer
@@ -37,7 +37,7 @@ class Ensemble(PerMissionModel):
     Each member maps the standardised features of state and action to mean and
     log-variance of the standardised state change,
     :math:`(s_{t+1} \ominus s_t - m) / c`. Networks read cosine and sine of every angle and the
-    matrix of a rotation (:meth:`Manifold.encode <afm_rl.manifold.Manifold.encode>`).
+    matrix of a rotation (:meth:`Manifold.encode <afm_rl.spaces.manifold.Manifold.encode>`).
 
     The prediction is the mean over members of their means (``propagation="mean"``), or of one
     sample each (``"sample"``, as published). With ``"member"`` candidate i, counted along the last

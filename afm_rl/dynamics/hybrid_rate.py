@@ -23,7 +23,7 @@ class HeldHybrid(HeldRate):
 
     >>> from afm_rl.dynamics.rates import FunctionRate
     >>> from afm_rl.dynamics.residual import draw_network
-    >>> from afm_rl.manifold import Manifold
+    >>> from afm_rl.spaces.manifold import Manifold
     >>> action, network = torch.zeros(1, 7, 1), draw_network(torch.ones(1, 10), 3, 2, 2)
     >>> nominal = FunctionRate(lambda x, u: -x + u, Manifold(2)).hold(action)
     >>> held = HeldHybrid(nominal, network, action, features=None)

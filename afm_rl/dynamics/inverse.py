@@ -7,9 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from afm_rl.compiling.tracing import all_hold
 from afm_rl.dynamics.base import DynamicsModel
-from afm_rl.small_matrices import invert_positive
-from afm_rl.tracing import all_hold
+from afm_rl.spaces.small_matrices import invert_positive
 
 UNSEEN = 4.0  # half ranges: standard deviation of an axis of which a transition shows nothing
 ASSUMED = 0.1  # half ranges: standard deviation where nothing needs an explanation

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_number
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 
 
 class KnownDynamics(DynamicsModel):

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.manifold import Manifold, wrap_angle
-from afm_rl.rotations import (
+from afm_rl.spaces.manifold import Manifold, wrap_angle
+from afm_rl.spaces.rotations import (
     quaternion_conjugate,
     quaternion_exp,
     quaternion_log,

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.errors import ConfigurationError
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 
 Self = TypeVar("Self", bound="PerMissionModel")
 

@@ -7,13 +7,13 @@ from functools import partial
 
 from torch import Tensor
 
-from afm_rl.airframe import QuadrotorBody
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.quadrotor_equations import QuadrotorRate, aligned, quadrotor_step
 from afm_rl.dynamics.rates import on_tangent
 from afm_rl.dynamics.runge_kutta import runge_kutta_tangent, undisturbed
 from afm_rl.errors import ConfigurationError, check_count, check_number
-from afm_rl.rotations import RigidBodySpace
+from afm_rl.spaces.airframe import QuadrotorBody
+from afm_rl.spaces.rotations import RigidBodySpace
 
 
 class Quadrotor(KnownDynamics):
@@ -21,7 +21,7 @@ class Quadrotor(KnownDynamics):
 
     States are position (m), velocity (m/s), quaternion (scalar-last) and body rate (rad/s), S = 13
     and D = 12; actions are thrust (N) and moments (N m) that the motors are taken to give:
-    :func:`~afm_rl.airframe.saturate` is the plant's affair. Predictions have unit quaternions.
+    :func:`~afm_rl.spaces.airframe.saturate` is the plant's affair. Quaternions stay of length 1.
 
     Args:
         body: the quadrotor, a Crazyflie if None.

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from afm_rl.airframe import QuadrotorBody
+from afm_rl.compiling.tracing import cached
 from afm_rl.dynamics.rates import HeldRate, Rate
 from afm_rl.dynamics.runge_kutta import runge_kutta_path
-from afm_rl.rotations import quaternion_normalise
-from afm_rl.tracing import cached
+from afm_rl.spaces.airframe import QuadrotorBody
+from afm_rl.spaces.rotations import quaternion_normalise
 
 
 class _Tables(NamedTuple):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics.derivatives import derivative
-from afm_rl.manifold import Manifold, wrap_angle
+from afm_rl.spaces.manifold import Manifold, wrap_angle
 
 
 class HeldRate(ABC):

@@ -11,7 +11,7 @@ from afm_rl.errors import ConfigurationError
 class UnknownDynamics(DynamicsModel):
     """The sizes of a model, and nothing else: whatever it is asked, it raises.
 
-    >>> from afm_rl.manifold import Manifold
+    >>> from afm_rl.spaces.manifold import Manifold
     >>> UnknownDynamics(Manifold(3), action_size=2).state_size
     3
     """

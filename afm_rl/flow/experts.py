@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from afm_rl.compiling.tracing import cached
 from afm_rl.flow.fits import (
     LEAST_GAIN,
     OUTLIER,
@@ -19,8 +20,7 @@ from afm_rl.flow.fits import (
     not_zero,
 )
 from afm_rl.flow.saturation import LIMIT, saturate
-from afm_rl.small_matrices import solve_positive
-from afm_rl.tracing import cached
+from afm_rl.spaces.small_matrices import solve_positive
 
 EXACT = 0.02  # half ranges: a fit that misses by less explains all rows
 EXPLAINED = 0.03  # of what the nominal map misses: a line that misses by less explains all rows

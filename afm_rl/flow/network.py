@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from afm_rl.compiling.tracing import may_look
 from afm_rl.flow.experts import ANSWERS, EXPERTS, LEAST_MISS, MISSES, Experts, Rows
 from afm_rl.flow.saturation import LIMIT, MODES
-from afm_rl.tracing import may_look
 
 SHARPNESS = 5.0  # of the logits of a mixture: shares of all or nothing are soon learnt
 LEAST_TIME = 0.1  # of the path that is left, in the velocity towards an expert's answer

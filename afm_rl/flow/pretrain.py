@@ -15,7 +15,6 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from afm_rl.files import write_whole
 from afm_rl.flow.experts import Rows, fit_experts
 from afm_rl.flow.network import AxisNetwork
 from afm_rl.flow.prior import KINDS, MIXES, Drawn, draw_examples
@@ -23,6 +22,7 @@ from afm_rl.flow.saturation import MODES
 from afm_rl.flow.solver import midpoint
 from afm_rl.flow.training import EFFECT_WEIGHT, flow_losses
 from afm_rl.flow.weights import load_universal
+from afm_rl.storage.files import write_whole
 
 SIZES = {1: 0.12, 2: 0.45, 3: 0.15, 4: 0.08, 6: 0.15, 9: 0.05}  # share of numbers of actions
 SHARES = {"mixed": 0.5, "clip": 0.3, "direction": 0.2}  # share of saturation modes

@@ -11,7 +11,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor, nn
 
-from afm_rl.devices import device_of
+from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import (
     ConfigurationError,

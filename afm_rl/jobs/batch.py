@@ -13,14 +13,14 @@ from omegaconf import DictConfig
 from yaml import safe_dump
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.files import locked, remove_parts, write_whole
 from afm_rl.jobs.layout import JOBS, MISSIONS, RECORD, is_batch, recorded
 from afm_rl.jobs.process import Ends, Job
 from afm_rl.jobs.progress import Board
 from afm_rl.jobs.run import begin, needs_run
 from afm_rl.jobs.tables import write_tables
-from afm_rl.manifest import MANIFEST, write_manifest
-from afm_rl.targets import trusted
+from afm_rl.storage.files import locked, remove_parts, write_whole
+from afm_rl.storage.manifest import MANIFEST, write_manifest
+from afm_rl.trust import trusted
 
 LONGEST = 120  # characters of the name of a job's folder
 

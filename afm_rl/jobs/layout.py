@@ -35,7 +35,7 @@ from pathlib import Path
 from yaml import YAMLError, safe_load
 
 from afm_rl.errors import ArtefactError
-from afm_rl.manifest import MANIFEST
+from afm_rl.storage.manifest import MANIFEST
 
 JOBS, RECORD, UNFINISHED = "jobs", "jobs.yaml", "unfinished"
 MISSIONS, STEPS, COMPUTE = "missions.csv", "steps.parquet", "compute.csv"

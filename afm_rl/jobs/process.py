@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 from afm_rl.errors import AFMError, causes
-from afm_rl.files import locked
 from afm_rl.jobs.layout import LOG, UNFINISHED, is_finished
-from afm_rl.targets import TRUST
+from afm_rl.storage.files import locked
+from afm_rl.trust import TRUST
 
 START = "forkserver"  # torch is imported once, and jobs are forked from there
 FAILURE, PROGRESS = "failure.txt", "progress.json"  # in the folder of unfinished results
@@ -38,7 +38,7 @@ class Job:
         name: what sets it apart from the others.
         folder: its own.
         cwd: where the command was given, which relative paths are relative to.
-        trust: packages that the command trusts, see :mod:`afm_rl.targets`.
+        trust: packages that the command trusts, see :mod:`afm_rl.trust`.
     """
 
     name: str

@@ -15,15 +15,15 @@ import pandas as pd
 from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError, safe_load
 
-from afm_rl import measures
 from afm_rl._version import __version__
-from afm_rl.csv_text import csv_text
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.files import remove_parts, sync_folder, write_whole
 from afm_rl.jobs.layout import COMPUTE, CONFIG, MISSIONS, STEPS, UNFINISHED, is_batch, is_finished
-from afm_rl.manifest import MANIFEST, check_manifest, read_manifest, write_manifest
 from afm_rl.missions import Agent, Results, build, prepare, run
 from afm_rl.missions.settings import differences, influential
+from afm_rl.storage import measures
+from afm_rl.storage.csv_text import csv_text
+from afm_rl.storage.files import remove_parts, sync_folder, write_whole
+from afm_rl.storage.manifest import MANIFEST, check_manifest, read_manifest, write_manifest
 
 REPLACED = "replaced.json"  # the manifest of results that are being replaced
 SHOWN = (

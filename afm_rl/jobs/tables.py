@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pandas as pd
 
-from afm_rl.files import write_whole
 from afm_rl.jobs.layout import COMPUTE, MISSIONS, RECORD, STEPS, is_finished, run_folders
 from afm_rl.jobs.run import csv_of
-from afm_rl.manifest import MANIFEST, write_manifest
-from afm_rl.measures import FILE, Measures
+from afm_rl.storage.files import write_whole
+from afm_rl.storage.manifest import MANIFEST, write_manifest
+from afm_rl.storage.measures import FILE, Measures
 
 OWN = ["run", "own"]  # the folder that a mission comes from, and its number there
 

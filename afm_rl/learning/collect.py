@@ -11,7 +11,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase
 
 from afm_rl.errors import check_count
-from afm_rl.keys import as_keys
+from afm_rl.spaces.keys import as_keys
 
 KEYS = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"))
 

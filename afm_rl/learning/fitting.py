@@ -10,12 +10,12 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from afm_rl.devices import device_of
+from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import Ensemble
 from afm_rl.errors import NonFiniteError, check_count, check_number
-from afm_rl.keys import as_keys
 from afm_rl.learning.nll import gaussian_nll
 from afm_rl.progress import Bar
+from afm_rl.spaces.keys import as_keys
 
 TOLERATED = 1 / 3  # unexplained share of the variance above which there is a warning
 
@@ -88,7 +88,7 @@ def fit_ensemble(
         UserWarning: if more than a third of the variance of a coordinate is left unexplained.
 
     >>> from tensordict import TensorDict
-    >>> from afm_rl.manifold import Manifold
+    >>> from afm_rl.spaces.manifold import Manifold
     >>> entries = {"observation": torch.randn(400, 1), "action": torch.randn(400, 1)}
     >>> cart = TensorDict(entries, [400])
     >>> cart["next", "observation"] = cart["observation"] + 0.1 * cart["action"]

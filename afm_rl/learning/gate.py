@@ -11,7 +11,7 @@ from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, NonFiniteError, check_number
-from afm_rl.keys import as_keys
+from afm_rl.spaces.keys import as_keys
 
 
 @torch.no_grad()

@@ -9,8 +9,8 @@ from tensordict import NestedKey, TensorDictBase
 from torchrl.trainers import Trainer, TrainerHookBase
 
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.keys import as_key
 from afm_rl.learning.updater import Updater
+from afm_rl.spaces.keys import as_key
 
 
 class UpdaterHook(TrainerHookBase):

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from afm_rl.dynamics.body_frame import to_world
 from afm_rl.dynamics.knode import KNODE
 from afm_rl.dynamics.residual import Network
-from afm_rl.manifold import wrap_angle
+from afm_rl.spaces.manifold import wrap_angle
 
 Triple = tuple[Tensor, Tensor, Tensor]  # states, actions, next states
 

@@ -19,12 +19,12 @@ from afm_rl.errors import (
     check_number,
 )
 from afm_rl.faults import whole
-from afm_rl.keys import as_key
 from afm_rl.learning.flight_window import FlightWindow, Rows
 from afm_rl.learning.knode_fit import fit_network
 from afm_rl.learning.learner import Learner
 from afm_rl.learning.nll import GaussianNLLLoss
 from afm_rl.mission_state import MissionState
+from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
 
 TRAINERS = ("fast", "exact")

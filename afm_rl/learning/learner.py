@@ -10,10 +10,10 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 from afm_rl.faults import count_repeats, trusted, whole
-from afm_rl.keys import as_key
 from afm_rl.learning.nll import GaussianNLLLoss
 from afm_rl.learning.updater import Updater
 from afm_rl.mission_state import MissionState
+from afm_rl.spaces.keys import as_key
 
 
 class Readings(NamedTuple):

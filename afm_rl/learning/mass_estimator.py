@@ -8,12 +8,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from afm_rl.airframe import saturate
 from afm_rl.dynamics import Oracle, Quadrotor
 from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.learning.learner import Learner
 from afm_rl.learning.nll import GaussianNLLLoss
-from afm_rl.rotations import body_z_axis
+from afm_rl.spaces.airframe import saturate
+from afm_rl.spaces.rotations import body_z_axis
 
 
 def inverse_mass(

@@ -5,13 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from afm_rl.devices import device_of
+from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import DynamicsModel, Oracle
 from afm_rl.dynamics.knode import KNODE
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.progress import Bar
 from afm_rl.regimes import Regime
-from afm_rl.sampling import uniform
+from afm_rl.spaces.sampling import uniform
 
 
 def pretrain_knode(

@@ -46,7 +46,7 @@ class StreamXUpdater(OnlineUpdater):
         ConfigurationError: for settings out of range, or a model that is no ensemble.
 
     >>> from tensordict import TensorDict
-    >>> from afm_rl.manifold import Manifold
+    >>> from afm_rl.spaces.manifold import Manifold
     >>> model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], layer_norm=True)
     >>> updater = StreamXUpdater(GaussianNLLLoss(model.expand_(4)))
     >>> td = TensorDict({"observation": torch.zeros(4, 3), "action": torch.ones(4, 2)}, [4])

@@ -45,7 +45,7 @@ class UnmatchedUpdater(Updater):
     >>> from functools import partial
     >>> from tensordict import TensorDict
     >>> from afm_rl.dynamics import Ensemble
-    >>> from afm_rl.manifold import Manifold
+    >>> from afm_rl.spaces.manifold import Manifold
     >>> model = Ensemble(Manifold(3, angles=[2]), 2, features=[2])
     >>> sgd = partial(OnlineUpdater, optimizer=partial(torch.optim.SGD, lr=1e-4))
     >>> updater = UnmatchedUpdater(GaussianNLLLoss(model), sgd, [1.0, 1.5])

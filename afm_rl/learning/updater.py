@@ -11,9 +11,9 @@ from torch import nn
 
 from afm_rl.dynamics import Oracle
 from afm_rl.errors import check_instance
-from afm_rl.keys import as_key
 from afm_rl.learning.nll import GaussianNLLLoss
 from afm_rl.mission_state import MissionState
+from afm_rl.spaces.keys import as_key
 
 
 class Updater(nn.Module):

@@ -15,7 +15,7 @@ from afm_rl.dynamics import Ensemble
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.learning.fitting import FitReport, fit_ensemble
 from afm_rl.learning.gate import fit_gate
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 
 KEPT_BACK = 0.2  # newest share of the transitions, to which only the gate is fitted
 WINDOW = 16  # transitions that a gate looks at: windows overlap, and few tell little

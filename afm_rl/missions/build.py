@@ -14,7 +14,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
-from afm_rl.devices import check_device
+from afm_rl.compiling.devices import check_device
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
 from afm_rl.learning import GaussianNLLLoss, Updater
@@ -30,8 +30,8 @@ from afm_rl.missions.selection import (
     select_tracks,
 )
 from afm_rl.planning import Cost, PlanningEnv
-from afm_rl.targets import check_targets
 from afm_rl.transforms import ActionFlowTransform, Guard
+from afm_rl.trust import check_targets
 
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
 MOST_STEPS, MOST_MISSIONS = 10_000_000, 1_000_000

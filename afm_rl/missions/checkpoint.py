@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from afm_rl._version import __version__
-from afm_rl.artefacts import read_tensors, save_tensors
 from afm_rl.errors import AFMError, ArtefactError, check_count, check_number
-from afm_rl.files import remove_parts
 from afm_rl.missions.build import Agent
 from afm_rl.missions.settings import differences, influential
 from afm_rl.missions.state import Loop, fingerprint, restore, snapshot
 from afm_rl.missions.tree import flatten, unflatten
+from afm_rl.storage.artefacts import read_tensors, save_tensors
+from afm_rl.storage.files import remove_parts
 
 FILES = "checkpoint-*.safetensors"
 

@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, TransformedEnv
 
-from afm_rl.devices import device_of
+from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import Ensemble
 from afm_rl.errors import ConfigurationError, check_count, check_counts
 from afm_rl.learning import collect, fit_ensemble

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from afm_rl.artefacts import load_artefact
 from afm_rl.correction import ActionFlow, Corrector, L1Augmentation, LeastSquares, PaperFlow
 from afm_rl.dynamics import (
     KNODE,
@@ -33,6 +32,7 @@ from afm_rl.missions.checks import check_training
 from afm_rl.missions.collected import fit_collected
 from afm_rl.missions.robot import Robot
 from afm_rl.planning.costs import SATURATIONS, KnownReward
+from afm_rl.storage.artefacts import load_artefact
 from afm_rl.transforms import ActionFlowTransform
 
 FLOW_UNIT = "shares of the largest action"

@@ -10,7 +10,7 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.learning import fit_gate
 from afm_rl.missions.build import Agent
 from afm_rl.missions.collected import transitions
-from afm_rl.sampling import uniform
+from afm_rl.spaces.sampling import uniform
 
 TRANSITIONS = 20_000
 EPISODE = 800  # transitions under the planner

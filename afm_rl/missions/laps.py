@@ -9,8 +9,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from afm_rl.measures import Measure, Measures
 from afm_rl.missions.score import Score
+from afm_rl.storage.measures import Measure, Measures
 
 
 class LapScore(Score):

@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 
 from afm_rl._version import __version__
-from afm_rl.artefacts import cached
 from afm_rl.missions.build import Agent
 from afm_rl.missions.gate import fit_agents_gate
+from afm_rl.storage.artefacts import cached
 
 
 def prepare(

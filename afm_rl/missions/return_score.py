@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from afm_rl.measures import Measure, Measures
 from afm_rl.missions.score import Score
+from afm_rl.storage.measures import Measure, Measures
 
 SOON = 20  # steps that count as "at" the change, and over which a recovery is told
 ENOUGH = 0.1  # share of the reward before that may be missing after a recovery

@@ -15,12 +15,12 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from afm_rl.errors import NonFiniteError
-from afm_rl.measures import Measures
 from afm_rl.missions.build import Agent
 from afm_rl.missions.checkpoint import Checkpoints, Stopped
 from afm_rl.missions.log import StepLog
 from afm_rl.missions.state import Loop, leave, unsaved
 from afm_rl.progress import Bar
+from afm_rl.storage.measures import Measures
 
 ALIGNED = 5.0  # innovation, in standard deviations, up to which a model counts as aligned
 STILL = 0.1  # innovation up to which a repeated reading shows a robot at rest, as foreseen

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.measures import Measures
+from afm_rl.storage.measures import Measures
 
 
 class Score(ABC):

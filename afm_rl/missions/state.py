@@ -13,13 +13,13 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torchrl.envs import EnvBase
 
-from afm_rl.artefacts import digest_of
-from afm_rl.dynamics.cast_cache import CastCache
+from afm_rl.compiling.cast_cache import CastCache
 from afm_rl.errors import ConfigurationError
 from afm_rl.mission_state import MissionState
 from afm_rl.missions.build import Agent
 from afm_rl.missions.log import StepLog
 from afm_rl.regimes import Regime
+from afm_rl.storage.artefacts import digest_of
 from afm_rl.streams import Streams
 
 PLAIN = (bool, int, float, str, type(None))

@@ -11,8 +11,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.errors import check_number
-from afm_rl.measures import Measure, Measures
 from afm_rl.missions.score import Score
+from afm_rl.storage.measures import Measure, Measures
 
 UP = 2  # index of the z axis
 

@@ -12,7 +12,7 @@ from tensordict import NestedKey
 from torch import Tensor, nn
 
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
-from afm_rl.keys import as_keys
+from afm_rl.spaces.keys import as_keys
 
 SATURATIONS = ("mixed", "direction", "clip")  # what gives way when an action cannot be had
 

@@ -11,12 +11,12 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from afm_rl.airframe import QuadrotorBody, saturate
 from afm_rl.dynamics.quadrotor import check_body
 from afm_rl.errors import ConfigurationError, check_count, check_number
-from afm_rl.keys import as_key
 from afm_rl.planning.planning_env import PlanningEnv
-from afm_rl.rotations import body_z_axis, quaternion_conjugate, rotate
+from afm_rl.spaces.airframe import QuadrotorBody, saturate
+from afm_rl.spaces.keys import as_key
+from afm_rl.spaces.rotations import body_z_axis, quaternion_conjugate, rotate
 
 LEAST = 1.0  # m/s^2 upwards: with less, tilting would not steer
 

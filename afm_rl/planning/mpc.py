@@ -11,13 +11,13 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_choice, check_count
-from afm_rl.keys import as_key
-from afm_rl.manifold import Manifold, wrap_angle
 from afm_rl.planning.conic import load_casadi, solve_conic
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.planning.riccati import LQProblem, LQSolution, solve_lq
 from afm_rl.planning.tracking import QuadraticCost
+from afm_rl.spaces.keys import as_key
+from afm_rl.spaces.manifold import Manifold, wrap_angle
 
 SOLVERS: dict[str, Callable[[LQProblem], LQSolution]] = {"riccati": solve_lq, "hpipm": solve_conic}
 

@@ -10,11 +10,11 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import ModelBasedEnvBase
 
-from afm_rl.devices import device_of, moved
+from afm_rl.compiling.devices import device_of, moved
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.keys import as_key
 from afm_rl.planning.costs import Cost
+from afm_rl.spaces.keys import as_key
 
 
 class PlanningEnv(ModelBasedEnvBase):

@@ -8,12 +8,12 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from afm_rl.airframe import QuadrotorBody, mix
 from afm_rl.dynamics.quadrotor import check_body
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
-from afm_rl.rotations import quaternion_conjugate, rotate
+from afm_rl.spaces.airframe import QuadrotorBody, mix
+from afm_rl.spaces.rotations import quaternion_conjugate, rotate
 
 HIDDEN = 16  # numbers of its recurrent layer
 MOTORS = (-45.0, -135.0, 135.0, 45.0)  # directions of its motors, degrees

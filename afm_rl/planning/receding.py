@@ -13,10 +13,10 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.modules.planners.common import MPCPlannerBase
 
-from afm_rl.devices import moved
+from afm_rl.compiling.devices import moved
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.keys import as_key
 from afm_rl.planning.primer import ZeroPrimer
+from afm_rl.spaces.keys import as_key
 
 
 def action_spec_of(env: EnvBase) -> TensorSpec:

@@ -11,11 +11,11 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.modules.planners.common import _mask_post_done_reward, _planning_done_keys
 
+from afm_rl.compiling.tracing import may_look
 from afm_rl.errors import ConfigurationError, check_choice, check_count
-from afm_rl.keys import as_key
 from afm_rl.planning.receding import RecedingHorizonPlanner
+from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
-from afm_rl.tracing import may_look
 
 
 class SamplingPlanner(RecedingHorizonPlanner):

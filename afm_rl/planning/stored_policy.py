@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from afm_rl.artefacts import digest_of, read_tensors, save_tensors
 from afm_rl.errors import ArtefactError, ConfigurationError, check_number
 from afm_rl.planning.law import LawPlanner
 from afm_rl.planning.planning_env import PlanningEnv
+from afm_rl.storage.artefacts import digest_of, read_tensors, save_tensors
 
 
 class StoredPolicy(nn.Module):

@@ -11,9 +11,9 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_choice, check_number
-from afm_rl.keys import as_keys
-from afm_rl.manifold import wrap_angle
 from afm_rl.planning.costs import SATURATIONS, Cost
+from afm_rl.spaces.keys import as_keys
+from afm_rl.spaces.manifold import wrap_angle
 
 
 class QuadraticCost(Cost):

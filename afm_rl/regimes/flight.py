@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.airframe import QuadrotorBody, mix, unmix
 from afm_rl.regimes.base import Regime, StaticRegime
 from afm_rl.regimes.compose import Compose
 from afm_rl.regimes.gain import ActionGain, divide
 from afm_rl.regimes.settings import check_span, draw_between
+from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix
 
 LEAST, MOST = 0.01, 100.0  # factors beyond these are typing errors
 
@@ -91,7 +91,7 @@ class MotorEfficiency(StaticRegime):
 
     .. math:: u_\mathrm{eff} = X\,\mathrm{diag}(\eta)\,X^{-1} u
 
-    X is the mixer, :func:`~afm_rl.airframe.mix`.
+    X is the mixer, :func:`~afm_rl.spaces.airframe.mix`.
 
     Args:
         body: the quadrotor, a Crazyflie if None.

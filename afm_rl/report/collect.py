@@ -11,10 +11,10 @@ from typing import Any
 import pandas as pd
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.manifest import MANIFEST, check_manifest
-from afm_rl.measures import FILE, Measures
 from afm_rl.report.frames import cell_names
 from afm_rl.report.results_files import read_measures, read_missions, read_settings, read_table
+from afm_rl.storage.manifest import MANIFEST, check_manifest
+from afm_rl.storage.measures import FILE, Measures
 
 KEY = ["method", "cell", "seed"]
 MOST_SEEDS = 100_000  # of a method

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from afm_rl.measures import Measure, Measures
 from afm_rl.report import style
 from afm_rl.report.summary import count_budgets, summarise
+from afm_rl.storage.measures import Measure, Measures
 
 PANELS = 3
 SPREAD = 0.26  # of a row: how far single missions lie off its middle

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from afm_rl.measures import Measure, Measures
 from afm_rl.report.frames import outcome
 from afm_rl.report.statistics import (
     interquartile_mean,
@@ -17,6 +16,7 @@ from afm_rl.report.statistics import (
 )
 from afm_rl.report.summary import summarise, summarise_cells
 from afm_rl.report.table import Table, best_places, interval_text, number
+from afm_rl.storage.measures import Measure, Measures
 
 BOOTSTRAP = (
     "Brackets are 95 % intervals of the stratified bootstrap (Agarwal et al. 2021): seeds are "

@@ -10,10 +10,10 @@ from rich.console import Console, JustifyMethod
 from rich.table import Table as Grid
 from rich.text import Text
 
-from afm_rl.measures import Measures
 from afm_rl.report.comparisons import cell_table, summary_table
 from afm_rl.report.summary import summarise
 from afm_rl.report.table import Table
+from afm_rl.storage.measures import Measures
 
 ABREAST = 6  # methods side by side in a table of cells; more get a table below
 WIDE = 1000  # columns: numbers that are cut off are worse than lines that wrap
@@ -30,7 +30,7 @@ def print_summary(missions: pd.DataFrame, measures: Measures, file: IO[str] | No
         measures: what methods are compared by.
         file: where to; standard output if none is given.
 
-    >>> from afm_rl.measures import Measure
+    >>> from afm_rl.storage.measures import Measure
     >>> steps = Measures((Measure("steps", "steps", "steps", better="lower"),))
     >>> row = {"method": "physics", "track": "oval", "seed": 0, "steps": 300, "finished": True}
     >>> print_summary(pd.DataFrame([row]), steps)  # doctest: +NORMALIZE_WHITESPACE

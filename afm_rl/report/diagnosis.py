@@ -18,11 +18,11 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
-from afm_rl.files import write_whole
 from afm_rl.report import style
 from afm_rl.report.console import WIDE
 from afm_rl.report.table import Table
 from afm_rl.report.write import render_page
+from afm_rl.storage.files import write_whole
 
 SHOWN = 300  # rows of the first panel
 POINTS = 3000  # of the others

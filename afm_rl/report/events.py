@@ -11,9 +11,9 @@ from tempfile import TemporaryDirectory
 import pandas as pd
 from torch.utils.tensorboard import SummaryWriter
 
-from afm_rl.files import write_whole
-from afm_rl.measures import Measures
 from afm_rl.report.frames import cell_names, steps_of
+from afm_rl.storage.files import write_whole
+from afm_rl.storage.measures import Measures
 
 POINTS = 500  # per curve
 SINGLE = 8  # missions of each method with curves of their own

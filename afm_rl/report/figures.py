@@ -10,12 +10,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from afm_rl.measures import Measures
 from afm_rl.report import comparison, heatmaps, learning, shares, space_plot, style
 from afm_rl.report.collect import Collection
 from afm_rl.report.recovery import MEASURES, recovery_times
 from afm_rl.report.results_files import read_steps
 from afm_rl.report.track_plot import DrawableTrack
+from afm_rl.storage.measures import Measures
 
 CELLS = 4  # of a track: curves and maps of more say less
 POINTS = 240  # of each curve of progress
@@ -44,7 +44,7 @@ class Excerpts:
 def telling_cells(missions: pd.DataFrame, measures: Measures) -> list[str]:
     """Return on each track the cells in which methods differ most, by the first measure.
 
-    >>> from afm_rl.measures import Measure
+    >>> from afm_rl.storage.measures import Measure
     >>> share = Measures((Measure("share", "share", "share"),))
     >>> rows = {"track": ["oval"] * 2, "method": ["a", "b"], "cell": ["oval, c"] * 2}
     >>> telling_cells(pd.DataFrame(rows | {"share": [0.5, 1.0]}), share)

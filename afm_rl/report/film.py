@@ -14,7 +14,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.files import write_whole
 from afm_rl.report.collect import collect
 from afm_rl.report.events import folder_names
 from afm_rl.report.frames import first_missions, steps_of
@@ -23,6 +22,7 @@ from afm_rl.report.results_files import read_steps
 from afm_rl.report.scenes import COLUMNS, Scene, map_scene, space_scene
 from afm_rl.report.style import FEW
 from afm_rl.report.track_plot import DrawableTrack, LoadTrack, load_tracks
+from afm_rl.storage.files import write_whole
 
 FRAMES, RATE = 150, 15  # at most; per second
 DPI, COLOURS = 100, 128

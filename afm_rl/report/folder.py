@@ -9,9 +9,6 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 
-from afm_rl.csv_text import csv_text
-from afm_rl.files import write_whole
-from afm_rl.measures import FILE, Measures
 from afm_rl.report.comparison import draw_comparison
 from afm_rl.report.events import write_events
 from afm_rl.report.frames import check_frames
@@ -20,6 +17,9 @@ from afm_rl.report.space_plot import COLUMNS, draw_space
 from afm_rl.report.style import png_bytes
 from afm_rl.report.track_plot import DrawableTrack
 from afm_rl.report.trajectory import draw_trajectories
+from afm_rl.storage.csv_text import csv_text
+from afm_rl.storage.files import write_whole
+from afm_rl.storage.measures import FILE, Measures
 
 
 def write_run(

@@ -7,7 +7,7 @@ from collections.abc import Container, Iterable
 import pandas as pd
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.measures import Measures
+from afm_rl.storage.measures import Measures
 
 STEPS = ["mission", "t", "error", "misaligned", "loss", "regime_active"]
 

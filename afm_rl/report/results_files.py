@@ -15,10 +15,10 @@ import pyarrow
 import pyarrow.parquet as parquet
 import yaml
 
-from afm_rl.csv_text import plain_text
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.measures import Measures
 from afm_rl.report.frames import outcome
+from afm_rl.storage.csv_text import plain_text
+from afm_rl.storage.measures import Measures
 
 WORDS = ["method", "track", "regime"]  # text, whatever they look like
 LONGEST = 500  # letters of a word

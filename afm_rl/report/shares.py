@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from afm_rl.measures import Measure
 from afm_rl.report import style
 from afm_rl.report.statistics import resampled_bounds, split
+from afm_rl.storage.measures import Measure
 
 PROFILE_CAPTION = (
     "Performance profile: the share of a method's missions that were finished within tau times the "

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from afm_rl.measures import Measures
 from afm_rl.report.frames import cell_names, outcome
 from afm_rl.report.statistics import stratified_interval
+from afm_rl.storage.measures import Measures
 
 
 def summarise(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
@@ -25,7 +25,7 @@ def summarise(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
         missions: one row per mission.
         measures: what methods are compared by.
 
-    >>> from afm_rl.measures import Measure
+    >>> from afm_rl.storage.measures import Measure
     >>> share = Measures((Measure("share", "share", "share"),))
     >>> missions = pd.DataFrame({"method": "a", "track": "oval", "seed": [0, 1], "share": [0, 1.0]})
     >>> summarise(missions.assign(finished=True), share)[["method", "share"]].values.tolist()
@@ -66,7 +66,7 @@ def count_budgets(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
     That is the most that any unfinished mission of the cell spent: without it a method with a
     smaller budget would look as if it needed less.
 
-    >>> from afm_rl.measures import Measure
+    >>> from afm_rl.storage.measures import Measure
     >>> steps = Measures((Measure("steps", "steps", "steps", better="lower", budget=True),))
     >>> rows = {"cell": ["a"] * 3, "steps": [90, 60, 99], "finished": [True, False, False]}
     >>> count_budgets(pd.DataFrame(rows), steps)["steps"].tolist()

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import pandas as pd
 
-from afm_rl.csv_text import csv_text
-from afm_rl.measures import Measure
+from afm_rl.storage.csv_text import csv_text
+from afm_rl.storage.measures import Measure
 
 # What LaTeX writes another way; the escapes of pandas leave these alone.
 LATEX = {"±": r"$\pm$", "∞": r"$\infty$"}

@@ -13,10 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
-from afm_rl.measures import Measures
 from afm_rl.report import style
 from afm_rl.report.frames import first_missions, left_out, outcome, steps_of
 from afm_rl.report.track_plot import MARGIN, Box, DrawableTrack, distance_to, draw_road, view
+from afm_rl.storage.measures import Measures
 
 PANELS = 12
 WIDE, TALL, NARROW = 9.9, 3.4, 1.9  # inches: all maps side by side; one map: at most, at least

@@ -11,10 +11,7 @@ from typing import Any
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
 
-from afm_rl.csv_text import csv_text
 from afm_rl.errors import ArtefactError
-from afm_rl.files import write_whole
-from afm_rl.measures import Measures
 from afm_rl.report import style
 from afm_rl.report.collect import Collection, collect
 from afm_rl.report.comparisons import (
@@ -33,6 +30,9 @@ from afm_rl.report.results_files import LONGEST, read_text
 from afm_rl.report.summary import budget_notes, count_budgets
 from afm_rl.report.table import Table
 from afm_rl.report.track_plot import LoadTrack, load_tracks
+from afm_rl.storage.csv_text import csv_text
+from afm_rl.storage.files import write_whole
+from afm_rl.storage.measures import Measures
 
 TEMPLATE = Path(__file__).with_name("page.html")
 REFERENCES = (

@@ -12,7 +12,7 @@ from torchrl.envs import FrameSkipTransform, Transform
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
-from afm_rl.keys import as_key, as_keys
+from afm_rl.spaces.keys import as_key, as_keys
 from afm_rl.transforms.memory import begin, correct, corrector_for, entries_spec, warn_of_old
 
 

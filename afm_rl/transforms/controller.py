@@ -16,8 +16,8 @@ from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from afm_rl.compiling.machine_code import has_compiler, settings_for
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.machine_code import has_compiler, settings_for
 from afm_rl.planning.sampling_planner import SamplingPlanner
 from afm_rl.streams import Streams
 from afm_rl.transforms.policy import ActionFlowPolicy

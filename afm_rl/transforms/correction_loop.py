@@ -21,7 +21,7 @@ from afm_rl.diagnosis import explain
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
 from afm_rl.errors import ConfigurationError, check_flag
 from afm_rl.learning.watching import Watching
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms.memory import begin, correct, corrector_for
 
 Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str

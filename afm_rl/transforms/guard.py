@@ -13,7 +13,7 @@ from torchrl.envs import Transform
 
 from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.faults import PATIENCE, as_reading, count_repeats, safe_action, trusted
-from afm_rl.keys import as_key
+from afm_rl.spaces.keys import as_key
 
 
 class Guard(Transform):

@@ -10,12 +10,12 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 
+from afm_rl.compiling.devices import moved
 from afm_rl.correction import Corrector
-from afm_rl.devices import moved
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
-from afm_rl.keys import as_key
 from afm_rl.planning.primer import ZeroPrimer
+from afm_rl.spaces.keys import as_key
 from afm_rl.transforms.memory import begin, correct, corrector_for, entries_spec, warn_of_old
 
 

@@ -11,8 +11,8 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
 from afm_rl.errors import ConfigurationError, check_flag
-from afm_rl.keys import as_key
 from afm_rl.regimes import Regime, Schedule, phase_parameters
+from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
 
 

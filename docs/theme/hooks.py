@@ -28,12 +28,12 @@ API = {
     "Missions": "missions",
     "Reports": "report",
     "Foundations": [
-        "manifold.Manifold",
+        "spaces.manifold.Manifold",
         "streams.Streams",
-        "artefacts.save_artefact",
-        "artefacts.load_artefact",
-        "manifest.write_manifest",
-        "manifest.check_manifest",
+        "storage.artefacts.save_artefact",
+        "storage.artefacts.load_artefact",
+        "storage.manifest.write_manifest",
+        "storage.manifest.check_manifest",
     ],
 }
 # Pages of the site that are kept elsewhere, because people look for them there.

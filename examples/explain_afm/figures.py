@@ -13,9 +13,9 @@ import torch
 from hydra import compose, initialize_config_module
 from matplotlib.axes import Axes
 
-from afm_rl.files import write_whole
 from afm_rl.missions import Agent, build, prepare, run
 from afm_rl.report.style import dress, method_styles, new_figure, png_bytes
+from afm_rl.storage.files import write_whole
 
 FORMS = {
     "no correction": ["method=physics"],

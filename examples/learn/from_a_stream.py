@@ -21,9 +21,9 @@ from afm_rl.learning import (
     UpdaterHook,
     pretrain_ensemble,
 )
-from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 from afm_rl.regimes import Schedule
+from afm_rl.spaces.manifold import Manifold
 
 ROBOTS, STEPS = 4, 25  # at once, and per batch
 

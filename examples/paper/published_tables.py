@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from afm_rl.files import write_whole
 from afm_rl.report.collect import collect
 from afm_rl.report.frames import cell_names
 from afm_rl.report.table import Table
+from afm_rl.storage.files import write_whole
 
 LAST = 4999  # step of a published mission that ran out
 LABELS = {  # the paper's name: our label

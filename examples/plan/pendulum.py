@@ -12,8 +12,8 @@ import torch
 from torchrl.envs import GymEnv, TransformedEnv
 
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, KnownReward, PlanningEnv
+from afm_rl.spaces.manifold import Manifold
 
 
 def swing(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:

@@ -23,8 +23,8 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from afm_rl.files import write_whole
 from afm_rl.planning import load_policy, save_policy
+from afm_rl.storage.files import write_whole
 
 BATCH, CHECKPOINT, DISCOUNT, AVERAGING, RATE = 256, 20_000, 0.99, 0.005, 3e-4
 

@@ -10,7 +10,7 @@ import torch
 from torchrl.envs import GymEnv, TransformedEnv
 
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform
 
 

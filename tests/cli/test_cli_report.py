@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from afm_rl.cli import report
-from afm_rl.manifest import write_manifest
-from afm_rl.measures import FILE
 from afm_rl.missions import LapScore
+from afm_rl.storage.manifest import write_manifest
+from afm_rl.storage.measures import FILE
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ import re
 import pytest
 import torch
 
-from afm_rl.artefacts import save_artefact
 from afm_rl.cli.error_messages import explain, one_line
 from afm_rl.correction import PaperFlow
 from afm_rl.errors import ConfigurationError
+from afm_rl.storage.artefacts import save_artefact
 
 # method, overrides, what the line must name
 CASES = """

@@ -9,7 +9,7 @@ import time
 import pandas as pd
 import pytest
 
-from afm_rl.manifest import check_manifest
+from afm_rl.storage.manifest import check_manifest
 
 SABOTAGE = """
 import os, signal

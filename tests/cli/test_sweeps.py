@@ -16,7 +16,7 @@ from afm_rl.cli.overrides import with_sweep_folder
 from afm_rl.errors import ConfigurationError
 from afm_rl.jobs.local import LocalPool
 from afm_rl.jobs.run import _publish
-from afm_rl.manifest import write_manifest
+from afm_rl.storage.manifest import write_manifest
 
 SWEEP = ["-m", "method=physics", "planner.horizon=3,5"]
 

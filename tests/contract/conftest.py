@@ -29,7 +29,6 @@ from afm_rl.learning import (
     UnmatchedUpdater,
     Updater,
 )
-from afm_rl.manifold import Manifold
 from afm_rl.planning import (
     CEM,
     ICEM,
@@ -41,6 +40,7 @@ from afm_rl.planning import (
     TrackingCost,
 )
 from afm_rl.regimes import ActionGain
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy
 
 BOX = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])

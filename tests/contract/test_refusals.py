@@ -9,8 +9,8 @@ from afm_rl.correction import LeastSquares
 from afm_rl.dynamics import Dubins, Ensemble, KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, Updater, UpdaterHook
-from afm_rl.manifold import Manifold
 from afm_rl.planning import CEM, ICEM, MPC, MPPI, GoalDistance, PlanningEnv
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform
 
 BOX = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])

@@ -22,7 +22,7 @@ from afm_rl.dynamics import Dubins, KnownDynamics, dubins_step
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
 from afm_rl.flow import AxisNetwork
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform
 
 LOC, SCALE = torch.tensor([1.0, -2.0, 0.5]), torch.tensor([2.0, 0.5, 3.0])

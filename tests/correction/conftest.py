@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 
 
 def push(state, action):

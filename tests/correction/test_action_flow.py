@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from afm_rl.artefacts import load_artefact, save_artefact
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
 from afm_rl.correction.choice import nearest_of, probes_of, source_points_of
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.flow import AxisNetwork, train_flow
 from afm_rl.flow.saturation import MODES
+from afm_rl.storage.artefacts import load_artefact, save_artefact
 
 SIZES = [1, 2, 6, 17]
 

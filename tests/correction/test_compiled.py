@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from afm_rl import machine_code
+from afm_rl.compiling import machine_code
 from afm_rl.correction import ActionFlow
 from afm_rl.correction.hypotheses import HYPOTHESES
 from afm_rl.flow import AxisNetwork

@@ -88,6 +88,6 @@ def test_training_states_lie_on_the_manifold(monkeypatch, generator):
     monkeypatch.setattr(
         Quadrotor, "forward", lambda model, state, action: seen.append(state) or state
     )
-    monkeypatch.setattr("afm_rl.manifold.Manifold.difference", lambda m, a, b: a - b)
+    monkeypatch.setattr("afm_rl.spaces.manifold.Manifold.difference", lambda m, a, b: a - b)
     paper._examples(Quadrotor(), states, 8, generator)
     torch.testing.assert_close(seen[-1][..., 6:10].norm(dim=-1), torch.ones(8))

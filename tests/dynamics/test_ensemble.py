@@ -10,7 +10,7 @@ from torch import nn
 from afm_rl.dynamics import Ensemble
 from afm_rl.dynamics import ensemble as module
 from afm_rl.errors import ConfigurationError
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 
 
 def member_by_member(model, state, action):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from afm_rl.dynamics import Dubins, KnownDynamics, Oracle, effective_action
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 
 HALF = torch.tensor([1.0, 1.5])
 

@@ -6,14 +6,14 @@ import math
 import pytest
 import torch
 
-from afm_rl.airframe import QuadrotorBody
 from afm_rl.dynamics import KNODE, Dubins, DynamicsModel, KnownDynamics, Quadrotor
 from afm_rl.dynamics.quadrotor_equations import QuadrotorRate
 from afm_rl.dynamics.residual import Network
 from afm_rl.dynamics.runge_kutta import runge_kutta_tangent
 from afm_rl.errors import ConfigurationError
-from afm_rl.manifold import Manifold
-from afm_rl.rotations import quaternion_normalise
+from afm_rl.spaces.airframe import QuadrotorBody
+from afm_rl.spaces.manifold import Manifold
+from afm_rl.spaces.rotations import quaternion_normalise
 
 SCALE = torch.tensor([0.1, 2e-5, 2e-5, 5e-6], dtype=torch.float64)
 

@@ -5,7 +5,7 @@ import torch
 
 from afm_rl.dynamics import DynamicsModel, KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 
 
 def push(state, action):

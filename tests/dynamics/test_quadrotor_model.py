@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from afm_rl.airframe import QuadrotorBody, mix, saturate, unmix
 from afm_rl.dynamics import Dubins, DynamicsModel, Oracle, Quadrotor
 from afm_rl.dynamics import quadrotor_equations as equations
 from afm_rl.dynamics.quadrotor_equations import quadrotor_path, quadrotor_rate, quadrotor_step
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import flight_regimes
-from afm_rl.rotations import body_z_axis, quaternion_normalise, rotate
+from afm_rl.spaces.airframe import QuadrotorBody, mix, saturate, unmix
+from afm_rl.spaces.rotations import body_z_axis, quaternion_normalise, rotate
 
 BODY = QuadrotorBody()
 INERTIA = torch.tensor(BODY.inertia, dtype=torch.float64)

@@ -19,7 +19,6 @@ import yaml
 from rich.console import Console
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.files import locked
 from afm_rl.jobs import process, progress
 from afm_rl.jobs.batch import file_name, run_batch
 from afm_rl.jobs.layout import run_folders
@@ -27,7 +26,8 @@ from afm_rl.jobs.local import LocalPool
 from afm_rl.jobs.process import Job
 from afm_rl.jobs.progress import Board
 from afm_rl.jobs.tables import read_missions, read_steps
-from afm_rl.manifest import check_manifest
+from afm_rl.storage.files import locked
+from afm_rl.storage.manifest import check_manifest
 
 QUIET = {"echo": lambda line: None}
 SAME = ("missions.csv", "steps.parquet")

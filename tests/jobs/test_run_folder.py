@@ -10,11 +10,11 @@ import pandas as pd
 import pytest
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.files import locked
 from afm_rl.jobs.layout import is_finished
 from afm_rl.jobs.run import Stop, begin, finish, needs_run
-from afm_rl.manifest import check_manifest, extend_manifest
 from afm_rl.missions.checkpoint import Stopped
+from afm_rl.storage.files import locked
+from afm_rl.storage.manifest import check_manifest, extend_manifest
 
 RESULTS = {"config.yaml", "missions.csv", "steps.parquet", "compute.csv", "measures.json"}
 SAME = ("missions.csv", "steps.parquet")  # to the byte

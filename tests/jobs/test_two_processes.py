@@ -6,7 +6,7 @@ from omegaconf import OmegaConf
 from afm_rl.jobs.batch import run_batch
 from afm_rl.jobs.layout import run_folders
 from afm_rl.jobs.local import LocalPool
-from afm_rl.manifest import check_manifest
+from afm_rl.storage.manifest import check_manifest
 
 METHODS = ["physics", "online_pe", "afm_physics", "stream_x_pe", "adaptive_gain", "rls", "oracle"]
 SMALL = {

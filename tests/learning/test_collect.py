@@ -7,8 +7,8 @@ from torchrl.envs import GymEnv, SerialEnv, TransformedEnv
 from afm_rl.dynamics import Ensemble
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import collect
-from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, KnownReward, PlanningEnv
+from afm_rl.spaces.manifold import Manifold
 
 
 def pendulum(steps=200):

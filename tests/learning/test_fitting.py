@@ -17,9 +17,9 @@ from afm_rl.learning import (
     UnmatchedUpdater,
     fit_ensemble,
 )
-from afm_rl.manifold import Manifold
 from afm_rl.planning import ICEM, MPPI, KnownReward, PlanningEnv
-from afm_rl.rotations import RigidBodySpace
+from afm_rl.spaces.manifold import Manifold
+from afm_rl.spaces.rotations import RigidBodySpace
 
 SHORT = {"epochs": 2, "batch_size": 64}
 

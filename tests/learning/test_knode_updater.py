@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from afm_rl.airframe import QuadrotorBody
 from afm_rl.dynamics import KNODE, Dubins, Quadrotor
 from afm_rl.dynamics.quadrotor_equations import quadrotor_path
 from afm_rl.errors import ConfigurationError
@@ -18,6 +17,7 @@ from afm_rl.learning.knode_fit import fit_network
 from afm_rl.missions.log import StepLog
 from afm_rl.missions.state import Loop, restore, snapshot
 from afm_rl.missions.tree import flatten, unflatten
+from afm_rl.spaces.airframe import QuadrotorBody
 
 BODY = QuadrotorBody()
 FACTORS = torch.tensor([1.5, 0.75, 2.0])  # gains of the thrust

@@ -17,7 +17,7 @@ from afm_rl.learning import (
     pretrain_ensemble,
 )
 from afm_rl.learning.error_decomposition import decompose_error
-from afm_rl.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 GRADIENT = partial(OnlineUpdater, optimizer=partial(ResetAdam, lr=1e-3))

@@ -10,12 +10,12 @@ from tensordict import unravel_key
 from torch import nn
 
 import afm_rl.conf
-from afm_rl.artefacts import save_artefact
 from afm_rl.correction import ActionFlow, PaperFlow
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.flow import AxisNetwork
 from afm_rl.missions import build, prepare
 from afm_rl.missions.checks import blaming, check_training
+from afm_rl.storage.artefacts import save_artefact
 
 ROBOTS = {  # of methods that the ground robot has no use for
     "raptor": "quadrotor_rotorpy_10ms",  # which tells what its motors gave

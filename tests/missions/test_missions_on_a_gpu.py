@@ -11,7 +11,7 @@ from afm_rl.missions.run import _advance, _start
 
 RUN = sys.modules["afm_rl.missions.run"]
 ALWAYS = {  # what a step waits for, whatever the method
-    "mission_env._checked",  # is an action not finite?
+    "env._checked",  # is an action not finite?
     "compose._active",  # which families of regimes are there?
     "log.add",  # the log is kept on the CPU
     "run._advance",  # has a mission ended?
@@ -33,7 +33,8 @@ METHODS = {
 @pytest.mark.parametrize("method", METHODS)
 def test_training_and_missions_stay_on_their_device(make_agent, monkeypatch, method):
     agent = make_agent(f"method={method}", "seeds=2", "budget=50")
-    for numbers in ("envs.missions.MissionFormat._check_values", "flow.training.check_states"):
+    values = "envs.missions.format.MissionFormat._check_values"
+    for numbers in (values, "flow.training.check_states"):
         monkeypatch.setattr(f"afm_rl.{numbers}", lambda *_: None)
     with FakeGPU(answer=False) as gpu, torch.no_grad():
         gpu.move(agent)

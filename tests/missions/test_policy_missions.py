@@ -9,11 +9,11 @@ import torch
 from hydra import compose, initialize_config_module
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from afm_rl.artefacts import save_tensors
 from afm_rl.envs import gymnasium_task
 from afm_rl.errors import AFMError
 from afm_rl.missions import build, run
 from afm_rl.planning import load_policy, save_policy
+from afm_rl.storage.artefacts import save_tensors
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 CHEETAH, PENDULUM = (POLICIES / f"{name}_sac.safetensors" for name in ("half_cheetah", "pendulum"))

@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 import torch
 
-from afm_rl.artefacts import read_tensors
 from afm_rl.errors import AFMError, ArtefactError, ConfigurationError
 from afm_rl.learning import Learner
 from afm_rl.mission_state import MissionState
@@ -17,6 +16,7 @@ from afm_rl.missions.checkpoint import Checkpoints, Stopped
 from afm_rl.missions.log import StepLog
 from afm_rl.missions.state import fingerprint
 from afm_rl.missions.tree import flatten, unflatten
+from afm_rl.storage.artefacts import read_tensors
 
 METHODS = [
     *("physics", "online_pe", "oracle", "afm_physics", "afm_paper", "stream_x_pe"),
@@ -77,7 +77,7 @@ def test_a_run_killed_at_each_write_in_turn(agent, tmp_path, method, monkeypatch
     real = os.replace
     for left in (1, 3, 1, 4):  # noqa: B007
         with monkeypatch.context() as patched, pytest.raises(Killed):
-            patched.setattr("afm_rl.files.os.replace", replace)
+            patched.setattr("afm_rl.storage.files.os.replace", replace)
             run(agent(method), checkpoint=path, every=0)
     assert list(path.glob(".*")) == []
     same(whole, run(agent(method), checkpoint=path, every=0))

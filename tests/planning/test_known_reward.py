@@ -6,8 +6,8 @@ from tensordict import TensorDict
 
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.manifold import Manifold
 from afm_rl.planning import MPPI, KnownReward, PlanningEnv
+from afm_rl.spaces.manifold import Manifold
 
 
 def test_the_cost_is_the_negative_reward():

@@ -5,10 +5,10 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
-from afm_rl.airframe import QuadrotorBody
 from afm_rl.dynamics.quadrotor import Quadrotor
 from afm_rl.envs import Circle, CrazyflieTrack
 from afm_rl.planning import MPC, PlanningEnv, TrackingCost
+from afm_rl.spaces.airframe import QuadrotorBody
 
 SPEEDS = (0.8, 1.0, 1.2)
 CHANGES = [{}, {"mass": 0.5}, {"mass": 4 / 3}]

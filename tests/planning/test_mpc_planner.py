@@ -10,8 +10,8 @@ from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.manifold import Manifold
 from afm_rl.planning import MPC, GoalDistance, PlanningEnv, TrackingCost
+from afm_rl.spaces.manifold import Manifold
 
 DT, HORIZON = 0.1, 12
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from afm_rl import machine_code
+from afm_rl.compiling import machine_code
 from afm_rl.dynamics import Dubins
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 

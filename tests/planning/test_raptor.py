@@ -7,11 +7,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from afm_rl.airframe import QuadrotorBody, unmix
 from afm_rl.dynamics import Quadrotor
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning import GoalDistance, PlanningEnv, Raptor
-from afm_rl.rotations import quaternion_normalise
+from afm_rl.spaces.airframe import QuadrotorBody, unmix
+from afm_rl.spaces.rotations import quaternion_normalise
 
 pytest.importorskip("foundation_policy")
 

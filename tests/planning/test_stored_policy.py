@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import nn
 
-from afm_rl.artefacts import save_tensors
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.planning import load_policy, save_policy
+from afm_rl.storage.artefacts import save_tensors
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-from afm_rl.airframe import QuadrotorBody, mix, unmix
 from afm_rl.dynamics.quadrotor_equations import quadrotor_rate
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import (
@@ -18,6 +17,7 @@ from afm_rl.regimes import (
     flight_regimes,
     wind_of,
 )
+from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix
 
 BODY = QuadrotorBody()
 LOW, HIGH = (torch.tensor(bound, dtype=torch.float64) for bound in BODY.bounds)

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from afm_rl.manifest import write_manifest
-from afm_rl.measures import Measure, Measures
+from afm_rl.storage.manifest import write_manifest
+from afm_rl.storage.measures import Measure, Measures
 
 LAPS = Measures(
     (

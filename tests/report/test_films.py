@@ -9,11 +9,11 @@ import pytest
 from PIL import Image
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.manifest import write_manifest
-from afm_rl.measures import Measure, Measures
 from afm_rl.report import check_video, film_results, write_films, write_run
 from afm_rl.report.film import ENCODERS, FRAMES, LAST, frames
 from afm_rl.report.scenes import map_scene, space_scene
+from afm_rl.storage.manifest import write_manifest
+from afm_rl.storage.measures import Measure, Measures
 
 MSE = Measures((Measure("mse", "MSE", "mean squared error", "m²", "lower", digits=5),))
 

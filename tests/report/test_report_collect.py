@@ -7,9 +7,9 @@ import pytest
 import yaml
 
 from afm_rl.errors import AFMError, ArtefactError, ConfigurationError
-from afm_rl.manifest import write_manifest
 from afm_rl.report.collect import collect
 from afm_rl.report.results_files import read_settings, read_steps, read_table
+from afm_rl.storage.manifest import write_manifest
 
 
 @pytest.fixture

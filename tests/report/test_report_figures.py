@@ -11,10 +11,10 @@ from matplotlib.colors import to_hex
 from matplotlib.image import imread
 from matplotlib.text import Text
 
-from afm_rl.measures import Measure, Measures
 from afm_rl.report import draw_comparison, draw_learning, draw_trajectories
 from afm_rl.report.style import DPI, FEW, REGIME, groups_of_methods, method_styles, png_bytes
 from afm_rl.report.track_plot import distance_to, resample, view
+from afm_rl.storage.measures import Measure, Measures
 
 
 def texts(figure):

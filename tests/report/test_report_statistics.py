@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from afm_rl.measures import Measure, Measures
 from afm_rl.report import summarise
 from afm_rl.report.comparisons import (
     aggregate,
@@ -26,6 +25,7 @@ from afm_rl.report.statistics import (
     stratified_interval,
 )
 from afm_rl.report.summary import budget_notes, count_budgets
+from afm_rl.storage.measures import Measure, Measures
 
 NOTHING = pd.DataFrame(columns=["seconds", "missions"])
 

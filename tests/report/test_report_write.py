@@ -8,10 +8,10 @@ import pandas as pd
 import pytest
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.manifest import write_manifest
-from afm_rl.measures import Measure, Measures
 from afm_rl.report import write_report, write_run
 from afm_rl.report.table import Table, best_places
+from afm_rl.storage.manifest import write_manifest
+from afm_rl.storage.measures import Measure, Measures
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose
 from torchrl.envs.utils import step_mdp
 
+from afm_rl.compiling.machine_code import has_compiler
 from afm_rl.correction import ActionFlow, LeastSquares
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
 from afm_rl.flow import AxisNetwork, experts
-from afm_rl.machine_code import has_compiler
 from afm_rl.planning import ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv
 from afm_rl.transforms import ActionFlowPolicy
 from afm_rl.transforms.controller import Controller, export_controller

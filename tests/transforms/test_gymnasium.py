@@ -21,8 +21,8 @@ from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning.watching import Watching
-from afm_rl.manifold import Manifold
 from afm_rl.planning import KnownReward, PlanningEnv
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform
 from afm_rl.transforms.correction_loop import CorrectionLoop
 

@@ -22,10 +22,10 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 from afm_rl.correction import L1Augmentation
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.manifold import Manifold
 from afm_rl.planning import KnownReward, PlanningEnv
 from afm_rl.regimes import ActionGain, Delay, GainNoise, Regime
 from afm_rl.regimes import Compose as Regimes
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform, RegimeTransform
 
 GAIN = ActionGain(["torque"])

@@ -7,8 +7,8 @@ from omegaconf import DictConfig
 from torchrl.envs import Compose, TransformedEnv
 
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.manifold import Manifold
 from afm_rl.planning import PlanningEnv
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform
 from envs import drift
 

@@ -1,0 +1,1 @@
+"""Compiling: modules as machine code, and what must not stand in its way."""

@@ -1,0 +1,1 @@
+"""Spaces: where states and actions live, and the mathematics done on them."""

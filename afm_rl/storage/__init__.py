@@ -1,0 +1,1 @@
+"""Storage: what is written to disk, whole and with its checksum."""

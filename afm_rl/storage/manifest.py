@@ -1,0 +1,131 @@
+"""Checksums of the files of a folder, in a file that is written last.
+
+A folder of results is whole if it has a manifest: ``manifest.json`` holds the SHA-256 of every file
+that a run wrote, and of itself. It is removed before any of these files is replaced.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from afm_rl._version import __version__
+from afm_rl.errors import ArtefactError
+from afm_rl.storage.files import write_whole
+
+MANIFEST = "manifest.json"
+
+
+def write_manifest(folder: str | Path, names: Iterable[str | Path] | None = None) -> None:
+    r"""Write the checksums of the files of a folder to its ``manifest.json``.
+
+    Args:
+        folder: where the files are.
+        names: the files, absolute or relative to ``folder``; a folder stands for all files in it.
+            None: all files, but for hidden ones, and for folders with a manifest of their own.
+
+    Raises:
+        ConfigurationError: if the manifest cannot be written.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = Path(folder, "missions.csv").write_text("mission,steps\n")
+    ...     write_manifest(folder)
+    ...     sorted(check_manifest(folder))
+    ['missions.csv']
+    """
+    folder = Path(folder)
+    roots = [folder] if names is None else [folder / name for name in names]
+    files = {path.relative_to(folder).as_posix() for root in roots for path in _files(root)}
+    sums = {name: _sum(folder / name) for name in sorted(files - {MANIFEST})}
+    write_whole(folder / MANIFEST, _text({"version": __version__, "files": sums}).encode())
+
+
+def extend_manifest(folder: str | Path, names: Iterable[str | Path]) -> None:
+    """Add files to a manifest, or renew their checksums.
+
+    Raises:
+        ArtefactError: if there is no manifest, or it is damaged.
+    """
+    folder = Path(folder)
+    write_manifest(folder, [*read_manifest(folder)["files"], *(folder / name for name in names)])
+
+
+def check_manifest(folder: str | Path) -> dict[str, str]:
+    """Return the SHA-256 of every file that the manifest of a folder names, by name.
+
+    Raises:
+        ArtefactError: if there is no manifest, or the manifest or a file that it names is damaged
+            or missing; the message names the file.
+    """
+    folder = Path(folder)
+    files = read_manifest(folder)["files"]
+    for name, expected in files.items():
+        path = folder / name
+        if not path.is_file():
+            raise ArtefactError(f"{path}: missing, although {MANIFEST} names it; {_REMEDY}")
+        if _sum(path) != expected:
+            raise ArtefactError(
+                f"{path}: damaged: its SHA-256 is not the one in {MANIFEST}; {_REMEDY}"
+            )
+    return files
+
+
+_REMEDY = "restore it, or delete the folder and run the same command again"
+
+
+def read_manifest(folder: str | Path, name: str = MANIFEST) -> dict[str, Any]:
+    """Return ``version`` and ``files`` of a manifest, without looking at the files.
+
+    Raises:
+        ArtefactError: if there is none, or it is damaged.
+    """
+    path = Path(folder) / name
+    try:
+        text = path.read_bytes().decode()
+    except FileNotFoundError:
+        raise ArtefactError(
+            f"{path}: no such file; expected the folder of a finished run"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ArtefactError(f"{path}: cannot be read: {error}") from error
+    try:
+        found = json.loads(text)
+        content = {name: found[name] for name in ("version", "files")}
+        if text == _text(content) and all(map(_inside, content["files"])):
+            return content
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        pass
+    raise ArtefactError(f"{path}: damaged: its checksum does not match; {_REMEDY}")
+
+
+def _files(root: Path) -> Iterable[Path]:
+    if root.is_file():
+        yield root
+        return
+    for path in root.iterdir():
+        own = path.is_dir() and (path / MANIFEST).exists()
+        if not own and not path.name.startswith("."):
+            yield from _files(path)
+
+
+def _inside(name: str) -> bool:
+    path = PurePosixPath(name)
+    return not path.is_absolute() and ".." not in path.parts
+
+
+def _sum(path: Path) -> str:
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise ArtefactError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _text(content: Mapping[str, Any]) -> str:
+    """Return a manifest's text, with the checksum of what it says."""
+    own = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return json.dumps({**content, "sha256": own}, indent=1, sort_keys=True) + "\n"

@@ -1,0 +1,1 @@
+"""Courses: where a robot is to go, as tracks on the ground and as flights."""

@@ -1,0 +1,323 @@
+"""Reference flights: where to be, and how fast, at any time."""
+
+from __future__ import annotations
+
+import math
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from afm_rl.envs.courses.columns import read_columns
+from afm_rl.envs.courses.track import check_near, local_origin
+from afm_rl.errors import (
+    ConfigurationError,
+    check_choice,
+    check_flag,
+    check_instance,
+    check_number,
+)
+
+
+class Reference(ABC):
+    """Position and velocity over time.
+
+    References made of points that are far from zero are moved by whole kilometres, so that single
+    precision does: see :func:`~afm_rl.envs.courses.track.local_origin`.
+
+    Attributes:
+        name: how missions call it.
+    """
+
+    name: str
+
+    @abstractmethod
+    def at(self, time: Tensor) -> Tensor:
+        """Return position (m) and velocity (m/s) ``(*B, 6)`` at times (s) ``(*B)``."""
+
+
+class Hover(Reference):
+    """Standing still.
+
+    Args:
+        position: where (m).
+
+    Raises:
+        ConfigurationError: unless it is three finite numbers.
+
+    >>> Hover([0.0, 0.0, 1.0]).at(torch.tensor(2.0))
+    tensor([0., 0., 1., 0., 0., 0.])
+    """
+
+    def __init__(self, position: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        self.name = "hover"
+        self.position = _points("hover: position", [position])[0]
+
+    def at(self, time: Tensor) -> Tensor:
+        here = torch.cat([self.position, torch.zeros_like(self.position)]).to(time)
+        return here.expand(*time.shape, 6)
+
+
+class Circle(Reference):
+    r"""A level circle about the origin at constant speed.
+
+    .. math:: r = R (\cos \varphi, \sin \varphi, 0),\quad \varphi = v t / R
+
+    Args:
+        radius: R (m).
+        speed: v (m/s).
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+
+    >>> Circle(radius=2.0, speed=0.5).at(torch.zeros(()))
+    tensor([2.0000, 0.0000, 0.0000, -0.0000, 0.5000, 0.0000])
+    """
+
+    def __init__(self, radius: float = 2.0, speed: float = 0.8) -> None:
+        self.radius = check_number("circle: radius", radius, low=0.0, open_low=True)
+        self.speed = check_number("circle: speed", speed, low=0.0)
+        self.name = f"circle_{self.radius:g}m_{self.speed:g}mps"
+
+    def at(self, time: Tensor) -> Tensor:
+        angle = time * (self.speed / self.radius)
+        cos, sin, none = angle.cos(), angle.sin(), torch.zeros_like(angle)
+        here = torch.stack([cos, sin, none], -1) * self.radius
+        return torch.cat([here, torch.stack([-sin, cos, none], -1) * self.speed], -1)
+
+
+class FigureEight(Reference):
+    r"""A level figure of eight, which starts in its centre.
+
+    .. math:: r = (a \sin \varphi, b \sin 2 \varphi, 0),\quad \varphi = 2 \pi t / P
+
+    Args:
+        length: half length a (m).
+        width: half width b (m).
+        period: P (s).
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+
+    >>> FigureEight(period=4.0).at(torch.ones(()))[:2].round(decimals=4)
+    tensor([1., -0.])
+    """
+
+    def __init__(self, length: float = 1.0, width: float = 0.5, period: float = 8.0) -> None:
+        names = ("length", "width", "period")
+        for name, value in zip(names, (length, width, period), strict=True):
+            check_number(f"figure_8: {name}", value, low=0.0, open_low=True)
+        self.length, self.width, self.pulse = length, width, 2 * math.pi / period
+        self.name = f"figure_8_{period:g}s"
+
+    def at(self, time: Tensor) -> Tensor:
+        angle = time * self.pulse
+        none, fast = torch.zeros_like(angle), self.width * 2 * self.pulse
+        here = [self.length * angle.sin(), self.width * (2 * angle).sin(), none]
+        speed = [self.length * self.pulse * angle.cos(), fast * (2 * angle).cos(), none]
+        return torch.stack(here + speed, -1)
+
+
+class Waypoints(Reference):
+    """Straight lines from point to point at constant speed; then the last point, at rest.
+
+    Args:
+        points: two or more points x, y, z (m), no two neighbours the same.
+        speed: speed (m/s).
+        closed: whether to go on to the first point and start again.
+        name: how missions call it.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+
+    >>> line = Waypoints([[0, 0, 0], [2, 0, 0]], speed=0.5)
+    >>> line.at(torch.tensor([1.0, 9.0]))[:, [0, 3]]
+    tensor([[0.5000, 0.5000],
+            [2.0000, 0.0000]])
+    """
+
+    def __init__(
+        self,
+        points: Sequence[Sequence[float]],
+        speed: float = 0.5,
+        closed: bool = False,
+        name: str = "waypoints",
+    ) -> None:
+        self.name = name
+        corners = _points("waypoints: points", points)
+        self.closed = check_flag("waypoints: closed", closed)
+        speed = check_number("waypoints: speed", speed, low=0.0, open_low=True)
+        if self.closed:
+            corners = torch.cat([corners, corners[:1]])
+        lengths = corners.diff(dim=0).norm(dim=-1)
+        if len(corners) < 2 or not lengths.gt(0).all():
+            raise ConfigurationError(
+                f"waypoints: points={points!r}: expected two or more, each unlike the one before"
+            )
+        self.starts = corners
+        self.times = torch.cat([lengths.new_zeros(1), lengths.cumsum(0) / speed])
+        moving = corners.diff(dim=0) / lengths[:, None] * speed
+        self.velocities = torch.cat([moving, torch.zeros_like(moving[:1])])
+
+    def at(self, time: Tensor) -> Tensor:
+        starts, times, velocities = (x.to(time) for x in (self.starts, self.times, self.velocities))
+        if self.closed:
+            time = time.remainder(times[-1])
+        leg = torch.searchsorted(times, time.contiguous(), right=True).sub(1).clamp(min=0)
+        moved = (time - times[leg]).unsqueeze(-1) * velocities[leg]
+        return torch.cat([starts[leg] + moved, velocities[leg]], -1)
+
+
+class Table(Reference):
+    """Positions and velocities at given times, linear in between and constant outside.
+
+    Args:
+        times: increasing times (s), N of them, at least two.
+        positions: ``(N, 3)`` in m.
+        velocities: ``(N, 3)`` in m/s.
+        name: how missions call it.
+
+    Raises:
+        ConfigurationError: for numbers that do not go together.
+
+    >>> rows = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]])
+    >>> Table(torch.tensor([0.0, 2.0]), rows, rows).at(torch.tensor(1.0))
+    tensor([0.5000, 0.0000, 0.0000, 0.5000, 0.0000, 0.0000])
+    """
+
+    def __init__(
+        self, times: Tensor, positions: Tensor, velocities: Tensor, name: str = "table"
+    ) -> None:
+        self.name = name
+        sizes = {positions.shape, velocities.shape}
+        if len(times) < 2 or sizes != {(len(times), 3)}:
+            raise ConfigurationError(
+                f"references: {name}: {len(times)} times, positions {tuple(positions.shape)} and "
+                f"velocities {tuple(velocities.shape)}: expected N >= 2 times and (N, 3) each"
+            )
+        if not times.diff().gt(0).all():
+            raise ConfigurationError(f"references: {name}: expected times that increase")
+        check_near(positions, f"{name}: position")
+        local = positions - local_origin(positions)
+        self.times, self.rows = times, torch.cat([local, velocities], -1)
+
+    def at(self, time: Tensor) -> Tensor:
+        times, rows = self.times.to(time), self.rows.to(time)
+        inside = time.clamp(times[0], times[-1])
+        last = torch.searchsorted(times, inside.contiguous(), right=True).clamp(1, len(times) - 1)
+        share = (inside - times[last - 1]) / (times[last] - times[last - 1])
+        return torch.lerp(rows[last - 1], rows[last], share.unsqueeze(-1))
+
+
+def load_reference(path: str | Path, velocity: str = "columns") -> Table:
+    """Read a reference from a CSV file with the columns t,x,y,z,vx,vy,vz (s, m, m/s).
+
+    Args:
+        path: the file. The reference is called like it.
+        velocity: ``"columns"``, or ``"differences"`` to take central differences of the
+            positions; a file with the columns t,x,y,z alone is only accepted then.
+
+    Raises:
+        ConfigurationError: if the file cannot be used, or has no velocities.
+
+    >>> load_reference("flight.csv")
+    Traceback (most recent call last):
+    afm_rl.errors.ConfigurationError: tracks: cannot read flight.csv: No such file or directory
+    """
+    check_choice("velocity", velocity, ("columns", "differences"))
+    path = Path(path)
+    short = ("t", "x", "y", "z")
+    header, rows = read_columns(path, [(*short, "vx", "vy", "vz"), short])
+    if header == short and velocity == "columns":
+        raise ConfigurationError(
+            f"references: {path} has no velocities: add the columns vx,vy,vz (m/s), or load it "
+            'with velocity="differences"'
+        )
+    times, positions = rows[:, 0], rows[:, 1:4]
+    velocities = rows[:, 4:] if velocity == "columns" else torch.zeros_like(positions)
+    if velocity == "differences" and len(times) > 1 and times.diff().gt(0).all():
+        (velocities,) = torch.gradient(positions, spacing=(times,), dim=0)
+    return Table(times, positions, velocities, path.stem)
+
+
+NUMBER = r"(\d+(?:\.\d+)?)"
+NAMED: dict[str, Callable[..., Reference]] = {
+    "hover": Hover,
+    f"circle_{NUMBER}m_{NUMBER}mps": Circle,
+    f"figure_8_{NUMBER}s": lambda period: FigureEight(period=period),
+}
+
+
+def find_reference(name: str) -> Reference:
+    """Return a reference by its name, or from a CSV file.
+
+    Args:
+        name: ``hover``, ``circle_2m_0.8mps`` (radius, speed), ``figure_8_8s`` (period), or the path
+            of a CSV file; see :func:`load_reference`.
+
+    Raises:
+        ConfigurationError: if there is no such reference, or the file cannot be used.
+
+    >>> find_reference("circle_3m_1.2mps").speed
+    1.2
+    """
+    for pattern, make in NAMED.items():
+        found = re.fullmatch(pattern, name)
+        if found:
+            return make(*map(float, found.groups()))
+    if not name.lower().endswith(".csv"):
+        raise ConfigurationError(
+            f"tracks={name!r}: expected hover, a circle such as circle_2m_0.8mps (radius, speed), "
+            "a figure of eight such as figure_8_8s (period), or the path of a CSV file"
+        )
+    return load_reference(name)
+
+
+def check_reference(reference: Reference) -> Reference:
+    """Return a reference if it gives positions and velocities.
+
+    Raises:
+        ConfigurationError: otherwise.
+    """
+    size = tuple(check_instance("tracks", reference, Reference).at(torch.zeros(2)).shape)
+    if size != (2, 6):
+        raise ConfigurationError(
+            f"tracks: {reference.name}: at() gives {size} for 2 times, expected (2, 6): position "
+            "and velocity"
+        )
+    return reference
+
+
+def references_at(references: Sequence[Reference], index: Tensor, time: Tensor) -> Tensor:
+    """Return positions and velocities ``(*B, K, 6)`` of flights that follow several references.
+
+    Args:
+        references: the references.
+        index: which one each flight follows, ``(*B)``.
+        time: times (s), ``(*B, K)``.
+
+    >>> flights = torch.tensor([0, 1])
+    >>> references_at([Hover(), Hover([0, 0, 1])], flights, torch.zeros(2, 3))[..., 2]
+    tensor([[0., 0., 0.],
+            [1., 1., 1.]])
+    """
+    if len(references) == 1:
+        return references[0].at(time)
+    every = torch.stack([reference.at(time) for reference in references])
+    chosen = index[None, ..., None, None].expand(1, *every.shape[1:])
+    return every.gather(0, chosen).squeeze(0)
+
+
+def _points(name: str, points: Sequence[Sequence[float]]) -> Tensor:
+    """Return points ``(N, 3)`` in double precision."""
+    try:
+        rows = torch.as_tensor(points, dtype=torch.float64)
+    except (TypeError, ValueError):
+        rows = torch.zeros(0)
+    if rows.dim() != 2 or rows.shape[-1] != 3 or not rows.isfinite().all():
+        raise ConfigurationError(f"{name}={points!r}: expected finite numbers x, y, z (m)")
+    check_near(rows, name)
+    return rows - local_origin(rows)

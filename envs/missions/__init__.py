@@ -1,0 +1,1 @@
+"""Missions: what one is made of, and what environments of missions share."""

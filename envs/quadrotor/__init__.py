@@ -1,0 +1,1 @@
+"""The quadrotor that follows references: own equations, or RotorPy's."""

@@ -1,0 +1,257 @@
+"""The quadrotor that follows references, under regimes that are hidden from it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from afm_rl.dynamics.quadrotor import check_body
+from afm_rl.envs.courses.references import Reference, check_reference, find_reference
+from afm_rl.envs.missions.env import MissionEnv
+from afm_rl.envs.missions.noise import flight_noise
+from afm_rl.envs.missions.settings import (
+    check_bounds,
+    check_names,
+    check_regime,
+    schedule_in_seconds,
+    steps_at,
+)
+from afm_rl.envs.quadrotor.simulation import QuadrotorSimulation
+from afm_rl.errors import ConfigurationError, check_choice, check_count, check_flag, check_number
+from afm_rl.regimes import Regime, Schedule, flight_regimes
+from afm_rl.spaces.airframe import QuadrotorBody
+
+ACTIONS = ("thrust (N)", "moment_x (N m)", "moment_y (N m)", "moment_z (N m)")
+UNIT = 1e-3  # how far a quaternion's length may be from 1
+
+
+class CrazyflieTrack(MissionEnv):
+    r"""Quadrotors that follow position references, tick by tick, batched.
+
+    The plant is the rigid body of :func:`~afm_rl.dynamics.quadrotor_equations.quadrotor_rate`,
+    integrated at 500 Hz while the action :math:`u = (T, M_x, M_y, M_z)` in N and N m is held for a
+    control tick of 50 ms. What the motors can give of it (:func:`~afm_rl.spaces.airframe.saturate`)
+    goes through a regime whose parameters follow the mission's phases. There is no ground, no drag
+    and no motor lag. The reward is minus the squared distance to the reference (m^2), averaged over
+    the tick. A flight is truncated after ``duration``; it terminates when it is lost: further than
+    ``limit`` from the reference, or no longer finite. It then stays at the last good state.
+
+    ================= ================ ==================================================
+    ``observation``   ``(*B, 13)``     position (m), velocity (m/s), quaternion
+                                       (scalar-last), body rate (rad/s), with sensor noise
+    ``reference``     ``(*B, N+1, 6)`` position and velocity to aim for, now and after
+                                       each of the next N ticks
+    ``trace``         ``(*B, K+1, 13)`` with ``trace=True``: the observation before the last
+                                       tick, after each of its K plant steps but the last,
+                                       and after the tick; for learners
+    ``square_error``  ``(*B, 3)``      mean over the last tick's plant steps of the squared
+                                       error per axis (m^2); this and ``reference`` are
+                                       one plant step ahead, as in the published metric
+    ``step``          ``(*B)``         number of ticks flown
+    ``since``         ``(*B)``         tick at which the present phase began
+    ``lost``          ``(*B)``         whether the flight is lost
+    ``past``          ``(*B, D, 4)``   the last D saturated actions, newest first; only
+                                       there if the regime depends on them
+    ``pose``          ``(*B, 13)``     the state itself; transforms should leave it alone
+    ``mission``       nested           see :class:`~afm_rl.envs.missions.format.MissionFormat`;
+                                       ``track`` is the index of the reference
+    ``phase``         ``(*B)``         index of the present phase; hidden truth
+    ``regime``        ``(*B, F)``      parameters that act on the next action: hidden
+                                       truth, for oracles and logs only
+    ``regime_active`` ``(*B)``         whether they differ from nominal; hidden as well
+    ================= ================ ==================================================
+
+    State, missions, resets and noise streams work as in :class:`~afm_rl.envs.UGVTrack`: with
+    ``batch_size=()`` a tensordict may hold any number of flights. A mass of 50 % is within the
+    published study, but a bare Crazyflie cannot lose it; 133 % is a payload of 10 g.
+
+    Args:
+        tracks: references, or their names (see :func:`~afm_rl.envs.find_reference`), such as
+            ``circle_2m_0.8mps`` (radius, speed) or the path of a CSV file.
+        regime: regime family; all of :func:`~afm_rl.regimes.flight_regimes` if None.
+        schedule: when regimes change: a schedule, or times in s; at 2 s and 5 s if None.
+        body: the quadrotor, a Crazyflie if None.
+        duration: length of a flight (s).
+        max_steps: control ticks after which a flight is over, if that is earlier.
+        horizon: ticks N by which ``reference`` looks ahead.
+        preview: whether it holds the future; otherwise it repeats the present set-point.
+        start: ``"moving"``, with the velocity of the reference, or ``"rest"``. Either starts at
+            the reference, level. None: moving with a preview, and at rest without, as published.
+        limit: distance from the reference at which a flight is lost (m).
+        sensor_noise: standard deviation in ``observation``: one number, or four for position
+            (m), velocity (m/s), attitude (rad) and body rate (rad/s).
+        start_noise: standard deviation of the start position per axis (m).
+        dt: control tick (s).
+        substeps: plant steps per tick, K.
+        trace: whether to publish the states in between.
+        batch_size: number of flights, or ``()`` for any.
+        seed: missions without a seed of their own get ``seed, seed + 1, ...``.
+        device: where the tensors live.
+        missions: what missions are unless ``reset`` is given others: a tensordict that
+            broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
+        action_low: lowest action, ``(4,)``; what the motors can do if None.
+        action_high: highest action.
+        dtype: floating-point type, torch's default if None.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+        NonFiniteError: at a step whose action is NaN or infinite.
+
+    >>> env = CrazyflieTrack()
+    >>> changes = [{}, {"mass": 0.5}, {"mass": 4 / 3}]
+    >>> missions = [env.mission(seed=seed, regime=changes) for seed in range(5)]
+    >>> data = env.reset(torch.stack(missions), set_state=False)
+    >>> data["action"] = torch.tensor([0.2943, 0, 0, 0]).expand(5, 4)
+    >>> env.step(data)["next", "reference"].shape
+    torch.Size([5, 21, 6])
+    """
+
+    simulation: QuadrotorSimulation
+    plant: type[QuadrotorSimulation] = QuadrotorSimulation
+
+    def __init__(
+        self,
+        tracks: Sequence[Reference | str | Path] | Reference | str | Path = "circle_2m_0.8mps",
+        regime: Regime | None = None,
+        schedule: Schedule | Sequence[float] | None = None,
+        body: QuadrotorBody | None = None,
+        duration: float = 8.0,
+        horizon: int = 20,
+        preview: bool = True,
+        start: str | None = None,
+        limit: float = 50.0,
+        sensor_noise: float | Sequence[float] = 0.0,
+        start_noise: float = 0.0,
+        dt: float = 0.05,
+        substeps: int = 25,
+        trace: bool = False,
+        max_steps: int = 5000,
+        batch_size: Sequence[int] = (),
+        seed: int = 0,
+        device: torch.device | str | None = None,
+        missions: TensorDictBase | Mapping[str, Any] | None = None,
+        *,
+        action_low: Sequence[float] | None = None,
+        action_high: Sequence[float] | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__(batch_size, seed, start_noise, device, dtype)
+        if isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable):
+            tracks = (tracks,)
+        self.references = tuple(
+            find_reference(str(one)) if isinstance(one, (str, Path)) else check_reference(one)
+            for one in tracks
+        )
+        names = [reference.name for reference in self.references]
+        check_names("tracks", names)
+        self.body = check_body(body)
+        substeps = check_count("substeps", substeps)
+        self.noise = flight_noise(between=substeps - 1)
+        dt = check_number("dt", dt, low=0.0, open_low=True)
+        if not isinstance(schedule, Schedule):
+            schedule = schedule_in_seconds((2.0, 5.0) if schedule is None else schedule, dt)
+        preview = check_flag("preview", preview)
+        if start is None:
+            start = "moving" if preview else "rest"
+        self.simulation = self.plant(
+            references=self.references,
+            regime=check_regime(regime, lambda: flight_regimes(self.body), 13, 4),
+            schedule=schedule,
+            body=self.body,
+            dt=dt,
+            substeps=substeps,
+            steps=min(_ticks(duration, dt), check_count("max_steps", max_steps)),
+            horizon=check_count("horizon", horizon),
+            preview=preview,
+            start=check_choice("start", start, ("rest", "moving")),
+            limit=check_number("limit", limit, low=0.0, open_low=True),
+            sensor_noise=_sensor_noise(sensor_noise),
+            trace=check_flag("trace", trace),
+        )
+        pairs = zip((action_low, action_high), self.body.bounds, strict=True)
+        low, high = (most if given is None else given for given, most in pairs)
+        self._complete(names, missions, check_bounds(low, high, ACTIONS))
+
+    def mission(
+        self,
+        track: int | str = 0,
+        seed: int | None = None,
+        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+        at: Sequence[float] | None = None,
+        ramp: int = 0,
+        times: Sequence[float] | None = None,
+    ) -> TensorDict:
+        """Describe one mission; see :meth:`~afm_rl.envs.missions.format.MissionFormat.build`.
+
+        Args:
+            track: index or name of the reference.
+            seed: seed of its noise.
+            regime: parameters that are not nominal, for the second phase or for each.
+            at: breakpoints in the unit of the schedule: a phase begins beyond them.
+            ramp: ticks that a change takes.
+            times: breakpoints in s instead: a phase begins with the first tick from then on.
+
+        Raises:
+            ConfigurationError: for a value that cannot be used.
+        """
+        if times is not None:
+            if at is not None:
+                raise ConfigurationError(f"missions: at={at!r}, times={times!r}: expected one")
+            whole = self.simulation.steps if self.schedule.by == "progress" else 1
+            at = [tick / whole for tick in steps_at(times, self.simulation.dt)]
+        return self.mission_format.build(track, seed, regime, at, ramp).to(self.device)
+
+    def _check_pose(self, pose: Tensor) -> None:
+        if pose.shape[-1] != 13 or not pose.isfinite().all():
+            raise ConfigurationError(
+                f"pose {tuple(pose.shape)}: expected 13 finite numbers per flight: position, "
+                "velocity, quaternion (scalar-last), body rate"
+            )
+        length = pose[..., 6:10].norm(dim=-1).reshape(-1)
+        rows = (length - 1).abs().gt(UNIT).nonzero().flatten().tolist()
+        if rows:
+            raise ConfigurationError(
+                f"pose: quaternions of flights {rows}: length {length[rows[0]].item():g}, "
+                "expected 1"
+            )
+
+    def _described(
+        self, mission: TensorDictBase, state: dict[str, Tensor], rows: Tensor | None
+    ) -> TensorDictBase:
+        return self.simulation.describe(mission, state, self._sensor(mission["seed"], rows))
+
+    def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:
+        seeds = tensordict["mission", "seed"]
+        actuator = self._actuator_noise(seeds)
+        between = self._sensor(seeds, event="between") if self.simulation.trace else None
+        return self.simulation.advance(tensordict, self._sensor(seeds), between, actuator)
+
+    def _sensor(
+        self, seeds: Tensor, rows: Tensor | None = None, event: str = "sensor"
+    ) -> Tensor | None:
+        if not self.simulation.sensor_noise.any():
+            return None
+        return self.noise.normal(event, seeds, rows, self.dtype)
+
+
+def _ticks(duration: float, dt: float) -> int:
+    """Return the number of control ticks in a flight, whose duration (s) must be a multiple."""
+    duration = check_number("duration", duration, low=0.0, open_low=True)
+    steps = round(duration / dt)
+    if steps < 1 or abs(steps * dt - duration) > 1e-6 * duration:
+        raise ConfigurationError(f"duration={duration!r}: expected a multiple of dt={dt!r} s")
+    return steps
+
+
+def _sensor_noise(std: float | Sequence[float]) -> Tensor:
+    """Return standard deviations ``(12,)`` from one number, or four: position, velocity, ..."""
+    given = list(std) if isinstance(std, Sequence) and not isinstance(std, str) else [std] * 4
+    if len(given) != 4:
+        raise ConfigurationError(f"sensor_noise={std!r}: expected one number, or four")
+    checked = [check_number("sensor_noise", value, low=0.0) for value in given]
+    return torch.tensor(checked, dtype=torch.float64).repeat_interleave(3)

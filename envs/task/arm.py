@@ -1,0 +1,114 @@
+"""An arm with seven joints in MuJoCo, whose actions are the positions that its servos are told."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.envs.task.sources import EXACT, Limits
+from afm_rl.envs.task.task import Reward, Task, trust
+from afm_rl.errors import check_count
+from afm_rl.spaces.rotations import quaternion_exp, quaternion_multiply, rotate
+
+MODEL = Path(__file__).with_name("arm.xml")
+JOINTS = 7
+SKIP = 5  # simulation steps per action: 50 ms
+SPREAD = 0.5  # rad, of goals around the middle pose
+
+
+def chain(model: Any, site: str) -> tuple[Tensor, Tensor]:
+    """Return offsets ``(N + 1, 3)`` (m) and axes ``(N, 3)`` of a chain of N hinges up to a site.
+
+    Each body has one hinge at its origin and is parallel to its parent when all angles are zero.
+    """
+    places = np.stack([*model.body_pos[1:], model.site(site).pos])
+    return torch.from_numpy(places), torch.from_numpy(model.jnt_axis.copy())
+
+
+def tip_of(angles: Tensor, offsets: Tensor, axes: Tensor) -> Tensor:
+    """Return where the tip of a chain is (m), ``(*B, 3)``, of joint angles ``(*B, N)`` (rad).
+
+    >>> offsets, axes = torch.tensor([[0.0, 0, 1], [1, 0, 0]]), torch.tensor([[0.0, 0, 1]])
+    >>> tip_of(torch.tensor([torch.pi / 2]), offsets, axes).round(decimals=4)
+    tensor([0., 1., 1.])
+    """
+    turned = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(angles)
+    place = offsets[0].to(angles)
+    for axis, offset, angle in zip(axes, offsets[1:], angles.unbind(-1), strict=True):
+        turned = quaternion_multiply(turned, quaternion_exp(axis.to(angles) * angle.unsqueeze(-1)))
+        place = place + rotate(turned, offset.to(angles))
+    return place
+
+
+def miss(
+    state: Tensor, action: Tensor, after: Tensor, goal: Tensor, offsets: Tensor, axes: Tensor
+) -> Tensor:
+    """Reward: how far the tip is from where it would be at the goal's joint angles (m), negative.
+
+    Args:
+        state: not used.
+        action: not used.
+        after: angles and speeds of the joints, ``(*B, 2 N)``.
+        goal: wanted angles, ``(*B, N)``.
+        offsets: see :func:`chain`.
+        axes: see :func:`chain`.
+    """
+    angles = after[..., : len(axes)]
+    return -(tip_of(angles, offsets, axes) - tip_of(goal, offsets, axes)).norm(dim=-1)
+
+
+def arm_task(
+    reward: Reward | None = None,
+    steps: int = 100,
+    action_low: Limits = None,
+    action_high: Limits = None,
+) -> Task:
+    """Return the task: bring the joints to angles that are drawn by seed, and stay there.
+
+    The state has the joints' angles (rad) and speeds (rad/s); actions are the angles that their
+    servos are told. The model's error counts as 3 % of what actions effect in a step, at most.
+
+    Args:
+        reward: to plan with and to count; the tip's distance (m) from its goal, negative, if None.
+        steps: length of an episode, of 50 ms each.
+        action_low: lowest angles; -2 rad if None.
+        action_high: highest angles.
+
+    >>> arm_task().start(3)[1].shape
+    torch.Size([7])
+    """
+    import mujoco
+
+    world = MuJoCoDynamics(MODEL, SKIP)
+    data = mujoco.MjData(world.mjcf)
+    mujoco.mj_resetDataKeyframe(world.mjcf, data, 0)
+    first = torch.cat([torch.tensor(data.qpos), torch.zeros(JOINTS)]).float()
+
+    def start(seed: int) -> tuple[Tensor, Tensor]:
+        drawn = 2 * torch.rand(JOINTS, generator=torch.Generator().manual_seed(seed)) - 1
+        return first, first[:JOINTS] + SPREAD * drawn
+
+    low = world.action_low.tolist() if action_low is None else action_low
+    high = world.action_high.tolist() if action_high is None else action_high
+    trust(world, first, low, high, EXACT)
+    offsets, axes = chain(world.mjcf, "tip")
+    states, actions = world.names
+    return Task(
+        name="arm",
+        world=world,
+        start=start,
+        reward=partial(miss, offsets=offsets, axes=axes) if reward is None else reward,
+        low=low,
+        high=high,
+        dt=world.dt,
+        steps=check_count("robot.steps", steps),
+        state_names=states,
+        action_names=actions,
+        goal_names=states[:JOINTS],
+    )

@@ -1,0 +1,215 @@
+"""Missions in somebody else's task, whose dynamics change under way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.envs.missions.env import MissionEnv
+from afm_rl.envs.missions.noise import MissionNoise
+from afm_rl.envs.missions.phases import PhasedSimulation
+from afm_rl.envs.missions.settings import check_bounds, check_regime
+from afm_rl.envs.task.film import curves, film
+from afm_rl.envs.task.task import Task
+from afm_rl.errors import ConfigurationError, check_count, check_instance
+from afm_rl.regimes import ActionGain, Regime, Schedule
+
+SALT = 0x5441534B  # of the noise of actuators
+NEXT_SEED = 1_000_003  # what an episode that follows of itself adds to its mission's seed
+
+
+class TaskEnv(MissionEnv):
+    r"""Episodes of a :class:`~afm_rl.envs.Task` under regimes, batched.
+
+    .. math:: s_{t+1} = f(s_t, g(\mathrm{clamp}(a_t); \rho_t))
+
+    with the task's world f and a regime g that is hidden from the robot. The observation is the
+    whole state, the reward is the task's, and a mission's progress is the share of its episode
+    that has passed. A mission's seed decides where it begins; episodes that follow by an automatic
+    reset begin elsewhere.
+
+    Args:
+        task: what to do in which world.
+        tracks: only the task's name is allowed.
+        regime: what can happen to actions; gains if None.
+        schedule: when it does; half-way if None.
+        max_steps: length of an episode, at most the task's; the task's if None.
+        action_low: lower bounds of the actions; the task's if None.
+        action_high: upper bounds. Actions are clamped before the regime acts on them.
+        batch_size: number of missions, or ``()`` for any.
+        seed: missions without a seed of their own get ``seed, seed + 1, ...``.
+        device: where the tensors live.
+        missions: what missions are unless ``reset`` is given others, see
+            :class:`~afm_rl.envs.UGVTrack`.
+        dtype: floating-point type, torch's default if None.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+        NonFiniteError: at a step whose action is NaN or infinite.
+    """
+
+    simulation: TaskSimulation
+
+    def __init__(
+        self,
+        task: Task,
+        tracks: Sequence[str] | None = None,
+        regime: Regime | None = None,
+        schedule: Schedule | None = None,
+        max_steps: int | None = None,
+        action_low: Sequence[float] | None = None,
+        action_high: Sequence[float] | None = None,
+        batch_size: Sequence[int] = (),
+        seed: int = 0,
+        device: torch.device | str | None = None,
+        missions: TensorDictBase | Mapping[str, Any] | None = None,
+        *,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__(batch_size, seed, 0.0, device, dtype)
+        if tracks is not None and list(tracks) != [task.name]:
+            raise ConfigurationError(f"tracks={list(tracks)}: expected all, or {task.name}")
+        low, high = (
+            list(own) if given is None else given
+            for own, given in ((task.low, action_low), (task.high, action_high))
+        )
+        bounds = check_bounds(low, high, task.action_names)
+        axes = range(len(low))
+        default = ActionGain([f"gain_{axis}" for axis in axes])
+        steps = task.steps if max_steps is None else check_count("max_steps", max_steps)
+        schedule = Schedule([0.5]) if schedule is None else schedule
+        self.task = task
+        self.noise = MissionNoise({"actuator": (SALT, len(low))})
+        self.simulation = TaskSimulation(
+            task,
+            check_regime(regime, lambda: default, len(task.state_names), len(low)),
+            check_instance("schedule", schedule, Schedule),
+            bounds[0].to(self.dtype),
+            bounds[1].to(self.dtype),
+            min(steps, task.steps),
+        ).to(self.device)
+        self._complete([task.name], missions, bounds)
+
+    def draw(self, steps: pd.DataFrame) -> Iterator[np.ndarray]:
+        """Yield a picture ``(H, W, 3)`` of each row of a table of steps.
+
+        Of MuJoCo's robots the body is drawn, of others the state as curves.
+        """
+        states = steps[list(self.task.state_names)].to_numpy()
+        if isinstance(self.task.world, MuJoCoDynamics):
+            return film(self.task.world.mjcf, states)
+        return curves(steps["t"].to_numpy(), states, self.task.state_names)
+
+    def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:
+        noise = self._actuator_noise(tensordict["mission", "seed"])
+        return self.simulation.advance(tensordict, noise)
+
+    def _begun(self, mission: TensorDictBase, rows: Tensor | None) -> dict[str, Tensor]:
+        return self.simulation.begin(mission, self.dtype, rows)
+
+    def _missions_of(self, given: TensorDictBase | None, batch: torch.Size) -> TensorDict:
+        mission = super()._missions_of(given, batch)
+        again = None if given is None else given.get("_reset", None)
+        if again is not None:
+            mission["seed"] = mission["seed"] + NEXT_SEED * again.reshape(batch)
+        return mission
+
+
+class TaskSimulation(nn.Module, PhasedSimulation):
+    """One step of a task under a regime: pure functions of the tensordict.
+
+    Arguments are those of :class:`TaskEnv`, with the bounds ``low`` and ``high`` as tensors
+    ``(A,)``, and ``steps``, the length of an episode.
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self,
+        task: Task,
+        regime: Regime,
+        schedule: Schedule,
+        low: Tensor,
+        high: Tensor,
+        steps: int,
+    ) -> None:
+        super().__init__()
+        self.task, self.regime, self.schedule, self.steps = task, regime, schedule, steps
+        self.register_buffer("low", low, persistent=False)
+        self.register_buffer("high", high, persistent=False)
+
+    def begin(
+        self, mission: TensorDictBase, dtype: torch.dtype, rows: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Return the state at the beginning of missions; only ``rows`` are asked for."""
+        physics = self.regime.physics_of(mission["parameters"][..., 0, :])
+        first = {
+            name: value.to(self.low.device, dtype if value.is_floating_point() else value.dtype)
+            for name, value in self.task.begin(mission["seed"], rows, physics).items()
+        }
+        return self.started(first.pop("pose"), mission, len(self.low), **first)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return what environments that keep their state to themselves have lived through."""
+        return self.task.history()
+
+    def set_extra_state(self, state: Mapping[str, Any]) -> None:
+        self.task.replay(state)
+
+    def displaced(self, pose: Tensor, noise: Tensor) -> Tensor:
+        """Return poses as they are: the task draws where missions begin."""
+        return pose
+
+    def progress(self, mission: TensorDictBase, state: Any) -> Tensor:
+        """Return the share of the episode that has passed in the middle of the next step."""
+        return (state["step"] + 0.5) / self.steps
+
+    def changes_at(self, mission: TensorDictBase) -> Tensor:
+        """Return the first step of the first phase that differs from the one before, ``(*B)``.
+
+        If all are alike, that of the first phase where it is not nominal, else that of the second;
+        the episode's length if it never comes.
+        """
+        parameters = mission["parameters"]  # (*B, P, F)
+        changed = (parameters != parameters[..., :1, :]).any(-1)
+        nominal = self.regime.is_identity(parameters[..., 0, :])
+        alike = torch.where(nominal, min(1, changed.shape[-1] - 1), 0)
+        first = torch.where(changed.any(-1), changed.int().argmax(-1), alike)
+        state = {"step": torch.arange(self.steps).expand(*first.shape, -1)}
+        progress, at = self.progress(mission, state), mission["at"].unsqueeze(-2)
+        begun = self.schedule.phase(progress, state["step"], at)
+        return (begun < first.unsqueeze(-1)).sum(-1)
+
+    def advance(self, data: TensorDictBase, actuator: Tensor | None = None) -> TensorDict:
+        """Return what one step leads to.
+
+        Args:
+            data: the state, ``mission`` and ``action``.
+            actuator: standard normal numbers for a noisy regime, ``(*B, A)``.
+        """
+        mission, pose = data["mission"], data["pose"]
+        action = data["action"].to(pose.dtype).clamp(self.low, self.high)
+        past = data["past"] if self.regime.history else None
+        parameters = self.regime_now(mission, data)
+        effective = self.regime.apply(action, parameters, pose, past, actuator)
+        physics = self.regime.physics_of(parameters)
+        moved, reward, ended = self.task.step(data, effective, physics)
+        state = {"pose": moved.to(pose), "step": data["step"] + 1}
+        state |= {name: data[name] for name in ("goal", "slot") if name in data.keys()}
+        out = self.describe(mission, self.followed(mission, data, state, action))
+        out["reward"] = reward.to(pose).unsqueeze(-1)
+        out["terminated"] = ended.unsqueeze(-1)
+        out["truncated"] = (state["step"] >= self.steps).unsqueeze(-1)
+        out["done"] = out["terminated"] | out["truncated"]
+        return out
+
+    def describe(self, mission: TensorDictBase, state: dict[str, Tensor]) -> TensorDict:
+        return self.described(mission, state, observation=state["pose"].clone())

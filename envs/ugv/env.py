@@ -1,0 +1,177 @@
+"""The ground robot on a track, under regimes that are hidden from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from afm_rl.dynamics import Dubins, DynamicsModel
+from afm_rl.envs.courses.course import Course
+from afm_rl.envs.courses.rendering import canvas_of
+from afm_rl.envs.courses.track import Track
+from afm_rl.envs.courses.tracks import load_track
+from afm_rl.envs.missions.env import MissionEnv
+from afm_rl.envs.missions.noise import MissionNoise
+from afm_rl.envs.missions.settings import check_bounds, check_names, check_regime
+from afm_rl.envs.ugv.simulation import UGVSimulation
+from afm_rl.errors import AFMError, check_choice, check_count, check_instance, check_number
+from afm_rl.regimes import ActionGain, Regime, Schedule
+
+ACTIONS = ("v (m/s)", "omega (rad/s)")
+
+
+class UGVTrack(MissionEnv):
+    r"""Dubins robots that drive along tracks, waypoint by waypoint, batched.
+
+    .. math:: s_{t+1} = f(s_t, g(\mathrm{clamp}(a_t); \rho_t)) + \sigma \epsilon_t,
+              \quad \epsilon_t \sim N(0, I)
+
+    with the pose :math:`s = (x, y, \theta)` in m and rad, the action :math:`a = (v, \omega)` in
+    m/s and rad/s, dynamics :math:`f` (Dubins, or a ``world`` whose states begin with the pose and
+    have more coordinates), and a regime :math:`g` whose parameters
+    :math:`\rho_t` follow the mission's progress (paper, section V-B). The next target becomes
+    the goal once the robot is nearer than ``reach``, at most one per step. The reward is the
+    distance gained on the current target in metres, plus 1 for a target reached. An episode
+    terminates with the last target and is truncated after ``max_steps``.
+
+    ================= ============== ====================================================
+    ``observation``   ``(*B, 3)``    the pose, for policies: x, y (m), theta (rad); or as many
+                                     of the state's coordinates as are ``observed``
+    ``goal``          ``(*B, 2)``    current target (m)
+    ``reached``       ``(*B)``       number of targets reached
+    ``step``          ``(*B)``       number of steps taken
+    ``since``         ``(*B)``       step at which the present phase began
+    ``past``          ``(*B, D, 2)`` the last D clamped actions, newest first; only there
+                                     if the regime depends on them
+    ``pose``          ``(*B, 3)``    the state itself; transforms should leave it alone
+    ``mission``       nested         see :class:`~afm_rl.envs.missions.format.MissionFormat`
+    ``regime``        ``(*B, F)``    parameters that act on the next action: hidden truth,
+                                     for oracles and logs only
+    ``regime_active`` ``(*B)``       whether they differ from nominal; hidden truth as well
+    ================= ============== ====================================================
+
+    Positions are relative to the ``origin`` of the track, whole kilometres: zero for tracks near
+    zero, and in single precision a track in UTM coordinates is then as good as any.
+
+    The state travels in the tensordict. With ``batch_size=()`` the environment accepts
+    tensordicts of any batch shape, also one that loses rows from step to step. ``reset`` keeps
+    the ``mission`` entries it is given (say ``set_state=False`` for a fresh start and
+    ``set_state=True`` to go on from ``pose``, ``reached``, ``step``, ``since`` and ``past``); an
+    automatic reset repeats the mission. Noise comes from one stream per mission seed, so a mission
+    meets the same noise alone as in a batch. The streams live in the environment: ``set_seed``
+    restarts them, a reset continues them, ``state_dict`` holds them.
+
+    Args:
+        tracks: names, CSV paths (see :func:`~afm_rl.envs.courses.tracks.load_track`) or tracks.
+        regime: regime family; gains on v and omega by default.
+        schedule: when regimes change; by default at 0.15 and 0.80 of the targets.
+        process_noise: standard deviation per step of each pose component (m, m, rad).
+        start_noise: the same for the start pose.
+        dt: time step of Dubins dynamics (s).
+        reach: distance at which a target counts as reached (m).
+        max_steps: steps after which an episode is truncated.
+        action_low: lower bounds of v (m/s) and omega (rad/s).
+        action_high: upper bounds. Actions are clamped before the regime acts on them.
+        batch_size: number of missions, or ``()`` for any.
+        seed: missions without a seed of their own get ``seed, seed + 1, ...``.
+        device: where the tensors live.
+        missions: what missions are unless ``reset`` is given others: a tensordict that
+            broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
+        dtype: floating-point type, torch's default if None.
+        world: how the robot moves; Dubins if None.
+        observed: how many of the state's coordinates are observed; all if None.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+        NonFiniteError: at a step whose action is NaN or infinite.
+
+    >>> env = UGVTrack(tracks=["ethz_1", "ethz_2"])
+    >>> missions = [env.mission("ethz_2", seed, {"v_gain": -1.0}) for seed in range(5)]
+    >>> data = env.reset(torch.stack(missions), set_state=False)
+    >>> data["action"] = torch.ones(5, 2)
+    >>> env.step(data)["next", "reached"]
+    tensor([1, 1, 1, 1, 1])
+    """
+
+    simulation: UGVSimulation
+
+    def __init__(
+        self,
+        tracks: Sequence[str | Path | Track] = ("ethz_2",),
+        regime: Regime | None = None,
+        schedule: Schedule | None = None,
+        process_noise: float = 1e-5,
+        start_noise: float = 0.02,
+        dt: float = 0.2,
+        reach: float = 0.5,
+        max_steps: int = 5000,
+        action_low: Sequence[float] = (-1.0, -math.pi / 2),
+        action_high: Sequence[float] = (1.0, math.pi / 2),
+        batch_size: Sequence[int] = (),
+        seed: int = 0,
+        device: torch.device | str | None = None,
+        missions: TensorDictBase | Mapping[str, Any] | None = None,
+        *,
+        dtype: torch.dtype | None = None,
+        world: DynamicsModel | None = None,
+        observed: int | None = None,
+    ) -> None:
+        super().__init__(batch_size, seed, start_noise, device, dtype)
+        if isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable):
+            tracks = (tracks,)
+        self.tracks = tuple(one if isinstance(one, Track) else load_track(one) for one in tracks)
+        names = [track.name for track in self.tracks]
+        check_names("tracks", names)
+        self.process_noise = check_number("process_noise", process_noise, low=0.0)
+        self.noise = MissionNoise()
+        bounds = check_bounds(action_low, action_high, ACTIONS)
+        schedule = Schedule() if schedule is None else schedule
+        world = Dubins(check_number("dt", dt, low=0.0, open_low=True)) if world is None else world
+        self.simulation = UGVSimulation(
+            Course(self.tracks, self.dtype),
+            check_regime(regime, lambda: ActionGain(["v_gain", "omega_gain"]), world.state_size, 2),
+            check_instance("schedule", schedule, Schedule),
+            low=bounds[0].to(self.dtype),
+            high=bounds[1].to(self.dtype),
+            world=world,
+            observed=world.state_size if observed is None else check_count("observed", observed),
+            reach=check_number("reach", reach, low=0.0, open_low=True),
+            steps=check_count("max_steps", max_steps),
+        ).to(self.device)
+        self._complete(names, missions, bounds)
+
+    @property
+    def course(self) -> Course:
+        """The targets of all tracks."""
+        return self.simulation.course
+
+    def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:
+        seeds = tensordict["mission", "seed"]
+        noise = self.process_noise * self.noise.normal("process", seeds, dtype=self.dtype)
+        return self.simulation.advance(tensordict, noise, self._actuator_noise(seeds))
+
+    def render(
+        self, tensordict: TensorDictBase | None = None, mode: str = "rgb_array"
+    ) -> np.ndarray:
+        """Draw the first mission, ``(H, W, 3)`` bytes.
+
+        Args:
+            tensordict: what to draw; the outcome of the last step or reset if None.
+            mode: only ``"rgb_array"``.
+
+        Raises:
+            AFMError: if there is nothing to draw yet.
+        """
+        check_choice("mode", mode, ["rgb_array"])
+        data = self._last if tensordict is None else tensordict
+        if data is None or 0 in data.batch_size:
+            raise AFMError("nothing to render: call reset() first")
+        first = data.reshape(-1)[0]
+        canvas = canvas_of(self.tracks[int(first["mission", "track"])])
+        return canvas.draw(first["pose"], first["goal"], reach=self.simulation.reach)

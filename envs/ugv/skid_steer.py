@@ -1,0 +1,98 @@
+"""A ground robot in MuJoCo: four wheels, skid steering, contacts with friction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.dynamics.mujoco_physics import changed_model
+from afm_rl.errors import check_count, check_number
+from afm_rl.regimes import Physics
+
+MODEL = Path(__file__).with_name("skid_steer.xml")
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+RADIUS = 0.098  # m, of a wheel
+WIDTH = 0.9  # m, distance of wheels on an axle that would turn like this without skidding
+STEP = 0.01  # s, of the simulation
+PLANAR = 3  # state coordinates that make the pose: x, y, theta
+
+
+def skid_steer(
+    dt: float = 0.2, noise_std: float | Sequence[float] = (2e-3, 2e-2), threads: int = 0
+) -> MuJoCoDynamics:
+    r"""Return a small robot with four wheels; actions are v (m/s) and omega (rad/s).
+
+    .. math:: w_{left} = (v - \omega b / 2) / r, \qquad w_{right} = (v + \omega b / 2) / r
+
+    are the speeds that the wheels' servos are told, with the radius r and a width b that is
+    larger than the robot's, as its wheels skid in turns. The state begins with x, y (m) and theta
+    (rad); then height, pitch, roll, the angles of the wheels, and the velocities of all of these.
+
+    Args:
+        dt: time of an action (s), a multiple of 0.01 s.
+        noise_std: see :class:`~afm_rl.dynamics.MuJoCoDynamics`.
+        threads: that simulate; 0 for the calling one.
+
+    >>> import torch
+    >>> robot = skid_steer()
+    >>> robot(torch.zeros(20), torch.tensor([1.0, 0.0]))[0] > 0.1
+    tensor(True)
+    """
+    skip = round(check_number("dynamics.dt", dt, low=STEP) / STEP)
+    turn = WIDTH / 2 / RADIUS
+    mix = [[1 / RADIUS, -turn], [1 / RADIUS, turn]] * 2
+    return MuJoCoDynamics(
+        MODEL,
+        check_count("dynamics.dt", skip),
+        noise_std,
+        threads,
+        changed_wheels,
+        dict(zip(WheelPhysics.names, WheelPhysics.identity, strict=True)),
+        mix,
+    )
+
+
+class WheelPhysics(Physics):
+    """Other physics of the robot on wheels.
+
+    Beside those of :class:`~afm_rl.regimes.Physics`: where the ``payload`` is, ``payload_x`` and
+    ``payload_y`` (m, from the middle); ``wheel_FRONT_LEFT`` and so on, factors of the speed that a
+    wheel is told (-1: it runs backwards; 0: it is held); ``tyre_FRONT_LEFT`` and so on, factors of
+    its radius.
+
+    >>> flat = WheelPhysics().encode({"tyre_rear_left": 0.8})
+    >>> len(flat)
+    18
+    """
+
+    names = (
+        *Physics.names,
+        *("payload_x", "payload_y"),
+        *(f"wheel_{name}" for name in WHEELS),
+        *(f"tyre_{name}" for name in WHEELS),
+    )
+    identity = (*Physics.identity, *[0.0] * 2, *[1.0] * 8)
+    limits = {**Physics.limits, **dict.fromkeys(names[-4:], (0.5, 1.2))}
+
+
+def changed_wheels(model: Any, row: tuple[float, ...]) -> Any:
+    """Return a copy of the robot's ``MjModel`` with other physics.
+
+    Args:
+        model: the nominal model.
+        row: values of ``WheelPhysics.names``.
+    """
+    import mujoco
+
+    value = dict(zip(WheelPhysics.names, row, strict=True))
+    found = changed_model(model, row[: len(Physics.names)])
+    base = model.body("base").id
+    load = value["payload"] * model.body_mass.sum() * value["mass"] / found.body_mass[base]
+    found.body_ipos[base, :2] += load * value["payload_x"], load * value["payload_y"]
+    for name in WHEELS:
+        found.actuator_gainprm[model.actuator(name).id, 0] *= value[f"wheel_{name}"]
+        found.geom_size[model.geom(name).id, ::2] *= value[f"tyre_{name}"]
+    mujoco.mj_setConst(found, mujoco.MjData(found))
+    return found

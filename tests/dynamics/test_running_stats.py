@@ -1,0 +1,92 @@
+"""Running mean and standard deviation against those of all data at once."""
+
+import math
+
+import pytest
+import torch
+
+from afm_rl.dynamics.running_stats import RunningStats
+from afm_rl.errors import ConfigurationError
+
+
+def stream(*shape, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    data = torch.randn(*shape, generator=generator, dtype=torch.float64)
+    return 1e3 + 5.0 * data  # far from zero, where naive sums of squares lose digits
+
+
+@pytest.mark.parametrize(
+    "pieces", [[1] * 40, [40], [1, 7, 0, 32]], ids=["one by one", "all", "mix"]
+)
+def test_they_are_those_of_all_samples(pieces):
+    data, stats = stream(40, 3), RunningStats(3).double()
+    for part in data.split(pieces):
+        stats.update_(part)
+    torch.testing.assert_close(stats.mean, data.mean(0))
+    torch.testing.assert_close(stats.std, data.std(0))
+    assert stats.count == 40
+    torch.testing.assert_close(stats(data), (data - data.mean(0)) / data.std(0))
+
+
+def test_streams_are_independent_and_samples_may_be_left_out():
+    data, where = stream(2, 3, 30, 4), torch.rand(2, 3, 30) < 0.5
+    where[0, 0] = False
+    stats = RunningStats(4, lead=(2, 3)).double()
+    dirty = torch.where(where.unsqueeze(-1), data, math.nan)
+    for k in range(30):
+        stats.update_(dirty[:, :, k], where[:, :, k])
+    for i in range(2):
+        for j in range(3):
+            kept = data[i, j][where[i, j]]
+            assert stats.count[i, j] == len(kept)
+            mean, std = (kept.mean(0), kept.std(0)) if len(kept) else (0 * data[0, 0, 0], None)
+            torch.testing.assert_close(stats.mean[i, j], mean)
+            if std is not None:
+                torch.testing.assert_close(stats.std[i, j], std)
+    whole = stats(data)
+    expected = (data - stats.mean.unsqueeze(-2)) / stats.std.unsqueeze(-2)
+    torch.testing.assert_close(whole, expected)
+    torch.testing.assert_close(stats(data[:, :, 0]), whole[:, :, 0])
+
+
+def test_they_go_on_from_where_they_are_told():
+    first, second = stream(25, 2), stream(9, 2, seed=1)
+    stats = RunningStats(2).double()
+    stats.start_(first.mean(0), first.std(0), 25)
+    stats.update_(second)
+    both = torch.cat([first, second])
+    torch.testing.assert_close((stats.mean, stats.std), (both.mean(0), both.std(0)))
+
+
+def test_streams_part_and_leave():
+    data = stream(10, 2)
+    stats = RunningStats(2).double()
+    stats.update_(data)
+    assert stats.expand_(3) is stats and stats.lead == (3,)
+    stats.update_(stream(3, 2, seed=1), torch.tensor([False, True, True]))
+    kept = stats.std[[2, 0]].clone()
+    assert stats.select_(torch.tensor([2, 0])) is stats
+    assert torch.equal(stats.std, kept) and stats.count.flatten().tolist() == [11, 10]
+    torch.testing.assert_close(stats.mean[1], data.mean(0))
+
+
+def test_nothing_is_divided_by_zero():
+    stats = RunningStats(1, min_std=0.5)
+    assert torch.equal(stats(torch.tensor([3.0])), torch.tensor([3.0]))  # nothing seen
+    stats.update_(torch.full((5, 1), 2.0))
+    assert torch.equal(stats.std, torch.tensor([0.5]))
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(ConfigurationError, match="size"):
+        RunningStats(0)
+    with pytest.raises(ConfigurationError, match="min_std"):
+        RunningStats(1, min_std=0.0)
+    stats = RunningStats(3, lead=(2,))
+    with pytest.raises(ConfigurationError, match="count"):
+        stats.start_(torch.zeros(3), torch.ones(3), 0)
+    for shape in [(3, 3), (2, 4), (3,)]:
+        with pytest.raises(ConfigurationError, match=r"values of shape .*\(2, \.\.\., 3\)"):
+            stats.update_(torch.zeros(shape))
+    with pytest.raises(ConfigurationError, match=r"where of shape \(3,\): expected \(2,\)"):
+        stats.update_(torch.zeros(2, 3), torch.ones(3, dtype=torch.bool))

@@ -1,0 +1,125 @@
+"""References: positions, velocities that belong to them, and files."""
+
+import math
+
+import pytest
+import torch
+
+from afm_rl.envs import Circle, FigureEight, Hover, Table, Waypoints, load_reference
+from afm_rl.envs.courses.references import references_at
+from afm_rl.errors import ConfigurationError
+
+SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0.5]]
+ALL = [Hover([1, 2, 3]), Circle(3.0, 1.2), FigureEight(), Waypoints(SQUARE, closed=True)]
+
+
+@pytest.mark.parametrize("reference", ALL, ids=lambda one: one.name)
+@pytest.mark.parametrize("shape", [(), (7,), (2, 5)])
+def test_velocities_are_those_of_the_positions(reference, shape):
+    time = 0.1 + 7 * torch.rand(shape, dtype=torch.float64)
+    found = reference.at(time)
+    assert found.shape == (*shape, 6)
+    step = 1e-6
+    slope = (reference.at(time + step) - reference.at(time - step)) / (2 * step)
+    torch.testing.assert_close(found[..., 3:], slope[..., :3], rtol=1e-6, atol=1e-6)
+    assert reference.at(time.float()).dtype is torch.float32
+
+
+def test_a_circle_is_flown_at_its_speed():
+    circle = Circle(radius=2.0, speed=0.8)
+    found = circle.at(torch.linspace(0, 20, 50, dtype=torch.float64))
+    ones = torch.ones(50, dtype=torch.float64)
+    torch.testing.assert_close(found[:, :3].norm(dim=-1), 2 * ones)
+    torch.testing.assert_close(found[:, 3:].norm(dim=-1), 0.8 * ones)
+    torch.testing.assert_close(found[0, [0, 4]], torch.tensor([2.0, 0.8], dtype=torch.float64))
+    around = circle.at(torch.tensor(2 * math.pi * 2.0 / 0.8, dtype=torch.float64))
+    torch.testing.assert_close(around, found[0])
+
+
+def test_a_figure_of_eight_crosses_its_centre():
+    middle = FigureEight(period=6.0).at(torch.tensor([0.0, 3.0, 6.0], dtype=torch.float64))
+    torch.testing.assert_close(middle[:, :3], torch.zeros(3, 3, dtype=torch.float64))
+    assert middle[0, 3] > 0 > middle[1, 3]
+
+
+def test_waypoints_are_met_in_time_and_the_last_is_held():
+    line = Waypoints([[0, 0, 0], [3, 0, 0], [3, 4, 0]], speed=0.5)
+    found = line.at(torch.tensor([-1.0, 0.0, 6.0, 10.0, 14.0, 99.0], dtype=torch.float64))
+    expected = [[-0.5, 0], [0, 0], [3, 0], [3, 2], [3, 4], [3, 4]]
+    torch.testing.assert_close(found[:, :2], torch.tensor(expected, dtype=torch.float64))
+    assert found[-1, 3:].tolist() == [0, 0, 0]
+
+
+def test_closed_waypoints_go_round():
+    square = Waypoints([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], speed=1.0, closed=True)
+    torch.testing.assert_close(square.at(torch.tensor(3.5)), square.at(torch.tensor(7.5)))
+    assert square.at(torch.tensor(3.5)).tolist() == [0, 0.5, 0, 0, -1, 0]
+
+
+def write(path, header, rows):
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]))
+    return path
+
+
+def test_a_file_with_velocities_is_read_as_it_is(tmp_path):
+    rows = [[0, 0, 0, 1, 1, 0, 0], [2, 2, 0, 1, 3, 0, 0]]
+    reference = load_reference(write(tmp_path / "line.csv", "t,x,y,z,vx,vy,vz", rows))
+    assert reference.name == "line"
+    found = reference.at(torch.tensor([-1.0, 0.5, 2.0, 9.0]))
+    assert found[:, 0].tolist() == [0, 0.5, 2, 2]
+    assert found[:, 3].tolist() == [1, 1.5, 3, 3]
+
+
+@pytest.mark.parametrize("header", ["t,x,y,z", "t,x,y,z,vx,vy,vz"])
+def test_velocities_can_be_taken_from_differences(tmp_path, header):
+    more = [9.0] * 3 if "vx" in header else []
+    rows = [[t, 2 * t, t * t, 1, *more] for t in (0, 0.5, 1.5, 2)]
+    path = write(tmp_path / "curve.csv", header, rows)
+    found = load_reference(path, velocity="differences").at(torch.tensor([0.5, 1.5]))
+    torch.testing.assert_close(found[:, 3:], torch.tensor([[2.0, 1.0, 0], [2, 3, 0]]))
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "settings", "message"),
+    [
+        ("t,x,y,z", [[0, 0, 0, 0], [1, 0, 0, 0]], {}, 'no velocities.*velocity="differences"'),
+        ("t,x,y,z", [[0, 0, 0, 0]] * 2, {"velocity": "differences"}, "times that increase"),
+        ("t,x,y,z", [[0, 0, 0, 0]], {"velocity": "differences"}, "1 times"),
+        ("t,x,y,z", [], {"velocity": "guess"}, "velocity='guess': expected one of"),
+        ("t,x,y", [[0, 0, 0]], {}, "the first line is t,x,y, expected t,x,y,z,vx,vy,vz or t,x"),
+        ("t,x,y,z", [[0, 0, "nan", 0]], {}, "'nan' is not a finite number"),
+    ],
+)
+def test_files_that_cannot_be_used_say_why(tmp_path, header, rows, settings, message):
+    path = write(tmp_path / "bad.csv", header, rows)
+    with pytest.raises(ConfigurationError, match=message):
+        load_reference(path, **settings)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Hover([0, 0]), "hover: position=.*expected finite numbers x, y, z"),
+        (lambda: Hover("abc"), "hover: position"),
+        (lambda: Circle(radius=0), "circle: radius=0"),
+        (lambda: Circle(speed=-1.0), "circle: speed=-1.0"),
+        (lambda: FigureEight(period=0.0), "figure_8: period=0.0"),
+        (lambda: Waypoints([[0, 0, 0]]), "two or more"),
+        (lambda: Waypoints([[0, 0, 0], [0, 0, 0]]), "each unlike the one before"),
+        (lambda: Waypoints([[0, 0, math.inf], [0, 0, 0]]), "waypoints: points"),
+        (lambda: Waypoints(SQUARE, speed=0.0), "waypoints: speed=0.0"),
+        (lambda: Waypoints(SQUARE, closed="yes"), "waypoints: closed='yes'"),
+        (lambda: Table(torch.arange(2.0), torch.zeros(2, 3), torch.zeros(2, 2)), r"\(N, 3\) each"),
+    ],
+)
+def test_impossible_references_are_refused(make, message):
+    with pytest.raises(ConfigurationError, match=message):
+        make()
+
+
+def test_each_flight_follows_its_own_reference():
+    index, time = torch.tensor([[0, 3], [1, 2]]), torch.rand(2, 2, 5)
+    found = references_at(ALL, index, time)
+    assert found.shape == (2, 2, 5, 6)
+    assert (found[0, 1] == ALL[3].at(time[0, 1])).all()
+    assert (references_at(ALL[1:2], index * 0, time) == ALL[1].at(time)).all()

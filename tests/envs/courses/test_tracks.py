@@ -1,0 +1,179 @@
+"""The tracks of the catalogue, the user's files, and what is wrong with them."""
+
+import math
+
+import pytest
+import torch
+
+from afm_rl.envs import Track, load_track
+from afm_rl.envs.courses.columns import read_columns
+from afm_rl.envs.courses.geometry import poses_at, round_corners
+from afm_rl.envs.courses.tracks import MAPS
+from afm_rl.errors import ConfigurationError
+
+
+def write(folder, text, name="mine.csv"):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "length", "targets", "width"), [("ethz_1", 107.2, 34, 2.2), ("ethz_2", 77.1, 19, 2.8)]
+)
+def test_the_catalogue_has_the_published_sizes(name, length, targets, width):
+    track = load_track(name)
+    _, corners = read_columns(MAPS / f"{name}.csv", [("x", "y", "radius")])
+    line = round_corners(corners[:, :2], corners[:, 2])
+    assert float(line.length.sum()) == pytest.approx(length, abs=0.05)
+    assert track.targets.shape == (targets, 2)
+    assert track.width == width
+    torch.testing.assert_close(track.targets[0], track.targets[-1])
+
+
+@pytest.mark.parametrize(
+    ("name", "start"),
+    [("ethz_1", (-5.07, 6.59, -math.pi / 4)), ("ethz_2", (7.2, 5.4, 0.0))],
+)
+def test_the_catalogue_starts_on_the_line_and_along_it(name, start):
+    track = load_track(name)
+    torch.testing.assert_close(track.start, torch.tensor(start).double(), atol=0.02, rtol=0)
+    torch.testing.assert_close(track.start[:2], track.waypoints[0])
+
+
+@pytest.mark.parametrize("name", ["ethz_1", "ethz_2"])
+def test_waypoints_lie_on_the_centre_line_in_driving_order(name):
+    track = load_track(name)
+    distance = torch.cdist(track.waypoints, track.centerline)
+    assert distance.amin(-1).max() < 0.03  # half the spacing of the drawn points
+    nearest = distance.argmin(-1)
+    ahead = (nearest.roll(-1) - nearest) % len(track.centerline)
+    assert int(ahead.sum()) == len(track.centerline)  # once around
+
+
+def test_the_second_track_has_uniform_stations():
+    track = load_track("ethz_2")
+    _, corners = read_columns(MAPS / "ethz_2.csv", [("x", "y", "radius")])
+    line = round_corners(corners[:, :2], corners[:, 2])
+    first = float(line.length.sum() - line.length[-1])  # the start is where the last arc begins
+    stations = first + 4.5 * torch.arange(18, dtype=torch.float64)
+    torch.testing.assert_close(track.waypoints, poses_at(line, stations)[:, :2])
+
+
+def test_a_file_of_waypoints(tmp_path):
+    track = load_track(write(tmp_path, "x,y\n1,2\n1,5\n\n4, 5\n"))
+    assert track.name == "mine"
+    assert track.waypoints.tolist() == [[1, 2], [1, 5], [4, 5]]
+    torch.testing.assert_close(track.start, torch.tensor([1, 2, math.pi / 2]).double())
+
+
+def test_a_file_written_by_a_spreadsheet(tmp_path):
+    track = load_track(write(tmp_path, "\ufeffX, Y\r\n0,0\r\n3,0\r\n"))
+    assert track.targets.tolist() == [[0, 0], [3, 0], [0, 0]]
+
+
+def test_a_file_of_corners_and_radii(tmp_path):
+    path = write(tmp_path, "x,y,radius\n0,0,1\n9,0,1\n9,9,1\n0,9,0\n")
+    track = load_track(str(path))
+    length = 36 - 3 * 2 + 3 * math.pi / 2
+    assert len(track.waypoints) == round(length / 3.5)
+    torch.testing.assert_close(track.start, torch.tensor([1.0, 0.0, 0.0]).double())
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("x,y\n0,0\n1,zwei\n", r"line 3: 'zwei' is not a finite number"),
+        ("x,y\n0,0\n1,nan\n", r"line 3: 'nan' is not a finite number"),
+        ("x,y\n0,0\ninf,1\n", r"line 3: 'inf' is not a finite number"),
+        ("x,y\n0,0\n1,\n", r"line 3: '' is not a finite number"),
+        ("x,y\n0,0\n1,2,3\n", r"line 3: 3 values, expected 2"),
+        ("x,z\n0,0\n1,1\n", r"first line is x,z, expected x,y or x,y,radius"),
+        ("", r"first line is nothing, expected"),
+        ("x,y\n", r"waypoint count 0: expected at least 2"),
+        ("x,y\n0,0\n", r"waypoint count 1: expected at least 2"),
+        ("x,y,radius\n0,0,1\n", r"vertex count 1: expected at least 2"),
+        ("x,y\n0,0\n0,0\n1,1\n", r"waypoint 1 and waypoint 2 coincide"),
+        ("x,y\n0,0\n1,1\n0,0\n", r"waypoint 3 and waypoint 1 coincide"),
+        ("x,y,radius\n0,0,1\n9,0,-1\n9,9,1\n", r"radius -1: expected at least 0"),
+        ("x,y,radius\n0,0,1\n9,0,8\n9,9,1\n", r"do not fit"),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_line(tmp_path, text, complaint):
+    with pytest.raises(ConfigurationError, match=complaint) as error:
+        load_track(write(tmp_path, text))
+    assert str(error.value).startswith("tracks: ")
+    assert "\n" not in str(error.value)
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path):
+    path = tmp_path / "noise.csv"
+    path.write_bytes(b"x,y\n\xff\xfe\x00")
+    with pytest.raises(ConfigurationError, match="not a text file"):
+        load_track(path)
+
+
+@pytest.mark.parametrize("name", ["missing.csv", "folder.csv"])
+def test_a_file_that_cannot_be_opened_is_refused(tmp_path, name):
+    (tmp_path / "folder.csv").mkdir()
+    with pytest.raises(ConfigurationError, match="tracks: cannot read"):
+        load_track(tmp_path / name)
+
+
+@pytest.mark.parametrize("source", ["ethz_3", "", 7])
+def test_an_unknown_name_lists_what_there_is(source):
+    with pytest.raises(ConfigurationError, match="expected one of ethz_1, ethz_2, or the path"):
+        load_track(source)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("waypoints", torch.zeros(3)),
+        ("waypoints", torch.tensor([[0.0, 0.0], [math.nan, 1.0]])),
+        ("start", torch.zeros(2)),
+        ("start", torch.full((3,), math.inf)),
+        ("centerline", torch.zeros(5, 3)),
+        ("width", 0.0),
+    ],
+)
+def test_a_track_checks_itself(field, value):
+    points = torch.tensor([[0.0, 0.0], [4.0, 0.0]])
+    fields = {"waypoints": points, "start": torch.zeros(3), "centerline": points}
+    with pytest.raises(ConfigurationError, match=rf"tracks: mine: {field[:5]}"):
+        Track("mine", **{**fields, field: value})
+
+
+SQUARE = [(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)]
+
+
+def square(folder, x=0.0, y=0.0, side=1.0, name="square"):
+    path = folder / f"{name}.csv"
+    rows = "".join(f"{x + side * a!r},{y + side * b!r}\n" for a, b in SQUARE)
+    path.write_text("x,y\n" + rows)
+    return path
+
+
+@pytest.mark.parametrize(("x", "y"), [(1e7, -1e7), (500_000.0, 5_400_000.0)])
+def test_far_from_zero_is_as_near(tmp_path, x, y):
+    near = load_track(square(tmp_path, name="near"))
+    far = load_track(square(tmp_path, x, y, name="far"))
+    assert (near.origin.tolist(), far.origin.tolist()) == ([0, 0], [x, y])
+    for part in ("waypoints", "start", "centerline"):
+        assert torch.equal(getattr(near, part), getattr(far, part))
+    points = near.waypoints + far.origin
+    whole = Track("far", points, torch.cat([points[0], torch.zeros(1)]), points)
+    assert torch.equal(whole.waypoints, near.waypoints) and whole.origin.tolist() == [x, y]
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"side": 5e4}, "tracks: square: a course of 800 km: expected at most 100 km"),
+        ({"side": 1e30}, r"square: waypoint 2 at \[4e\+30, 0.0\]: expected coordinates of at most"),
+        ({"x": 1e30}, r"square: waypoint 1 at \[1e\+30, 0.0\]"),
+    ],
+)
+def test_tracks_that_nobody_can_mean_are_refused(tmp_path, settings, complaint):
+    with pytest.raises(ConfigurationError, match=complaint):
+        load_track(square(tmp_path, **settings))

@@ -1,0 +1,442 @@
+"""The quadrotor environment: plant, phases, errors, ends and resets."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, InitTracker, RewardSum, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from afm_rl.dynamics import Quadrotor
+from afm_rl.dynamics.quadrotor_equations import quadrotor_path
+from afm_rl.envs import Circle, CrazyflieTrack, Hover, Reference, schedule_in_seconds
+from afm_rl.errors import ConfigurationError, NonFiniteError
+from afm_rl.regimes import ActionGain, Delay, GainNoise, MassFactor, Schedule, flight_regimes
+from afm_rl.regimes import Compose as Families
+from afm_rl.spaces.airframe import QuadrotorBody, saturate
+
+BODY = QuadrotorBody()
+HOVER = (BODY.hover_thrust, 0.0, 0.0, 0.0)
+
+
+def act(env, data, action=HOVER):
+    data["action"] = torch.as_tensor(action, dtype=env.dtype).expand(*data.batch_size, 4)
+    return env.step(data)["next"]
+
+
+def fly(env, data, steps, action=HOVER):
+    """Return what each of several steps leads to."""
+    record = []
+    for _ in range(steps):
+        record.append(act(env, data, action).clone())
+        data = env.step_mdp(data)
+    return torch.stack(record)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+@pytest.mark.parametrize("schedule", [None, Schedule([]), Schedule([0.5]), [0.1]])
+def test_specs_hold(batch, schedule):
+    env = CrazyflieTrack(batch_size=batch, duration=0.15, schedule=schedule, substeps=2)
+    check_env_specs(env, break_when_any_done="both")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_specs_hold_in_either_precision(dtype):
+    families = Families([Delay(), GainNoise(), MassFactor()])
+    env = CrazyflieTrack(dtype=dtype, regime=families, sensor_noise=0.01, start_noise=0.01)
+    check_env_specs(env)
+    data = env.rollout(3)
+    keys = ("pose", "observation", "reference", "square_error", "regime", "past")
+    assert {data[key].dtype for key in keys} == {dtype}
+    assert data["next", "reward"].dtype is dtype
+
+
+def test_specs_hold_under_transforms():
+    env = CrazyflieTrack(batch_size=(2,), duration=0.15, substeps=2)
+    env = TransformedEnv(env, Compose(StepCounter(), RewardSum(), InitTracker()))
+    check_env_specs(env, break_when_any_done="both")
+
+
+def test_the_action_is_bounded_per_axis():
+    space = CrazyflieTrack(batch_size=(2,)).action_spec.space
+    low, high = (torch.tensor(bound).expand(2, 4) for bound in BODY.bounds)
+    torch.testing.assert_close((space.low, space.high), (low, high))
+
+
+def test_a_step_is_the_rigid_body_under_what_the_motors_give():
+    env = CrazyflieTrack(dtype=torch.float64)
+    action = torch.tensor([0.5, 5e-3, -4e-3, 1e-4], dtype=torch.float64)  # beyond the motors
+    given = saturate(action, BODY)
+    assert (given != action).any()
+    after = act(env, env.reset(), action)
+    expected = Quadrotor(substeps=25)(env.reset()["pose"], given)
+    torch.testing.assert_close(after["pose"], expected, rtol=1e-12, atol=1e-12)
+    assert (after["observation"] == after["pose"]).all()
+
+
+def test_flights_start_on_the_reference():
+    for start, speed in (("rest", 0.0), ("moving", 0.8)):
+        pose = CrazyflieTrack(start=start).reset()["pose"]
+        assert pose.tolist() == pytest.approx([2, 0, 0, 0, speed, 0, 0, 0, 0, 1, 0, 0, 0])
+
+
+def test_the_reference_is_previewed_or_held():
+    circle = Circle(1.0, 0.7)
+    for preview in (True, False):
+        env = CrazyflieTrack(circle, preview=preview, start="moving", horizon=4)
+        seen = fly(env, env.reset(), 3)["reference"][-1]
+        ticks = torch.arange(3, 8) if preview else torch.full((5,), 3)
+        torch.testing.assert_close(seen, circle.at(ticks * 0.05 + 0.002))  # the metric's
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+@pytest.mark.parametrize("settings", [{}, {"sensor_noise": 0.01}, {"substeps": 1}], ids=str)
+def test_specs_hold_with_a_trace(batch, settings):
+    check_env_specs(CrazyflieTrack(batch_size=batch, duration=0.15, trace=True, **settings))
+
+
+def test_the_trace_is_the_flight_between_two_ticks():
+    env = CrazyflieTrack(dtype=torch.float64, trace=True, substeps=5)
+    data = env.reset(TensorDict(batch_size=[2]))
+    assert (data["trace"] == data["observation"].unsqueeze(-2)).all()
+    action = torch.tensor([0.4, 1e-5, 0.0, 0.0], dtype=torch.float64)
+    first = act(env, data, action)
+    expected = quadrotor_path(data["pose"], action.expand(2, 4), 0.05, 5, BODY).movedim(0, -2)
+    torch.testing.assert_close(first["trace"][:, 1:], expected, rtol=1e-12, atol=1e-12)
+    second = act(env, env.step_mdp(data), action)
+    for trace, before, after in ((first, data, first), (second, first, second)):
+        assert (trace["trace"][:, 0] == before["observation"]).all()
+        assert (trace["trace"][:, -1] == after["observation"]).all()
+    assert "trace" not in CrazyflieTrack().reset()
+
+
+def test_sensors_see_the_trace():
+    env = CrazyflieTrack(Hover(), sensor_noise=[0.1, 0.2, 0.3, 0.4], trace=True, substeps=3)
+    data = env.reset(TensorDict(batch_size=[3000]))
+    after = act(env, data)
+    assert (after["trace"][:, 0] == data["observation"]).all()
+    assert (after["trace"][:, -1] == after["observation"]).all()
+    seen, pose = after["trace"], data["pose"].unsqueeze(-2)  # it hovers
+    spread = Quadrotor().manifold.difference(seen, pose.expand_as(seen)).std(0)
+    expected = torch.tensor([0.1, 0.2, 0.3, 0.4]).repeat_interleave(3).expand(4, 12)
+    torch.testing.assert_close(spread, expected, rtol=0.1, atol=0)
+    quiet = CrazyflieTrack(Hover(), sensor_noise=[0.1, 0.2, 0.3, 0.4], substeps=3)
+    same = act(quiet, quiet.reset(TensorDict(batch_size=[3000])))
+    assert (same["observation"] == after["observation"]).all()  # whether there is a trace or not
+
+
+def test_a_lost_flight_leaves_a_finite_trace():
+    env = CrazyflieTrack(Hover(), limit=0.1, trace=True)
+    record = fly(env, env.reset(), 8, [0.575, 0, 0, 0])
+    lost = record["lost"]
+    assert lost[-1] and not lost[0]
+    assert (record["trace"][lost] == record["pose"][lost].unsqueeze(-2)).all()
+
+
+def test_the_error_is_the_mean_over_the_plant_steps():
+    env = CrazyflieTrack(Circle(), dtype=torch.float64, start="rest")
+    after = act(env, env.reset(), [0.0, 0.0, 0.0, 0.0])
+    time = torch.arange(1, 26, dtype=torch.float64) * 0.002
+    wanted = Circle().at(time + 0.002)[:, :3]
+    fallen = torch.tensor([2.0, 0, 0]) - torch.tensor([0, 0, 1.0]) * (9.81 / 2 * time[:, None] ** 2)
+    expected = (wanted - fallen).square().mean(0)
+    torch.testing.assert_close(after["square_error"], expected, rtol=1e-6, atol=1e-15)
+    torch.testing.assert_close(after["reward"], -expected.sum(0, keepdim=True))
+
+
+def test_a_hovering_flight_has_no_error():
+    env = CrazyflieTrack(Hover([0, 0, 1]), dtype=torch.float64)
+    record = fly(env, env.reset(), 40)
+    torch.testing.assert_close(record["pose"], env.reset()["pose"].expand(40, 13))
+    assert record["square_error"].max() < 1e-20
+
+
+def test_the_mass_changes_at_two_and_at_five_seconds():
+    env = CrazyflieTrack(Hover(), dtype=torch.float64, limit=1e3)
+    mission = env.mission(regime=[{}, {"mass": 0.5}, {"mass": 4 / 3}])
+    record = fly(env, env.reset(mission, set_state=False), 160)
+    column = env.regime.names.index("mass")
+    start = env.reset(mission, set_state=False)["regime"][None, column]
+    factors = torch.cat([start, record["regime"][:-1, column]])  # of the step that they act in
+    expected = torch.ones(160, dtype=torch.float64)
+    expected[40:100], expected[100:] = 0.5, 4 / 3
+    torch.testing.assert_close(factors, expected)
+    lift = record["pose"][:, 5].diff(prepend=torch.zeros(1)) / 0.05 / 9.81
+    torch.testing.assert_close(lift, 1 / expected - 1, rtol=1e-6, atol=1e-9)
+    assert record["truncated"].flatten().tolist() == [False] * 159 + [True]
+    assert not record["terminated"].any()
+
+
+@pytest.mark.parametrize(
+    ("values", "body"),
+    [
+        ({"mass": 0.5}, replace(BODY, mass=BODY.mass / 2)),
+        ({"inertia": 2.0}, replace(BODY, inertia=tuple(2 * x for x in BODY.inertia))),
+    ],
+)
+def test_a_regime_is_another_body(values, body):
+    action = [0.25, 2e-5, -1e-5, 1e-6]
+    settings = {"dtype": torch.float64, "schedule": Schedule([], by="step")}
+    changed, other = CrazyflieTrack(**settings), CrazyflieTrack(body=body, **settings)
+    mission = changed.mission(regime=values)
+    one = fly(changed, changed.reset(mission, set_state=False), 10, action)
+    two = fly(other, other.reset(), 10, action)
+    torch.testing.assert_close(one["pose"], two["pose"], rtol=1e-12, atol=1e-12)
+
+
+def test_wind_is_an_acceleration():
+    env = CrazyflieTrack(Hover(), dtype=torch.float64, schedule=Schedule([], by="step"))
+    mission = env.mission(regime={"wind_x": 0.5, "wind_z": -1.0})
+    last = fly(env, env.reset(mission, set_state=False), 20)[-1]
+    expected = torch.tensor([0.25, 0, -0.5, 0.5, 0, -1.0], dtype=torch.float64)
+    torch.testing.assert_close(last["pose"][:6], expected)
+
+
+@pytest.mark.parametrize("schedule", [[0.1, 0.3], Schedule([0.2, 0.8])])
+def test_missions_have_times_of_their_own(schedule):
+    env = CrazyflieTrack(Hover(), duration=0.5, schedule=schedule)
+    changes = [{}, {"mass": 0.5}, {}]
+    missions = [
+        env.mission(regime=changes, times=times) for times in (None, [0.25, 0.4], [0.21, 0.26])
+    ]
+    record = fly(env, env.reset(torch.stack(missions), set_state=False), 9)
+    # what is seen after step k holds for step k + 1
+    begun = record["regime_active"][:, 1:].T.tolist()
+    assert begun[0] == [k + 1 in (5, 6, 7) for k in range(9)]
+    assert begun[1] == [k + 1 in (5,) for k in range(9)]
+
+
+def test_breakpoints_can_be_steps():
+    env = CrazyflieTrack(Hover(), schedule=Schedule([1], by="step").padded(4))
+    mission = env.mission(regime=[{}, {"mass": 0.5}, {}], at=[1, 3])
+    record = fly(env, env.reset(mission, set_state=False), 5)
+    assert record["regime_active"].tolist() == [False, True, True, False, False]
+
+
+def test_changes_can_be_ramped():
+    env = CrazyflieTrack(Hover(), schedule=[0.05])
+    mission = env.mission(regime={"mass": 0.5}, ramp=4)
+    record = fly(env, env.reset(mission, set_state=False), 6)
+    column = env.regime.names.index("mass")
+    assert record["regime"][:, column].tolist() == [1.0, 0.875, 0.75, 0.625, 0.5, 0.5]
+
+
+def test_a_flight_alone_equals_the_flight_in_a_batch():
+    families = Families([Delay(), GainNoise(), flight_regimes()])
+    settings = {"sensor_noise": 0.01, "start_noise": 0.1, "schedule": [0.1]}
+    references = [Circle(2.0, speed) for speed in (0.3, 0.8, 1.7)]
+    regimes = [{}, {"mass": 0.5, "delay": 1}, {"gain_noise": 0.2, "wind_x": 1.0}, {"motor_1": 0.7}]
+
+    def fleet():
+        env = CrazyflieTrack(references, families, **settings)
+        missions = [env.mission(k % 3, k % 5, regimes[k % 4]) for k in range(12)]
+        return env, torch.stack(missions)
+
+    def flown(env, missions):
+        data = env.reset(missions, set_state=False)
+        record = []
+        for _ in range(8):
+            lean = 1e-5 * data["observation"][..., :3]
+            data["action"] = torch.cat([0.3 - lean[..., :1], lean], -1)
+            record.append(env.step(data)["next"].clone())
+            data = env.step_mdp(data)
+        return torch.stack(record)
+
+    together = flown(*fleet())
+    assert (flown(*fleet()) == together).all()  # deterministic
+    env, missions = fleet()
+    assert (flown(env, missions.reshape(3, 4)).reshape(8, 12) == together).all()
+    for row in (0, 5, 11):
+        env, missions = fleet()
+        assert (flown(env, missions[row]) == together[:, row]).all()
+
+
+def test_flights_may_leave_an_open_batch():
+    env = CrazyflieTrack()
+    data = env.reset(TensorDict(batch_size=[4]))
+    act(env, data)
+    data = env.step_mdp(data)[[0, 2]]
+    assert act(env, data)["step"].tolist() == [2, 2]
+
+
+@pytest.mark.parametrize("action", [[0.575, 0, 0, 0], [0.3, 6.6e-3, -6.6e-3, 9e-4]])
+def test_a_lost_flight_terminates_and_stays_finite(action):
+    env = CrazyflieTrack(Hover(), limit=1.0)
+    record = fly(env, env.reset(), 60, action)
+    ended = record["terminated"].flatten()
+    first = int(ended.int().argmax())
+    assert 0 < first < 50
+    assert ended[first:].all() and record["done"].flatten()[first:].all()
+    assert record["pose"].isfinite().all() and record["square_error"].isfinite().all()
+    assert (record["pose"][first:] == record["pose"][first - 1]).all()
+    assert record["pose"][:, :3].norm(dim=-1).max() <= 1.0
+    assert not record["lost"][:first].any()
+
+
+def test_numbers_without_end_terminate(monkeypatch):
+    env = CrazyflieTrack(Hover(), regime=ActionGain(["a", "b", "c", "d"]), schedule=[])
+    monkeypatch.setattr(env.regime, "limits", {})
+    missions = [env.mission(regime={"b": value}) for value in (1.0, 1e30)]
+    record = fly(env, env.reset(torch.stack(missions), set_state=False), 3, [0.3, 1e-3, 0, 0])
+    assert record["terminated"][..., 0].tolist() == [[False, True]] * 3
+    assert record["pose"].isfinite().all() and record["reward"].isfinite().all()
+
+
+def test_sensors_are_noisy_and_the_state_is_not():
+    env = CrazyflieTrack(Hover(), sensor_noise=[0.1, 0.2, 0.3, 0.4])
+    data = env.reset(TensorDict(batch_size=[3000]))
+    after = act(env, data)
+    for seen in (data, after):
+        assert (seen["pose"] == seen["pose"][0]).all()
+        length = seen["observation"][:, 6:10].norm(dim=-1)
+        torch.testing.assert_close(length, torch.ones(3000))
+        space = Quadrotor().manifold
+        spread = space.difference(seen["observation"], seen["pose"]).std(0)
+        expected = torch.tensor([0.1, 0.2, 0.3, 0.4]).repeat_interleave(3)
+        torch.testing.assert_close(spread, expected, rtol=0.1, atol=0)
+    assert (data["observation"] != after["observation"]).any()
+
+
+def test_the_start_can_be_displaced():
+    env = CrazyflieTrack(start_noise=0.02)
+    pose = env.reset(TensorDict(batch_size=[3000]))["pose"]
+    torch.testing.assert_close(pose[:, :3].std(0), torch.full((3,), 0.02), rtol=0.1, atol=0)
+    assert (pose[:, 3:] == pose[0, 3:]).all()
+
+
+def test_a_flight_goes_on_from_a_given_state():
+    families = Families([Delay(), flight_regimes()])
+    env = CrazyflieTrack(regime=families, schedule=[0.1])
+    mission = env.mission(seed=4, regime={"delay": 2, "mass": 0.5}, ramp=3)
+    whole = fly(env, env.reset(mission, set_state=False), 8)
+    middle = whole[3].exclude("reward", "done", "terminated", "truncated", "square_error")
+    rest = fly(env, env.reset(middle, set_state=True), 4)
+    assert (rest == whole[4:]).all()
+
+
+def test_a_partial_reset_restarts_some_flights():
+    env = CrazyflieTrack(batch_size=(3,), duration=0.5, start_noise=0.1, sensor_noise=0.01)
+    data = env.reset()
+    act(env, data)
+    data = env.step_mdp(data)
+    before = data.clone()
+    data["_reset"] = torch.tensor([[False], [True], [False]])
+    after = env.reset(data, set_state=False)
+    assert after["step"].tolist() == [1, 0, 1]
+    assert (after["pose"][[0, 2]] == before["pose"][[0, 2]]).all()
+    assert (after["observation"][[0, 2]] == before["observation"][[0, 2]]).all()
+    assert (after["pose"][1] != before["pose"][1]).any()
+    rolled = env.rollout(25, break_when_any_done=False)
+    assert rolled["next", "truncated"][..., 0].sum(-1).tolist() == [2, 2, 2]
+
+
+def test_some_flights_can_wait():
+    env = CrazyflieTrack(batch_size=(2,))
+    data = env.reset().set("_step", torch.tensor([True, False]))
+    assert act(env, data)["step"].tolist() == [1, 0]
+
+
+def test_noise_can_be_saved_restored_and_repeated():
+    env = CrazyflieTrack(start_noise=0.1)
+    first = env.reset()["pose"]
+    saved = env.get_extra_state()
+    second = env.reset()["pose"]
+    env.set_extra_state(saved)
+    assert (env.reset()["pose"] == second).all()
+    env.set_seed(0, static_seed=True)
+    assert (env.reset()["pose"] == first).all()
+    env.set_seed(1, static_seed=True)
+    assert (env.reset()["pose"] != first).any()
+    env._set_seed(None)
+    assert env.seed == 1
+
+
+class Halfway(Reference):
+    """A reference that forgot the velocity."""
+
+    name = "halfway"
+
+    def at(self, time):
+        return torch.zeros(*time.shape, 3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"tracks": []}, "expected at least one"),
+        ({"tracks": [Circle(), Circle()]}, "distinct names"),
+        ({"tracks": 3}, "tracks: expected a Reference, got 3"),
+        ({"tracks": "nowhere.csv"}, "cannot read nowhere.csv"),
+        ({"action_low": [0.0]}, r"action_low=\[0.0\]: expected numbers for .*thrust"),
+        ({"action_high": "far"}, "action_high='far': expected numbers for"),
+        ({"action_low": [0.6, -1, -1, -1]}, "expected less than action_high"),
+        ({"tracks": Halfway()}, r"halfway: at\(\) gives \(2, 3\).*position and velocity"),
+        ({"regime": "heavy"}, "regime: expected a Regime, got 'heavy'"),
+        ({"regime": ActionGain(["a", "b"])}, "the robot has 4 actions"),
+        ({"regime": Delay(), "missions": {"regime": {"delay": 0.5}}}, "delay=0.5"),
+        ({"schedule": [5.0, 2.0]}, r"times=\[5.0, 2.0\]: expected increasing"),
+        ({"schedule": [0.0]}, "times=0.0: expected a finite number in"),
+        ({"schedule": "later"}, "times='later': expected a list"),
+        ({"body": 3}, "body=3: expected a QuadrotorBody"),
+        ({"duration": 0.0}, "duration=0.0"),
+        ({"duration": 0.12}, "duration=0.12: expected a multiple of dt=0.05"),
+        ({"horizon": 0}, "horizon=0: expected a whole number of at least 1"),
+        ({"preview": 1}, "preview=1: expected true or false"),
+        ({"start": "flying"}, "start='flying': expected one of rest, moving"),
+        ({"limit": 0.0}, "limit=0.0"),
+        ({"sensor_noise": [0.1, 0.2]}, "expected one number, or four"),
+        ({"sensor_noise": -0.1}, "sensor_noise=-0.1"),
+        ({"start_noise": -0.1}, "start_noise=-0.1"),
+        ({"dt": 0.0}, "dt=0.0"),
+        ({"substeps": 0}, "substeps=0"),
+        ({"trace": 1}, "trace=1: expected true or false"),
+        ({"missions": {"mass": 0.5}}, "missions='mass': expected one of"),
+        ({"missions": {"regime": {"mass": 0.0}}}, "mass=0.0"),
+        ({"missions": {"times": [5.0, 2.0]}}, "expected increasing"),
+        ({"missions": {"times": [5.0], "at": [3]}}, "expected one"),
+    ],
+)
+def test_impossible_settings_are_refused(settings, message):
+    with pytest.raises(ConfigurationError, match=message):
+        CrazyflieTrack(**settings)
+
+
+@pytest.mark.parametrize("regime", [None, MassFactor()])
+def test_impossible_parameters_in_a_tensordict_are_refused(regime):
+    env = CrazyflieTrack(regime=regime)
+    mission = env.mission(regime={"mass": 0.5})
+    mission["mission", "parameters"][1, env.regime.names.index("mass")] = -0.5
+    with pytest.raises(ConfigurationError, match=r"mass=-0.5: expected a number in \[0.01, 100\]"):
+        env.reset(mission, set_state=False)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        (0, float("nan"), "expected 13 finite numbers"),
+        (4, float("inf"), "expected 13 finite numbers"),
+        (9, 2.0, r"quaternions of flights \[1\]: length 2, expected 1"),
+    ],
+)
+def test_impossible_states_are_refused(column, value, message):
+    env = CrazyflieTrack()
+    data = env.reset(TensorDict(batch_size=[3]))
+    data["pose"][1, column] = value
+    with pytest.raises(ConfigurationError, match=message):
+        env.reset(data, set_state=True)
+
+
+def test_steps_without_sense_are_refused():
+    env = CrazyflieTrack()
+    data = env.reset(TensorDict(batch_size=[2]))
+    data["action"] = torch.tensor([[0.3, 0, 0, 0], [float("nan"), 0, 0, 0]])
+    with pytest.raises(NonFiniteError, match=r"missions \[1\]"):
+        env.step(data)
+    with pytest.raises(ConfigurationError, match=r"start with reset\(\)"):
+        env.step(TensorDict({"action": torch.zeros(4)}))
+
+
+def test_a_schedule_in_seconds_is_one_in_steps():
+    schedule = schedule_in_seconds([0.1, 0.12], dt=0.05)
+    assert (schedule.by, schedule.at) == ("step", (1.5, 2.5))

@@ -1,0 +1,104 @@
+"""Pictures of MuJoCo robots."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from afm_rl.envs import TaskEnv, gymnasium_task
+from afm_rl.envs.task.film import HEIGHT, WIDTH, can_render, film, segments
+
+mujoco = pytest.importorskip("mujoco")
+MODEL = """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+<body pos="0 0 1"><joint type="hinge" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 -1" size=".02"/><geom size=".1" pos="0 0 -1"/></body>
+</worldbody></mujoco>"""
+
+
+@pytest.fixture
+def pole():
+    return mujoco.MjModel.from_xml_string(MODEL)
+
+
+@pytest.fixture
+def blind(monkeypatch):
+    """A computer on which nothing can render; returns how often that was tried."""
+    tries = []
+
+    def fail(*args):
+        tries.append(args)
+        raise RuntimeError("no OpenGL")
+
+    can_render.cache_clear()
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    yield tries
+    can_render.cache_clear()
+
+
+def test_bones_are_where_the_body_is(pole):
+    ends, radii = segments(pole, np.array([[0.0], [-np.pi / 2]]))
+    hanging, lying = (sorted(map(tuple, part.round(6) + 0.0)) for part in ends[:, 0])
+    assert hanging == [(0, 0, 0), (0, 0, 1)]
+    assert lying == [(0, 0, 1), (1, 0, 1)]
+    np.testing.assert_allclose(ends[1, 1].mean(0), [1, 0, 1], atol=1e-6)
+    assert radii.tolist() == [0.02, 0.1]
+
+
+def test_where_nothing_can_render_bones_are_drawn(pole, blind):
+    pictures = np.stack(list(film(pole, np.array([[0.0], [0.0], [0.5]]))))
+    assert pictures.shape == (3, HEIGHT, WIDTH, 3)
+    assert (pictures[0] == pictures[1]).all()
+    assert (pictures[0] != pictures[2]).any()
+    inside = (pictures[0] == (0, 114, 178)).all(-1)
+    assert 500 < inside.sum() < HEIGHT * WIDTH / 4
+    assert len(list(film(pole, np.zeros((1, 1))))) == len(blind) == 1  # a second failure may kill
+
+
+def test_mujocos_renderer_is_used_where_there_is_one(pole, monkeypatch):
+    shown = []
+
+    class Renderer:
+        def __init__(self, model, height, width):
+            self.picture = np.zeros((height, width, 3), np.uint8)
+
+        def close(self):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            shown.append("closed")
+
+        def update_scene(self, data, camera):
+            shown.append((float(data.qpos[0]), camera))
+
+        def render(self):
+            return self.picture
+
+    monkeypatch.setattr(mujoco, "Renderer", Renderer)
+    can_render.cache_clear()
+    assert len(list(film(pole, np.array([[0.1], [0.2]])))) == 2
+    assert shown == [(0.1, -1), (0.2, -1), "closed"]
+    can_render.cache_clear()
+
+
+def test_a_task_draws_the_steps_of_a_mission(blind):
+    task = gymnasium_task("InvertedPendulum-v5")
+    steps = pd.DataFrame(np.zeros((2, 4)), columns=task.state_names)
+    assert len(list(TaskEnv(task).draw(steps))) == 2
+
+
+def test_a_state_without_a_body_is_drawn_as_curves_that_grow():
+    task = gymnasium_task("Pendulum-v1")
+    steps = pd.DataFrame({"t": [0, 5, 10], "angle": [0.0, 1.0, 0.0], "speed": [1.0, 0.0, -1.0]})
+    pictures = np.stack(list(TaskEnv(task).draw(steps)))
+    assert pictures.shape == (3, HEIGHT, WIDTH, 3)
+    drawn = (np.abs(pictures.astype(int) - (0, 114, 178)).max(-1) < 60).sum((1, 2))
+    assert drawn[0] < 20 < drawn[1] < drawn[2]
+
+
+def test_a_ball_is_drawn(blind):
+    ball = "<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body></worldbody>"
+    model = mujoco.MjModel.from_xml_string(f"{ball}</mujoco>")
+    (picture,) = film(model, np.zeros((1, 1)))
+    assert (picture == (0, 114, 178)).all(-1).sum() > 500

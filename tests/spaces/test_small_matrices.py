@@ -1,0 +1,30 @@
+"""Systems of a few equations: written out as they are, and by LAPACK."""
+
+import pytest
+import torch
+
+from afm_rl.spaces.small_matrices import FEW, eliminate, invert_positive, solve_positive
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, FEW, FEW + 2])
+@pytest.mark.parametrize("function", [eliminate, solve_positive])
+def test_solutions_solve(size, function):
+    root = torch.randn(4, 3, size, size, dtype=torch.float64)
+    matrix = root @ root.mT + 0.1 * torch.eye(size).double()
+    wanted = torch.randn(4, 3, size, 2).double()
+    torch.testing.assert_close(function(matrix, matrix @ wanted), wanted, atol=1e-6, rtol=0)
+    whole = torch.eye(size).double().expand_as(matrix)
+    torch.testing.assert_close(invert_positive(matrix) @ matrix, whole, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("size", "calls"), [(2, 0), (FEW, 0), (FEW + 1, 2)])
+def test_what_is_exported_calls_lapack_for_many_equations_only(size, calls):
+    class Both(torch.nn.Module):
+        def forward(self, matrix):
+            return invert_positive(matrix) + solve_positive(matrix, matrix)
+
+    matrix = 2 * torch.eye(size)
+    program = torch.export.export(Both(), (matrix,))
+    names = [str(node.target) for node in program.graph.nodes]
+    assert sum("solve_ex" in name or "cholesky_ex" in name for name in names) == calls
+    torch.testing.assert_close(program.module()(matrix), torch.eye(size) * 1.5)

@@ -1,0 +1,178 @@
+"""Stored models are whole and fit, or they are refused."""
+
+import json
+import os
+import random
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.storage.artefacts import cached, load_artefact, save_artefact
+from afm_rl.storage.files import write_whole
+
+MADE_FOR = {"name": "net", "sizes": [3, 2], "rate": 0.1, "of": {"robot": "ugv"}}
+
+
+def net(outputs=2, seed=0):
+    torch.manual_seed(seed)
+    return nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4), nn.Linear(4, outputs))
+
+
+def same(left, right):
+    left, right = left.state_dict(), right.state_dict()
+    return all(torch.equal(left[name], right[name]) for name in left)
+
+
+@pytest.fixture
+def stored(tmp_path):
+    path = tmp_path / "net.safetensors"
+    save_artefact(path, net(), MADE_FOR)
+    return path
+
+
+def refuses(path, match=None, description=MADE_FOR, module=None):
+    module = module or net(seed=1)
+    before = {name: value.clone() for name, value in module.state_dict().items()}
+    with pytest.raises(ArtefactError, match=match) as caught:
+        load_artefact(path, module, description)
+    assert str(path) in str(caught.value)
+    for name, value in module.state_dict().items():
+        assert torch.equal(value, before[name])
+
+
+def test_a_module_comes_back_as_it_was(stored):
+    module = net(seed=1)
+    load_artefact(str(stored), module, {"name": "net"})
+    assert same(module, net())
+
+
+def test_a_description_is_compared_as_json(stored):
+    load_artefact(stored, net(), {**MADE_FOR, "sizes": (3, 2)})
+
+
+def test_any_flipped_bit_is_noticed(stored):
+    whole = stored.read_bytes()
+    dice = random.Random(0)
+    for _ in range(100):
+        position, bit = dice.randrange(len(whole)), dice.randrange(8)
+        damaged = bytearray(whole)
+        damaged[position] ^= 1 << bit
+        stored.write_bytes(damaged)
+        refuses(stored)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
+def test_a_truncated_file_is_noticed(stored, share):
+    whole = stored.read_bytes()
+    stored.write_bytes(whole[: int(share * len(whole))])
+    refuses(stored, "damaged")
+
+
+def test_trailing_bytes_are_noticed(stored):
+    stored.write_bytes(stored.read_bytes() + b"x")
+    refuses(stored, "damaged")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigurationError, match="nowhere.safetensors: no such file"):
+        load_artefact(tmp_path / "nowhere.safetensors", net(), {})
+
+
+@pytest.mark.parametrize("edit", [{"rate": 0.2}, {"of": {"robot": "quadrotor"}}, {"extra": 1}])
+def test_a_file_made_for_something_else_is_refused(stored, edit):
+    refuses(stored, next(iter(edit)), {**MADE_FOR, **edit})
+
+
+def test_a_file_that_fits_another_module_is_refused(stored):
+    refuses(stored, r"2\.bias has shape \(2,\), expected \(5,\)", module=net(outputs=5))
+    refuses(stored, "expected None", module=nn.Linear(3, 4))
+
+
+def test_swapped_contents_are_noticed(stored):
+    tensors = load_file(stored)
+    tensors["0.bias"], tensors["1.bias"] = tensors["1.bias"], tensors["0.bias"]
+    save_file(tensors, stored, _metadata_of(stored))
+    refuses(stored, "checksum")
+
+
+def test_an_edited_description_is_noticed(stored):
+    metadata = _metadata_of(stored)
+    metadata["description"] = json.dumps({**MADE_FOR, "rate": 0.2})
+    save_file(load_file(stored), stored, metadata)
+    refuses(stored, "checksum", {**MADE_FOR, "rate": 0.2})
+
+
+def test_a_file_of_other_origin_is_refused(stored):
+    save_file(load_file(stored), stored)
+    refuses(stored, "checksum")
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_an_interrupted_write_leaves_the_old_file(stored, monkeypatch, step):
+    before = stored.read_bytes()
+
+    def fail(*args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(ConfigurationError, match="net.safetensors: No space left on device"):
+        save_artefact(stored, net(seed=1), MADE_FOR)
+    assert stored.read_bytes() == before
+    assert [path.name for path in stored.parent.iterdir()] == [stored.name]
+
+
+def test_an_abandoned_write_leaves_no_litter(tmp_path, monkeypatch):
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(tmp_path / "file", b"content")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folders_are_made_and_impossible_ones_reported(tmp_path):
+    write_whole(tmp_path / "a" / "b" / "file", b"content")
+    assert (tmp_path / "a" / "b" / "file").read_bytes() == b"content"
+    with pytest.raises(ConfigurationError, match="cannot write"):
+        write_whole(tmp_path / "a" / "b" / "file" / "below", b"content")
+
+
+def test_the_cache_trains_once_for_each_description(tmp_path):
+    calls = []
+
+    def train(module, value):
+        calls.append(value)
+        nn.init.constant_(module[0].weight, value)
+        return value / 10
+
+    def use(description, value):
+        module = net(seed=len(calls))
+        outcome = cached(tmp_path, module, description, lambda: train(module, value))
+        return module, outcome
+
+    first, outcome = use(MADE_FOR, 1.0)
+    assert outcome == (0.1, False)
+    again, outcome = use({**MADE_FOR, "sizes": (3, 2)}, 2.0)
+    assert outcome == (0.1, True) and same(first, again)
+    other, outcome = use({**MADE_FOR, "rate": 0.2}, 3.0)
+    assert outcome == (0.3, False) and not same(first, other)
+    assert calls == [1.0, 3.0]
+    assert len(list(tmp_path.glob("net-*.safetensors"))) == 2
+
+
+def test_a_damaged_cache_is_reported_not_used(tmp_path):
+    cached(tmp_path, net(), MADE_FOR, lambda: 0.0)
+    (path,) = tmp_path.glob("net-*")
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(ArtefactError, match=path.name):
+        cached(tmp_path, net(), MADE_FOR, lambda: 0.0)
+
+
+def _metadata_of(path):
+    with safe_open(path, framework="pt") as file:
+        return file.metadata()

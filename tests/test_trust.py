@@ -1,0 +1,96 @@
+"""A configuration calls nothing but parts of this library and what the user trusts."""
+
+import subprocess
+import sys
+
+import pytest
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.trust import check_composed, check_targets
+
+DANGEROUS = """
+os.system os.popen os.execv os.execvp os.spawnl os.remove os.unlink os.rename os.rmdir os.removedirs
+os.kill os.fork os.chmod os.symlink os.link os.makedirs os.putenv os.open os.startfile posix.system
+nt.system pty.spawn subprocess.run subprocess.Popen subprocess.call subprocess.check_call
+subprocess.check_output subprocess.getoutput builtins.eval builtins.exec builtins.compile
+builtins.open builtins.__import__ builtins.getattr builtins.breakpoint importlib.import_module
+importlib.reload runpy.run_path runpy.run_module code.interact codeop.compile_command
+pathlib.Path.unlink pathlib.Path.write_text pathlib.Path.rmdir pathlib.Path.touch shutil.rmtree
+shutil.copyfile shutil.move shutil.unpack_archive shutil.chown tarfile.open zipfile.ZipFile
+tempfile.mktemp pickle.load pickle.loads pickle.Unpickler shelve.open marshal.loads joblib.load
+cloudpickle.loads dill.load torch.load torch.hub.load torch.jit.load torch.package.PackageImporter
+torch.save torch.utils.cpp_extension.load torch.serialization.load numpy.load numpy.save
+numpy.fromfile numpy.memmap numpy.f2py.compile pandas.read_pickle pandas.eval pandas.to_pickle
+pandas.read_sql sympy.sympify yaml.unsafe_load yaml.load ctypes.CDLL ctypes.cdll.LoadLibrary
+cffi.FFI.dlopen socket.create_connection urllib.request.urlopen urllib.request.urlretrieve
+requests.get http.server.test smtplib.SMTP ftplib.FTP webbrowser.open asyncio.run
+multiprocessing.Process threading.Thread signal.raise_signal sys.exit sys.setprofile atexit.register
+pdb.run timeit.timeit logging.config.dictConfig hydra.utils.instantiate hydra.utils.get_method
+""".split()
+INDIRECT = """
+afm_rl.planning.costs.torch.load afm_rl.missions.factories.torch.load
+afm_rl.storage.artefacts.write_whole
+afm_rl.missions.factories.load_artefact afm_rl.missions.run afm_rl.missions.build
+afm_rl.cli.main afm_rl.report.write_report afm_rl.dynamics.Ensemble.load_state_dict
+afm_rl.planning.MPPI.__init__ afm_rl.missions.checkpoint.write_whole afm_rl.missions.factories
+afm_rl.learning.updater.os.system afm_rl_other.anything torch.optim.adam.torch.load afm_rl
+hydra_plugins.anything hydra._internal.core_plugins.basic_launcher.BasicLauncher
+""".split()
+PLACES = (
+    lambda evil: {"planner": evil},
+    lambda evil: {"robot": {"regime": {"regimes": {"gain": evil}}}},
+    lambda evil: {"regimes": [[{"v_gain": evil}]]},
+    lambda evil: {"hydra": {"callbacks": {"x": evil}}},
+)
+
+
+def test_every_dangerous_target_is_refused_wherever_it_stands(tmp_path):
+    canary = tmp_path / "canary"
+    assert len(DANGEROUS) == len(set(DANGEROUS)) >= 98
+    for target in DANGEROUS + INDIRECT:
+        evil = {"_target_": target, "_args_": [f"touch {canary}"]}
+        for place in PLACES:
+            with pytest.raises(ConfigurationError, match="_target_='"):
+                check_targets(place(evil))
+            if target in DANGEROUS:
+                with pytest.raises(ConfigurationError, match="_target_='"):
+                    check_composed(place(evil))
+    assert not canary.exists()
+
+
+@pytest.mark.parametrize("target", [None, 3, "", ".", ["os.system"], "afm_rl..x", {}], ids=str)
+def test_what_is_no_name_is_refused(target):
+    with pytest.raises(ConfigurationError, match="_target_="):
+        check_targets({"planner": {"_target_": target}})
+
+
+def test_trust_covers_what_a_package_defines_and_nothing_it_imports(tmp_path, monkeypatch):
+    (tmp_path / "boat").mkdir()
+    (tmp_path / "boat" / "__init__.py").write_text("import os\nfrom json import loads\n")
+    (tmp_path / "boat" / "hull.py").write_text("class Hull: ...\nraised = 3\n")
+    (tmp_path / "boat" / "broken.py").write_text("1 / 0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    hull = {"model": {"_target_": "boat.hull.Hull"}}
+    check_targets(hull, trust=["boat"])
+    check_composed(hull, trust=["boat"])
+    for target in (
+        "os.system",
+        "loads",
+        "hull.raised",
+        "hull",
+        "nothing",
+        "broken.X",
+        "__loader__",
+    ):
+        with pytest.raises(ConfigurationError, match=f"_target_='boat.{target}'"):
+            check_targets({"model": {"_target_": f"boat.{target}"}}, trust=["boat"])
+    for trust in ([], ["boa"], ["boats"]):
+        with pytest.raises(ConfigurationError, match="trust="):
+            check_targets(hull, trust)
+    monkeypatch.setenv("AFM_RL_TRUST", "boat")
+    check_targets(hull)
+
+
+def test_names_are_checked_without_torch():
+    code = "import afm_rl.trust, sys; assert 'torch' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
