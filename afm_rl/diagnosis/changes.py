@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from afm_rl.diagnosis.checks import travel
 from afm_rl.diagnosis.fit import FLOOR, consistent, fit_response
 from afm_rl.diagnosis.intervals import independence
 from afm_rl.diagnosis.log import Log
@@ -50,11 +51,12 @@ class Part:
         return self.model.predict(problem_of(log, j, self))
 
 
-def problem_of(log: Log, j: int, part: Part | Lead) -> Problem:
+def problem_of(log: Log, j: int, part: Part | Lead, settings: Settings | None = None) -> Problem:
     """Return the problem of one response.
 
     Rows at the begin of an episode, whose commands are not all known, do not count where they are
-    few; otherwise the response begins where the first row shows it.
+    few; otherwise the response begins where the first row shows it. Rows before any command moves,
+    and long after the last move, do not count: who commands there is not known.
     """
     first, last = (part.first, part.last) if isinstance(part, Part) else (0, len(log.command))
     lead = part.lead if isinstance(part, Part) else part
@@ -66,6 +68,11 @@ def problem_of(log: Log, j: int, part: Part | Lead) -> Problem:
     use = since >= warm
     if use.mean() < 0.95:
         use = since > 0
+    moves = np.flatnonzero((np.diff(log.command, axis=0) != 0).any(1))
+    settings = settings or Settings()
+    settle = max(settings.longest_s / log.step if log.t is not None else 0, settings.longest)
+    if len(moves):
+        use[: moves[0]] = use[moves[-1] + 1 + int(settle) :] = False
     begin = None
     if lead.line is not None:
         u = log.command[:, lead.driver]
@@ -115,15 +122,15 @@ def _divide(log: Log, j: int, whole: Part, most: int, settings: Settings) -> lis
     row = _likely_change(log, j, whole, settings)
     if row is None:
         return [whole]
-    for _ in range(3):
+    for _ in range(2):
         left = fit_part(log, j, whole.first, row, settings)
         right = fit_part(log, j, row, whole.last, settings)
         better = _exact_row(log, j, left, right)
-        if abs(better - row) < 2:
+        if abs(better - row) < 0.01 * len(whole):
             break
         row = better
     apart = _apart(log, j, whole, left, right, settings)
-    if not apart and whole.model.cost < 0.03:  # what leaves more may mix several
+    if not apart and whole.model.cost < 0.1:  # what leaves more may mix several
         return [whole]
     first = _divide(log, j, left, most - 1, settings)
     found = first + _divide(log, j, right, most - len(first), settings)
@@ -132,24 +139,20 @@ def _divide(log: Log, j: int, whole: Part, most: int, settings: Settings) -> lis
 
 
 def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | None:
-    """Return the row at which two lines are best instead of one, if that matters at all."""
+    """Return the row at which two lines are best instead of one, if that is clear and matters."""
     problem, rows, model = problem_of(log, j, part), part.rows, part.model
     shape, u, own = model.shape, log.command, model.driver
     slow = lagging(problem.clock, u, shape.keep) if shape.keep else u
     linear = shape.linear
-    late = [look_back(problem.clock, slow, linear)[rows]]
-    unclear = model.cost > 0.03
-    if unclear:  # a delay that is that of no part
-        late.append(u[rows, own, None])
+    late = [look_back(problem.clock, slow, linear)[rows], u[rows, own, None]]
     for more in (1, 3, 8) if len(part) > 400 else ():
         later = linear._replace(delay=linear.delay + more)
         late.append(look_back(problem.clock, slow[:, own], later)[rows, None])
     late.append(model.parts(problem)[0][rows, None])
     if len(part) < 200 + 40 * u.shape[1]:
         late = late[1:]  # without other commands
-    design = np.column_stack(late)
     y = problem.y[rows]
-    table = np.column_stack([design, np.ones(len(y)), y])
+    table = np.column_stack([*late, np.ones(len(y)), y])
     size = table.shape[1]
     length = max(len(part) // 60, 5)
     ends = np.append(np.arange(1, len(part) // length) * length, len(part))
@@ -160,18 +163,29 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
     if not good.any():
         return None
     before, places, total = before[good], places[good], sums.sum(0)
-    ((whole,), _), (left, early), (right, later) = (
+    (_, one), (left, early), (right, later) = (
         _left_over(moments) for moments in (total[None], before, total - before)
     )
-    floor = FLOOR * len(y)
-    gain = len(part) * np.log((whole + floor) / (left + right + floor))
-    best = int(np.argmax(gain))
-    turned = early[best] - later[best]
-    apart = turned @ total[:-1, :-1] @ turned / len(y)
-    enough = (settings.penalty + size) / (1.0 if unclear else part.weight)
-    if gain[best] < enough or apart < (2 * settings.matters) ** 2 * y.var():
+    best = int(np.argmin(left + right))
+    misses = [y - table[:, :-1] @ line for line in (one[0], early[best], later[best])]
+    near = np.arange(len(y))
+    row = int(places[best])
+    inside = np.abs(near - row) <= length
+    turns = np.cumsum((misses[1] ** 2 - misses[2] ** 2)[inside])
+    row = int(np.clip(near[inside][turns.argmin()] + 1, SHORTEST, len(y) - SHORTEST))
+    split = np.where(near < row, misses[1], misses[2])
+    scale = scale_of(split)
+    gain, kept = costs(misses[0], scale), costs(split, scale)
+    won = len(y) * math.log((gain.mean() + FLOOR) / (kept.mean() + FLOOR))
+    apart = float(np.std(misses[1] - misses[2]))
+    clear = any(consistent((gain - kept)[side], settings) for side in (near < row, near >= row))
+    if (
+        won * independence(split) < settings.penalty + size
+        or apart < 2 * settings.matters * y.std()
+        or not clear
+    ):
         return None
-    return part.first + int(places[best])
+    return part.first + row
 
 
 def _left_over(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -202,8 +216,8 @@ def _exact_row(log: Log, j: int, left: Part, right: Part, share: float = 0.05) -
 def _apart(log: Log, j: int, whole: Part, left: Part, right: Part, settings: Settings) -> bool:
     """Return whether two explanations are clearly better than one, and differ enough to matter."""
     rows, border = whole.rows, len(left)
-    own = log.command[rows, whole.model.driver]
-    moves = min(own[:border].std(), own[border:].std())
+    own = whole.model.driver
+    moved = min(travel(log, own, part.rows) for part in (left, right))
     one, first, second = (part.predict(log, j)[rows] for part in (whole, left, right))
     y, use = log.response[rows, j], problem_of(log, j, whole).use[rows]
     split = np.where(np.arange(len(y)) < border, first, second)
@@ -224,5 +238,5 @@ def _apart(log: Log, j: int, whole: Part, left: Part, right: Part, settings: Set
         won > settings.penalty * max(more, 2)
         and any(clear)
         and apart > 2 * settings.matters * split[use].std()
-        and moves > 0.2 * own.std()
+        and moved >= 0.5 * settings.travel
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from afm_rl.diagnosis.findings import Status
 from afm_rl.diagnosis.log import Log
+from afm_rl.diagnosis.response import follow_with_stiction
 from afm_rl.diagnosis.search import Lead, find_leads, without_outliers
 from afm_rl.diagnosis.settings import Settings
 
@@ -17,18 +18,21 @@ COPY = 0.999  # correlation of two commands that cannot be told apart
 
 
 def find_doubts(
-    log: Log, leads: Sequence[Lead], settings: Settings, exact: Sequence[bool]
+    log: Log, leads: Sequence[Lead], reach: np.ndarray, exact: Sequence[bool], settings: Settings
 ) -> dict[int, Doubt]:
     """Return why nothing can be said of some actuators, by number.
 
     Args:
         log: scaled.
         leads: of the actuators.
-        settings: is a response that equals its command a copy?
+        reach: half range of each command, ``(A,)``.
         exact: is the response of an actuator its command in every row?
+        settings: is a response that equals its command a copy? Which actuator is idle?
     """
     doubts: dict[int, Doubt] = {}
     summed = _summed(log, leads, settings)
+    ranges = reach * (np.ptp(log.command, axis=0) > 0)
+    usual = float(np.median(ranges[ranges > 0])) if len(ranges) > 2 and ranges.any() else 0.0
     for j, lead in enumerate(leads):
         u, y = log.command[:, j], log.response[:, j]
         if not np.ptp(u) > 0:
@@ -38,10 +42,18 @@ def find_doubts(
                 "not measured",
                 "its response is its command, digit by digit; log what a sensor reads",
             )
-        elif lead.left > 0.6 and _causes(log, y, u) and not _causes(log, u, y):
+        elif lead.left > 0.1 and _causes(log, y, u) and not _causes(log, u, y):
             doubts[j] = (
                 "not actuated",
                 "its command answers its response, and not the other way round; is it armed?",
+            )
+        elif ranges[j] < settings.moves * usual:
+            share = 100 * ranges[j] / usual
+            doubts[j] = "cannot tell", f"its command moves by {share:.1g} % of the usual; move it"
+        elif travel(log, j) < settings.travel and _still(u) > 0.8:
+            doubts[j] = (
+                "cannot tell",
+                f"its command moves {round(travel(log, j))} times only; move it up and down",
             )
         elif j in summed:
             doubts[j] = (
@@ -60,6 +72,34 @@ def echoes(log: Log, rows: Sequence[int] = (0, 1)) -> list[bool]:
         same = apart[late:] == apart[: len(apart) - late]
         found |= (u == y)[same].all(0)
     return list(found & (np.ptp(log.command, axis=0) > 0))
+
+
+def travel(log: Log, j: int, rows: slice = slice(None), least: float = 0.1) -> float:
+    """Return how far a command moves in some rows, in its ranges.
+
+    Moves below a tenth of its range do not count.
+
+    >>> u = np.sin(np.arange(100.0) / 10)[:, None]
+    >>> round(travel(Log(("a",), u, u), 0))
+    3
+    """
+    size = max(float(_range_of(log.command)[j]), 1e-300)
+    part = log.part(rows)
+    count = np.arange(len(part.command))
+    start = np.maximum.accumulate(np.where(part.begins, count, 0))
+    moves = np.abs(np.diff(follow_with_stiction(part.command[:, j], least * size, start)))
+    return float(moves[~part.begins[1:]].clip(max=size).sum() / size)
+
+
+def _range_of(command: np.ndarray) -> np.ndarray:
+    """Return the range of each command ``(N, A)`` but for one in a hundred rows at each end."""
+    low, high = np.quantile(command, [0.01, 0.99], axis=0)
+    return np.where(high > low, high - low, np.ptp(command, axis=0))
+
+
+def _still(command: np.ndarray) -> float:
+    """Return the share of rows in which a command stands still."""
+    return float((np.abs(np.diff(command)) < 1e-3 * np.ptp(command)).mean())
 
 
 def copies_of(command: np.ndarray) -> list[list[int]]:

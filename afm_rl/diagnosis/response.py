@@ -162,9 +162,7 @@ def follow_with_stiction(command: np.ndarray, stick: float, start: np.ndarray) -
     array([0. , 0. , 0.3, 0.3])
     """
     if _many(start):
-        return _side_by_side(
-            command, start, lambda x, u: np.where(np.abs(u - x) > stick, u, x)
-        )
+        return _side_by_side(command, start, lambda x, u: np.where(np.abs(u - x) > stick, u, x))
     place, places = 0.0, []
     for row, (value, first) in enumerate(zip(command.tolist(), start.tolist(), strict=True)):
         if first == row or abs(value - place) > stick:

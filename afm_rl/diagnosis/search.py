@@ -147,9 +147,7 @@ def _with_starts(log: Log, j: int, lead: Lead, delays: np.ndarray) -> Lead:
     return lead._replace(starts=(*plain, *(shape for _, shape in found.values())))
 
 
-def beginning(
-    clock: Clock, u: np.ndarray, y: np.ndarray, line: tuple[float, float]
-) -> np.ndarray:
+def beginning(clock: Clock, u: np.ndarray, y: np.ndarray, line: tuple[float, float]) -> np.ndarray:
     """Return where each episode begins, as its first response shows, in units of the command.
 
     Args:

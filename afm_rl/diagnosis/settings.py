@@ -51,7 +51,10 @@ class Settings:
     """Share of the variance: what leaves more than that unexplained says so."""
     unknown: float = 0.3
     """Share of the variance: what leaves more than that, and no noise, is not explained."""
-    moves: float = 0.02
-    """Share of the largest move of its kind: a joint that moves less is idle."""
+    moves: float = 0.05
+    """Share of the usual range of commands: an actuator that moves less is idle."""
+    travel: float = 4.0
+    """Ranges of its command that an actuator has to move: up and down twice. Take-off and landing
+    alone do not tell a delay from chance; half of it is enough on either side of a change."""
     shared: float = 0.25
     """Share of a delay by which those of several actuators may differ, to be the loop's."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from afm_rl.diagnosis.changes import Part, find_parts, problem_of
 from afm_rl.diagnosis.checks import copies_of, echoes, find_doubts
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
+from afm_rl.diagnosis.kinds import agree
 from afm_rl.diagnosis.likely import likely_intervals
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.lost import without_lost
@@ -46,37 +48,42 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     scaled = replace(log, command=log.command / reach, response=log.response / spread)
     count = len(log.names)
     leads = find_leads(scaled.thinned(settings.searched), range(count), settings)
-    doubts = find_doubts(scaled, leads, settings, exact)
+    doubts = find_doubts(scaled, leads, reach, exact, settings)
     fitted = np.repeat(log.response.mean(0)[None], len(log.response), 0) / spread
-    found: list[list[Actuator]] = []
-    firsts: list[list[int]] = []
+    clean, parts = scaled, dict[int, Sequence[Part]]()
+    lost = dict.fromkeys(range(count), 0.0)
+    quanta = [_quantum(response) for response in log.response.T]
     for j, lead in enumerate(leads):
+        if j in doubts:
+            continue
+        parts[j] = find_parts(scaled, j, lead, settings)
+        clean, lost[j] = without_lost(clean, j, lead, parts[j], repeats=not quanta[j])
+        if lost[j]:
+            parts[j] = find_parts(clean, j, lead, settings)
+    parts = agree(clean, parts, settings)
+    found: list[list[Actuator]] = []
+    for j, name in enumerate(log.names):
         common = {
-            "name": log.names[j],
-            "quantum": _quantum(log.response[:, j]),
+            "name": name,
+            "lost": lost[j],
+            "quantum": quanta[j],
             "turn": turns.get(j, 0.0),
             "copies": tuple(log.names[i] for i in same[j]),
         }
-        if j in doubts:
-            found.append([Actuator(**common, rows=len(log.command))])
-            firsts.append([0])
-            continue
-        parts = find_parts(scaled, j, lead, settings)
-        clean, lost = without_lost(scaled, j, lead, parts, repeats=not common["quantum"])
-        if lost:
-            parts = find_parts(clean, j, lead, settings)
-        common["lost"] = lost
-        numbers = [_report(log, scaled, clean, part, j, reach, spread, settings) for part in parts]
+        numbers = [
+            _report(log, scaled, clean, part, j, reach, spread, settings)
+            for part in parts.get(j, ())
+        ]
+        numbers = numbers or [Actuator(name=name, rows=len(log.command))]
         found.append([replace(actuator, **common) for actuator in numbers])
-        firsts.append([part.first for part in parts])
-        for part in parts:
+        for part in parts.get(j, ()):
             fitted[part.rows, j] = part.predict(clean, j)[part.rows]
-        shape = parts[-1].model.shape
-        if shape.keep > ENDLESS or shape.rate < 0.003:  # half ranges per step: it never arrives
-            doubts[j] = (
-                "cannot tell",
-                "its response moves as if it added up its command; log its rate of change",
-            )
+            shape = part.model.shape
+            if shape.keep > ENDLESS or shape.rate < 0.003:  # half ranges per step: never arrives
+                doubts[j] = (
+                    "cannot tell",
+                    "its response moves as if it added up its command; log its rate of change",
+                )
     found = unit_of(found)
     usual, note = shared_delay([own[-1] for own in found], log, settings)
     actuators = []
@@ -84,9 +91,10 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         how = {"step": log.step, "timed": log.t is not None, "usual_delay": usual[j]}
         how |= {"doubt": doubts.get(j), "settings": settings}
         said = [judge(actuator, **how) for actuator in numbers]
+        firsts = [part.first for part in parts.get(j, ())]
         changes = tuple(
             Change(t=float(log.since[first]), before=before, after=after)
-            for first, before, after in zip(firsts[j][1:], said[:-1], said[1:], strict=True)
+            for first, before, after in zip(firsts[1:], said[:-1], said[1:], strict=True)
             if before.sentence != after.sentence  # otherwise too small to be told
             and "cannot tell" not in (before.status, after.status)
         )
@@ -165,15 +173,15 @@ def _report(
     gains, offsets = intervals[0] * scale, intervals[1] * spread[j]
     y = problem.y[problem.use]
     residual = y - model.predict(problem)[problem.use]
-    whole = scaled.response[part.rows, j] - part.predict(clean, j)[part.rows]
-    total = float(scaled.response[part.rows, j].var())
+    rows = np.flatnonzero(problem_of(scaled, j, part).use)
+    rows = rows[(rows >= part.first) & (rows < part.last)]
+    whole = (scaled.response[:, j] - part.predict(clean, j))[rows]
+    total = float(scaled.response[rows, j].var())
     left = min(float(whole.var()) / total, 1.0) if total > 0 else 0.0
     noticed = residual.var() > 0.005 * total
     pattern, share = find_pattern(problem, model) if noticed else ("", 0.0)
     extra = dict(zip(model.others, model.gains, strict=True))
-    coupling = {
-        log.names[i]: float(g * spread[j] / reach[i]) for i, g in extra.items() if i >= 0
-    }
+    coupling = {log.names[i]: float(g * spread[j] / reach[i]) for i, g in extra.items() if i >= 0}
     largest = max(coupling, key=lambda name: abs(coupling[name]), default=None)
     dead_zone = shape.dead_zone or shape.jump
     for end, beyond, sign in ((shape.low, low, 1), (-shape.high, -high, -1)):
