@@ -25,6 +25,7 @@ class Log:
         episode: number of the episode of each row, ``(N,)``; None: one episode.
         usual_delay: delay and lag of the healthy robot (s).
         row: number of each row, ``(N,)``, where rows of a longer log are left out.
+        read_from: rows of the file that this was read from; 0: as many as there are.
         notes: what a reader must know.
 
     Raises:
@@ -39,6 +40,7 @@ class Log:
     episode: np.ndarray | None = None
     usual_delay: float = 0.0
     row: np.ndarray | None = None
+    read_from: int = 0
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

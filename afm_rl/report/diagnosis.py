@@ -18,8 +18,10 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
+from afm_rl.diagnosis.replay import Table as Replayed
 from afm_rl.report import style
 from afm_rl.report.console import WIDE
+from afm_rl.report.replay import errors_table, pictures_of
 from afm_rl.report.table import Table
 from afm_rl.report.write import render_page
 from afm_rl.storage.files import write_whole
@@ -112,7 +114,12 @@ def _with_interval(value: float, interval: tuple[float, float]) -> str:
 
 
 def write_diagnosis(
-    diagnosis: Diagnosis, log: Log, out: Path, source: str, page: bool = True
+    diagnosis: Diagnosis,
+    log: Log,
+    out: Path,
+    source: str,
+    page: bool = True,
+    replayed: Replayed | None = None,
 ) -> Iterator[Path]:
     """Write ``diagnosis.json`` and ``index.html``; yield their paths as they are written.
 
@@ -122,6 +129,7 @@ def write_diagnosis(
         out: folder; made if it is not there.
         source: what the log is called.
         page: write the page, too.
+        replayed: the same log replayed, for the page.
 
     Raises:
         ConfigurationError: if a file cannot be written.
@@ -130,13 +138,13 @@ def write_diagnosis(
     write_whole(out / "diagnosis.json", text.encode())
     yield out / "diagnosis.json"
     if page:
-        write_whole(out / "index.html", _page(diagnosis, log, source).encode())
+        write_whole(out / "index.html", _page(diagnosis, log, source, replayed).encode())
         yield out / "index.html"
 
 
-def _page(diagnosis: Diagnosis, log: Log, source: str) -> str:
+def _page(diagnosis: Diagnosis, log: Log, source: str, replayed: Replayed | None) -> str:
     shown = _table(diagnosis)
-    table = Table("actuators", "All actuators", NOTE, shown, shown)
+    tables = [Table("actuators", "All actuators", NOTE, shown, shown)]
     figures = []
     for place, actuator in enumerate(diagnosis.actuators):
         png = style.png_bytes(draw_actuator(diagnosis, log, place))
@@ -148,8 +156,12 @@ def _page(diagnosis: Diagnosis, log: Log, source: str) -> str:
         f"{diagnosis.step_s:.4g} s, from {source}."
     )
     notes = [*diagnosis.notes, *(actuator.sentence for actuator in diagnosis.actuators)]
+    if replayed is not None:
+        tables.append(errors_table(replayed))
+        figures += list(pictures_of(replayed))
+        notes.append(replayed.sentence)
     content = {"title": "Diagnosis of the actuators", "summary": summary, "notes": notes}
-    return render_page(**content, figures=figures, tables=[table], references=[])
+    return render_page(**content, figures=figures, tables=tables, references=[])
 
 
 def draw_actuator(diagnosis: Diagnosis, log: Log, place: int) -> Figure:
