@@ -16,7 +16,7 @@ from afm_rl.diagnosis.response import lagging, look_back
 from afm_rl.diagnosis.search import Lead, beginning, find_leads
 from afm_rl.diagnosis.settings import Settings
 
-SHORTEST = 40  # rows of a part
+SHORTEST = 20  # rows of a part
 PARTS = 5  # at most
 
 
@@ -71,7 +71,7 @@ def problem_of(log: Log, j: int, part: Part | Lead, settings: Settings | None = 
     moves = np.flatnonzero((np.diff(log.command, axis=0) != 0).any(1))
     settings = settings or Settings()
     settle = max(settings.longest_s / log.step if log.t is not None else 0, settings.longest)
-    if len(moves):
+    if len(moves) and settings.travel:
         use[: moves[0]] = use[moves[-1] + 1 + int(settle) :] = False
     begin = None
     if lead.line is not None:
@@ -91,9 +91,8 @@ def fit_part(
     rows = log.part(slice(first, last))
     if lead is None:
         (lead,) = find_leads(rows.thinned(settings.searched), [j], settings)
-    small, large = (
-        problem_of(rows.thinned(most), j, lead) for most in (settings.fitted, settings.refined)
-    )
+    most = (settings.fitted, settings.refined)
+    small, large = (problem_of(rows.thinned(n), j, lead, settings) for n in most)
     model = fit_response(small, large, lead.driver, lead.starts, settings).led_by(j)
     return Part(first, last, lead, model, weight_of(large, model))
 
@@ -178,9 +177,11 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
     gain, kept = costs(misses[0], scale), costs(split, scale)
     won = len(y) * math.log((gain.mean() + FLOOR) / (kept.mean() + FLOOR))
     apart = float(np.std(misses[1] - misses[2]))
-    clear = any(consistent((gain - kept)[side], settings) for side in (near < row, near >= row))
+    sides = near < row, near >= row
+    clear = any(consistent((gain - kept)[side], settings) for side in sides)
+    clean = split[min(sides, key=lambda side: split[side].std())]  # the other one may change again
     if (
-        won * independence(split) < settings.penalty + size
+        won * independence(clean) < settings.penalty + size
         or apart < 2 * settings.matters * y.std()
         or not clear
     ):
@@ -215,28 +216,25 @@ def _exact_row(log: Log, j: int, left: Part, right: Part, share: float = 0.05) -
 
 def _apart(log: Log, j: int, whole: Part, left: Part, right: Part, settings: Settings) -> bool:
     """Return whether two explanations are clearly better than one, and differ enough to matter."""
-    rows, border = whole.rows, len(left)
-    own = whole.model.driver
-    moved = min(travel(log, own, part.rows) for part in (left, right))
+    rows, border, own = whole.rows, len(left), whole.model.driver
     one, first, second = (part.predict(log, j)[rows] for part in (whole, left, right))
-    y, use = log.response[rows, j], problem_of(log, j, whole).use[rows]
-    split = np.where(np.arange(len(y)) < border, first, second)
+    y, use = log.response[rows, j], problem_of(log, j, whole, settings).use[rows]
+    early = np.arange(len(y)) < border
+    sides = [side & use for side in (early, ~early) if (side & use).any()]
+    split = np.where(early, first, second)
     scale = scale_of((y - split)[use])
-    kept = costs((y - split)[use], scale)
-    gain = costs((y - one)[use], scale) - kept
+    kept, gain = costs(y - split, scale), costs(y - one, scale)
+    gain -= kept
     weight = min(independence((y - split)[use]), 0.5 + 0.5 * whole.weight)
     more = left.model.size + right.model.size + 4 - whole.model.size
-    won = len(y) * weight * math.log((kept.mean() + gain.mean() + FLOOR) / (kept.mean() + FLOOR))
-    side = np.arange(len(y))[use] < border
-    clear = [consistent(gain[some], settings) for some in (side, ~side) if some.sum() > SHORTEST]
-    apart = min(
-        float(np.sqrt(((first - second)[some & use] ** 2).mean()))
-        for some in (np.arange(len(y)) < border, np.arange(len(y)) >= border)
-        if (some & use).any()
-    )
+    better, best = gain[use].mean() + kept[use].mean(), kept[use].mean()
+    won = len(y) * weight * math.log((better + FLOOR) / (best + FLOOR))
+    moved = min(travel(log, own, part.rows) for part in (left, right))
+    explained = all((y - split)[side].var() < 0.1 * y[side].var() for side in sides)
+    apart = min(float(np.sqrt(((first - second)[side] ** 2).mean())) for side in sides)
     return (
         won > settings.penalty * max(more, 2)
-        and any(clear)
+        and any(consistent(gain[side], settings) for side in sides)
         and apart > 2 * settings.matters * split[use].std()
-        and moved >= 0.5 * settings.travel
+        and (explained or moved >= 0.5 * settings.travel)
     )

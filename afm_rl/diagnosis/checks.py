@@ -30,6 +30,7 @@ def find_doubts(
         settings: is a response that equals its command a copy? Which actuator is idle?
     """
     doubts: dict[int, Doubt] = {}
+    idle = bool(log.effort) and all(np.ptp(values) == 0 for values in log.effort.values())
     summed = _summed(log, leads, settings)
     ranges = reach * (np.ptp(log.command, axis=0) > 0)
     usual = float(np.median(ranges[ranges > 0])) if len(ranges) > 2 and ranges.any() else 0.0
@@ -37,6 +38,9 @@ def find_doubts(
         u, y = log.command[:, j], log.response[:, j]
         if not np.ptp(u) > 0:
             doubts[j] = "cannot tell", "its command does not change; move it"
+        elif idle:
+            name, values = next(iter(log.effort.items()))
+            doubts[j] = "not actuated", f"{name} is {values[0]:.4g} all the time; is it armed?"
         elif exact[j] and settings.echo:
             doubts[j] = (
                 "not measured",
@@ -50,7 +54,7 @@ def find_doubts(
         elif ranges[j] < settings.moves * usual:
             share = 100 * ranges[j] / usual
             doubts[j] = "cannot tell", f"its command moves by {share:.1g} % of the usual; move it"
-        elif travel(log, j) < settings.travel and _still(u) > 0.8:
+        elif lead.left > 0.01 and travel(log, j) < settings.travel and _still(u) > 0.8:
             doubts[j] = (
                 "cannot tell",
                 f"its command moves {round(travel(log, j))} times only; move it up and down",
@@ -61,6 +65,21 @@ def find_doubts(
                 "its response moves as if it added up its command; log its rate of change",
             )
     return doubts
+
+
+def effort_notes(log: Log, often: float = 0.2) -> tuple[str, ...]:
+    """Return which motors were driven as hard as can be in more than a fifth of the rows.
+
+    >>> pwm = {"pwm_1": np.minimum(np.arange(100.0), 60.0)}
+    >>> effort_notes(Log(("a",), np.zeros((100, 1)), np.zeros((100, 1)), effort=pwm))
+    ('pwm_1 is at its limit, 60, in 40 % of the rows: no more can be commanded',)
+    """
+    return tuple(
+        f"{name} is at its limit, {values.max():.5g}, in {100 * share:.0f} % of the rows: no more "
+        "can be commanded"
+        for name, values in log.effort.items()
+        if (share := float((values == values.max()).mean())) > often and len(set(values)) > 9
+    )
 
 
 def echoes(log: Log, rows: Sequence[int] = (0, 1)) -> list[bool]:
@@ -84,11 +103,9 @@ def travel(log: Log, j: int, rows: slice = slice(None), least: float = 0.1) -> f
     3
     """
     size = max(float(_range_of(log.command)[j]), 1e-300)
-    part = log.part(rows)
-    count = np.arange(len(part.command))
-    start = np.maximum.accumulate(np.where(part.begins, count, 0))
-    moves = np.abs(np.diff(follow_with_stiction(part.command[:, j], least * size, start)))
-    return float(moves[~part.begins[1:]].clip(max=size).sum() / size)
+    u = log.command[rows, j]
+    places = follow_with_stiction(u, least * size, np.zeros(len(u), dtype=int))
+    return float(np.abs(np.diff(places)).clip(max=size).sum() / size)
 
 
 def _range_of(command: np.ndarray) -> np.ndarray:
@@ -117,6 +134,9 @@ def _causes(log: Log, cause: np.ndarray, effect: np.ndarray, past: int = 8) -> b
     A tenth of what the own past leaves must be predicted in rows that were held out, with the past
     8 rows or each fifth of the past 40.
     """
+    if not (np.ptp(cause) > 0 and np.ptp(effect) > 0):
+        return False
+    cause, effect = ((x - x.mean()) / x.std() for x in (cause, effect))
     place = np.arange(len(effect)) - np.maximum.accumulate(
         np.where(log.begins, np.arange(len(effect)), 0)
     )

@@ -107,7 +107,10 @@ def needed(problem: Problem, more: Model, less: Model, settings: Settings) -> bo
 
 def consistent(gain: np.ndarray, settings: Settings) -> bool:
     """Return whether what rows gain is above 0 in most blocks of a log."""
-    blocks = np.array([block.mean() for block in np.array_split(gain, settings.blocks)])
+    count = min(settings.blocks, len(gain) // 3)
+    if count < 2:
+        return False
+    blocks = np.array([block.mean() for block in np.array_split(gain, count)])
     error = blocks.std(ddof=1) / math.sqrt(len(blocks))
     return bool(blocks.mean() > settings.consistent * error)
 

@@ -51,7 +51,7 @@ def agree(
         if len({found[j][0].model.active for j in members}) < 2:
             continue
         some = log.thinned(settings.refined)
-        problems = {j: problem_of(some, j, found[j][0].lead) for j in members}
+        problems = {j: problem_of(some, j, found[j][0].lead, settings) for j in members}
         options = []
         for other in members:
             pattern = found[other][0].model

@@ -86,8 +86,7 @@ def _scan(
     for lag in (lag for lag in LAGS if lag * 10 < len(u)):
         keep = math.exp(-1 / lag) if lag else 0.0
         slow = lagging(clock, u, keep) if keep else u
-        most = delays.max() // 2 if keep else delays.max()
-        for delay in delays[(delays <= most) & (delays >= (0 if keep else -EARLIEST))]:
+        for delay in delays[delays >= 0] if keep else delays:
             x = look_back(clock, slow, Shape(float(delay)))[inside]
             level = x.mean(0)
             x = x - level

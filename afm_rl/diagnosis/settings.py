@@ -55,6 +55,7 @@ class Settings:
     """Share of the usual range of commands: an actuator that moves less is idle."""
     travel: float = 4.0
     """Ranges of its command that an actuator has to move: up and down twice. Take-off and landing
-    alone do not tell a delay from chance; half of it is enough on either side of a change."""
+    alone do not tell a delay from chance; half of it is enough on either side of a change. 0 for
+    responses that were computed: nothing else moves them."""
     shared: float = 0.25
     """Share of a delay by which those of several actuators may differ, to be the loop's."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from afm_rl.diagnosis.changes import Part, find_parts, problem_of
-from afm_rl.diagnosis.checks import copies_of, echoes, find_doubts
+from afm_rl.diagnosis.checks import copies_of, echoes, effort_notes, find_doubts
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
 from afm_rl.diagnosis.kinds import agree
 from afm_rl.diagnosis.likely import likely_intervals
@@ -19,7 +19,7 @@ from afm_rl.diagnosis.model import DOWN, GAIN_DRIFT, OFFSET_DRIFT
 from afm_rl.diagnosis.pattern import find_pattern
 from afm_rl.diagnosis.search import find_leads
 from afm_rl.diagnosis.settings import Settings
-from afm_rl.diagnosis.together import shared_delay, unit_of
+from afm_rl.diagnosis.together import shared_delay, unit_of, with_basis
 from afm_rl.diagnosis.words import judge
 from afm_rl.diagnosis.wrap import unwrapped
 
@@ -44,7 +44,9 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     settings = settings or Settings()
     read, exact, same = log, echoes(log), copies_of(log.command)
     log, turns = unwrapped(log, settings)
-    reach, spread = _reach(log.command), _spread(log.response)
+    low, high = _ends(log.command)
+    reach = np.where(high > low, 0.5 * (high - low), 1.0)
+    spread = _spread(log.response)
     scaled = replace(log, command=log.command / reach, response=log.response / spread)
     count = len(log.names)
     leads = find_leads(scaled.thinned(settings.searched), range(count), settings)
@@ -68,6 +70,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
             "lost": lost[j],
             "quantum": quanta[j],
             "turn": turns.get(j, 0.0),
+            "units": log.units,
             "copies": tuple(log.names[i] for i in same[j]),
         }
         numbers = [
@@ -85,10 +88,12 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
                     "its response moves as if it added up its command; log its rate of change",
                 )
     found = unit_of(found)
+    if all(len(parts) == 1 for parts in found):
+        found = [[actuator] for actuator in with_basis([one for (one,) in found], settings)]
     usual, note = shared_delay([own[-1] for own in found], log, settings)
     actuators = []
     for j, numbers in enumerate(found):
-        how = {"step": log.step, "timed": log.t is not None, "usual_delay": usual[j]}
+        how = {"step": log.step, "timed": log.step != 1.0, "usual_delay": usual[j]}
         how |= {"doubt": doubts.get(j), "settings": settings}
         said = [judge(actuator, **how) for actuator in numbers]
         firsts = [part.first for part in parts.get(j, ())]
@@ -103,16 +108,19 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         actuators=tuple(actuators),
         step_s=log.step,
         rows=len(log.command),
-        notes=(*log.notes, *note),
+        notes=(*log.notes, *note, *effort_notes(log)),
         fitted=fitted * spread + read.response - log.response,
     )
 
 
-def _reach(command: np.ndarray) -> np.ndarray:
-    """Return half of the range of each command, ``(A,)``; 1 if it does not change."""
+def _ends(command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return lowest and highest commands, ``(A,)``, but for one row in a hundred at each end.
+
+    All rows count where a command hardly moves otherwise.
+    """
     low, high = np.quantile(command, [0.01, 0.99], axis=0)
-    reach = 0.5 * np.where(high > low, high - low, np.ptp(command, axis=0))
-    return np.where(reach > 0, reach, 1.0)
+    rare = high - low < 0.1 * np.ptp(command, axis=0)
+    return np.where(rare, command.min(0), low), np.where(rare, command.max(0), high)
 
 
 def _spread(response: np.ndarray) -> np.ndarray:
@@ -162,23 +170,29 @@ def _report(
         settings: what matters.
     """
     model, shape = part.model, part.model.shape
-    problem = problem_of(clean.part(part.rows).thinned(settings.refined), j, part.lead)
+    problem = problem_of(clean.part(part.rows).thinned(settings.refined), j, part.lead, settings)
     unit = reach[model.driver]
     scale = spread[j] / unit
-    low, high = np.quantile(log.command[part.rows, model.driver], [0.01, 0.99])
+    command = log.command[:, model.driver]
+    low, high = (float(end[0]) for end in _ends(command[:, None]))
     middle = 0.5 * (low + high)
     centre = 0.0 if low - 0.2 * unit <= 0.0 <= high + 0.2 * unit else float(middle)
     intervals = likely_intervals(problem, model, part, centre / unit, settings)
     gain, offset = model.gain * scale, (model.offset + model.gain * centre / unit) * spread[j]
     gains, offsets = intervals[0] * scale, intervals[1] * spread[j]
+    away = np.abs(log.response[part.rows, j] - command[part.rows])
+    held = command[part.rows].std() < 0.1 * unit and away.max() < settings.matters * unit
+    if held:  # as a healthy one would
+        gain, offset, gains, offsets = 1.0, centre, np.ones(2), np.full(2, centre)
     y = problem.y[problem.use]
     residual = y - model.predict(problem)[problem.use]
-    rows = np.flatnonzero(problem_of(scaled, j, part).use)
+    rows = np.flatnonzero(problem_of(scaled, j, part, settings).use)
     rows = rows[(rows >= part.first) & (rows < part.last)]
     whole = (scaled.response[:, j] - part.predict(clean, j))[rows]
     total = float(scaled.response[rows, j].var())
     left = min(float(whole.var()) / total, 1.0) if total > 0 else 0.0
-    noticed = residual.var() > 0.005 * total
+    left *= not held
+    noticed = residual.var() > 0.005 * total and not held
     pattern, share = find_pattern(problem, model) if noticed else ("", 0.0)
     extra = dict(zip(model.others, model.gains, strict=True))
     coupling = {log.names[i]: float(g * spread[j] / reach[i]) for i, g in extra.items() if i >= 0}

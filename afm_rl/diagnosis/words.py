@@ -53,8 +53,13 @@ def judge(
     if actuator.changes:
         now = ", ".join(faults) or "healthy"
         first, *more = actuator.changes
-        story = f"changed at {first.t:.4g} s: {_said(first.before)}, then "
-        story += "".join(f"{_said(c.before)}; at {c.t:.4g} s " for c in more)
+        when = [_when(change.t, step, timed) for change in actuator.changes]
+        story = f"changed at {when[0]}: {_said(first.before)}, then "
+        story += "".join(
+            f"{_said(c.before)}; at {at} " for c, at in zip(more, when[1:], strict=True)
+        )
+        if not more and first.before.status == "healthy":
+            story, now = "", f"{now}, since {when[0]}"
         parts = [now, *(_said(c.before) for c in actuator.changes)]
         if len(parts) > FEW and any(NO_FAULT in part for part in parts):
             story, now = f"{NO_FAULT}: ", f"no explanation holds longer than a part of {len(parts)}"
@@ -171,12 +176,19 @@ def _faults(
         yield f"{sides[0]:.0f} % of positive commands, {sides[1]:.0f} % of negative ones"
     elif "gain" in actuator.drift:
         pass
+    elif actuator.basis is not None:
+        name, kind, p, q = actuator.basis
+        what = ("of their sum", "of their difference")
+        if kind == "sides":
+            what = ("on one side", "on the other side")
+        p, q = 100 * p / unit, 100 * q / unit
+        yield f"with {name} as one: {p:.0f} % {what[0]}, {q:.0f} % {what[1]}"
     elif not low <= 1.0 <= high and abs(share - 1.0) > s.matters:
         odd = [name for name, gain in UNITS.items() if abs(share / gain - 1.0) < s.matters]
         yield (
             f"{share:.3g} times its command: {odd[0]}" if odd else f"{100 * share:.0f} % of {moves}"
         )
-    for name, gain in actuator.coupling.items():
+    for name, gain in actuator.coupling.items() if actuator.basis is None else ():
         yield f"takes in {100 * gain / unit:+.0f} % of the command of {name}"
     if (
         "offset" not in actuator.drift
@@ -251,6 +263,15 @@ def widened(interval: Interval, settings: Settings) -> Interval:
 def outside(interval: Interval) -> bool:
     """Return whether 0 is outside of an interval."""
     return not interval[0] <= 0.0 <= interval[1]
+
+
+def _when(time: float, step: float, timed: bool) -> str:
+    """Return a time since the log began in words.
+
+    >>> _when(2.0, 0.1, True)
+    'step 20 (2 s)'
+    """
+    return f"step {time / step:.0f}" + (f" ({time:.4g} s)" if timed else "")
 
 
 def _steps(time: float, step: float, timed: bool) -> str:
