@@ -179,9 +179,10 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
     apart = float(np.std(misses[1] - misses[2]))
     sides = near < row, near >= row
     clear = any(consistent((gain - kept)[side], settings) for side in sides)
-    clean = split[min(sides, key=lambda side: split[side].std())]  # the other one may change again
+    clean = min(sides, key=lambda side: split[side].std())  # the other one may change again
+    alone = independence(split[clean])
     if (
-        won * independence(clean) < settings.penalty + size
+        won * alone < settings.price(len(y) * alone) + size
         or apart < 2 * settings.matters * y.std()
         or not clear
     ):
@@ -233,7 +234,7 @@ def _apart(log: Log, j: int, whole: Part, left: Part, right: Part, settings: Set
     explained = all((y - split)[side].var() < 0.1 * y[side].var() for side in sides)
     apart = min(float(np.sqrt(((first - second)[side] ** 2).mean())) for side in sides)
     return (
-        won > settings.penalty * max(more, 2)
+        won > settings.price(len(y) * weight) * max(more, 2)
         and any(consistent(gain[side], settings) for side in sides)
         and apart > 2 * settings.matters * split[use].std()
         and (explained or moved >= 0.5 * settings.travel)

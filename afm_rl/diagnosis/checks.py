@@ -27,7 +27,7 @@ def find_doubts(
         leads: of the actuators.
         reach: half range of each command, ``(A,)``.
         exact: is the response of an actuator its command in every row?
-        settings: is a response that equals its command a copy? Which actuator is idle?
+        settings: which actuator is idle?
     """
     doubts: dict[int, Doubt] = {}
     idle = bool(log.effort) and all(np.ptp(values) == 0 for values in log.effort.values())
@@ -41,7 +41,7 @@ def find_doubts(
         elif idle:
             name, values = next(iter(log.effort.items()))
             doubts[j] = "not actuated", f"{name} is {values[0]:.4g} all the time; is it armed?"
-        elif exact[j] and settings.echo:
+        elif exact[j] and not log.computed:
             doubts[j] = (
                 "not measured",
                 "its response is its command, digit by digit; log what a sensor reads",

@@ -50,6 +50,8 @@ class Actuator:
     """Every how many rows a command is taken over."""
     delay_s: float = 0.0
     """d (s); below 0 where the response comes before its command in the log."""
+    time_interval: Interval = (0.0, math.inf)
+    """95 % interval of delay and lag together (s)."""
     made_up: bool = False
     """Does a correction act so that delay and lag do no harm?"""
     lag_s: float = 0.0

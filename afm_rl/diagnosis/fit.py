@@ -28,7 +28,7 @@ from afm_rl.diagnosis.response import Shape, respond
 from afm_rl.diagnosis.settings import Settings
 
 FLOOR = 1e-7  # share of the variance: better fits are all the same
-QUICK = ("play", "stick", "rate", "hold")  # may be mistaken for delay and lag
+QUICK = ("play", "stick", "hold")  # may be mistaken for delay and lag
 DYNAMICS = ("delay", "keep", "rate")
 COST = attrgetter("cost")
 NONE = Shape._field_defaults
@@ -50,44 +50,51 @@ def fit_response(
         starts: delays, lags and rate limits to begin with.
         settings: how clear it must be.
     """
-    model = _dynamics(problem, large, driver, starts, settings)
+    model = _dynamics(problem, driver, starts)
+    if weight_of(problem, model[-1]) * problem.use.sum() > settings.enough:
+        whole, large = large, problem
+    else:
+        whole = large
+    model = _simplest(large, model, settings)
     added = 0
-    while added < settings.most:
-        found = [refine(large, candidate) for candidate in larger(problem, model, settings)]
-        better = min(found, key=COST, default=model)
-        if not (
-            needed(large, better, model, settings) and _visible(large, better, model, settings)
-        ):
-            break
-        model, added = better, added + 1
-    return _smaller(large, model, settings) if added else model
+    for step in (larger, _with_drift):  # a drift last, since it explains a little of everything
+        while added < settings.most:
+            found = [refine(large, other) for other in step(problem, model)]
+            better = min(found, key=COST, default=model)
+            if not (
+                needed(large, better, model, settings) and _visible(large, better, model, settings)
+            ):
+                break
+            model, added = better, added + 1
+    model = _smaller(large, model, settings) if added else model
+    return model if whole is large else refine(whole, model)
 
 
-def _dynamics(
-    problem: Problem, large: Problem, driver: int, starts: Sequence[Shape], settings: Settings
-) -> Model:
-    """Return the simplest of a delay, a lag, a rate limit, and any of them together."""
-    options = {}
+def _dynamics(problem: Problem, driver: int, starts: Sequence[Shape]) -> list[Model]:
+    """Return the best models with none, some, and all of delay, lag and rate limit."""
+    options: dict[tuple[str, ...], list[Model]] = {(): [Model(driver, Shape())]}
     for start in starts:
         names = tuple(name for name in DYNAMICS if getattr(start, name) != NONE[name])
-        wanted = [names, ("delay", *(n for n in names if n != "delay")), ("delay",)]
-        if len(names) > 1:
-            wanted.append(tuple(name for name in names if name != "delay"))
-        for some in wanted:
+        more = ("delay", *(name for name in names if name != "delay"))
+        for some in dict.fromkeys((names, more, more[1:], ("delay",))):
             shape = Shape(**{name: getattr(start, name) for name in some})
-            options[shape, some] = Model(driver, shape, some)
-    found: dict[tuple[str, ...], Model] = {}
-    for option in options.values():
-        refined = refine(problem, option)
-        if refined.cost < found.get(option.active, option).cost:
-            found[option.active] = refined
-    model = refine(large, Model(driver, Shape()))
-    for size in (1, 2, 3):
-        some = [refine(large, other) for other in found.values() if other.size == size]
-        better = min(some, key=COST, default=model)
-        if better.size > model.size and needed(large, better, model, settings):
-            model = better
-    return model
+            options.setdefault(some, []).append(fit_lines(problem, Model(driver, shape, some)))
+    best = sorted((min(some, key=COST) for some in options.values()), key=lambda m: m.shape.rate)
+    found: list[Model] = []
+    for model in reversed(best):  # limits last: row after row takes time
+        if model.shape.rate == math.inf or model.cost < 2 * min(m.cost for m in found):
+            found.append(refine(problem, model))
+    return sorted(found, key=lambda model: (model.size, -model.cost))
+
+
+def _simplest(problem: Problem, models: Sequence[Model], settings: Settings) -> Model:
+    """Return the simplest of some models that is not clearly worse than a larger one."""
+    first, *others = [refine(problem, model) for model in models]
+    for size in sorted({other.size for other in others}):
+        better = min((other for other in others if other.size == size), key=COST)
+        if better.size > first.size and needed(problem, better, first, settings):
+            first = better
+    return first
 
 
 def needed(problem: Problem, more: Model, less: Model, settings: Settings) -> bool:
@@ -102,17 +109,23 @@ def needed(problem: Problem, more: Model, less: Model, settings: Settings) -> bo
     gain = costs((y - less.predict(problem))[use], scale) - costs(residual, scale)
     rows = use.sum() * weight_of(problem, more)
     won = rows * math.log((less.cost + FLOOR) / (more.cost + FLOOR))
-    return won > settings.penalty * (more.size - less.size) and consistent(gain, settings)
+    others = problem.u.shape[1] if len(more.others) > len(less.others) else 1
+    chance = 2 * math.log(others)  # another command is the best of many
+    enough = settings.price(rows) * (more.size - less.size) + chance
+    return won > enough and consistent(gain, settings, math.sqrt(chance))
 
 
-def consistent(gain: np.ndarray, settings: Settings) -> bool:
-    """Return whether what rows gain is above 0 in most blocks of a log."""
+def consistent(gain: np.ndarray, settings: Settings, chance: float = 0.0) -> bool:
+    """Return whether what rows gain is above 0 in most blocks of a log.
+
+    By ``chance`` standard errors more, where it is the best of many.
+    """
     count = min(settings.blocks, len(gain) // 3)
     if count < 2:
         return False
     blocks = np.array([block.mean() for block in np.array_split(gain, count)])
     error = blocks.std(ddof=1) / math.sqrt(len(blocks))
-    return bool(blocks.mean() > settings.consistent * error)
+    return bool(blocks.mean() > (settings.consistent + 0.5 * chance) * error)
 
 
 def _visible(problem: Problem, one: Model, other: Model, settings: Settings) -> bool:
@@ -120,23 +133,30 @@ def _visible(problem: Problem, one: Model, other: Model, settings: Settings) -> 
     return bool(apart.std() > settings.visible)
 
 
-def larger(problem: Problem, model: Model, settings: Settings, tried: int = 3) -> Iterator[Model]:
+def _with_drift(problem: Problem, model: Model) -> Iterator[Model]:
+    """Yield the model with a gain, or an offset, that drifts."""
+    for kind in {GAIN_DRIFT, OFFSET_DRIFT} - {*model.others}:
+        some = replace(model, others=(*model.others, kind), gains=(*model.gains, 0.0))
+        yield fit_lines(problem, some)
+
+
+def larger(problem: Problem, model: Model, tried: int = 3) -> Iterator[Model]:
     """Yield the best models with one number more, each with a good beginning for it."""
     own, shape = problem.u[:, model.driver], model.shape
     found = []
     for names, options in _beginnings(own, shape).items():
         for begin in _bases(model, names):
             trial = replace(begin, active=(*begin.active, *names.split()))
-            best = _best(problem, trial, options)
-            for width in (0.12, 0.03) if names in ("jump", "stick") else ():
-                near = getattr(best.shape, names) * np.linspace(1 - width, 1 + width, 9)
-                best = min(best, _best(problem, best, [{names: float(x)} for x in near]), key=COST)
-            found.append(best)
-    extra = [GAIN_DRIFT, OFFSET_DRIFT, *((DOWN,) if own.min() < 0 < own.max() else ())]
-    for kind in (kind for kind in extra if kind not in model.others):
-        some = replace(model, others=(*model.others, kind), gains=(*model.gains, 0.0))
-        found.append(fit_lines(problem, some))
-    yield from sorted(found, key=COST)[:tried]
+            found.append(_best(problem, trial, options))
+    if own.min() < 0 < own.max() and DOWN not in model.others:
+        sides = replace(model, others=(*model.others, DOWN), gains=(*model.gains, 0.0))
+        found.append(fit_lines(problem, sides))
+    for best in sorted(found, key=COST)[:tried]:
+        for width in (0.12, 0.03):
+            for name in {"jump", "stick"} & {*best.active} - {*model.active}:
+                near = getattr(best.shape, name) * np.linspace(1 - width, 1 + width, 9)
+                best = min(best, _best(problem, best, [{name: float(x)} for x in near]), key=COST)
+        yield best
     yield from _with_another(problem, model)
 
 
@@ -152,7 +172,6 @@ def _beginnings(own: np.ndarray, shape: Shape) -> dict[str, list[dict[str, Any]]
         "high": high - (high - low) * np.array([0.08, 0.16, 0.25, 0.35, 0.45]),
         "play": (high - low) * np.array([0.02, 0.05, 0.1, 0.18, 0.28]),
         "stick": float(sizes.max()) * np.geomspace(0.03, 0.8, 14),
-        "rate": np.geomspace(0.01, 1.0, 10),
     }
     if low < 0 < high and not shape.dead_zone and not shape.jump:
         grids["dead_zone"] = np.quantile(sizes, 0.98) * np.array([0.05, 0.1, 0.2, 0.35, 0.5, 0.7])
@@ -186,7 +205,7 @@ def _bases(model: Model, names: str) -> Iterator[Model]:
         return
     yield replace(model, active=rest, shape=model.shape._replace(delay=0.0, keep=0.0))
     delay = round(model.shape.delay)
-    for late in range(max(delay - 2, 1) if names == "hold phase" else max(delay, 1), delay + 1):
+    for late in range(max(delay - 2, 1), delay + 1) if names == "hold phase" else ():
         shape = model.shape._replace(delay=float(late), keep=0.0)
         yield replace(model, active=(*rest, "delay"), shape=shape)
 
@@ -217,7 +236,7 @@ def _with_another(
     design = np.column_stack([*parts, np.ones(use.sum())])
     others = np.column_stack([respond(problem.clock, problem.u[:, i], linear)[use] for i in rest])
     residual = problem.y[use] - model.predict(problem)[use]
-    both = np.column_stack([others, residual])
+    raw, both = others, np.column_stack([others, residual])
     both -= design @ np.linalg.lstsq(design, both, rcond=None)[0]
     others, residual = both[:, :-1], cut(both[:, -1])
     power = (others**2).sum(0)
@@ -229,13 +248,30 @@ def _with_another(
     left = residual[:, None] - slope * others  # of each, were it the one
     error = half_widths(left * others / np.maximum(power, 1e-300), chosen=1.0) / 1.96
     good = kept & (np.abs(slope) > clear * error) & (influence > coupled * main)
-    if good.any():
+    won = float(np.max(slope**2 * power, initial=0.0, where=good))
+    if won > 2 * _by_chance(raw, residual, design):
         best = int(np.argmax(np.where(good, slope**2 * power, -1.0)))
         yield replace(
             model,
             others=(*model.others, rest[best]),
             gains=(*model.gains, float(slope[best])),
         )
+
+
+def _by_chance(
+    others: np.ndarray, residual: np.ndarray, design: np.ndarray, shifts: int = 12
+) -> float:
+    """Return what the best of other commands ``(N, A)`` wins where it cannot act.
+
+    That is what it wins when it is moved along the log, of as many places the most: slow series
+    that have nothing to do with each other look alike.
+    """
+    most = 0.0
+    for k in range(1, shifts):
+        moved = np.roll(others, k * len(others) // shifts, axis=0)
+        moved = moved - design @ np.linalg.lstsq(design, moved, rcond=None)[0]
+        most = max(most, float(((residual @ moved) ** 2 / ((moved**2).sum(0) + 1e-300)).max()))
+    return most
 
 
 def _smaller(problem: Problem, model: Model, settings: Settings) -> Model:

@@ -16,7 +16,9 @@ from afm_rl.diagnosis.settings import Settings
 def likely_intervals(
     problem: Problem, model: Model, part: Part, centre: float, settings: Settings
 ) -> np.ndarray:
-    """Return the 95 % intervals of the gain, and of the response to a command, ``(2, 2)``.
+    """Return the 95 % intervals of the gain, of a response, and of the time it takes.
+
+    ``(3, 2)``, the time is delay and lag together, in steps.
 
     They span those of every mixture of delay and lag that explains the response about as well, and
     of a model with one number more that explains it a little better: what was left out because it
@@ -34,8 +36,12 @@ def likely_intervals(
     for found in [model, *_others(problem, model, settings)]:
         lost = rows * math.log((found.cost + FLOOR) / (model.cost + FLOOR))
         if lost < 4.0 - 6.0 * max(found.size - max(model.size, 1), 0):
-            middle, widths = values_of(found)[:2], interval_widths(problem, found, centre)[:2]
-            middle[1] += centre * middle[0]
+            gain, offset = values_of(found)[:2]
+            late = max(found.shape.delay, 0.0)
+            if found.shape.keep > 1e-6:
+                late -= 1 / math.log(found.shape.keep)
+            middle = np.array([gain, offset + centre * gain, late])
+            widths = interval_widths(problem, found, centre)
             ends.append([middle - widths, middle + widths])
     lows, highs = np.moveaxis(np.array(ends), 1, 0)
     return np.stack([lows.min(0), highs.max(0)], -1)
@@ -44,7 +50,7 @@ def likely_intervals(
 def _others(problem: Problem, model: Model, settings: Settings) -> list[Model]:
     """Return other explanations: one number more, or another mixture of delay and lag."""
     if len(problem.y) <= settings.fitted:
-        found = list(larger(problem, model, settings))
+        found = list(larger(problem, model))
     else:
         found = []
     late = model.shape.delay

@@ -29,6 +29,7 @@ class Log:
         read_from: rows of the file that this was read from; 0: as many as there are.
         notes: what a reader must know.
         effort: how hard the motors were driven, ``(M,)`` each, such as their PWM.
+        computed: were responses computed from states, and not measured?
         units: of all commands and responses, as text; empty if they are not known.
 
     Raises:
@@ -46,6 +47,7 @@ class Log:
     read_from: int = 0
     notes: tuple[str, ...] = ()
     effort: Mapping[str, np.ndarray] = field(default_factory=dict)
+    computed: bool = False
     units: tuple[str, str] = ("", "")
 
     def __post_init__(self) -> None:

@@ -179,7 +179,7 @@ def refine(problem: Problem, model: Model) -> Model:
         return (_with_values(model, values).predict(problem) - problem.y)[use]
 
     def slope(values: np.ndarray) -> np.ndarray:
-        return slopes(problem, _with_values(model, values))[use]
+        return slopes(problem, _with_values(model, values), central=False)[use]
 
     begin = np.clip(values_of(model), low + 1e-9, high - 1e-9)
     found = least_squares(
@@ -216,9 +216,11 @@ def _with_values(model: Model, values: np.ndarray) -> Model:
     )
 
 
-def slopes(problem: Problem, model: Model) -> np.ndarray:
+def slopes(problem: Problem, model: Model, central: bool = True) -> np.ndarray:
     """Return derivatives of the prediction by :func:`values_of`, ``(N, P)``."""
     parts = model.parts(problem)
+    gains = (model.gain, *model.gains)
+    middle = model.offset + np.sum([g * x for g, x in zip(gains, parts, strict=True)], 0)
     columns = [parts[0], np.ones(len(problem.y)), *parts[1:]]
     here = values_of(model)
     first = len(here) - len(model.smooth)
@@ -231,18 +233,20 @@ def slopes(problem: Problem, model: Model) -> np.ndarray:
             down[place] = max(down[place], 0.0)
         if name == "keep":
             up[place] = min(up[place], 0.995)
-        ends = [_with_values(model, x).predict(problem) for x in (up, down)]
-        columns.append((ends[0] - ends[1]) / (up[place] - down[place]))
+        if not central:
+            down = here
+        upper = _with_values(model, up).predict(problem)
+        lower = _with_values(model, down).predict(problem) if central else middle
+        columns.append((upper - lower) / (up[place] - down[place]))
     return np.column_stack(columns)
 
 
 def interval_widths(problem: Problem, model: Model, centre: float = 0.0) -> np.ndarray:
-    """Return half widths of the 95 % intervals of :func:`values_of`, ``(P,)``.
+    """Return half widths of the 95 % intervals of three numbers, ``(3,)``.
 
-    The uncertainty of a delay that was found to be none counts, too. Instead of the offset, the
-    second is the response to the command ``centre``.
+    These are the gain, the response to the command ``centre``, and delay and lag together (steps).
+    The uncertainty of a delay that was found to be none counts, too.
     """
-    count = len(values_of(model))
     if not {"delay", "keep"} & set(model.active):
         model = replace(model, active=(*model.active, "delay"))
     use = problem.use
@@ -260,6 +264,11 @@ def interval_widths(problem: Problem, model: Model, centre: float = 0.0) -> np.n
     inverse = (vectors / values) @ vectors.T / size
     freedom = math.sqrt(len(residual) / max(len(residual) - len(size), 1))
     influence = (columns / size * pull[:, None]) @ inverse
-    influence[:, 1] += centre * influence[:, 0]
-    widths = half_widths(influence) * freedom
-    return widths[:count]
+    late = np.zeros(len(influence))
+    for place, name in enumerate(model.smooth, len(influence.T) - len(model.smooth)):
+        keep = model.shape.keep
+        by = {"delay": 1.0, "keep": 1 / (max(keep, 0.05) * math.log(max(keep, 0.05)) ** 2)}
+        late += by.get(name, 0.0) * influence[:, place]
+    three = (influence[:, 0], influence[:, 1] + centre * influence[:, 0], late)
+    widths = half_widths(np.column_stack(three)) * freedom
+    return widths

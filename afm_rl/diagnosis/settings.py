@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -13,8 +14,6 @@ class Settings:
     0.1
     """
 
-    echo: bool = True
-    """Is a response that equals its command in every row a copy of it? Not if it was computed."""
     longest_s: float = 1.2
     """Delays are searched up to here (s), and at least ``longest`` rows: networks, hydraulics."""
     longest: int = 40
@@ -24,9 +23,11 @@ class Settings:
     """Rows by which a model is chosen, at most: more of them hardly make a difference."""
     refined: int = 12000
     """Rows by which its numbers are found, at most."""
-    penalty: float = 10.0
-    """Twice the log-likelihood that a number has to win. BIC's is the logarithm of the rows, 6 to 9
-    here; a little more, since each number is the best of several that were tried."""
+    enough: float = 300.0
+    """Independent rows that are enough to choose a model by: more are not looked at."""
+    penalty: float = 3.0
+    """Twice the log-likelihood that a number has to win beyond BIC's, the logarithm of the rows:
+    each number is the best of several that were tried."""
     consistent: float = 1.8
     """Standard errors by which a number has to improve the fit in blocks of the log: 95 %, one
     side, of 12 blocks. What helps in one place only is chance, or another actuator."""
@@ -56,6 +57,14 @@ class Settings:
     travel: float = 4.0
     """Ranges of its command that an actuator has to move: up and down twice. Take-off and landing
     alone do not tell a delay from chance; half of it is enough on either side of a change. 0 for
-    responses that were computed: nothing else moves them."""
+    responses that were computed: nothing else moves those."""
     shared: float = 0.25
     """Share of a delay by which those of several actuators may differ, to be the loop's."""
+
+    def price(self, rows: float) -> float:
+        """Return twice the log-likelihood that a number has to win in independent rows.
+
+        >>> round(Settings().price(1000), 1)
+        9.9
+        """
+        return self.penalty + math.log(max(rows, 1.0))

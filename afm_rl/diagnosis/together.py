@@ -91,15 +91,23 @@ def shared_delay(
     middle, late = float(np.median(times)), log.usual_delay + settings.late * log.step
     scatter = 1.5 * float(np.median(np.abs(times - middle)))
     reach = max(settings.shared * middle, log.step, 3 * scatter if len(times) > 4 else 0.0)
-    near = times[np.abs(times - middle) <= reach]
-    alike = len(near) == len(times) if len(times) < 5 else len(near) >= 0.8 * len(times)
-    if not alike or near.min() < late:
+    near = times[(np.abs(times - middle) <= reach) & (times > late)]
+    if len(near) < (1.0 if len(times) < 5 else 0.8) * len(times):
         return usual, ()
-    steps = [f"{time / log.step:.2g}" for time in (near.min(), near.max())]
-    span = steps[0] if steps[0] == steps[1] else " to ".join(steps)
-    seconds = f" ({near.min():.2g} to {near.max():.2g} s)" if log.step != 1.0 else ""
+    delay, lag = (float(np.median([getattr(a, n) for a in known])) for n in ("delay_s", "lag_s"))
+    parts = [f"a delay of {_span([delay], log)}", f"a lag of {_span([lag], log)}"]
+    kept = [text for text, time in zip(parts, (delay, lag), strict=True) if time > 0.1 * middle]
     note = (
-        f"all actuators are {span} steps{seconds} behind their commands, delay and lag together: "
-        "that is the loop's, and no fault of one of them"
+        f"all actuators are {_span(near, log)} behind their commands ({' and '.join(kept)}): that "
+        "is the loop's, and no fault of one of them"
     )
     return [max(middle + reach, near.max())] * len(actuators), (note,)
+
+
+def _span(times: Sequence[float] | np.ndarray, log: Log) -> str:
+    """Return from which time to which, in steps and, if these are known, seconds."""
+    low, high = min(times), max(times)
+    texts = [f"{time / log.step:.2g}" for time in (low, high)]
+    seconds = [f"{time:.2g}" for time in (low, high)]
+    steps, known = (" to ".join(dict.fromkeys(some)) for some in (texts, seconds))
+    return f"{steps} steps" + (f" ({known} s)" if log.step != 1.0 else "")

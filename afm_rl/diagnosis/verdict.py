@@ -11,7 +11,7 @@ import numpy as np
 from afm_rl.diagnosis.changes import Part, find_parts, problem_of
 from afm_rl.diagnosis.checks import copies_of, echoes, effort_notes, find_doubts
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
-from afm_rl.diagnosis.kinds import agree
+from afm_rl.diagnosis.kinds import agree, small_twins
 from afm_rl.diagnosis.likely import likely_intervals
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.lost import without_lost
@@ -42,6 +42,8 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     elbow: reversed, 50 % of the command
     """
     settings = settings or Settings()
+    if log.computed:
+        settings = replace(settings, travel=0.0)
     read, exact, same = log, echoes(log), copies_of(log.command)
     log, turns = unwrapped(log, settings)
     low, high = _ends(log.command)
@@ -62,7 +64,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         clean, lost[j] = without_lost(clean, j, lead, parts[j], repeats=not quanta[j])
         if lost[j]:
             parts[j] = find_parts(clean, j, lead, settings)
-    parts = agree(clean, parts, settings)
+    parts = agree(clean, parts, reach, settings)
     found: list[list[Actuator]] = []
     for j, name in enumerate(log.names):
         common = {
@@ -91,7 +93,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     if all(len(parts) == 1 for parts in found):
         found = [[actuator] for actuator in with_basis([one for (one,) in found], settings)]
     usual, note = shared_delay([own[-1] for own in found], log, settings)
-    actuators = []
+    actuators, small = [], small_twins(log.names, reach)
     for j, numbers in enumerate(found):
         how = {"step": log.step, "timed": log.step != 1.0, "usual_delay": usual[j]}
         how |= {"doubt": doubts.get(j), "settings": settings}
@@ -103,7 +105,10 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
             if before.sentence != after.sentence  # otherwise too small to be told
             and "cannot tell" not in (before.status, after.status)
         )
-        actuators.append(judge(replace(said[-1], changes=changes), **how))
+        last = judge(replace(said[-1], changes=changes), **how)
+        if j in small and last.status == "changed" and not last.reversed:
+            last = judge(last, **how | {"doubt": ("cannot tell", small[j])})
+        actuators.append(last)
     return Diagnosis(
         actuators=tuple(actuators),
         step_s=log.step,
@@ -121,6 +126,13 @@ def _ends(command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low, high = np.quantile(command, [0.01, 0.99], axis=0)
     rare = high - low < 0.1 * np.ptp(command, axis=0)
     return np.where(rare, command.min(0), low), np.where(rare, command.max(0), high)
+
+
+def _middle(command: np.ndarray) -> float:
+    """Return the middle of a command, 0 if it comes near 0."""
+    low, high = (float(end[0]) for end in _ends(command[:, None]))
+    near = 0.1 * (high - low)
+    return 0.0 if low - near <= 0.0 <= high + near else 0.5 * (low + high)
 
 
 def _spread(response: np.ndarray) -> np.ndarray:
@@ -175,11 +187,13 @@ def _report(
     scale = spread[j] / unit
     command = log.command[:, model.driver]
     low, high = (float(end[0]) for end in _ends(command[:, None]))
-    middle = 0.5 * (low + high)
-    centre = 0.0 if low - 0.2 * unit <= 0.0 <= high + 0.2 * unit else float(middle)
+    centre = _middle(command)
     intervals = likely_intervals(problem, model, part, centre / unit, settings)
+    extra = dict(zip(model.others, model.gains, strict=True))
+    usual = sum(g * _middle(log.command[:, i]) / reach[i] for i, g in extra.items() if i >= 0)
     gain, offset = model.gain * scale, (model.offset + model.gain * centre / unit) * spread[j]
-    gains, offsets = intervals[0] * scale, intervals[1] * spread[j]
+    gains, offsets = intervals[0] * scale, (intervals[1] + usual) * spread[j]
+    offset += usual * spread[j]
     away = np.abs(log.response[part.rows, j] - command[part.rows])
     held = command[part.rows].std() < 0.1 * unit and away.max() < settings.matters * unit
     if held:  # as a healthy one would
@@ -194,7 +208,6 @@ def _report(
     left *= not held
     noticed = residual.var() > 0.005 * total and not held
     pattern, share = find_pattern(problem, model) if noticed else ("", 0.0)
-    extra = dict(zip(model.others, model.gains, strict=True))
     coupling = {log.names[i]: float(g * spread[j] / reach[i]) for i, g in extra.items() if i >= 0}
     largest = max(coupling, key=lambda name: abs(coupling[name]), default=None)
     dead_zone = shape.dead_zone or shape.jump
@@ -230,6 +243,7 @@ def _report(
         rate=float(abs(gain) * shape.rate * unit / log.step) if shape.rate < math.inf else None,
         every=shape.hold,
         delay_s=shape.delay * log.step,
+        time_interval=(float(intervals[2, 0] * log.step), float(intervals[2, 1] * log.step)),
         lag_s=-log.step / math.log(shape.keep) if shape.keep > 1e-6 else 0.0,
         driven_by=log.names[model.driver] if model.driver != j else largest,
         coupling=coupling,

@@ -50,7 +50,7 @@ def judge(
     """
     s = settings or Settings()
     status, faults = _judged(actuator, step, usual_delay, doubt, timed, s)
-    if actuator.changes:
+    if actuator.changes and not doubt:
         now = ", ".join(faults) or "healthy"
         first, *more = actuator.changes
         when = [_when(change.t, step, timed) for change in actuator.changes]
@@ -227,6 +227,8 @@ def _timing(
 ) -> Iterator[str]:
     """Yield what is wrong with the time that an actuator takes."""
     delay, lag, late = actuator.delay_s, actuator.lag_s, s.late * step
+    if widened(actuator.time_interval, s)[0] < usual_delay < delay + lag:
+        usual_delay = delay + lag  # it may as well be the usual one
     made_up = ", made up for" if actuator.made_up else ""
     if delay < -late:
         yield f"answers {_steps(-delay, step, timed)} before its command in the log"

@@ -114,7 +114,6 @@ def state_names(model: Any) -> list[str]:
 
 def actuator_names(model: Any) -> list[str]:
     """Return the names of actuators, those without one by the joint that they drive, or ``a_k``."""
-
     names = []
     for k in range(model.nu):
         name, kind = model.actuator(k).name, model.actuator_trntype[k]

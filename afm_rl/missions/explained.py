@@ -6,15 +6,13 @@ import numpy as np
 import pandas as pd
 import torch
 
-from afm_rl.diagnosis import Diagnosis, Log, Settings, diagnose
+from afm_rl.diagnosis import Diagnosis, Log, diagnose
 from afm_rl.diagnosis.log import FEWEST
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions.robot import Robot
 
-COMPUTED = Settings(echo=False, travel=0.0)
-"""Responses come through a model: they may equal commands, and nothing else moves them."""
 UNSEEN = 1.0  # half ranges: effective actions with a larger standard deviation are left out
 LONGEST, LONGEST_STIFF = 3000, 400  # newest steps, which are looked at: a simulator takes its time
 
@@ -62,6 +60,7 @@ def effective_log(
         response=seen.action.double().numpy()[known],
         t=kept.astype(float) if t is None else t[kept],
         episode=border[kept],
+        computed=True,
         notes=("responses are effective actions, through the model of the healthy robot",),
     )
 
@@ -84,4 +83,4 @@ def explain_mission(robot: Robot, steps: pd.DataFrame) -> tuple[Diagnosis, Log]:
         raise ConfigurationError("steps that are not finite show nothing of the actuators")
     t = steps["t"].to_numpy(dtype=float) * (robot.dt or 1.0)
     log = effective_log(robot.model, tuple(robot.action_names), states, actions, t)
-    return diagnose(log, COMPUTED), log
+    return diagnose(log), log

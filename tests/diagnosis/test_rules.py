@@ -145,8 +145,8 @@ def test_take_off_and_landing_are_no_change():
 
 def test_a_wide_interval_cannot_tell_and_says_what_would():
     rng = np.random.default_rng(3)
-    u = commands(rng, 400, 1, "steps")
-    drift = np.cumsum(0.2 * rng.standard_normal((400, 1)), axis=0)  # slip
+    u = commands(rng, 600, 1, "walk")
+    drift = np.cumsum(0.1 * rng.standard_normal((600, 1)), axis=0)  # slip
     (slipping,) = diagnose(Log(("v",), u, 0.4 * u + drift)).actuators
     assert slipping.status == "cannot tell" and "would tell" in slipping.sentence
     low, high = slipping.gain_interval
