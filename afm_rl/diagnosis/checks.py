@@ -14,6 +14,10 @@ from afm_rl.diagnosis.search import Lead, find_leads, without_outliers
 from afm_rl.diagnosis.settings import Settings
 
 Doubt = tuple[Status, str]
+SUMMED: Doubt = (
+    "cannot tell",
+    "its response moves as if it added up its command; log its rate of change",
+)
 COPY = 0.999  # correlation of two commands that cannot be told apart
 
 
@@ -60,10 +64,7 @@ def find_doubts(
                 f"its command moves {round(travel(log, j))} times only; move it up and down",
             )
         elif j in summed:
-            doubts[j] = (
-                "cannot tell",
-                "its response moves as if it added up its command; log its rate of change",
-            )
+            doubts[j] = SUMMED
     return doubts
 
 
