@@ -162,11 +162,10 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
     if not good.any():
         return None
     before, places, total = before[good], places[good], sums.sum(0)
-    (_, one), (left, early), (right, later) = (
-        _left_over(moments) for moments in (total[None], before, total - before)
-    )
+    one = _left_over(total[None])[1]
+    (left, early), (right, after) = (_left_over(some) for some in (before, total - before))
     best = int(np.argmin(left + right))
-    misses = [y - table[:, :-1] @ line for line in (one[0], early[best], later[best])]
+    misses = [y - table[:, :-1] @ line for line in (one[0], early[best], after[best])]
     near = np.arange(len(y))
     row = int(places[best])
     inside = np.abs(near - row) <= length

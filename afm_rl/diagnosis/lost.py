@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ FAR = 5.0  # standard deviations of the others: rows that are as far from the li
 
 
 def without_lost(
-    log: Log, j: int, lead: Lead, parts: list[Part], repeats: bool
+    log: Log, j: int, lead: Lead, parts: Sequence[Part], repeats: bool
 ) -> tuple[Log, float]:
     """Return the log with one response as it would be if it always followed, and the share lost.
 

@@ -63,8 +63,7 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
             shift = sign * gain * end * unit
             dead_zone, offset, offsets = end, offset + shift, offsets + shift
     limits = (shape.low, shape.high, -shape.cut, shape.cut)
-    limits = [end for end in limits if math.isfinite(end)]
-    ends = [end * unit for end in limits if abs(end) != dead_zone]
+    ends = [end * unit for end in limits if math.isfinite(end) and abs(end) != dead_zone]
     drift = {}
     for name, kind, value, size in (
         ("gain", GAIN_DRIFT, gain, scale),

@@ -67,7 +67,9 @@ def rows_enough(log: Log, settings: Settings) -> np.ndarray:
         return rows
     start = np.maximum.accumulate(np.where(log.begins, rows, 0))
     some = rows[(rows - start) % every == 0]
-    moved = np.flatnonzero(np.ptp(log.command, axis=0) > 0)
+    moved = [int(j) for j in np.flatnonzero(np.ptp(log.command, axis=0) > 0)]
+    if not moved:
+        return rows
     left = [
         np.median(
             [lead.left for lead in find_leads(part.thinned(settings.searched), moved, settings)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -53,7 +54,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         own = parts.get(j, ())
         numbers = [numbers_of(scaled, clean, part, j, settings) for part in own]
         numbers = numbers or [Actuator(name=name, rows=len(log.command))]
-        how = {"units": log.units, "copies": tuple(log.names[i] for i in same[j])}
+        how: dict[str, Any] = {"units": log.units, "copies": tuple(log.names[i] for i in same[j])}
         how |= {"turn": turns.get(j, 0.0), "quantum": quantum_of(straight.response[:, j])}
         lost = float((clean.response[:, j] != scaled.log.response[:, j]).mean())
         found.append([replace(actuator, lost=lost, **how) for actuator in numbers])
@@ -121,7 +122,12 @@ def _judged(
     """
     actuators, small = [], small_twins(scaled.raw.names, scaled.reach)
     for j, numbers in enumerate(found):
-        how = {"step": step, "timed": step != 1.0, "usual_delay": usual[j], "settings": settings}
+        how: dict[str, Any] = {
+            "step": step,
+            "timed": step != 1.0,
+            "usual_delay": usual[j],
+            "settings": settings,
+        }
         how |= {"doubt": doubts.get(j)}
         said = [judge(actuator, **how) for actuator in numbers]
         changes = tuple(
