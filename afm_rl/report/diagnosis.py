@@ -26,6 +26,7 @@ from afm_rl.report.write import render_page
 from afm_rl.storage.files import write_whole
 
 LOOKS = {"healthy": "green", "changed": "bold red", "dead": "bold red", "cannot tell": "yellow"}
+LOOKS |= {"not measured": "yellow", "not actuated": "yellow"}
 CAPTION = (
     "Left: an excerpt of command, response and fit. Middle: response against command; the line is "
     "a healthy actuator. Right: what the fit leaves, over the whole log."
@@ -160,7 +161,8 @@ def _page(diagnosis: Diagnosis, log: Log, source: str, replayed: Replayed | None
         tables.append(errors_table(replayed))
         figures += list(pictures_of(replayed))
         notes.append(replayed.sentence)
-    return render_page("Diagnosis of the actuators", summary, notes, figures, tables)
+    content = {"title": "Diagnosis of the actuators", "summary": summary, "notes": notes}
+    return render_page(**content, figures=figures, tables=tables, references=[])
 
 
 def draw_actuator(diagnosis: Diagnosis, log: Log, place: int, points: int = 3000) -> Figure:

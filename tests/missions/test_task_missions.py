@@ -297,7 +297,7 @@ def test_mistakes_in_code_of_mine_are_said_in_one_line(mine, overrides, message)
     [
         ("<mujoco><bodi/></mujoco>", "robot.xml='<mujoco><bodi/></mujoco>': .*unrecognized"),
         ("<mujoco/>", "expected actuators, found none"),
-        (MODEL.replace('ctrlrange="-1 1"', ""), "robot: mjcf: actions a_0 have no limits"),
+        (MODEL.replace('ctrlrange="-1 1"', ""), "robot: mjcf: actions x have no limits"),
         ("nothing.xml", "robot.xml=nothing.xml: no such file"),
     ],
 )
