@@ -46,9 +46,9 @@ class Table:
         none = [name for name, share in self.removed.items() if share == 0]
         more = [f"{-100 * s:.0f} % to that of {name}" for name, s in self.removed.items() if s < 0]
         said += [f"none of {_listed(none)}"] if none else []
-        first = f"A correction would have removed {_listed(said, ',')}" if said else ""
-        second = f"{'and added' if said else 'A correction would have added'} {_listed(more)}"
-        return f"{', '.join([first] * bool(said) + [second] * bool(more))}."
+        both = [("removed", said, ","), ("added", more, "")]
+        parts = [f"{done} {_listed(what, comma)}" for done, what, comma in both if what]
+        return f"A correction would have {', and '.join(parts)}."
 
     @property
     def notes(self) -> tuple[str, ...]:
