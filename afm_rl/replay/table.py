@@ -28,7 +28,7 @@ class Table:
             ``p90`` with the ends of their 95 % intervals, ``median_low`` and so on.
         removed: share of each actuator's median error that a correction would have removed; 0
             where it may be chance, below 0 where it would have added.
-        slow: actuators whose response hardly differs from the one a row before.
+        slow: actuators whose commands act in later rows, see :func:`slow_in`.
     """
 
     log: Log
@@ -56,9 +56,9 @@ class Table:
         if not self.slow:
             return ()
         return (
-            f"{_listed(self.slow)}: responses hardly differ from the row before. What is known of "
-            "the next row is then not what another command would change at once; replay rows that "
-            "are as far apart as a command takes to act.",
+            f"{_listed(self.slow)}: commands act in later rows. What is known of the next row is "
+            "then not what another command would change at once; log rows that are as far apart as "
+            "a command takes to act.",
         )
 
     def rows(self) -> pd.DataFrame:
@@ -146,14 +146,22 @@ def removed_by(
 
 
 def slow_in(log: Log, share: float = 0.5) -> tuple[str, ...]:
-    """Return the actuators whose response is nearer to the one before than to its command.
+    r"""Return the actuators of which less than a ``share`` of a command acts in its own row.
 
-    By a factor of ``share``, in the median.
+    By least squares, :math:`y_k = a y_{k-1} + b u_k + c u_{k-1} + d`: what acts at once is b, what
+    acts in the end :math:`(b + c) / (1 - a)`.
+
+    >>> u = np.random.default_rng(0).uniform(-1, 1, (60, 1))
+    >>> slow_in(Log(("pan",), u, 0.5 * u)), slow_in(Log(("pan",), u, np.roll(u, 1, axis=0)))
+    ((), ('pan',))
     """
-    change = np.abs(np.diff(log.response, axis=0))[~log.begins[1:]]
-    miss = np.abs(log.command - log.response)
-    slow = np.median(change, 0) < share * np.median(miss, 0)
-    return tuple(name for name, is_slow in zip(log.names, slow, strict=True) if is_slow)
+    slow, known = [], ~log.begins[1:]
+    for name, u, y in zip(log.names, log.command.T, log.response.T, strict=True):
+        columns = np.c_[y[:-1], u[1:], u[:-1], np.ones(len(u) - 1)]
+        a, b, c, _ = np.linalg.lstsq(columns[known], y[1:][known])[0]
+        if abs(b * (1 - a)) < share * abs(b + c):
+            slow.append(name)
+    return tuple(slow)
 
 
 def _listed(parts: Sequence[str], before_and: str = "") -> str:

@@ -143,10 +143,10 @@ def test_sentences():
     assert say(-0.2) == "A correction would have added 20 % to that of a."
 
 
-def test_a_log_with_many_rows_in_a_response_says_so():
+def test_slow_actuators_are_named():
     u = np.repeat(np.random.default_rng(0).uniform(-1, 1, (10, 1)), 12, axis=0)
     table = replay(Log(("arm",), u, lfilter([0.1], [1.0, -0.9], u, axis=0)))
-    assert table.slow == ("arm",) and table.notes[0].startswith("arm: responses hardly differ")
+    assert table.slow == ("arm",) and table.notes[0].startswith("arm: commands act in later rows")
 
 
 def test_intervals_hold_what_they_promise():
