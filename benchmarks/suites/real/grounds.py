@@ -12,7 +12,6 @@ replays the three one after the other, as if the robot had driven from one to th
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +90,7 @@ def one_drive() -> Log:
     command, response = (
         np.concatenate([getattr(log, kind) for log in parts]) for kind in ("command", "response")
     )
-    return replace(parts[0], command=command, response=response, t=2.0 * np.arange(len(command)))
+    return Log(parts[0].names, command, response, 2.0 * np.arange(len(command)))
 
 
 def draw(log: Log, window: int = 15) -> Figure:
