@@ -1,13 +1,11 @@
 """Planners, and the world in which they imagine."""
 
 from afm_rl.planning.costs import Cost, GoalDistance, KnownReward
-from afm_rl.planning.geometric import GeometricController
 from afm_rl.planning.icem import ICEM
 from afm_rl.planning.law import LawPlanner
 from afm_rl.planning.mpc import MPC
 from afm_rl.planning.mppi import MPPI
 from afm_rl.planning.planning_env import PlanningEnv
-from afm_rl.planning.raptor import Raptor
 from afm_rl.planning.shooting import CEM, TorchRLMPPI
 from afm_rl.planning.stored_policy import PolicyPlanner, StoredPolicy, load_policy, save_policy
 from afm_rl.planning.tracking import QuadraticCost, TrackingCost
@@ -18,14 +16,12 @@ __all__ = [
     "MPC",
     "MPPI",
     "Cost",
-    "GeometricController",
     "GoalDistance",
     "KnownReward",
     "LawPlanner",
     "PlanningEnv",
     "PolicyPlanner",
     "QuadraticCost",
-    "Raptor",
     "StoredPolicy",
     "TorchRLMPPI",
     "TrackingCost",
