@@ -8,33 +8,32 @@ from dataclasses import replace
 
 import numpy as np
 
+from afm_rl.diagnosis.changes import Part, find_parts, problem_of
+from afm_rl.diagnosis.checks import copies_of, echoes, effort_notes, find_doubts
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
+from afm_rl.diagnosis.kinds import agree, small_twins
+from afm_rl.diagnosis.likely import likely_intervals
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.lost import without_lost
-from afm_rl.diagnosis.model import DOWN
-from afm_rl.diagnosis.parts import SEARCHED, Part, find_parts, predict, settle
+from afm_rl.diagnosis.model import DOWN, GAIN_DRIFT, OFFSET_DRIFT
 from afm_rl.diagnosis.pattern import find_pattern
-from afm_rl.diagnosis.search import Lead, find_leads
-from afm_rl.diagnosis.words import MISFIT, UNITS, judge
+from afm_rl.diagnosis.search import find_leads
+from afm_rl.diagnosis.settings import Settings
+from afm_rl.diagnosis.together import shared_delay, unit_of, with_basis
+from afm_rl.diagnosis.words import judge
 from afm_rl.diagnosis.wrap import unwrapped
 
-ALIKE = 0.1  # deviation of the median gain of all actuators from such a gain
-FEW = 0.1  # share of the rows: a response with more values moves freely
-EXACT = 0.01  # of a step, by which steps may differ
-LOOSE = 0.1  # share of the variance: a response of which less is left follows its command
-CLOSE = 0.3  # times what is left of the response: rates of change of which less is left follow
 ENDLESS = 0.985  # share of the way that is left after a step: no lag, but a sum
-CREEPS = 0.003  # half ranges per step: what is no faster never arrives
-COPY = 0.999  # correlation of two commands that cannot be told apart
 
 
-def diagnose(log: Log) -> Diagnosis:
+def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     """Say what each actuator of a log does.
 
-    Each response is fitted by the model of :class:`Actuator`: first lines with every delay, lag
-    and command, then the numbers that its response needs, by robust nonlinear least squares.
-    The log is split where an actuator changed. Intervals take residuals that depend on each other
-    into account, and commands that hardly differ.
+    Each response is fitted by the model of :class:`Actuator`: delay, lag and rate limit together on
+    a grid, then the numbers that its response needs, by robust nonlinear least squares. The log is
+    split where an actuator changed. Intervals take residuals that depend on each other into
+    account, and commands that hardly differ. Then the actuators are judged together: a delay that
+    all share is that of the loop.
 
     >>> u = np.random.default_rng(0).uniform(-1, 1, (400, 2))
     >>> y = u * [1.0, -0.5] + 0.01 * np.random.default_rng(1).standard_normal((400, 2))
@@ -42,55 +41,98 @@ def diagnose(log: Log) -> Diagnosis:
     shoulder: healthy
     elbow: reversed, 50 % of the command
     """
-    read, (log, turns) = log, unwrapped(log, SEARCHED)
-    reach, spread = _reach(log.command), _spread(log.response)
-    moved = np.ptp(log.command, axis=0) > 0
+    settings = settings or Settings()
+    if log.computed:
+        settings = replace(settings, travel=0.0)
+    read, exact, same = log, echoes(log), copies_of(log.command)
+    log, turns = unwrapped(log, settings)
+    low, high = _ends(log.command)
+    reach = np.where(high > low, 0.5 * (high - low), 1.0)
+    spread = _spread(log.response)
     scaled = replace(log, command=log.command / reach, response=log.response / spread)
-    leads = find_leads(scaled.thinned(SEARCHED), range(len(log.names)))
-    summed = _summed(scaled, leads)
-    lost = [0.0] * len(leads)
+    count = len(log.names)
+    leads = find_leads(scaled.thinned(settings.searched), range(count), settings)
+    doubts = find_doubts(scaled, leads, reach, exact, settings)
+    fitted = np.repeat(log.response.mean(0)[None], len(log.response), 0) / spread
+    clean, parts = scaled, dict[int, Sequence[Part]]()
+    lost = dict.fromkeys(range(count), 0.0)
     quanta = [_quantum(response) for response in log.response.T]
     for j, lead in enumerate(leads):
-        scaled, lost[j] = without_lost(scaled, j, lead, repeats=not quanta[j])
-    parts = [find_parts(scaled, j, lead) for j, lead in enumerate(leads)]
-    fitted = np.empty_like(scaled.response)
+        if j in doubts:
+            continue
+        parts[j] = find_parts(scaled, j, lead, settings)
+        clean, lost[j] = without_lost(clean, j, lead, parts[j], repeats=not quanta[j])
+        if lost[j]:
+            parts[j] = find_parts(clean, j, lead, settings)
+    parts = agree(clean, parts, reach, settings)
     found: list[list[Actuator]] = []
-    for j, own in enumerate(parts):
-        found.append([_report(log, scaled, part, j, reach, spread) for part in own])
-        for part in own:
-            rows = slice(part.first, part.last)
-            fitted[rows, j] = predict(scaled, j, part)[rows]
-    unit, since = _unit([own[-1] for own in found]), log.since
-    actuators = []
-    for j, numbers in enumerate(found):
-        shape = parts[j][-1].model.shape
-        endless = {j} if shape.keep > ENDLESS or shape.rate < CREEPS else set()
-        how = (log.step, log.usual_delay, _doubt(scaled, j, moved, summed | endless))
-        whole = [
-            replace(a, unit=unit, lost=lost[j], quantum=quanta[j], turn=turns.get(j, 0.0))
-            for a in numbers
+    for j, name in enumerate(log.names):
+        common = {
+            "name": name,
+            "lost": lost[j],
+            "quantum": quanta[j],
+            "turn": turns.get(j, 0.0),
+            "units": log.units,
+            "copies": tuple(log.names[i] for i in same[j]),
+        }
+        numbers = [
+            _report(log, scaled, clean, part, j, reach, spread, settings)
+            for part in parts.get(j, ())
         ]
-        said = [judge(actuator, *how) for actuator in whole]
+        numbers = numbers or [Actuator(name=name, rows=len(log.command))]
+        found.append([replace(actuator, **common) for actuator in numbers])
+        for part in parts.get(j, ()):
+            fitted[part.rows, j] = part.predict(clean, j)[part.rows]
+            shape = part.model.shape
+            if shape.keep > ENDLESS or shape.rate < 0.003:  # half ranges per step: never arrives
+                doubts[j] = (
+                    "cannot tell",
+                    "its response moves as if it added up its command; log its rate of change",
+                )
+    found = unit_of(found)
+    if all(len(parts) == 1 for parts in found):
+        found = [[actuator] for actuator in with_basis([one for (one,) in found], settings)]
+    usual, note = shared_delay([own[-1] for own in found], log, settings)
+    actuators, small = [], small_twins(log.names, reach)
+    for j, numbers in enumerate(found):
+        how = {"step": log.step, "timed": log.step != 1.0, "usual_delay": usual[j]}
+        how |= {"doubt": doubts.get(j), "settings": settings}
+        said = [judge(actuator, **how) for actuator in numbers]
+        firsts = [part.first for part in parts.get(j, ())]
         changes = tuple(
-            Change(t=float(since[part.first]), before=before, after=after)
-            for part, before, after in zip(parts[j][1:], said[:-1], said[1:], strict=True)
+            Change(t=float(log.since[first]), before=before, after=after)
+            for first, before, after in zip(firsts[1:], said[:-1], said[1:], strict=True)
             if before.sentence != after.sentence  # otherwise too small to be told
+            and "cannot tell" not in (before.status, after.status)
         )
-        actuators.append(judge(replace(said[-1], changes=changes), *how))
+        last = judge(replace(said[-1], changes=changes), **how)
+        if j in small and last.status == "changed" and not last.reversed:
+            last = judge(last, **how | {"doubt": ("cannot tell", small[j])})
+        actuators.append(last)
     return Diagnosis(
         actuators=tuple(actuators),
         step_s=log.step,
         rows=len(log.command),
-        notes=log.notes,
+        notes=(*log.notes, *note, *effort_notes(log)),
         fitted=fitted * spread + read.response - log.response,
     )
 
 
-def _reach(command: np.ndarray) -> np.ndarray:
-    """Return half of the range of each command, ``(A,)``; 1 if it does not change."""
+def _ends(command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return lowest and highest commands, ``(A,)``, but for one row in a hundred at each end.
+
+    All rows count where a command hardly moves otherwise.
+    """
     low, high = np.quantile(command, [0.01, 0.99], axis=0)
-    reach = 0.5 * np.where(high > low, high - low, np.ptp(command, axis=0))
-    return np.where(reach > 0, reach, 1.0)
+    rare = high - low < 0.1 * np.ptp(command, axis=0)
+    return np.where(rare, command.min(0), low), np.where(rare, command.max(0), high)
+
+
+def _middle(command: np.ndarray) -> float:
+    """Return the middle of a command, 0 if it comes near 0."""
+    low, high = (float(end[0]) for end in _ends(command[:, None]))
+    near = 0.1 * (high - low)
+    return 0.0 if low - near <= 0.0 <= high + near else 0.5 * (low + high)
 
 
 def _spread(response: np.ndarray) -> np.ndarray:
@@ -101,103 +143,107 @@ def _spread(response: np.ndarray) -> np.ndarray:
     return np.where(spread > 1e-12 * (1e-300 + np.abs(response).max(0)), spread, 1.0)
 
 
-def _quantum(response: np.ndarray) -> float:
-    """Return the size of the steps of a response, 0 if it moves freely."""
+def _quantum(response: np.ndarray, few: float = 0.1) -> float:
+    """Return the size of the steps of a response, 0 if it moves freely.
+
+    Args:
+        response: ``(N,)``.
+        few: share of the rows: a response with more values moves freely.
+    """
     values = np.unique(response)
     steps = np.diff(values)
-    if not 3 <= len(values) < FEW * len(response) or not steps.min() > 1e-6 * np.ptp(values):
+    if not 3 <= len(values) < few * len(response) or not steps.min() > 1e-6 * np.ptp(values):
         return 0.0
     size = float(np.median(steps))
     whole = steps / size
-    return size if np.abs(whole - whole.round()).max() < EXACT else 0.0
-
-
-def _summed(log: Log, leads: Sequence[Lead]) -> set[int]:
-    """Return the actuators whose responses do not follow, but change as the commands say."""
-    odd = [j for j, lead in enumerate(leads) if lead.left > LOOSE]
-    rates = np.diff(log.response, axis=0, prepend=log.response[:1])
-    rates[log.begins] = 0.0
-    found = find_leads(replace(log, response=rates / _spread(rates)).thinned(SEARCHED), odd)
-    close = (rate.left < CLOSE * leads[j].left for j, rate in zip(odd, found, strict=True))
-    return {j for j, good in zip(odd, close, strict=True) if good}
-
-
-def _doubt(log: Log, j: int, moved: np.ndarray, summed: set[int]) -> str:
-    """Return why nothing can be told of an actuator, if so."""
-    if not moved[j]:
-        return "its command does not change"
-    if j in summed:
-        return "its response moves as if it added up its command; log its rate of change"
-    u = log.command - log.command.mean(0)
-    power = np.sqrt((u**2).sum(0))
-    alike = np.abs(u.T @ u[:, j]) / np.maximum(power * power[j], 1e-300)
-    copies = [name for i, name in enumerate(log.names) if i != j and alike[i] > COPY]
-    return f"its command is that of {copies[0]}, up to a factor" if copies else ""
-
-
-def _unit(actuators: Sequence[Actuator]) -> float:
-    """Return the gain of healthy actuators: 1, or that of two known units if most have it."""
-    gains = np.array([abs(a.gain) for a in actuators])
-    clear = [a.gain_interval[0] * a.gain_interval[1] > 0 and abs(a.gain) > 1e-4 for a in actuators]
-    if not any(clear):
-        return 1.0
-    middle = float(np.median(gains[clear]))
-    return next((unit for unit in UNITS.values() if abs(middle / unit - 1) < ALIKE), 1.0)
+    return size if np.abs(whole - whole.round()).max() < 0.01 else 0.0
 
 
 def _report(
-    log: Log, scaled: Log, part: Part, j: int, reach: np.ndarray, spread: np.ndarray
+    log: Log,
+    scaled: Log,
+    clean: Log,
+    part: Part,
+    j: int,
+    reach: np.ndarray,
+    spread: np.ndarray,
+    settings: Settings,
 ) -> Actuator:
-    """Return the numbers of a part in the units of the log."""
-    part, problem, intervals = settle(scaled, j, part)
+    """Return the numbers of a part in the units of the log.
+
+    Args:
+        log: as it was written.
+        scaled: in half ranges of commands and standard deviations of responses.
+        clean: without lost rows.
+        part: what was found.
+        j: number of the actuator.
+        reach: half range of each command.
+        spread: standard deviation of each response.
+        settings: what matters.
+    """
     model, shape = part.model, part.model.shape
+    problem = problem_of(clean.part(part.rows).thinned(settings.refined), j, part.lead, settings)
     unit = reach[model.driver]
     scale = spread[j] / unit
-    gain, offset = model.gain * scale, model.offset * spread[j]
-    gains, offsets = intervals[0] * scale, intervals[1] * spread[j]
+    command = log.command[:, model.driver]
+    low, high = (float(end[0]) for end in _ends(command[:, None]))
+    centre = _middle(command)
+    intervals = likely_intervals(problem, model, part, centre / unit, settings)
+    extra = dict(zip(model.others, model.gains, strict=True))
+    usual = sum(g * _middle(log.command[:, i]) / reach[i] for i, g in extra.items() if i >= 0)
+    gain, offset = model.gain * scale, (model.offset + model.gain * centre / unit) * spread[j]
+    gains, offsets = intervals[0] * scale, (intervals[1] + usual) * spread[j]
+    offset += usual * spread[j]
+    away = np.abs(log.response[part.rows, j] - command[part.rows])
+    held = command[part.rows].std() < 0.1 * unit and away.max() < settings.matters * unit
+    if held:  # as a healthy one would
+        gain, offset, gains, offsets = 1.0, centre, np.ones(2), np.full(2, centre)
     y = problem.y[problem.use]
     residual = y - model.predict(problem)[problem.use]
-    total = float(y.var())
-    left = min(float(residual.var()) / total, 1.0) if total > 0 else 0.0
-    pattern, share = find_pattern(problem, model) if left > MISFIT else ("", 0.0)
-    rows = slice(part.first, part.last)
-    low, high = np.quantile(log.command[rows, model.driver], [0.01, 0.99])
-    coupling = {
-        log.names[i]: float(g * spread[j] / reach[i])
-        for i, g in zip(model.others, model.gains, strict=True)
-        if i != DOWN
-    }
-    down = [g for i, g in zip(model.others, model.gains, strict=True) if i == DOWN]
+    rows = np.flatnonzero(problem_of(scaled, j, part, settings).use)
+    rows = rows[(rows >= part.first) & (rows < part.last)]
+    whole = (scaled.response[:, j] - part.predict(clean, j))[rows]
+    total = float(scaled.response[rows, j].var())
+    left = min(float(whole.var()) / total, 1.0) if total > 0 else 0.0
+    left *= not held
+    noticed = residual.var() > 0.005 * total and not held
+    pattern, share = find_pattern(problem, model) if noticed else ("", 0.0)
+    coupling = {log.names[i]: float(g * spread[j] / reach[i]) for i, g in extra.items() if i >= 0}
     largest = max(coupling, key=lambda name: abs(coupling[name]), default=None)
     dead_zone = shape.dead_zone or shape.jump
     for end, beyond, sign in ((shape.low, low, 1), (-shape.high, -high, -1)):
-        if math.isfinite(end) and 0 < end and -0.1 * end * unit < beyond:
+        if math.isfinite(end) and 0 < end and -0.1 * end * unit < beyond and not centre:
             # One direction only: what is not followed are the small commands.
             shift = sign * gain * end * unit
             dead_zone, offset, offsets = end, offset + shift, offsets + shift
-    limits = [end for end in (shape.low, shape.high) if math.isfinite(end)]
-    ends = [abs(end) * unit for end in limits if abs(end) != dead_zone]
+    limits = (shape.low, shape.high, -shape.cut, shape.cut)
+    limits = [end for end in limits if math.isfinite(end)]
+    ends = [end * unit for end in limits if abs(end) != dead_zone]
     drift = {}
-    for name, value, change in zip(
-        ("gain", "offset"), (gain, offset), np.multiply(part.drift, (scale, spread[j])), strict=True
+    for name, kind, value, size in (
+        ("gain", GAIN_DRIFT, gain, scale),
+        ("offset", OFFSET_DRIFT, offset, spread[j]),
     ):
-        if change:
+        if kind in extra:
+            change = extra[kind] * size
             drift[name] = (float(value - change / 2), float(value + change / 2))
     return Actuator(
         name=log.names[j],
         gain=float(gain),
         gain_interval=(float(gains[0]), float(gains[1])),
-        gain_down=float((model.gain + down[0]) * scale) if down else None,
-        reversed=bool(gains[1] < 0 and (not down or model.gain + down[0] < 0)),
+        gain_down=float((model.gain + extra[DOWN]) * scale) if DOWN in extra else None,
+        reversed=bool(gains[1] < 0 and model.gain + extra.get(DOWN, 0.0) < 0),
         offset=float(offset),
         offset_interval=(float(offsets[0]), float(offsets[1])),
+        centre=centre,
         dead_zone=float(dead_zone * unit),
-        saturation=float(np.mean(ends)) if ends else None,
+        limits=(float(min(ends)), float(max(ends))) if ends else None,
         backlash=float(shape.play * unit),
         stick=float(shape.stick * unit),
-        rate=float(shape.rate * unit / log.step) if shape.rate < math.inf else None,
+        rate=float(abs(gain) * shape.rate * unit / log.step) if shape.rate < math.inf else None,
         every=shape.hold,
         delay_s=shape.delay * log.step,
+        time_interval=(float(intervals[2, 0] * log.step), float(intervals[2, 1] * log.step)),
         lag_s=-log.step / math.log(shape.keep) if shape.keep > 1e-6 else 0.0,
         driven_by=log.names[model.driver] if model.driver != j else largest,
         coupling=coupling,
@@ -207,5 +253,5 @@ def _report(
         misfit=share * left,
         command_range=(float(low), float(high)),
         drift=drift,
-        rows=part.rows,
+        rows=len(part),
     )

@@ -60,6 +60,7 @@ def effective_log(
         response=seen.action.double().numpy()[known],
         t=kept.astype(float) if t is None else t[kept],
         episode=border[kept],
+        computed=True,
         notes=("responses are effective actions, through the model of the healthy robot",),
     )
 

@@ -29,6 +29,7 @@ from afm_rl.storage.files import write_whole
 SHOWN = 300  # rows of the first panel
 POINTS = 3000  # of the others
 LOOKS = {"healthy": "green", "changed": "bold red", "dead": "bold red", "cannot tell": "yellow"}
+LOOKS |= {"not measured": "yellow", "not actuated": "yellow"}
 CAPTION = (
     "Left: an excerpt of command, response and fit. Middle: response against command; the line is "
     "a healthy actuator. Right: what the fit leaves, over the whole log."

@@ -46,7 +46,7 @@ def test_a_log_becomes_a_table_a_file_and_a_page(call, log):
     done = call(log)
     assert (done.status, done.err) == (0, "")
     assert "pan: healthy" in done.out.splitlines()
-    assert "<b>elbow: reversed, 62 % of the command, 2 steps late" in done.out.splitlines()
+    assert "<b>elbow: reversed, 62 % of the command, 2 steps (0.04 s) late" in done.out.splitlines()
     out = log.parent / "log_diagnosis"
     pan, elbow = json.loads((out / "diagnosis.json").read_text())["actuators"]
     assert pan["status"] == "healthy" and pan["saturation"] is None

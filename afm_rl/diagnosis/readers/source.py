@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import stat
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +89,7 @@ class Columns:
         read_from: rows of the file.
         frame: time between command and response of a healthy robot (s).
         notes: what a reader must know.
+        effort: how hard the motors were driven, ``(M,)`` each.
     """
 
     names: tuple[Sequence[str], Sequence[str]]
@@ -100,6 +101,7 @@ class Columns:
     read_from: int
     frame: float = 0.0
     notes: tuple[str, ...] = ()
+    effort: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 class Unchosen(ConfigurationError):
