@@ -231,11 +231,13 @@ def _apart(log: Log, j: int, whole: Part, left: Part, right: Part, settings: Set
     better, best = gain[use].mean() + kept[use].mean(), kept[use].mean()
     won = len(y) * weight * math.log((better + FLOOR) / (best + FLOOR))
     moved = min(travel(log, own, part.rows) for part in (left, right))
-    explained = all((y - split)[side].var() < 0.1 * y[side].var() for side in sides)
+    rest = [((y - split)[side].var(), y[side].var()) for side in sides]
+    explained = all(left < 0.1 * moves for left, moves in rest)
+    known = all(left < 0.5 * moves or moves < 0.05 * y[use].var() for left, moves in rest)
     apart = min(float(np.sqrt(((first - second)[side] ** 2).mean())) for side in sides)
     return (
         won > settings.price(len(y) * weight) * max(more, 2)
         and any(consistent(gain[side], settings) for side in sides)
         and apart > 2 * settings.matters * split[use].std()
-        and (explained or moved >= 0.5 * settings.travel)
+        and (explained or known and moved >= 0.5 * settings.travel)
     )

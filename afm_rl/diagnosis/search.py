@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
@@ -52,6 +53,40 @@ def find_leads(log: Log, actuators: Sequence[int], settings: Settings) -> list[L
         options = [_choose(scan, place, j, k) for k, scan in enumerate(found)]
         leads.append(min(options, key=lambda lead: lead.left))
     return [_with_starts(log, j, lead, delays) for j, lead in zip(actuators, leads, strict=True)]
+
+
+def rows_enough(log: Log, settings: Settings) -> np.ndarray:
+    """Return the numbers of the rows to look at: all, or every k-th of a quick logger.
+
+    Where commands are another ones in every row, none can be left out: then lines behind delays and
+    lags explain less.
+    """
+    rows = np.arange(len(log.command))
+    every = round(1 / log.step / settings.quickest) if log.step != 1.0 else 1
+    if every < 2 or len(rows) < 100 * every:
+        return rows
+    start = np.maximum.accumulate(np.where(log.begins, rows, 0))
+    some = rows[(rows - start) % every == 0]
+    moved = np.flatnonzero(np.ptp(log.command, axis=0) > 0)
+    left = [
+        np.median(
+            [lead.left for lead in find_leads(part.thinned(settings.searched), moved, settings)]
+        )
+        for part in (log, only(log, some))
+    ]
+    return some if left[1] < 1.1 * left[0] + 1e-3 else rows
+
+
+def only(log: Log, rows: np.ndarray) -> Log:
+    """Return a log of some rows, which still follow each other."""
+    return replace(
+        log,
+        command=log.command[rows],
+        response=log.response[rows],
+        t=log.seconds[rows],
+        episode=np.cumsum(log.begins)[rows],
+        row=None,
+    )
 
 
 def _delays(log: Log, settings: Settings) -> np.ndarray:

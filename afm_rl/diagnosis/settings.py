@@ -16,6 +16,9 @@ class Settings:
 
     longest_s: float = 1.2
     """Delays are searched up to here (s), and at least ``longest`` rows: networks, hydraulics."""
+    quickest: float = 125.0
+    """Rows per second that are looked at, at most, where leaving rows out loses nothing: a delay of
+    a second is 150 of them."""
     longest: int = 40
     searched: int = 4000
     """Rows of the first search, at most: it takes time in proportion to them."""

@@ -17,7 +17,7 @@ from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.lost import without_lost
 from afm_rl.diagnosis.model import DOWN, GAIN_DRIFT, OFFSET_DRIFT
 from afm_rl.diagnosis.pattern import find_pattern
-from afm_rl.diagnosis.search import find_leads
+from afm_rl.diagnosis.search import find_leads, only, rows_enough
 from afm_rl.diagnosis.settings import Settings
 from afm_rl.diagnosis.together import shared_delay, unit_of, with_basis
 from afm_rl.diagnosis.words import judge
@@ -44,7 +44,13 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     settings = settings or Settings()
     if log.computed:
         settings = replace(settings, travel=0.0)
-    read, exact, same = log, echoes(log), copies_of(log.command)
+    exact, same = echoes(log), copies_of(log.command)
+    whole, rows = log, rows_enough(log, settings)
+    if len(rows) < len(log.command):
+        log = only(log, rows)
+        note = f"every {len(whole.command) / len(rows):.0f}th row is looked at: they come quickly"
+        log = replace(log, notes=(*log.notes, note))
+    read = log
     log, turns = unwrapped(log, settings)
     low, high = _ends(log.command)
     reach = np.where(high > low, 0.5 * (high - low), 1.0)
@@ -92,10 +98,14 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     found = unit_of(found)
     if all(len(parts) == 1 for parts in found):
         found = [[actuator] for actuator in with_basis([one for (one,) in found], settings)]
-    usual, note = shared_delay([own[-1] for own in found], log, settings)
+    usual, note = shared_delay([own[-1] for own in found], whole, settings)
+    jumps = [
+        f"{log.names[j]} is an angle that jumps by {turn:.4g}; it was unwrapped"
+        for j, turn in turns.items()
+    ]
     actuators, small = [], small_twins(log.names, reach)
     for j, numbers in enumerate(found):
-        how = {"step": log.step, "timed": log.step != 1.0, "usual_delay": usual[j]}
+        how = {"step": whole.step, "timed": log.step != 1.0, "usual_delay": usual[j]}
         how |= {"doubt": doubts.get(j), "settings": settings}
         said = [judge(actuator, **how) for actuator in numbers]
         firsts = [part.first for part in parts.get(j, ())]
@@ -111,10 +121,12 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         actuators.append(last)
     return Diagnosis(
         actuators=tuple(actuators),
-        step_s=log.step,
-        rows=len(log.command),
-        notes=(*log.notes, *note, *effort_notes(log)),
-        fitted=fitted * spread + read.response - log.response,
+        step_s=whole.step,
+        rows=len(whole.command),
+        notes=(*log.notes, *note, *effort_notes(log), *jumps),
+        fitted=(fitted * spread + read.response - log.response)[
+            np.searchsorted(rows, np.arange(len(whole.command)), side="right") - 1
+        ],
     )
 
 

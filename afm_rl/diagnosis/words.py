@@ -214,8 +214,6 @@ def _faults(
     if actuator.every > 1:
         yield f"takes over one of {actuator.every} commands only"
     yield from _timing(actuator, step, usual_delay, timed, s)
-    if actuator.turn:
-        yield f"jumps by {actuator.turn:.4g}{response}: an angle that is not unwrapped"
     if actuator.lost:
         yield f"does not follow in {100 * actuator.lost:.0f} % of the rows"
     for name, (begin, end) in actuator.drift.items():

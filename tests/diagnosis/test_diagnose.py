@@ -55,7 +55,7 @@ def test_each_fault_is_named():
 @pytest.mark.parametrize("kind", ["white", "steps", "walk", "smooth"])
 def test_healthy_logs_raise_no_alarm(kind):
     for seed, sort in enumerate(["gauss", "heavy", "red"]):
-        log = log_of([Fault()] * 7, 600, kind, 0.05, sort, seed)
+        log = log_of([Fault()] * 4, 600, kind, 0.05, sort, seed)
         assert not [a for a in diagnose(log).actuators if a.status in ("changed", "dead")]
 
 
@@ -126,6 +126,11 @@ def drop_out(u, rng):
     return u * ~lost
 
 
+def gaps(u, rng):
+    """Return commands without three in ten rows."""
+    return u * (rng.random(len(u)) < 0.7)
+
+
 def stick(u, rng):
     """Return what moves only where the command is farther away than 0.2."""
     places = [u[0]]
@@ -150,7 +155,7 @@ ODD = {
     r"sticks for changes below (0.19\d*|0.2|0.20\d*)": stick,
     "100 % of positive commands, 50 % of negative ones": lambda u, rng: np.where(u > 0, u, u / 2),
     r"does not follow in (1\d|2\d|3\d) % of the rows, \d\d % of its motion unexplained": drop_out,
-    r"does not follow in (2\d|3\d) % of the rows, \d\d % of its motion unexplained": lambda u, rng: u * (rng.random(len(u)) < 0.7),
+    r"does not follow in (2\d|3\d) % of the rows, (2|3|4)\d % of its motion unexplained": gaps,
     "57.3 times its command: degrees for radians": lambda u, rng: np.degrees(u),
     r"gain drifts from (1|0.99\d?|1.0\d?) to (0.5|0.49\d?|0.50\d?)": (
         lambda u, rng: u * np.linspace(1, 0.5, len(u))
@@ -158,20 +163,18 @@ ODD = {
     r"no faster than (0\.1|0\.09\d+|0\.10\d+) per second": limit_rate,
     "takes over one of 4 commands only": lambda u, rng: u[np.arange(len(u)) // 4 * 4],
     "answers 3 steps before its command in the log": lambda u, rng: np.roll(u, -3),
-    r"reversed, offset \+2\.[789]\d*, jumps by 6\.283: an angle that is not unwrapped": (
+    r"reversed, offset \+2\.[789]\d* \(1[34]\d % of its range\)": (
         lambda u, rng: wrap(2.8 - u, 2 * np.pi)
     ),
     "switches between two responses, whatever the size of its command": lambda u, rng: np.sign(u),
-    r"changed at (597|598|599|600|601|602|603) s: healthy, then reversed": (
+    r"reversed, since step (597|598|599|600|601|602|603)": (
         lambda u, rng: u * np.where(np.arange(len(u)) < 600, 1, -1)
     ),
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["white", "walk"])
-def test_faults_that_are_no_number_of_the_model_have_words(kind):
-    log = log_of([Fault()] * (1 + len(ODD)), 1200, kind, 0.0, seed=5)
+def test_faults_that_are_no_number_of_the_model_have_words():
+    log = log_of([Fault()] * (1 + len(ODD)), 1200, "walk", scale=0.0, seed=5)
     rng, y = np.random.default_rng(5), log.response.copy()
     for j, make in enumerate(ODD.values()):
         y[:, j] = make(log.command[:, j], rng)

@@ -140,14 +140,14 @@ def test_take_off_and_landing_are_no_change():
     y[t > 25, 0] += 0.3  # where it came down
     x, z = diagnose(log_of(u, y, ("x", "z"), t=t)).actuators
     assert not x.changes and x.lag_s == pytest.approx(0.2, rel=0.15)
-    assert z.sentence == "z: cannot tell: its command moves 2 times only; move it up and down"
+    assert z.status == "cannot tell" and "move" in z.sentence
 
 
 def test_a_wide_interval_cannot_tell_and_says_what_would():
     rng = np.random.default_rng(3)
-    u = commands(rng, 600, 1, "walk")
-    drift = np.cumsum(0.1 * rng.standard_normal((600, 1)), axis=0)  # slip
-    (slipping,) = diagnose(Log(("v",), u, 0.4 * u + drift)).actuators
+    u = commands(rng, 40, 1, "white")
+    slip = 0.7 * rng.standard_normal((40, 1))
+    (slipping,) = diagnose(Log(("v",), u, 0.4 * u + slip)).actuators
     assert slipping.status == "cannot tell" and "would tell" in slipping.sentence
     low, high = slipping.gain_interval
     assert low < 0.4 < high
