@@ -160,7 +160,7 @@ def _page(diagnosis: Diagnosis, log: Log, source: str, replayed: Replayed | None
     if replayed is not None:
         tables.append(errors_table(replayed))
         figures += list(pictures_of(replayed))
-        notes.append(replayed.sentence)
+        notes += [replayed.sentence, *replayed.notes]
     content = {"title": "Diagnosis of the actuators", "summary": summary, "notes": notes}
     return render_page(**content, figures=figures, tables=tables, references=[])
 
