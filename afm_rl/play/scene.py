@@ -64,8 +64,9 @@ class PendulumFigure:
     """The rod of gymnasium's pendulum, which stands up at angle 0."""
 
     def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
-        self.inner, height = inner, np.array([0.0, 0.0, 1.2])
-        self.label = place + 2.5 * height
+        self.inner, height = inner, np.array([0.0, 0.0, 1.0])
+        place = -place[[1, 0, 2]]  # one beside the other
+        self.label = place + 2.3 * height
         self.root = server.scene.add_frame(f"/{name}", show_axes=False, position=place + height)
         rod = trimesh.creation.capsule(height=1.0, radius=0.08)
         rod.apply_translation([0.0, 0.0, 0.5 - rod.bounds.mean(0)[2]])
