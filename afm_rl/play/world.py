@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from afm_rl import ActionFlowWrapper
+from afm_rl.transforms.gymnasium import ActionFlowWrapper
 from afm_rl.play.actuators import Actuators, Faults
 from afm_rl.play.robots import Robot
 
