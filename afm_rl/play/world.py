@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from afm_rl.transforms.gymnasium import ActionFlowWrapper
 from afm_rl.play.actuators import Actuators, Faults
 from afm_rl.play.robots import Robot
+from afm_rl.transforms.gymnasium import ActionFlowWrapper
 
 SIDES = ("alone", "AFM")
 KEPT = 400  # steps that are drawn as curves
