@@ -25,7 +25,6 @@ class MuJoCoFigure:
 
     def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
         self.inner, self.place, model = inner, place, inner.model
-        self.label = place + [0.0, 0.0, 1.8]
         self.root = server.scene.add_frame(f"/{name}", show_axes=False, position=place)
         solid = np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
         self.bodies = {
@@ -56,6 +55,7 @@ class MuJoCoFigure:
         _, y, z = self.floor.position
         self.floor.position = (self.place[0] - shift[0] % 1.0, y, z)
         self.root.position = self.place - shift
+        self.label = self.place + [0.0, 0.0, data.xpos[1, 2] + 0.5]
         for body, frame in self.bodies.items():
             frame.position, frame.wxyz = data.xpos[body], data.xquat[body]
 
@@ -133,7 +133,7 @@ def ways_of(model: Any) -> list[int]:
     return [k for k in (0, 1) if slides[k : k + 1].any() and model.jnt_axis[k].argmax() == k]
 
 
-def shape_of(model: Any, geom: int) -> trimesh.Trimesh:
+def shape_of(model: Any, geom: Any) -> trimesh.Trimesh:
     """Return the shape of a geom, in its own frame."""
     kind, size = model.geom_type[geom], model.geom_size[geom]
     kinds = mujoco.mjtGeom

@@ -43,9 +43,7 @@ def print_tables(results: pd.DataFrame) -> None:
     for policy, rows in results.groupby("policy"):
         print(f"\n{policy}: return after the fault (survivors, where some fell)\n")
         print_table(rows, _sum)
-    print(
-        "\nAll policies: share of the healthy return; survivors; median steps until recovered\n"
-    )
+    print("\nAll policies: share of the healthy return; survivors; median steps until recovered\n")
     print_table(results, _summary)
 
 
