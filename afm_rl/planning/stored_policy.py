@@ -129,9 +129,6 @@ def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
     tensors, description = read_tensors(Path(file))
     if description.get("kind") != "policy" or "form" not in description:
         raise ArtefactError(f"{file}: holds no policy; make one with save_policy")
-    form: dict[str, Any] = {
-        name: math.inf if x == "inf" else x for name, x in description["form"].items()
-    }
     count = range(sum(name.startswith("weights") for name in tensors))
     layers = [(tensors[f"weights.{index}"], tensors[f"biases.{index}"]) for index in count]
     box, normaliser = (tensors["low"], tensors["high"]), tensors.get("normaliser")
