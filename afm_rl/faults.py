@@ -22,8 +22,13 @@ How a stale sensor and a robot that stands still differ:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import torch
 from torch import Tensor
+
+from afm_rl.errors import ConfigurationError
 
 ABSURD = 1e12  # in any unit: a reading beyond it is a fault, also where an angle would wrap it
 PATIENCE = 20  # repetitions in a row that count as a stale sensor
@@ -76,6 +81,33 @@ def trusted(reading: Tensor, count: Tensor, patience: float = PATIENCE) -> Tenso
     return whole(reading) & ((count == 0) | (count > patience))
 
 
+def fault_of(found: Any, shape: Sequence[int]) -> str:
+    """Return what keeps a value from being real numbers of a shape; nothing if it is that.
+
+    >>> fault_of(torch.zeros(2), (3,)), fault_of(torch.zeros(3), (3,))
+    ('shape (2,), expected (3,)', '')
+    """
+    if not isinstance(found, Tensor):
+        return f"{type(found).__name__}, expected real numbers {tuple(shape)}"
+    if found.is_complex() or found.dtype is torch.bool:
+        return f"type {found.dtype}, expected real numbers {tuple(shape)}"
+    if found.shape != torch.Size(shape):
+        return f"shape {tuple(found.shape)}, expected {tuple(shape)}"
+    return ""
+
+
+def check_numbers(key: object, given: Any, shape: Sequence[int]) -> Tensor:
+    """Return what was found under a key, if it is a tensor of real numbers of a shape.
+
+    Raises:
+        ConfigurationError: otherwise, naming key, shape and what was expected.
+    """
+    fault = fault_of(given, shape)
+    if fault:
+        raise ConfigurationError(f"{key!r}: {fault}")
+    return given
+
+
 def as_reading(found: Tensor, like: Tensor) -> tuple[Tensor, str]:
     """Return a reading of the shape and type of ``like``, and what was wrong with it.
 
@@ -89,11 +121,10 @@ def as_reading(found: Tensor, like: Tensor) -> tuple[Tensor, str]:
     >>> as_reading(torch.zeros(2), torch.zeros(3))
     (tensor([nan, nan, nan]), 'shape (2,), expected (3,)')
     """
-    if found.shape != like.shape:
-        fault = f"shape {tuple(found.shape)}, expected {tuple(like.shape)}"
-    elif not found.is_floating_point():
+    fault = fault_of(found, like.shape)
+    if not fault and not found.is_floating_point():
         fault = f"type {found.dtype}, expected {like.dtype}"
-    else:
+    if not fault:
         return found.to(like.dtype), ""
     return torch.full_like(like, torch.nan), fault
 

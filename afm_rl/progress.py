@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from tqdm import tqdm
@@ -54,3 +55,29 @@ class Bar(tqdm):
                 Bar.listener(str(self), self.n / self.total if self.total else 0.0)
             else:
                 print(self, file=sys.stderr, flush=True)
+
+
+@contextmanager
+def waiting(what: str, expected: float, every: float = 1.0) -> Iterator[Bar]:
+    """Show how much of an expected time has passed; what takes longer counts as nearly done.
+
+    Args:
+        what: is waited for.
+        expected: how long it may take (s).
+        every: how often it is looked at (s).
+    """
+    ended = threading.Event()
+
+    def show() -> None:
+        while not ended.wait(every):
+            bar.total = max(bar.total, 1.1 * (bar.n + every))
+            bar.update(every)
+
+    with Bar(total=expected, desc=what) as bar:
+        clock = threading.Thread(target=show, daemon=True)
+        clock.start()
+        try:
+            yield bar
+        finally:
+            ended.set()
+            clock.join()

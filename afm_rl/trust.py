@@ -2,14 +2,19 @@
 
 Hydra calls whatever a ``_target_`` names, so a configuration from elsewhere is a program. Ours may
 name the parts of this library, and packages that the user trusts by name, on the command line
-(``trust=[mine]``) or in the call of :func:`~afm_rl.missions.build`. No file can add to these.
+(``trust=[mine]``) or in the call of :func:`~afm_rl.missions.build`. No file can add to these. A
+trusted package may also bring settings to choose from, in its folder ``conf``.
 """
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -39,23 +44,92 @@ HANDLERS = ("logging.StreamHandler", "logging.FileHandler")
 
 
 def trusted() -> list[str]:
-    """Return the packages that this process was told to trust."""
-    return [name for name in os.environ.get(TRUST, "").split(",") if name]
+    """Return what this process trusts: names of packages, and paths that end in one."""
+    return [entry for entry in os.environ.get(TRUST, "").split(",") if entry]
 
 
-def check_trust(names: Any) -> list[str]:
-    """Return names of packages.
+def trust(entries: Iterable[str]) -> None:
+    """Trust packages, here and in processes that this one starts.
+
+    They are searched for where their paths lead, in the present folder if there is none, and only
+    after all that is installed.
+    """
+    entries = [os.path.abspath(one) if "/" in one else one for one in entries]
+    os.environ[TRUST] = ",".join(dict.fromkeys([*trusted(), *entries]))
+    for entry in trusted():
+        folder = os.path.dirname(entry) or os.getcwd()
+        if folder not in sys.path:
+            sys.path.append(folder)
+
+
+@contextmanager
+def trusting(entries: Iterable[str]) -> Iterator[None]:
+    """Trust packages for a while."""
+    before, path = os.environ.get(TRUST), sys.path[:]
+    trust(entries)
+    try:
+        yield
+    finally:
+        sys.path[:] = path
+        os.environ.pop(TRUST)
+        os.environ.update({} if before is None else {TRUST: before})
+
+
+def name_of(entry: str) -> str:
+    """Return the name of a package.
+
+    >>> name_of("suites/flight"), name_of("my.models")
+    ('flight', 'my.models')
+    """
+    return entry.rstrip("/").rpartition("/")[2]
+
+
+def conf_folders() -> list[Path]:
+    """Return the folders of settings of trusted packages: ``conf`` in each, or beside a module.
+
+    Raises:
+        ConfigurationError: for a package that is not there.
+    """
+    folders = []
+    for entry in trusted():
+        try:
+            spec = find_spec(name_of(entry))
+        except Exception as error:  # the packages around it are imported, and may raise anything
+            raise ConfigurationError(f"trust=[{entry}]: cannot be found: {error}") from error
+        inside = list(spec.submodule_search_locations or ()) if spec else []
+        origin = spec.origin if spec else None
+        place = inside[0] if inside else origin and os.path.dirname(origin)
+        if place is None:
+            raise ConfigurationError(
+                f"trust=[{entry}]: cannot be found: expected a package that is installed, one in "
+                f"{os.getcwd()}, or a path that ends in one, such as lib/mine"
+            )
+        wanted = os.path.dirname(entry)
+        if wanted and not os.path.realpath(place).startswith(os.path.realpath(wanted)):
+            raise ConfigurationError(
+                f"trust=[{entry}]: another package of that name comes first, {place}; rename yours"
+            )
+        folders.append(Path(place, "conf"))
+    return [folder for folder in folders if folder.is_dir()]
+
+
+def check_trust(entries: Any) -> list[str]:
+    """Return names of packages, and paths that end in one.
 
     Raises:
         ConfigurationError: if they are something else.
 
-    >>> check_trust(["mine", "my.models"])
-    ['mine', 'my.models']
+    >>> check_trust(["mine", "my.models", "lib/boat"])
+    ['mine', 'my.models', 'lib/boat']
     """
-    listed = isinstance(names, list | tuple) and all(isinstance(name, str) for name in names)
-    if not listed or not all(name.replace(".", "_").isidentifier() for name in names):
-        raise ConfigurationError(f"trust={names!r}: expected a list of names of packages")
-    return list(names)
+    listed = isinstance(entries, list | tuple) and all(isinstance(one, str) for one in entries)
+    if not listed or not all(
+        name_of(one).replace(".", "_").isidentifier() and "," not in one for one in entries
+    ):
+        raise ConfigurationError(
+            f"trust={entries!r}: expected a list of names of packages, or of paths that end in one"
+        )
+    return list(entries)
 
 
 def check_targets(settings: Any, trust: Iterable[str] = ()) -> None:
@@ -77,13 +151,13 @@ def check_targets(settings: Any, trust: Iterable[str] = ()) -> None:
         ...
     afm_rl.errors.ConfigurationError: cost._target_='os.system': only parts of ...
     """
-    trust = [*trusted(), *check_trust(list(trust))]
+    names = [name_of(one) for one in (*trusted(), *check_trust(list(trust)))]
     for place, target in _targets(settings, ""):
-        _check_name(place, target, [*ALLOWED, *trust])
+        _check_name(place, target, [*ALLOWED, *names])
         found = find_code(place, target)
         home = str(getattr(found, "__module__", None) or type(found).__module__)
         makes = isinstance(found, type) or home == FACTORIES
-        if not _inside(home, [*ALLOWED, *trust]) or (_inside(home, MISSIONS) and not makes):
+        if not _inside(home, [*ALLOWED, *names]) or (_inside(home, MISSIONS) and not makes):
             raise ConfigurationError(f"{place}={target!r}: is code of {home}; {REMEDY}")
 
 
@@ -98,11 +172,12 @@ def check_composed(settings: Mapping[str, Any], trust: Iterable[str] = ()) -> No
         ConfigurationError: naming the setting.
     """
     own = settings.get("hydra") or {}
+    names = [name_of(one) for one in trust]
     for place, target in _targets(settings, ""):
         plugin = place in ("hydra.launcher._target_", "hydra.sweeper._target_")
         if isinstance(target, str) and "${" in target and not place.startswith("hydra."):
             continue  # checked once it is known
-        _check_name(place, target, [*ALLOWED, *trust, *(HYDRA if plugin else ())])
+        _check_name(place, target, [*ALLOWED, *names, *(HYDRA if plugin else ())])
     for group in ("job_logging", "hydra_logging"):
         for place, key, value in _texts(own.get(group), f"hydra.{group}"):
             stray = str(value).startswith(("ext://", "cfg://")) and value not in STREAMS

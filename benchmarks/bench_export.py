@@ -61,7 +61,8 @@ def main() -> None:
     for name, planned in (("correction", False), ("MPPI and correction", True)):
         plain, fast = controller(planned, compile=False), controller(planned, compile=True)
         with tempfile.TemporaryDirectory() as folder, torch.inference_mode(False):
-            path = export_controller(plain, Path(folder) / "policy.pt2")
+            path = Path(folder) / "policy.pt2"
+            export_controller(plain, path)
             exported = torch._inductor.aoti_load_package(str(path))
         ways = {"as it is": plain, "corrector.compile=true": fast, "exported": exported}
         for way, tick in ways.items():

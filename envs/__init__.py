@@ -1,6 +1,5 @@
 """Environments: robots whose dynamics change under way."""
 
-from afm_rl.envs.actuator_inversion import actuator_inversion_task
 from afm_rl.envs.courses.course import Course
 from afm_rl.envs.courses.references import (
     Circle,
@@ -15,7 +14,6 @@ from afm_rl.envs.courses.references import (
 from afm_rl.envs.courses.rendering import TrackCanvas
 from afm_rl.envs.courses.track import Track
 from afm_rl.envs.courses.tracks import load_track
-from afm_rl.envs.gusty_pendulum import gusty_pendulum_task
 from afm_rl.envs.missions.format import MissionFormat
 from afm_rl.envs.missions.noise import MissionNoise
 from afm_rl.envs.missions.settings import schedule_in_seconds
@@ -53,12 +51,10 @@ __all__ = [
     "UGVTrackVectorEnv",
     "Waypoints",
     "WheelPhysics",
-    "actuator_inversion_task",
     "arm_task",
     "dm_control_task",
     "environment_task",
     "find_reference",
-    "gusty_pendulum_task",
     "gymnasium_task",
     "load_reference",
     "load_track",

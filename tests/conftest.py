@@ -9,6 +9,7 @@ from hypothesis import settings
 
 import afm_rl.flow
 import afm_rl.learning
+from afm_rl.compiling import machine_code
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, Ensemble
 from afm_rl.flow import AxisNetwork
@@ -102,6 +103,22 @@ def trained_error(_trained_ensemble):
 def universal_flow():
     """The action flow of the ground robot, as it comes with the package."""
     return ActionFlow(LOW, HIGH)
+
+
+@pytest.fixture
+def traced(monkeypatch):
+    """Run what is traced for machine code as it is, uncompiled; names of what was traced.
+
+    tests/compiling and tests/transforms/test_controller.py compile.
+    """
+    names = []
+
+    def compile_module(module, inputs, cache, traced):
+        names.append(module.name)
+        return machine_code._trace(module, inputs).program.module()
+
+    monkeypatch.setattr(machine_code, "compile_module", compile_module)
+    return names
 
 
 @pytest.fixture

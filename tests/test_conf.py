@@ -57,19 +57,11 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "updater=stream_x_literal": ["dynamics=pe_stream_x"],
     "updater=stream_x_unmatched": ["dynamics=pe_stream_x"],
     "updater=knode": ["dynamics=knode", "robot=quadrotor"],
-    "updater=sysid": ["robot=inversion_cartpole"],
-    "method=sysid": ["robot=inversion_cartpole"],
-    "method=afm_sysid": ["robot=inversion_cartpole"],
-    "updater=mass": ["dynamics=oracle", "robot=quadrotor"],
+    "updater=sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
+    "method=sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
+    "method=afm_sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
     "planner=mpc": ["robot=quadrotor"],
     "planner=policy": ["robot=gymnasium", f"planner.file={POLICY}"],
-    "planner=law": ["robot=gusty_pendulum"],
-    "planner=geometric": ["robot=quadrotor"],
-    "planner=geometric_soft": ["robot=quadrotor"],
-    "planner=raptor": ["robot=quadrotor_rotorpy_10ms"],
-    "method=raptor": ["robot=quadrotor_rotorpy_10ms"],
-    "method=geometric": ["robot=quadrotor"],
-    "method=mass_estimator": ["robot=quadrotor"],
     "method=offline_knode": ["robot=quadrotor"],
     "method=online_knode": ["robot=quadrotor"],
     "method=afm_offline_knode": ["robot=quadrotor"],
@@ -166,15 +158,7 @@ def test_a_method_chooses_three_parts_and_nothing_else(method):
     loaded = OmegaConf.create(text)
     assert list(loaded) == ["defaults"]
     parts = [next(iter(entry)).removeprefix("override /") for entry in loaded.defaults]
-    own = method in ("geometric", "raptor")  # which are planners of their own
-    planner = ["planner"] if own else []
-    assert parts == ["dynamics", "updater", "corrector", *planner]
-
-
-def test_a_method_has_the_last_word_on_its_planner_but_for_the_user():
-    chosen = ["robot=quadrotor", "method=geometric"]
-    assert composed(*chosen).planner._target_ == "afm_rl.planning.GeometricController"
-    assert composed(*chosen, "planner=mpc").planner._target_ == "afm_rl.planning.MPC"
+    assert parts == ["dynamics", "updater", "corrector"]
 
 
 def test_a_robot_may_choose_a_cost_and_a_planner_but_the_user_has_the_last_word():

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from hydra import compose, initialize_config_module
 
-from afm_rl.cli.overrides import trusted_packages
+from afm_rl.cli.trusted import checked
 from afm_rl.missions import build
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,7 +53,8 @@ def commands():
 def desk(monkeypatch, tmp_path):
     """Work in a folder with the examples alone, from which modules are imported."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    for name in ("examples", "benchmarks"):
+        (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.syspath_prepend(str(tmp_path))
     yield tmp_path
     sys.modules.pop("mine", None)
@@ -90,8 +91,8 @@ def test_commands_can_be_run(page, asked, desk):
         at = asked.index("--config-dir")
         folder = desk / asked[at + 1]
         asked = [*asked[:at], *asked[at + 2 :], f"hydra.searchpath=[file://{folder}]"]
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        agent = build(compose("config", asked), trusted_packages(asked))
+    with checked(asked) as names, initialize_config_module("afm_rl.conf", version_base="1.3"):
+        agent = build(compose("config", asked), names)
     assert len(agent.missions)
 
 

@@ -77,7 +77,10 @@ def test_only_finite_actions_inside_the_box_pass(actions, last):
     [
         (torch.zeros(4, 2), "shape (4, 2), expected (4, 3)"),
         (torch.zeros(4, 3, dtype=torch.int64), "type torch.int64, expected torch.float32"),
-        (torch.zeros(4, 3, dtype=torch.complex64), "type torch.complex64, expected torch.float32"),
+        (
+            torch.zeros(4, 3, dtype=torch.complex64),
+            "type torch.complex64, expected real numbers (4, 3)",
+        ),
     ],
 )
 def test_a_malformed_reading_is_no_reading(found, fault):

@@ -3,8 +3,9 @@
 import multiprocessing
 import os
 import signal
+import time
 
-from afm_rl.progress import Bar
+from afm_rl.progress import Bar, waiting
 
 
 def show_one():
@@ -27,3 +28,10 @@ def test_a_process_killed_while_it_shows_progress_stops_no_other():
         process.kill()
         process.join()
         assert process.exitcode == status
+
+
+def test_what_takes_longer_than_expected_is_nearly_done():
+    with waiting("compiling", expected=0.03, every=0.01) as bar:
+        while bar.n < 0.1:
+            time.sleep(0.01)
+    assert 0.03 < bar.n < bar.total < 1.2 * bar.n

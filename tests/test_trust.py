@@ -2,11 +2,19 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.trust import check_composed, check_targets
+from afm_rl.trust import (
+    check_composed,
+    check_targets,
+    conf_folders,
+    find_code,
+    trusted,
+    trusting,
+)
 
 DANGEROUS = """
 os.system os.popen os.execv os.execvp os.spawnl os.remove os.unlink os.rename os.rmdir os.removedirs
@@ -89,6 +97,36 @@ def test_trust_covers_what_a_package_defines_and_nothing_it_imports(tmp_path, mo
             check_targets(hull, trust)
     monkeypatch.setenv("AFM_RL_TRUST", "boat")
     check_targets(hull)
+
+
+def test_a_package_is_found_by_its_path_and_brings_its_settings(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("lib/punt/conf", "raft/conf", "conf"):
+        Path(name).mkdir(parents=True)
+    Path("lib/punt/__init__.py").write_text("Hull = dict")
+    Path("canoe.py").write_text("Hull = dict")
+    before = sys.path[:]
+    with trusting(["lib/punt", "canoe", "raft"]):  # a path, a module, a folder of settings
+        places = [tmp_path / "lib/punt/conf", tmp_path / "conf", tmp_path / "raft/conf"]
+        assert [path.resolve() for path in conf_folders()] == places
+        assert sys.path[: len(before)] == before  # what is installed comes first
+        monkeypatch.chdir("/")
+        assert find_code("x", "punt.Hull") is find_code("x", "canoe.Hull") is dict
+    assert (trusted(), sys.path) == ([], before)
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ("dinghy", "expected a package that is installed, one in .*, or a path that ends in one"),
+        ("lib/dinghy", "expected a package that is installed"),
+        ("lib/torch", "another package of that name comes first, .*torch; rename yours"),
+    ],
+)
+def test_a_package_that_is_not_there_is_named(tmp_path, monkeypatch, entry, words):
+    monkeypatch.chdir(tmp_path)
+    with trusting([entry]), pytest.raises(ConfigurationError, match=rf"trust=\[.*\]: .*{words}"):
+        conf_folders()
 
 
 def test_names_are_checked_without_torch():

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import hydra
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from afm_rl._version import __version__
 from afm_rl.cli.error_messages import explain, one_line
 from afm_rl.cli.launchers import register
 from afm_rl.cli.launchers.base import JobsFailed
-from afm_rl.cli.overrides import relaxed, trusted_packages, with_sweep_folder
-from afm_rl.trust import TRUST, check_composed, trusted
+from afm_rl.cli.overrides import relaxed, with_sweep_folder
+from afm_rl.cli.trusted import checked
 
 _launched: list[bool] = []
 """Whether Hydra is done with the settings."""
@@ -55,28 +52,6 @@ def _explained(sweep: bool = False) -> Iterator[None]:
         sys.exit(1 if isinstance(error, JobsFailed) else 2)
 
 
-@contextmanager
-def _checked(trust: Sequence[str]) -> Iterator[None]:
-    """Check what Hydra composes, before it calls anything that is named there."""
-    load, before = ConfigLoaderImpl.load_configuration, os.environ.get(TRUST)
-
-    @functools.wraps(load)
-    def checked(*args: Any, **kwargs: Any) -> DictConfig:
-        cfg = load(*args, **kwargs)
-        settings: Any = OmegaConf.to_container(cfg, resolve=False)
-        check_composed(settings, trusted())
-        return cfg
-
-    os.environ[TRUST] = ",".join([*trusted(), *trust])  # for processes that this one starts
-    ConfigLoaderImpl.load_configuration = checked  # type: ignore[method-assign]
-    try:
-        yield
-    finally:
-        ConfigLoaderImpl.load_configuration = load  # type: ignore[method-assign]
-        os.environ.pop(TRUST)
-        os.environ.update({} if before is None else {TRUST: before})
-
-
 def main() -> None:
     """Run ``afm-rl``; a mistake in the settings ends in one line and exit status 2."""
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # hand errors to us instead of printing them
@@ -85,6 +60,6 @@ def main() -> None:
         return
     _launched.clear()
     sys.argv[1:] = with_sweep_folder(relaxed(sys.argv[1:]))
-    with _explained(), _checked(trusted_packages(sys.argv[1:])):
+    with _explained(), checked(sys.argv[1:]):
         register()
         _run()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from afm_rl.cli.error_messages import told_by
-from afm_rl.cli.overrides import trusted_packages
+from afm_rl.cli.trusted import checked
 
 NAME = "afm-rl-export"
 ABOUT = """\
@@ -18,7 +18,8 @@ Write planner and correction of a method as machine code, which runs without thi
 The settings are those of afm-rl. The file is a function of tensors: (memory, observation, the
 task's entries such as the goal, noise) -> (memory, action). A memory of zeros begins a mission; the
 file's metadata says how many numbers each argument has. It runs where it was made: on the same kind
-of processor, with the same version of torch, from Python or C++ (examples/deploy/cpp).
+of processor, with the same version of torch, from Python or C++ (examples/deploy/cpp). It is a
+program: load it only where its SHA-256 is the one that is printed.
 """
 ALONE = "planner=null"
 
@@ -51,9 +52,12 @@ def _run(arguments: list[str]) -> None:
     path, alone = check_exportable(out[0]), ALONE in arguments
     given = [text for text in arguments if text != ALONE and not text.startswith("out=")]
     GlobalHydra.instance().clear()
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+    with (
+        checked(given) as packages,
+        initialize_config_module("afm_rl.conf", version_base="1.3"),
+    ):
         cfg = compose("config", given)
-    agent = build(cfg, trusted_packages(given))
+        agent = build(cfg, packages)
     if agent.transform is None:
         raise ConfigurationError(
             "corrector=none: nothing to export; choose a method with a correction, such as "
@@ -77,7 +81,8 @@ def _run(arguments: list[str]) -> None:
         transform.enabled,
         transform.extend_action_box,
     )
-    print("exporting (a minute or two)", flush=True)
+    print("exporting: tracing, then compiling, which takes about six times as long", flush=True)
     controller = Controller(None if alone else agent.planner, policy)
-    export_controller(controller, path)
+    checksum = export_controller(controller, path, cfg.cache)
     print(f"wrote {path}: " + ", ".join(f"{k} ({n})" for k, n in controller.sizes.items()))
+    print(f"sha256 {checksum}: whoever loads this program should ask for it")

@@ -7,10 +7,6 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-
-from afm_rl.trust import check_trust
-
 PARTS = ("dynamics", "updater", "corrector")
 OPTIONAL = "++"  # how Hydra is told to take a setting whether it is there or not
 BESIDE = (
@@ -67,20 +63,6 @@ def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
 def _bare(value: str) -> str:
     """Leave out lists and mappings, whose commas do not sweep."""
     return re.sub(r"\[.*]|\{.*}", "", value)
-
-
-def trusted_packages(arguments: Sequence[str]) -> list[str]:
-    """Return the packages that the command line itself trusts; files cannot.
-
-    Raises:
-        ConfigurationError: if these are no names.
-
-    >>> trusted_packages(["method=physics", "trust=[mine, my.models]"])
-    ['mine', 'my.models']
-    """
-    given = [text for text in arguments if re.match(r"\+{0,2}trust=", text)]
-    found = [each.value() for each in OverridesParser.create().parse_overrides(given)]
-    return [name for names in found for name in check_trust(names)]
 
 
 def optional(overrides: Sequence[str]) -> dict[str, str]:

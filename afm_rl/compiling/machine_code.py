@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import shutil
-import tempfile
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl._version import __version__
+from afm_rl.compiling.programs import Trace, folder_in, keep, loaded, package, recall, trace
 
 
 class MachineCode:
@@ -94,7 +94,8 @@ def compile_module(
     """Return a module as machine code, for any number of missions.
 
     It is compiled ahead of time (AOTInductor), which takes half a minute of one core, and only if
-    the cache does not hold it already for these weights, shapes, settings and versions.
+    the cache does not hold it already for these weights, shapes, settings and versions, with its
+    checksum and in a folder of this user alone; a line says why if it does not run what is there.
 
     Args:
         module: takes tensors whose first dimension counts missions, returns a tuple of such.
@@ -107,13 +108,15 @@ def compile_module(
         The compiled function; None, with a warning, where there is no compiler or it fails.
     """
     try:
-        program = _export(module, inputs) if traced else None
-        digest = _digest(module, inputs, program)
-        path = Path(cache).expanduser() / "compiled" / f"{digest}.pt2"
-        if not path.exists():
-            _compile(module, inputs, program, path)
+        drawn = _trace(module, inputs) if traced else None
+        path = folder_in(cache) / f"{_digest(module, inputs, drawn and drawn.program)}.pt2"
+        code, why = recall(path)
+        if code is None:
+            print(f"{why or 'nothing compiled for this robot yet'}: compiling anew", flush=True)
+            code = _compile(module, inputs, drawn, cache)
+            keep(path, code)
         # What is loaded could be called, but would read its description anew each time.
-        run = torch._inductor.aoti_load_package(str(path)).loader.boxed_run
+        run = loaded(code).loader.boxed_run
         return lambda *given: run(list(given))
     except Exception as error:  # compilers fail in many ways
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -126,38 +129,22 @@ def has_compiler() -> bool:
     return any(shutil.which(name) for name in (os.environ.get("CXX", "c++"), "g++", "clang++"))
 
 
-def _export(module: nn.Module, inputs: Sequence[Tensor]) -> torch.export.ExportedProgram:
+def _trace(module: nn.Module, inputs: Sequence[Tensor]) -> Trace:
     missions = torch.export.Dim("missions", min=1, max=2**20)
-    shapes = (tuple({0: missions} for _ in inputs),)
-    with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return torch.export.export(module, tuple(inputs), dynamic_shapes=shapes)
+    return trace(module, inputs, (tuple({0: missions} for _ in inputs),))
 
 
 def _compile(
-    module: nn.Module,
-    inputs: Sequence[Tensor],
-    program: torch.export.ExportedProgram | None,
-    path: Path,
-) -> None:
+    module: nn.Module, inputs: Sequence[Tensor], traced: Trace | None, cache: str | Path
+) -> bytes:
     if not has_compiler():
         raise RuntimeError("no C++ compiler was found")
-    print("compiling, once for this robot (a minute or so)", flush=True)
-    program = _export(module, inputs) if program is None else program
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            made = torch._inductor.aoti_compile_and_package(
-                program,
-                package_path=str(Path(folder) / path.name),
-                inductor_configs=settings_for(inputs),
-            )
-            found = torch._inductor.aoti_load_package(made)(*inputs)
-            for one, other in zip(found, module(*inputs), strict=True):
-                if not torch.allclose(one, other, rtol=1e-2, atol=1e-2, equal_nan=True):
-                    raise RuntimeError("the compiled function says something else")
-            os.replace(made, path)
+    code = package(traced or _trace(module, inputs), settings_for(inputs), cache)
+    with torch.no_grad():
+        for one, other in zip(loaded(code)(*inputs), module(*inputs), strict=True):
+            if not torch.allclose(one, other, rtol=1e-2, atol=1e-2, equal_nan=True):
+                raise RuntimeError("the compiled function says something else")
+    return code
 
 
 def settings_for(inputs: Sequence[Tensor]) -> dict[str, Any]:

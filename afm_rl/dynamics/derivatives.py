@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+
+ONE_AT_A_TIME = threading.RLock()  # the level of dual numbers is that of the process
 
 
 def derivative(
@@ -14,7 +17,7 @@ def derivative(
 ) -> tuple[Tensor, Tensor]:
     """Return a function's value, and its derivative along the ``tangents`` of its ``inputs``.
 
-    What ``torch.func.jvp`` returns, in a third of its time for small tensors.
+    What ``torch.func.jvp`` returns, in a third of its time for small tensors, and from any thread.
 
     >>> derivative(torch.square, [torch.tensor(3.0)], [torch.tensor(1.0)])
     (tensor(9.), tensor(6.))
@@ -24,7 +27,7 @@ def derivative(
     if torch.compiler.is_compiling():
         found = torch.func.jvp(function, inputs, tangents)
         return found[0], found[1]
-    with forward_ad.dual_level():
+    with ONE_AT_A_TIME, forward_ad.dual_level():
         duals = [forward_ad.make_dual(*pair) for pair in zip(inputs, tangents, strict=True)]
         value, slope = forward_ad.unpack_dual(function(*duals))
     return value, torch.zeros_like(value) if slope is None else slope

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.dynamics.known import KnownDynamics
+from afm_rl.dynamics.mujoco_model import HUGE, actuator_names, read_model, space_of, state_names
 from afm_rl.dynamics.mujoco_physics import changed_model
-from afm_rl.dynamics.mujoco_space import MuJoCoSpace
 from afm_rl.dynamics.per_mission import PerMissionModel
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.regimes import Physics
@@ -30,91 +28,6 @@ STEP = 1e-4  # of finite differences, in half ranges and units of the state: far
 Change = Callable[[Any, tuple[float, ...]], Any]
 NOMINAL = dict(zip(Physics.names, Physics.identity, strict=True))
 MOST_MODELS = 1024  # with changed physics that are kept
-HUGE = 1e9  # MuJoCo resets a simulation that holds larger numbers
-
-
-def read_model(source: Any) -> tuple[Any, int]:
-    """Return a copy of the ``MjModel`` in a source, and the simulation steps per action.
-
-    Args:
-        source: see :class:`MuJoCoDynamics`.
-
-    Raises:
-        ConfigurationError: if there is no model in it, or none with actuators.
-    """
-    if mujoco is None:
-        raise ConfigurationError(
-            "dynamics=mujoco: the package mujoco is missing; install afm-rl[mujoco]"
-        )
-    skip, inner = 1, getattr(source, "unwrapped", source)
-    if isinstance(source, str | Path):
-        found = _parse(source)
-    elif isinstance(getattr(inner, "model", inner), mujoco.MjModel):  # gymnasium, or plain
-        found, skip = getattr(inner, "model", inner), getattr(inner, "frame_skip", 1)
-    elif hasattr(source, "physics"):  # dm_control
-        found = source.physics.model.ptr
-        skip = round(source.control_timestep() / source.physics.timestep())
-    else:
-        raise ConfigurationError(
-            f"dynamics.model={source!r}: expected an MJCF file or string, an mjModel, or a MuJoCo "
-            "environment of gymnasium or dm_control"
-        )
-    if found.nu == 0:
-        raise ConfigurationError(f"dynamics.model={source!r}: expected actuators, found none")
-    return copy.copy(found), skip
-
-
-def _parse(source: str | Path) -> Any:
-    text = str(source)
-    try:
-        if text.lstrip().startswith("<"):
-            return mujoco.MjModel.from_xml_string(text)
-        if not Path(text).is_file():
-            raise ConfigurationError(f"dynamics.model={text}: no such file")
-        return mujoco.MjModel.from_xml_path(text)
-    except ConfigurationError:
-        raise
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise ConfigurationError(f"dynamics.model={text[:80]!r}: {reason}") from error
-
-
-def space_of(model: Any) -> MuJoCoSpace:
-    """Return the state space of an ``MjModel``."""
-    angles, quaternions = [], []
-    for kind, first, limited in zip(
-        model.jnt_type, model.jnt_qposadr, model.jnt_limited, strict=True
-    ):
-        if kind == mujoco.mjtJoint.mjJNT_HINGE and not limited:
-            angles.append(int(first))
-        elif kind == mujoco.mjtJoint.mjJNT_BALL:
-            quaternions.append(int(first))
-        elif kind == mujoco.mjtJoint.mjJNT_FREE:
-            quaternions.append(int(first) + 3)
-    return MuJoCoSpace(model.nq + model.nv + model.na, angles, quaternions)
-
-
-def state_names(model: Any) -> list[str]:
-    """Name positions ``q_JOINT``, velocities ``v_JOINT`` and activations ``w_k``."""
-    places, turn, rates = ("_x", "_y", "_z"), ("_qw", "_qx", "_qy", "_qz"), ("_wx", "_wy", "_wz")
-    positions, velocities = [], []
-    ends: tuple[str, ...]
-    moves: tuple[str, ...]
-    for joint, kind in enumerate(model.jnt_type):
-        name = model.joint(joint).name or str(joint)
-        ends, moves = ("",), ("",)  # of a slide or a hinge
-        if kind == mujoco.mjtJoint.mjJNT_BALL:
-            ends, moves = turn, rates
-        elif kind == mujoco.mjtJoint.mjJNT_FREE:
-            ends, moves = (*places, *turn), (*places, *rates)
-        positions += [f"q_{name}{end}" for end in ends]
-        velocities += [f"v_{name}{end}" for end in moves]
-    return [*positions, *velocities, *(f"w_{k}" for k in range(model.na))]
-
-
-def actuator_names(model: Any) -> list[str]:
-    """Return the names of actuators; those without one are called ``a_k``."""
-    return [model.actuator(k).name or f"a_{k}" for k in range(model.nu)]
 
 
 class Simulator:
@@ -212,7 +125,7 @@ class MuJoCoDynamics(KnownDynamics, PerMissionModel):
             actuators: the controls are ``mix @ action``.
 
     Raises:
-        ConfigurationError: if there is no MuJoCo, or no such model.
+        ConfigurationError: if there is no MuJoCo, no such model, or none that can be simulated.
 
     >>> cart = '''<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="1"/></body>
     ... </worldbody><actuator><motor joint="x"/></actuator></mujoco>'''
@@ -249,6 +162,12 @@ class MuJoCoDynamics(KnownDynamics, PerMissionModel):
         if not isinstance(noise_std, int | float) and len(noise_std) == 2:
             position, velocity = noise_std
             noise_std = [position] * found.nv + [velocity] * found.nv + [position] * found.na
+        start = simulator.rest[None, simulator.state]
+        if not np.isfinite(simulator(start, np.zeros((1, 1, found.nu)))).all():
+            raise ConfigurationError(
+                f"dynamics.model={str(model)[:80]!r}: its first step leads to numbers that are not "
+                "finite; look at its time step, damping, stiffness, and contacts"
+            )
         size = found.nu if mix is None else len(mix[0])
         super().__init__(simulator, space_of(found), size, noise_std)
         controls = None if mix is None else torch.tensor(mix, dtype=torch.float64)

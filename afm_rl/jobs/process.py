@@ -23,7 +23,7 @@ from typing import Any
 from afm_rl.errors import AFMError, causes
 from afm_rl.jobs.layout import LOG, UNFINISHED, is_finished
 from afm_rl.storage.files import locked
-from afm_rl.trust import TRUST
+from afm_rl.trust import trust
 
 START = "forkserver"  # torch is imported once, and jobs are forked from there
 FAILURE, PROGRESS = "failure.txt", "progress.json"  # in the folder of unfinished results
@@ -110,7 +110,7 @@ def work(job: Job) -> None:
         os.dup2(log.fileno(), number)
     sys.stdout = sys.stderr = log
     os.chdir(job.cwd)
-    os.environ[TRUST] = ",".join(job.trust)
+    trust(job.trust)
     try:
         _finish(job.folder)
     except KeyboardInterrupt:  # told to stop

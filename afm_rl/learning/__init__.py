@@ -7,7 +7,6 @@ from afm_rl.learning.hook import UpdaterHook
 from afm_rl.learning.knode_updater import KNODEUpdater
 from afm_rl.learning.learner import Learner
 from afm_rl.learning.loss import InPlaceLoss
-from afm_rl.learning.mass_estimator import MassEstimator
 from afm_rl.learning.nll import GaussianNLLLoss, gaussian_nll
 from afm_rl.learning.obgd import ObGD
 from afm_rl.learning.online_updater import OnlineUpdater
@@ -27,7 +26,6 @@ __all__ = [
     "InPlaceLoss",
     "KNODEUpdater",
     "Learner",
-    "MassEstimator",
     "ObGD",
     "OnlineUpdater",
     "OracleUpdater",

@@ -15,11 +15,12 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from afm_rl.compiling.devices import check_device
+from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
 from afm_rl.learning import GaussianNLLLoss, Updater
 from afm_rl.missions.checks import blaming, check_cost, check_keys, check_label, check_updater
-from afm_rl.missions.factories import Training
+from afm_rl.missions.factories import Training, as_part
 from afm_rl.missions.robot import SHAPE_TRAINING, Robot
 from afm_rl.missions.selection import (
     build_missions,
@@ -33,6 +34,8 @@ from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.transforms import ActionFlowTransform, Guard
 from afm_rl.trust import check_targets
 
+TRANSFORM = ("enabled", "extend_action_box")
+"""Settings of whatever corrector is chosen."""
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
 MOST_STEPS, MOST_MISSIONS = 10_000_000, 1_000_000
 DEFAULTS = {
@@ -146,15 +149,23 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
         with blaming(group):
             return instantiate({**settings[group], **changed}, _convert_="all")(*args)
 
-    dynamics = make("dynamics", robot)
-    corrector = make("corrector", robot, dynamics)
+    dynamics = as_part("dynamics", make("dynamics", robot), DynamicsModel)
+    model = dynamics.module
+    own = {key: value for key, value in settings["corrector"].items() if key not in TRANSFORM}
+    around = {key: value for key, value in settings["corrector"].items() if key in TRANSFORM}
+    with blaming("corrector"):
+        found = instantiate(own, _convert_="all")(robot, dynamics)
+        corrector = as_part("corrector", found, Corrector)
+        transform = None
+        if corrector.module is not None:
+            around["reported_key"] = robot.reported
+            transform = ActionFlowTransform(model, corrector.module, **around)
     shape = {name: value for name, value in settings["robot"].items() if name in SHAPE_TRAINING}
     trainings = [
         part.training._replace(settings=[shape, *part.training.settings])
         for part in (dynamics, corrector)
         if part.training is not None
     ]
-    model, transform = dynamics.module, corrector.module
     with blaming("cost"):
         cost = instantiate(settings["cost"], _convert_="all")
         cost = cost if isinstance(cost, Cost) else cost(robot)

@@ -121,7 +121,7 @@ def check_updater(updater: Updater, model: DynamicsModel) -> None:
     if "regime" in (wanted, given):
         raise ConfigurationError(
             "dynamics=oracle and an updater that sets its regime belong together: choose both, "
-            "dynamics=oracle with updater=oracle or updater=mass, or neither"
+            "dynamics=oracle with updater=oracle, or neither"
         )
     raise ConfigurationError(
         f"dynamics: a calibrated model stays as it is but for its calibration, and "

@@ -1,7 +1,8 @@
 """Makers of the parts that a method is composed of, for the configuration groups.
 
-Each takes the robot first and its own settings by name. A part that needs training carries
-it as a :class:`Training`, so that everything is built and checked before anything is trained.
+Each takes the robot first, a corrector also the model, and its own settings by name, and returns a
+module. One that needs training comes as a :class:`Part` with its :class:`Training`, so that all is
+built and checked before anything is trained.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from afm_rl.correction import ActionFlow, Corrector, L1Augmentation, LeastSquares, PaperFlow
+from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
 from afm_rl.dynamics import (
     KNODE,
     Calibrated,
@@ -25,7 +26,7 @@ from afm_rl.dynamics import (
     Quadrotor,
     UnknownDynamics,
 )
-from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_flag
+from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_flag, check_instance
 from afm_rl.flow import train_flow
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
@@ -33,7 +34,6 @@ from afm_rl.missions.collected import fit_collected
 from afm_rl.missions.robot import Robot
 from afm_rl.planning.costs import SATURATIONS, KnownReward
 from afm_rl.storage.artefacts import load_artefact
-from afm_rl.transforms import ActionFlowTransform
 
 FLOW_UNIT = "shares of the largest action"
 
@@ -63,31 +63,44 @@ class Part(NamedTuple):
     """What its predictions before the missions depend on; None: on the nominal physics alone."""
 
 
-def physics(robot: Robot) -> Part:
-    """Return the robot's nominal physics."""
-    return Part(_known(robot))
+def as_part(group: str, found: Any, kind: type) -> Part:
+    """Return what a maker gave as a part: a bare module needs no training.
+
+    Raises:
+        ConfigurationError: if it is neither.
+    """
+    if isinstance(found, Part):
+        return found
+    return Part(check_instance(f"{group}: its maker", found, kind))
 
 
-def oracle(robot: Robot, base: Callable[[Robot], Part]) -> Part:
+def physics(robot: Robot) -> DynamicsModel:
+    """Return the robot's nominal physics, if there are any."""
+    if isinstance(robot.model, UnknownDynamics):
+        robot.model(torch.zeros(0), torch.zeros(0))  # says what to do
+    return robot.model
+
+
+def oracle(robot: Robot, base: Callable[[Robot], Part | DynamicsModel]) -> Part:
     """Return another model seen through the true regime.
 
     Args:
         robot: whose regime it is.
         base: makes the model.
     """
-    part = base(robot)
+    part = as_part("dynamics.base", base(robot), DynamicsModel)
     settings = {"model": "oracle", **(part.settings or {})}
     return part._replace(module=Oracle(part.module, robot.regime), settings=settings)
 
 
-def calibrated(robot: Robot, base: Callable[[Robot], Part]) -> Part:
+def calibrated(robot: Robot, base: Callable[[Robot], Part | DynamicsModel]) -> Part:
     """Return another model, frozen, with a calibration per mission.
 
     Args:
         robot: whose action box gives the unit.
         base: makes the model.
     """
-    part = base(robot)
+    part = as_part("dynamics.base", base(robot), DynamicsModel)
     low, high = robot.usual_box
     return part._replace(module=Calibrated(part.module, (high - low) / 2))
 
@@ -181,18 +194,15 @@ def afm(
     dynamics: Part,
     train: Mapping[str, Any] | None = None,
     checkpoint: str | None = None,
-    enabled: bool = True,
-    extend_action_box: bool = True,
     **settings: Any,
 ) -> Part:
-    """Return the transform with the universal action flow; ``train`` refines it on the robot."""
+    """Return the universal action flow; ``train`` refines it on the robot."""
     place, scale = list(robot.place), robot.place_scale
     flow = ActionFlow(*robot.action_box, place=place, place_scale=scale, **settings)
     if train is None and checkpoint is None:
-        return Part(_transform(robot, dynamics, flow, enabled, extend_action_box))
+        return Part(flow)
     own: dict[str, Any] = {k: v for k, v in settings.items() if k in ("hypotheses", "rows")}
-    training = _training(flow, robot, dynamics, train or {}, checkpoint, own, FLOW_UNIT)
-    return Part(_transform(robot, dynamics, flow, enabled, extend_action_box), training)
+    return Part(flow, _training(flow, robot, dynamics, train or {}, checkpoint, own, FLOW_UNIT))
 
 
 def paper_flow(
@@ -200,11 +210,9 @@ def paper_flow(
     dynamics: Part,
     train: Mapping[str, Any],
     checkpoint: str | None = None,
-    enabled: bool = True,
-    extend_action_box: bool = True,
     **settings: Any,
 ) -> Part:
-    """Return the transform with the published flow, to be trained over the dynamics model.
+    """Return the published flow, to be trained over the dynamics model.
 
     Raises:
         ConfigurationError: if states turn: the flow reads errors as differences of numbers.
@@ -217,45 +225,17 @@ def paper_flow(
     size, features = model.state_size, list(robot.features)
     flow = PaperFlow(*robot.action_box, features=features, state_size=size, **settings)
     own = _without(settings, "gate", "steps", "error_action", "wrap", "latch")
-    training = _training(flow, robot, dynamics, train, checkpoint, own, "action units")
-    return Part(_transform(robot, dynamics, flow, enabled, extend_action_box), training)
+    return Part(flow, _training(flow, robot, dynamics, train, checkpoint, own, "action units"))
 
 
-def least_squares(
-    robot: Robot,
-    dynamics: Part,
-    enabled: bool = True,
-    extend_action_box: bool = True,
-    **settings: Any,
-) -> Part:
-    """Return the transform with least squares with forgetting, which need no training."""
-    corrector = LeastSquares(*robot.action_box, **settings)
-    return Part(_transform(robot, dynamics, corrector, enabled, extend_action_box))
+def least_squares(robot: Robot, dynamics: Part, **settings: Any) -> LeastSquares:
+    """Return least squares with forgetting, which need no training."""
+    return LeastSquares(*robot.action_box, **settings)
 
 
-def l1(
-    robot: Robot,
-    dynamics: Part,
-    enabled: bool = True,
-    extend_action_box: bool = True,
-    **settings: Any,
-) -> Part:
-    """Return the transform with L1 adaptive augmentation, which needs no training."""
-    settings["dt"] = robot.dt if settings.get("dt") is None else settings["dt"]
-    corrector = L1Augmentation(*robot.action_box, **settings)
-    return Part(_transform(robot, dynamics, corrector, enabled, extend_action_box))
-
-
-def _transform(
-    robot: Robot, dynamics: Part, corrector: Corrector, enabled: bool, extend_action_box: bool
-) -> ActionFlowTransform:
-    return ActionFlowTransform(
-        dynamics.module,
-        corrector,
-        enabled=enabled,
-        extend_action_box=extend_action_box,
-        reported_key=robot.reported,
-    )
+def l1(robot: Robot, dynamics: Part, dt: float | None = None, **settings: Any) -> L1Augmentation:
+    """Return L1 adaptive augmentation, which needs no training."""
+    return L1Augmentation(*robot.action_box, dt=robot.dt if dt is None else dt, **settings)
 
 
 def _training(
@@ -286,13 +266,6 @@ def _training(
 
     shape = {**own, "train": settings}
     return Training("flow", flow, train, unit, [dynamics.settings or {}, shape])
-
-
-def _known(robot: Robot) -> DynamicsModel:
-    """Return the nominal physics, if there are any."""
-    if isinstance(robot.model, UnknownDynamics):
-        robot.model(torch.zeros(0), torch.zeros(0))  # says what to do
-    return robot.model
 
 
 def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:

@@ -5,18 +5,27 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import Composite, TensorSpec
-from torchrl.envs import FrameSkipTransform, Transform
+from torchrl.envs import FrameSkipTransform
 
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.spaces.keys import as_key, as_keys
-from afm_rl.transforms.memory import begin, correct, corrector_for, entries_spec, warn_of_old
+from afm_rl.transforms.carried import CarriedTransform
+from afm_rl.transforms.memory import (
+    begin,
+    correct,
+    corrector_for,
+    entries_spec,
+    observe,
+    warn_of_old,
+)
 
 
-class ActionFlowTransform(Transform):
+class ActionFlowTransform(CarriedTransform):
     r"""Action Flow Matching: the planned action goes in, the action that does it comes out.
 
     On the way to the environment the transform asks the dynamics model what the last executed
@@ -73,6 +82,8 @@ class ActionFlowTransform(Transform):
     torch.Size([5, 2])
     """
 
+    essential = ("memory",)
+
     def __init__(
         self,
         model: DynamicsModel,
@@ -84,27 +95,16 @@ class ActionFlowTransform(Transform):
         extend_action_box: bool = True,
         reported_key: NestedKey | None = None,
     ) -> None:
-        states = _one_key("in_keys", ["observation"] if in_keys is None else in_keys)
-        actions = _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv)
-        super().__init__(in_keys=states, in_keys_inv=actions)
+        state = _one_key("in_keys", ["observation"] if in_keys is None else in_keys)
+        action = _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv)
+        super().__init__(state, action, prefix)
         self.__dict__["model"] = check_instance("transform.model", model, DynamicsModel)
         if corrector is not None:
             corrector = corrector_for("transform", model, corrector, None)
         self._corrector = corrector
-        self.prefix = as_key(prefix)
         self.enabled = check_flag("transform.enabled", enabled)
         self.extend_action_box = check_flag("transform.extend_action_box", extend_action_box)
         self.reported_key = None if reported_key is None else as_key(reported_key)
-
-    @property
-    def observation_key(self) -> NestedKey:
-        """Key of the state."""
-        return self.in_keys[0]
-
-    @property
-    def action_key(self) -> NestedKey:
-        """Key of the action."""
-        return self.in_keys_inv[0]
 
     @property
     def corrector(self) -> Corrector:
@@ -117,14 +117,6 @@ class ActionFlowTransform(Transform):
                 )
             self._corrector = corrector_for("transform", self.model, None, self._action_spec)
         return self._corrector
-
-    def key(self, *names: str) -> NestedKey:
-        """Return the key of an entry."""
-        return unravel_key((self.prefix, *names))
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the tensordict as it is: a replay buffer or a policy has no step to watch."""
-        return tensordict
 
     @property
     def _action_spec(self):
@@ -141,18 +133,19 @@ class ActionFlowTransform(Transform):
             )
         return found
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.parent is None:  # inside a replay buffer: nothing to execute
-            return tensordict
-        planned = tensordict.get(self.action_key)
+    def act(self, tensordict: TensorDictBase, memory: Tensor) -> TensorDictBase:
+        """Replace the planned action by the corrected one."""
+        warn_of_old(tensordict, self.prefix)
+        planned = tensordict.get(self.action_key, None)
         entries = correct(
-            self._recall(tensordict),
+            memory,
             planned,
             self.model,
             self.corrector,
             self._action_spec,
             self.enabled,
             self.extend_action_box,
+            self.action_key,
         )
         tensordict.set(self.action_key, entries.get("executed_action").to(planned.dtype))
         return tensordict.set(self.prefix, entries)
@@ -163,8 +156,8 @@ class ActionFlowTransform(Transform):
         if self.reported_key is not None:
             given = next_tensordict.get(self.reported_key).to(memory.dtype)
             memory = self.corrector.reported(memory, given)
-        state = next_tensordict.get(self.observation_key).to(memory.dtype)
-        entries["memory"] = self.corrector.observe(memory, state)
+        state = next_tensordict.get(self.observation_key, None)
+        entries["memory"] = observe(memory, state, self.model, self.corrector, self.observation_key)
         # Of the device that the next tensordict names: else every entry is moved to where it is.
         device, batch = next_tensordict.device, next_tensordict.batch_size
         return next_tensordict.set(self.prefix, TensorDict(entries, batch, device=device))
@@ -177,16 +170,6 @@ class ActionFlowTransform(Transform):
         if state is None:
             self._entry("in_keys", self.parent.full_observation_spec)
         return tensordict_reset.set(self.prefix, begin(self.corrector, state, self._action_spec))
-
-    def _recall(self, tensordict: TensorDictBase):
-        memory = tensordict.get(self.key("memory"), None)
-        if memory is None:
-            raise KeyError(
-                f"ActionFlowTransform: no {self.prefix!r} in the tensordict; start from "
-                "env.reset(), and carry its entries on"
-            )
-        warn_of_old(tensordict, self.prefix)
-        return memory
 
     def _check_process(self) -> None:
         """Refuse a copy of a model that learns in another process: it would stay behind."""
@@ -211,7 +194,8 @@ class ActionFlowTransform(Transform):
                     "it, and give it a model of the whole stride"
                 )
 
-    def _with_memory(self, spec: Composite) -> Composite:
+    def memory_spec(self, spec: Composite, executed: bool) -> Composite:
+        """Return the specs of the entries."""
         self._check_order()
         found = self._entry("in_keys", self.parent.full_observation_spec)
         if not found.shape or found.shape[-1] != self.model.state_size:
@@ -220,20 +204,11 @@ class ActionFlowTransform(Transform):
                 f"{tuple(found.shape)}, but the dynamics model's state has "
                 f"{self.model.state_size} numbers"
             )
-        entries = entries_spec(self.corrector, self.model.state_size, spec.shape, found.dtype)
-        spec[self.prefix] = entries.to(spec.device)
-        return spec
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return self._with_memory(observation_spec)
-
-    def transform_state_spec(self, state_spec: Composite) -> Composite:
-        """Add the entries: they are an input of the next step."""
-        return self._with_memory(state_spec)
+        return entries_spec(self.corrector, self.model.state_size, spec.shape, found.dtype)
 
 
-def _one_key(name: str, keys: Sequence[NestedKey]) -> list[NestedKey]:
+def _one_key(name: str, keys: Sequence[NestedKey]) -> NestedKey:
     found = as_keys([keys] if isinstance(keys, str) else keys)
     if len(found) != 1:
         raise ConfigurationError(f"ActionFlowTransform: {name}={keys!r}: expected one key")
-    return found
+    return found[0]

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import os
-import tempfile
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,8 +14,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from afm_rl.compiling.machine_code import has_compiler, settings_for
+from afm_rl.compiling.programs import checksum_of, package, trace
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.planning.sampling_planner import SamplingPlanner
+from afm_rl.storage.files import write_whole
 from afm_rl.streams import Streams
 from afm_rl.transforms.policy import ActionFlowPolicy
 
@@ -182,47 +181,42 @@ def check_exportable(path: str | Path) -> Path:
     return path
 
 
-def export_controller(controller: Controller, path: str | Path) -> Path:
+def export_controller(
+    controller: Controller, path: str | Path, cache: str | Path = "~/.cache/afm_rl"
+) -> str:
     """Write a controller as machine code (``.pt2``), which torch runs without this library.
 
     Its metadata names the arguments and their sizes (``memory:526 observation:3 ...``) and the
-    bound of the noise. It takes a minute or two of one core, and a C++ compiler.
+    bound of the noise. It takes a minute or two of one core, and a C++ compiler. The file is a
+    program: who loads it should ask for the checksum that is returned.
 
     Args:
         controller: what to export, with weights and settings as they are now.
         path: the file, ``.pt2``.
+        cache: folder of what the compiler keeps for the next time.
+
+    Returns:
+        The SHA-256 of the file.
 
     Raises:
         ConfigurationError: where there is no compiler, or a part cannot be exported.
     """
     path = check_exportable(path)
-    example = tuple(torch.zeros(n).to(controller.start) for n in controller.sizes.values())
+    example = [torch.zeros(n).to(controller.start) for n in controller.sizes.values()]
     about = {
         "arguments": " ".join(f"{name}:{size}" for name, size in controller.sizes.items()),
         "noise_bound": str(controller.noise_bound),
         "dtype": str(controller.start.dtype).removeprefix("torch."),
     }
-    with (
-        torch.no_grad(),
-        warnings.catch_warnings(),
-        tempfile.TemporaryDirectory(dir=path.parent) as folder,
-    ):
-        warnings.simplefilter("ignore")
-        try:
-            program = torch.export.export(controller, example)
-        except Exception as error:  # it says in many ways that code cannot be traced
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ConfigurationError(
-                f"export: planner, model or corrector decide by numbers or leave torch, so they "
-                f"cannot be exported: {reason}"
-            ) from error
-        made = torch._inductor.aoti_compile_and_package(
-            program,
-            package_path=str(Path(folder) / path.name),
-            inductor_configs={
-                "aot_inductor.metadata": about,
-                **settings_for([controller.policy.action_spec.zero()]),
-            },
-        )
-        os.replace(made, path)
-    return path
+    try:
+        traced = trace(controller, example)
+    except Exception as error:  # it says in many ways that code cannot be traced
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ConfigurationError(
+            "export: planner, model or corrector decide by numbers or leave torch, so they "
+            f"cannot be exported: {reason}"
+        ) from error
+    settings = settings_for([controller.policy.action_spec.zero()])
+    code = package(traced, {"aot_inductor.metadata": about, **settings}, cache)
+    write_whole(path, code)
+    return checksum_of(code)

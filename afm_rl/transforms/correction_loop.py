@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -20,39 +20,22 @@ from afm_rl.correction.pairs import PairCorrector
 from afm_rl.diagnosis import explain
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
 from afm_rl.errors import ConfigurationError, check_flag
+from afm_rl.faults import fault_of, safe_action
 from afm_rl.learning.watching import Watching
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.transforms.memory import begin, correct, corrector_for
+from afm_rl.transforms.memory import begin, computable, correct, corrector_for, observe
 
 Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str
 State = Callable[[Any, Any], Any]
 AS_EXPECTED = "as the model expects"
-ENDS = {"planned": "action", "executed": "action", "predicted": "effect"}
-
-
-class Told(dict[str, Any]):
-    """What is known of a step; its ``diagnosis``, some milliseconds, is made when it is asked for.
-
-    >>> told = Told({"corrects": False}, lambda: "healthy")
-    >>> told["diagnosis"], told["corrects"]
-    ('healthy', False)
-    """
-
-    def __init__(self, known: Mapping[str, Any], diagnose: Callable[[], Any]) -> None:
-        super().__init__(known)
-        self._diagnose = diagnose
-
-    def __missing__(self, key: str) -> Any:
-        if key != "diagnosis":
-            raise KeyError(key)
-        self[key] = self._diagnose()
-        return self[key]
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Told:
-        return Told(deepcopy(dict(self), memo), self._diagnose)
-
-    def __reduce__(self) -> Any:
-        return dict, ({**self, "diagnosis": self["diagnosis"]},)
+SHOWN = {
+    "planned": "planned_action",
+    "executed": "executed_action",
+    "predicted": "predicted_effect",
+    "corrects": "misaligned",
+    "innovation": "innovation",
+}
+"""What ``info["afm"]`` has of the entries."""
 
 
 class CorrectionLoop:
@@ -107,7 +90,6 @@ class CorrectionLoop:
         names = self.model.names[1] if isinstance(self.model, MuJoCoDynamics) else None
         self.names = names or [f"actuator {k}" for k in range(actions.shape[0])]
         self.entries: Any = None  # a tensordict, from the first reset on
-        self.told: Told = Told({}, lambda: AS_EXPECTED)
         self.random = np.random.default_rng(0)
 
     @property
@@ -115,10 +97,16 @@ class CorrectionLoop:
         """Is there no model yet?"""
         return self.watching is not None and self.watching.fitted is None
 
+    @property
+    def state_shape(self) -> tuple[int, ...] | None:
+        """Shape of one state, once it is known."""
+        return None if self.entries is None else tuple(self.states.shape[1:])
+
     @torch.no_grad()
-    def begin(self, states: Any, rows: np.ndarray | None = None, seed: int | None = None) -> None:
+    def begin(
+        self, states: Tensor, rows: np.ndarray | None = None, seed: int | None = None
+    ) -> None:
         """Begin episodes in ``states`` ``(N, S)``; only in ``rows`` ``(N,)``, if given."""
-        states = _tensor(states)
         if seed is not None:
             self.random = np.random.default_rng(seed)
         if self.entries is None:
@@ -129,12 +117,10 @@ class CorrectionLoop:
         fresh = begin(self.corrector, states, self.spec)
         if rows is None or self.entries is None:
             self.entries, self.states = fresh, states
-            self.shown, self.odd = fresh.get("memory"), np.zeros(len(states), dtype=bool)
         else:
             mask = torch.from_numpy(rows)
             self.entries = torch.where(mask, fresh, self.entries)
             self.states = torch.where(mask.unsqueeze(-1), states, self.states)
-            self.odd = self.odd & ~rows
         self.told = self._tell()
 
     def _complete(self, states: Tensor) -> None:
@@ -156,74 +142,80 @@ class CorrectionLoop:
         self.corrector.to(states.dtype)
 
     @torch.no_grad()
-    def act(self, planned: np.ndarray) -> np.ndarray:
+    def act(self, planned: Tensor) -> np.ndarray:
         """Return what to execute instead of ``planned`` ``(N, A)``."""
         if self.entries is None:
             raise ResetNeeded("call reset() before step()")
-        wanted = torch.as_tensor(planned).to(self.states)
         if self.watching and self.learning:
-            low, high = self.spec.space.low, self.spec.space.high
-            noise = self.random.standard_normal(wanted.shape) * self.watching.noise
-            executed = wanted + torch.from_numpy(noise).to(wanted) * (high - low) / 2
-            executed = executed.clamp(low, high)
-            found = {"planned": wanted, "executed": executed, "predicted": executed}
-            self.entries.update({f"{name}_{ENDS[name]}": value for name, value in found.items()})
+            self._explore(planned)
         else:
             memory, how = self.entries.get("memory"), (self.spec, self.enabled)
-            self.entries = correct(memory, wanted, self.model, self.corrector, *how)
-            self._remember()
+            self.entries = correct(memory, planned, self.model, self.corrector, *how)
         self.told = self._tell()
         return self.told["executed"].astype(self.space.dtype)
 
+    def _explore(self, planned: Tensor) -> None:
+        """Execute plans ``(N, A)`` with noise, which shows what actions do."""
+        low, high = self.spec.space.low, self.spec.space.high
+        wanted = computable(planned, low, high, self.states.dtype)
+        noise = self.random.standard_normal(wanted.shape) * self.watching.noise  # type: ignore[union-attr]
+        noisy = wanted + torch.from_numpy(noise).to(wanted) * (high - low) / 2
+        executed, _ = safe_action(noisy, low, high, self.entries.get("executed_action"))
+        found = {"planned": wanted, "executed": executed, "predicted": executed}
+        self.entries.update({SHOWN[name]: value for name, value in found.items()})
+
     @torch.no_grad()
-    def observe(self, states: Any, fresh: np.ndarray | None = None) -> None:
+    def observe(self, states: Tensor, fresh: np.ndarray | None = None) -> None:
         """Add what the actions led to, ``(N, S)``; where ``fresh`` ``(N,)``, an episode began."""
-        states, entries = _tensor(states), self.entries
-        fresh = np.zeros(len(states), dtype=bool) if fresh is None else fresh
+        fresh, entries = np.zeros(len(states), dtype=bool) if fresh is None else fresh, self.entries
         if self.watching and self.learning:
             executed, valid = entries.get("executed_action"), torch.from_numpy(~fresh)
             self.watching.add(self.states, executed, states, valid)
         else:
-            entries.set("memory", self.corrector.observe(entries.get("memory"), states))
+            memory = observe(entries.get("memory"), states, self.model, self.corrector)
+            entries.set("memory", memory)
         self.states, told = states, self.told
         if fresh.any():
             self.begin(states, fresh)
             self.told = told
 
-    def _remember(self) -> None:
-        """Keep the pairs of where actions are corrected, for a diagnosis."""
-        misaligned, memory = self.entries.get("misaligned"), self.entries.get("memory")
-        if bool(misaligned.any()) and isinstance(self.corrector, PairCorrector):
-            self.shown = torch.where(misaligned.unsqueeze(-1), memory, self.shown)
-            self.odd = self.odd | misaligned.numpy()
+    def diagnosis(self, row: int) -> str:
+        """Say in words what the pairs that an environment remembers show of its actuators."""
+        corrects = self.entries is not None and bool(self.entries.get("misaligned")[row])
+        if not corrects or not isinstance(self.corrector, PairCorrector):
+            return AS_EXPECTED
+        memory, size = self.entries.get("memory")[row], len(self.names)
+        pairs = self.corrector.unpack(memory, self.states.shape[-1])["pairs"][:, : 3 * size + 1]
+        executed, effective, std, valid = (x.numpy() for x in pairs.split([size, size, size, 1], 1))
+        use, step = valid[:, 0] > 0, getattr(self.model, "dt", 1.0)
+        return str(explain(executed[use], effective[use], self.names, std[use], step))
 
-    def _diagnosis(self, memory: Tensor, odd: np.ndarray) -> np.ndarray:
-        """Say in words what the pairs of a memory ``(N, P)`` show, of ``odd`` rows ``(N,)``."""
-        words = np.full(len(odd), AS_EXPECTED, dtype=object)
-        for row in odd.nonzero()[0]:
-            parts, size = self.corrector.unpack(memory[row], self.states.shape[-1]), len(self.names)
-            pairs = parts["pairs"][:, : 3 * size + 1].split([size, size, size, 1], -1)
-            executed, effective, std, valid = (part.numpy() for part in pairs)
-            use, step = valid[:, 0] > 0, getattr(self.model, "dt", 1.0)
-            words[row] = str(explain(executed[use], effective[use], self.names, std[use], step))
-        return words
-
-    def _tell(self) -> Told:
+    def _tell(self) -> dict[str, np.ndarray]:
         """Return what is known of the newest step, ``(N, ...)`` each."""
-        told: dict[str, Any] = {
-            name: self.entries.get(f"{name}_{end}").numpy().copy() for name, end in ENDS.items()
-        }
-        corrects = self.entries.get("misaligned").numpy() & self.enabled
-        told |= {"corrects": corrects, "innovation": self.entries.get("innovation").numpy().copy()}
+        told = {name: self.entries.get(key).numpy().copy() for name, key in SHOWN.items()}
+        told["corrects"] &= self.enabled
         if self.watching:
-            told["learned"] = np.full(len(corrects), not self.learning)
-        shown, odd = self.shown, self.odd
-        return Told(told, lambda: self._diagnosis(shown, odd))
+            told["learned"] = np.full(len(told["corrects"]), not self.learning)
+        return told
 
 
-def _tensor(states: Any) -> Tensor:
-    """Return states as a tensor of real numbers, a copy."""
-    found = torch.tensor(np.asarray(states))
+def as_numbers(name: str, given: Any, shape: Sequence[int] | None) -> Tensor:
+    """Return real numbers of a shape (None: of any) as a tensor, a copy.
+
+    Raises:
+        ConfigurationError: for anything else, naming what was given and what was expected.
+
+    >>> as_numbers("action", [1, 0.5], (2,))
+    tensor([1.0000, 0.5000], dtype=torch.float64)
+    """
+    try:
+        numbers = np.asarray(given)
+    except ValueError:  # lists of several lengths
+        numbers = np.asarray(None)
+    found: Any = torch.tensor(numbers) if numbers.dtype.kind in "iufcb" else given
+    fault = fault_of(found, np.shape(numbers) if shape is None else shape)
+    if fault:
+        raise ConfigurationError(f"ActionFlowWrapper: {name}: {fault}")
     return found if found.is_floating_point() else found.to(torch.get_default_dtype())
 
 

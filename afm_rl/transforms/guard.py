@@ -6,17 +6,24 @@ import math
 import warnings
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
-from torchrl.envs import Transform
 
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.faults import PATIENCE, as_reading, count_repeats, safe_action, trusted
+from afm_rl.faults import (
+    PATIENCE,
+    as_reading,
+    check_numbers,
+    count_repeats,
+    safe_action,
+    trusted,
+)
 from afm_rl.spaces.keys import as_key
+from afm_rl.transforms.carried import CarriedTransform
 
 
-class Guard(Transform):
+class Guard(CarriedTransform):
     r"""Finite actions inside the action spec, whatever came before; and a look at the readings.
 
     .. math:: a_\mathrm{exec} = \min(\max(a, l), h), \quad
@@ -61,36 +68,16 @@ class Guard(Transform):
         stamp_key: NestedKey | None = None,
         patience: float = PATIENCE,
     ) -> None:
-        self.observation_key, self.action_key = as_key(observation_key), as_key(action_key)
-        super().__init__(in_keys=[self.observation_key], in_keys_inv=[self.action_key])
-        self.prefix = as_key(prefix)
+        super().__init__(observation_key, action_key, prefix)
         self.stamp_key = None if stamp_key is None else as_key(stamp_key)
         if patience != math.inf:
             check_number("patience", patience, low=0.0)
         self.patience = math.inf if stamp_key is not None else patience
 
-    def key(self, name: str) -> NestedKey:
-        """Return the key of an entry of the memory."""
-        return unravel_key((self.prefix, name))
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the tensordict as it is: a replay buffer or a policy executes nothing."""
-        return tensordict
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.parent is None:  # inside a replay buffer: nothing to execute
-            return tensordict
-        memory = tensordict.get(self.prefix, None)
-        if memory is None:
-            raise KeyError(
-                f"Guard: no {self.prefix!r} in the tensordict; start from env.reset(), and carry "
-                "its entries on"
-            )
-        action, last = tensordict.get(self.action_key), memory.get("executed_action")
-        if action.shape != last.shape:
-            raise ConfigurationError(
-                f"{self.action_key!r}: shape {tuple(action.shape)}, expected {tuple(last.shape)}"
-            )
+    def act(self, tensordict: TensorDictBase, memory: TensorDictBase) -> TensorDictBase:
+        """Let only an action pass that can be executed."""
+        last = memory.get("executed_action")
+        action = check_numbers(self.action_key, tensordict.get(self.action_key, None), last.shape)
         space = self._action_spec.space
         executed, held = safe_action(action, space.low, space.high, last)
         memory = memory.clone(recurse=False).set("executed_action", executed).set("held", held)
@@ -115,7 +102,8 @@ class Guard(Transform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         reading = tensordict_reset.get(self.observation_key)
-        memory = self._memory_spec(tensordict_reset.batch_size).to(reading.device).zero()
+        spec = Composite(shape=tensordict_reset.batch_size)
+        memory = self.memory_spec(spec).to(reading.device).zero()
         space = self._action_spec.space
         rest, _ = safe_action(memory["executed_action"], space.low, space.high, torch.zeros(()))
         memory.update({"executed_action": rest, "sound": torch.ones_like(memory["sound"])})
@@ -133,7 +121,9 @@ class Guard(Transform):
     def _action_spec(self) -> TensorSpec:
         return self.parent.full_action_spec[self.action_key]
 
-    def _memory_spec(self, batch: torch.Size) -> Composite:
+    def memory_spec(self, spec: Composite, executed: bool = True) -> Composite:
+        """Return the specs of the memory."""
+        batch = spec.shape
         action = self.parent.full_action_spec_unbatched[self.action_key]
         seen = self.parent.full_observation_spec_unbatched
         reading = seen[self.observation_key]
@@ -153,14 +143,3 @@ class Guard(Transform):
         if self.stamp_key is not None:
             found["stamp"] = Unbounded(batch, dtype=seen[self.stamp_key].dtype)
         return found
-
-    def _with_memory(self, spec: Composite) -> Composite:
-        spec[self.prefix] = self._memory_spec(spec.shape).to(spec.device)
-        return spec
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return self._with_memory(observation_spec)
-
-    def transform_state_spec(self, state_spec: Composite) -> Composite:
-        """Add the memory: it is an input of the next step."""
-        return self._with_memory(state_spec)

@@ -7,13 +7,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from torch import Tensor
 
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning.watching import Watching
-from afm_rl.transforms.correction_loop import CorrectionLoop, Model, State, Told
+from afm_rl.transforms.correction_loop import CorrectionLoop, Model, State, as_numbers
 
 
 class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
@@ -25,8 +26,8 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
 
     ``info["afm"]`` has, after each step, ``planned``, ``executed`` and ``predicted`` ``(A,)``, the
     last being the effect that the executed action is expected to have; ``corrects``, whether the
-    planned action was replaced by the corrector's; the ``innovation``, in standard deviations of
-    the model; and, when it is asked for, the ``diagnosis`` of the actuators in words.
+    planned action was replaced by the corrector's; and the ``innovation``, in standard deviations
+    of the model. :attr:`diagnosis` says in words what the actuators seem to do.
 
     What the model takes for the state is, with ``"mujoco"`` or a
     :class:`~afm_rl.dynamics.MuJoCoDynamics`, the whole state of the environment's simulation, else
@@ -47,7 +48,8 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         enabled: False to watch only.
 
     Raises:
-        ConfigurationError: for spaces or a model that cannot be used, or do not fit each other.
+        ConfigurationError: for spaces or a model that cannot be used, or do not fit each other;
+            at a step, for actions or states that are not real numbers of the right shape.
 
     >>> env = ActionFlowWrapper(gymnasium.make("Pendulum-v1"), "learn")
     >>> env.reset(seed=0)[1]["afm"]["learned"]
@@ -86,7 +88,8 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
 
     def step(self, action: Any):
         """Execute the corrected action."""
-        executed = self._loop.act(np.asarray(action)[None])[0]
+        planned = as_numbers("action", action, self.action_space.shape)
+        executed = self._loop.act(planned[None])[0]
         observation, reward, terminated, truncated, info = self.env.step(executed)
         self._loop.observe(self._state(observation))
         return observation, reward, terminated, truncated, {**info, "afm": self._told()}
@@ -96,14 +99,18 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         """What has been learned, with ``model="learn"``."""
         return self._loop.watching
 
-    def _state(self, observation: Any) -> np.ndarray:
-        return np.asarray(self._loop.state(self.env, observation))[None]
+    @property
+    def diagnosis(self) -> str:
+        """What the actuators seem to do, in words; takes some milliseconds."""
+        return self._loop.diagnosis(0)
+
+    def _state(self, observation: Any) -> Tensor:
+        state = self._loop.state(self.env, observation)
+        return as_numbers("observation", state, self._loop.state_shape)[None]
 
     def _told(self) -> dict[str, Any]:
-        told = self._loop.told
-        found = {name: value[0] for name, value in told.items()}
-        known = {k: v.item() if isinstance(v, np.generic) else v for k, v in found.items()}
-        return Told(known, lambda: told["diagnosis"][0])
+        told = {name: value[0] for name, value in self._loop.told.items()}
+        return {k: v.item() if isinstance(v, np.generic) else v for k, v in told.items()}
 
 
 class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
@@ -112,6 +119,10 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
     As :class:`ActionFlowWrapper`, with arrays ``(N, ...)``, each environment with a memory of its
     own that an automatic reset empties, in whichever mode. ``state(env, observations)`` returns
     ``(N, S)``. ``infos["_afm"]`` ``(N,)`` says in which environments a step was made.
+
+    Raises:
+        ConfigurationError: as :class:`ActionFlowWrapper`; and if the vector does not say in its
+            metadata when it resets environments that ended.
 
     >>> envs = gymnasium.make_vec("Pendulum-v1", num_envs=2, vectorization_mode="sync")
     >>> envs = ActionFlowVectorWrapper(envs, "learn")
@@ -132,8 +143,7 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         VectorWrapper.__init__(self, env)
         spaces = env.single_observation_space, env.single_action_space
         self._loop = CorrectionLoop(*spaces, model, state, corrector, enabled, env)
-        mode = (env.metadata or {}).get("autoreset_mode")
-        self._mode = getattr(mode, "name", "NEXT_STEP")  # gymnasium 1.0 knows no other
+        self._mode = autoreset_mode_of(env)
         self._over = np.zeros(env.num_envs, dtype=bool)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None):
@@ -142,18 +152,18 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         rows = np.ones(self.env.num_envs, dtype=bool) if rows is None else rows.copy()
         observations, infos = self.env.reset(seed=seed, options=options)
         first = seed[0] if isinstance(seed, list | tuple) else seed
-        self._loop.begin(self._loop.state(self.env, observations), rows, first)
+        self._loop.begin(self._states(observations), rows, first)
         self._over &= ~rows
         return observations, {**infos, "afm": self._loop.told, "_afm": rows}
 
     def step(self, actions: Any):
         """Execute the corrected actions."""
-        executed = self._loop.act(np.asarray(actions))
+        executed = self._loop.act(as_numbers("actions", actions, self.action_space.shape))
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         made, over = ~self._over, np.asarray(terminated) | np.asarray(truncated)
-        same = self._mode == "SAME_STEP"
-        self._loop.observe(self._loop.state(self.env, observations), over if same else self._over)
-        self._over = over & (self._mode == "NEXT_STEP")
+        same = self._mode is AutoresetMode.SAME_STEP
+        self._loop.observe(self._states(observations), over if same else self._over)
+        self._over = over & (self._mode is AutoresetMode.NEXT_STEP)
         infos = {**infos, "afm": self._loop.told, "_afm": made}
         return observations, rewards, terminated, truncated, infos
 
@@ -161,3 +171,32 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
     def watching(self) -> Watching | None:
         """What has been learned, with ``model="learn"``."""
         return self._loop.watching
+
+    @property
+    def diagnosis(self) -> list[str]:
+        """What the actuators of each environment seem to do, in words."""
+        return [self._loop.diagnosis(row) for row in range(self.num_envs)]
+
+    def _states(self, observations: Any) -> Tensor:
+        states, shape = self._loop.state(self.env, observations), self._loop.state_shape
+        return as_numbers("observations", states, shape and (self.num_envs, *shape))
+
+
+def autoreset_mode_of(env: VectorEnv) -> AutoresetMode:
+    """Return when a vector resets environments that ended, as its metadata say.
+
+    Raises:
+        ConfigurationError: if they do not say it: actions would be those of other episodes.
+
+    >>> autoreset_mode_of(gymnasium.make_vec("Pendulum-v1", vectorization_mode="sync"))
+    <AutoresetMode.NEXT_STEP: 'NextStep'>
+    """
+    given = (env.metadata or {}).get("autoreset_mode")
+    text = str(given).rpartition(".")[-1].replace("_", "").lower()
+    for mode in AutoresetMode:
+        if text == mode.value.lower():
+            return mode
+    raise ConfigurationError(
+        f"ActionFlowVectorWrapper: {env}: metadata['autoreset_mode']={given!r}: expected one of "
+        f"{', '.join(map(str, AutoresetMode))}; set it to what the vector does"
+    )

@@ -14,7 +14,7 @@ from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction import ActionFlow, Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.faults import safe_action
+from afm_rl.faults import check_numbers, safe_action
 
 
 def corrector_for(
@@ -78,6 +78,36 @@ def begin(corrector: Corrector, state: Tensor, action_spec: TensorSpec) -> Tenso
     return entries.set("memory", corrector.begin(state))
 
 
+def observe(
+    memory: Tensor,
+    state: Any,
+    model: DynamicsModel,
+    corrector: Corrector,
+    key: NestedKey = "observation",
+) -> Tensor:
+    """Return the memory with the state ``(*B, S)`` that was found under a key.
+
+    Raises:
+        ConfigurationError: for anything but real numbers of this shape.
+    """
+    state = check_numbers(key, state, (*memory.shape[:-1], model.state_size))
+    return corrector.observe(memory, state.to(memory.dtype))
+
+
+def computable(plan: Tensor, low: Tensor, high: Tensor, dtype: torch.dtype) -> Tensor:
+    r"""Return a plan ``(*B, A)`` in a precision, with NaN where it is infinite.
+
+    Beyond the box by more than :math:`\varepsilon^{-1/2}` times its width, rounding would leave
+    nothing of the box: there it is brought back to this distance.
+
+    >>> computable(torch.tensor([1e30, 0.5]), -torch.ones(2), torch.ones(2), torch.float32)
+    tensor([5.7936e+03, 5.0000e-01])
+    """
+    reach = torch.finfo(dtype).eps ** -0.5 * (high - low)
+    near = torch.minimum(torch.maximum(plan, low - reach), high + reach)
+    return torch.where(plan.isinf(), torch.nan, near).to(dtype)
+
+
 def warn_of_old(tensordict: TensorDictBase, prefix: NestedKey) -> None:
     """Warn if a tensordict holds the entries of the next step already: it is an old one."""
     later = tensordict.get("next", None)
@@ -97,6 +127,7 @@ def correct(
     action_spec: TensorSpec,
     enabled: bool = True,
     extend_action_box: bool = True,
+    key: NestedKey = "action",
 ) -> TensorDictBase:
     """Return the entries with what was planned ``(*B, A)`` and what should be executed.
 
@@ -108,14 +139,19 @@ def correct(
         action_spec: actions that can be executed.
         enabled: False to watch only.
         extend_action_box: note effects beyond the action box, if the model can predict them.
+        key: where the planned action was found.
+
+    Raises:
+        ConfigurationError: for a plan that is not real numbers ``(*B, A)``.
     """
-    planned = planned.to(memory.dtype)
+    low, high = bounds_of(action_spec)
+    check_numbers(key, planned, (*memory.shape[:-1], corrector.action_size))
+    planned = computable(planned, low, high, memory.dtype)
     box = box_of(action_spec, planned)
     before = memory
     memory, found = corrector.correct(memory, planned, model, box)
     wanted = found.executed if enabled else planned
     # The last clamp depends on nothing but the spec, whatever the corrector answers.
-    low, high = bounds_of(action_spec)
     executed = wanted.clamp(low, high).to(memory.dtype)
     predicted, misaligned = found.predicted, found.misaligned
     if not all_hold(executed == found.executed):  # what is no number equals nothing

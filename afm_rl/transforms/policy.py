@@ -16,7 +16,14 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.planning.primer import ZeroPrimer
 from afm_rl.spaces.keys import as_key
-from afm_rl.transforms.memory import begin, correct, corrector_for, entries_spec, warn_of_old
+from afm_rl.transforms.memory import (
+    begin,
+    correct,
+    corrector_for,
+    entries_spec,
+    observe,
+    warn_of_old,
+)
 
 
 class ActionFlowPolicy(TensorDictModuleBase):
@@ -117,16 +124,17 @@ class ActionFlowPolicy(TensorDictModuleBase):
                 "make_tensordict_primer() to the first one, and carry the entries of 'next' on"
             )
         warn_of_old(tensordict, self.prefix)
-        planned = tensordict.get(self.action_key)
-        state = tensordict.get(self.observation_key).to(memory.dtype)
+        planned = tensordict.get(self.action_key, None)
+        state = tensordict.get(self.observation_key, None)
         entries = correct(
-            self.corrector.observe(memory, state),
+            observe(memory, state, self.model, self.corrector, self.observation_key),
             planned,
             self.model,
             self.corrector,
             self.action_spec,
             self.enabled,
             self.extend_action_box,
+            self.action_key,
         )
         tensordict.set(unravel_key(("next", self.prefix)), entries)
         return tensordict.set(self.action_key, entries.get("executed_action").to(planned.dtype))

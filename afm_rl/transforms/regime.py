@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import Transform
 
 from afm_rl.errors import ConfigurationError, check_flag
 from afm_rl.regimes import Regime, Schedule, phase_parameters
-from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
+from afm_rl.transforms.carried import CarriedTransform
 
 
-class RegimeTransform(Transform):
+class RegimeTransform(CarriedTransform):
     r"""Change the dynamics of any environment: it receives the effects of actions.
 
     .. math:: a_\mathrm{eff} = \mathrm{clip}(g(a_t;\, \rho_k,\, s_t))
@@ -69,8 +68,7 @@ class RegimeTransform(Transform):
         prefix: NestedKey = "regime",
         seed: int = 0,
     ) -> None:
-        observation_key, action_key = as_key(observation_key), as_key(action_key)
-        super().__init__(in_keys=[observation_key], in_keys_inv=[action_key])
+        super().__init__(observation_key, action_key, prefix)
         self.regime = regime
         self.schedule = Schedule(at, by="step")
         rows = phases if isinstance(phases, Tensor) else [regime.encode(row) for row in phases]
@@ -84,33 +82,15 @@ class RegimeTransform(Transform):
             )
         self.register_buffer("rows", rows, persistent=False)
         self.clip = check_flag("clip", clip)
-        self.observation_key = observation_key
-        self.action_key = action_key
-        self.prefix = as_key(prefix)
         self.streams = Streams(salt=5, seed=seed)
-
-    def key(self, *names: str) -> NestedKey:
-        """Return the key of an entry of the memory."""
-        return unravel_key((self.prefix, *names))
 
     def parameters_at(self, step: Tensor) -> Tensor:
         """Return the parameters ``(*B, F)`` that act after ``step`` ``(*B)`` steps."""
         phase = self.schedule.phase(step.to(self.rows.dtype), step + 1)
         return phase_parameters(self.rows.expand(*step.shape, *self.rows.shape[-2:]), phase)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the tensordict as it is: a replay buffer or a policy has no actuators."""
-        return tensordict
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.parent is None:  # inside a replay buffer: nothing to execute
-            return tensordict
-        memory = tensordict.get(self.prefix, None)
-        if memory is None:
-            raise KeyError(
-                f"RegimeTransform: no {self.prefix!r} in the tensordict; start from "
-                "env.reset(), and carry its entries on"
-            )
+    def act(self, tensordict: TensorDictBase, memory: TensorDictBase) -> TensorDictBase:
+        """Replace the action by its effect."""
         memory, command = memory.clone(recurse=False), tensordict.get(self.action_key)
         parameters, state = memory.get("parameters"), memory.get("state")
         past, noise = memory.get("past", None), None
@@ -137,14 +117,15 @@ class RegimeTransform(Transform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         state = tensordict_reset.get(self.observation_key)
-        spec = self._memory_spec(tensordict_reset.batch_size, state.dtype, executed=True)
-        memory = spec.to(state.device).zero()
+        spec = Composite(shape=tensordict_reset.batch_size)
+        memory = self.memory_spec(spec, executed=True).to(state.device).zero()
         parameters = self.parameters_at(memory.get("step"))
         memory.set("parameters", parameters.to(memory.get("parameters")))
         return tensordict_reset.set(self.prefix, memory.set("state", state.clone()))
 
-    def _memory_spec(self, batch: torch.Size, dtype: torch.dtype, executed: bool) -> Composite:
+    def memory_spec(self, spec: Composite, executed: bool) -> Composite:
         """Return the specs of the memory, with or without what the last step leaves behind."""
+        batch, dtype = spec.shape, self.parent.full_observation_spec[self.observation_key].dtype
         action = self.parent.full_action_spec_unbatched[self.action_key]
         state = self.parent.full_observation_spec_unbatched[self.observation_key]
         kind = action.dtype
@@ -164,15 +145,3 @@ class RegimeTransform(Transform):
         if executed:
             found["effective_action"] = Unbounded((*batch, *action.shape), dtype=kind)
         return found
-
-    def _with_memory(self, spec: Composite, executed: bool) -> Composite:
-        dtype = self.parent.full_observation_spec[self.observation_key].dtype
-        spec[self.prefix] = self._memory_spec(spec.shape, dtype, executed).to(spec.device)
-        return spec
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        return self._with_memory(observation_spec, executed=True)
-
-    def transform_state_spec(self, state_spec: Composite) -> Composite:
-        """Add the memory but for the effective action: it is an input of the next step."""
-        return self._with_memory(state_spec, executed=False)

@@ -22,7 +22,8 @@ FLOORS = [
     {"learning": 2},
     {"dynamics": 2},
     {"regimes": 2, "diagnosis": 4},
-    {"spaces": 2, "compiling": 3, "storage": 4},
+    {"spaces": 2, "compiling": 3},
+    {"storage": 4},
     {"foundations": 2},
 ]
 

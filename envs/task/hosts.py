@@ -85,6 +85,7 @@ class HostedTask(Task):
             torch.stack([td[name].reshape(()) for td in after]).reshape(data["slot"].shape)
             for name in ("reward", "done")
         )
+        self._check_finite(reward, ahead)
         return ahead, reward, done
 
     def history(self) -> dict[str, dict[str, Any]]:

@@ -260,28 +260,35 @@ def function_task(
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Silence what packages say of missing screens, and of old settings in their own files."""
-    try:
-        from mujoco import set_mju_user_warning as say
-    except ImportError:  # an extra
-
-        def say(function: Callable[[str], None] | None) -> None:
-            """Do nothing."""
-
+    """Silence what packages say of missing screens, and of old settings in files of theirs."""
     logger = logging.getLogger("absl")
-    before = logger.level
+    level = logger.level
     logger.setLevel(logging.ERROR)
-    say(lambda message: None)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+    with warnings.catch_warnings(), _deprecations_of_mujoco_unsaid():
+        warnings.simplefilter("ignore")
+        try:
             yield
+        finally:
+            logger.setLevel(level)
+            absl: Any = sys.modules.get("absl.logging")
+            if absl is not None:  # it would close what stood for stderr when it was imported
+                absl.get_absl_handler().python_handler.stream = sys.__stderr__
+
+
+@contextmanager
+def _deprecations_of_mujoco_unsaid() -> Iterator[None]:
+    try:
+        from mujoco import get_mju_user_warning, set_mju_user_warning
+    except ImportError:  # an extra
+        yield
+        return
+    before = get_mju_user_warning()
+    tell = partial(print, file=sys.stderr) if before is None else before
+    set_mju_user_warning(lambda text: None if "deprecated" in text else tell(text))
+    try:
+        yield
     finally:
-        logger.setLevel(before)
-        say(None)
-        absl: Any = sys.modules.get("absl.logging")
-        if absl is not None:  # it would close what stood for stderr when it was imported
-            absl.get_absl_handler().python_handler.stream = sys.__stderr__
+        set_mju_user_warning(before)
 
 
 def _known(

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, NonFiniteError
 from afm_rl.planning.costs import check_arguments
 from afm_rl.regimes import Regime
 
@@ -88,9 +88,9 @@ class Task:
             self._check(reward)
 
     def _check(self, reward: Reward) -> None:
-        goals = [torch.zeros(*PROBE, len(self.goal_names))] if self.goal_names else []
+        state, goal = (part.float().expand(*PROBE, -1) for part in self.start(0))
+        goals = [goal] if self.goal_names else []
         check_arguments("robot.reward", reward, 3 + len(goals))
-        state = self.start(0)[0].float().expand(*PROBE, -1)
         action = torch.zeros(*PROBE, len(self.low))
         try:
             found = reward(state, action, state, *goals)
@@ -104,6 +104,11 @@ class Task:
             raise ConfigurationError(
                 f"robot.reward: returned {shape} for states {tuple(state.shape)}; expected a "
                 f"tensor {PROBE}, one number per state"
+            )
+        if not bool(found.isfinite().all()):
+            raise ConfigurationError(
+                f"robot.reward: is {found[0, 0]:g} in the first state, {state[0, 0].tolist()}, for "
+                "an action of zeros; expected a finite number"
             )
 
     @property
@@ -148,7 +153,18 @@ class Task:
         reward = self._rewards(physics, state, action, ahead, *goal)
         lost = ~ahead.isfinite().all(-1)
         ended = lost if self.ends is None else lost | self.ends(ahead)
+        self._check_finite(torch.where(lost, 0.0, reward), ahead)
         return ahead, torch.where(lost, 0.0, reward), ended
+
+    def _check_finite(self, reward: Tensor, ahead: Tensor) -> None:
+        """Refuse a reward that would be the best of all where others are negative."""
+        if not bool(reward.isfinite().all()):
+            first = (~reward.isfinite()).flatten().nonzero()[0]
+            raise NonFiniteError(
+                f"{self.name}: the reward is {reward.flatten()[first].item():g} in the state "
+                f"{ahead.flatten(0, -2)[first].tolist()[0]}; expected finite numbers: mend "
+                "robot.reward, or the environment that gives it"
+            )
 
     def _models(self, physics: Tensor) -> list[Any]:
         """Return the MuJoCo model of each row ``(N, P)``."""

@@ -4,11 +4,14 @@
 
 A message is a few numbers, and in 28 bytes more: its own number, the number of the other side's
 message that it answers, a stamp, and a checksum. Whoever reads gets the newest sound one; what is
-damaged, late, doubled or out of order is dropped and counted.
+damaged, late, doubled, out of order or far ahead is dropped and counted.
+
+The checksum finds damage, not forgery: beyond one machine both sides need keys (keys.sh).
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import struct
@@ -16,14 +19,17 @@ import threading
 import time
 import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from statistics import quantiles
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import zenoh
 
 ENDPOINT = "tcp/127.0.0.1:7447"
+HERE = ("127.0.0.1", "localhost")
 WATCHDOG = 2  # ticks without a message, after which a side does what is safe
+AHEAD = 100  # messages that may be missed at once; whoever missed more has long done what is safe
 SAFE = (0.0, 0.0)  # the safe action of this robot: it stands still
 
 
@@ -49,10 +55,11 @@ class Inbox:
         size: how many numbers a message has.
         late: age (s) at which a message is too old; the clocks of both machines must agree better
             than this, as NTP has it.
+        clock: what time it is (s).
     """
 
-    def __init__(self, size: int, late: float) -> None:
-        self.layout, self.late = struct.Struct(f"<qqd{size}dI"), late
+    def __init__(self, size: int, late: float, clock: Callable[[], float] = time.time) -> None:
+        self.layout, self.late, self.clock = struct.Struct(f"<qqd{size}dI"), late, clock
         self.dropped: Counter[str] = Counter()
         self.last = 0
         self.kept: Message | None = None
@@ -78,11 +85,13 @@ class Inbox:
             return None, "damaged"
         if number <= self.last:
             return None, "doubled" if number == self.last else "out of order"
+        if self.last and number > self.last + AHEAD:
+            return None, "far ahead"
         message = Message(number, answers, stamp, tuple(numbers))
         return message, "late" if self._is_late(message) else ""
 
     def _is_late(self, message: Message) -> bool:
-        return abs(time.time() - message.stamp) > self.late
+        return abs(self.clock() - message.stamp) > self.late
 
     def _has_one(self) -> bool:
         if self.kept is not None and self._is_late(self.kept):  # it became so before it was read
@@ -103,18 +112,48 @@ class Inbox:
             self.last = 0
 
 
+def options(description: str, side: str) -> argparse.ArgumentParser:
+    """Return a parser of what both sides are told about the link."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument(f"--{side}", default=ENDPOINT, help="PROTOCOL/HOST:PORT")
+    parser.add_argument("--keys", help="folder of keys.sh, for an endpoint tls/HOST:PORT")
+    parser.add_argument("--tick", type=float, default=0.1, help="s, the same on both sides")
+    return parser
+
+
+def settings(side: str, endpoint: str, keys: str | None) -> zenoh.Config:
+    """Return how Zenoh is set: nobody without a key of ours gets through, if there are keys."""
+    protocol, _, host = endpoint.partition("/")
+    if (protocol == "tls") != bool(keys):
+        raise SystemExit(f"{endpoint}: tls/HOST:PORT and --keys belong together")
+    if not keys and host.rpartition(":")[0] not in HERE:
+        raise SystemExit(f"{endpoint}: anybody there could drive the robot; make keys (keys.sh)")
+    config: dict[str, Any] = {
+        "listen/endpoints": [],  # else it would listen to everybody
+        f"{side}/endpoints": [endpoint],  # side: listen or connect
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000},
+    }
+    if keys:
+        mine = Path(keys) / ("robot" if side == "listen" else "controller")
+        config["transport/link/protocols"] = ["tls"]
+        config["transport/link/tls"] = {
+            "root_ca_certificate": str(Path(keys) / "authority.pem"),
+            "enable_mtls": True,  # the robot asks for a key, too
+            f"{side}_private_key": f"{mine}.key",
+            f"{side}_certificate": f"{mine}.pem",
+        }
+    found = zenoh.Config()
+    for name, value in config.items():
+        found.insert_json5(name, json.dumps(value))
+    return found
+
+
 class Link:
     """Sends to one key, and has the :class:`Inbox` of another."""
 
-    def __init__(self, side: str, endpoint: str, sends: str, receives: str, inbox: Inbox) -> None:
-        config = zenoh.Config()
-        settings = {
-            f"{side}/endpoints": [endpoint],  # side: listen or connect
-            "scouting/multicast/enabled": False,
-            "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000},
-        }
-        for name, value in settings.items():
-            config.insert_json5(name, json.dumps(value))
+    def __init__(self, config: zenoh.Config, sends: str, receives: str, inbox: Inbox) -> None:
         self.session, self.inbox, self.number = zenoh.open(config), inbox, 0
         drop = zenoh.CongestionControl.DROP  # a receiver that stands still must not hold us up
         make = self.session.declare_publisher
@@ -124,7 +163,7 @@ class Link:
     def send(self, numbers: Sequence[float], answers: int = 0, stamp: float | None = None) -> int:
         """Send the next message, stamped now if nothing else is said; return its number."""
         self.number += 1
-        stamp = time.time() if stamp is None else stamp
+        stamp = self.inbox.clock() if stamp is None else stamp
         self.publisher.put(Message(self.number, answers, stamp, tuple(numbers)).pack())
         return self.number
 

@@ -9,16 +9,19 @@ runs until it is ended (Ctrl-C, SIGTERM), and then prints how well it kept time.
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import threading
 import time
 from math import cos, pi, sin
 
-from link import ENDPOINT, SAFE, WATCHDOG, Inbox, Link, spread
+from link import SAFE, WATCHDOG, Inbox, Link, options, settings, spread
 
 DT = 0.2  # s of the robot's time in a tick
+BOX = (
+    (-1.0, 1.0),
+    (-1.57, 1.57),
+)  # m/s, rad/s: what this robot does at most, whoever asks for more
 
 
 def move(pose: tuple[float, ...], v: float, omega: float) -> tuple[float, float, float]:
@@ -28,44 +31,56 @@ def move(pose: tuple[float, ...], v: float, omega: float) -> tuple[float, float,
     return x + v * cos(heading) * DT, y + v * sin(heading) * DT, turned
 
 
+class Robot:
+    """A robot that obeys sound actions inside its box, and stands still without any."""
+
+    def __init__(self, inbox: Inbox) -> None:
+        self.inbox, self.pose, self.gain = inbox, (0.0, 0.0, 0.0), 1.0
+        self.action, self.obeyed, self.silent, self.stopped = SAFE, 0, WATCHDOG, 0
+
+    def tick(self) -> None:
+        """Obey the newest action for a tick."""
+        message = self.inbox.get()
+        if message is not None:
+            asked = zip(message.numbers, BOX, strict=True)
+            self.action = tuple(min(max(number, low), high) for number, (low, high) in asked)
+            self.obeyed, self.silent = message.number, 0
+        else:
+            self.silent += 1
+            if self.silent >= WATCHDOG:
+                self.action, self.obeyed = SAFE, 0
+                self.inbox.forget()
+                self.stopped += 1
+        v, omega = self.action
+        self.pose = move(self.pose, self.gain * v, omega)
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--listen", default=ENDPOINT)
-    parser.add_argument("--tick", type=float, default=0.1, help="s")
-    asked = parser.parse_args()
-    ended, gains = threading.Event(), {"v": 1.0}
+    asked = options(__doc__.splitlines()[0], "listen").parse_args()
+    inbox = Inbox(len(SAFE), WATCHDOG * asked.tick)
+    ended, robot = threading.Event(), Robot(inbox)
     for ending in (signal.SIGTERM, signal.SIGINT):
         signal.signal(ending, lambda *_: ended.set())
-    signal.signal(signal.SIGUSR1, lambda *_: gains.update(v=-gains["v"]))
+    signal.signal(signal.SIGUSR1, lambda *_: vars(robot).update(gain=-robot.gain))
 
-    inbox = Inbox(len(SAFE), WATCHDOG * asked.tick)
-    link = Link("listen", asked.listen, "robot/state", "robot/action", inbox)
+    link = Link(settings("listen", asked.listen, asked.keys), "robot/state", "robot/action", inbox)
     print(f"robot {os.getpid()} at {asked.listen}, {1 / asked.tick:g} states a second", flush=True)
-    pose, action, obeyed, silent = (0.0, 0.0, 0.0), SAFE, 0, WATCHDOG
-    due, periods, stopped = time.monotonic(), [], 0
+    due, periods = time.monotonic(), []
     begun = due
     while not ended.is_set():
-        link.send(pose, answers=obeyed)
+        link.send(robot.pose, answers=robot.obeyed)
         due = max(due + asked.tick, time.monotonic())  # never two ticks at once after a pause
         ended.wait(due - time.monotonic())
         now = time.monotonic()
         periods.append(now - begun)
         begun = now
-        message = inbox.get()
-        if message is not None:
-            action, obeyed, silent = message.numbers, message.number, 0
-        else:
-            silent += 1
-            if silent >= WATCHDOG:
-                action, obeyed = SAFE, 0
-                inbox.forget()
-                stopped += 1
-        v, omega = action
-        pose = move(pose, gains["v"] * v, omega)
+        robot.tick()
     link.session.close()
     print(f"{'ms':34}{'p50':>9}{'p99':>9}")
     print(spread("between ticks", periods))
-    print(f"{len(periods)} ticks, {stopped} without an action; dropped: {dict(inbox.dropped)}")
+    print(
+        f"{len(periods)} ticks, {robot.stopped} without an action; dropped: {dict(inbox.dropped)}"
+    )
 
 
 if __name__ == "__main__":

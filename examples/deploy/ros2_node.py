@@ -1,10 +1,10 @@
 """Planner and correction as a node of ROS 2: odometry comes in, velocities go out.
 
-    python examples/deploy/ros2_node.py --policy policy.pt2
+    python examples/deploy/ros2_node.py --policy policy.pt2 --sha256 CHECKSUM
 
-It needs a sourced ROS 2 (``rclpy``, ``geometry_msgs``, ``nav_msgs``), torch, and what controller.py
-needs. It was never run under ROS 2: the tests import it with stand-ins for these packages, give it
-messages, and look at what it sends.
+It needs a sourced ROS 2 (``rclpy``, ``geometry_msgs``, ``nav_msgs``), and what agent.py needs. It
+was never run under ROS 2: the tests import it with stand-ins for these packages, give it messages,
+and look at what it sends.
 
     /odom       nav_msgs/Odometry          in: the state, at least once a tick
     /goal_pose  geometry_msgs/PoseStamped  in: where to
@@ -18,11 +18,13 @@ import argparse
 import math
 
 import rclpy
-from controller import Agent, load, make
+from agent import Agent, load, make
 from geometry_msgs.msg import PoseStamped, Twist
-from link import SAFE, WATCHDOG, Message
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
+
+WATCHDOG = 2  # ticks without a state, after which the robot is stopped
+SAFE = (0.0, 0.0)  # it stands still
 
 
 class ActionFlowNode(Node):
@@ -36,6 +38,7 @@ class ActionFlowNode(Node):
     def __init__(self, agent: Agent, tick: float) -> None:
         super().__init__("action_flow")
         self.agent, self.pose, self.goal, self.silent = agent, None, None, 0
+        self.follows = False  # does the next state follow from an action of the agent?
         self.publisher = self.create_publisher(Twist, "cmd_vel", 1)
         self.create_subscription(Odometry, "odom", self.on_odometry, 1)
         self.create_subscription(PoseStamped, "goal_pose", self.on_goal, 1)
@@ -57,12 +60,10 @@ class ActionFlowNode(Node):
         pose, self.pose = self.pose, None
         self.silent = 0 if pose else self.silent + 1
         if pose and self.goal:
-            # Ticks have no numbers here: each follows the last one, unless that was missed.
-            state = Message(self.agent.seen + 1, 0, 0.0, pose)
-            self.send(self.agent.act(state, self.goal))
-            self.agent.sent = 0
+            self.send(self.agent.act(pose, self.goal, self.follows))
+            self.follows = True
             return
-        self.agent.sent = -1
+        self.follows = False
         if self.silent >= WATCHDOG or not self.goal:
             self.send(SAFE)
 
@@ -76,10 +77,11 @@ class ActionFlowNode(Node):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--policy", help="a file of afm-rl-export")
+    parser.add_argument("--sha256", help="its checksum, as afm-rl-export printed it")
     parser.add_argument("--tick", type=float, default=0.2, help="s, the time step of the model")
     asked = parser.parse_args()
     rclpy.init()
-    node = ActionFlowNode(load(asked.policy) if asked.policy else make(), asked.tick)
+    node = ActionFlowNode(load(asked.policy, asked.sha256) if asked.policy else make(), asked.tick)
     try:
         rclpy.spin(node)
     finally:

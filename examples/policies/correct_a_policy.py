@@ -52,22 +52,22 @@ def main() -> None:
         told = corrected.reset()[1]["afm"]
     robot.at = args.at
     for name, env in {"alone": robot, "corrected": corrected}.items():
-        rewards, info = play(env, args.steps, seed=0)
+        rewards = play(env, args.steps, seed=0)
         before, after = rewards[: args.at], rewards[args.at :]
         print(f"{name}: a step {mean(before):.2f} before, {mean(after):.2f} after")
-        for line in info["afm"]["diagnosis"].splitlines() if "afm" in info else ():
-            print(f"    {line}")
+    for line in corrected.diagnosis.splitlines():
+        print(f"    {line}")
 
 
-def play(env: gymnasium.Env, steps: int, seed: int | None = None) -> tuple[list[float], dict]:
-    """Return the rewards of an episode of the policy, and what was told of its last step."""
+def play(env: gymnasium.Env, steps: int, seed: int | None = None) -> list[float]:
+    """Return the rewards of an episode of the policy."""
     policy, _ = load_policy(POLICY)
-    (observation, info), rewards = env.reset(seed=seed), []
+    (observation, _), rewards = env.reset(seed=seed), []
     for _ in range(steps):
         action = policy(torch.as_tensor(observation)).numpy()
-        observation, reward, _, _, info = env.step(action)
+        observation, reward, *_ = env.step(action)
         rewards.append(float(reward))
-    return rewards, info
+    return rewards
 
 
 def mean(values: list[float]) -> float:

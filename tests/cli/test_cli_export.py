@@ -14,7 +14,12 @@ def run(monkeypatch, capsys):
     """Run the command, and return what it would have compiled, its exit status, and its words."""
     made = []
     monkeypatch.setattr(controller, "has_compiler", lambda: True)
-    monkeypatch.setattr(controller, "export_controller", lambda what, path: made.append(what))
+
+    def export_controller(what, path, cache):
+        made.append(what)
+        return "c0ffee"
+
+    monkeypatch.setattr(controller, "export_controller", export_controller)
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", [export.NAME, *map(str, arguments)])
@@ -32,6 +37,7 @@ def test_it_exports_planner_and_correction_of_a_method(run, tmp_path):
     out = f"out={tmp_path / 'policy.pt2'}"
     made, status, said = run("method=afm_physics", "planner.population=7", out)
     assert status == 0 and f"wrote {tmp_path / 'policy.pt2'}: memory (" in said
+    assert "sha256 c0ffee" in said
     sizes = made[0].sizes
     assert sizes["noise"] == 7 * 5 * 2 and sizes["goal"] == 2
     given = [torch.zeros(size) for size in sizes.values()]

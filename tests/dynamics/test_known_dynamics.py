@@ -1,5 +1,7 @@
 """Dynamics that are written down."""
 
+import threading
+
 import pytest
 import torch
 
@@ -30,6 +32,27 @@ def test_its_jacobian_needs_no_closed_form():
     state, action = torch.randn(7, 2), torch.randn(7, 1)
     expected = torch.stack([torch.zeros(7), 0.1 * action[:, 0].cos()], -1).unsqueeze(-1)
     torch.testing.assert_close(cart().jacobian(state, action), expected)
+
+
+def test_two_threads_may_ask_for_derivatives_at_once():
+    inside, done, found = threading.Event(), threading.Event(), []
+
+    def slow(state, action):
+        inside.set()
+        done.wait(0.2)  # the other thread has all this time to meet this one
+        return push(state, action)
+
+    def ask(step):
+        model = KnownDynamics(step, Manifold(2), action_size=1)
+        found.append(model.jacobian(torch.zeros(2), torch.zeros(1)))
+
+    first = threading.Thread(target=ask, args=(slow,))
+    first.start()
+    inside.wait()
+    ask(push)
+    done.set()
+    first.join()
+    assert torch.equal(*found)
 
 
 @pytest.mark.parametrize(

@@ -213,3 +213,25 @@ def test_each_mission_has_physics_of_its_own():
     assert torch.equal(oracle.rollout(state, plans), together)
     oracle.select_(torch.tensor([1]))
     assert torch.equal(oracle.rollout(state[:1], plans[1:]), together[1:])
+
+
+def slider(option="", geom="", compiler=""):
+    return f"""<mujoco><compiler {compiler}/><option {option}/><worldbody><body name="sled">
+    <joint name="x" type="slide" axis="1 0 0" damping="1"/><geom size=".1" {geom}/></body>
+    </worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("xml", "words"),
+    [
+        (slider('timestep="nan"'), r"timestep=nan: expected a finite number in \(0, inf]"),
+        (slider('timestep="0"'), r"timestep=0.0: expected a finite number in \(0, inf]"),
+        (slider('timestep="-0.1"'), "timestep=-0.1: expected"),
+        (slider(geom='mass="1e300"'), r"body 'sled' has mass 1e\+300; expected .* below 1e\+09"),
+        (slider(geom='mass="inf"'), "body 'sled' has mass inf"),
+        (slider('gravity="nan 0 0"'), "its first step leads to numbers that are not finite"),
+    ],
+)
+def test_a_model_that_cannot_be_simulated_is_refused_by_name(xml, words):
+    with pytest.raises(ConfigurationError, match=rf"dynamics.model=.*: {words}"):
+        MuJoCoDynamics(xml)

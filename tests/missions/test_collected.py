@@ -33,12 +33,3 @@ def test_data_under_regimes_are_of_each_by_turns(robot):
 def test_regimes_of_data_have_known_parameters(robot):
     with pytest.raises(ConfigurationError, match="unknown parameter 'gain_7'"):
         transitions(robot, 8, 0, regimes=[{"gain_7": 0.0}])
-
-
-def test_data_are_planned_with_the_robots_own_cost():
-    small = ["method=frozen_pe", "dynamics.members=2", "dynamics.hidden=[8,8]"]
-    small += ["robot.data.rounds=[32,16]", "robot.data.fit.epochs=1", "planner.horizon=3"]
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        agent = build(compose("config", ["robot=inversion_double_integrator", *small]))
-    (training,) = agent.trainings
-    assert len(training.train(False)["rewards"]) == 2  # mpc, which needs a quadratic cost

@@ -91,7 +91,7 @@ def test_a_flight_alone_is_the_same_as_among_others(fly, method):
     pd.testing.assert_frame_equal(rows.reset_index(drop=True), one.steps, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("method", ["rls", "l1", "mass_estimator", "online_knode"])
+@pytest.mark.parametrize("method", ["rls", "l1", "online_knode"])
 def test_what_befalls_others_changes_nothing(fly, method):
     """Each learns from its own flight, whatever others go through."""
     regimes = [{"mass": 0.5}, {"wind_x": 1.0}, {"payload": 0.3, "payload_x": 2e-3}]
@@ -163,13 +163,9 @@ def test_settings_that_do_not_fit_are_refused(configure, no_training, overrides,
         build(configure("robot=quadrotor", *overrides))
 
 
-@pytest.mark.parametrize("method", ["mass_estimator", "online_knode"])
-def test_who_learns_keeps_the_height_better(fly, method):
-    settings = {"budget": 40, **({"updater.begin": 0.1} if method == "online_knode" else {})}
-    physics, learner = (
-        fly(f"method={name}", **(settings if name == method else {"budget": 40})).missions.iloc[0]
-        for name in ("physics", method)
-    )
+def test_who_learns_keeps_the_height_better(fly):
+    physics = fly("method=physics", budget=40).missions.iloc[0]
+    learner = fly("method=online_knode", budget=40, **{"updater.begin": 0.1}).missions.iloc[0]
     assert learner["mse_z"] < 0.2 * physics["mse_z"]
 
 

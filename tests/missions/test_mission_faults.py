@@ -18,7 +18,6 @@ PLANNERS = {
     "icem": ("planner=icem",),
     "cem": ("planner=cem",),
     "torchrl_mppi": ("planner=torchrl_mppi",),
-    "geometric": (*FLIGHT, "planner=geometric"),
     "mpc": FLIGHT,
 }
 NAN = float("nan")
@@ -95,8 +94,6 @@ def test_a_reading_that_is_nan_is_survived_and_the_others_do_not_notice(three, p
     assert first["fault"].tolist() == [0, 0, 1, 1, 0, 0, 0, 0]
     executed = first.filter(like="executed_").to_numpy()
     assert np.isfinite(executed).all()
-    if planner == "geometric":  # it plans NaN from NaN
-        assert (executed[3] == executed[2]).all()
 
 
 def test_a_policy_that_plans_nan(three):
@@ -113,7 +110,7 @@ def test_a_mission_with_a_fault_can_be_ended(three):
     results = drive(three("faults=skip"), Sensor([2], NAN))
     assert results.missions["steps"].tolist() == [2, 7, 7]
     assert results.missions["faults"].tolist() == [1, 0, 0]
-    flight = drive(three(*FLIGHT, "planner=geometric", "faults=skip"), Sensor([2], NAN))
+    flight = drive(three(*FLIGHT, "faults=skip"), Sensor([2], NAN))
     assert flight.missions["finished"].tolist() == [False, True, True]
 
 

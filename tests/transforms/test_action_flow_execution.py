@@ -11,12 +11,13 @@ from torchrl.envs import Compose, Transform, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from afm_rl.correction import Correction, Corrector
-from afm_rl.dynamics import Calibrated, Dubins, Oracle, dubins_step
+from afm_rl.dynamics import Calibrated, Dubins, KnownDynamics, Oracle, dubins_step
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss
-from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+from afm_rl.planning import MPPI, GoalDistance, KnownReward, PlanningEnv
 from afm_rl.regimes import ActionGain, Schedule
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
 from afm_rl.transforms.memory import correct
 
@@ -154,6 +155,44 @@ def test_a_plan_outside_the_box_is_brought_into_it():
     assert torch.equal(entries["planned_action"], torch.full((4, 2), 9.0))
     torch.testing.assert_close(entries["executed_action"], HIGH.expand(4, 2))
     torch.testing.assert_close(entries["predicted_effect"], HIGH.expand(4, 2))
+
+
+NO_NUMBERS = {
+    "shape": (torch.zeros(4, 3), r"'%s': shape \(4, 3\), expected \(4, %d\)"),
+    "complex": (
+        torch.zeros(4, 2, dtype=torch.complex64),
+        "'%s': type torch.complex64, expected .*%d",
+    ),
+    "text": ("left", r"'%s': NonTensorData, expected real numbers \(4, %d\)"),
+    "missing": (None, r"'%s': NoneType, expected real numbers \(4, %d\)"),
+}
+
+
+@pytest.mark.parametrize("case", NO_NUMBERS)
+@pytest.mark.parametrize(("key", "size"), [("action", 2), ("observation", 4)])
+def test_what_is_no_action_and_no_state_is_refused_by_name(case, key, size):
+    given, words = NO_NUMBERS[case]
+
+    def put(td):
+        return td.exclude(key) if given is None else td.set(key, given)
+
+    box = -torch.ones(2), torch.ones(2)
+    model = KnownDynamics(lambda s, a: s + a.repeat_interleave(2, -1), Manifold(4), 2)
+    policy = ActionFlowPolicy(model, Bounded(*box))
+    td = policy.make_tensordict_primer()(TensorDict(batch_size=[4]))
+    td.update({"observation": torch.zeros(4, 4), "action": torch.zeros(4, 2)})
+    with pytest.raises(ConfigurationError, match=words % (key, size)):
+        policy(put(td.clone()))
+    cost = KnownReward(lambda s, a, n: -n.square().sum(-1))
+    world = PlanningEnv(model, cost, *box)
+    whole = TransformedEnv(world, ActionFlowTransform(model))
+    td = whole.reset(TensorDict({"observation": torch.zeros(4, 4)}, [4]))
+    td["action"] = torch.zeros(4, 2)
+    with pytest.raises(ConfigurationError, match=words % (key, size)):
+        if key == "action":
+            whole.transform._inv_call(put(td))
+        else:
+            whole.transform._step(whole.transform._inv_call(td), put(td.clone()))
 
 
 def test_an_answer_that_is_not_finite_holds_the_last_action():

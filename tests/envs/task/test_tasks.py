@@ -1,10 +1,13 @@
 """Other people's tasks: their worlds and rewards are those of the packages they come from."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
-from afm_rl.envs import TaskEnv, dm_control_task, gymnasium_task
+from afm_rl.envs import TaskEnv, dm_control_task, gymnasium_task, mujoco_task
+from afm_rl.errors import ConfigurationError, NonFiniteError
 
 mujoco = pytest.importorskip("mujoco")
 gymnasium = pytest.importorskip("gymnasium")
@@ -98,3 +101,30 @@ def test_episodes_begin_by_seed_and_begin_elsewhere_after_a_reset():
     again = env.rollout(6, break_when_any_done=False)["observation"][:, ::3]
     assert torch.equal(data[:, 0], again[:, 0])
     assert len(data.reshape(-1, 2).unique(dim=0)) == 4
+
+
+CART = """<mujoco><compiler settotalmass="2"/><worldbody><body><joint name="x" type="slide"
+axis="1 0 0"/><geom size=".1"/></body></worldbody><actuator><motor joint="x" ctrlrange="-1 1"/>
+</actuator></mujoco>"""
+
+
+def test_rewards_that_are_no_numbers_are_refused():
+    """A return of 0 would be the best of all where rewards are negative."""
+    with pytest.raises(ConfigurationError, match=r"robot.reward: is nan in the first state, \["):
+        mujoco_task(CART, lambda state, action, after: math.nan * after[..., 0])
+    task = mujoco_task(CART, lambda state, action, after: (after[..., 0] + 0.01).sqrt())
+    with pytest.raises(NonFiniteError, match="mjcf: the reward is nan in the state"):
+        drive(task, 0, -torch.ones(200, 1))
+
+
+def test_deprecations_in_others_files_alone_are_not_repeated():
+    said, before = [], mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        gymnasium_task("HalfCheetah-v5")
+        assert said == []
+        mujoco_task(CART, lambda state, action, after: -after[..., 0].abs())
+        (line,) = said  # who listened still does
+        assert "settotalmass" in line
+    finally:
+        mujoco.set_mju_user_warning(before)

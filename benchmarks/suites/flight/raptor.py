@@ -50,7 +50,7 @@ class Raptor(RecedingHorizonPlanner):
             from foundation_policy import Raptor as published
         except ImportError as error:
             raise ConfigurationError(
-                "planner=raptor: the package foundation-policy is missing; install afm-rl[rotorpy]"
+                "planner=raptor: foundation-policy is missing; pip install foundation-policy"
             ) from error
         self.body, self.reference_key = check_body(body), reference_key
         if sorted(self.body.motors) != sorted(MOTORS):

@@ -2,14 +2,14 @@ import math
 
 import pytest
 import torch
+from flight.geometric import Gains, GeometricController, geometric_wrench
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins, Quadrotor
 from afm_rl.dynamics.quadrotor_equations import quadrotor_path, quadrotor_step
 from afm_rl.envs import Circle, CrazyflieTrack, Hover
 from afm_rl.errors import ConfigurationError, NonFiniteError
-from afm_rl.planning import GeometricController, GoalDistance, PlanningEnv
-from afm_rl.planning.geometric import Gains, geometric_wrench
+from afm_rl.planning import GoalDistance, PlanningEnv
 from afm_rl.spaces.airframe import QuadrotorBody, saturate
 from afm_rl.spaces.rotations import RigidBodySpace, body_z_axis, quaternion_exp
 

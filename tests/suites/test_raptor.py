@@ -5,11 +5,12 @@ import sys
 import numpy as np
 import pytest
 import torch
+from flight import Raptor
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Quadrotor
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import GoalDistance, PlanningEnv, Raptor
+from afm_rl.planning import GoalDistance, PlanningEnv
 from afm_rl.spaces.airframe import QuadrotorBody, unmix
 from afm_rl.spaces.rotations import quaternion_normalise
 
@@ -60,5 +61,5 @@ def test_it_needs_motors_where_it_has_them():
 
 def test_it_says_what_is_missing(monkeypatch):
     monkeypatch.setitem(sys.modules, "foundation_policy", None)
-    with pytest.raises(ConfigurationError, match=r"install afm-rl\[rotorpy\]"):
+    with pytest.raises(ConfigurationError, match=r"pip install foundation-policy"):
         planner()

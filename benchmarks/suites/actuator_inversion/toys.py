@@ -1,6 +1,6 @@
 """Toys of the Actuator Inversion Benchmark, which need no simulator.
 
-See :func:`~afm_rl.envs.actuator_inversion_task`.
+See :func:`~actuator_inversion.actuator_inversion_task`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from actuator_inversion.contexts import body_regime, contexts_of
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.envs.inversion_contexts import body_regime, contexts_of
 from afm_rl.envs.task.task import NOWHERE, Task
 from afm_rl.regimes import Regime
 from afm_rl.spaces.manifold import Manifold

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from actuator_inversion import actuator_inversion_task
+from actuator_inversion.toys import COEFFICIENT, MASS, Coefficients, Sled
 
-from afm_rl.envs import TaskEnv, actuator_inversion_task
-from afm_rl.envs.inversion_toys import COEFFICIENT, MASS, Coefficients, Sled
+from afm_rl.envs import TaskEnv
 from afm_rl.missions.task_robot import TaskRobot
 from afm_rl.regimes import Physics, Schedule
 

@@ -12,10 +12,10 @@ from functools import partial
 from typing import Any, cast
 from xml.etree import ElementTree
 
+from actuator_inversion.contexts import Span, body_regime, contexts_of
+from actuator_inversion.toys import SIGNS, TOYS
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.dynamics.mujoco_physics import NAMES, changed_model
-from afm_rl.envs.inversion_contexts import Span, body_regime, contexts_of
-from afm_rl.envs.inversion_toys import SIGNS, TOYS
 from afm_rl.envs.task.sources import Limits, dm_control_task, quiet
 from afm_rl.envs.task.task import Reward, Task, trust
 from afm_rl.errors import check_choice, check_count

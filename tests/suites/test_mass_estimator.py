@@ -2,12 +2,13 @@
 
 import pytest
 import torch
+from flight import MassEstimator
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins, Oracle, Quadrotor
 from afm_rl.dynamics.quadrotor_equations import quadrotor_step
 from afm_rl.errors import ConfigurationError
-from afm_rl.learning import GaussianNLLLoss, MassEstimator
+from afm_rl.learning import GaussianNLLLoss
 from afm_rl.regimes import ActionGain, MassFactor, flight_regimes
 from afm_rl.spaces.airframe import QuadrotorBody
 

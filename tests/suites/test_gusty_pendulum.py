@@ -4,8 +4,7 @@ import math
 
 import pytest
 import torch
-
-from afm_rl.envs.gusty_pendulum import (
+from gusts.pendulum import (
     DAMPING,
     GRAVITY,
     Gusts,

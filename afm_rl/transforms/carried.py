@@ -1,0 +1,76 @@
+"""A transform whose memory is carried in the tensordict."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torchrl.data import Composite
+from torchrl.envs import Transform
+
+from afm_rl.spaces.keys import as_key
+
+
+class CarriedTransform(Transform, ABC):
+    """Stands between policy and environment, and remembers under ``prefix``.
+
+    Each environment of a batch has a memory of its own, and resets, branches and resumed rollouts
+    are exact: the memory is an observation, and an input of the next step. In a replay buffer or a
+    policy, where nothing is executed, it does nothing.
+
+    Args:
+        observation_key: the state.
+        action_key: the action.
+        prefix: where the memory is kept.
+    """
+
+    essential: tuple[str, ...] = ()  # the entry without which there is no next step; (): all
+
+    def __init__(
+        self, observation_key: NestedKey, action_key: NestedKey, prefix: NestedKey
+    ) -> None:
+        self.observation_key, self.action_key = as_key(observation_key), as_key(action_key)
+        super().__init__(in_keys=[self.observation_key], in_keys_inv=[self.action_key])
+        self.prefix = as_key(prefix)
+
+    def key(self, *names: str) -> NestedKey:
+        """Return the key of an entry."""
+        return unravel_key((self.prefix, *names))
+
+    @abstractmethod
+    def act(self, tensordict: TensorDictBase, memory: Any) -> TensorDictBase:
+        """Put the action to execute, and what is remembered of it, into a tensordict."""
+
+    @abstractmethod
+    def memory_spec(self, spec: Composite, executed: bool) -> Composite:
+        """Return the specs of the memory.
+
+        Args:
+            spec: of all that stands beside it.
+            executed: whether a step has been made: is it an observation, or an input?
+        """
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.parent is None:
+            return tensordict
+        memory = tensordict.get(self.key(*self.essential), None)
+        if memory is None:
+            raise KeyError(
+                f"{type(self).__name__}: no {self.prefix!r} in the tensordict; start from "
+                "env.reset(), and carry its entries on"
+            )
+        return self.act(tensordict, memory)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        return self._with_memory(observation_spec, executed=True)
+
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
+        return self._with_memory(state_spec, executed=False)
+
+    def _with_memory(self, spec: Composite, executed: bool) -> Composite:
+        spec[self.prefix] = self.memory_spec(spec, executed).to(spec.device)
+        return spec

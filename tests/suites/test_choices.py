@@ -1,0 +1,61 @@
+"""Every choice that a suite adds says what it is, and runs."""
+
+import doctest
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from afm_rl.missions import run
+
+SUITES = Path(__file__).parents[2] / "benchmarks" / "suites"
+FILES = sorted(SUITES.glob("*/conf/*/*.yaml"))
+MODULES = sorted(path.relative_to(SUITES) for path in SUITES.glob("*/*.py"))
+FLIGHT = "robot=quadrotor"
+PARTNERS = {
+    "planner=law": ["robot=gusty_pendulum"],
+    "planner=geometric": [FLIGHT],
+    "planner=geometric_soft": [FLIGHT],
+    "planner=raptor": ["robot=quadrotor_rotorpy_10ms"],
+    "method=raptor": ["robot=quadrotor_rotorpy_10ms"],
+    "method=geometric": [FLIGHT],
+    "method=mass_estimator": [FLIGHT],
+    "updater=mass": ["dynamics=oracle", FLIGHT],
+}
+NEEDS = {"actuator_inversion": ["dm_control"], "flight": ["foundation_policy", "rotorpy"]}
+
+
+def name_of(path):
+    return f"{path.parent.name}={path.stem}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_every_choice_runs(agent_of, path):
+    suite, choice = path.parents[2].name, name_of(path)
+    for package in NEEDS.get(suite, []):
+        pytest.importorskip(package)
+    results = run(agent_of(suite, choice, *PARTNERS.get(choice, []), "budget=5", "seeds=1"))
+    assert results.missions["steps"].eq(4).all()
+    assert np.isfinite(results.steps.to_numpy(dtype=float)).all()
+
+
+@pytest.mark.parametrize("path", FILES, ids=name_of)
+def test_every_file_begins_with_what_it_is(path):
+    first = path.read_text().removeprefix("# @package _global_\n").splitlines()[0]
+    assert first.startswith("# ") and first[2].isupper() and first.endswith(".")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=str)
+def test_examples_in_docstrings(path):
+    name = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+    flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    assert doctest.testmod(importlib.import_module(name), optionflags=flags).failed == 0
+
+
+def test_data_are_planned_with_the_robots_own_cost(agent_of):
+    small = ["method=frozen_pe", "dynamics.members=2", "dynamics.hidden=[8,8]"]
+    small += ["robot.data.rounds=[32,16]", "robot.data.fit.epochs=1", "planner.horizon=3"]
+    agent = agent_of("actuator_inversion", "robot=inversion_double_integrator", *small)
+    (training,) = agent.trainings
+    assert len(training.train(False)["rewards"]) == 2  # mpc, which needs a quadratic cost

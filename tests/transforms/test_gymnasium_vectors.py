@@ -1,0 +1,136 @@
+"""Vectors of environments, in one process, in several, and wrappers in several threads."""
+
+import threading
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from puck import Puck, play, push
+
+from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
+from afm_rl.errors import ConfigurationError
+
+GAINS, ENDS = (1.0, -1.0, 0.5), (6, 9, 7)
+
+
+def makers():
+    return [
+        lambda gain=gain, end=end: Puck(gain=gain, ends=end)
+        for gain, end in zip(GAINS, ENDS, strict=True)
+    ]
+
+
+def alone(plans, mode):
+    """Return what a wrapper of its own executes for each environment, and at which steps."""
+    executed, made = np.zeros((len(plans), 3, 2)), np.ones((len(plans), 3), dtype=bool)
+    for row, make in enumerate(makers()):
+        env, over = ActionFlowWrapper(make(), push), False
+        env.reset(seed=row)
+        for step, plan in enumerate(plans[:, row]):
+            if over and mode is AutoresetMode.NEXT_STEP:  # this step only resets
+                env.reset()
+                made[step, row], over = False, False
+                continue
+            *_, over, _, info = env.step(plan)
+            executed[step, row] = info["afm"]["executed"]
+            if over and mode is not AutoresetMode.NEXT_STEP:
+                env.reset()
+    return executed, made
+
+
+def processes(makers, **settings):
+    # Forked, which takes no time; torchrl has others spawned, and each would import torch.
+    return AsyncVectorEnv(makers, context="fork", **settings)
+
+
+@pytest.mark.parametrize("kind", [SyncVectorEnv, processes])
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_each_environment_gets_the_actions_of_a_wrapper_of_its_own(kind, mode):
+    plans = np.random.default_rng(0).uniform(-1, 1, (25, 3, 2))
+    envs = ActionFlowVectorWrapper(kind(makers(), autoreset_mode=mode), push)
+    envs.reset(seed=[0, 1, 2])
+    expected, made = alone(plans, mode)
+    for step, plan in enumerate(plans):
+        _, _, over, _, infos = envs.step(plan)
+        np.testing.assert_array_equal(infos["_afm"], made[step])
+        found = infos["afm"]["executed"][made[step]]
+        np.testing.assert_allclose(found, expected[step, made[step]], atol=1e-3)
+        if mode is AutoresetMode.DISABLED and over.any():
+            envs.reset(options={"reset_mask": over.copy()})
+    assert (np.abs(expected[:, 1] + plans[:, 1]).max(-1) < 0.1).sum() > 10  # it was corrected
+    envs.close()
+
+
+def test_mujoco_in_a_vector_of_one_process_or_of_several():
+    pytest.importorskip("mujoco")
+    ran, rng = [], np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (30, 2, 2)).astype(np.float32)
+    for kind in (SyncVectorEnv, processes):
+        makers = [
+            lambda turn=turn: turn(gymnasium.make("Reacher-v5", max_episode_steps=25))
+            for turn in (gymnasium.Wrapper, Reversed)
+        ]
+        envs = ActionFlowVectorWrapper(kind(makers), "mujoco")
+        envs.reset(seed=0)
+        ran.append([envs.step(each) for each in actions[:25]])
+        assert "a_0: reversed" in envs.diagnosis[1]
+        ran[-1] += [envs.step(each) for each in actions[25:]]
+        envs.close()
+    for (seen, *_, infos), (other, *_, told) in zip(*ran, strict=True):
+        np.testing.assert_array_equal(seen, other)
+        np.testing.assert_array_equal(infos["afm"]["executed"], told["afm"]["executed"])
+        assert not infos["afm"]["corrects"][0]
+    assert infos["afm"]["corrects"][1] and not ran[0][25][-1]["_afm"].any()
+
+
+class Reversed(gymnasium.ActionWrapper):
+    def action(self, action):
+        return -action
+
+
+@pytest.mark.parametrize("text", ["SameStep", "same_step", "SAME_STEP", "AutoresetMode.SAME_STEP"])
+def test_when_environments_are_reset_may_be_said_in_words(text):
+    envs = SyncVectorEnv(makers(), autoreset_mode=AutoresetMode.SAME_STEP)
+    envs.metadata = {**envs.metadata, "autoreset_mode": text}
+    wrapped = ActionFlowVectorWrapper(envs, push)
+    wrapped.reset(seed=0)
+    made = [wrapped.step(np.zeros((3, 2)))[-1]["_afm"] for _ in range(8)]
+    assert np.all(made)
+
+
+@pytest.mark.parametrize("given", [None, "sometimes", 3])
+def test_a_vector_that_does_not_say_when_it_resets_is_refused(given):
+    envs = SyncVectorEnv(makers())
+    envs.metadata = {} if given is None else {"autoreset_mode": given}
+    with pytest.raises(ConfigurationError, match=rf"autoreset_mode'\]={given!r}: expected one of"):
+        ActionFlowVectorWrapper(envs, push)
+
+
+def test_actions_for_another_number_of_environments_are_refused():
+    envs = ActionFlowVectorWrapper(SyncVectorEnv(makers()), push)
+    envs.reset()
+    with pytest.raises(ConfigurationError, match=r"actions: shape \(2, 2\), expected \(3, 2\)"):
+        envs.step(np.zeros((2, 2)))
+
+
+def test_wrappers_in_threads_execute_what_they_do_in_one():
+    def run(gain, into):
+        steps = play(ActionFlowWrapper(Puck(gain=gain), push), 12)
+        into.append(np.array([info["afm"]["executed"] for *_, info in steps]))
+
+    expected = []
+    for gain in (-1.0, 0.5):
+        run(gain, expected)
+    for _ in range(10):
+        found = [], []
+        pair = [
+            threading.Thread(target=run, args=given)
+            for given in zip((-1.0, 0.5), found, strict=True)
+        ]
+        for thread in pair:
+            thread.start()
+        for thread in pair:
+            thread.join()
+        for (mine,), alone_ in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(mine, alone_)
