@@ -117,6 +117,8 @@ class Page:
 
     def end(self) -> None:
         """End the page, and :meth:`run`."""
+        if self.ended:
+            return
         self.ended = True
         with redirect_stdout(io.StringIO()):
             self.server.stop()
@@ -172,7 +174,7 @@ class Page:
         state = "**corrects**" if afm["corrects"] else "does nothing"
         lines = [f"AFM {state}; innovation {afm['innovation']:.2f}"]
         lines += [f"{name}: {afm[name]}" for name in ("belief", "noise", "delay") if name in afm]
-        words = str(afm["diagnosis"])
+        words = str(sides[1].env.diagnosis)
         for k, name in enumerate(self.world.robot.names):
             words = words.replace(f"actuator {k}:", f"{name}:").replace(f"a_{k}:", f"{name}:")
         words = words.replace("\n", "  \n")

@@ -116,12 +116,36 @@ class GroundFigure:
         self.label = self.root.position + [0, 0, 0.4]
 
 
+class FlyingFigure:
+    """A quadrotor as a cross, and the circle that it flies."""
+
+    def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
+        self.inner, self.place = inner, 0.2 * place + [0.0, 0.0, 1.0]
+        self.root = server.scene.add_frame(f"/{name}", show_axes=False)
+        for arm, turn in enumerate((1, -1)):
+            wxyz = (np.cos(np.pi / 8), 0.0, 0.0, turn * np.sin(np.pi / 8))
+            server.scene.add_box(f"/{name}/{arm}", COLOURS[name], (0.5, 0.06, 0.06), wxyz=wxyz)
+        self.goal = server.scene.add_icosphere(
+            f"/goal/{name}", 0.06, opacity=0.5, color=COLOURS[name]
+        )
+
+    def draw(self) -> None:
+        """Put the quadrotor and its reference where they are."""
+        pose = self.inner._data["pose"].tolist()
+        self.root.position = self.place + pose[:3]
+        self.root.wxyz = (pose[9], *pose[6:9])
+        self.goal.position = self.place + self.inner._data["reference"][0, :3].tolist()
+        self.label = self.root.position + [0.0, 0.0, 0.3]
+
+
 def figure_of(server: Any, name: str, inner: Any) -> Any:
     """Return what draws the robot of an environment."""
     place = np.array([0.0, LANE if name == "alone" else -LANE, 0.0])
     if hasattr(inner, "data"):
         return MuJoCoFigure(server, name, inner, place)
-    kind = GroundFigure if hasattr(inner, "native") else PendulumFigure
+    if not hasattr(inner, "native"):
+        return PendulumFigure(server, name, inner, place)
+    kind = GroundFigure if hasattr(inner.native, "tracks") else FlyingFigure
     return kind(server, name, inner, place)
 
 

@@ -24,7 +24,8 @@ class Side:
         self.robot, self.act = robot, robot.policy()
         self.env: Any = Actuators(robot.make(), faults)
         if corrected:
-            self.env = ActionFlowWrapper(self.env, **robot.model)
+            model, corrector = robot.model, robot.corrector()
+            self.env = ActionFlowWrapper(self.env, **model, corrector=corrector)
         self.rewards: deque[float] = deque(maxlen=KEPT)
         self.commands: deque[np.ndarray] = deque(maxlen=KEPT)
         self.falls = 0

@@ -16,13 +16,27 @@ LONG = 120_000  # ms, for slow machines
 
 
 @pytest.fixture
-def served():
-    """A page of carts with poles."""
+def page_of():
+    """Make the page of a robot."""
     pytest.importorskip("viser")
     from afm_rl.cli.play import free_port
     from afm_rl.play.page import Page
 
-    page = Page(World(make_robot("cart_pole")), "cart_pole", free_port(0))
+    pages = []
+
+    def make(name):
+        pages.append(Page(World(make_robot(name)), name, free_port(0)))
+        return pages[-1]
+
+    yield make
+    for page in pages:
+        page.end()
+
+
+@pytest.fixture
+def served(page_of):
+    """A page of carts with poles, which runs."""
+    page = page_of("cart_pole")
     running = threading.Thread(target=page.run)
     running.start()
     yield page
@@ -60,6 +74,25 @@ def opened(browser, served, errors):
     page.wait_for_selector("canvas")
     page.get_by_text("Push", exact=True).wait_for()
     return page
+
+
+@pytest.mark.parametrize("name", ["hopper", "pendulum", "ugv", "quadrotor"])
+def test_robots_are_drawn_and_described(name, page_of):
+    page = page_of(name)
+    page.choose("reverse one")
+    for _ in range(20):
+        page.world.step()
+    page.draw()
+    page.say()
+    effect = page.world.sides["AFM"].effect
+    assert page.world.faults.values["gain_0"] == -1.0
+    executed = page.world.sides["AFM"].info["afm"]["executed"]
+    assert effect[0] == pytest.approx(-executed[0], rel=1e-5)
+    assert "| alone | AFM |" in page.words.content and "AFM " in page.words.content
+    for figure in page.figures.values():
+        assert all(abs(number) < 1e3 for number in figure.root.position)
+    page.choose("healthy")
+    assert page.world.faults.values["gain_0"] == 1.0
 
 
 def test_a_slider_reverses_a_motor(served, browser):
