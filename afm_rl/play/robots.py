@@ -23,7 +23,7 @@ from afm_rl.errors import ConfigurationError, check_choice
 from afm_rl.planning import MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost, load_policy
 
 Acting = Callable[[np.ndarray], np.ndarray]
-LONG = 3600.0  # s, of a flight
+LONG, NEAR = 3600.0, 3.0  # s, of a flight; m, from its reference, beyond which it is lost
 POLICIES = Path(__file__).parents[2] / "examples" / "policies" / "zoo"
 
 
@@ -175,7 +175,7 @@ def _quadrotor(file: Path | None) -> Robot:
     unit = torch.tensor([0.575, 3e-4, 3e-4, 1e-4])  # what flights use of the box
 
     def make() -> gymnasium.Env:
-        env = gymnasium.make(name, max_episode_steps=-1, duration=LONG, horizon=ahead)
+        env = gymnasium.make(name, max_episode_steps=-1, duration=LONG, horizon=ahead, limit=NEAR)
         shape = (13 + 6 * (ahead + 1),)
         space = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
 
