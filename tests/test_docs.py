@@ -179,6 +179,6 @@ def test_imports_point_downwards(monkeypatch):
         if layers.floor_of(pair[0]) >= layers.floor_of(pair[1])
     }
     assert upwards == {}
-    # environments are found by name: only the command line imports them
-    assert {here for here, there in layers.imports() if there == "envs"} <= {"cli"}
+    # environments are found by name: only the command line and the page import them
+    assert {here for here, there in layers.imports() if there == "envs"} <= {"cli", "play"}
     assert layers.draw().count("<rect") == sum(map(len, layers.FLOORS))
