@@ -33,9 +33,7 @@ def read(reading, rows=4, pairs=None, away=None):
     """Return executed, effective, std and valid of what one reading reads, ``(K,)`` each."""
     timed = [READINGS["recent"]] if reading.near or reading.varied else []
     layout = lay_out([*timed, reading], rows)
-    found = read_rows(
-        pairs_of() if pairs is None else pairs, layout, 1, away, int(reading.varied)
-    )
+    found = read_rows(pairs_of() if pairs is None else pairs, layout, 1, away, int(reading.varied))
     return [part[-1, :, 0] for part in found]
 
 
