@@ -18,7 +18,7 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
-from afm_rl.diagnosis.replay import Table as Replayed
+from afm_rl.replay import Table as Replayed
 from afm_rl.report import style
 from afm_rl.report.console import WIDE
 from afm_rl.report.replay import errors_table, pictures_of
@@ -160,7 +160,7 @@ def _page(diagnosis: Diagnosis, log: Log, source: str, replayed: Replayed | None
     if replayed is not None:
         tables.append(errors_table(replayed))
         figures += list(pictures_of(replayed))
-        notes.append(replayed.sentence)
+        notes += [replayed.sentence, *replayed.notes]
     content = {"title": "Diagnosis of the actuators", "summary": summary, "notes": notes}
     return render_page(**content, figures=figures, tables=tables, references=[])
 

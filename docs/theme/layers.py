@@ -16,7 +16,7 @@ FLOORS = [
     {"cli": 2},
     {"jobs": 2},
     {"missions": 2, "report": 4},
-    {"envs": 0, "transforms": 2},
+    {"envs": 0, "transforms": 2, "replay": 4},
     {"correction": 2, "planning": 3},
     {"flow": 2},
     {"learning": 2},

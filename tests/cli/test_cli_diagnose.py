@@ -84,7 +84,7 @@ def test_a_log_is_replayed(call, log, tmp_path):
     done = call(log, "--replay", tmp_path / "out.csv")
     assert (done.status, done.err) == (0, "")
     sentence = next(line for line in done.out.splitlines() if line.startswith("A correction"))
-    assert "none of pan; " in sentence and "% of the error of <b>elbow" in sentence
+    assert sentence.endswith("% of the error of <b>elbow, and none of pan.")
     rows = pd.read_csv(tmp_path / "out.csv")
     assert len(rows) == 398 and np.isfinite(rows["<b>elbow.afm"]).all()
     page = (log.parent / "log_diagnosis" / "index.html").read_text()

@@ -49,8 +49,8 @@ def open_lerobot(folder: Path) -> Source:
 
     def read(wanted: Sequence[str]) -> dict[str, Series]:
         found = dict(source.read([name for name in wanted if name in names]))
-        row = found[EPISODE].row
-        t = found[TIME].values if every else row / fps
+        row = next(iter(found.values())).row
+        t = found[TIME].values if every else np.asarray(row) / fps
         whole = np.round(t * fps) / fps  # stored in single precision, a little off
         t = np.where(np.abs(t - whole) < 0.02 / fps, whole, t)
         return found | {TIME: Series(t, row=row)}

@@ -74,9 +74,9 @@ def source_of(
             found[name] = Series(values if place is None else values[:, place], row=number)
         return found
 
-    there = [name if name in names else None for name in (time, episode)]
+    at, number = (name if name in names else None for name in (time, episode))
     notes = (*notes, *thinned_note(sum(sizes), blocks))
-    return Source(path, list(names), read, frame, *there, notes=notes)
+    return Source(path, list(names), read, frame, at, number, notes=notes)
 
 
 def columns_of(file: Path) -> dict[str, arrow.DataType]:

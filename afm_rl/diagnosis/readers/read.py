@@ -138,10 +138,10 @@ def read_columns(
                 )
         first, second = (np.column_stack([found[n].values for n in group]) for group in wanted)
         time = found[source.time].values if source.time else clock
-        episode = found[source.episode].values if source.episode else None
+        border = found[source.episode].values if source.episode else None
         number = found[wanted[0][0]].row
         number = np.arange(len(first)) if number is None else number
-        done = _complete(source, names, first, second, number, time, episode, notes)
+        done = _complete(source, names, first, second, number, time, border, notes)
         return replace(done, effort=_effort(source))
 
 

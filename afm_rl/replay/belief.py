@@ -25,12 +25,17 @@ def watcher(size: int) -> ActionFlow:
 def identity(size: int) -> KnownDynamics:
     """Return the model of a healthy robot whose state is its response: the last command.
 
-    >>> identity(2)(torch.zeros(2), torch.tensor([0.1, 0.2]))
-    tensor([0.1000, 0.2000])
+    A further coordinate turns from 0 to 1 and back at each row. It tells a response that is the
+    same again from a reading that is repeated: what a log holds between two messages counts.
+
+    >>> identity(2)(torch.zeros(3), torch.tensor([0.1, 0.2]))
+    tensor([0.1000, 0.2000, 1.0000])
     """
-    return KnownDynamics(
-        lambda state, action: action + 0 * state, Manifold(size), size, affine=True
-    )
+
+    def step(state: Tensor, action: Tensor) -> Tensor:
+        return torch.cat([action, 1 - state[..., -1:].expand_as(action[..., -1:])], -1)
+
+    return KnownDynamics(step, Manifold(size + 1), size, affine=True)
 
 
 def follow(
@@ -68,6 +73,8 @@ def believe(
     """
     sent, felt = (torch.as_tensor(part, dtype=torch.float32) for part in (command, response))
     model = identity(sent.shape[-1])
+    turn = (torch.arange(1.0, len(felt) + 1) % 2).view(-1, *[1] * (felt.dim() - 1))
+    felt = torch.cat([felt, turn.expand(*felt.shape[:-1], 1)], -1)
     memory, found = corrector.begin(torch.zeros_like(felt[0])), []
     for row, (action, state) in enumerate(zip(sent, felt, strict=True)):
         memory, effect, std = follow(corrector, memory, action, model)

@@ -9,10 +9,10 @@ from scipy.signal import lfilter
 
 from afm_rl.diagnosis import Log
 from afm_rl.diagnosis.readers import read_log
-from afm_rl.diagnosis.replay import replay
-from afm_rl.diagnosis.replay.belief import believe, identity, watcher
-from afm_rl.diagnosis.replay.simple import affine, arx, running_gain
-from afm_rl.diagnosis.replay.table import AFM, ALONE, quantile_with_interval
+from afm_rl.replay import replay
+from afm_rl.replay.belief import believe, identity, watcher
+from afm_rl.replay.simple import affine, arx, running_gain
+from afm_rl.replay.table import AFM, ALONE, Table, quantile_with_interval
 
 LOGS = Path(__file__).parents[2] / "examples" / "real_logs"
 
@@ -30,10 +30,10 @@ def replayed():
 
 
 def test_what_a_correction_would_have_removed(replayed):
-    first, second = replayed.sentences
-    share = int(first.split(" ")[0])
-    assert share > 85 and first.endswith("% of the error of arm") and second == "none of hand"
-    assert replayed.sentence == f"A correction would have removed {first}; {second}."
+    share = round(100 * replayed.removed["arm"])
+    assert share > 85 and replayed.removed["hand"] == 0 and not replayed.slow
+    said = f"A correction would have removed {share} % of the error of arm, and none of hand."
+    assert replayed.sentence == said
     miss = np.abs(replayed.predictions[AFM] - replayed.log.response)[20:]
     assert np.median(miss) < 0.04
     assert 0.5 < np.mean(miss < replayed.std[20:])  # the noise is learnt
@@ -82,13 +82,21 @@ def test_a_row_is_what_the_corrector_predicts():
     u, y = (torch.as_tensor(x / unit, dtype=torch.float32) for x in (log.command, log.response))
     effects, stds = believe(corrector, log.command / unit, log.response / unit)
     box = torch.tensor([[-1.0, -1.0], [1.0, 1.0]])
-    memory = corrector.begin(torch.zeros(2))
+    memory = corrector.begin(torch.zeros(3))
     for k in range(40):
         effect, std = corrector.predict(memory, u[k], model)
         np.testing.assert_allclose(effect, effects[k], atol=1e-5)
         np.testing.assert_allclose(std, stds[k], atol=1e-5)
         memory, _ = corrector.correct(memory, u[k], model, box)
-        memory = corrector.observe(corrector.executing(memory, u[k], u[k]), y[k])
+        state = torch.cat([y[k], torch.tensor([1.0 - k % 2])])
+        memory = corrector.observe(corrector.executing(memory, u[k], u[k]), state)
+
+
+def test_a_response_that_is_held_between_messages_counts():
+    log = make(rows=80)
+    u, y = log.command[:, :1], np.repeat(-log.command[::4, :1], 4, axis=0)  # every fourth is new
+    table = replay(Log(("arm",), np.repeat(u[::4], 4, axis=0), y))
+    assert np.median(np.abs(table.predictions[AFM] - y)[40:]) < 0.05
 
 
 def test_each_row_of_the_file_has_a_row(tmp_path):
@@ -116,6 +124,29 @@ def test_errors_are_those_of_the_rows(replayed):
     assert errors.loc[("arm", "2", ALONE), "p90"] == np.quantile(miss[30:60], 0.9)
     assert (errors["median_low"] <= errors["median"]).all()
     assert (errors["p90"] <= errors["p90_high"]).all()
+
+
+def test_sentences():
+    log = make(rows=30)
+
+    def say(*shares):
+        return Table(log, {}, log.command, None, dict(zip("abc", shares, strict=False))).sentence
+
+    assert say(0.5, 0.7) == (
+        "A correction would have removed 50 % of the error of a, and 70 % of the error of b."
+    )
+    assert say(0.0, 0.0) == "A correction would have removed none of a and b."
+    assert say(0.5, 0.0, -0.2) == (
+        "A correction would have removed 50 % of the error of a, and none of b, and added 20 % to "
+        "that of c."
+    )
+    assert say(-0.2) == "A correction would have added 20 % to that of a."
+
+
+def test_slow_actuators_are_named():
+    u = np.repeat(np.random.default_rng(0).uniform(-1, 1, (10, 1)), 12, axis=0)
+    table = replay(Log(("arm",), u, lfilter([0.1], [1.0, -0.9], u, axis=0)))
+    assert table.slow == ("arm",) and table.notes[0].startswith("arm: commands act in later rows")
 
 
 def test_intervals_hold_what_they_promise():
