@@ -12,13 +12,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from rich import box
+from rich.console import Console
 from rich.table import Table as Grid
 from rich.text import Text
 
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
 from afm_rl.replay import Table as Replayed
 from afm_rl.report import style
-from afm_rl.report.console import terminal
+from afm_rl.report.console import WIDE
 from afm_rl.report.figures import Picture
 from afm_rl.report.replay import errors_table, pictures_of
 from afm_rl.report.table import Table
@@ -51,7 +52,7 @@ def print_diagnosis(diagnosis: Diagnosis, file: IO[str] | None = None) -> None:
     <BLANKLINE>
     wrist: healthy
     """
-    console = terminal(file)
+    console = Console(file=file, width=WIDE, highlight=False)
     grid = Grid(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     shown = _table(diagnosis)
     shown = shown.loc[:, [name for name in shown if name in KEPT or (shown[name] != "-").any()]]
