@@ -38,6 +38,16 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or error.__context__
 
 
+def printable(name: str, longest: int = 80) -> str:
+    r"""Return a name that no terminal takes for an order, and that fits on a line.
+
+    >>> printable("pan\x1b[31m"), printable("x" * 100)[-4:]
+    ('pan?[31m', 'x...')
+    """
+    clean = "".join(letter if letter.isprintable() else "?" for letter in name[: 2 * longest])
+    return clean if len(clean) <= longest else f"{clean[: longest - 3]}..."
+
+
 def check_number(
     name: str,
     value: float,

@@ -10,12 +10,17 @@ from typing import NoReturn
 from afm_rl.cli.error_messages import told_by
 
 NAME = "afm-rl-diagnose"
+PATIENCE = 3.0  # s: shorter work shows no progress
+KINDS = ".csv, .parquet, .ulg, .mcap, .db3, .bag, or a folder of LeRobot or ROS"
 ABOUT = """\
 Say what the actuators of a robot do, from what it logged.
 
   afm-rl-diagnose log.csv                          columns command.NAME, response.NAME, and t (s)
   afm-rl-diagnose log.parquet --out report         diagnosis.json and index.html in report/
   afm-rl-diagnose datasets/pick_cube               a data set of LeRobot's
+  afm-rl-diagnose flight.ulg                       what is in it: PX4's ULog, MCAP, bags of ROS
+  afm-rl-diagnose drive.mcap --command /cmd_vel.linear.x --response /odom.twist.twist.linear.x
+  afm-rl-diagnose log.csv --replay out.csv         what a correction would have known, row by row
   afm-rl-diagnose log.csv --delay 0.1              a robot whose healthy response takes 0.1 s
   afm-rl-diagnose log.csv --model mine.step        columns action.NAME, state.NAME; the responses
                                                    are the actions that explain the states
@@ -39,10 +44,17 @@ def main() -> None:
         prog=NAME, description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add("file", metavar="FILE", type=Path, help="a log (.csv, .parquet), or a folder of LeRobot's")
+    add("file", metavar="FILE", type=Path, help=f"a log: {KINDS}")
     add("--out", metavar="DIR", type=Path, help="where to (FILE_diagnosis, beside FILE)")
     healthy = "delay and lag of the healthy robot (s): 0; one frame in LeRobot's data sets"
     add("--delay", metavar="SECONDS", type=float, help=healthy)
+    for name, what in (("command", "commands"), ("response", "their responses, in that order")):
+        told = f"names of {what}, FIELD or NAME=FIELD, with commas; a topic stands for its fields"
+        add(f"--{name}", metavar="FIELDS", action="append", default=[], help=told)
+    episode = "the column in which episodes or windows are numbered (episode_index)"
+    add("--episode", metavar="COLUMN", help=episode)
+    replay = "also replay the log: what would a correction have predicted of each row?"
+    add("--replay", metavar="OUT.csv", type=Path, help=replay)
     model = "a step function, step(state, action) -> next state, in torch; code that you trust"
     add("--model", metavar="MODULE.FUNCTION", help=model)
     add("--no-page", dest="page", action="store_false", help="write diagnosis.json only")
@@ -56,12 +68,20 @@ def _run(options: argparse.Namespace) -> None:
     from dataclasses import replace
 
     from afm_rl.diagnosis import diagnose
-    from afm_rl.diagnosis.read import read_log
-    from afm_rl.errors import check_number
+    from afm_rl.diagnosis.readers import Unchosen, read_log
+    from afm_rl.errors import check_number, printable
     from afm_rl.report.diagnosis import print_diagnosis, write_diagnosis
 
     if options.model is None:
-        log = read_log(options.file)
+        command, response = (
+            [field.strip() for text in given for field in text.split(",")]
+            for given in (options.command, options.response)
+        )
+        try:
+            log = read_log(options.file, command, response, options.episode)
+        except Unchosen as error:
+            print("\n".join(error.listing))
+            raise
     else:
         from afm_rl.cli.effective import read_effective  # torch takes seconds
 
@@ -69,8 +89,20 @@ def _run(options: argparse.Namespace) -> None:
     if options.delay is not None:
         log = replace(log, usual_delay=check_number("--delay", options.delay, low=0.0))
     found = diagnose(log)
+    replayed = None
+    if options.replay is not None:
+        from afm_rl.progress import Bar
+        from afm_rl.replay import replay
+        from afm_rl.report.replay import print_replay, write_replay
+
+        with Bar(total=1.0, desc="replaying", delay=PATIENCE) as bar:
+            replayed = replay(log, lambda share: bar.update(share - bar.n))
     file = options.file.resolve()
     out = options.out or file.with_name(f"{file.stem}_diagnosis")
     print_diagnosis(found)
-    for path in write_diagnosis(found, log, out, str(options.file), page=options.page):
+    if replayed is not None:
+        print_replay(replayed)
+        print(f"wrote {write_replay(replayed, options.replay)}")
+    source, page = printable(str(options.file)), options.page
+    for path in write_diagnosis(found, log, out, source, page, replayed):
         print(f"wrote {path}")

@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from afm_rl.errors import AFMError, causes
+from afm_rl.errors import AFMError, causes, printable
 
 NOISE = ("Config search path:", "Set the env", "See https://")  # of no help here
 UNKNOWN = re.compile(r"Could not override '([^']+)'")  # Hydra's words for a misspelt setting
@@ -36,7 +36,7 @@ def told_by(name: str) -> Iterator[None]:
         message = explain(error)
         if message is None:
             raise
-        print(f"{name}: {one_line(message)}", file=sys.stderr)
+        print(f"{name}: {printable(one_line(message), 4000)}", file=sys.stderr)
         sys.exit(2)
 
 

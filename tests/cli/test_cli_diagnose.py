@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -45,7 +46,7 @@ def test_a_log_becomes_a_table_a_file_and_a_page(call, log):
     done = call(log)
     assert (done.status, done.err) == (0, "")
     assert "pan: healthy" in done.out.splitlines()
-    assert "<b>elbow: reversed, 62 % of the command, 2 steps late" in done.out.splitlines()
+    assert "<b>elbow: reversed, 62 % of the command, 2 steps (0.04 s) late" in done.out.splitlines()
     out = log.parent / "log_diagnosis"
     pan, elbow = json.loads((out / "diagnosis.json").read_text())["actuators"]
     assert pan["status"] == "healthy" and pan["saturation"] is None
@@ -79,9 +80,37 @@ def test_effective_actions_of_a_model(call, tmp_path, monkeypatch):
     sys.modules.pop("own_model")
 
 
+def test_a_log_is_replayed(call, log, tmp_path):
+    done = call(log, "--replay", tmp_path / "out.csv")
+    assert (done.status, done.err) == (0, "")
+    sentence = next(line for line in done.out.splitlines() if line.startswith("A correction"))
+    assert sentence.endswith("% of the error of <b>elbow, and none of pan.")
+    rows = pd.read_csv(tmp_path / "out.csv")
+    assert len(rows) == 398 and np.isfinite(rows["<b>elbow.afm"]).all()
+    page = (log.parent / "log_diagnosis" / "index.html").read_text()
+    assert page.count("data:image/png;base64,") == 3 and "affine least squares" in page
+
+
+def test_what_is_in_a_log_of_messages_is_listed(call):
+    ulog = Path(__file__).parents[2] / "examples" / "real_logs" / "px4_disarmed.ulg"
+    done = call(ulog)
+    assert done.status == 2 and done.err.count("\n") == 1 and "--command" in done.err
+    assert "vehicle_rates_setpoint (184 messages): roll, pitch, yaw, thrust" in done.out
+
+
+def test_fields_are_named(call, log, tmp_path):
+    table = pd.read_csv(log).rename(columns=lambda name: name.replace(".", "_"))
+    table.to_csv(tmp_path / "other.csv", index=False)
+    pairs = ["--command", "joint=command_pan", "--response", "response_pan", "--no-page"]
+    done = call(tmp_path / "other.csv", *pairs)
+    assert done.err == "" and "joint: healthy" in done.out.splitlines()
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["\x1b[31m.csv"], "?[31m.csv: no such file"),
+        (["log.csv", "--episode", "run"], "log.csv: --episode run: there is no such name"),
         ([], "the following arguments are required: FILE"),
         (["nowhere.csv"], "nowhere.csv: no such file"),
         (["log.csv", "--delay", "-1"], "--delay=-1.0: expected a finite number"),

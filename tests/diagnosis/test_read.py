@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from afm_rl.diagnosis import diagnose
-from afm_rl.diagnosis.read import read_log
+from afm_rl.diagnosis.readers import read_log
 from afm_rl.errors import ConfigurationError
 
 
@@ -39,6 +39,7 @@ def lerobot(tmp_path, request):
     for episode in range(2):
         u = rng.uniform(-1, 1, (100, 2)).astype(np.float32)
         y = np.concatenate([u[:1], u[:-1]]) * np.array([1, -1], dtype=np.float32)
+        y += np.float32(1e-3) * rng.standard_normal(y.shape).astype(np.float32)
         columns = {"action": list(u), "observation.state": list(y), "episode_index": episode}
         columns |= {"timestamp": (np.arange(100) / 30).astype(np.float32)}
         episodes.append(pd.DataFrame(columns))
@@ -73,7 +74,7 @@ def test_rows_with_missing_numbers_are_dropped(table, tmp_path):
     table.drop(columns="t").to_csv(tmp_path / "log.csv", index=False)
     log = read_log(tmp_path / "log.csv")
     assert log.notes == (
-        "2 of 60 rows were dropped: numbers are missing",
+        "2 of 60 rows were dropped: numbers are missing or infinite",
         "no column t: times are in rows",
     )
     assert len(log.command) == 58 and log.seconds[4] == 5
@@ -114,7 +115,7 @@ def test_tables_that_cannot_be_used(table, tmp_path, spoil, message):
     ("name", "content", "message"),
     [
         ("none.csv", None, "no such file"),
-        ("log.txt", b"a", r"expected a file \.csv or \.parquet"),
+        ("log.txt", b"a", r"expected a file \.csv, \.parquet, \.ulg, \.mcap"),
         ("log.csv", b"", "empty"),
         ("log.csv", b"\xff\xfe\x00", "no CSV file"),
         ("log.parquet", b"no", "no parquet file"),
@@ -132,11 +133,23 @@ def test_files_that_cannot_be_used(tmp_path, name, content, message):
     [
         (lambda d: (d / "meta" / "info.json").unlink(), "info.json: No such file"),
         (lambda d: (d / "meta" / "info.json").write_text("{}"), "damaged"),
-        (lambda d: change_info(d, fps=0), "expected a rate above 0"),
+        (lambda d: change_info(d, fps=float("inf")), "fps=inf: expected a rate between"),
+        (lambda d: change_info(d, fps=1e-308), "fps=1e-308: expected a rate between"),
+        (lambda d: change_info(d, fps=10**400), "damaged"),
+        (lambda d: change_info(d, features=[]), "damaged"),
+        (lambda d: change_info(d, features={}), "no feature action or actions"),
+        (lambda d: write_info(d, "[" * 100_000), "damaged"),
+        (lambda d: write_info(d, '{"fps": ' + 5000 * "1" + "}"), "damaged"),
+        (lambda d: change_names(d, [[["a", "b"]], {"x": ["c"]}]), "2 numbers per row, but 3 names"),
+        (lambda d: change_names(d, ["one", "one"]), "two of the 2 names are the same"),
+        (lambda d: spoil_column(d, episode_index="x"), "episode_index: .*: expected numbers"),
+        (lambda d: spoil_column(d, timestamp="soon"), "timestamp: .*: expected numbers"),
+        (lambda d: mix_lengths(d), "lists of 2 and 1 and 3 numbers"),
+        (lambda d: change_info(d, fps=0), "fps=0.0: expected a rate between"),
         (lambda d: change_names(d, ["one"]), "2 numbers per row, but 1 names"),
         (lambda d: [p.unlink() for p in d.glob("data/*/*")], r"no data/chunk-\*"),
         (lambda d: next(d.glob("data/*/*")).write_bytes(b""), "no parquet file"),
-        (lambda d: spoil_column(d, action=1.0), "expected lists of numbers"),
+        (lambda d: spoil_column(d, action=1.0), "1 numbers per row, but 2 names"),
         (lambda d: spoil_column(d, other=1.0, drop="action"), "no column action"),
     ],
 )
@@ -144,6 +157,18 @@ def test_data_sets_that_cannot_be_used(lerobot, spoil, message):
     spoil(lerobot)
     with pytest.raises(ConfigurationError, match=message):
         read_log(lerobot)
+
+
+def write_info(folder, text):
+    (folder / "meta" / "info.json").write_text(text)
+
+
+def mix_lengths(folder):
+    """The numbers of lists of 1 and of 3 are as many as of lists of 2."""
+    path = sorted(folder.glob("data/*/*"))[0]
+    table = pd.read_parquet(path)
+    lists = [np.zeros(2), *(np.zeros(1 + 2 * (row % 2)) for row in range(len(table) - 1))]
+    table.assign(action=lists).to_parquet(path)
 
 
 def change_info(folder, **settings):
@@ -158,4 +183,5 @@ def change_names(folder, names):
 
 def spoil_column(folder, drop=None, **columns):
     path = sorted(folder.glob("data/*/*"))[0]
-    pd.read_parquet(path).drop(columns=drop or []).assign(**columns).to_parquet(path)
+    table = pd.read_parquet(path).drop(columns=drop or [])
+    table.assign(**columns).to_parquet(path)

@@ -1,0 +1,191 @@
+"""Parquet files: columns of numbers, and of lists of numbers of one length."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pyarrow as arrow
+import pyarrow.compute as compute
+import pyarrow.parquet as parquet
+
+from afm_rl.diagnosis.readers.source import Series, Source
+from afm_rl.diagnosis.readers.tables import EPISODE, TIME
+from afm_rl.diagnosis.readers.thin import blocks_of, thinned_note
+from afm_rl.errors import ConfigurationError, printable
+
+STAMP, FLOATS = "timestamp", ("float", "double")
+LISTS = (arrow.types.is_list, arrow.types.is_large_list, arrow.types.is_fixed_size_list)
+
+
+def open_parquet(path: Path) -> Source:
+    """Return the columns of a parquet file; a list's numbers are called ``COLUMN.0`` and so on.
+
+    Raises:
+        ConfigurationError: if it is no parquet file.
+    """
+    names: dict[str, tuple[str, int | None]] = {}
+    columns = columns_of(path)
+    for column in columns:
+        width = width_of(path, column)
+        if width is None:
+            names[column] = (column, None)
+        names |= {f"{column}.{k}": (column, k) for k in range(width or 0)}
+    # An episode of LeRobot's has the time (s) under another name.
+    time = STAMP if TIME not in columns and str(columns.get(STAMP)) in FLOATS else TIME
+    return source_of(path, [path], names, time)
+
+
+def source_of(
+    path: Path,
+    files: Sequence[Path],
+    names: Mapping[str, tuple[str, int | None]],
+    time: str = TIME,
+    episode: str = EPISODE,
+    frame: float = 0.0,
+    notes: tuple[str, ...] = (),
+) -> Source:
+    """Return the rows of parquet files, one after the other, as a source.
+
+    Args:
+        path: what they belong to.
+        files: in order.
+        names: of numbers: a column, and the place in its lists.
+        time: name of the time.
+        episode: name of the number of the episode.
+        frame: time between command and response of a healthy robot (s).
+        notes: what a reader must know.
+    """
+    sizes = [_rows(file) for file in files]
+    blocks = blocks_of(sum(sizes))
+
+    def read(wanted: Sequence[str]) -> dict[str, Series]:
+        columns = list(dict.fromkeys(names[name][0] for name in wanted))
+        number, arrays = _read(files, sizes, columns, blocks)
+        found = {}
+        for name in wanted:
+            column, place = names[name]
+            values = arrays[column]
+            if (values.ndim == 1) != (place is None) or (place or 0) >= values.shape[-1]:
+                expected = "one number a row" if place is None else f"lists of more than {place}"
+                raise ConfigurationError(f"{printable(column)}: expected {expected}")
+            found[name] = Series(values if place is None else values[:, place], row=number)
+        return found
+
+    at, number = (name if name in names else None for name in (time, episode))
+    notes = (*notes, *thinned_note(sum(sizes), blocks))
+    return Source(path, list(names), read, frame, at, number, notes=notes)
+
+
+def columns_of(file: Path) -> dict[str, arrow.DataType]:
+    """Return names and types of the columns of a file."""
+    with _reading(file):
+        schema = parquet.read_schema(file)
+    if len(set(schema.names)) < len(schema.names):
+        raise ConfigurationError(
+            f"{printable(str(file), 200)}: two columns of one name; rename one"
+        )
+    return dict(zip(schema.names, schema.types, strict=True))
+
+
+def width_of(file: Path, column: str) -> int | None:
+    """Return how many numbers the first list of a column has; None: they are single numbers."""
+    with _reading(file):
+        opened = parquet.ParquetFile(file)
+        if not any(is_list(opened.schema_arrow.field(column).type) for is_list in LISTS):
+            return None
+        first = next(opened.iter_batches(1, columns=[column]), None)
+        return 0 if first is None or not len(first) else len(first.column(0)[0].as_py() or ())
+
+
+def _rows(file: Path) -> int:
+    with _reading(file):
+        return parquet.read_metadata(file).num_rows
+
+
+def _read(
+    files: Sequence[Path],
+    sizes: Sequence[int],
+    columns: Sequence[str],
+    blocks: Sequence[tuple[int, int]],
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the numbers of the rows of blocks, and columns ``(N,)`` or ``(N, K)``."""
+    parts: dict[str, list[np.ndarray]] = {column: [] for column in columns}
+    numbers, begin = [np.empty(0, dtype=int)], 0
+    for file, size in zip(files, sizes, strict=True):
+        wanted = [(max(a - begin, 0), min(b - begin, size)) for a, b in blocks]
+        wanted = [(a, b) for a, b in wanted if a < b]
+        with _reading(file):
+            for first, batch in _batches(file, columns, wanted):
+                numbers.append(begin + first + np.arange(len(batch)))
+                for column in columns:
+                    parts[column].append(_values(column, batch.column(column)))
+        begin += size
+    for column, found in parts.items():
+        if len({part.shape[1:] for part in found}) > 1:
+            raise ConfigurationError(
+                f"{printable(column)}: lists of {' and '.join(_widths(found))} numbers: expected "
+                "one length"
+            )
+    joined = {name: np.concatenate(found or [np.empty(0)]) for name, found in parts.items()}
+    return np.concatenate(numbers), joined
+
+
+def _widths(found: Sequence[np.ndarray]) -> list[str]:
+    return sorted({str(part.shape[1]) if part.ndim > 1 else "single" for part in found})
+
+
+def _batches(
+    file: Path, columns: Sequence[str], wanted: Sequence[tuple[int, int]]
+) -> Iterator[tuple[int, arrow.RecordBatch]]:
+    """Yield rows of a file in batches, with the number of the first; only wanted rows."""
+    if not wanted:
+        return
+    opened, first = parquet.ParquetFile(file), 0
+    for batch in opened.iter_batches(1 << 16, columns=list(columns)):
+        for low, high in wanted:
+            a, b = max(low - first, 0), min(high - first, len(batch))
+            if a < b:
+                yield first + a, batch.slice(a, b - a)
+        first += len(batch)
+        if first >= wanted[-1][1]:
+            return
+
+
+def _values(name: str, column: arrow.Array) -> np.ndarray:
+    """Return a column of numbers ``(N,)``, NaN where one is missing, or of lists ``(N, K)``."""
+    if any(is_list(column.type) for is_list in LISTS):
+        widths = compute.unique(compute.list_value_length(column)).to_pylist()
+        if len(widths) != 1 or widths[0] is None:
+            raise ConfigurationError(
+                f"{printable(name)}: lists of {' and '.join(str(w or 'no') for w in widths)} "
+                "numbers: expected lists of numbers of one length"
+            )
+        return _values(name, column.flatten()).reshape(len(column), widths[0])
+    kind = column.type
+    is_number = arrow.types.is_integer(kind) or arrow.types.is_floating(kind)
+    if not (is_number or arrow.types.is_boolean(kind)):
+        raise ConfigurationError(f"{printable(name)}: {kind}: expected numbers, or lists of them")
+    with np.errstate(invalid="ignore"):  # a signalling NaN
+        return column.to_numpy(zero_copy_only=False).astype(float)
+
+
+@contextmanager
+def _reading(file: Path) -> Iterator[None]:
+    """Turn an error of the reader into one line."""
+    try:
+        yield
+    except ConfigurationError:
+        raise
+    except OSError as error:
+        reason = error.strerror or printable(str(error))
+        raise ConfigurationError(
+            f"{printable(str(file), 200)}: no parquet file: {reason}"
+        ) from error
+    except (arrow.ArrowException, ValueError, TypeError, OverflowError, KeyError) as error:
+        reason = printable(str(error), 120)
+        raise ConfigurationError(
+            f"{printable(str(file), 200)}: no parquet file: {reason}"
+        ) from error

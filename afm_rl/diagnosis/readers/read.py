@@ -1,0 +1,240 @@
+"""A file or folder becomes a log."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from afm_rl.diagnosis.log import FEWEST, Log
+from afm_rl.diagnosis.readers import bags, lerobot, parquet, tables, ulog
+from afm_rl.diagnosis.readers.choose import choose
+from afm_rl.diagnosis.readers.source import Columns, Series, Source, check_regular
+from afm_rl.errors import ConfigurationError, printable
+
+PAIRS = ("command", "response")
+TRANSITIONS = ("action", "state")
+LOST = 0.5  # share of the rows that may be dropped because a number is missing
+EFFORT = re.compile(r"(pwm|thrust|throttle|motor|esc)[._]?\d*")
+"""Columns that say how hard the motors are driven, if at all."""
+LARGEST = 1e30  # squares of larger numbers leave single precision
+
+READERS: dict[str, Callable[[Path], Source]] = {
+    ".csv": tables.open_csv,
+    ".parquet": parquet.open_parquet,
+    ".pq": parquet.open_parquet,
+    ".ulg": ulog.open_ulog,
+    ".ulog": ulog.open_ulog,
+    ".mcap": bags.open_mcap,
+    ".bag": bags.open_bag,
+    ".db3": bags.open_bag,
+}
+EXPECTED = (
+    "expected a file .csv, .parquet, .ulg, .mcap, .db3 or .bag, or a folder of LeRobot or ROS"
+)
+
+
+def open_source(path: Path) -> Source:
+    """Return what there is in a file or folder.
+
+    Raises:
+        ConfigurationError: if it cannot be read.
+    """
+    if path.is_dir():
+        if (path / lerobot.INFO).parent.exists():
+            return lerobot.open_lerobot(path)
+        if (path / "metadata.yaml").exists():
+            return bags.open_bag(path)
+        raise ConfigurationError(
+            f"{path}: a folder without {lerobot.INFO} (LeRobot) or metadata.yaml (ROS); {EXPECTED}"
+        )
+    if not path.is_symlink() and not path.exists():
+        raise ConfigurationError(f"{path}: no such file; {EXPECTED}")
+    reader = READERS.get(check_regular(path).suffix.lower())
+    if reader is None:
+        raise ConfigurationError(f"{path}: {EXPECTED}; export the log as one of these")
+    return reader(path)
+
+
+def read_log(
+    path: str | Path,
+    command: Sequence[str] = (),
+    response: Sequence[str] = (),
+    episode: str | None = None,
+) -> Log:
+    """Read what a robot logged.
+
+    * a CSV or parquet file with columns ``command.NAME`` and ``response.NAME``, optionally ``t``
+      (s) and ``episode_index``, or lists ``action`` and ``observation.state``,
+    * a folder of LeRobot (versions 2 and 3). There a state is read before the action is sent, so
+      that a healthy robot is late by one frame,
+    * a ULog of PX4, an MCAP file, a bag of ROS (extra ``logs``): ``command`` and ``response`` name
+      their fields. A row is made for each message of the first response; of all others, the last
+      message before it counts.
+
+    Rows in which a number is missing are dropped, with a note. Where the number of the episode
+    changes, the command before is not known.
+
+    Args:
+        path: of the file or folder.
+        command: names of fields that are commands, ``FIELD`` or ``NAME=FIELD``; a topic or array
+            stands for all its fields.
+        response: their responses, in the same order.
+        episode: name of the number of the episode, or of the window; ``episode_index`` if None.
+
+    Raises:
+        Unchosen: if it is not known what a command is; has a listing of what there is.
+        ConfigurationError: if the file cannot be used; says what was expected.
+    """
+    found = read_columns(Path(path), PAIRS, command, response, episode)
+    with _about(path):
+        return Log(
+            names=tuple(printable(name) for name in found.names[0]),
+            command=found.first,
+            response=found.second,
+            t=found.t,
+            episode=found.episode,
+            usual_delay=found.frame,
+            row=found.row if found.read_from > len(found.first) else None,
+            read_from=found.read_from,
+            notes=found.notes,
+            effort=found.effort,
+        )
+
+
+def read_columns(
+    path: Path,
+    kinds: tuple[str, str],
+    command: Sequence[str] = (),
+    response: Sequence[str] = (),
+    episode: str | None = None,
+) -> Columns:
+    """Read two groups of columns, ``command.*`` and ``response.*`` or ``action.*`` and ``state.*``.
+
+    Raises:
+        ConfigurationError: if the file cannot be used.
+    """
+    with _about(path):
+        source = open_source(path)
+        if episode is not None:
+            if episode not in source.names:
+                raise ConfigurationError(f"--episode {printable(episode)}: there is no such name")
+            source = replace(source, episode=episode)
+        wanted, names, notes = choose(source, kinds, command, response, kinds == PAIRS)
+        others = [name for name in (source.time, source.episode) if name is not None]
+        found = source.read(list(dict.fromkeys([*wanted[0], *wanted[1], *others])))
+        clock = found[wanted[1][0]].t
+        if clock is not None:
+            found = {name: _held(series, clock) for name, series in found.items()}
+        for name, series in found.items():
+            if not (np.abs(series.values[np.isfinite(series.values)]) < LARGEST).all():
+                row = int(np.flatnonzero(np.abs(np.nan_to_num(series.values)) >= LARGEST)[0])
+                raise ConfigurationError(
+                    f"{printable(name)}: row {row}: expected numbers below {LARGEST:g}"
+                )
+        first, second = (np.column_stack([found[n].values for n in group]) for group in wanted)
+        time = found[source.time].values if source.time else clock
+        border = found[source.episode].values if source.episode else None
+        number = found[wanted[0][0]].row
+        number = np.arange(len(first)) if number is None else number
+        done = _complete(source, names, first, second, number, time, border, notes)
+        return replace(done, effort=_effort(source))
+
+
+@contextmanager
+def _about(path: str | Path) -> Iterator[None]:
+    """Let messages begin with the path."""
+    try:
+        yield
+    except ConfigurationError as error:
+        begin, text = (printable(str(x), 4000) for x in (path, error))
+        text = text.removeprefix("log: ")
+        if not text.startswith(begin):
+            error.args = (f"{begin}: {text}",)
+        raise
+    except RecursionError as error:
+        raise ConfigurationError(f"{path}: nested too deeply; expected a log") from error
+    except MemoryError as error:
+        raise ConfigurationError(f"{path}: not enough memory; log less at a time") from error
+
+
+def _effort(source: Source, most: int = 16) -> dict[str, np.ndarray]:
+    """Return how hard the motors were driven, as far as that was logged in numbers."""
+    names = [name for name in source.names if EFFORT.fullmatch(name)][:most]
+    try:
+        found = source.read(names) if names else {}
+    except ConfigurationError:
+        return {}
+    kept = {name: series.values[np.isfinite(series.values)] for name, series in found.items()}
+    return {printable(name): values for name, values in kept.items() if len(values)}
+
+
+def _held(series: Series, clock: np.ndarray) -> Series:
+    """Return the newest value at each time of a clock, NaN before the first one."""
+    if series.t is None:
+        return series
+    place = np.searchsorted(series.t, clock, side="right") - 1
+    values = np.append(series.values, np.nan)
+    return Series(values[place], clock)  # -1, before the first one, is the NaN
+
+
+def _complete(
+    source: Source,
+    names: tuple[list[str], list[str]],
+    first: np.ndarray,
+    second: np.ndarray,
+    number: np.ndarray,
+    t: np.ndarray | None,
+    episode: np.ndarray | None,
+    notes: tuple[str, ...],
+) -> Columns:
+    """Return the rows in which nothing is missing."""
+    for group, values in zip(names, (first, second), strict=True):
+        for name, column in zip(group, values.T, strict=True):
+            if len(column) and not np.isfinite(column).any():
+                raise ConfigurationError(
+                    f"{printable(name)}: no number in {len(column)} rows; log it, or leave its "
+                    "columns out"
+                )
+    sound = np.isfinite(first).all(1) & np.isfinite(second).all(1)
+    for column in (t, episode):
+        if column is not None:
+            sound &= np.isfinite(column)
+    lost = int((~sound).sum())
+    if lost > LOST * len(sound) or len(sound) - lost < FEWEST:
+        missing = f", {lost} of them with missing numbers" if lost else ""
+        raise ConfigurationError(
+            f"{len(sound)} rows{missing}: expected at least {FEWEST} complete ones, and half of "
+            "all; log for a longer time"
+        )
+    notes = (*source.notes, *notes)
+    if lost:
+        notes += (f"{lost} of {len(sound)} rows were dropped: numbers are missing or infinite",)
+    rows = np.flatnonzero(sound)
+    total, number = int(number[-1]) + 1, number[rows]
+    if t is None:
+        notes += ("no column t: times are in rows",)
+    time = number.astype(float) if t is None else t[rows]
+    # Of a log that was read in blocks, each is an episode.
+    apart = np.diff(number, prepend=number[0] - 1) > 1 + lost
+    if episode is not None:
+        apart |= np.diff(episode[rows], prepend=episode[rows[0]]) != 0
+    border = np.cumsum(apart)
+    back = np.flatnonzero((np.diff(time) <= 0) & (np.diff(border) == 0))
+    if len(back):
+        row = int(number[back[0] + 1])
+        raise ConfigurationError(
+            f"t goes from {time[back[0]]:.6g} to {time[back[0] + 1]:.6g} s at row {row}: expected "
+            "ascending times; sort the rows, or number episodes in a column episode_index"
+        )
+    if border[-1] > len(rows) / 2:
+        raise ConfigurationError(
+            f"{source.episode}: {border[-1] + 1} episodes in {len(rows)} rows: expected some of "
+            "several rows; leave the column out, or see --episode"
+        )
+    kept = first[rows], second[rows], time, border, number, total
+    return Columns(names, *kept, source.frame, notes)

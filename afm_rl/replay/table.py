@@ -1,0 +1,174 @@
+"""How far predictions of a log were off, by actuator and by stretch of time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from afm_rl.diagnosis.log import Log
+
+AFM, ALONE = "AFM", "as commanded"
+SHARES = {"median": 0.5, "p90": 0.9}
+
+
+@dataclass(frozen=True)
+class Table:
+    """A log, what was predicted of it, and how far that was off.
+
+    Args:
+        log: what was replayed.
+        predictions: of each predictor, ``(N, A)``; *as commanded* and *AFM* are among them.
+        std: standard deviation that AFM gives its predictions, ``(N, A)``.
+        errors: a row for each actuator, stretch of time and predictor: ``actuator``, ``stretch``,
+            ``from``, ``to`` (s), ``predictor``, ``rows``, and of the absolute error ``median`` and
+            ``p90`` with the ends of their 95 % intervals, ``median_low`` and so on.
+        removed: share of each actuator's median error that a correction would have removed; 0
+            where it may be chance, below 0 where it would have added.
+        slow: actuators whose commands act in later rows, see :func:`slow_in`.
+    """
+
+    log: Log
+    predictions: Mapping[str, np.ndarray]
+    std: np.ndarray
+    errors: pd.DataFrame
+    removed: Mapping[str, float]
+    slow: tuple[str, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """What a correction would have done."""
+        gone = {name: share for name, share in self.removed.items() if share > 0}
+        said = [f"{100 * gone[name]:.0f} % of the error of {name}" for name in gone]
+        none = [name for name, share in self.removed.items() if share == 0]
+        more = [f"{-100 * s:.0f} % to that of {name}" for name, s in self.removed.items() if s < 0]
+        said += [f"none of {_listed(none)}"] if none else []
+        both = [("removed", said, ","), ("added", more, "")]
+        parts = [f"{done} {_listed(what, comma)}" for done, what, comma in both if what]
+        return f"A correction would have {', and '.join(parts)}."
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader must know."""
+        if not self.slow:
+            return ()
+        return (
+            f"{_listed(self.slow)}: commands act in later rows. What is known of the next row is "
+            "then not what another command would change at once; log rows that are as far apart as "
+            "a command takes to act.",
+        )
+
+    def rows(self) -> pd.DataFrame:
+        """Return a row for each row of the log: ``t``, and of each actuator four columns.
+
+        ``NAME.command``, ``NAME.response``, ``NAME.afm`` (what the command was predicted to do) and
+        ``NAME.std``. They are NaN in rows of the file that could not be used.
+        """
+        log, columns = self.log, {"t": self.log.seconds}
+        for j, name in enumerate(log.names):
+            columns |= {
+                f"{name}.command": log.command[:, j],
+                f"{name}.response": log.response[:, j],
+                f"{name}.afm": self.predictions[AFM][:, j],
+                f"{name}.std": self.std[:, j],
+            }
+        found = pd.DataFrame(columns)
+        if log.row is None:
+            return found
+        return found.set_axis(log.row).reindex(range(log.read_from or int(log.row[-1]) + 1))
+
+
+def errors_of(log: Log, predictions: Mapping[str, np.ndarray], stretches: int = 4) -> pd.DataFrame:
+    """Return :attr:`Table.errors`: of the whole log, and of stretches of equally many rows."""
+    size, since = len(log.command), log.since
+    parts = [("all", 0, size)]
+    if size >= 20 * stretches:
+        ends = np.linspace(0, size, stretches + 1).astype(int)
+        parts += [(str(k + 1), *ends[k : k + 2]) for k in range(stretches)]
+    rows = []
+    for j, name in enumerate(log.names):
+        for stretch, first, last in parts:
+            where = {"actuator": name, "stretch": stretch}
+            where |= {"from": since[first], "to": since[last - 1]}
+            for predictor, predicted in predictions.items():
+                miss = np.abs(predicted[first:last, j] - log.response[first:last, j])
+                row = {**where, "predictor": predictor, "rows": last - first}
+                for kind, share in SHARES.items():
+                    low, middle, high = quantile_with_interval(miss, share)
+                    row |= {kind: middle, f"{kind}_low": low, f"{kind}_high": high}
+                rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def quantile_with_interval(values: np.ndarray, share: float) -> tuple[float, float, float]:
+    r"""Return lower end, quantile and upper end of its 95 % interval.
+
+    The interval is that of order statistics: how many of N values are below the true quantile is
+    binomial, with a standard deviation of :math:`\sqrt{p (1 - p) / N}` as a share. Values that
+    follow each other are alike, so that N is smaller than their count: by :math:`(1 - r) / (1 + r)`
+    with the correlation r of neighbours being above the quantile.
+
+    >>> x = np.random.default_rng(0).uniform(0, 1, 10_000)
+    >>> [round(end, 2) for end in quantile_with_interval(x, 0.5)]
+    [0.49, 0.5, 0.51]
+    """
+    middle = float(np.quantile(values, share))
+    above = (values > middle) - np.mean(values > middle)
+    power = float(above @ above)
+    alike = max(float(above[1:] @ above[:-1]) / power, 0.0) if power else 0.0
+    count = max(len(values) * (1 - alike) / (1 + alike), 1.0)
+    width = 1.96 * math.sqrt(share * (1 - share) / count)
+    ends = np.quantile(values, np.clip([share - width, share + width], 0.0, 1.0))
+    return float(ends[0]), middle, float(ends[1])
+
+
+def removed_by(
+    log: Log, predictions: Mapping[str, np.ndarray], least: float = 0.1
+) -> dict[str, float]:
+    """Return for each actuator which share of its median error a correction would have removed.
+
+    It is 0 where it is smaller than ``least``, or where the difference of the errors may be chance.
+    """
+    found = {}
+    for j, name in enumerate(log.names):
+        alone, corrected = (
+            np.abs(predictions[kind][:, j] - log.response[:, j]) for kind in (ALONE, AFM)
+        )
+        before, after = float(np.median(alone)), float(np.median(corrected))
+        low, _, high = quantile_with_interval(alone - corrected, 0.5)
+        share = 1 - after / before if before > 0 else 0.0
+        clear = low > 0 if share > 0 else high < 0
+        found[name] = share if clear and abs(share) >= least else 0.0
+    return found
+
+
+def slow_in(log: Log, share: float = 0.5) -> tuple[str, ...]:
+    r"""Return the actuators of which less than a ``share`` of a command acts in its own row.
+
+    By least squares, :math:`y_k = a y_{k-1} + b u_k + c u_{k-1} + d`: what acts at once is b, what
+    acts in the end :math:`(b + c) / (1 - a)`.
+
+    >>> u = np.random.default_rng(0).uniform(-1, 1, (60, 1))
+    >>> slow_in(Log(("pan",), u, 0.5 * u)), slow_in(Log(("pan",), u, np.roll(u, 1, axis=0)))
+    ((), ('pan',))
+    """
+    slow, known = [], ~log.begins[1:]
+    for name, u, y in zip(log.names, log.command.T, log.response.T, strict=True):
+        columns = np.c_[y[:-1], u[1:], u[:-1], np.ones(len(u) - 1)]
+        a, b, c, _ = np.linalg.lstsq(columns[known], y[1:][known])[0]
+        if abs(b * (1 - a)) < share * abs(b + c):
+            slow.append(name)
+    return tuple(slow)
+
+
+def _listed(parts: Sequence[str], before_and: str = "") -> str:
+    """Return a list in words.
+
+    >>> _listed(["a", "b", "c"]), _listed(["a"])
+    ('a, b and c', 'a')
+    """
+    *first, last = parts
+    return f"{', '.join(first)}{before_and} and {last}" if first else last

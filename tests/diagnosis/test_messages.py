@@ -1,0 +1,121 @@
+"""Logs of messages: ULog, MCAP, and bags of ROS 2."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import Writer as Mcap
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Bag
+from rosbags.typesys import Stores, get_typestore
+
+from afm_rl.diagnosis.readers import Unchosen, read_log
+from afm_rl.errors import ConfigurationError
+
+LOGS = Path(__file__).parents[2] / "examples" / "real_logs"
+COMMAND, RESPONSE = ["/cmd_vel.linear.x", "turn=/cmd_vel.angular.z"], ["/odom.v", "/odom.w[0]"]
+
+
+@pytest.fixture
+def drive(tmp_path):
+    """Commands at 20 Hz and odometry at 50 Hz, which follows the last command."""
+    u = np.random.default_rng(0).uniform(-1, 1, (40, 2))
+    with (tmp_path / "drive.mcap").open("wb") as file:
+        writer = Mcap(file)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        ids = {
+            topic: writer.register_channel(topic, "json", schema)
+            for topic in ("/cmd_vel", "/odom", "/text")
+        }
+
+        def write(topic, t, content):
+            writer.add_message(ids[topic], int(1e9 * t), json.dumps(content).encode(), int(1e9 * t))
+
+        write("/text", 0.0, {"words": "begin"})
+        for k, (x, z) in enumerate(u):
+            write("/cmd_vel", 1 + 0.05 * k, {"linear": {"x": x}, "angular": {"z": z}})
+        for k in range(90):
+            x, z = u[int((0.02 * k + 0.005) / 0.05)]
+            write("/odom", 1.005 + 0.02 * k, {"v": x, "w": [-z, 0.0]})
+        writer.finish()
+    return tmp_path / "drive.mcap"
+
+
+def test_the_last_command_before_each_response_counts(drive):
+    log = read_log(drive, COMMAND, RESPONSE)
+    assert log.names == ("linear.x", "turn") and len(log.command) == 90
+    assert log.step == pytest.approx(0.02) and log.seconds[0] == pytest.approx(1.005)
+    np.testing.assert_array_equal(log.response, log.command * [1, -1])
+
+
+def test_what_is_there_is_listed(drive):
+    with pytest.raises(Unchosen, match="--command TOPIC.FIELD") as found:
+        read_log(drive)
+    assert found.value.listing == [
+        "/cmd_vel (40 messages): linear.x, angular.z",
+        "/odom (90 messages): v, w[0..1]",
+        "/text (1 messages): ",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("command", "response", "message"),
+    [
+        (COMMAND, [], "expected both --command and --response"),
+        (["/cmd_vel.linear.y"], RESPONSE[:1], r"no such name; did you mean /cmd_vel\.linear\.x"),
+        (["/nothing\x1b[2J"], RESPONSE[:1], r"--command /nothing\?\[2J: there is no such name"),
+        (["/cmd_vel"], ["/odom"], "2 commands .* but 3 responses"),
+        (COMMAND[:1] * 2, RESPONSE, "given twice"),
+    ],
+)
+def test_names_that_do_not_fit(drive, command, response, message):
+    with pytest.raises(ConfigurationError, match=message):
+        read_log(drive, command, response)
+
+
+@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_bags_of_ros_2(tmp_path, storage):
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    twist, vector = store.types["geometry_msgs/msg/Twist"], store.types["geometry_msgs/msg/Vector3"]
+    joints, header = store.types["sensor_msgs/msg/JointState"], store.types["std_msgs/msg/Header"]
+    stamp = store.types["builtin_interfaces/msg/Time"](0, 0)
+    zero, none = vector(0.0, 0.0, 0.0), np.zeros(0)
+    u = np.random.default_rng(0).uniform(-1, 1, 30)
+    with Bag(tmp_path / "bag", version=8, storage_plugin=storage) as bag:
+        sent = bag.add_connection("/cmd", twist.__msgtype__, typestore=store)
+        seen = bag.add_connection("/joints", joints.__msgtype__, typestore=store)
+        for k, x in enumerate(u):
+            data = store.serialize_cdr(twist(vector(x, 0.0, 0.0), zero), twist.__msgtype__)
+            bag.write(sent, 10**8 * k, data)
+            order = [0, 1] if k % 2 else [1, 0]  # the order of joints may change
+            names, at = [["lift", "pan"][j] for j in order], np.array([0.0, 0.5 * x])[order]
+            message = joints(header(stamp, "base"), names, at, none, none)
+            data = store.serialize_cdr(message, joints.__msgtype__)
+            bag.write(seen, 10**8 * k + 1000, data)
+    files = [tmp_path / "bag"]
+    if storage is StoragePlugin.MCAP:
+        files += sorted((tmp_path / "bag").glob("*.mcap"))  # also without the folder's metadata
+    for file in files:
+        log = read_log(file, ["/cmd.linear.x"], ["/joints.position[pan]"])
+        np.testing.assert_allclose(log.response[:, 0], 0.5 * u)
+        np.testing.assert_allclose(log.command[:, 0], u)
+
+
+def test_a_ulog_of_px4():
+    log = read_log(
+        LOGS / "px4_disarmed.ulg",
+        ["vehicle_rates_setpoint.roll", "vehicle_rates_setpoint.pitch"],
+        ["vehicle_attitude.rollspeed", "vehicle_attitude.pitchspeed"],
+    )
+    assert log.names == ("roll", "pitch") and len(log.command) == 182
+    assert log.step == pytest.approx(0.0105, abs=0.003)
+    assert np.abs(log.response).max() < 0.01  # rad/s: at rest, whatever is commanded
+    assert np.abs(log.command).max() > 0.5
+
+
+def test_the_packages_are_asked_for(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pyulog", None)
+    with pytest.raises(ConfigurationError, match=r"pip install 'afm-rl\[logs\]'"):
+        read_log(LOGS / "px4_disarmed.ulg")
