@@ -16,9 +16,6 @@ from afm_rl.diagnosis.response import lagging, look_back
 from afm_rl.diagnosis.search import Lead, beginning, find_leads
 from afm_rl.diagnosis.settings import Settings
 
-SHORTEST = 20  # rows of a part
-PARTS = 5  # at most
-
 
 @dataclass(frozen=True)
 class Part:
@@ -104,10 +101,12 @@ def find_parts(log: Log, j: int, lead: Lead, settings: Settings) -> list[Part]:
     they differ by more than a tenth of the response, and where the command moves on both sides;
     then each part in the same way.
     """
-    parts = _divide(log, j, fit_part(log, j, 0, len(log.command), settings, lead), PARTS, settings)
+    parts = _divide(
+        log, j, fit_part(log, j, 0, len(log.command), settings, lead), settings.parts, settings
+    )
     for k in range(len(parts) - 1 if len(parts) > 2 else 0):  # borders, now that no part is mixed
         left, right = parts[k : k + 2]
-        row = _exact_row(log, j, left, right, 0.5)
+        row = _exact_row(log, j, left, right, settings, 0.5)
         if abs(row - left.last) > 1:
             parts[k] = fit_part(log, j, left.first, row, settings)
             parts[k + 1] = fit_part(log, j, row, right.last, settings)
@@ -116,7 +115,7 @@ def find_parts(log: Log, j: int, lead: Lead, settings: Settings) -> list[Part]:
 
 def _divide(log: Log, j: int, whole: Part, most: int, settings: Settings) -> list[Part]:
     """Return the parts of a part."""
-    if most < 2 or len(whole) < 2 * SHORTEST:
+    if most < 2 or len(whole) < 2 * settings.shortest:
         return [whole]
     row = _likely_change(log, j, whole, settings)
     if row is None:
@@ -124,7 +123,7 @@ def _divide(log: Log, j: int, whole: Part, most: int, settings: Settings) -> lis
     for _ in range(2):
         left = fit_part(log, j, whole.first, row, settings)
         right = fit_part(log, j, row, whole.last, settings)
-        better = _exact_row(log, j, left, right)
+        better = _exact_row(log, j, left, right, settings)
         if abs(better - row) < 0.01 * len(whole):
             break
         row = better
@@ -157,21 +156,22 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
     ends = np.append(np.arange(1, len(part) // length) * length, len(part))
     sums = np.stack([block.T @ block for block in np.split(table, ends[:-1])])
     before, places = np.cumsum(sums, 0)[:-1], ends[:-1]
-    least = max(SHORTEST, 2 * size)
+    least = max(settings.shortest, 2 * size)
     good = (places >= least) & (len(part) - places >= least)
     if not good.any():
         return None
     before, places, total = before[good], places[good], sums.sum(0)
-    (_, one), (left, early), (right, later) = (
-        _left_over(moments) for moments in (total[None], before, total - before)
-    )
+    one = _left_over(total[None])[1]
+    (left, early), (right, after) = (_left_over(some) for some in (before, total - before))
     best = int(np.argmin(left + right))
-    misses = [y - table[:, :-1] @ line for line in (one[0], early[best], later[best])]
+    misses = [y - table[:, :-1] @ line for line in (one[0], early[best], after[best])]
     near = np.arange(len(y))
     row = int(places[best])
     inside = np.abs(near - row) <= length
     turns = np.cumsum((misses[1] ** 2 - misses[2] ** 2)[inside])
-    row = int(np.clip(near[inside][turns.argmin()] + 1, SHORTEST, len(y) - SHORTEST))
+    row = int(
+        np.clip(near[inside][turns.argmin()] + 1, settings.shortest, len(y) - settings.shortest)
+    )
     split = np.where(near < row, misses[1], misses[2])
     scale = scale_of(split)
     gain, kept = costs(misses[0], scale), costs(split, scale)
@@ -200,7 +200,9 @@ def _left_over(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.maximum(left, 0.0), solution[..., 0]
 
 
-def _exact_row(log: Log, j: int, left: Part, right: Part, share: float = 0.05) -> int:
+def _exact_row(
+    log: Log, j: int, left: Part, right: Part, settings: Settings, share: float = 0.05
+) -> int:
     """Return the row from which on the right explanation is better."""
     rows = slice(left.first, right.last)
     y = log.response[rows, j]
@@ -209,9 +211,9 @@ def _exact_row(log: Log, j: int, left: Part, right: Part, share: float = 0.05) -
     early, late = (np.minimum(m, cut) ** 2 for m in misses)
     total = np.concatenate([[0.0], np.cumsum(early - late)])
     # Close by: where one of both is a mixture itself, it may be worse wherever the other holds.
-    near = max(SHORTEST // 2, int(share * len(y)))
-    low = max(SHORTEST, len(left) - near)
-    high = min(len(y) - SHORTEST, len(left) + near) + 1
+    near = max(settings.shortest // 2, int(share * len(y)))
+    low = max(settings.shortest, len(left) - near)
+    high = min(len(y) - settings.shortest, len(left) + near) + 1
     return left.first + low + int(total[low:high].argmin())
 
 

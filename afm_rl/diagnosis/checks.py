@@ -14,7 +14,10 @@ from afm_rl.diagnosis.search import Lead, find_leads, without_outliers
 from afm_rl.diagnosis.settings import Settings
 
 Doubt = tuple[Status, str]
-COPY = 0.999  # correlation of two commands that cannot be told apart
+SUMMED: Doubt = (
+    "cannot tell",
+    "its response moves as if it added up its command; log its rate of change",
+)
 
 
 def find_doubts(
@@ -60,10 +63,7 @@ def find_doubts(
                 f"its command moves {round(travel(log, j))} times only; move it up and down",
             )
         elif j in summed:
-            doubts[j] = (
-                "cannot tell",
-                "its response moves as if it added up its command; log its rate of change",
-            )
+            doubts[j] = SUMMED
     return doubts
 
 
@@ -119,13 +119,13 @@ def _still(command: np.ndarray) -> float:
     return float((np.abs(np.diff(command)) < 1e-3 * np.ptp(command)).mean())
 
 
-def copies_of(command: np.ndarray) -> list[list[int]]:
-    """Return for each command the others that are the same up to a factor."""
+def copies_of(command: np.ndarray, alike_from: float = 0.999) -> list[list[int]]:
+    """Return for each command the others that are the same up to a factor, by their correlation."""
     u = command - command.mean(0)
     power = np.sqrt((u**2).sum(0))
     alike = np.abs(u.T @ u) / np.maximum(np.outer(power, power), 1e-300)
     np.fill_diagonal(alike, 0.0)
-    return [[int(i) for i in np.flatnonzero(row > COPY)] for row in alike]
+    return [[int(i) for i in np.flatnonzero(row > alike_from)] for row in alike]
 
 
 def _causes(log: Log, cause: np.ndarray, effect: np.ndarray, past: int = 8) -> bool:

@@ -50,12 +50,10 @@ def fit_response(
         starts: delays, lags and rate limits to begin with.
         settings: how clear it must be.
     """
-    model = _dynamics(problem, driver, starts)
-    if weight_of(problem, model[-1]) * problem.use.sum() > settings.enough:
-        whole, large = large, problem
-    else:
-        whole = large
-    model = _simplest(large, model, settings)
+    options, whole = _dynamics(problem, driver, starts), large
+    if weight_of(problem, options[-1]) * problem.use.sum() > settings.enough:
+        large = problem
+    model = _simplest(large, options, settings)
     added = 0
     for step in (larger, _with_drift):  # a drift last, since it explains a little of everything
         while added < settings.most:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ FAR = 5.0  # standard deviations of the others: rows that are as far from the li
 
 
 def without_lost(
-    log: Log, j: int, lead: Lead, parts: list[Part], repeats: bool
+    log: Log, j: int, lead: Lead, parts: Sequence[Part], repeats: bool
 ) -> tuple[Log, float]:
     """Return the log with one response as it would be if it always followed, and the share lost.
 
@@ -60,9 +61,11 @@ def without_lost(
         return log, 0.0
     late = clock.places(max(shape.delay for shape in lead.starts)).astype(int)
     moves = [hats(np.abs(u - u[np.maximum(late - k, clock.start)])) for k in (2, 8, 20)]
-    if predictable(np.column_stack([hats(u[late]), *moves]), lost - share) > 0.25:
+    since = hats(np.minimum(np.arange(len(y)) - clock.start, 100.0))  # what was before is not known
+    if predictable(np.column_stack([hats(u[late]), since, *moves]), lost - share) > 0.25:
         return log, 0.0
-    if residual.std() > 0.35 * best.std():
+    explained = (best[lost] ** 2).mean() < 0.3 * (far[lost] ** 2).mean()
+    if explained or residual.std() > 0.35 * best.std():
         return log, 0.0
     response = log.response.copy()
     drawn = np.random.default_rng(0).choice(residual, int(lost.sum()))

@@ -39,6 +39,11 @@ class Shape(NamedTuple):
     """First of the rows that are taken over."""
 
     @property
+    def endless(self) -> bool:
+        """Is it so slow, in half ranges per step, that it never arrives? Then it is a sum."""
+        return self.keep > 0.985 or self.rate < 0.003
+
+    @property
     def linear(self) -> Shape:
         """Return the shape as other commands have it: delay, lag and hold."""
         return Shape(self.delay, self.keep, hold=self.hold, phase=self.phase)

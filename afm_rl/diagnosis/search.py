@@ -14,9 +14,6 @@ from afm_rl.diagnosis.log import Clock, Log, clocks_of
 from afm_rl.diagnosis.response import Shape, begin_at, lagging, limit_rate, look_back
 from afm_rl.diagnosis.settings import Settings
 
-EARLIEST = 5  # steps by which a response may come before its command in the log
-LAGS = (0.0, 1.0, 2.5, 6.0, 15.0, 40.0)  # steps
-RATES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03, 0.015)  # half ranges per step
 TINY = 1e-300
 
 
@@ -47,12 +44,17 @@ class Lead(NamedTuple):
 def find_leads(log: Log, actuators: Sequence[int], settings: Settings) -> list[Lead]:
     """Return where to begin with each of some actuators."""
     delays = _delays(log, settings)
-    found = [_scan(log, clock, log.response[:, actuators], delays) for clock in clocks_of(log)]
+    found = [
+        _scan(log, clock, log.response[:, actuators], delays, settings) for clock in clocks_of(log)
+    ]
     leads = []
     for place, j in enumerate(actuators):
         options = [_choose(scan, place, j, k) for k, scan in enumerate(found)]
         leads.append(min(options, key=lambda lead: lead.left))
-    return [_with_starts(log, j, lead, delays) for j, lead in zip(actuators, leads, strict=True)]
+    return [
+        _with_starts(log, j, lead, delays, settings)
+        for j, lead in zip(actuators, leads, strict=True)
+    ]
 
 
 def rows_enough(log: Log, settings: Settings) -> np.ndarray:
@@ -67,7 +69,9 @@ def rows_enough(log: Log, settings: Settings) -> np.ndarray:
         return rows
     start = np.maximum.accumulate(np.where(log.begins, rows, 0))
     some = rows[(rows - start) % every == 0]
-    moved = np.flatnonzero(np.ptp(log.command, axis=0) > 0)
+    moved = [int(j) for j in np.flatnonzero(np.ptp(log.command, axis=0) > 0)]
+    if not moved:
+        return rows
     left = [
         np.median(
             [lead.left for lead in find_leads(part.thinned(settings.searched), moved, settings)]
@@ -95,12 +99,14 @@ def _delays(log: Log, settings: Settings) -> np.ndarray:
     longest = max(settings.longest_s / log.step if log.t is not None else 0, settings.longest)
     longest = min(longest, len(log.command) / 10, episode / 4)
     many = 20 * 1.08 ** np.arange(100)
-    delays = np.unique(np.concatenate([np.arange(-EARLIEST, 20), many.round()])).astype(int)
+    delays = np.unique(np.concatenate([np.arange(-settings.earliest, 20), many.round()])).astype(
+        int
+    )
     return delays[delays <= max(longest, 1)]
 
 
 def _scan(
-    log: Log, clock: Clock, response: np.ndarray, delays: np.ndarray
+    log: Log, clock: Clock, response: np.ndarray, delays: np.ndarray, settings: Settings
 ) -> tuple[np.ndarray, ...]:
     """Fit lines with every delay and lag to responses ``(N, R)``.
 
@@ -118,7 +124,7 @@ def _scan(
     power = np.maximum((y**2).sum(0), TINY)
     size = u.shape[1]
     grid, singles, joint, lines = [], [], [], []
-    for lag in (lag for lag in LAGS if lag * 10 < len(u)):
+    for lag in (lag for lag in settings.lags if lag * 10 < len(u)):
         keep = math.exp(-1 / lag) if lag else 0.0
         slow = lagging(clock, u, keep) if keep else u
         for delay in delays[delays >= 0] if keep else delays:
@@ -149,7 +155,7 @@ def _choose(scan: tuple[np.ndarray, ...], place: int, j: int, clock: int) -> Lea
     return Lead(clock, float(delay), float(keep), driver, float(joint[best, place]), line)
 
 
-def _with_starts(log: Log, j: int, lead: Lead, delays: np.ndarray) -> Lead:
+def _with_starts(log: Log, j: int, lead: Lead, delays: np.ndarray, settings: Settings) -> Lead:
     """Return the lead with the best of each kind of dynamics: delay, lag, rate limit together."""
     plain = [Shape(lead.delay, lead.keep)]
     if lead.keep:
@@ -159,7 +165,7 @@ def _with_starts(log: Log, j: int, lead: Lead, delays: np.ndarray) -> Lead:
     clock = lead.clock_of(log)
     u, y = log.command[:, lead.driver], without_outliers(log.response[:, j, None])[:, 0]
     begin = beginning(clock, u, log.response[:, j], lead.line)
-    rates = np.array(RATES) * max(0.5 * float(np.ptp(u)), 1e-12)
+    rates = np.array(settings.rates) * max(0.5 * float(np.ptp(u)), 1e-12)
     here = begin_at(clock, u, begin, 0.0)
     fast = limit_rate(np.repeat(here[:, None], len(rates), 1), rates, clock.start)
     late = delays[delays >= 0]

@@ -40,6 +40,16 @@ class Settings:
     """Standard deviations of the response: a number that changes it by less is left out."""
     most: int = 6
     """Numbers beside delay, lag and rate limit, at most."""
+    shortest: int = 20
+    """Rows of a part of the log in which an actuator stayed as it was."""
+    parts: int = 5
+    """Such parts, at most: what changes more often is not explained."""
+    lags: tuple[float, ...] = (0.0, 1.0, 2.5, 6.0, 15.0, 40.0)
+    """Lags at which the search begins (steps)."""
+    rates: tuple[float, ...] = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03, 0.015)
+    """Rate limits at which it begins (half ranges per step): 2 to 133 steps from end to end."""
+    earliest: int = 5
+    """Steps by which a response may come before its command in the log, where rows are shifted."""
     sure: float = 1.45
     """Times the 95 % interval: what a fault has to exceed. That is 99.5 %: ten actuators have a
     hundred numbers."""

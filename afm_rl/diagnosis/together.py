@@ -80,20 +80,22 @@ def shared_delay(
 ) -> tuple[list[float], tuple[str, ...]]:
     """Return delay and lag that are no fault of each actuator (s), and what to say of the loop.
 
-    Where all that are known are late by about the same time, that is the loop's: bus, controller,
-    logger. Of many, a few may stand out; their own fault is what is more than the others have.
+    Where all that are known are late, that is the loop's: bus, controller, logger. Arms and hands
+    may have a loop each: what a fifth of the actuators share is no fault of one, and what one is
+    later than all of these is.
     """
-    known = [a for a in actuators if a.gain_interval[0] * a.gain_interval[1] > 0]
+    known = [a for a in actuators if _is_timed(a, log.step)]
     times = np.array([max(a.delay_s, 0.0) + a.lag_s for a in known])
     usual = [log.usual_delay] * len(actuators)
-    if len(times) < 2:
+    late = log.usual_delay + settings.late * log.step
+    if len(times) < 2 or (times > late).mean() < (1.0 if len(times) < 5 else 0.8):
         return usual, ()
-    middle, late = float(np.median(times)), log.usual_delay + settings.late * log.step
-    scatter = 1.5 * float(np.median(np.abs(times - middle)))
-    reach = max(settings.shared * middle, log.step, 3 * scatter if len(times) > 4 else 0.0)
-    near = times[(np.abs(times - middle) <= reach) & (times > late)]
-    if len(near) < (1.0 if len(times) < 5 else 0.8) * len(times):
+    alike = np.abs(times - times[:, None]) <= np.maximum(settings.shared * times, log.step)
+    shared = alike.sum(1) > max(1.0, 0.2 * len(times))
+    if shared.sum() < 0.6 * len(times):
         return usual, ()
+    middle, most = float(np.median(times)), float(times[shared].max())
+    near = times[(times <= most) & (times > late)]
     delay, lag = (float(np.median([getattr(a, n) for a in known])) for n in ("delay_s", "lag_s"))
     parts = [f"a delay of {_span([delay], log)}", f"a lag of {_span([lag], log)}"]
     kept = [text for text, time in zip(parts, (delay, lag), strict=True) if time > 0.1 * middle]
@@ -101,7 +103,14 @@ def shared_delay(
         f"all actuators are {_span(near, log)} behind their commands ({' and '.join(kept)}): that "
         "is the loop's, and no fault of one of them"
     )
-    return [max(middle + reach, near.max())] * len(actuators), (note,)
+    return [max(most, log.usual_delay)] * len(actuators), (note,)
+
+
+def _is_timed(actuator: Actuator, step: float) -> bool:
+    """Return whether delay and lag of an actuator are known."""
+    low, high = actuator.time_interval
+    follows = actuator.gain_interval[0] * actuator.gain_interval[1] > 0
+    return follows and high - low < max(low + high, 2 * step)
 
 
 def _span(times: Sequence[float] | np.ndarray, log: Log) -> str:

@@ -108,9 +108,10 @@ def _judged(
         return "healthy", ["healthy", _rest(actuator)] if left > s.left else []
     if faults and left > s.unknown:
         return "changed", [_rest(actuator) + _closest(faults)]
+    status: Status = "changed" if faults or left > s.left else "healthy"
     if noticed or left > s.left:
         faults = [*(faults or ["nearly healthy"]), _rest(actuator)]
-    return "changed", faults
+    return status, faults
 
 
 def _said(actuator: Actuator) -> str:
