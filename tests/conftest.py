@@ -7,12 +7,12 @@ import pytest
 import torch
 from hypothesis import settings
 
-import afm_rl.flow
+import afm_rl.correction.training
 import afm_rl.learning
 from afm_rl.compiling import machine_code
 from afm_rl.correction import ActionFlow
+from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins, Ensemble
-from afm_rl.flow import AxisNetwork
 from afm_rl.learning import pretrain_ensemble
 from afm_rl.regimes import ActionGain
 from afm_rl.spaces.manifold import Manifold
@@ -149,7 +149,7 @@ def remembered():
 def short_trainings(monkeypatch):
     """Cut every training short."""
     for module, name, small in (
-        (afm_rl.flow, "train_flow", {"iterations": 5}),
+        (afm_rl.correction.training, "train_flow", {"iterations": 5}),
         (afm_rl.learning, "pretrain_ensemble", {"samples": 512, "epochs": 1}),
     ):
         whole = getattr(module, name)

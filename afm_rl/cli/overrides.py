@@ -80,7 +80,7 @@ def optional(overrides: Sequence[str]) -> dict[str, str]:
 def has(settings: Mapping[str, Any], key: str) -> bool:
     """Return whether there is a setting of this name.
 
-    >>> has({"corrector": {"gate": 5.0}}, "corrector.gate"), has({}, "corrector.gate")
+    >>> has({"corrector": {"odds": 2.0}}, "corrector.odds"), has({}, "corrector.odds")
     (True, False)
     """
     place: Any = settings

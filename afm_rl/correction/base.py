@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from afm_rl.compiling.tracing import may_look
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.faults import count_repeats, trusted
 
 Fields = dict[str, Tensor]
@@ -31,9 +31,12 @@ class Correction(NamedTuple):
     bounds: Tensor
     """Lowest and highest effect that an action can have, ``(*B, 2, A)``."""
     innovation: Tensor
-    """Largest normalised innovation of the newest transitions, ``(*B)``."""
+    """Largest error of the newest transition, in standard deviations that the model states,
+    ``(*B)``."""
     misaligned: Tensor
     """Is the action corrected? ``(*B)``."""
+    noise: Tensor
+    """Standard deviation of effects that nothing explains, ``(*B, A)``."""
 
 
 def rows_of(mask: Tensor) -> Any:
@@ -82,7 +85,6 @@ class Corrector(nn.Module, ABC):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        gate: misalignment above which actions are corrected.
         recent: transitions that are kept as they were observed, R.
 
     Raises:
@@ -93,7 +95,7 @@ class Corrector(nn.Module, ABC):
     lowest: Tensor
     highest: Tensor
 
-    def __init__(self, action_low: Tensor, action_high: Tensor, gate: float, recent: int) -> None:
+    def __init__(self, action_low: Tensor, action_high: Tensor, recent: int) -> None:
         super().__init__()
         low, high = torch.as_tensor(action_low), torch.as_tensor(action_high)
         fits = low.shape == high.shape and low.dim() == 1 and len(low)
@@ -102,7 +104,6 @@ class Corrector(nn.Module, ABC):
                 f"corrector: action bounds {low.tolist()}, {high.tolist()}: expected two lists of "
                 "one size, finite, low < high"
             )
-        self.gate = check_number("corrector.gate", gate, low=0.0)
         self.recent = check_count("corrector.recent", recent)
         scale = torch.maximum(low.abs(), high.abs())
         self.action_size = len(scale)
@@ -163,6 +164,17 @@ class Corrector(nn.Module, ABC):
             model: the dynamics model as it is now.
             box: lowest and highest action, ``(*B, 2, A)``.
         """
+
+    def predict(
+        self, memory: Tensor, action: Tensor, model: DynamicsModel
+    ) -> tuple[Tensor, Tensor]:
+        """Return the effect that an action ``(*B, A)`` will have, and its standard deviation.
+
+        Both ``(*B, A)``, in units of the action: what the model would have to be given so that it
+        expects what the robot will do. The memory ``(*B, P)`` is not changed. By default the
+        action itself, and no deviation.
+        """
+        return action, torch.zeros_like(action)
 
     def latest(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the present state, and the actions planned and executed last."""
@@ -233,7 +245,7 @@ class Corrector(nn.Module, ABC):
     def unchanged(self, planned: Tensor, innovation: Tensor, box: Tensor) -> Correction:
         """Return the correction that executes what was planned."""
         still = torch.zeros_like(planned)
-        return Correction(planned, planned, still, box, innovation, innovation > torch.inf)
+        return Correction(planned, planned, still, box, innovation, innovation > torch.inf, still)
 
     def normalise(self, action: Tensor) -> Tensor:
         """Return u for an action in its own units."""

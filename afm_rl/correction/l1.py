@@ -7,11 +7,11 @@ import math
 import torch  # noqa: F401, for the examples
 from torch import Tensor
 
-from afm_rl.correction.pairs import ClassicalCorrector
+from afm_rl.correction.achievable import MODES, saturate
+from afm_rl.correction.classical import ClassicalCorrector
+from afm_rl.correction.experts import Rows
+from afm_rl.correction.fits import weigh
 from afm_rl.errors import check_choice, check_number
-from afm_rl.flow.experts import Rows
-from afm_rl.flow.fits import weigh
-from afm_rl.flow.saturation import MODES, saturate
 
 
 def low_pass(signal: Tensor, valid: Tensor, bandwidth: float, dt: float) -> Tensor:
@@ -64,7 +64,7 @@ class L1Augmentation(ClassicalCorrector):
         dt: control tick (s).
         bandwidth: of the low-pass, :math:`\omega` (rad/s).
         window: transitions that can be remembered, K.
-        gate: in standard deviations of the model.
+        gate: innovation at which it does nothing, in standard deviations that the model states.
         saturation: ``"clip"``, as is customary, ``"direction"`` or ``"mixed"``.
 
     Raises:
@@ -89,8 +89,13 @@ class L1Augmentation(ClassicalCorrector):
         self.bandwidth = check_number("corrector.bandwidth", bandwidth, low=0.0, open_low=True)
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
 
-    def answer(self, rows: Rows, planned: Tensor) -> tuple[Tensor, Tensor]:
+    def inverse(self, rows: Rows, planned: Tensor) -> Tensor:
         """Take the disturbance off."""
-        found = low_pass(rows.effective - rows.executed, rows.valid, self.bandwidth, self.dt)
-        executed = saturate(planned - found, self.saturation)
-        return executed, executed + found
+        return saturate(planned - self._disturbance(rows), self.saturation)
+
+    def effect(self, rows: Rows, executed: Tensor) -> Tensor:
+        """Add the disturbance."""
+        return executed + self._disturbance(rows)
+
+    def _disturbance(self, rows: Rows) -> Tensor:
+        return low_pass(rows.effective - rows.executed, rows.valid, self.bandwidth, self.dt)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from afm_rl.correction.pairs import ClassicalCorrector
-from afm_rl.errors import check_choice, check_number
-from afm_rl.flow.experts import Rows
-from afm_rl.flow.fits import (
+from afm_rl.correction.achievable import MODES, saturate
+from afm_rl.correction.classical import ClassicalCorrector
+from afm_rl.correction.experts import Rows
+from afm_rl.correction.fits import (
     confidence,
     fit_affine,
     fit_gain,
@@ -16,7 +16,7 @@ from afm_rl.flow.fits import (
     invert_affine,
     weigh,
 )
-from afm_rl.flow.saturation import MODES, saturate
+from afm_rl.errors import check_choice, check_number
 
 FORMS = ("gain", "gain_offset", "affine")
 
@@ -25,7 +25,7 @@ class LeastSquares(ClassicalCorrector):
     r"""Certainty-equivalent adaptive control: fit the regime, execute the inverse.
 
     Executes :math:`g^{-1} u_0` (``form="gain"``), :math:`g^{-1} (u_0 - b)` with a robust fit
-    (``"gain_offset"``, :func:`~afm_rl.flow.fits.fit_gain_offset`) or :math:`D^{-1} (u_0 - b)`
+    (``"gain_offset"``, :func:`~afm_rl.correction.fits.fit_gain_offset`) or :math:`D^{-1} (u_0 - b)`
     (``"affine"``), saturated. Pairs count by their age and, all but ``"affine"``, by their noise.
     Nothing is trained; any control engineer's first answer, and the bar for a learned flow.
 
@@ -35,7 +35,7 @@ class LeastSquares(ClassicalCorrector):
         form: ``"gain"`` or ``"gain_offset"``, each axis for itself, or ``"affine"``.
         window: transitions that are remembered, K.
         forgetting: weight of a transition relative to the next one, in (0, 1].
-        gate: in standard deviations of the model.
+        gate: innovation at which it does nothing, in standard deviations that the model states.
         saturation: ``"clip"``, as is customary, ``"direction"`` or ``"mixed"``.
 
     Raises:
@@ -62,18 +62,28 @@ class LeastSquares(ClassicalCorrector):
         )
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
 
-    def answer(self, rows: Rows, planned: Tensor) -> tuple[Tensor, Tensor]:
-        """Invert the fit, which also predicts the effect."""
+    def inverse(self, rows: Rows, planned: Tensor) -> Tensor:
+        """Invert the fit."""
+        matrix, offset = self._fit(rows)
+        if self.form == "affine":
+            return saturate(invert_affine(matrix, offset, planned), self.saturation)
+        return saturate((planned - offset) / matrix, self.saturation)
+
+    def effect(self, rows: Rows, executed: Tensor) -> Tensor:
+        """Apply the fit."""
+        matrix, offset = self._fit(rows)
+        if self.form == "affine":
+            return (matrix @ executed.unsqueeze(-1)).squeeze(-1) + offset
+        return matrix * executed + offset
+
+    def _fit(self, rows: Rows) -> tuple[Tensor, Tensor]:
+        """Return matrix or gains, and offset."""
         executed, effective, std, valid = rows
         weight = weigh(valid, self.forgetting)
         if self.form == "affine":
-            matrix, bias = fit_affine(executed, effective, weight)
-            found = saturate(invert_affine(matrix, bias, planned), self.saturation)
-            return found, (matrix @ found.unsqueeze(-1)).squeeze(-1) + bias
+            return fit_affine(executed, effective, weight)
         weight = weight * confidence(std)
         if self.form == "gain":
-            gain, offset = fit_gain(executed, effective, weight), torch.zeros_like(planned)
-        else:
-            gain, offset = fit_gain_offset(executed, effective, weight)
-        found = saturate((planned - offset) / gain, self.saturation)
-        return found, gain * found + offset
+            gain = fit_gain(executed, effective, weight)
+            return gain, torch.zeros_like(gain)
+        return fit_gain_offset(executed, effective, weight)

@@ -9,6 +9,8 @@ from torch import Tensor, nn
 
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.base import Correction, Corrector
+from afm_rl.correction.network import mlp
+from afm_rl.correction.solver import midpoint
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import (
     ConfigurationError,
@@ -16,9 +18,8 @@ from afm_rl.errors import (
     check_count,
     check_counts,
     check_flag,
+    check_number,
 )
-from afm_rl.flow.network import mlp
-from afm_rl.flow.solver import midpoint
 from afm_rl.regimes import Regime
 from afm_rl.spaces.sampling import draw_states, uniform
 
@@ -64,7 +65,8 @@ class PaperFlow(Corrector):
         latch: bool = True,
         seed: int = 0,
     ) -> None:
-        super().__init__(action_low, action_high, gate, recent=1)
+        super().__init__(action_low, action_high, recent=1)
+        self.gate = check_number("corrector.gate", gate, low=0.0)
         self.state_size = check_count("corrector.state_size", state_size)
         self.state_features = check_counts("corrector.features", features, low=0)
         if max(self.state_features, default=0) >= state_size:

@@ -9,44 +9,31 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from afm_rl.correction.choice import nearest_of, probes_of, source_points_of
-from afm_rl.correction.hypotheses import HYPOTHESES, IDENTITY, Layout, lay_out, read_rows
+from afm_rl.correction.achievable import MODES, attainable, extend
+from afm_rl.correction.belief import Belief, mean_and_std
+from afm_rl.correction.believing import Answer
+from afm_rl.correction.experts import MISSES, Rows, fit_experts
+from afm_rl.correction.linear import LINEAR, Lines, fit_lines
+from afm_rl.correction.network import AxisNetwork, Encoded
+from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows
+from afm_rl.correction.solver import midpoint
 from afm_rl.errors import check_choice, check_count, check_number
-from afm_rl.flow.experts import Experts, Rows, fit_experts
-from afm_rl.flow.network import AxisNetwork, Encoded
-from afm_rl.flow.saturation import DEAD, MODES, attainable, cut_off
-from afm_rl.flow.solver import midpoint
-
-TOLERANCE = 0.25  # of the largest action: at an error of this size the loss is half its maximum
-FORGIVEN = 0.02  # loss of a hypothesis that explains all that it has read
-LATE = -0.01  # of one that finds nothing but a delay, with its penalty
-EXCITED = 0.05  # range of the actions that show whether an axis is dead
-LEAST_WIDTH = 0.02  # of the box: effects that a planner may still ask for
 
 
-class Answer(NamedTuple):
-    """What a tick makes of plans."""
+class Models(NamedTuple):
+    """What is believed of the next action: the models, or the most likely of them."""
 
-    losses: Tensor
-    """Of the hypotheses, ``(B, H + 1)``."""
-    forecasts: Tensor
-    """Effects predicted of what acts now, shares of the largest action, ``(B, H + 1, A)``."""
-    acting: Tensor
-    """The one that is believed, in units of the action, ``(B, A)``."""
-    executed: Tensor
-    """The action, in its own units, ``(B, A)``."""
-    predicted: Tensor
-    """The effect that it is predicted to have, in units of the action, ``(B, A)``."""
-    spread: Tensor
-    """Of the samples, in units of the action, ``(B, A)``."""
-    bounds: Tensor
-    """Lowest and highest effect, in units of the action, ``(B, 2, A)``."""
-    misaligned: Tensor
-    """Is a correction believed? ``(B)``."""
+    encoded: Encoded
+    """What the K most likely readings of every axis have read, B K sets."""
+    lines: Lines
+    """The linear models."""
+    weights: Tensor
+    """Probabilities ``(B, 1 + K + L, A)``: that actions have their nominal effect, now or late;
+    of the readings; of the linear models."""
 
 
 class Tick(nn.Module):
-    """Hypotheses, experts, flow and choice as one function of tensors, for B missions.
+    """The correction as one function of tensors, for B missions.
 
     A function of its arguments alone, so that it can run as machine code
     (:mod:`~afm_rl.compiling.machine_code`). The arguments are settings of
@@ -54,9 +41,9 @@ class Tick(nn.Module):
     """
 
     scale: Tensor
-    source_points: Tensor
+    points: Tensor
     probes: Tensor
-    penalty: Tensor
+    prior: Tensor
     late: Tensor
     rows_acting: Tensor
 
@@ -64,36 +51,32 @@ class Tick(nn.Module):
         self,
         network: AxisNetwork,
         scale: Tensor,
-        hypotheses: Sequence[str],
-        identity: bool,
+        readings: Sequence[str],
         rows: int,
-        memory: int,
-        forgetting: float,
+        prior: Tensor,
+        likely: int,
         samples: int,
         source_std: float,
         steps: int,
-        choose: str,
         saturation: str,
     ) -> None:
         super().__init__()
-        self.network, self.memory = network, memory
-        self.count, size = len(hypotheses), len(scale)
-        self.forgetting = check_number("corrector.forgetting", forgetting, low=0.0, high=1.0)
+        self.network, size = network, len(scale)
         self.source_std = check_number("corrector.source_std", source_std, low=0.0)
         self.steps = check_count("corrector.steps", steps)
-        self.choose = check_choice("corrector.choose", choose, ("best", "mean"))
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
-        chosen = [HYPOTHESES[name] for name in hypotheses]
-        self.by_place = any(h.near for h in chosen)
-        self.varied = sum(h.varied for h in chosen)
-        never = 0.0 if identity else torch.inf
-        penalty = [h.penalty for h in chosen] + [HYPOTHESES[IDENTITY].penalty + never]
+        chosen = [READINGS[name] for name in readings]
+        self.by_place = any(r.near for r in chosen)
+        self.varied = sum(r.varied for r in chosen)
+        self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings))]
+        self.likely = min(check_count("corrector.likely", likely), len(chosen))
+        late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
         fixed = {
             "scale": scale.to(network.modes),
-            "source_points": source_points_of(check_count("corrector.samples", samples), size),
+            "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
-            "penalty": torch.tensor(penalty),
-            "late": torch.tensor([float(h.delay + h.lag) for h in chosen]),
+            "prior": prior,
+            "late": torch.tensor(late, dtype=torch.long),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
         for name, value in fixed.items():
@@ -103,79 +86,47 @@ class Tick(nn.Module):
         self,
         pairs: Tensor,
         losses: Tensor,
-        forecasts: Tensor,
-        misaligned: Tensor,
+        noise: Tensor,
         place: Tensor,
         planned: Tensor,
         box: Tensor,
     ) -> Answer:
-        """Return the answer for B missions whose model is misaligned.
+        """Return the answers to the plans of B missions.
 
         Args:
             pairs: what is remembered, the newest last, ``(B, M, D)``.
-            losses: of the hypotheses before the newest pair, ``(B, H + 1)``.
-            forecasts: effects that they predicted of it, ``(B, H + 1, A)``.
-            misaligned: was anything predicted? ``(B, 1)``.
+            losses: of the models, ``(B, M + 1, A)``.
+            noise: that no model explains, ``(B, A)``.
             place: where the missions are, ``(B, P)``.
             planned: in units of the action, ``(B, A)``.
             box: lowest and highest action, ``(B, 2, A)``.
         """
         unit, ends = planned / self.scale, box / self.scale
-        encoded = self.encode(pairs, place)
-        losses = self.judge(pairs, losses, forecasts, misaligned)
-        losses = self.forgive(losses, encoded.experts)
-        belief = (losses + self.penalty).argmin(-1)
+        encoded, lines = self.read(pairs, noise, place)
+        weights = Belief(losses, losses, noise).weights(self.prior)
+        models = self.most_likely(encoded, lines, weights)
+        proposals, spread = self.propose(models, unit, ends)
+        expected = self.expect(models, proposals)
+        reach = self.reach(models, expected)
+        wanted = attainable(unit, *reach.unbind(-2), self.saturation)
         sent = pairs[..., : len(self.scale)]
-        tried = sent.amax(-2) - sent.amin(-2)
-        known = self.pick(encoded, belief)
-        action, effect, spread, bounds = self.propose(known, unit, ends, tried)
-        bounds = self.hope(tried, ends, bounds)
-        sound = (action + effect).isfinite().all(-1)
-        believed = sound & (belief < self.count)
-        action = torch.where(believed.unsqueeze(-1), action, unit)
-        forecasts = self.predict(encoded, pairs, action)
-        acting = forecasts.gather(1, belief[:, None, None].expand(-1, 1, len(self.scale)))
-        found = torch.stack([action, effect], -2) * self.scale
-        found = torch.where(believed[:, None, None], found, planned.unsqueeze(-2))
-        bounds = torch.where(believed[:, None, None], bounds * self.scale, box)
-        executed, effect = found.unbind(-2)
+        tried = sent.amax(1) - sent.amin(1)
+        bounds = extend(reach, ends, tried, self.saturation)
+        action = self.decide(models, proposals, expected, wanted, noise)
+        action = torch.where(action.isfinite().all(-1, True), action, unit)
+        predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
+        forecasts = self.forecast(encoded, lines, pairs, action)
         return Answer(
-            losses,
-            forecasts,
-            acting.squeeze(1) * self.scale,
-            executed,
-            effect,
+            action * self.scale,
+            predicted * self.scale,
             spread * self.scale,
-            bounds,
-            believed,
+            bounds * self.scale,
+            (weights.argmax(1) > 0).any(-1),
+            forecasts,
         )
 
-    def judge(self, pairs: Tensor, losses: Tensor, forecasts: Tensor, misaligned: Tensor) -> Tensor:
-        """Return the hypotheses' losses ``(B, H + 1)`` after the newest pair."""
-        size = len(self.scale)
-        newest = pairs[:, -1:]
-        effective, std = newest[..., size : 2 * size], newest[..., 2 * size : 3 * size]
-        tolerance = TOLERANCE**2
-        miss = (forecasts - effective).square()
-        share = miss / ((miss + tolerance) * (1 + std.square() / tolerance))
-        valid = newest[..., 3 * size]
-        return self.forgetting * losses + valid * misaligned * share.mean(-1)
-
-    def forgive(self, losses: Tensor, experts: Experts) -> Tensor:
-        """Return losses that are small where a line explains all that a hypothesis has read.
-
-        Its first forecasts were guesses: one pair does not tell a gain from an offset. Where
-        actions have their nominal effect, only late, that is believed before any line: of plans
-        that change slowly, a late one looks like an offset.
-        """
-        line, nominal = (part.view(-1, self.count) for part in experts.explained())
-        read, identity = losses.split([self.count, 1], -1)  # the identity reads nothing
-        read = torch.where(line, read.clamp_max(FORGIVEN), read)
-        late = nominal & (self.late > 0)
-        return torch.cat([torch.where(late, LATE - self.penalty[:-1], read), identity], -1)
-
-    def encode(self, pairs: Tensor, place: Tensor) -> Encoded:
-        """Return what the network reads under every hypothesis, B H sets of rows."""
+    def read(self, pairs: Tensor, noise: Tensor, place: Tensor) -> tuple[Encoded, Lines]:
+        """Return what is read in every reading, B R sets of rows, and the linear models."""
         away, size = None, len(self.scale)
         if self.by_place:
             first = 3 * size + 2
@@ -183,85 +134,112 @@ class Tick(nn.Module):
             away = torch.where(pairs[..., first - 2] > 0, away, torch.inf)
         layout = Layout(*(getattr(self, f"rows_{name}") for name in Layout._fields))
         rows = read_rows(pairs, layout, size, away, self.varied)
-        rows = Rows(*(part.flatten(0, 1) for part in rows))
-        return self.network.encode(rows, fit_experts(rows))
+        loud = torch.hypot(rows.std, noise[:, None, None]) * rows.valid
+        rows = Rows(*(part.flatten(0, 1) for part in rows._replace(std=loud)))
+        sent, came, std, valid = pairs[..., : 3 * size + 1].split([size, size, size, 1], -1)
+        sound = (valid == 1.0).to(pairs)
+        lines = fit_lines(sent, came, torch.hypot(std, noise.unsqueeze(1)), sound)
+        return self.network.encode(rows, fit_experts(rows)), lines
 
-    def pick(self, encoded: Encoded, belief: Tensor) -> Encoded:
-        """Return what is read under one hypothesis for each mission, ``(B,)``.
+    def most_likely(self, encoded: Encoded, lines: Lines, weights: Tensor) -> Models:
+        """Return the most likely models of every axis."""
+        still, read, linear, late = weights.split(self.counts, 1)
+        # Of models that are alike the first, on any machine and in any batch.
+        order = torch.arange(read.shape[1], device=read.device).view(-1, 1)
+        best = (read * (1 - 1e-4 * order)).topk(self.likely, 1)
+        which = encoded.choose(best.indices)
+        share = best.values / best.values.sum(1, keepdim=True).clamp_min(1e-30)
+        share = read.sum(1, keepdim=True) * share
+        still = still + late.sum(1, keepdim=True)
+        return Models(which, lines, torch.cat([still, share, linear], 1))
 
-        The first stands in for the identity, which reads nothing.
+    def propose(self, models: Models, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
+        """Return actions ``(B, C, A)``, the first the planned one, and the samples' deviation.
+
+        The flow's samples of the most likely reading, the exact answers of all fits, and a few
+        actions from all over the box.
         """
-        first = torch.arange(belief.shape[0], device=belief.device) * self.count
-        return encoded.pick(first + belief.where(belief < self.count, 0))
-
-    def propose(
-        self, known: Encoded, planned: Tensor, box: Tensor, tried: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return action, predicted effect and spread ``(B, A)``, and bounds ``(B, 2, A)``.
-
-        Args:
-            known: what is read under the hypothesis that is believed.
-            planned: u, ``(B, A)``.
-            box: its lowest and highest, ``(B, 2, A)``.
-            tried: range of the remembered actions, ``(B, A)``.
-        """
-        # Where a line explains all rows, it is believed to go on where nothing was tried.
-        line = known.experts.lines(box)
-        plans = planned.unsqueeze(-2)
-        if self.saturation != "clip":  # for an axis without influence nothing need be slower
-            small = line.diff(dim=-2).abs() < DEAD * box.diff(dim=-2)
-            # Of an action that never changed it is not known what another one would do.
-            dead = small & (tried > EXCITED).unsqueeze(-2)
-            plans = torch.where(dead, line.mean(-2, keepdim=True), plans)
-        asked = self.network.ask(known, plans, self.saturation)
-        velocity = partial(self.network.velocity, asked)
-        start = plans + self.source_std * self.source_points
-        ends = midpoint(velocity, start, self.steps)
-        mean, spread = ends.mean(-2, keepdim=True), ends.std(-2, correction=0)
-        proposals = mean
-        if self.choose == "best":  # mixtures come near; an expert that explains all is exact
-            sure = known.experts.sure().unsqueeze(-1)
-            exact = torch.where(sure, asked.answers[..., 0, :-1].mT, mean)
-            proposals = torch.cat([mean, ends, exact], -2)
-        least, most = box.split(1, -2)
-        proposals = torch.minimum(torch.maximum(proposals, least), most)
-        count = proposals.shape[-2]
+        count, size = planned.shape
+        plans = planned.repeat_interleave(self.likely, 0).unsqueeze(1)
+        asked = self.network.ask(models.encoded, plans, self.saturation)
+        first = asked.pick(torch.arange(count, device=planned.device) * self.likely)
+        plan = planned.unsqueeze(1)
+        start = plan + self.source_std * self.points
+        ends = midpoint(partial(self.network.velocity, first), start, self.steps)
+        mean, spread = ends.mean(1, keepdim=True), ends.std(1, correction=0)
+        exact = asked.answers[..., 0, :MISSES].mT.reshape(count, -1, size)
+        least, most = box.split(1, 1)
         probes = torch.lerp(least, most, 0.5 * (self.probes + 1))
-        foreseen = self.network.effect(known, torch.cat([proposals, probes], -2))
-        effects, found = foreseen[:, :count], foreseen[:, count:]
-        low, high = found.amin(-2), found.amax(-2)
-        low, high = torch.fmin(low, line.amin(-2)), torch.fmax(high, line.amax(-2))
-        wanted = attainable(plans.squeeze(-2), low, high, self.saturation)
-        best = nearest_of(effects, wanted, 0.5 * (high - low))
-        chosen = torch.cat([proposals, effects], -1)
-        chosen = chosen.gather(-2, best.expand(best.shape[0], 1, chosen.shape[-1])).squeeze(-2)
-        action, effect = chosen.tensor_split(2, -1)
-        return action, effect, spread, torch.stack([low, high], -2)
+        found = [plan, mean, ends, exact, models.lines.invert(planned), probes]
+        return torch.cat(found, 1).clamp(least, most), spread
 
-    def hope(self, tried: Tensor, box: Tensor, bounds: Tensor) -> Tensor:
-        """Return the bounds of effects ``(B, 2, A)`` that plans should keep.
+    def expect(self, models: Models, actions: Tensor) -> Tensor:
+        """Return the effects ``(B, 1 + K + L, C, A)`` of actions ``(B, C, A)`` by every model."""
+        each = actions.repeat_interleave(self.likely, 0)
+        read = self.network.effect(models.encoded, each).unflatten(0, (-1, self.likely))
+        return torch.cat([actions.unsqueeze(1), read, models.lines.effect(actions)], 1)
 
-        Smaller than the box only where most of it was tried of late: what was not tried may do
-        what the model says. And only where the saturation cuts a plan: where it makes the robot
-        slower instead, plans may ask for more.
+    def mean(self, models: Models, expected: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation of effects over the models, ``(B, C, A)`` each."""
+        weights = models.weights.unsqueeze(2)
+        return mean_and_std(expected.transpose(1, 2), weights.transpose(1, 2))
 
-        Args:
-            tried: range of the remembered actions, ``(B, A)``.
-            box: lowest and highest action, ``(B, 2, A)``.
-            bounds: lowest and highest effect that is predicted of them, ``(B, 2, A)``.
+    def reach(self, models: Models, foreseen: Tensor) -> Tensor:
+        """Return the lowest and highest effects that actions may have, ``(B, 2, A)``.
+
+        As far as the models differ, the best is hoped for: a planner that may try learns more.
         """
-        (least, most), (low, high) = box.unbind(-2), bounds.unbind(-2)
-        width = most - least
-        left = (1 - tried / width).clamp_min(LEAST_WIDTH) * width
-        left = torch.where(cut_off((high - low) / width, self.saturation), left, width)
-        low = torch.fmin(low, torch.fmax(low - left, least))
-        high = torch.fmax(high, torch.fmin(high + left, most))
-        return torch.stack([low, high], -2)
+        mean, std = self.mean(models, foreseen)
+        return torch.stack([(mean - std).amin(1), (mean + std).amax(1)], 1)
 
-    def predict(self, encoded: Encoded, pairs: Tensor, executed: Tensor) -> Tensor:
-        """Return the effects ``(B, H + 1, A)`` that the hypotheses predict of what acts now."""
-        size = len(self.scale)
-        sent = torch.cat([pairs[..., :size], executed.unsqueeze(-2)], -2)
-        acted = self.rows_acting @ sent[:, -self.rows_acting.shape[-1] :]  # (B, H, A)
-        effects = self.network.effect(encoded, acted.reshape(-1, 1, size)).view_as(acted)
-        return torch.cat([effects, executed.unsqueeze(-2)], -2)
+    def decide(
+        self, models: Models, proposals: Tensor, expected: Tensor, wanted: Tensor, noise: Tensor
+    ) -> Tensor:
+        r"""Return the actions ``(B, A)`` with the least expected loss.
+
+        .. math:: u_a = \operatorname{argmin}_u \sum_h w_{ha}
+                  \log\Big(1 + \frac{(T_{ha}(u) - u^*_a)^2}{s_a^2}\Big)
+
+        over the proposals, axis by axis, if these actions together are no worse than the best
+        proposal as a whole, as they may be where one command moves several axes. The loss averages
+        models that differ by less than the noise s, and decides between those that differ by
+        more: half of two opposite answers would do nothing, and tell nothing.
+        """
+        cost = self.loss(models, expected, wanted, noise)  # (B, C, A)
+        mixed = proposals.gather(1, cost.argmin(1, keepdim=True))
+        joint = cost.sum(-1).argmin(1)[:, None, None].expand_as(mixed)
+        again = self.loss(models, self.expect(models, mixed), wanted, noise)
+        whole = cost.gather(1, joint).sum(-1, keepdim=True)
+        better = again.sum(-1, keepdim=True) <= whole + 1e-6
+        return torch.where(better, mixed, proposals.gather(1, joint)).squeeze(1)
+
+    def loss(self, models: Models, expected: Tensor, wanted: Tensor, noise: Tensor) -> Tensor:
+        """Return the expected loss ``(B, C, A)`` of effects ``(B, 1 + K + L, C, A)``."""
+        miss = (expected - wanted[:, None, None]).square() / noise[:, None, None].square()
+        return (models.weights.unsqueeze(2) * miss.log1p()).sum(1)
+
+    def forecast(self, encoded: Encoded, lines: Lines, pairs: Tensor, executed: Tensor) -> Tensor:
+        """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now."""
+        size, now = len(self.scale), executed.unsqueeze(1)
+        sent = torch.cat([pairs[..., :size], now], -2)
+        acted = self.rows_acting @ sent[:, -self.rows_acting.shape[-1] :]  # (B, R, A)
+        read = self.network.effect(encoded, acted.reshape(-1, 1, size)).view_as(acted)
+        linear = lines.effect(now).squeeze(2)
+        return torch.cat([now, read, linear, acted[:, self.late]], 1)
+
+
+def points_of(count: int, size: int) -> Tensor:
+    """Return normal points ``(count, A)``, the same ones always; each has its opposite."""
+    half = torch.randn((count + 1) // 2, size, generator=torch.Generator().manual_seed(0))
+    return torch.cat([half, -half])[:count]
+
+
+def probes_of(size: int, count: int = 32) -> Tensor:
+    """Return actions ``(P, A)`` in [-1, 1]: ends of the axes, and between them.
+
+    >>> probes_of(1)[:2].tolist()
+    [[1.0], [-1.0]]
+    """
+    ends = torch.cat([torch.eye(size), -torch.eye(size)])
+    inner = torch.quasirandom.SobolEngine(size).draw(max(1, count - 2 * size))
+    return torch.cat([ends, 2 * inner - 1])

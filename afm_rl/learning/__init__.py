@@ -2,7 +2,6 @@
 
 from afm_rl.learning.collect import collect
 from afm_rl.learning.fitting import FitReport, fit_ensemble
-from afm_rl.learning.gate import fit_gate, largest_innovation
 from afm_rl.learning.hook import UpdaterHook
 from afm_rl.learning.knode_updater import KNODEUpdater
 from afm_rl.learning.learner import Learner
@@ -37,9 +36,7 @@ __all__ = [
     "UpdaterHook",
     "collect",
     "fit_ensemble",
-    "fit_gate",
     "gaussian_nll",
-    "largest_innovation",
     "pretrain_ensemble",
     "pretrain_knode",
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,13 +11,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from afm_rl.dynamics import Ensemble
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import check_count, check_number
 from afm_rl.learning.fitting import FitReport, fit_ensemble
-from afm_rl.learning.gate import fit_gate
 from afm_rl.spaces.manifold import Manifold
-
-KEPT_BACK = 0.2  # newest share of the transitions, to which only the gate is fitted
-WINDOW = 16  # transitions that a gate looks at: windows overlap, and few tell little
 
 
 @dataclass
@@ -27,8 +22,7 @@ class Watching:
 
     After ``transitions`` of them it is fitted, at the next :meth:`fit`. It is good enough when
     its held-out error, root mean square in standard deviations of the data, is at most ``error``;
-    if not, twice as many transitions are waited for. The gate of the corrector is fitted to the
-    newest fifth, which the model has not seen, see :func:`~afm_rl.learning.fit_gate`.
+    if not, twice as many transitions are waited for.
 
     A policy's action is a function of the state, so that its own data do not tell what another
     action would have done. While it watches, normal noise of ``noise`` half ranges on the executed
@@ -38,7 +32,6 @@ class Watching:
         transitions: watched before the first fit.
         error: largest held-out error of a model that is used.
         noise: standard deviation, in half ranges of the action box.
-        false_alarms: share of healthy steps at which the gate opens, in (0, 0.5].
         fit: settings of :func:`~afm_rl.learning.fit_ensemble`.
         model: settings of the ensemble.
         manifold: of the states; plain numbers if None.
@@ -47,7 +40,7 @@ class Watching:
     Raises:
         ConfigurationError: for numbers that cannot be used.
 
-    >>> watching = Watching(transitions=300, false_alarms=0.5, model={"hidden": [16], "members": 2})
+    >>> watching = Watching(transitions=300, model={"hidden": [16], "members": 2})
     >>> state, action = torch.randn(300, 1, 2), torch.randn(300, 1, 1)
     >>> for s, a in zip(state, action, strict=True):
     ...     watching.add(s, a, s + 0.5 * a, torch.tensor([True]))
@@ -58,7 +51,6 @@ class Watching:
     transitions: int = 20_000
     error: float = 0.5
     noise: float = 0.1
-    false_alarms: float = 0.01
     fit: Mapping[str, Any] = field(default_factory=dict)
     model: Mapping[str, Any] = field(default_factory=lambda: {"hidden": [200, 200]})
     manifold: Manifold | None = None
@@ -74,13 +66,6 @@ class Watching:
         self.needed = check_count("learn.transitions", self.transitions)
         check_number("learn.error", self.error, low=0.0, open_low=True)
         check_number("learn.noise", self.noise, low=0.0)
-        check_number("learn.false_alarms", self.false_alarms, low=0.0, high=0.5, open_low=True)
-        least = math.ceil(WINDOW / self.false_alarms / KEPT_BACK)
-        if self.transitions < least:
-            raise ConfigurationError(
-                f"learn.transitions={self.transitions}: expected at least {least}, so that a gate "
-                f"with false_alarms={self.false_alarms} can be fitted"
-            )
 
     @property
     def count(self) -> int:
@@ -102,28 +87,18 @@ class Watching:
             if bool(whole):
                 mine.append(row)
 
-    def learn(self, corrector: Any) -> FitReport:
-        """Fit model and gate to all that was watched; :attr:`fitted` is set if it is good enough.
-
-        Args:
-            corrector: whose gate is fitted.
-        """
+    def learn(self) -> FitReport:
+        """Fit a model to all that was watched; :attr:`fitted` is set if it is good enough."""
         states, actions = self._sizes
-        cuts = [round((1 - KEPT_BACK) * len(mine)) for mine in self._seen]
-        old = [row for mine, cut in zip(self._seen, cuts, strict=True) for row in mine[:cut]]
-        new = [row for mine, cut in zip(self._seen, cuts, strict=True) for row in mine[cut:]]
+        rows = torch.stack([row for mine in self._seen for row in mine])
         manifold = Manifold(states) if self.manifold is None else self.manifold
         features, settings = list(range(states)), {"seed": self.seed, **self.model}
         model = Ensemble(manifold, actions, features, **settings)
-
-        def data(rows: list[Tensor]) -> TensorDict:
-            parts = torch.stack(rows).split([states, actions, states], -1)
-            names = ("observation", "action", ("next", "observation"))
-            return TensorDict({}, [len(rows)]).update(dict(zip(names, parts, strict=True)))
-
-        self.report = fit_ensemble(model, data(old), **{"seed": self.seed, **self.fit})
+        names = ("observation", "action", ("next", "observation"))
+        parts = rows.split([states, actions, states], -1)
+        data = TensorDict({}, [len(rows)]).update(dict(zip(names, parts, strict=True)))
+        self.report = fit_ensemble(model, data, **{"seed": self.seed, **self.fit})
         if self.report.error <= self.error:
-            fit_gate(corrector, model, data(new), self.false_alarms)
             self.fitted = model.requires_grad_(False)
         else:
             self.needed = 2 * self.count

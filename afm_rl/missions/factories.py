@@ -17,6 +17,7 @@ import torch
 from torch import nn
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
+from afm_rl.correction.training import train_flow
 from afm_rl.dynamics import (
     KNODE,
     Calibrated,
@@ -26,13 +27,12 @@ from afm_rl.dynamics import (
     Quadrotor,
     UnknownDynamics,
 )
-from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_flag, check_instance
-from afm_rl.flow import train_flow
+from afm_rl.errors import AFMError, ConfigurationError, check_flag, check_instance
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
 from afm_rl.missions.collected import fit_collected
 from afm_rl.missions.robot import Robot
-from afm_rl.planning.costs import SATURATIONS, KnownReward
+from afm_rl.planning.costs import KnownReward
 from afm_rl.storage.artefacts import load_artefact
 
 FLOW_UNIT = "shares of the largest action"
@@ -168,19 +168,17 @@ def knode(
     return Part(model, Training("KNODE", model, train, unit, [shape]), shape)
 
 
-def reward(robot: Robot, saturation: str = "clip") -> KnownReward:
+def reward(robot: Robot) -> KnownReward:
     """Return the cost that is the negative reward of the robot's task.
 
     Args:
         robot: one with a reward.
-        saturation: see :class:`~afm_rl.planning.GoalDistance`.
     """
     if robot.reward is None:
         raise ConfigurationError(
             f"cost=reward: robot={robot.name} has no reward; choose cost=goal_position, or a "
             "robot with a task: gymnasium, dm_control or mujoco"
         )
-    check_choice("cost.saturation", saturation, SATURATIONS)
     return KnownReward(robot.reward, list(robot.reward_reads), list(robot.reward_reads.values()))
 
 
@@ -201,7 +199,7 @@ def afm(
     flow = ActionFlow(*robot.action_box, place=place, place_scale=scale, **settings)
     if train is None and checkpoint is None:
         return Part(flow)
-    own: dict[str, Any] = {k: v for k, v in settings.items() if k in ("hypotheses", "rows")}
+    own: dict[str, Any] = {k: v for k, v in settings.items() if k in ("readings", "rows")}
     return Part(flow, _training(flow, robot, dynamics, train or {}, checkpoint, own, FLOW_UNIT))
 
 
@@ -235,7 +233,8 @@ def least_squares(robot: Robot, dynamics: Part, **settings: Any) -> LeastSquares
 
 def l1(robot: Robot, dynamics: Part, dt: float | None = None, **settings: Any) -> L1Augmentation:
     """Return L1 adaptive augmentation, which needs no training."""
-    return L1Augmentation(*robot.action_box, dt=robot.dt if dt is None else dt, **settings)
+    step: Any = robot.dt if dt is None else dt  # None is refused, by name
+    return L1Augmentation(*robot.action_box, dt=step, **settings)
 
 
 def _training(

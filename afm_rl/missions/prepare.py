@@ -9,7 +9,6 @@ from pathlib import Path
 
 from afm_rl._version import __version__
 from afm_rl.missions.build import Agent
-from afm_rl.missions.gate import fit_agents_gate
 from afm_rl.storage.artefacts import cached
 
 
@@ -45,7 +44,3 @@ def prepare(
         if "rewards" in known:
             rewards = ", ".join(f"{reward:.3g}" for reward in known["rewards"])
             echo(f"{part.title}: reward per step of each round of data, random first: {rewards}")
-    gate = fit_agents_gate(agent)
-    if gate is not None:
-        rate = 100 * agent.settings["false_alarms"]
-        echo(f"corrector: gate {gate:.1f} standard deviations, for {rate:g} % false alarms")

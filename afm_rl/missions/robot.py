@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.missions.collected import Collection
+from afm_rl.missions.collection import Collection
 from afm_rl.missions.laps import LapScore
 from afm_rl.missions.score import Score
 from afm_rl.regimes import Regime, Schedule
@@ -53,7 +53,7 @@ class Robot:
         usual_low: lowest corner of the box that actions mostly keep to, the unit of calibrations
             and the box in which residual networks are trained; the action box if None.
         usual_high: its highest corner.
-        hypotheses: those of :data:`~afm_rl.correction.hypotheses.HYPOTHESES` that make sense for
+        readings: those of :data:`~afm_rl.correction.readings.READINGS` that make sense for
             the robot; all if None.
         place: indices of the state coordinates in which the ground may differ, if any.
         place_scale: distance at which ground counts as other ground, in their unit.
@@ -87,7 +87,7 @@ class Robot:
     score: Score | None = None
     usual_low: Sequence[float] | None = None
     usual_high: Sequence[float] | None = None
-    hypotheses: Sequence[str] | None = None
+    readings: Sequence[str] | None = None
     place: Sequence[int] = ()
     place_scale: float = 1.0
     reward: Callable[..., Tensor] | None = None

@@ -2,6 +2,7 @@
 
 from afm_rl.planning.costs import Cost, GoalDistance, KnownReward
 from afm_rl.planning.icem import ICEM
+from afm_rl.planning.imported_policy import policy_from_cleanrl, policy_from_sb3
 from afm_rl.planning.law import LawPlanner
 from afm_rl.planning.mpc import MPC
 from afm_rl.planning.mppi import MPPI
@@ -26,5 +27,7 @@ __all__ = [
     "TorchRLMPPI",
     "TrackingCost",
     "load_policy",
+    "policy_from_cleanrl",
+    "policy_from_sb3",
     "save_policy",
 ]

@@ -11,10 +11,8 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
-from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.spaces.keys import as_keys
-
-SATURATIONS = ("mixed", "direction", "clip")  # what gives way when an action cannot be had
 
 
 class Cost(nn.Module, ABC):
@@ -48,10 +46,6 @@ class GoalDistance(Cost):
         in_keys: the goal's key.
         goal_size: number of goal coordinates.
         weights: weight of each coordinate (1 each), in cost units per m or rad.
-        saturation: what should give way when an action cannot be had in full, for whoever
-            executes the plan: ``"direction"`` (be late, keep the path) suits a cost that can
-            wait, ``"clip"`` one that asks for a heading at every instant, ``"mixed"`` (clip, but
-            be late where less than 30 % can be had) most others.
 
     >>> cost = GoalDistance([0, 1])
     >>> here = torch.zeros(3)
@@ -67,10 +61,8 @@ class GoalDistance(Cost):
         in_keys: Sequence[NestedKey] = ("goal",),
         goal_size: int = 2,
         weights: Sequence[float] | None = None,
-        saturation: str = "mixed",
     ) -> None:
         super().__init__()
-        self.saturation = check_choice("cost.saturation", saturation, SATURATIONS)
         self.coordinates = list(coordinates)
         self.in_keys = as_keys(in_keys)
         self.in_sizes = [check_count("cost.goal_size", goal_size)]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,24 +11,43 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from afm_rl.errors import ArtefactError, ConfigurationError, check_number
+from afm_rl.errors import ArtefactError, ConfigurationError, check_choice, check_number
 from afm_rl.planning.law import LawPlanner
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.storage.artefacts import digest_of, read_tensors, save_tensors
 
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "relu": nn.functional.relu,
+    "tanh": torch.tanh,
+    "elu": nn.functional.elu,
+    "silu": nn.functional.silu,
+    "gelu": nn.functional.gelu,
+}
+
 
 class StoredPolicy(nn.Module):
-    r"""A feed-forward policy: linear layers with ReLU between them, tanh at the end.
+    r"""The mean action of a trained feed-forward actor.
 
     It is used as it is: no gradients are recorded for its weights.
 
-    .. math:: a = c + h \tanh(W_n \max(0, \dots \max(0, W_1 o + b_1) \dots) + b_n)
+    .. math::
+        x_0 = \operatorname{clip}((o - \mu) / \sigma, \pm k), \qquad
+        x_i = \phi(W_i x_{i-1} + b_i), \qquad y = W_n x_{n-1} + b_n
 
-    with centre c and half range h of the action box: the mean action of a trained actor.
+    and the action is :math:`c + h \tanh(\operatorname{clip}(y, \pm l))`, with centre c and half
+    range h of the action box, or, if not squashed, y brought into the box.
 
     Args:
         layers: weights ``(units, inputs)`` and biases ``(units,)``, in order.
         low, high: action box ``(A,)``.
+        activation: phi between the layers: relu, tanh, elu, silu or gelu.
+        squash: whether a tanh keeps the action in the box, or the box itself does.
+        limit: l, of what is squashed.
+        normaliser: mean and standard deviation ``(2, O)`` of the observations; None without.
+        clip: k, of normalised observations.
+
+    Raises:
+        ConfigurationError: for layers or an action box that do not fit each other.
 
     >>> import torch
     >>> layers, low, high = [(torch.eye(2), torch.zeros(2))], -2 * torch.ones(2), torch.ones(2)
@@ -37,24 +57,54 @@ class StoredPolicy(nn.Module):
 
     low: Tensor
     high: Tensor
+    normaliser: Tensor | None
 
-    def __init__(self, layers: list[tuple[Tensor, Tensor]], low: Tensor, high: Tensor) -> None:
+    def __init__(
+        self,
+        layers: Sequence[tuple[Tensor, Tensor]],
+        low: Tensor,
+        high: Tensor,
+        activation: str = "relu",
+        squash: bool = True,
+        limit: float = math.inf,
+        normaliser: Tensor | None = None,
+        clip: float = math.inf,
+    ) -> None:
         super().__init__()
+        inputs = [weight.shape[1] for weight, _ in layers] + [len(low)]
+        if [len(weight) for weight, _ in layers] != inputs[1:] or len(low) != len(high):
+            shapes = [tuple(weight.shape) for weight, _ in layers]
+            raise ConfigurationError(
+                f"policy: layers of the shapes {shapes} and an action box of {len(low)} and "
+                f"{len(high)} numbers: expected that each feeds the next"
+            )
         self.weights = nn.ParameterList([weight.detach().float() for weight, _ in layers])
         self.biases = nn.ParameterList([bias.detach().float() for _, bias in layers])
         self.register_buffer("low", low.float())
         self.register_buffer("high", high.float())
+        self.register_buffer("normaliser", None if normaliser is None else normaliser.float())
+        self.form: dict[str, Any] = {
+            "activation": check_choice("policy.activation", activation, tuple(ACTIVATIONS)),
+            "squash": squash,
+            "limit": limit,
+            "clip": clip,
+        }
         self.requires_grad_(False)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the action ``(*B, A)`` for an observation ``(*B, O)``."""
         value = observation.to(self.low.dtype)
-        last = len(self.weights) - 1
+        if self.normaliser is not None:
+            mean, std = self.normaliser
+            value = ((value - mean) / std).clamp(-self.form["clip"], self.form["clip"])
+        activate, last = ACTIVATIONS[self.form["activation"]], len(self.weights) - 1
         for index, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             value = nn.functional.linear(value, weight, bias)
-            value = value.tanh() if index == last else value.relu()
-        action = self.low + (self.high - self.low) * (value + 1) / 2
-        return action.to(observation.dtype)
+            value = value if index == last else activate(value)
+        if self.form["squash"]:
+            value = value.clamp(-self.form["limit"], self.form["limit"]).tanh()
+            value = self.low + (self.high - self.low) * (value + 1) / 2
+        return value.clamp(self.low, self.high).to(observation.dtype)
 
     @property
     def observation_size(self) -> int:
@@ -62,19 +112,11 @@ class StoredPolicy(nn.Module):
         return self.weights[0].shape[1]
 
 
-def save_policy(
-    file: Path,
-    layers: list[tuple[Tensor, Tensor]],
-    low: Tensor,
-    high: Tensor,
-    description: Mapping[str, Any],
-) -> None:
-    """Write a policy, in half precision; ``description`` says how it was made."""
-    named = {"low": low.float(), "high": high.float()}
-    for index, (weight, bias) in enumerate(layers):
-        named[f"{index}.weight"] = weight.detach().half()
-        named[f"{index}.bias"] = bias.detach().half()
-    save_tensors(Path(file), named, {**description, "kind": "policy", "layers": len(layers)})
+def save_policy(file: Path, policy: StoredPolicy, description: Mapping[str, Any]) -> None:
+    """Write a policy, its weights in half precision; ``description`` says how it was made."""
+    kept = {name: value.half() for name, value in policy.named_parameters()}
+    kept |= dict(policy.named_buffers())
+    save_tensors(Path(file), kept, {**description, "kind": "policy", "form": policy.form})
 
 
 def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
@@ -85,11 +127,12 @@ def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
         ArtefactError: if it is damaged, or holds something else.
     """
     tensors, description = read_tensors(Path(file))
-    if description.get("kind") != "policy":
+    if description.get("kind") != "policy" or "form" not in description:
         raise ArtefactError(f"{file}: holds no policy; make one with save_policy")
-    count = range(description["layers"])
-    layers = [(tensors[f"{index}.weight"], tensors[f"{index}.bias"]) for index in count]
-    return StoredPolicy(layers, tensors["low"], tensors["high"]), description
+    count = range(sum(name.startswith("weights") for name in tensors))
+    layers = [(tensors[f"weights.{index}"], tensors[f"biases.{index}"]) for index in count]
+    box, normaliser = (tensors["low"], tensors["high"]), tensors.get("normaliser")
+    return StoredPolicy(layers, *box, normaliser=normaliser, **description["form"]), description
 
 
 class PolicyPlanner(LawPlanner):

@@ -10,8 +10,8 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_choice, check_number
-from afm_rl.planning.costs import SATURATIONS, Cost
+from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.planning.costs import Cost
 from afm_rl.spaces.keys import as_keys
 from afm_rl.spaces.manifold import wrap_angle
 
@@ -54,8 +54,6 @@ class TrackingCost(QuadraticCost):
         rest: targets of the other coordinates, one per state coordinate; zeros if None.
         angles: indices of the coordinates in rad, whose difference wraps.
         in_keys: the reference's key; none without a reference.
-        saturation: what should give way when an action cannot be had in full, for whoever
-            executes the plan, see :class:`~afm_rl.planning.GoalDistance`.
 
     Raises:
         ConfigurationError: for settings that do not fit together.
@@ -79,10 +77,8 @@ class TrackingCost(QuadraticCost):
         rest: Sequence[float] | None = None,
         angles: Sequence[int] = (),
         in_keys: Sequence[NestedKey] = ("reference",),
-        saturation: str = "clip",
     ) -> None:
         super().__init__()
-        self.saturation = check_choice("cost.saturation", saturation, SATURATIONS)
         size, self.in_keys = len(weights), as_keys(in_keys)
         if len(self.in_keys) != bool(coordinates):
             raise ConfigurationError(
@@ -113,6 +109,7 @@ class TrackingCost(QuadraticCost):
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, *task: Tensor) -> Tensor:
         """Return the cost ``(*B)`` of an action and of the state that it leads to."""
+        self._check_sizes(next_state, action)
         off = self._gap(next_state, *task).square() @ self.weights.to(next_state)
         return off + action.square() @ self.action_weights.to(action)
 
@@ -120,13 +117,7 @@ class TrackingCost(QuadraticCost):
         self, states: Tensor, actions: Tensor, *task: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the expansion, which is exact."""
-        sizes = (states.shape[-1], actions.shape[-1])
-        if sizes != (len(self.weights), len(self.action_weights)):
-            raise ConfigurationError(
-                f"cost: weights for {len(self.weights)} state coordinates and "
-                f"{len(self.action_weights)} action components, but there are "
-                f"{sizes[0]} and {sizes[1]}"
-            )
+        self._check_sizes(states, actions)
         state_twice = 2.0 * self.weights.to(states)
         action_twice = 2.0 * self.action_weights.to(actions)
         return (
@@ -135,6 +126,15 @@ class TrackingCost(QuadraticCost):
             action_twice.diag().expand(*actions.shape, -1),
             action_twice * actions,
         )
+
+    def _check_sizes(self, states: Tensor, actions: Tensor) -> None:
+        sizes = states.shape[-1], actions.shape[-1]
+        if sizes != (len(self.weights), len(self.action_weights)):
+            raise ConfigurationError(
+                f"cost: weights for {len(self.weights)} state coordinates and "
+                f"{len(self.action_weights)} action components, but there are "
+                f"{sizes[0]} and {sizes[1]}"
+            )
 
     def _gap(self, state: Tensor, *reference: Tensor) -> Tensor:
         """Return by how much states ``(*B, S)`` miss the targets."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
@@ -18,6 +17,7 @@ from rich.text import Text
 from afm_rl.replay import Table as Replayed
 from afm_rl.replay.table import AFM, ALONE, SHARES
 from afm_rl.report import style
+from afm_rl.report.figures import Picture
 from afm_rl.report.table import Table
 from afm_rl.storage.csv_text import csv_text
 from afm_rl.storage.files import write_whole
@@ -138,8 +138,7 @@ def _running(values: np.ndarray, rows: np.ndarray, window: int) -> list[float]:
     return [float(np.median(values[max(0, row + 1 - window) : row + 1])) for row in rows]
 
 
-def pictures_of(replayed: Replayed) -> Iterator[dict[str, object]]:
-    """Yield what a page needs of the figure: name, title, caption and the picture itself."""
+def pictures_of(replayed: Replayed) -> Iterator[Picture]:
+    """Yield the figure as a picture for a page."""
     figure, caption = draw_replay(replayed)
-    data = base64.b64encode(style.png_bytes(figure)).decode()
-    yield {"name": "replay", "title": replayed.sentence, "caption": caption, "data": data}
+    yield Picture("replay", replayed.sentence, caption, style.png_bytes(figure))

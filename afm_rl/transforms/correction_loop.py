@@ -112,7 +112,7 @@ class CorrectionLoop:
         if self.entries is None:
             self._complete(states)
         if self.watching and self.learning and self.watching.due:
-            self.watching.learn(self.corrector)
+            self.watching.learn()
             self.model, rows = self.watching.fitted or self.model, None
         fresh = begin(self.corrector, states, self.spec)
         if rows is None or self.entries is None:

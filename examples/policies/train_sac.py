@@ -23,7 +23,7 @@ import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from afm_rl.planning import load_policy, save_policy
+from afm_rl.planning import StoredPolicy, load_policy, save_policy
 from afm_rl.storage.files import write_whole
 
 BATCH, CHECKPOINT, DISCOUNT, AVERAGING, RATE = 256, 20_000, 0.99, 0.005, 3e-4
@@ -205,9 +205,10 @@ class Run:
             "steps": self.step,
             "randomised": args.randomise,
         }
-        save_policy(args.out, layers, low, high, about)
+        policy = StoredPolicy(layers, low, high)
+        save_policy(args.out, policy, about)
         found = returns(args.id, args.out, episodes=5)
-        save_policy(args.out, layers, low, high, {**about, "return": round(float(found.mean()), 2)})
+        save_policy(args.out, policy, {**about, "return": round(float(found.mean()), 2)})
         print(f"{args.out}: return {found.mean():.1f} +- {found.std():.1f}", flush=True)
 
 

@@ -10,6 +10,8 @@ from pushing import push
 from tensordict import TensorDict
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.training import CFMLoss
 from afm_rl.dynamics import (
     KNODE,
     Calibrated,
@@ -19,7 +21,6 @@ from afm_rl.dynamics import (
     Oracle,
     Quadrotor,
 )
-from afm_rl.flow import AxisNetwork, CFMLoss
 from afm_rl.learning import (
     GaussianNLLLoss,
     OnlineUpdater,

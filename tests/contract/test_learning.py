@@ -11,10 +11,11 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 from torchrl.trainers import ReplayBufferTrainer, Trainer
 
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.training import CFMLoss, draw_examples
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import AxisNetwork, CFMLoss, draw_examples
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam, Updater, UpdaterHook
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 

@@ -18,10 +18,10 @@ from torchrl.envs import (
 )
 
 from afm_rl.correction import ActionFlow
+from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins, KnownDynamics, dubins_step
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import AxisNetwork
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from afm_rl.correction import L1Augmentation
+from afm_rl.correction.achievable import MODES
 from afm_rl.correction.l1 import low_pass
 from afm_rl.dynamics import Quadrotor
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow.saturation import MODES
 from afm_rl.spaces.airframe import QuadrotorBody
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from afm_rl.correction import LeastSquares
+from afm_rl.correction.achievable import MODES
+from afm_rl.correction.fits import fit_affine, fit_gain, weigh
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow.fits import fit_affine, fit_gain, weigh
-from afm_rl.flow.saturation import MODES
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 TURN = torch.tensor([[0.6, -0.8], [0.8, 0.6]])
@@ -53,7 +53,7 @@ def test_recent_pairs_outweigh_old_ones():
 def test_the_corrected_action_has_the_planned_effect(line, drive, plans, form):
     corrector = LeastSquares(LOW, HIGH, form=form, forgetting=0.95)
     planned = plans(10, 5, 2, size=0.5)
-    (executed, predicted, spread, *_, misaligned), effects = drive(
+    (executed, predicted, spread, _, _, misaligned, _), effects = drive(
         corrector, line(2), REGIMES[form], planned
     )
     assert misaligned[1:].all() and not spread.any()

@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from afm_rl.correction import PaperFlow
+from afm_rl.correction.solver import midpoint
+from afm_rl.correction.training import train_flow
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import midpoint, train_flow
 
 
 @pytest.fixture

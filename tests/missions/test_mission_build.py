@@ -11,8 +11,8 @@ from torch import nn
 
 import afm_rl.conf
 from afm_rl.correction import ActionFlow, PaperFlow
+from afm_rl.correction.network import AxisNetwork
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.flow import AxisNetwork
 from afm_rl.missions import build, prepare
 from afm_rl.missions.checks import blaming, check_training
 from afm_rl.storage.artefacts import save_artefact
@@ -138,7 +138,6 @@ NAN = float("nan")
         ("physics", "planner.sigma", -1, "planner.sigma=-1: expected a finite"),
         ("physics", "planner.noise", "loud", "planner.noise='loud': expected one of scaled, unit"),
         ("physics", "planner.past", "long", "planner.past='long': expected one of"),
-        ("physics", "cost.saturation", "foo", "cost.saturation='foo': expected one of"),
         ("physics", "cost.coordinates", 3, "cost: 'int' object is not iterable"),
         ("physics", "robot.schedule.at", [0.15, 1.8], r"schedule.at=1.8: .* \[0, 1\]"),
         ("physics", "robot.schedule.by", "foo", "schedule.by='foo': expected one of progress"),
@@ -168,13 +167,13 @@ NAN = float("nan")
             "torch.Nope",
             "updater.optimizer._target_=.torch.Nope",
         ),
-        ("afm_physics", "corrector.gate", NAN, "corrector.gate=nan: expected a finite number"),
+        ("afm_physics", "corrector.odds", NAN, "corrector.odds=nan: expected a finite number"),
         ("afm_physics", "corrector.samples", 0, "corrector.samples=0: expected a whole number"),
         ("afm_physics", "corrector.steps", 0, "corrector.steps=0: expected a whole number"),
         ("afm_physics", "corrector.source_std", -1, "corrector.source_std=-1: expected a finite"),
         ("afm_physics", "corrector.memory", 10, "corrector.memory=10: expected at least"),
-        ("afm_physics", "corrector.hypotheses", ["late"], "corrector.hypotheses='late': expected"),
-        ("afm_physics", "corrector.hypotheses", ["identity"], "corrector.hypotheses=.* by time"),
+        ("afm_physics", "corrector.readings", ["late"], "corrector.readings='late': expected"),
+        ("afm_physics", "corrector.readings", ["near"], "corrector.readings=.* by time"),
         ("afm_physics", "corrector.train", 3, "corrector: 'int' object"),
         ("afm_physics", "corrector.train", {"batch_size": 1}, "corrector.train.batch_size=1: exp"),
         ("afm_physics", "corrector.train", {"seed": "abc"}, "corrector.train.seed='abc': expected"),

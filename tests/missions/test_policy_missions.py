@@ -12,7 +12,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from afm_rl.envs import gymnasium_task
 from afm_rl.errors import AFMError
 from afm_rl.missions import build, run
-from afm_rl.planning import load_policy, save_policy
+from afm_rl.planning import StoredPolicy, load_policy, save_policy
 from afm_rl.storage.artefacts import save_tensors
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
@@ -99,11 +99,11 @@ def test_actions_are_noisy_only_while_data_are_collected():
 
 
 def test_a_learned_model_is_that_of_the_policy_whatever_its_file_is_called(tmp_path):
-    layers = [(torch.eye(1, 3), torch.zeros(1))]
     box = -2 * torch.ones(1), 2 * torch.ones(1)
     found = []
     for scale in (1.0, 2.0):
-        save_policy(tmp_path / "p.safetensors", [(scale * layers[0][0], layers[0][1])], *box, {})
+        policy = StoredPolicy([(scale * torch.eye(1, 3), torch.zeros(1))], *box)
+        save_policy(tmp_path / "p.safetensors", policy, {})
         agent = agent_of(f"planner.file={tmp_path / 'p.safetensors'}", "method=afm_frozen_pe")
         found.append(agent.trainings[0].settings)
     assert found[0] != found[1]

@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.planning import load_policy, save_policy
+from afm_rl.planning import StoredPolicy, load_policy, save_policy
 from afm_rl.storage.artefacts import save_tensors
 
 
@@ -15,7 +15,8 @@ def stored(tmp_path):
     linear = [nn.Linear(3, 8), nn.Linear(8, 8), nn.Linear(8, 2)]
     layers = [(part.weight.half().float(), part.bias.half().float()) for part in linear]
     low, high = torch.tensor([-2.0, 0.0]), torch.tensor([2.0, 1.0])
-    save_policy(tmp_path / "policy.safetensors", layers, low, high, {"id": "Some-v0"})
+    policy = StoredPolicy(layers, low, high)
+    save_policy(tmp_path / "policy.safetensors", policy, {"id": "Some-v0"})
     return tmp_path / "policy.safetensors", layers
 
 

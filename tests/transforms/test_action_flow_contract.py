@@ -20,10 +20,10 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
+from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import AxisNetwork
 from afm_rl.planning import GoalDistance, PlanningEnv
 from afm_rl.transforms import ActionFlowTransform
 

@@ -15,10 +15,10 @@ from torchrl.envs import Compose
 from torchrl.envs.utils import step_mdp
 
 from afm_rl.compiling.machine_code import has_compiler
-from afm_rl.correction import ActionFlow, LeastSquares
+from afm_rl.correction import ActionFlow, LeastSquares, experts
+from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
-from afm_rl.flow import AxisNetwork, experts
 from afm_rl.planning import ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv
 from afm_rl.transforms import ActionFlowPolicy
 from afm_rl.transforms.controller import Controller, export_controller
@@ -36,7 +36,7 @@ def planner_of(kind=MPPI, **settings):
 
 def policy_of(corrector=None):
     torch.manual_seed(0)
-    # Among samples or hypotheses that are as good, rounding would decide.
+    # Among samples or readings that are as good, rounding would decide.
     network = AxisNetwork(width=8, latent=8)
     flow = ActionFlow(LOW, HIGH, ["recent"], source_std=0.0, network=network)
     return ActionFlowPolicy(Dubins(), planner_of().action_spec, corrector or flow)

@@ -26,7 +26,6 @@ from afm_rl.transforms.correction_loop import CorrectionLoop
 
 SMALL = {
     "transitions": 800,
-    "false_alarms": 0.1,
     "model": {"hidden": [24], "members": 2},
     "fit": {"epochs": 60},
 }
@@ -190,9 +189,7 @@ def test_models_are_learned_from_healthy_steps():
 
 @pytest.mark.filterwarnings("ignore")
 def test_models_that_are_not_good_enough_are_not_used():
-    watching = Watching(
-        **{**SMALL, "error": 1e-6, "fit": {"epochs": 1}, "false_alarms": 0.5, "transitions": 260}
-    )
+    watching = Watching(**{**SMALL, "error": 1e-6, "fit": {"epochs": 1}, "transitions": 260})
     env = ActionFlowWrapper(Puck(), watching)
     play(env, 270)
     _, info = env.reset()

@@ -1,0 +1,82 @@
+"""The command ``afm-rl-play``."""
+
+from __future__ import annotations
+
+import argparse
+import socket
+import sys
+import webbrowser
+from pathlib import Path
+from typing import NoReturn
+
+from afm_rl.cli.error_messages import told_by
+
+NAME = "afm-rl-play"
+ABOUT = """\
+A page in the browser to play with: the same policy on two robots, alone and with AFM.
+
+  afm-rl-play                          a half cheetah
+  afm-rl-play --robot hopper --open    another robot; the browser opens
+  afm-rl-play --policy mine.safetensors   a policy of your own, written by save_policy
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong in one line."""
+        print(f"{NAME}: {message} (see {NAME} --help)", file=sys.stderr)
+        sys.exit(2)
+
+
+def main() -> None:
+    """Run ``afm-rl-play``; a mistake ends in one line and exit status 2."""
+    parser = _Parser(
+        prog=NAME, description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--robot", default="half_cheetah", help="half_cheetah, hopper, ant, ugv, ...")
+    add("--policy", metavar="FILE", type=Path, help="a stored policy of a task of gymnasium")
+    add("--port", type=int, default=0, help="of 127.0.0.1; a free one")
+    add("--open", action="store_true", help="open the browser")
+    options = parser.parse_args()
+    with told_by(NAME):
+        _run(options)
+
+
+def _run(options: argparse.Namespace) -> None:
+    from afm_rl.errors import ConfigurationError
+
+    port = free_port(options.port)
+    try:
+        from afm_rl.play.page import Page
+        from afm_rl.play.robots import make_robot
+        from afm_rl.play.world import World
+    except ImportError as error:
+        raise ConfigurationError(f"{error.name} is missing: pip install 'afm-rl[play]'") from error
+    import torch
+
+    torch.set_num_threads(1)
+    world = World(make_robot(options.robot, options.policy))
+    page = Page(world, f"{options.robot}: alone and with AFM", port)
+    print(f"{NAME}: {options.robot} at {page.url}; Ctrl-C ends it", flush=True)
+    if options.open:
+        webbrowser.open(page.url)
+    try:
+        page.run()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        page.end()
+
+
+def free_port(port: int) -> int:
+    """Return a port that is free, ``port`` itself unless it is 0."""
+    from afm_rl.errors import ConfigurationError
+
+    try:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(("127.0.0.1", port))
+            return probe.getsockname()[1]
+    except (OSError, OverflowError) as error:
+        raise ConfigurationError(f"--port={port}: {error}; leave it out for a free one") from error

@@ -1,0 +1,123 @@
+"""What to do when an action cannot be had in full."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from afm_rl.regimes import Regime
+
+LIMIT = 4.0  # half ranges: effects beyond carry no more news
+MODES = ("mixed", "direction", "clip")
+LEAST = 0.3  # share of an action that must be had for "mixed" to clip it
+DEAD = 0.025  # share of which nothing can be had
+ROUNDS, TOLERANCE = 8, 0.01  # bisection of the scale; miss in half ranges that still counts
+
+
+def saturate(unit: Tensor, mode: str, dim: int = -1) -> Tensor:
+    """Bring an action in half ranges, ``(*B, A)``, into the box [-1, 1]^A.
+
+    The axes are in the dimension ``dim``.
+
+    ``"clip"`` cuts each component for itself; ``"direction"`` shrinks all alike, so that the
+    robot does the same thing slower: the ratio of turning to driving is kept. ``"mixed"``
+    clips what can be had to 30 % at least, and does the rest slower.
+
+    >>> saturate(torch.tensor([0.5, 2.0]), "direction")
+    tensor([0.2500, 1.0000])
+    """
+    if mode == "clip":
+        return unit.clamp(-1.0, 1.0)
+    excess = unit.abs().amax(dim, keepdim=True).clamp_min(1.0)
+    if mode == "direction":
+        return unit / excess
+    return torch.where(excess * LEAST > 1.0, unit / excess, unit.clamp(-1.0, 1.0))
+
+
+def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
+    """Return the part of a planned action ``(*B, A)`` that should be had, in half ranges.
+
+    Args:
+        unit: the planned action.
+        low: lowest effect that can be had, ``(*B, A)``.
+        high: highest.
+        mode: see :func:`saturate`; ``"clip"`` still asks for all of it.
+
+    >>> half, most = torch.tensor([-1.0, -0.5]), torch.tensor([1.0, 0.5])
+    >>> attainable(torch.tensor([0.5, -1.0]), half, most, "direction")
+    tensor([ 0.2500, -0.5000])
+    """
+    if mode == "clip":
+        return unit
+    limit = torch.where(unit < 0, -low, high).clamp_min(0.0)
+    share = limit / unit.abs().clamp_min(1e-6)
+    share = torch.where(high - low < 2 * DEAD, 1.0, share)  # no slowness helps there
+    share = share.amin(-1, keepdim=True).clamp_max(1.0)
+    return unit * share if mode == "direction" else torch.where(share < LEAST, unit * share, unit)
+
+
+def extend(reach: Tensor, box: Tensor, tried: Tensor, mode: str) -> Tensor:
+    """Return the bounds ``(*B, 2, A)`` that plans should keep, given what can be reached.
+
+    All of the box where a plan is not cut but done slower: there it may ask for more. But no
+    slowness helps where nothing can be reached at all; and where only a small part of the box was
+    tried, plans that stay within reach try more of it.
+
+    Args:
+        reach: lowest and highest effect, ``(*B, 2, A)``.
+        box: lowest and highest action, ``(*B, 2, A)``.
+        tried: range of the actions that were tried, ``(*B, A)``.
+        mode: see :func:`saturate`.
+
+    >>> box, all_of_it = torch.tensor([[-1.0], [1.0]]), torch.tensor([2.0])
+    >>> [extend(share * box, box, all_of_it, "mixed")[1].item() for share in (0.0, 0.25, 0.5)]
+    [0.0, 1.0, 0.5]
+    """
+    if mode == "clip":
+        return reach
+    width = box.diff(dim=-2)
+    share = reach.diff(dim=-2) / width
+    slower = (share > DEAD) & (tried.unsqueeze(-2) > 0.1 * width)
+    if mode == "mixed":
+        slower = slower & (share < LEAST)
+    (low, high), (least, most) = reach.unbind(-2), box.unbind(-2)
+    return torch.where(slower, torch.stack([low.fmin(least), high.fmax(most)], -2), reach)
+
+
+def intend(
+    regime: Regime,
+    planned: Tensor,
+    parameters: Tensor,
+    state: Tensor,
+    low: Tensor,
+    high: Tensor,
+    mode: str,
+) -> Tensor:
+    r"""Return the action whose effect under a regime T is the planned action, ``(*B, A)``.
+
+    .. math:: u = T^{-1}(s\,a),\qquad s = \max\{s \in [0, 1] : s\,a \in T(\text{box})\}
+
+    with ``mode="direction"``; with ``"clip"``, or ``"mixed"`` and s > 0.3, u has the nearest
+    effect there is.
+    """
+    intended = regime.inverse(planned, parameters, state, low, high)
+    if mode == "clip":
+        return intended
+
+    def possible(action: Tensor, effect: Tensor, now: Tensor, here: Tensor) -> Tensor:
+        miss = (regime.apply(action, now, here) - effect).abs() / (0.5 * (high - low))
+        return (miss < TOLERANCE).all(-1, keepdim=True)
+
+    short = ~possible(intended, planned, parameters, state).squeeze(-1)
+    wanted = planned[short]
+    now, here = (part.expand(*short.shape, -1)[short] for part in (parameters, state))
+    scale = torch.zeros_like(wanted[..., :1])
+    for k in range(1, ROUNDS + 1):
+        trial = scale + 0.5**k
+        action = regime.inverse(trial * wanted, now, here, low, high)
+        scale = torch.where(possible(action, trial * wanted, now, here), trial, scale)
+    slower = regime.inverse(scale * wanted, now, here, low, high)
+    intended = intended.clone()
+    nearest = scale == 0 if mode == "direction" else (scale == 0) | (scale > LEAST)
+    intended[short] = torch.where(nearest, intended[short], slower)
+    return intended

@@ -1,0 +1,88 @@
+r"""The belief: which of several models of the actuators are to be trusted, axis by axis.
+
+Dynamic model averaging (Raftery, Karny and Ettler 2010, Technometrics 52) with a Student-t
+likelihood and a noise that is learnt. Model 0 says that *nothing has changed*.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Belief(NamedTuple):
+    """What is believed of M models on A axes; everything is a share of the largest action."""
+
+    losses: Tensor
+    """Discounted negative log-likelihood, less its smallest possible value, ``(*B, M, A)``."""
+    forecasts: Tensor
+    """The effects that the models expect of what acts now, ``(*B, M, A)``."""
+    noise: Tensor
+    """Standard deviation that no model explains, ``(*B, A)``."""
+
+    def update(
+        self,
+        effect: Tensor,
+        std: Tensor,
+        valid: Tensor,
+        prior: Tensor,
+        discount: float,
+        rate: float,
+        floor: float,
+        tails: float,
+    ) -> Belief:
+        r"""Return the belief after an effect was seen.
+
+        .. math::
+
+            l_h &\leftarrow \alpha\,l_h + \log\Big(1 + \frac{(v - T_h)^2}{s^2 + \sigma^2}\Big) \\
+            s^2 &\leftarrow s^2 + \beta\,k\,\big(\min\{(v - T)^2 - \sigma^2, 3 s^2\} - s^2\big),
+            \qquad k = \frac{s^2}{s^2 + \sigma^2}
+
+        with the forecasts :math:`T_h`, that of the model that is believed most, T, and no noise
+        below ``floor``. An effect of which the transition showed nothing has a large
+        :math:`\sigma` and changes little.
+
+        Args:
+            effect: v, ``(*B, A)``.
+            std: :math:`\sigma` of v, ``(*B, A)``.
+            valid: does the transition count? ``(*B, 1)``, 0 or 1.
+            prior: log-odds of the models, ``(M, 1)``.
+            discount: :math:`\alpha`.
+            rate: :math:`\beta`.
+            floor: least noise.
+            tails: degrees of freedom of the Student-t distribution.
+        """
+        variance, stated = self.noise.square(), std.square()
+        miss = (self.forecasts - effect.unsqueeze(-2)).square()
+        scaled = miss / (variance + stated).unsqueeze(-2)
+        losses = discount * self.losses + 0.5 * (tails + 1) * (scaled / tails).log1p()
+        losses = torch.where(valid.unsqueeze(-2) > 0, losses, self.losses)
+        best = (losses - prior).argmin(-2, keepdim=True)
+        excess = miss.gather(-2, best).squeeze(-2) - stated
+        excess = torch.minimum(excess.clamp_min(0.0), 3 * variance)
+        gain = rate * valid * variance / (variance + stated)
+        noise = torch.lerp(variance, excess, gain).sqrt().clamp_min(floor)
+        return self._replace(losses=losses, noise=noise)
+
+    def weights(self, prior: Tensor) -> Tensor:
+        """Return the posterior probabilities of the models, ``(*B, M, A)``.
+
+        >>> losses = torch.tensor([[0.0], [0.0]])
+        >>> even = Belief(losses, losses, torch.ones(1)).weights(torch.zeros(2, 1))
+        >>> even.squeeze(-1)
+        tensor([0.5000, 0.5000])
+        """
+        return (prior - self.losses).softmax(-2)
+
+
+def mean_and_std(effects: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation ``(*B, A)`` of the effects ``(*B, M, A)`` of models.
+
+    >>> mean_and_std(torch.tensor([[1.0], [-1.0]]), torch.tensor([[0.5], [0.5]]))
+    (tensor([0.]), tensor([1.]))
+    """
+    mean = (weights * effects).sum(-2)
+    return mean, (weights * (effects - mean.unsqueeze(-2)).square()).sum(-2).sqrt()

@@ -1,0 +1,238 @@
+"""Least-squares experts: what simple maps make of a set of pairs (executed, effective action)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from afm_rl.compiling.tracing import cached
+from afm_rl.correction.achievable import LIMIT, saturate
+from afm_rl.correction.fits import (
+    LEAST_GAIN,
+    OUTLIER,
+    PRIOR,
+    STUCK,
+    apply_friction,
+    confidence,
+    invert_friction,
+    not_zero,
+)
+from afm_rl.spaces.small_matrices import solve_positive
+
+EXACT = 0.02  # half ranges: a fit that misses by less explains all rows
+LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
+LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
+NEAR = 0.15  # half ranges: a pair so far from the question counts half as much
+SHORT, LONG = 0.5, 0.9  # forgetting per row
+EXPERTS = 6
+ANSWERS = EXPERTS + 1  # the experts' answers, and the effect or nearness of the nearest pairs
+MISSES = EXPERTS - 1  # the nearest pairs have no residual of their own
+
+
+class Rows(NamedTuple):
+    """Pairs that describe a regime, oldest first, in half ranges."""
+
+    executed: Tensor
+    """Executed actions u, ``(*B, K, A)``."""
+    effective: Tensor
+    """Their effective actions, ``(*B, K, A)``."""
+    std: Tensor
+    """Standard deviation of the effective actions, ``(*B, K, A)``."""
+    valid: Tensor
+    """Which rows count, ``(*B, K, 1)``, 0 or 1."""
+
+
+class Experts(NamedTuple):
+    """Five least-squares fits of N sets of rows, and the rows themselves, axis by axis.
+
+    Gains with short and with long memory; robust gain and offset; gain and friction; an affine
+    map, with one command only where that explains an axis (swapped cables); and, for what none of
+    them expresses, a kernel average of the nearest pairs.
+
+    >>> u = torch.tensor([[[0.5], [-1.0]]])
+    >>> experts = fit_experts(Rows(u, -2 * u, torch.zeros(1, 2, 1), torch.ones(1, 2, 1)))
+    >>> experts.execute(torch.tensor([[[0.4]]]), "clip")[..., :4].round(decimals=2)
+    tensor([[[[-0.2000, -0.2000, -0.2000, -0.2000]]]])
+    >>> experts.effect(torch.tensor([[[0.4]]]))[..., :2].round(decimals=2)
+    tensor([[[[-0.8000, -0.8000]]]])
+    """
+
+    gain: Tensor
+    """Gains of the first four fits, ``(N, A, 1, 4)``."""
+    offset: Tensor
+    """Their offsets; the last one's is against the motion, ``(N, A, 1, 4)``."""
+    matrix: Tensor
+    """Of the affine map, ``(N, A, A)``."""
+    inverse: Tensor
+    """Its regularised inverse, ``(N, A, A)``."""
+    bias: Tensor
+    """Of the affine map, ``(N, A, 1)``."""
+    residuals: Tensor
+    """What each fit leaves of each row, ``(N, A, K, 5)``."""
+    misses: Tensor
+    """Logarithm of their root mean squares, ``(N, A, 1, 5)``."""
+    executed: Tensor
+    """The rows' executed actions, ``(N, A, 1, K)``."""
+    effective: Tensor
+    """Their effective actions, ``(N, A, 1, K)``."""
+    trust: Tensor
+    """Logarithm of their weights, ``(N, A, 1, K)``."""
+
+    def execute(self, planned: Tensor, mode: str) -> Tensor:
+        """Return answers ``(N, A, C, 7)`` to plans ``(N, C, A)``.
+
+        The action that each of the five fits would execute, saturated; the kernel average of the
+        actions whose effects came nearest to the plan, and that effect.
+        """
+        plan = planned.mT.to(self.bias)
+        unit = plan.unsqueeze(-1)
+        linear = (unit - self.offset[..., :3]) / self.gain[..., :3]
+        rubbed = invert_friction(self.gain[..., 3:], self.offset[..., 3:], unit)
+        affine = (self.inverse @ (plan - self.bias)).unsqueeze(-1)
+        exact = saturate(torch.cat([linear, rubbed, affine], -1), mode, dim=-3)
+        share = self._likeness(self.effective, unit).softmax(-1)
+        pairs = torch.cat([self.executed, self.effective], -2).mT
+        return torch.cat([exact, share @ pairs], -1).to(planned)
+
+    def effect(self, executed: Tensor) -> Tensor:
+        """Return answers ``(N, A, C, 7)`` about actions ``(N, C, A)``.
+
+        The effect that each of the five fits predicts, the kernel average of the effects of the
+        nearest actions, and how near those are.
+        """
+        actions = executed.mT.to(self.bias)
+        unit = actions.unsqueeze(-1)
+        likeness = self._likeness(self.executed, unit)
+        nearest = likeness.softmax(-1) @ self.effective.mT
+        nearness = likeness.exp().sum(-1, keepdim=True).clamp_max(1.0)
+        answers = torch.cat([*self.predict(actions), nearest, nearness], -1)
+        return answers.clamp(-LIMIT, LIMIT).to(executed)
+
+    def predict(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what the fits predict of actions ``(N, A, C)``: ``(N, A, C, 5)`` in parts."""
+        unit = actions.unsqueeze(-1)
+        linear = self.gain[..., :3] * unit + self.offset[..., :3]
+        rubbed = apply_friction(self.gain[..., 3:], self.offset[..., 3:], unit)
+        return linear, rubbed, (self.matrix @ actions + self.bias).unsqueeze(-1)
+
+    def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
+        """Return the log-weight of each row for ``unit`` ``(N, A, C, 1)``, ``(N, A, C, K)``."""
+        return self.trust - ((among - unit) / NEAR).square()
+
+
+def fit_experts(rows: Rows) -> Experts:
+    """Fit all experts to N sets of rows ``(N, K, A)``.
+
+    In double precision: where all actions are alike, gain and friction can hardly be told apart.
+    The fits per axis share one product of weights and terms; they are those of
+    :mod:`~afm_rl.correction.fits`, the robust one with one round.
+    """
+    inputs, valid = rows.executed.double(), rows.valid.double().mT
+    u, e = inputs.mT, rows.effective.double().mT  # (N, A, K)
+    size, (count, axes, length) = u.shape[-2], u.shape
+    ages, prior, nominal, lines, places = _constants(length, size, u.device)
+    weights = ages * (valid * confidence(rows.std.double().mT)).unsqueeze(-2)  # (N, A, 2, K)
+    long = weights[..., 1, :]
+    moved = (long * (e.abs() > STUCK)).unsqueeze(-2)
+    sign = u.sign()
+    each = [u * u, u, sign * sign, u * e, e, sign * u, sign * e, torch.ones_like(u)]
+    terms = torch.stack(each, -1).flatten(0, 1)  # (N A, K, 8)
+    flat = torch.cat([weights, moved], -2).flatten(0, 1)  # (N A, 3, K)
+    moments = torch.baddbmm(prior, flat, terms)
+    gains = moments[:, :2, 3] / moments[:, :2, 0]
+    slopes, offsets = _solve_line(moments[:, lines, places])  # with offset, with friction
+    miss = e.flatten(0, 1) - torch.addcmul(offsets[:, :1], slopes[:, :1], u.flatten(0, 1))
+    robust = flat[:, 1] / (1 + (miss / OUTLIER).square())
+    robust = torch.baddbmm(prior[1:2], robust.unsqueeze(1), terms)[:, 0, places[0]]
+    slope, offset = _solve_line(robust.unsqueeze(1))
+    gain = not_zero(torch.cat([gains, slope, slopes[:, 1:]], -1))
+    offset = torch.cat([torch.zeros_like(gains), offset, offsets[:, 1:]], -1)
+    outer = torch.nn.functional.pad(inputs, (0, 1), value=1.0)  # (N, K, A + 1)
+    square = (outer.unsqueeze(-1) * outer.unsqueeze(-2)).flatten(-2)
+    square = torch.baddbmm(nominal.flatten(), long, square).unflatten(-1, (size + 1, size + 1))
+    cross = torch.baddbmm(nominal[:-1], long * e, outer)
+    solution = solve_positive(square, cross.unsqueeze(-1)).squeeze(-1)  # (N, A, A + 1)
+    solution = torch.where(*_drivers(u, e, long), solution)
+    matrix, bias = solution[..., :-1], solution[..., -1:]
+    inverse = invert_matrix(matrix)
+    wide = (count, axes, 1)
+    experts = Experts(
+        gain.unflatten(0, wide[:2]).unsqueeze(-2),
+        offset.unflatten(0, wide[:2]).unsqueeze(-2),
+        matrix,
+        inverse,
+        bias,
+        bias,  # until the residuals are known
+        bias,
+        u.unsqueeze(-2),
+        e.unsqueeze(-2),
+        long.clamp_min(LEAST_MISS**2).log().unsqueeze(-2),
+    )
+    residuals = e.unsqueeze(-1) - torch.cat(experts.predict(u), -1)  # (N, A, K, 5)
+    mass = weights.sum(-1, keepdim=True).clamp_min(LEAST_MISS)
+    left = weights @ residuals.square() / mass
+    left = torch.cat([left[..., :1, :1], left[..., 1:, 1:]], -1)
+    return experts._replace(residuals=residuals, misses=(left.sqrt() + LEAST_MISS).log())
+
+
+def invert_matrix(matrix: Tensor) -> Tensor:
+    """Return the inverse of matrices ``(*B, A, A)``, regularised by the least gain there is."""
+    ridge = LEAST_GAIN**2 * torch.eye(matrix.shape[-1], device=matrix.device, dtype=matrix.dtype)
+    return solve_positive(ridge + matrix.mT @ matrix, matrix.mT)
+
+
+def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Fit every effect to the one command that drives it: swapped cables need no more.
+
+    Of many axes an affine map needs many rows, and a gait that repeats itself shows only a few.
+
+    Args:
+        u: executed actions, ``(N, A, K)``.
+        e: effective actions.
+        weight: of both.
+
+    Returns:
+        Which axes are explained by one command, ``(N, A, 1)``, and their rows of the affine map,
+        ``(N, A, A + 1)``.
+    """
+    own = torch.eye(u.shape[-2], device=u.device, dtype=u.dtype)
+    pull = weight * e
+    square, mean, cross = weight @ (u * u).mT + PRIOR, weight @ u.mT, pull @ u.mT + PRIOR * own
+    mass, shift = weight.sum(-1, keepdim=True) + 10 * PRIOR, pull.sum(-1, keepdim=True)
+    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
+    slope = (mass * cross - mean * shift) / determinant
+    offset = (square * shift - mean * cross) / determinant
+    left = (pull * e).sum(-1, keepdim=True) - slope * cross - offset * shift
+    # An axis that its own command explains is driven by it, whatever else fits by chance.
+    left, driver = (left.abs() / mass - EXACT**2 * own).min(-1, keepdim=True)
+    limit = torch.where(own.bool(), 0.0, EXACT**2).expand_as(slope).gather(-1, driver)
+    explained = (left < limit) & (mass > LEAST_ROWS)
+    chosen = torch.zeros_like(slope).scatter(-1, driver, slope.gather(-1, driver))
+    return explained, torch.cat([chosen, offset.gather(-1, driver)], -1)
+
+
+def _solve_line(moments: Tensor) -> tuple[Tensor, Tensor]:
+    """Return slope and offset ``(*B)`` of weighted least squares, given its moments ``(*B, 5)``."""
+    square, mean, mass, cross, shift = moments.unbind(-1)
+    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
+    slope = (mass * cross - mean * shift) / determinant
+    return slope, (square * shift - mean * cross) / determinant
+
+
+@cached(maxsize=16)
+def _constants(rows: int, size: int, device: torch.device) -> tuple[Tensor, ...]:
+    """Return the weights by age ``(2, K)``, the moments of the priors, and indices.
+
+    The moments of the lines are ``(3, 8)``, those of the affine map ``(A + 1, A + 1)``. The indices
+    are rows and columns of the moments of the two lines that are fitted with an offset.
+    """
+    kind: dict[str, Any] = {"dtype": torch.float64, "device": device}
+    age = torch.arange(rows - 1, -1, -1, **kind)
+    prior = torch.zeros(3, 8, **kind)
+    prior[:, [0, 3]], prior[:, [2, 7]] = PRIOR, 10 * PRIOR
+    nominal = PRIOR * torch.eye(size + 1, **kind)
+    lines = torch.tensor([[1], [2]], device=device)
+    places = torch.tensor([[0, 1, 7, 3, 4], [0, 5, 2, 3, 6]], device=device)
+    return torch.stack([SHORT**age, LONG**age]), prior, nominal, lines, places

@@ -1,0 +1,86 @@
+"""Linear models of the actuators, from the newest few pairs to all that are remembered.
+
+Two rows may tell a sign, but in noise it takes many; so the belief has windows of several lengths.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from afm_rl.correction.fits import LEAST_GAIN, PRIOR, not_zero
+from afm_rl.spaces.small_matrices import solve_positive
+
+LINEAR = ("offset_1", "offset_3", "gain_3", "gain_12", "gain", "line_12", "line", "drift", "affine")
+"""Offset at a gain of one; gain; gain and offset (*line*); gain and the newest offset (*drift*);
+affine map. Of the newest rows, or of all pairs."""
+WINDOWS = (1, 3, 12, 0)  # rows; 0: all
+
+
+class Lines(NamedTuple):
+    """L linear models of B missions, :math:`T(u) = D u + b`, shares of the largest action."""
+
+    matrix: Tensor
+    """D, ``(B, L, A, A)``."""
+    bias: Tensor
+    """b, ``(B, L, A)``."""
+
+    def effect(self, actions: Tensor) -> Tensor:
+        """Return the effects ``(B, L, C, A)`` of actions ``(B, C, A)``."""
+        return actions.unsqueeze(1) @ self.matrix.mT + self.bias.unsqueeze(2)
+
+    def invert(self, planned: Tensor) -> Tensor:
+        """Return the actions ``(B, L, A)`` whose effects come nearest to plans ``(B, A)``."""
+        eye = torch.eye(planned.shape[-1], device=planned.device, dtype=planned.dtype)
+        ridge = self.matrix.mT @ self.matrix + LEAST_GAIN**2 * eye
+        pull = self.matrix.mT @ (planned.unsqueeze(1) - self.bias).unsqueeze(-1)
+        return solve_positive(ridge, pull).squeeze(-1)
+
+
+def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
+    r"""Fit all :data:`LINEAR` models by least squares, with a weak prior D = 1, b = 0.
+
+    Args:
+        sent: executed actions, the oldest first, ``(B, M, A)``.
+        came: their effects.
+        std: of the effects; a row counts by :math:`1 / \sigma^2`.
+        valid: which rows count, ``(B, M, 1)``, 0 or 1.
+
+    >>> u = torch.tensor([[[0.5], [-1.0], [0.2]]])
+    >>> lines = fit_lines(u, 0.1 - 2 * u, torch.full((1, 3, 1), 0.02), torch.ones(1, 3, 1))
+    >>> lines.effect(torch.ones(1, 1, 1))[0, LINEAR.index("line_12")].round(decimals=2)
+    tensor([[-1.9000]])
+    """
+    size, length = sent.shape[-1], sent.shape[-2]
+    weight = valid * (std.square() + PRIOR).reciprocal()
+    scale = weight.amax(-2, keepdim=True).clamp_min(PRIOR)
+    u, v, weight = (part.mT.double() for part in (sent, came, weight / scale))  # (B, A, M)
+    age = torch.arange(length - 1, -1, -1, device=sent.device)
+    newest = torch.stack([age < (rows or length) for rows in WINDOWS]).to(u)
+    ones = torch.ones_like(u)
+    terms = torch.stack([u * u, u, ones, u * v, v], -1)  # (B, A, M, 5)
+    moments = (newest * weight.unsqueeze(-2)) @ terms  # (B, A, W, 5)
+    square, mean, mass, cross, shift = moments.unbind(-1)
+    square, mass, cross = square + PRIOR, mass + 10 * PRIOR, cross + PRIOR
+    gain = not_zero(cross / square)
+    offset = (shift - mean) / mass
+    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
+    slope = (mass * cross - mean * shift) / determinant
+    rest = (square * shift - mean * cross) / determinant
+    zero, one = torch.zeros_like(gain[..., 0]), torch.ones_like(gain[..., 0])
+    drift = (shift - gain[..., 2:3] * mean)[..., 0] / mass[..., 0]
+    gains = [one, one, gain[..., 1], gain[..., 2], gain[..., 3], slope[..., 2], slope[..., 3]]
+    biases = [offset[..., 0], offset[..., 1], zero, zero, zero, rest[..., 2], rest[..., 3]]
+    gains, biases = [*gains, gain[..., 2]], [*biases, drift]
+    matrix = torch.diag_embed(torch.stack(gains, 1))  # (B, L - 1, A, A)
+    outer = torch.nn.functional.pad(u.mT, (0, 1), value=1.0)  # (B, M, A + 1)
+    nominal = PRIOR * torch.eye(size + 1, device=sent.device, dtype=u.dtype)
+    pairs = (outer.unsqueeze(-1) * outer.unsqueeze(-2)).flatten(-2)
+    left = (weight @ pairs).unflatten(-1, (size + 1, size + 1)) + nominal
+    right = (weight * v) @ outer + nominal[:-1]
+    solution = solve_positive(left, right.unsqueeze(-1)).squeeze(-1)  # (B, A, A + 1)
+    matrix = torch.cat([matrix, solution[:, None, :, :-1]], 1)
+    bias = torch.cat([torch.stack(biases, 1), solution[:, None, :, -1]], 1)
+    return Lines(matrix.to(sent), bias.to(sent))

@@ -1,0 +1,208 @@
+"""Readings: which remembered pairs tell what an action does now.
+
+The newest pairs tell it, unless commands act late, the ground changes from place to place, or the
+newest commands were all alike. Each reading is a model of the belief, by what the network answers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from afm_rl.correction.experts import Rows
+from afm_rl.errors import ConfigurationError, check_choice
+
+FILTER = 6  # commands that a lag looks back on
+AGE = 20.0  # steps that separate two pairs as much as one unit of place does
+FAR = 1e3  # squared distance beyond all
+OLDER = 1e-6  # squared distance that a pair is worth less, times its squared age
+
+
+class Reading(NamedTuple):
+    """One way of reading the memory."""
+
+    share: float = 0.5
+    """Part of the K rows that is filled."""
+    delay: int = 0
+    """Steps from a command to its effect."""
+    lag: float = 0.0
+    """Time constant with which effects follow commands, in steps."""
+    near: bool = False
+    """Whether it reads the pairs nearest in place instead of in time."""
+    varied: bool = False
+    """Whether it reads pairs whose commands differ as much as possible."""
+
+
+READINGS = {
+    "recent": Reading(),
+    "newest": Reading(share=1 / 6),  # right after a change
+    "long": Reading(share=1.0),
+    "varied": Reading(share=1.0, varied=True),  # also when it was at rest of late
+    **{f"delay_{k}": Reading(delay=k) for k in range(1, 9)},
+    **{f"lag_{k}": Reading(lag=k) for k in range(1, 4)},
+    "near": Reading(near=True),
+    "nearest": Reading(share=1 / 6, near=True),
+    "here": Reading(share=1 / 12, near=True),  # at the edge of two grounds
+}
+
+
+class Layout(NamedTuple):
+    """How H readings fill K rows, in the order of :func:`check_readings`.
+
+    Ages count from the newest pair, 0.
+    """
+
+    command: Tensor
+    """What the commands of the readings by time weigh, by age, the oldest first, ``(T K, L)``."""
+    effect: Tensor
+    """Ages of their effects, ``(T K,)``."""
+    filled: Tensor
+    """Which rows are filled, ``(H, K, 1)``, 0 or 1."""
+    acting: Tensor
+    """What commands weigh in what acts now, by age, the oldest first, ``(H, L)``."""
+
+
+def lay_out(readings: Sequence[Reading], rows: int) -> Layout:
+    """Return the layout of K ``rows``.
+
+    >>> lay_out([Reading(share=1.0, delay=1)], rows=2).command
+    tensor([[1., 0., 0.],
+            [0., 1., 0.]])
+    """
+    age = torch.arange(rows - 1, -1, -1)
+    timed = [h for h in readings if not (h.near or h.varied)]
+    length = memory_of(readings, rows)
+    acting = torch.stack([_weights(h, length) for h in readings])
+    command = torch.stack([w.roll(-int(k)) for w in acting[: len(timed)] for k in age])
+    count = torch.tensor([max(1, round(h.share * rows)) for h in readings])
+    filled = (age < count.unsqueeze(-1)).unsqueeze(-1).float()
+    return Layout(command, age.repeat(len(timed)), filled, acting)
+
+
+def _weights(reading: Reading, length: int) -> Tensor:
+    """Return what the newest commands weigh in what acts now, the oldest first, ``(length,)``."""
+    newest = torch.zeros(length)
+    count, keep = (FILTER, math.exp(-1 / reading.lag)) if reading.lag else (1, 0.0)
+    for k in range(count):
+        share = 1.0 if k == count - 1 else 1 - keep  # the oldest stands for those before it
+        newest[reading.delay + k] = share * keep**k
+    return newest.flip(0)
+
+
+def memory_of(readings: Sequence[Reading], rows: int) -> int:
+    """Return how many pairs the readings of K ``rows`` read at most."""
+    return rows + max(h.delay + (FILTER - 1 if h.lag else 0) for h in readings)
+
+
+def late_ones(names: Sequence[str]) -> list[str]:
+    """Return the readings by which actions act late, or slowly.
+
+    >>> late_ones(["recent", "delay_2", "lag_1"])
+    ['delay_2', 'lag_1']
+    """
+    return [name for name in names if READINGS[name].delay or READINGS[name].lag]
+
+
+def check_readings(names: Sequence[str], by_place: bool) -> list[str]:
+    """Return the names in the order of :func:`read_rows`: by time, by variety, by place.
+
+    Those by place are dropped without a place.
+
+    Raises:
+        ConfigurationError: if it is no list of readings, or none by time is left.
+
+    >>> check_readings(["near", "recent"], by_place=True)
+    ['recent', 'near']
+    """
+    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
+        raise ConfigurationError(
+            f"corrector.readings={names!r}: expected a list of {', '.join(READINGS)}"
+        )
+    for name in names:
+        check_choice("corrector.readings", name, READINGS)
+    near = [name for name in names if READINGS[name].near]
+    varied = [name for name in names if READINGS[name].varied]
+    timed = [name for name in names if name not in near + varied]
+    if not timed:
+        raise ConfigurationError(
+            f"corrector.readings={list(names)!r}: expected one by time, such as recent"
+        )
+    return timed + varied + (near if by_place else [])
+
+
+def read_rows(
+    pairs: Tensor, layout: Layout, size: int, away: Tensor | None, varied: int = 0
+) -> Rows:
+    """Return the rows of each reading, ``(*B, H, K, A)``.
+
+    Args:
+        pairs: the memory, oldest first: executed, effective, standard deviation, valid, and what
+            else there is, ``(*B, M, D)``.
+        layout: of the readings.
+        size: number of actions, A.
+        away: squared distance in place of each pair from here, ``(*B, M)``; None without
+            readings by place.
+        varied: number of readings by variety.
+
+    >>> u = torch.tensor([[0.1], [0.2], [0.3]])
+    >>> pairs = torch.cat([u, 10 * u, 0 * u, torch.ones(3, 1)], -1)
+    >>> late = lay_out([Reading(share=1.0, delay=1)], rows=2)
+    >>> rows = read_rows(pairs, late, 1, None)
+    >>> rows.executed.flatten(), rows.effective.flatten()
+    (tensor([0.1000, 0.2000]), tensor([2., 3.]))
+    """
+    newest, rows = pairs.shape[-2] - 1, layout.filled.shape[-2]
+    effects = pairs.index_select(-2, newest - layout.effect)
+    commands = pairs[..., -layout.command.shape[-1] :, :]
+    lost = (commands[..., 3 * size : 3 * size + 1] == 0).to(commands)
+    valid = ((layout.command > 0).to(lost) @ lost == 0).to(lost)
+    executed = layout.command.to(lost) @ commands[..., :size]
+    effective, std, came = effects[..., size : 3 * size + 1].split([size, size, 1], -1)
+    came = (came == 1.0).to(came)  # what was sound before a change tells nothing about it
+    parts = [part.unflatten(-2, (-1, rows)) for part in (executed, effective, std, valid * came)]
+    by_time = parts[0].shape[-3]
+    found = [(_varied(pairs, size, rows), varied)] if varied else []
+    if away is not None:
+        found.append((_nearest(pairs, away, rows), len(layout.filled) - by_time - varied))
+    for read, count in found:
+        shape = (*read.shape[:-2], count, *read.shape[-2:])
+        sizes = [size, size, size, 1, read.shape[-1] - 3 * size - 1]
+        more = read.unsqueeze(-3).expand(shape).split(sizes, -1)
+        more = (*more[:3], (more[3] > 0).to(pairs))
+        parts = [torch.cat([part, new], -3) for part, new in zip(parts, more, strict=False)]
+    filled = parts[3] * layout.filled
+    executed, effective, std = (part * filled for part in parts[:3])
+    return Rows(executed, effective, std, filled)
+
+
+def _nearest(pairs: Tensor, away: Tensor, rows: int) -> Tensor:
+    """Return the K pairs ``(*B, K, D)`` nearest to here, the nearest last."""
+    age = torch.arange(away.shape[-1] - 1, -1, -1, device=away.device) / AGE
+    nearest = (away + age.square()).topk(rows, -1, largest=False).indices.flip(-1)
+    return pairs.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, pairs.shape[-1]))
+
+
+def _varied(pairs: Tensor, size: int, rows: int) -> Tensor:
+    """Return the newest pair, and each time the one whose command is farthest from all of them.
+
+    Farthest-point sampling (Gonzalez 1985) of the pairs since the last change, ``(*B, K, D)``,
+    oldest first. Where there are fewer, rows are not valid.
+    """
+    sent, sound = pairs[..., :size], pairs[..., 3 * size] == 1.0
+    apart = (sent.unsqueeze(-2) - sent.unsqueeze(-3)).square().sum(-1)
+    age = torch.arange(pairs.shape[-2] - 1, -1, -1, device=pairs.device)
+    old = OLDER * age.square()
+    nearest, picks = torch.where(sound, FAR - age, -torch.inf), []  # the newest first
+    for _ in range(rows):
+        worth, pick = nearest.max(-1, keepdim=True)
+        picks.append(torch.where(worth > -torch.inf, pick, -1))
+        row = pick.unsqueeze(-1).expand(*pick.shape, apart.shape[-1])
+        nearest = torch.minimum(nearest, apart.gather(-2, row).squeeze(-2) - old)
+        nearest = nearest.scatter(-1, pick, -torch.inf)
+    chosen = torch.cat(picks, -1).sort(-1).values
+    row = chosen.clamp_min(0).unsqueeze(-1).expand(*chosen.shape, pairs.shape[-1])
+    return pairs.gather(-2, row) * (chosen >= 0).unsqueeze(-1)

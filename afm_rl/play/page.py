@@ -1,0 +1,187 @@
+"""The page: the scene, what can be changed, and what is known."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from typing import Any
+
+import numpy as np
+import viser
+from viser import uplot
+
+from afm_rl.play.actuators import presets
+from afm_rl.play.scene import COLOURS, figure_of
+from afm_rl.play.world import SIDES, World
+
+FRAME, WORDS = 0.04, 0.25  # seconds between two pictures, and between two texts
+PLOT: Any = {"aspect": 2.0, "scales": {"x": uplot.Scale(time=False)}}
+STROKES = {name: f"rgb{colour}" for name, colour in COLOURS.items()}
+
+
+class Page:
+    """A page in the browser for a world, on 127.0.0.1 only.
+
+    Args:
+        world: the robots.
+        title: of the page.
+        port: a free one.
+    """
+
+    def __init__(self, world: World, title: str, port: int) -> None:
+        self.world, self.ended = world, False
+        with redirect_stdout(io.StringIO()):  # the command says where the page is
+            self.server = viser.ViserServer("127.0.0.1", port, label=title, verbose=False)
+        self.url = f"http://127.0.0.1:{self.server.get_port()}"
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.server.scene.set_up_direction("+z")
+        self.server.initial_camera.position = (1.0, -6.0, 3.0)
+        self.server.initial_camera.look_at = (1.0, 0.0, 0.0)  # left of the controls
+        sides = world.sides.items()
+        self.figures = {name: figure_of(self.server, name, side.inner) for name, side in sides}
+        self.labels = {
+            name: self.server.scene.add_label(f"/label/{name}", name, anchor="bottom-center")
+            for name in self.figures
+        }
+        self.sliders: dict[str, Any] = {}
+        self.setting = False  # several sliders at once
+        self._controls()
+        self._live()
+
+    def _controls(self) -> None:
+        gui, names = self.server.gui, self.world.robot.names
+        self.presets = presets(len(names))
+        choice = gui.add_dropdown("What fails", list(self.presets), order=-2.0)
+        choice.on_update(lambda _: self.choose(choice.value))
+        with gui.add_folder("Run"):
+            self.speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
+            self.pause = gui.add_checkbox("Pause", False)
+            self._button("Push", self.world.push)
+            self._button("Reset", self.world.reset)
+        with gui.add_folder("All actuators"):
+            self._slider("delay", "Late by (steps)", 0.0, 8.0, 1.0, 0.0)
+            self._slider("lag", "Slow (steps)", 0.0, 6.0, 0.5, 0.0)
+            self._slider("noise", "Noise", 0.0, 0.5, 0.05, 0.0)
+        for k, name in enumerate(names):
+            with gui.add_folder(name, expand_by_default=k == 0):
+                self._slider(f"gain_{k}", "Gain", -1.5, 1.5, 0.1, 1.0)
+                self._slider(f"bias_{k}", "Bias", -0.5, 0.5, 0.05, 0.0)
+                self._slider(f"loss_{k}", "Lost share", 0.0, 1.0, 0.1, 0.0)
+
+    def _button(self, label: str, action: Callable[[], None]) -> None:
+        self.server.gui.add_button(label).on_click(lambda _: action())
+
+    def _slider(
+        self, name: str, label: str, low: float, high: float, step: float, usual: float
+    ) -> None:
+        slider = self.server.gui.add_slider(label, low, high, step, usual)
+        slider.on_update(lambda _: self._read())
+        self.sliders[name] = slider, usual
+
+    def choose(self, preset: str) -> None:
+        """Set all sliders as a preset says."""
+        values = self.presets[preset]
+        self.setting = True
+        for name, (slider, usual) in self.sliders.items():
+            slider.value = values.get(name, usual)
+        self.setting = False
+        self.swapped = {name: x for name, x in values.items() if name.startswith("from_")}
+        self._read()
+
+    def _read(self) -> None:
+        """Take the faults from the sliders."""
+        if self.setting:
+            return
+        found = {name: slider.value for name, (slider, _) in self.sliders.items()}
+        with self.world.lock:
+            self.world.faults.noise = found.pop("noise")
+            self.world.faults.values = {**found, **self.swapped}
+
+    swapped: dict[str, float] = {}
+
+    def _live(self) -> None:
+        gui, empty = self.server.gui, np.zeros(2)
+        with gui.add_folder("Now", order=-1.0):
+            self.words = gui.add_markdown("")
+            lines = [uplot.Series(label=name, stroke=STROKES[name], width=2) for name in SIDES]
+            series = (uplot.Series(label="step"), *lines)
+            self.rewards = gui.add_uplot((empty,) * 3, series, title="Reward", **PLOT)
+        with gui.add_folder("Commands of AFM", order=100.0):
+            self.shown = gui.add_dropdown("Actuator", self.world.robot.names)
+            looks = {"planned": "gray", "executed": STROKES["AFM"], "effect": STROKES["alone"]}
+            lines = [uplot.Series(label=name, stroke=x, width=2) for name, x in looks.items()]
+            series, data = (uplot.Series(label="step"), *lines), (empty,) * 4
+            self.commands = gui.add_uplot(data, series, title="Command", **PLOT)
+
+    def end(self) -> None:
+        """End the page, and :meth:`run`."""
+        if self.ended:
+            return
+        self.ended = True
+        with redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def run(self) -> None:
+        """Let the world go on and draw it, until :meth:`end` or an interrupt."""
+        worded = done = time.monotonic()  # up to when the world has been simulated
+        while not self.ended:
+            now = time.monotonic()
+            step = self.world.robot.dt / self.speed.value
+            done = now if self.pause.value else max(done, now - FRAME - step)
+            while not self.pause.value and done + step <= now:
+                self.world.step()
+                done += step
+                if time.monotonic() > now + FRAME:  # slower than life
+                    break
+            self.draw()
+            if now - worded > WORDS:
+                self.say()
+                worded = now
+            time.sleep(max(0.0, now + FRAME - time.monotonic()))
+
+    def draw(self) -> None:
+        """Draw both robots."""
+        with self.world.lock, self.server.atomic():
+            for name, figure in self.figures.items():
+                figure.draw()
+                self.labels[name].position = figure.label
+
+    def say(self) -> None:
+        """Renew words and curves."""
+        with self.world.lock:
+            self.words.content = self.text()
+            rewards = [np.array(side.rewards) for side in self.world.sides.values()]
+            commands = np.array(self.world.sides["AFM"].commands)
+        size = min(map(len, rewards))
+        if size > 1:
+            steps = np.arange(size, dtype=float)
+            self.rewards.data = (steps, *(line[-size:] for line in rewards))
+        if len(commands) > 1:
+            one = commands[..., self.world.robot.names.index(self.shown.value)].T
+            self.commands.data = (np.arange(len(commands), dtype=float), *one.astype(float))
+
+    def text(self) -> str:
+        """Say how both are, and what AFM knows."""
+        sides, score = [self.world.sides[name] for name in SIDES], self.world.robot.score
+        table = {"": SIDES, "---": ["---"] * 2, "falls": [side.falls for side in sides]}
+        table["reward a step"] = [f"{mean(side.rewards):.2f}" for side in sides]
+        if score != "reward":
+            table[score] = [side.info.get(score, "") for side in sides]
+        rows = ["| " + " | ".join(map(str, (name, *row))) + " |" for name, row in table.items()]
+        afm = sides[1].info["afm"]
+        state = "**corrects**" if afm["corrects"] else "does nothing"
+        lines = [f"AFM {state}; innovation {afm['innovation']:.2f}"]
+        lines += [f"{name}: {afm[name]}" for name in ("belief", "noise", "delay") if name in afm]
+        words = str(sides[1].env.diagnosis)
+        for k, name in enumerate(self.world.robot.names):
+            words = words.replace(f"actuator {k}:", f"{name}:").replace(f"a_{k}:", f"{name}:")
+        words = words.replace("\n", "  \n")
+        return "\n".join([*rows, "", "  \n".join(lines), "", words])
+
+
+def mean(values: Any) -> float:
+    """Return the mean of the newest 50 values."""
+    newest = list(values)[-50:]
+    return sum(newest) / max(len(newest), 1)

@@ -1,0 +1,211 @@
+"""The robots of the page, each with a policy or a planner."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.wrappers import TransformObservation
+from scipy.linalg import solve_discrete_are
+from tensordict import TensorDict
+from torchrl.envs.utils import step_mdp
+
+from afm_rl.correction import ActionFlow
+from afm_rl.dynamics import Dubins, MuJoCoDynamics, Quadrotor
+from afm_rl.envs.task.pendulum import pendulum_step
+from afm_rl.errors import ConfigurationError, check_choice
+from afm_rl.planning import MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost, load_policy
+
+Acting = Callable[[np.ndarray], np.ndarray]
+LONG, NEAR = 3600.0, 3.0  # s, of a flight; m, from its reference, beyond which it is lost
+POLICIES = Path(__file__).parents[2] / "examples" / "policies" / "zoo"
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What the page needs to know of a robot.
+
+    Attributes:
+        make: makes an environment without a time limit.
+        policy: makes a policy; each robot has its own, as planners remember.
+        model: keyword arguments of :class:`~afm_rl.ActionFlowWrapper`.
+        push: pushes a robot, given its innermost environment and a direction of -1 or 1.
+        dt: seconds a step.
+        names: of the actuators.
+        score: what is counted of an episode: the name of an info, or ``reward``.
+        corrector: makes the correction; the universal one in units of the box, if None comes of it.
+    """
+
+    make: Callable[[], gymnasium.Env]
+    policy: Callable[[], Acting]
+    model: dict[str, Any]
+    push: Callable[[Any, float], None]
+    dt: float
+    names: list[str]
+    score: str = "reward"
+    corrector: Callable[[], Any] = lambda: None
+
+
+def make_robot(name: str, file: Path | None = None) -> Robot:
+    """Return a robot of :data:`ROBOTS`, with the policy in a file, if one is given.
+
+    Raises:
+        ConfigurationError: for an unknown name, or if there is no policy at hand.
+    """
+    return ROBOTS[check_choice("--robot", name, ROBOTS)](file)
+
+
+def _from_file(default: str) -> Callable[[Path | None], Robot]:
+    """Return what makes a robot of gymnasium with a stored policy."""
+
+    def build(file: Path | None) -> Robot:
+        file = POLICIES / f"{default}.safetensors" if file is None else Path(file)
+        if not file.is_file():
+            raise ConfigurationError(
+                f"--policy={file}: no such file; it is in the repository, or written by "
+                "afm_rl.planning.save_policy"
+            )
+        policy, about = load_policy(file)
+
+        def act(seen: np.ndarray) -> np.ndarray:
+            return policy(torch.as_tensor(seen, dtype=torch.float32)).numpy()
+
+        return _gymnasium(about["id"], lambda: act, about.get("settings", {}))
+
+    return build
+
+
+def _gymnasium(task: str, policy: Callable[[], Acting], settings: dict[str, Any]) -> Robot:
+    def make() -> gymnasium.Env:
+        return gymnasium.make(task, max_episode_steps=-1, **settings)
+
+    inner: Any = make().unwrapped
+    if hasattr(inner, "model"):
+        found = inner.model
+        joints = [found.joint(joint).name for joint in found.actuator_trnid[:, 0]]
+        return Robot(make, policy, {"model": "mujoco"}, _push_root, inner.dt, joints)
+    model = {"model": pendulum_step, "state": lambda env, seen: env.unwrapped.state}
+    return Robot(make, policy, model, _push_pendulum, inner.dt, ["joint"])
+
+
+def _push_root(inner: Any, direction: float) -> None:
+    """Add 1 m/s, or 1 rad/s, to the first velocity."""
+    inner.data.qvel[0] += direction
+
+
+def _push_pendulum(inner: Any, direction: float) -> None:
+    inner.state = np.array(inner.state) + [0.0, 3.0 * direction]
+
+
+def _cart_pole(file: Path | None) -> Robot:
+    """A cart with a pole, by the linear quadratic regulator."""
+    env: Any = gymnasium.make("InvertedPendulum-v5")
+    model, zero = MuJoCoDynamics(env), torch.zeros(1, 4, dtype=torch.float64)
+    a, b = (
+        torch.stack(
+            [
+                (model(zero + p, u) - model(zero - p, -u))[0] / 2e-4
+                for p, u in zip(1e-4 * states, 1e-4 * actions, strict=True)
+            ],
+            -1,
+        ).numpy()
+        for states, actions in (
+            (torch.eye(4, dtype=torch.float64), torch.zeros(4, 1, dtype=torch.float64)),
+            (torch.zeros(1, 4, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64)),
+        )
+    )
+    cost = solve_discrete_are(a, b, np.diag([1.0, 10.0, 0.1, 0.1]), np.eye(1))
+    gain = np.linalg.solve(np.eye(1) + b.T @ cost @ b, b.T @ cost @ a)
+    space = env.action_space
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        return np.clip(-gain @ seen, space.low, space.high).astype(np.float32)
+
+    return _gymnasium("InvertedPendulum-v5", lambda: act, {})
+
+
+def _planned(planner: Any, parts: dict[str, tuple[int, ...]]) -> Acting:
+    """Return a policy that plans; what it sees are ``parts``, by key and shape, in a row."""
+    memory = planner.make_tensordict_primer()(TensorDict({}))
+    sizes = [math.prod(shape) for shape in parts.values()]
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        nonlocal memory
+        values = torch.as_tensor(seen).float().split(sizes)
+        for (key, shape), value in zip(parts.items(), values, strict=True):
+            memory[key] = value.reshape(shape)
+        planned = planner(memory)
+        memory = step_mdp(planned)
+        return planned["action"].numpy()
+
+    return act
+
+
+def _ugv(file: Path | None) -> Robot:
+    """The ground robot on its track, by MPPI."""
+    low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
+    dynamics = Dubins()
+
+    def policy() -> Acting:
+        planner = MPPI(PlanningEnv(dynamics, GoalDistance(), low, high), population=512)
+        return _planned(planner, {"observation": (3,), "goal": (2,)})
+
+    def make() -> gymnasium.Env:
+        return gymnasium.make("afm_rl/UGVTrack-v0", max_episode_steps=-1)
+
+    def push(inner: Any, direction: float) -> None:
+        inner._data["pose"] += torch.tensor([0.0, 0.0, 0.5 * direction])
+
+    model = {"model": dynamics, "state": lambda env, seen: seen[:3]}
+    return Robot(make, policy, model, push, 0.2, ["speed", "turn"], score="reached")
+
+
+def _quadrotor(file: Path | None) -> Robot:
+    """A small quadrotor that flies in a circle, by model predictive control."""
+    name, ahead = "afm_rl/CrazyflieTrack-v0", 20
+    dynamics, level = Quadrotor(dt=0.05), [0.0] * 9 + [1.0] + [0.0] * 3
+    cost = TrackingCost([1.0] * 13, [1.0] * 4, coordinates=range(6), rest=level)
+    box: Any = gymnasium.make(name).action_space
+    unit = torch.tensor([0.575, 3e-4, 3e-4, 1e-4])  # what flights use of the box
+
+    def make() -> gymnasium.Env:
+        env = gymnasium.make(name, max_episode_steps=-1, duration=LONG, horizon=ahead, limit=NEAR)
+        shape = (13 + 6 * (ahead + 1),)
+        space = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
+
+        def seen(observation: np.ndarray) -> np.ndarray:  # and the circle ahead
+            ahead_of: Any = env.unwrapped
+            return np.append(observation[:13], ahead_of._data["reference"].numpy().ravel())
+
+        return TransformObservation(env, seen, space)
+
+    def policy() -> Acting:
+        low, high = torch.from_numpy(box.low), torch.from_numpy(box.high)
+        planner = MPC(PlanningEnv(dynamics, cost, low, high), horizon=ahead, bounded=[0])
+        return _planned(planner, {"observation": (13,), "reference": (ahead + 1, 6)})
+
+    def push(inner: Any, direction: float) -> None:
+        inner._data["pose"][3] += 0.5 * direction
+
+    model = {"model": dynamics, "state": lambda env, seen: seen[:13]}
+    names = ["thrust", "roll", "pitch", "yaw"]
+    return Robot(make, policy, model, push, 0.05, names, corrector=lambda: ActionFlow(-unit, unit))
+
+
+ROBOTS: dict[str, Callable[[Path | None], Robot]] = {
+    "half_cheetah": _from_file("half_cheetah_tqc"),
+    "hopper": _from_file("hopper_trpo"),
+    "walker2d": _from_file("walker2d_tqc"),
+    "ant": _from_file("ant_trpo"),
+    "swimmer": _from_file("swimmer_trpo"),
+    "pendulum": _from_file("pendulum_sac"),
+    "cart_pole": _cart_pole,
+    "ugv": _ugv,
+    "quadrotor": _quadrotor,
+}

@@ -1,0 +1,104 @@
+"""Two robots with the same policy and the same faults: one alone, one with AFM."""
+
+from __future__ import annotations
+
+from collections import deque
+from threading import RLock
+from typing import Any
+
+import numpy as np
+
+from afm_rl.play.actuators import Actuators, Faults
+from afm_rl.play.robots import Robot
+from afm_rl.transforms.gymnasium import ActionFlowWrapper
+
+SIDES = ("alone", "AFM")
+KEPT = 400  # steps that are drawn as curves
+LYING = 1.0  # seconds that a robot lies where it fell
+
+
+class Side:
+    """One of the two robots."""
+
+    def __init__(self, robot: Robot, faults: Faults, corrected: bool) -> None:
+        self.robot, self.act = robot, robot.policy()
+        self.env: Any = Actuators(robot.make(), faults)
+        if corrected:
+            model, corrector = robot.model, robot.corrector()
+            self.env = ActionFlowWrapper(self.env, **model, corrector=corrector)
+        self.rewards: deque[float] = deque(maxlen=KEPT)
+        self.commands: deque[np.ndarray] = deque(maxlen=KEPT)
+        self.falls = 0
+        self.reset(0)
+
+    def reset(self, seed: int) -> None:
+        """Begin anew."""
+        self.observation, self.info = self.env.reset(seed=seed)
+        self.steps, self.total, self.lying = 0, 0.0, 0.0
+
+    def step(self) -> None:
+        """Act once; a robot that fell lies for a moment and begins anew."""
+        if self.lying > 0:
+            self.lying -= self.robot.dt
+            if self.lying <= 0:
+                self.reset(self.falls)
+            return
+        planned = self.act(self.observation)
+        self.observation, reward, over, _, self.info = self.env.step(planned)
+        self.steps, self.total = self.steps + 1, self.total + float(reward)
+        self.rewards.append(float(reward))
+        executed = self.info.get("afm", {}).get("executed", planned)
+        self.commands.append(np.stack([planned, executed, self.effect]))
+        if over:
+            self.falls, self.lying = self.falls + 1, LYING
+
+    @property
+    def effect(self) -> np.ndarray:
+        """What the actuators gave in the newest step, ``(A,)``."""
+        env = self.env
+        while not isinstance(env, Actuators):
+            env = env.env
+        return env.effect
+
+    @property
+    def inner(self) -> Any:
+        """The innermost environment."""
+        return self.env.unwrapped
+
+
+class World:
+    """Both robots; whoever reads or changes them holds the ``lock``.
+
+    >>> from afm_rl.play.robots import make_robot
+    >>> world = World(make_robot("pendulum"))
+    >>> world.faults.values = {"gain_0": -1.0}
+    >>> world.step()
+    >>> world.sides["AFM"].steps
+    1
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot, self.faults, self.lock = robot, Faults(), RLock()
+        self.sides = {name: Side(robot, self.faults, name == "AFM") for name in SIDES}
+        self.seed, self.direction = 0, 1.0
+
+    def step(self) -> None:
+        """Let both act once."""
+        with self.lock:
+            for side in self.sides.values():
+                side.step()
+
+    def reset(self) -> None:
+        """Begin a new episode, the same for both."""
+        with self.lock:
+            self.seed += 1
+            for side in self.sides.values():
+                side.reset(self.seed)
+                side.falls = 0
+
+    def push(self) -> None:
+        """Push both, once from the left and once from the right."""
+        with self.lock:
+            for side in self.sides.values():
+                self.robot.push(side.inner, self.direction)
+            self.direction = -self.direction

@@ -1,0 +1,195 @@
+"""Two robots as batches: every row is an episode with a disturbance of its own.
+
+A world is what happens; the correction sees only the step function that a user would write, and a
+state as the sensor gives it. Nothing here is a fault of the actuators, unless its name says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+NOMINAL = {
+    "push": 0.0,  # jump of a speed at a third of the episode
+    "teleport": 0.0,  # jump of a position there
+    "gust": 0.0,  # standard deviation of a force at every step
+    "wind": 0.0,  # constant force
+    "noise": 0.0,  # standard deviation of the sensor
+    "outliers": 0.0,  # share of readings that are off by a lot
+    "quantum": 0.0,  # of the readings
+    "stale": 0.0,  # share of readings that are sent twice
+    "wall": math.inf,  # where the robot is stopped
+    "stall": 0.0,  # share of the steps in which it stands still
+    "fade": 0.0,  # of the actuators, per second
+    "mass": 1.0,
+    "gravity": 1.0,
+    "length": 1.0,
+    "friction": 0.0,
+    "dt": 1.0,  # of the world, relative to what the model believes
+    "zero": 0.0,  # is the command zero from a third of the episode on?
+    "constant": 0.0,  # is it the one of then?
+    "bang": 0.0,  # is it at a limit, always?
+}
+
+
+@dataclass
+class World:
+    """A robot: its step function, its policy, its cost.
+
+    Args:
+        dt: of the model (s).
+        limit: largest action, ``(A,)``.
+        step: what the user writes: state, action, to the next state.
+        move: what happens: state, action, rules by name ``(N, 1)``, random numbers, time.
+        read: the sensor's noise scale of each coordinate, ``(S,)``.
+        policy: action of a reading and the time.
+        cost: of a state and the time, ``(N,)``.
+        start: first states, of a number and a generator.
+        steps: of an episode.
+    """
+
+    dt: float
+    limit: Tensor
+    step: Callable
+    move: Callable
+    read: Tensor
+    policy: Callable
+    cost: Callable
+    start: Callable
+    steps: int
+
+
+def pendulum() -> World:
+    """Return gymnasium's pendulum, held upright by a saturated PD."""
+    limit, dt = torch.tensor([2.0]), 0.05
+
+    def step(state: Tensor, action: Tensor, g=10.0, m=1.0, l=1.0, rub=0.0, dt=dt) -> Tensor:
+        angle = torch.atan2(state[..., 1:2], state[..., :1])
+        torque = action - rub * state[..., 2:]
+        pull = 3 * g / (2 * l) * angle.sin() + 3 / (m * l**2) * torque
+        speed = (state[..., 2:] + pull * dt).clamp(-8, 8)
+        angle = angle + speed * dt
+        return torch.cat([angle.cos(), angle.sin(), speed], -1)
+
+    def move(state: Tensor, action: Tensor, rules: dict[str, Tensor], draw: Tensor) -> Tensor:
+        r = rules
+        action = action + r["wind"]
+        after = step(
+            state, action, 10 * r["gravity"], r["mass"], r["length"], r["friction"], dt * r["dt"]
+        )
+        speed = after[..., 2:] + r["gust"] * draw[..., :1] + r["jump"] * r["push"]
+        angle = torch.atan2(after[..., 1:2], after[..., :1]) + r["jump"] * r["teleport"]
+        stopped = angle.abs() > r["wall"]
+        angle = torch.where(stopped, angle.clamp(-r["wall"], r["wall"]), angle)
+        speed = torch.where(stopped, 0.0, speed).clamp(-8, 8)
+        return torch.cat([angle.cos(), angle.sin(), speed], -1)
+
+    def policy(state: Tensor, time: int) -> Tensor:
+        angle = torch.atan2(state[..., 1:2], state[..., :1])
+        return (-10 * angle - 2.5 * state[..., 2:]).clamp(-limit, limit)
+
+    def cost(state: Tensor, time: int) -> Tensor:
+        angle = torch.atan2(state[..., 1], state[..., 0])
+        return angle.square() + 0.1 * state[..., 2].square()
+
+    def start(count: int, generator: torch.Generator) -> Tensor:
+        angle, speed = 0.25 * (2 * torch.rand(2, count, 1, generator=generator) - 1)
+        return torch.cat([angle.cos(), angle.sin(), speed], -1)
+
+    read = torch.tensor([0.3, 0.3, 1.0])
+    return World(dt, limit, step, move, read, policy, cost, start, 200)
+
+
+def ground() -> World:
+    """Return a ground robot that follows a point on a circle."""
+    limit, dt = torch.tensor([1.0, 1.5]), 0.2
+
+    def step(state: Tensor, action: Tensor, dt=dt) -> Tensor:
+        x, y, heading = state.unbind(-1)
+        v, turn = action.unbind(-1)
+        dt = torch.as_tensor(dt).reshape(-1) if isinstance(dt, Tensor) else dt
+        middle = heading + 0.5 * turn * dt
+        after = [x + v * dt * middle.cos(), y + v * dt * middle.sin(), heading + turn * dt]
+        return torch.stack(after, -1)
+
+    def move(state: Tensor, action: Tensor, rules: dict[str, Tensor], draw: Tensor) -> Tensor:
+        r = rules
+        action = action / r["mass"]  # heavier: slower
+        action = action - r["friction"] * 0.3 * action.tanh()
+        action = action * torch.cat([torch.ones_like(r["length"]), 1 / r["length"]], -1)
+        after = step(state, action, dt * r["dt"])
+        ahead = torch.tensor([1.0, 1.0, 0.3])
+        after = after + dt * (r["gust"] * draw[..., :3] * ahead)
+        after = after + dt * r["wind"] * torch.tensor([1.0, 0.5, 0.0])
+        sink = r["gravity"] - 1  # a slope
+        after = after + dt * sink * torch.tensor([0.0, -1.0, 0.0])
+        after = after + r["jump"] * (r["push"] + r["teleport"]) * torch.tensor([0.3, -0.3, 0.3])
+        place = after[..., :2].clamp(-r["wall"], r["wall"])
+        return torch.cat([place, after[..., 2:]], -1)
+
+    def goal(time: int) -> Tensor:
+        angle = 0.15 * time * dt
+        return torch.tensor([2 * math.cos(angle) - 2, 2 * math.sin(angle)])
+
+    def policy(state: Tensor, time: int) -> Tensor:
+        ahead = (goal(time + 1) - goal(time)) / dt
+        pull = ahead + 1.5 * (goal(time) - state[..., :2])  # the velocity that is wanted
+        away = torch.atan2(pull[..., 1], pull[..., 0]) - state[..., 2]
+        away = torch.remainder(away + math.pi, 2 * math.pi) - math.pi
+        speed = pull.norm(dim=-1) * away.cos()
+        return torch.stack([speed, 2.0 * away + 0.15], -1).clamp(-limit, limit)
+
+    def cost(state: Tensor, time: int) -> Tensor:
+        return (goal(time) - state[..., :2]).norm(dim=-1)
+
+    def start(count: int, generator: torch.Generator) -> Tensor:
+        place = 0.5 * (2 * torch.rand(count, 2, generator=generator) - 1)
+        heading = math.pi * (2 * torch.rand(count, 1, generator=generator) - 1)
+        return torch.cat([place, heading], -1)
+
+    read = torch.tensor([1.0, 1.0, 1.0])
+    return World(dt, limit, step, move, read, policy, cost, start, 200)
+
+
+SITUATIONS: dict[str, dict[str, float]] = {
+    "healthy": {},
+    "push 2": {"push": 2.0},
+    "push 5": {"push": 5.0},
+    "teleport 0.5": {"teleport": 0.5},
+    "teleport 2": {"teleport": 2.0},
+    "gust 0.1": {"gust": 0.1},
+    "gust 0.3": {"gust": 0.3},
+    "gust 1": {"gust": 1.0},
+    "wind 0.1": {"wind": 0.1},
+    "wind 0.3": {"wind": 0.3},
+    "noise 0.01": {"noise": 0.01},
+    "noise 0.05": {"noise": 0.05},
+    "noise 0.2": {"noise": 0.2},
+    "noise 0.1": {"noise": 0.1},
+    "outliers 1 %": {"outliers": 0.01},
+    "outliers 5 %": {"outliers": 0.05},
+    "quantised 0.05": {"quantum": 0.05},
+    "stale 20 %": {"stale": 0.2},
+    "wall": {"wall": 0.25},
+    "stall 10 %": {"stall": 0.1},
+    "fading": {"fade": 0.05},
+    "mass x 1.3": {"mass": 1.3},
+    "mass x 0.7": {"mass": 0.7},
+    "gravity x 1.2": {"gravity": 1.2},
+    "gravity x 0.8": {"gravity": 0.8},
+    "friction 0.3": {"friction": 0.3},
+    "friction 1": {"friction": 1.0},
+    "length x 1.3": {"length": 1.3},
+    "length x 0.8": {"length": 0.8},
+    "dt x 0.7": {"dt": 0.7},
+    "dt x 1.4": {"dt": 1.4},
+    "zero commands": {"zero": 1.0},
+    "constant commands": {"constant": 1.0},
+    "bang-bang": {"bang": 1.0},
+    "bang-bang, noise 0.2": {"bang": 1.0, "noise": 0.2},
+    "friction 0.3, noise 0.05": {"friction": 0.3, "noise": 0.05},
+}

@@ -1,0 +1,100 @@
+"""Who acts: the policy alone, corrected, or given the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from faults import FaultyVector
+from task import Task
+from torch import Tensor
+
+from afm_rl import ActionFlowVectorWrapper
+from afm_rl.correction import LeastSquares
+from afm_rl.learning.watching import Watching
+
+Acting = Callable[[np.ndarray], np.ndarray]
+WATCHED = 20  # healthy environments that a model is learned from, side by side
+
+
+def alone(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+    return envs, task.act
+
+
+def least_squares(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+    """Gain and offset per actuator, by least squares over effective actions."""
+    corrector = LeastSquares(task.low, task.high, form="gain_offset")
+    return ActionFlowVectorWrapper(envs, corrector=corrector, **task.model), task.act
+
+
+def afm(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+    """The wrapper as it comes, over the exact model."""
+    return ActionFlowVectorWrapper(envs, **task.model), task.act
+
+
+def afm_learned(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+    """The same over an ensemble that is fitted to healthy episodes of this policy."""
+    healthy = ActionFlowVectorWrapper(task.vector(WATCHED), Watching())
+    observations, infos = healthy.reset(seed=list(range(10_000, 10_000 + WATCHED)))
+    while not infos["afm"]["learned"].all():
+        for _ in range(task.steps):
+            observations = healthy.step(task.act(observations))[0]
+        observations, infos = healthy.reset()
+    found = healthy.watching.fitted
+    return ActionFlowVectorWrapper(envs, found, corrector=healthy._loop.corrector), task.act
+
+
+class Truth:
+    """The policy, given the faults as soon as they are there.
+
+    It is asked about the state in which its command will act, and its answer is inverted.
+    """
+
+    def __init__(self, task: Task, envs: FaultyVector) -> None:
+        self.task, self.envs = task, envs
+        names = list(task.regime.names)
+        self.late = envs.rows[:, names.index("delay")].long().tolist()
+        lag = envs.rows[:, names.index("lag"), None]
+        self.keep = torch.where(lag > 0, (-1 / lag).exp(), 0.0)
+        self.static = envs.rows.clone()
+        self.static[:, names.index("delay")] = self.static[:, names.index("lag")] = 0.0
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        if not self.envs.failed:
+            return self.task.act(observations)
+        regime, past = self.task.regime, self.envs.past
+        seen = observations.copy()
+        for row, steps in enumerate(self.late):
+            if steps:
+                parameters = self.static[row].expand(steps, -1)
+                pending = past[row, :steps].flip(0)  # oldest first
+                effects = regime.apply(pending, parameters, pending[:, :1])
+                seen[row] = self.task.after(self.envs.env.envs[row], effects.numpy())
+        wanted = torch.as_tensor(self.task.act(seen)).double()
+        reached = _lagged(past, self.keep)
+        wanted = (wanted - self.keep * reached) / (1 - self.keep)
+        found = regime.inverse(wanted, self.static, wanted[:, :1], self.task.low, self.task.high)
+        return found.numpy()
+
+
+def _lagged(past: Tensor, keep: Tensor) -> Tensor:
+    """Return where actuators with a lag are after commands ``(N, D, A)``, newest first."""
+    found = past[:, 7]  # as far back as the regime remembers
+    for command in past[:, :7].flip(1).unbind(1):
+        found = command + keep * (found - command)
+    return found
+
+
+def truth(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+    return envs, Truth(task, envs)
+
+
+METHODS = {
+    "alone": alone,
+    "least squares": least_squares,
+    "AFM": afm,
+    "AFM, learned": afm_learned,
+    "truth": truth,
+}

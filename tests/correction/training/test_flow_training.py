@@ -1,0 +1,224 @@
+"""The loss of flow matching, training, and the weights of the package."""
+
+import hashlib
+import io
+import math
+import sys
+from importlib.resources import files
+
+import pytest
+import torch
+from safetensors.torch import load
+from tensordict import TensorDict
+
+import afm_rl.correction.weights
+from afm_rl.correction.experts import fit_experts
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.training import CFMLoss, draw_examples, train_flow
+from afm_rl.correction.training.pretrain import pretrain
+from afm_rl.correction.training.refine import EFFECT_WEIGHT, PRECISION, flow_losses
+from afm_rl.correction.weights import load_universal
+from afm_rl.dynamics import Dubins
+from afm_rl.errors import ArtefactError, ConfigurationError
+
+KEYS = ["executed", "effective", "std", "valid", "planned", "intended", "probe", "effect"]
+
+
+def network(seed=0):
+    return AxisNetwork(width=16, latent=8, seed=seed)
+
+
+@pytest.fixture
+def drawn():
+    return draw_examples(32, 2, 6, 4, "mixed", torch.Generator().manual_seed(0))
+
+
+@pytest.fixture
+def examples(drawn):
+    rows, *answers = drawn
+    names = [*rows._fields, *drawn._fields[1:]]
+    return TensorDict(dict(zip(names, [*rows, *answers], strict=True)), [32])
+
+
+class Exact(AxisNetwork):
+    """Knows the right answers, effects but for some."""
+
+    def __init__(self, drawn, off):
+        super().__init__(width=16, latent=8)
+        self.drawn, self.off = drawn, off
+
+    def velocity(self, asked, tau, point):
+        return (self.drawn.intended - point) / (1 - tau)
+
+    def effect(self, encoded, executed):
+        return self.drawn.effect + self.off
+
+
+@pytest.mark.parametrize("off", [0.0, 0.1])
+def test_the_exact_velocity_costs_nothing_and_a_wrong_effect_its_size(drawn, off):
+    generator = torch.Generator().manual_seed(0)
+    velocity, effect = flow_losses(Exact(drawn, off), drawn, "mixed", generator)
+    assert velocity.shape == effect.shape == (32,)
+    torch.testing.assert_close(velocity, torch.zeros(32), rtol=0, atol=1e-4)
+    size = math.hypot(off, PRECISION) - PRECISION  # quadratic near zero, then linear
+    torch.testing.assert_close(effect, torch.full((32,), size), rtol=1e-3, atol=1e-6)
+
+
+def test_the_loss_module_is_the_loss_of_both(drawn, examples):
+    parts = flow_losses(network(), drawn, "clip", torch.Generator().manual_seed(3))
+    each = CFMLoss(network(), "clip", reduction="none", seed=3)(examples)["loss_cfm"]
+    torch.testing.assert_close(each, parts[0] + EFFECT_WEIGHT * parts[1])
+    mean = CFMLoss(network(), "clip", seed=3)(examples)["loss_cfm"]
+    total = CFMLoss(network(), "clip", reduction="sum", seed=3)(examples)["loss_cfm"]
+    torch.testing.assert_close(mean, each.mean())
+    torch.testing.assert_close(total, each.sum())
+
+
+def test_keys_can_be_chosen_and_entries_come_by_name(examples):
+    expected = CFMLoss(network())(examples)["loss_cfm"]
+    assert CFMLoss(network()).in_keys == KEYS
+    by_name = CFMLoss(network())(**{name: examples[name] for name in KEYS})
+    torch.testing.assert_close(by_name, expected)
+    loss = CFMLoss(network())
+    loss.set_keys(planned=("plan", "action"))
+    moved = examples.exclude("planned").set(("plan", "action"), examples["planned"])
+    torch.testing.assert_close(loss(moved)["loss_cfm"], expected)
+
+
+def test_the_network_is_shared_and_learns_through_the_loss(examples):
+    shared = network()
+    loss = CFMLoss(shared)
+    assert loss.network is shared and not loss.functional
+    loss(examples)["loss_cfm"].backward()
+    assert all(parameter.grad.isfinite().all() for parameter in shared.parameters())
+    assert sum(p.grad.abs().sum() > 0 for p in shared.parameters()) == len([*shared.parameters()])
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"network": None}, "loss.network: expected a AxisNetwork"),
+        ({"reduction": "median"}, "loss.reduction"),
+        ({"saturation": "fold"}, "loss.saturation"),
+        ({"seed": 1.5}, "loss.seed=1.5"),
+    ],
+    ids=str,
+)
+def test_a_loss_that_cannot_be_made_is_refused(settings, complaint):
+    with pytest.raises(ConfigurationError, match=complaint):
+        CFMLoss(**{"network": network(), **settings})
+
+
+def test_pretraining_helps_and_follows_the_seed():
+    def error(trained):
+        fresh = draw_examples(200, 2, 12, 4, "mixed", torch.Generator().manual_seed(7))
+        with torch.no_grad():
+            parts = flow_losses(trained, fresh, "mixed", torch.Generator().manual_seed(7))
+        return float((parts[0] + parts[1]).mean())
+
+    trained = []
+    for _ in range(2):
+        fresh = network()
+        pretrain(fresh, 30, batch_size=24, seed=1)
+        trained.append(fresh)
+    assert error(trained[0]) < 0.9 * error(network())
+    for one, other in zip(*(net.parameters() for net in trained), strict=True):
+        assert torch.equal(one, other)
+
+
+@pytest.fixture
+def train(small_flow, states, gains):
+    def run(seed=0, **settings):
+        flow = small_flow()
+        settings = {"iterations": 4, "batch_size": 8, "seed": seed, **settings}
+        return flow, train_flow(flow, Dubins(), gains, states, **settings)
+
+    return run
+
+
+def same(left, right):
+    right = right.state_dict()
+    return all(torch.equal(value, right[name]) for name, value in left.state_dict().items())
+
+
+def test_the_seed_decides_everything_and_the_global_generator_nothing(train):
+    before = torch.get_rng_state()
+    first, error = train()
+    assert torch.equal(torch.get_rng_state(), before)
+    again, same_error = train()
+    other, _ = train(seed=1)
+    assert same(first, again) and error == same_error and not same(first, other)
+
+
+def test_the_model_is_not_changed_and_gradients_may_be_off(
+    make_ensemble, small_flow, states, gains
+):
+    model, flow, start = make_ensemble(), small_flow(), small_flow()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    with torch.no_grad():
+        train_flow(flow, model, gains, states, iterations=2, batch_size=8)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert not same(flow, start)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_can_be_shown_on_a_terminal(train, monkeypatch):
+    written = {}
+    for progress in (False, True):
+        monkeypatch.setattr("sys.stderr", Terminal())
+        train(progress=progress)
+        written[progress] = sys.stderr.getvalue()
+    assert written[False] == "" and "training the flow" in written[True]
+
+
+@pytest.mark.parametrize(
+    "settings", [{"iterations": 0}, {"batch_size": 1}, {"lr": 0.0}, {"seed": 1.5}], ids=str
+)
+def test_impossible_settings_are_refused(train, settings):
+    with pytest.raises(ConfigurationError, match=f"corrector.train.{next(iter(settings))}"):
+        train(**settings)
+
+
+def test_the_weights_of_the_package_are_small_sound_and_frozen():
+    data = files("afm_rl.correction").joinpath("universal.safetensors").read_bytes()
+    assert len(data) < 2 * 2**20
+    net = load_universal()
+    stored = load(data)
+    assert all(torch.equal(value, stored[name]) for name, value in net.state_dict().items())
+    assert not any(parameter.requires_grad for parameter in net.parameters())
+    assert all(value.isfinite().all() for value in stored.values())
+
+
+@pytest.mark.parametrize("place", [100, -5])
+def test_a_flipped_bit_in_the_weights_is_refused(place, tmp_path, monkeypatch):
+    folder = files("afm_rl.correction")
+    data = bytearray(folder.joinpath("universal.safetensors").read_bytes())
+    data[place] ^= 1
+    (tmp_path / "universal.safetensors").write_bytes(data)
+    said = folder.joinpath("universal.safetensors.sha256").read_text()
+    (tmp_path / "universal.safetensors.sha256").write_text(said)
+    assert hashlib.sha256(data).hexdigest() not in said
+    monkeypatch.setattr(afm_rl.correction.weights, "files", lambda package: tmp_path)
+    with pytest.raises(ArtefactError, match="universal.safetensors: damaged"):
+        load_universal()
+
+
+def test_experts_fitted_while_driving_can_be_used_in_training(drawn):
+    """Constants that were made in inference mode must not spoil gradients later."""
+    with torch.inference_mode():
+        fit_experts(draw_examples(2, 5, 7, 1, "clip", torch.Generator().manual_seed(0)).rows)
+    later = draw_examples(2, 5, 7, 4, "clip", torch.Generator().manual_seed(0))
+    net = network()
+    flow_losses(net, later, "clip", torch.Generator())[0].mean().backward()
+
+
+@pytest.mark.parametrize(
+    "box", [(torch.zeros(2), torch.ones(2)), (torch.zeros(3), torch.full((3,), math.inf))], ids=str
+)
+def test_a_box_of_states_that_cannot_be_drawn_from_is_refused(box):
+    with pytest.raises(ConfigurationError, match="states=.*expected finite states of 3 numbers"):
+        train_flow(None, Dubins(), None, box)
