@@ -95,7 +95,7 @@ class ActionFlow(Believer):
         samples: int = 16,
         source_std: float = 0.3,
         steps: int = 1,
-        saturation: str = "clip",
+        saturation: str = "mixed",
         compile: bool = False,
         cache: str | Path = "~/.cache/afm_rl",
         network: AxisNetwork | None = None,

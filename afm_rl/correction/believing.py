@@ -39,9 +39,9 @@ class Believer(PairCorrector):
     r"""A corrector that believes in models of the actuators as far as they predict.
 
     It holds a :class:`~afm_rl.correction.belief.Belief` over M models of the pairs that it
-    remembers; the first is *nothing has changed*. No loss is negative, so while that model's own loss is below its ``odds`` no other one
-    can outweigh it: then the planned action is executed, and nothing more is computed. When it
-    is exceeded, the pairs from before are marked as old: "valid" is halved.
+    remembers; the first is *nothing has changed*. No loss is negative, so while that model's own
+    loss is below its ``odds`` no other one can outweigh it: then the planned action is executed,
+    and nothing more is computed. When it is exceeded, the pairs from before are marked as old.
 
     Args:
         action_low: lowest action, ``(A,)``.
@@ -223,6 +223,7 @@ class Believer(PairCorrector):
         more = self.normalise(given - sent).unsqueeze(-2)
         return self.pack({**parts, "forecasts": parts["forecasts"] + more})
 
+    @torch.no_grad()
     def _foresee(self, memory: Tensor, executed: Tensor) -> Tensor:
         """Return the memory with forecasts of what is executed, where models are to be asked."""
         parts = self.unpack(memory, self.states_in(memory))
