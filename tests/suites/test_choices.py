@@ -11,7 +11,8 @@ from afm_rl.missions import run
 
 SUITES = Path(__file__).parents[2] / "benchmarks" / "suites"
 FILES = sorted(SUITES.glob("*/conf/*/*.yaml"))
-MODULES = sorted(path.relative_to(SUITES) for path in SUITES.glob("*/*.py"))
+PACKAGES = sorted(SUITES.glob("*/__init__.py"))  # the others are scripts
+MODULES = sorted(m.relative_to(SUITES) for p in PACKAGES for m in p.parent.glob("*.py"))
 FLIGHT = "robot=quadrotor"
 PARTNERS = {
     "planner=law": ["robot=gusty_pendulum"],
