@@ -86,10 +86,18 @@ def _dynamics(problem: Problem, driver: int, starts: Sequence[Shape]) -> list[Mo
 
 
 def _simplest(problem: Problem, models: Sequence[Model], settings: Settings) -> Model:
-    """Return the simplest of some models that is not clearly worse than a larger one."""
+    """Return the simplest of some models that is not clearly worse than a larger one.
+
+    Of those that explain as much, every machine has a delay, and few have a rate limit.
+    """
     first, *others = [refine(problem, model) for model in models]
     for size in sorted({other.size for other in others}):
-        better = min((other for other in others if other.size == size), key=COST)
+        best, *some = sorted((other for other in others if other.size == size), key=COST)
+        rows = problem.use.sum() * weight_of(problem, best)
+        alike = [m for m in some if rows * math.log((m.cost + FLOOR) / (best.cost + FLOOR)) < 4]
+        better = min(
+            (best, *alike), key=lambda m: ("rate" in m.active, "delay" not in m.active, m.cost)
+        )
         if better.size > first.size and needed(problem, better, first, settings):
             first = better
     return first

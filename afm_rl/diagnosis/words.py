@@ -19,7 +19,7 @@ UNITS = {
     "rad/s for rpm": math.pi / 30,
 }
 """Gain of a healthy actuator whose response is in another unit than its command."""
-NO_FAULT, FEW = "no known fault", 3  # parts of a log
+NO_FAULT = "no known fault"
 
 
 def judge(
@@ -61,7 +61,8 @@ def judge(
         if not more and first.before.status == "healthy":
             story, now = "", f"{now}, since {when[0]}"
         parts = [now, *(_said(c.before) for c in actuator.changes)]
-        if len(parts) > FEW and any(NO_FAULT in part for part in parts):
+        since = len(parts) == 2 and first.before.status == "healthy"
+        if any(NO_FAULT in part for part in parts) and not since:
             story, now = f"{NO_FAULT}: ", f"no explanation holds longer than a part of {len(parts)}"
         faults = [story + now]
         status = "dead" if status == "dead" else "changed"
