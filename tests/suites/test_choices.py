@@ -11,8 +11,11 @@ from afm_rl.missions import run
 
 SUITES = Path(__file__).parents[2] / "benchmarks" / "suites"
 FILES = sorted(SUITES.glob("*/conf/*/*.yaml"))
-PACKAGES = sorted(SUITES.glob("*/__init__.py"))  # the others are scripts
-MODULES = sorted(m.relative_to(SUITES) for p in PACKAGES for m in p.parent.glob("*.py"))
+MODULES = sorted(
+    path.relative_to(SUITES)
+    for folder in SUITES.glob("*/__init__.py")
+    for path in folder.parent.glob("*.py")
+)
 FLIGHT = "robot=quadrotor"
 PARTNERS = {
     "planner=law": ["robot=gusty_pendulum"],
