@@ -197,11 +197,6 @@ def test_models_that_are_not_good_enough_are_not_used():
     assert env.watching.needed == 540 and watching.count == 0  # that of the user is a description
 
 
-def test_too_few_steps_for_a_gate_are_refused():
-    with pytest.raises(ConfigurationError, match="transitions=500: expected at least 8000"):
-        Watching(transitions=500)
-
-
 def test_what_cannot_be_used_is_refused():
     def refused(match, env, *args):
         with pytest.raises(ConfigurationError, match=match):
