@@ -202,10 +202,8 @@ class Believer(PairCorrector):
             model: the dynamics model as it is now.
         """
         with torch.no_grad():
-            parts = self.asleep(self.look(memory, model), action)
-            awake = parts["misaligned"].squeeze(-1) == 1.0
-            if not all_hold(~awake):
-                parts = self.unpack(self._foresee(self.pack(parts), action), model.state_size)
+            seen = self._foresee(self.pack(self.look(memory, model)), action)
+            parts = self.unpack(seen, model.state_size)
             weights = self.belief(parts).weights(self.prior.to(memory))
             mean, std = mean_and_std(parts["forecasts"], weights)
             return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))

@@ -108,7 +108,8 @@ class Tick(nn.Module):
         proposals, spread = self.propose(models, unit, ends)
         expected = self.expect(models, proposals)
         reach = self.reach(models, expected)
-        wanted = attainable(unit, *reach.unbind(-2), self.saturation)
+        low, high = reach.unbind(-2)
+        wanted = attainable(unit, low, high, self.saturation)
         sent = pairs[..., : len(self.scale)]
         tried = sent.amax(1) - sent.amin(1)
         bounds = extend(reach, ends, tried, self.saturation)
