@@ -48,7 +48,7 @@ class Controller(nn.Module):
     >>> controller = Controller(planner, ActionFlowPolicy(Dubins(), planner.action_spec))
     >>> controller.sizes
     {'memory': 944, 'observation': 3, 'goal': 2, 'noise': 3000}
-    >>> memory, noise = torch.zeros(526), controller.draw()
+    >>> memory, noise = torch.zeros(944), controller.draw()
     >>> memory, action = controller(memory, torch.zeros(3), torch.ones(2), noise)
     >>> action.shape
     torch.Size([2])
