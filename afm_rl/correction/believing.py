@@ -202,9 +202,11 @@ class Believer(PairCorrector):
             model: the dynamics model as it is now.
         """
         with torch.no_grad():
-            parts = self.asleep(self.look(memory, model), action)
-            awake = parts["misaligned"].squeeze(-1) == 1.0
+            seen = self.look(memory, model)
+            awake = seen["misaligned"] == 1.0
+            parts = self.asleep(seen, action)
             if not all_hold(~awake):
+                parts["losses"] = torch.where(awake.unsqueeze(-1), seen["losses"], parts["losses"])
                 parts = self.unpack(self._foresee(self.pack(parts), action), model.state_size)
             weights = self.belief(parts).weights(self.prior.to(memory))
             mean, std = mean_and_std(parts["forecasts"], weights)
