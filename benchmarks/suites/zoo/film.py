@@ -2,7 +2,8 @@
 
     python benchmarks/suites/zoo/film.py --out docs/images/policies.gif
 
-It draws MuJoCo's capsules from the side, so no graphics card is needed. A robot that fell lies still.
+It draws MuJoCo's capsules from the side, so no graphics card is needed. A robot that fell stays as
+it is.
 """
 
 from __future__ import annotations
