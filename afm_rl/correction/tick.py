@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.correction.achievable import MODES, attainable, extend
-from afm_rl.correction.belief import Belief, mean_and_std
+from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.linear import LINEAR, Lines, fit_lines
@@ -43,7 +43,7 @@ class Tick(nn.Module):
     scale: Tensor
     points: Tensor
     probes: Tensor
-    prior: Tensor
+    worth: Tensor
     late: Tensor
     rows_acting: Tensor
 
@@ -53,7 +53,9 @@ class Tick(nn.Module):
         scale: Tensor,
         readings: Sequence[str],
         rows: int,
-        prior: Tensor,
+        worth: Tensor,
+        odds: float,
+        still: float,
         likely: int,
         samples: int,
         source_std: float,
@@ -62,6 +64,7 @@ class Tick(nn.Module):
     ) -> None:
         super().__init__()
         self.network, size = network, len(scale)
+        self.odds, self.still = odds, still
         self.source_std = check_number("corrector.source_std", source_std, low=0.0)
         self.steps = check_count("corrector.steps", steps)
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
@@ -75,7 +78,7 @@ class Tick(nn.Module):
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
-            "prior": prior,
+            "worth": worth,
             "late": torch.tensor(late, dtype=torch.long),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
@@ -103,7 +106,8 @@ class Tick(nn.Module):
         """
         unit, ends = planned / self.scale, box / self.scale
         encoded, lines = self.read(pairs, noise, place)
-        weights = Belief(losses, losses, noise).weights(self.prior)
+        prior = prior_of(self.worth, self.odds, noise, self.still)
+        weights = Belief(losses, losses, noise).weights(prior)
         models = self.most_likely(encoded, lines, weights)
         proposals, spread = self.propose(models, unit, ends)
         expected = self.expect(models, proposals)
@@ -114,7 +118,7 @@ class Tick(nn.Module):
         tried = sent.amax(1) - sent.amin(1)
         bounds = extend(reach, ends, tried, self.saturation)
         action = self.decide(models, proposals, expected, wanted, noise)
-        changed = weights[:, 0] < 0.5  # else the plan, to the bit
+        changed = weights[:, 0] < float(__import__('os').environ.get('ACT','0.5'))  # else the plan, to the bit
         action = torch.where(changed & action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
         forecasts = self.forecast(encoded, lines, pairs, action)
