@@ -32,7 +32,6 @@ class Belief(NamedTuple):
         rate: float,
         floor: float,
         tails: float,
-        still: float,
     ) -> Belief:
         r"""Return the belief after an effect was seen.
 
@@ -55,9 +54,8 @@ class Belief(NamedTuple):
             rate: :math:`\beta`.
             floor: least noise.
             tails: degrees of freedom of the Student-t distribution.
-            still: noise up to which one looks back no longer than ``discount`` says.
         """
-        kept = 1 - (1 - discount) * haste(self.noise, still).unsqueeze(-2)
+        kept = 1 - (1 - discount) * haste(self.noise, floor).unsqueeze(-2)
         variance, stated = self.noise.square(), std.square()
         miss = (self.forecasts - effect.unsqueeze(-2)).square()
         scaled = miss / (variance + stated).unsqueeze(-2)
@@ -81,16 +79,16 @@ class Belief(NamedTuple):
         return (prior - self.losses).softmax(-2)
 
 
-def haste(noise: Tensor, still: float) -> Tensor:
+def haste(noise: Tensor, floor: float) -> Tensor:
     r"""Return :math:`q = \min\{1, (s_0 / s)^2\}`: how little a row tells in noise, ``(*B, A)``.
 
-    >>> haste(torch.tensor([0.01, 0.04]), still=0.02)
+    >>> haste(torch.tensor([0.02, 0.04]), floor=0.02)
     tensor([1.0000, 0.2500])
     """
-    return (still / noise).square().clamp_max(1.0)
+    return (floor / noise).square().clamp_max(1.0)
 
 
-def prior_of(worth: Tensor, odds: float, noise: Tensor, still: float) -> Tensor:
+def prior_of(worth: Tensor, odds: float, noise: Tensor, floor: float) -> Tensor:
     """Return the prior log-odds of the models, that of *nothing has changed* first, ``(*B, M, A)``.
 
     What one model is worth more than another counts where it is quiet: in noise none is exact.
@@ -99,9 +97,9 @@ def prior_of(worth: Tensor, odds: float, noise: Tensor, still: float) -> Tensor:
         worth: of the others, ``(M - 1,)``.
         odds: of *nothing has changed* against all others together.
         noise: that no model explains, ``(*B, A)``.
-        still: noise up to which ``worth`` counts in full.
+        floor: least noise, in which ``worth`` counts in full.
     """
-    among = worth.unsqueeze(-1) * haste(noise, still).unsqueeze(-2)
+    among = worth.unsqueeze(-1) * haste(noise, floor).unsqueeze(-2)
     return torch.cat([torch.full_like(among[..., :1, :], odds), among.log_softmax(-2)], -2)
 
 

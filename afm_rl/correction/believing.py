@@ -56,9 +56,8 @@ class Believer(PairCorrector):
         discount: of the losses; .95 looks back on twenty steps.
         noise: standard deviation that no model explains, at first, a share of the largest action.
         noise_rate: share of its square that is renewed at every step.
-        least_noise: its floor: effects nearer than that are all the same.
-        still: noise up to which a belief looks back no longer than ``discount`` says, and ``worth``
-            counts in full.
+        least_noise: its floor: effects nearer than that are all the same. In more noise a belief looks
+            back longer.
         quiet: normalised innovation up to which a transition needs no explanation.
     """
 
@@ -73,14 +72,13 @@ class Believer(PairCorrector):
         models: Sequence[str],
         place: int = 0,
         worth: Sequence[float] | None = None,
-        odds: float = 3.0,
+        odds: float = 2.5,
         discount: float = 0.95,
         noise: float = 0.1,
         noise_rate: float = 0.1,
-        least_noise: float = 0.05,
+        least_noise: float = 0.02,
         quiet: float = 1.0,
         tails: float = 1.0,
-        still: float = 0.02,
     ) -> None:
         super().__init__(action_low, action_high, recent, memory, place, quiet)
         self.models = ("nothing has changed", *models)
@@ -92,7 +90,6 @@ class Believer(PairCorrector):
         )
         self.noise = check_number("corrector.noise", noise, low=self.least_noise)
         self.tails = check_number("corrector.tails", tails, low=0.0, open_low=True)
-        self.still = check_number("corrector.still", still, low=0.0, open_low=True)
         among = torch.zeros(len(models)) if worth is None else torch.tensor(worth)
         self.register_buffer("worth", among, persistent=False)
 
@@ -113,14 +110,14 @@ class Believer(PairCorrector):
 
     def prior(self, parts: Fields) -> Tensor:
         """Return the prior log-odds of the models ``(*B, M, A)``."""
-        return prior_of(self.worth.to(parts["noise"]), self.odds, parts["noise"], self.still)
+        return prior_of(self.worth.to(parts["noise"]), self.odds, parts["noise"], self.least_noise)
 
     def look(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts of the memory with the newest pairs and the belief after them."""
         parts = super().look(memory, model)
         newest, size = parts["pairs"][..., -1, :], self.action_size
         _, effect, std, valid, _ = newest.split([size, size, size, 1, self.tail], -1)
-        rules = (self.discount, self.noise_rate, self.least_noise, self.tails, self.still)
+        rules = (self.discount, self.noise_rate, self.least_noise, self.tails)
         belief = self.belief(parts).update(effect, std, valid, self.prior(parts), *rules)
         awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
         begins = (parts["misaligned"] != 1.0) & awake

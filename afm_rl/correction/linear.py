@@ -88,6 +88,27 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
     return Lines(matrix.to(sent), bias.to(sent))
 
 
+def sensor_noise(sent: Tensor, came: Tensor, valid: Tensor, keep: float = 0.7) -> Tensor:
+    r"""Return what errors of the readings add to the next effect, ``(B, 1, A)``.
+
+    An error n of a reading is in two effects, :math:`v_k = u_k + n_{k+1} - n_k`. A policy answers
+    it, too, so it looks like another gain. Exponential smoothing of the misses foresees it
+    (Muth 1960): :math:`-\sum_j \theta^j (v_{k-j} - u_{k-j})`.
+
+    Args:
+        sent: executed actions, the oldest first, ``(B, M, A)``.
+        came: their effects.
+        valid: which rows count, ``(B, M, 1)``, 0 or 1.
+        keep: :math:`\theta`, 1 if nothing but the readings is noisy, 0 if nothing of them is.
+
+    >>> sensor_noise(torch.zeros(1, 2, 1), torch.tensor([[[-0.4], [0.4]]]), torch.ones(1, 2, 1))
+    tensor([[[-0.0840]]])
+    """
+    age = torch.arange(sent.shape[-2], 0, -1, device=sent.device)
+    weight = valid * (keep**age).unsqueeze(-1).to(sent)
+    return (weight * (sent - came)).sum(-2, keepdim=True)
+
+
 def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     r"""Return gain and offset ``(B, A)`` of :math:`v_k = b u_k + c u_{k-1} + a v_{k-1} + d`.
 
