@@ -13,7 +13,18 @@ from torch import Tensor
 from afm_rl.correction.fits import LEAST_GAIN, PRIOR, not_zero
 from afm_rl.spaces.small_matrices import solve_positive
 
-LINEAR = ("offset_1", "offset_3", "gain_3", "gain_12", "gain", "line_12", "line", "drift", "arx", "affine")
+LINEAR = (
+    "offset_1",
+    "offset_3",
+    "gain_3",
+    "gain_12",
+    "gain",
+    "line_12",
+    "line",
+    "drift",
+    "arx",
+    "affine",
+)
 """Offset at a gain of one; gain; gain and offset (*line*); gain and the newest offset (*drift*);
 what goes on from row to row (*arx*); affine map. Of the newest rows, or of all pairs."""
 WINDOWS = (1, 3, 12, 0)  # rows; 0: all
