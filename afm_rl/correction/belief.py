@@ -37,13 +37,14 @@ class Belief(NamedTuple):
 
         .. math::
 
-            l_h &\leftarrow \big(1 - (1 - \alpha)\,q\big)\,l_h + \log\Big(1 + \frac{(v - T_h)^2}{s^2 + \sigma^2}\Big) \\
+            l_h &\leftarrow \big(1 - (1 - \alpha)\,q\big)\,l_h
+            + \log\Big(1 + \frac{(v - T_h)^2}{s^2 + \sigma^2}\Big) \\
             s^2 &\leftarrow s^2 + \beta\,k\,\big(\min\{(v - T)^2 - \sigma^2, 3 s^2\} - s^2\big),
             \qquad k = \frac{s^2}{s^2 + \sigma^2}
 
         with the forecasts :math:`T_h`, that of the model that is believed most, T, and no noise
-        below ``floor``. In noise one has to look back longer, by the :func:`haste` q. An effect of which the transition showed nothing has a large
-        :math:`\sigma` and changes little.
+        below ``floor``. In noise one has to look back longer, by the :func:`haste` q. An effect of
+        which the transition showed nothing has a large :math:`\sigma` and changes little.
 
         Args:
             effect: v, ``(*B, A)``.

@@ -56,8 +56,8 @@ class Believer(PairCorrector):
         discount: of the losses; .95 looks back on twenty steps.
         noise: standard deviation that no model explains, at first, a share of the largest action.
         noise_rate: share of its square that is renewed at every step.
-        least_noise: its floor: effects nearer than that are all the same. In more noise a belief looks
-            back longer.
+        least_noise: its floor: effects nearer than that are all the same. In more noise a belief
+            looks back longer.
         quiet: normalised innovation up to which a transition needs no explanation.
     """
 
