@@ -11,6 +11,7 @@ from torch import Tensor
 
 from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.correction.base import Fields
+from afm_rl.correction.belief import Belief
 from afm_rl.correction.linear import LINEAR
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.pairs import Answer, PairCorrector
@@ -107,7 +108,11 @@ class ActionFlow(PairCorrector):
         models = [*names, *LINEAR, *(f"only {name}" for name in late_ones(names))]
         late = late_ones(names)
         worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * len(late)
-        super().__init__(action_low, action_high, rows, memory, models, len(place), worth, **rules)
+        delays = [READINGS[name].delay for name in names] + [0] * len(LINEAR)
+        delays += [READINGS[name].delay for name in late]
+        super().__init__(
+            action_low, action_high, rows, memory, models, len(place), worth, delays, **rules
+        )
         self.readings, self.place = names, place
         self.place_scale = check_number(
             "corrector.place_scale", place_scale, low=0.0, open_low=True
@@ -126,6 +131,7 @@ class ActionFlow(PairCorrector):
             names,
             rows,
             self.prior,
+            self.delays,
             likely,
             samples,
             source_std,
@@ -151,14 +157,16 @@ class ActionFlow(PairCorrector):
         """Ask the :class:`~afm_rl.correction.tick.Tick`."""
         return self.tick(*self._read(parts), *(x.to(self.tick.scale) for x in (planned, box)))
 
-    def foresee(self, parts: Fields, executed: Tensor) -> Tensor:
-        """Return the forecasts of all models."""
-        pairs, _, noise, place = self._read(parts)
-        lead = pairs.shape[:-2]
-        flat = [part.reshape(math.prod(lead), *part.shape[len(lead) :]) for part in (pairs, noise, place)]
-        unit = self.normalise(executed).to(pairs).reshape(-1, self.action_size)
-        forecasts = self.tick.forecast(*self.tick.read(*flat), flat[0], unit)
-        return forecasts.view(*lead, *forecasts.shape[1:]).to(executed)
+    def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the forecasts of all models, and what is under way."""
+        lead, given = executed.shape[:-1], [*self._read(parts), self.normalise(executed)]
+        rows = math.prod(lead)
+        pairs, losses, noise, place, unit = (x.reshape(rows, *x.shape[len(lead) :]) for x in given)
+        weights = Belief(losses, losses, noise).weights(self.tick.prior)
+        read = self.tick.read(pairs, noise, place)
+        found = self.tick.forecast(*read, weights, pairs, unit.to(pairs))
+        forecasts, late = (x.view(*lead, *x.shape[1:]).to(executed) for x in found)
+        return forecasts, late
 
     def _read(self, parts: Fields) -> list[Tensor]:
         given = [parts[name] for name in ("pairs", "losses", "noise")]

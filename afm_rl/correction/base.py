@@ -173,6 +173,15 @@ class Corrector(nn.Module, ABC):
         )
         return state, planned, executed
 
+    def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the state, the newest commands' effects, and how many of them are to come.
+
+        Returns:
+            ``(*B, S)``; ``(*B, K, A)``, in units of the action, the oldest first; ``(*B)``.
+        """
+        state, planned, _ = self.latest(memory)
+        return state, planned.unsqueeze(-2)[..., :0, :], torch.zeros_like(state[..., 0]).long()
+
     def executing(
         self,
         memory: Tensor,

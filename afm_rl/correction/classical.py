@@ -42,7 +42,7 @@ class ClassicalCorrector(PairCorrector):
         corrects = weights[..., 1, :] > weights[..., 0, :]
         unit = self.normalise(planned)
         found = torch.where(corrects, self.inverse(self.rows(parts), unit), unit)
-        forecasts = self.foresee(parts, self.denormalise(found))
+        forecasts, late = self.foresee(parts, self.denormalise(found))
         predicted = torch.where(corrects, forecasts[..., 1, :], unit)
         return Answer(
             self.denormalise(found),
@@ -51,12 +51,14 @@ class ClassicalCorrector(PairCorrector):
             box,
             corrects.any(-1),
             forecasts,
+            late,
         )
 
-    def foresee(self, parts: Fields, executed: Tensor) -> Tensor:
-        """Return the effects by both models."""
+    def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the effects by both models; nothing is late."""
         unit = self.normalise(executed)
-        return torch.stack([unit, self.effect(self.rows(parts), unit)], -2)
+        forecasts = torch.stack([unit, self.effect(self.rows(parts), unit)], -2)
+        return forecasts, parts["under_way"]
 
     @abstractmethod
     def inverse(self, rows: Rows, planned: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.compiling.tracing import all_hold
+from afm_rl.correction.arrival import steps_late
 from afm_rl.correction.base import Correction, Corrector, Fields, put, rows_of
 from afm_rl.correction.belief import Belief, mean_and_std
 from afm_rl.correction.experts import LIMIT
@@ -36,6 +37,8 @@ class Answer(NamedTuple):
     forecasts: Tensor
     """The effects that the models expect of what acts now, shares of the largest action,
     ``(B, M, A)``; the first is that of *nothing has changed*."""
+    under_way: Tensor
+    """The effects that the newest K commands have or will have, likewise, ``(B, K, A)``."""
 
 
 class PairCorrector(Corrector):
@@ -55,6 +58,7 @@ class PairCorrector(Corrector):
         models: names of the models but the first.
         place: number of state coordinates that are remembered with a pair.
         worth: prior log-odds of these models among themselves; all alike if None.
+        delays: steps from a command to its effect by these models; none late if None.
         odds: prior log-odds of *nothing has changed* against all other models together: one
             surprise that its Student-t distribution gives e^-odds is no reason to act.
         discount: of the losses; .95 looks back on twenty steps.
@@ -65,7 +69,9 @@ class PairCorrector(Corrector):
     """
 
     is_valid: Tensor
+    is_command: Tensor
     prior: Tensor
+    delays: Tensor
 
     def __init__(
         self,
@@ -76,6 +82,7 @@ class PairCorrector(Corrector):
         models: Sequence[str],
         place: int = 0,
         worth: Sequence[float] | None = None,
+        delays: Sequence[int] | None = None,
         odds: float = 3.0,
         discount: float = 0.95,
         noise: float = 0.1,
@@ -99,9 +106,14 @@ class PairCorrector(Corrector):
         self.pair_size, self.tail = 3 * self.action_size + 2 + place, 1 + place
         is_valid = torch.arange(self.pair_size) == 3 * self.action_size
         self.register_buffer("is_valid", is_valid, persistent=False)
+        is_command = torch.arange(self.pair_size) < self.action_size
+        self.register_buffer("is_command", is_command, persistent=False)
         among = torch.zeros(len(models)) if worth is None else torch.tensor(worth)
         prior = torch.cat([torch.tensor([self.odds]), among.log_softmax(0)]).unsqueeze(-1)
         self.register_buffer("prior", prior, persistent=False)
+        late = torch.tensor([0, *(delays or [0] * len(models))])
+        self.register_buffer("delays", late, persistent=False)
+        self.most_late = max(late.tolist())
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the pairs: u, its effect, std, valid, innovation, place."""
@@ -112,6 +124,7 @@ class PairCorrector(Corrector):
             "acting": (size,),
             "losses": (count, size),
             "forecasts": (count, size),
+            "under_way": (self.most_late, size),
             "noise": (size,),
         }
 
@@ -157,7 +170,7 @@ class PairCorrector(Corrector):
             -1,
         )
         sound = (valid == 1.0) & rows.isfinite().all(-1, keepdim=True)
-        rows = torch.where(sound, rows, 0.0)
+        rows = torch.where(sound | self.is_command, rows, 0.0)
         _, effect, std, came, _ = rows[..., -1, :].split(
             [size, size, size, 1, self.pair_size - 3 * size - 1], -1
         )
@@ -179,7 +192,13 @@ class PairCorrector(Corrector):
         losses = parts["losses"][..., :1, :].expand_as(parts["losses"])
         forecasts = self.normalise(action).unsqueeze(-2).expand_as(losses)
         alike = {"planned": action, "executed": action, "acting": action}
-        return {**parts, **alike, "losses": losses, "forecasts": forecasts}
+        alike |= {"losses": losses, "forecasts": forecasts}
+        return {**parts, **alike, "under_way": self.newest(parts, self.normalise(action))}
+
+    def newest(self, parts: Fields, unit: Tensor) -> Tensor:
+        """Return the newest commands with the present one ``(*B, A)``, ``(*B, K, A)``."""
+        sent = parts["pairs"][..., self.memory - self.most_late + 1 :, : self.action_size]
+        return torch.cat([sent, unit.unsqueeze(-2)], -2)[..., -self.most_late :, :]
 
     def watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> tuple[Tensor, ...]:
         """Return the memory with the newest pair, and what it is if the plan is executed.
@@ -201,7 +220,7 @@ class PairCorrector(Corrector):
             box: lowest and highest action, ``(B, 2, A)``.
 
         Returns:
-            The next memory, and the parts of an :class:`Answer` but the forecasts.
+            The next memory, and the parts of an :class:`Answer` but the last two.
         """
         parts = self.unpack(memory, self.states_in(memory))
         answer = self.answer(parts, planned, box)
@@ -209,7 +228,8 @@ class PairCorrector(Corrector):
         acting = self.denormalise((weights * answer.forecasts.to(memory)).sum(-2))
         parts |= {"planned": planned, "executed": answer.executed.to(memory), "acting": acting}
         parts["forecasts"] = answer.forecasts.to(memory)
-        return (self.pack(parts), *answer[:-1])
+        parts["under_way"] = answer.under_way.to(memory)
+        return (self.pack(parts), *answer[:-2])
 
     def correct(
         self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
@@ -223,11 +243,18 @@ class PairCorrector(Corrector):
                 return idle, found
             use = rows_of(awake)
             after, *answer = self._decide(memory[use], planned[use], box[use])
-            given = dict(zip(Answer._fields[:-1], answer, strict=True))
+            given = dict(zip(Answer._fields[:-2], answer, strict=True))
             given["misaligned"] = given.pop("corrects")
             now = found._asdict()
             changed = {name: put(now[name], awake, use, part) for name, part in given.items()}
             return put(idle, awake, use, after), found._replace(**changed)
+
+    def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the state, the newest commands' effects, and how many of them are to come."""
+        parts = self.unpack(memory, self.states_in(memory))
+        weights = self.belief(parts).weights(self.prior.to(memory))
+        steps = steps_late(weights, self.delays)
+        return parts["state"], self.denormalise(parts["under_way"]), steps
 
     def noise_in(self, memory: Tensor) -> Tensor:
         """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
@@ -277,12 +304,14 @@ class PairCorrector(Corrector):
         """Return the memory with forecasts of what is executed, where models are to be asked."""
         parts = self.unpack(memory, self.states_in(memory))
         awake = parts["misaligned"].squeeze(-1) == 1.0
-        calm = self.asleep(parts, executed)["forecasts"]
+        calm = self.asleep(parts, executed)
+        found = [calm[name] for name in ("forecasts", "under_way")]
         if not all_hold(~awake):
             use = rows_of(awake)
             asked = {name: part[use] for name, part in parts.items()}
-            calm = put(calm, awake, use, self.foresee(asked, executed[use]))
-        return self.pack({**parts, "forecasts": calm})
+            seen = self.foresee(asked, executed[use])
+            found = [put(*pair) for pair in ((x, awake, use, y) for x, y in zip(found, seen))]
+        return self.pack({**parts, "forecasts": found[0], "under_way": found[1]})
 
     def _watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
         return self.watch(memory, planned, model)
@@ -295,5 +324,5 @@ class PairCorrector(Corrector):
         """Return what to execute for plans ``(*B, A)``, given the parts of memories."""
 
     @abstractmethod
-    def foresee(self, parts: Fields, executed: Tensor) -> Tensor:
-        """Return the forecasts ``(*B, M, A)`` of what acts now if ``executed`` is executed."""
+    def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return forecasts ``(*B, M, A)`` and what is under way if ``executed`` is executed."""

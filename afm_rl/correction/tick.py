@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.correction.achievable import MODES, attainable, extend
+from afm_rl.correction.arrival import effects_of
 from afm_rl.correction.belief import Belief, mean_and_std
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.linear import LINEAR, Lines, fit_lines
@@ -45,6 +46,7 @@ class Tick(nn.Module):
     probes: Tensor
     prior: Tensor
     late: Tensor
+    delays: Tensor
     rows_acting: Tensor
 
     def __init__(
@@ -54,6 +56,7 @@ class Tick(nn.Module):
         readings: Sequence[str],
         rows: int,
         prior: Tensor,
+        delays: Tensor,
         likely: int,
         samples: int,
         source_std: float,
@@ -70,12 +73,14 @@ class Tick(nn.Module):
         self.varied = sum(r.varied for r in chosen)
         self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings))]
         self.likely = min(check_count("corrector.likely", likely), len(chosen))
+        self.most_late = max(delays.tolist())
         late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "prior": prior,
+            "delays": delays,
             "late": torch.tensor(late, dtype=torch.long),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
@@ -113,7 +118,7 @@ class Tick(nn.Module):
         action = self.decide(models, proposals, expected, wanted)
         action = torch.where(action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
-        forecasts = self.forecast(encoded, lines, pairs, action)
+        forecasts, under_way = self.forecast(encoded, lines, weights, pairs, action)
         return Answer(
             action * self.scale,
             predicted * self.scale,
@@ -121,6 +126,7 @@ class Tick(nn.Module):
             bounds * self.scale,
             (weights.argmax(1) > 0).any(-1),
             forecasts,
+            under_way,
         )
 
     def read(self, pairs: Tensor, noise: Tensor, place: Tensor) -> tuple[Encoded, Lines]:
@@ -207,14 +213,28 @@ class Tick(nn.Module):
         better = worth <= cost.gather(1, joint).sum(-1, keepdim=True) + 1e-9
         return torch.where(better, mixed, whole).squeeze(1)
 
-    def forecast(self, encoded: Encoded, lines: Lines, pairs: Tensor, executed: Tensor) -> Tensor:
-        """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now."""
+    def forecast(
+        self, encoded: Encoded, lines: Lines, weights: Tensor, pairs: Tensor, executed: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now.
+
+        And those ``(B, K, A)`` that the newest commands have or will have, by the models that are
+        as late as is most probable.
+        """
         size, now = len(self.scale), executed.unsqueeze(1)
         sent = torch.cat([pairs[..., :size], now], -2)
         acted = self.rows_acting @ sent[:, -self.rows_acting.shape[-1] :]  # (B, R, A)
-        read = self.network.effect(encoded, acted.reshape(-1, 1, size)).view_as(acted)
-        linear = lines.effect(now).squeeze(2)
-        return torch.cat([now, read, linear, acted[:, self.late]], 1)
+        newest = sent[:, sent.shape[1] - self.most_late :]
+        asked = torch.cat(
+            [acted.unsqueeze(2), newest.unsqueeze(1).expand(-1, acted.shape[1], -1, -1)], 2
+        )
+        found = self.network.effect(encoded, asked.flatten(0, 1)).view_as(asked)
+        read, static = found[:, :, 0], found[:, :, 1:]
+        linear = lines.effect(torch.cat([now, newest], 1))
+        nominal = newest.unsqueeze(1)
+        every = [nominal, static, linear[:, :, 1:], nominal.expand(-1, len(self.late), -1, -1)]
+        under_way = effects_of(torch.cat(every, 1), weights, self.delays)
+        return torch.cat([now, read, linear[:, :, 0], acted[:, self.late]], 1), under_way
 
 
 def points_of(count: int, size: int) -> Tensor:

@@ -16,17 +16,21 @@ from torch import Tensor
 from torchrl.data import Bounded
 
 from afm_rl.correction import Corrector
+from afm_rl.correction.arrival import arrival
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.diagnosis import explain
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
-from afm_rl.errors import ConfigurationError, check_flag
+from afm_rl.errors import ConfigurationError, check_choice, check_flag
 from afm_rl.faults import fault_of, safe_action
 from afm_rl.learning.watching import Watching
 from afm_rl.spaces.manifold import Manifold
+from afm_rl.transforms.arrival import simulated_observations, warn_unseen
 from afm_rl.transforms.memory import begin, computable, correct, corrector_for, observe
 
 Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str
 State = Callable[[Any, Any], Any]
+Observe = Callable[[np.ndarray], Any]
+LATE = ("predict", "leave")
 AS_EXPECTED = "as the model expects"
 SHOWN = {
     "planned": "planned_action",
@@ -49,6 +53,8 @@ class CorrectionLoop:
         corrector: the correction.
         enabled: False to watch only.
         source: environment, or vector of environments, that may have a simulation.
+        late: see :class:`ActionFlowWrapper`, as the next one.
+        observe: what is observed in states.
     """
 
     def __init__(
@@ -60,7 +66,10 @@ class CorrectionLoop:
         corrector: Corrector | None = None,
         enabled: bool = True,
         source: Any = None,
+        late: str = "predict",
+        observe: Observe | None = None,
     ) -> None:
+        self.late = check_choice("wrapper.late", late, LATE)
         if not isinstance(actions, Box) or len(actions.shape) != 1 or actions.dtype.kind != "f":
             raise ConfigurationError(
                 f"ActionFlowWrapper: action_space={actions}: expected a Box of one vector of real "
@@ -79,6 +88,11 @@ class CorrectionLoop:
                 "or a DynamicsModel"
             )
         self.corrector: Any = corrector
+        if observe is None and state is None and isinstance(self.model, MuJoCoDynamics):
+            observe = simulated_observations(source, observations)
+        elif observe is None and state is None:
+            observe = _states
+        self.seen_in: Observe | None = observe
         if state is None and isinstance(self.model, MuJoCoDynamics):
             state = _vector_state if isinstance(source, VectorEnv) else _env_state
         if state is None and not (isinstance(observations, Box) and len(observations.shape) == 1):
@@ -179,6 +193,29 @@ class CorrectionLoop:
             self.begin(states, fresh)
             self.told = told
 
+    @torch.no_grad()
+    def at_arrival(self, observations: Any, over: np.ndarray | None = None) -> Any:
+        """Return the observations ``(N, ...)`` in the states in which the next commands act.
+
+        Args:
+            observations: what was measured.
+            over: where episodes have ended, and nothing is predicted, ``(N,)``.
+        """
+        if self.late == "leave" or not self.enabled or self.watching and self.learning:
+            return observations
+        memory = self.entries.get("memory")
+        states, steps = arrival(self.corrector, memory, self.model)
+        rows = (steps > 0).numpy() & (states != self.states).any(-1).numpy()
+        rows &= np.ones_like(rows) if over is None else ~over
+        if not rows.any():
+            return observations
+        if self.seen_in is None:
+            warn_unseen()
+            return observations
+        found = np.array(observations)
+        found[rows] = self.seen_in(states.numpy())[rows]
+        return found
+
     def diagnosis(self, row: int) -> str:
         """Say in words what the pairs that an environment remembers show of its actuators."""
         corrects = self.entries is not None and bool(self.entries.get("misaligned")[row])
@@ -221,6 +258,10 @@ def as_numbers(name: str, given: Any, shape: Sequence[int] | None) -> Tensor:
 
 def _observed(env: Any, observation: Any) -> Any:
     return observation
+
+
+def _states(states: np.ndarray) -> np.ndarray:
+    return states
 
 
 def _env_state(env: Any, observation: Any) -> np.ndarray:

@@ -1,0 +1,82 @@
+r"""Where a robot will be when its next command acts.
+
+Commands that act late cannot be undone by others. But policy or planner can be asked about the
+state in which their command will act (Smith 1957, Chem. Eng. Progress 53): the model is rolled
+through the effects of the commands that are still under way.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from afm_rl.compiling.tracing import all_hold
+from afm_rl.dynamics import DynamicsModel
+
+if TYPE_CHECKING:
+    from afm_rl.correction.base import Corrector
+
+LEAST = 1e-3  # probability that every delay keeps on every axis: no axis decides alone
+
+
+def steps_late(weights: Tensor, delays: Tensor) -> Tensor:
+    """Return the most probable delay of commands in steps, ``(*B)``.
+
+    One for all axes: an axis whose commands hardly change shows none.
+
+    Args:
+        weights: probabilities of the models on every axis, ``(*B, M, A)``.
+        delays: of the models, ``(M,)``.
+
+    >>> weights = torch.tensor([[0.9, 0.5], [0.1, 0.5], [0.0, 0.0]])
+    >>> steps_late(weights, torch.tensor([0, 1, 2])), steps_late(weights, torch.tensor([1, 0, 2]))
+    (tensor(0), tensor(1))
+    """
+    found = [(weights * (delays == k).unsqueeze(-1)).sum(-2) for k in range(_most(delays) + 1)]
+    return torch.stack(found, -1).clamp_min(LEAST).log().sum(-2).argmax(-1)
+
+
+def effects_of(models: Tensor, weights: Tensor, delays: Tensor) -> Tensor:
+    """Return the effects of commands ``(*B, K, A)`` by the models with the most probable delay.
+
+    Args:
+        models: their effects by every model, ``(*B, M, K, A)``.
+        weights: probabilities of the models, ``(*B, M, A)``.
+        delays: of the models, ``(M,)``.
+    """
+    late = steps_late(weights, delays)[..., None, None]
+    among = torch.where(delays.unsqueeze(-1) == late, weights.clamp_min(LEAST**3), 0.0)
+    among = among / among.sum(-2, keepdim=True)
+    return (among.unsqueeze(-2) * models).sum(-3)
+
+
+def arrival(corrector: Corrector, memory: Tensor, model: DynamicsModel) -> tuple[Tensor, Tensor]:
+    """Return the state ``(*B, S)`` in which the next command will act, and in how many steps.
+
+    The present state where no command is late, or where the model leads to no number.
+
+    Args:
+        corrector: whose memory it is.
+        memory: up to the present state, ``(*B, P)``.
+        model: the dynamics model as it is now.
+    """
+    with torch.no_grad():
+        state, effects, steps = corrector.under_way(memory)
+        if all_hold(steps == 0):
+            return state, steps
+        most = int(steps.max()) if steps.is_cpu else effects.shape[-2]
+        # Every mission's commands under way, the oldest first; what follows them is not looked at.
+        ages = effects.shape[-2] - steps.unsqueeze(-1) + torch.arange(most, device=steps.device)
+        ages = ages.clamp_max(effects.shape[-2] - 1).unsqueeze(-1)
+        plan = effects.gather(-2, ages.expand(*ages.shape[:-1], effects.shape[-1]))
+        states = model.rollout(state, plan.unsqueeze(-3)).squeeze(-3)
+        last = (steps - 1).clamp_min(0)[..., None, None].expand(*steps.shape, 1, state.shape[-1])
+        found = states.gather(-2, last).squeeze(-2).to(state)
+        late = (steps > 0).unsqueeze(-1) & found.isfinite().all(-1, keepdim=True)
+        return torch.where(late, found, state), steps
+
+
+def _most(delays: Tensor) -> int:
+    return max(delays.tolist())
