@@ -12,42 +12,51 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from afm_rl.compiling.tracing import all_hold
+from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.dynamics import DynamicsModel
 
 if TYPE_CHECKING:
     from afm_rl.correction.base import Corrector
 
-LEAST = 1e-3  # probability that every delay keeps on every axis: no axis decides alone
+LEAST = 1e-3  # share of the best that every delay keeps on every axis: none decides alone
 
 
-def steps_late(weights: Tensor, delays: Tensor) -> Tensor:
-    """Return the most probable delay of commands in steps, ``(*B)``.
+def steps_late(weights: Tensor, prior: Tensor, delays: Tensor) -> Tensor:
+    r"""Return the most probable delay of commands in steps, ``(*B)``.
 
-    One for all axes: an axis whose commands hardly change shows none.
+    .. math:: k = \operatorname{argmax}_k \log p_k + \sum_a \log\frac{p_{ka}}{p_k}
+
+    One for all axes, from the evidence of all: an axis whose commands hardly change shows none.
 
     Args:
         weights: probabilities of the models on every axis, ``(*B, M, A)``.
+        prior: log-odds of the models, ``(M, 1)``.
         delays: of the models, ``(M,)``.
 
-    >>> weights = torch.tensor([[0.9, 0.5], [0.1, 0.5], [0.0, 0.0]])
-    >>> steps_late(weights, torch.tensor([0, 1, 2])), steps_late(weights, torch.tensor([1, 0, 2]))
-    (tensor(0), tensor(1))
+    >>> weights = torch.tensor([[0.8, 0.1], [0.1, 0.8], [0.1, 0.1]])
+    >>> even = torch.zeros(3, 1)
+    >>> steps_late(weights, even, torch.tensor([0, 1, 1])), steps_late(weights, even, torch.arange(3))
+    (tensor(1), tensor(0))
     """
-    found = [(weights * (delays == k).unsqueeze(-1)).sum(-2) for k in range(_most(delays) + 1)]
-    return torch.stack(found, -1).clamp_min(LEAST).log().sum(-2).argmax(-1)
+    most = max(delays.tolist())
+    among = torch.stack([delays == k for k in range(most + 1)]).to(weights)  # (K, M)
+    first = among @ prior.to(weights).softmax(-2)
+    evidence = among @ weights / first.clamp_min(1e-30)
+    evidence = (evidence / evidence.amax(-2, keepdim=True)).clamp_min(LEAST)
+    return (first.log() + evidence.log().sum(-1, keepdim=True)).squeeze(-1).argmax(-1)
 
 
-def effects_of(models: Tensor, weights: Tensor, delays: Tensor) -> Tensor:
-    """Return the effects of commands ``(*B, K, A)`` by the models with the most probable delay.
+def effects_of(models: Tensor, weights: Tensor, late: Tensor, delays: Tensor) -> Tensor:
+    """Return the effects ``(*B, K, A)`` of commands by those models that are so late.
 
     Args:
         models: their effects by every model, ``(*B, M, K, A)``.
         weights: probabilities of the models, ``(*B, M, A)``.
+        late: steps, ``(*B)``.
         delays: of the models, ``(M,)``.
     """
-    late = steps_late(weights, delays)[..., None, None]
-    among = torch.where(delays.unsqueeze(-1) == late, weights.clamp_min(LEAST**3), 0.0)
+    so_late = delays.unsqueeze(-1) == late[..., None, None]
+    among = torch.where(so_late, weights.clamp_min(1e-9), 0.0)
     among = among / among.sum(-2, keepdim=True)
     return (among.unsqueeze(-2) * models).sum(-3)
 
@@ -66,7 +75,7 @@ def arrival(corrector: Corrector, memory: Tensor, model: DynamicsModel) -> tuple
         state, effects, steps = corrector.under_way(memory)
         if all_hold(steps == 0):
             return state, steps
-        most = int(steps.max()) if steps.is_cpu else effects.shape[-2]
+        most = int(steps.max()) if may_look(steps) else effects.shape[-2]
         # Every mission's commands under way, the oldest first; what follows them is not looked at.
         ages = effects.shape[-2] - steps.unsqueeze(-1) + torch.arange(most, device=steps.device)
         ages = ages.clamp_max(effects.shape[-2] - 1).unsqueeze(-1)
@@ -76,7 +85,3 @@ def arrival(corrector: Corrector, memory: Tensor, model: DynamicsModel) -> tuple
         found = states.gather(-2, last).squeeze(-2).to(state)
         late = (steps > 0).unsqueeze(-1) & found.isfinite().all(-1, keepdim=True)
         return torch.where(late, found, state), steps
-
-
-def _most(delays: Tensor) -> int:
-    return max(delays.tolist())

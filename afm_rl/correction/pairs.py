@@ -253,7 +253,7 @@ class PairCorrector(Corrector):
         """Return the state, the newest commands' effects, and how many of them are to come."""
         parts = self.unpack(memory, self.states_in(memory))
         weights = self.belief(parts).weights(self.prior.to(memory))
-        steps = steps_late(weights, self.delays)
+        steps = steps_late(weights, self.prior, self.delays)
         return parts["state"], self.denormalise(parts["under_way"]), steps
 
     def noise_in(self, memory: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.correction.achievable import MODES, attainable, extend
-from afm_rl.correction.arrival import effects_of
+from afm_rl.correction.arrival import effects_of, steps_late
 from afm_rl.correction.belief import Belief, mean_and_std
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.linear import LINEAR, Lines, fit_lines
@@ -233,7 +233,8 @@ class Tick(nn.Module):
         linear = lines.effect(torch.cat([now, newest], 1))
         nominal = newest.unsqueeze(1)
         every = [nominal, static, linear[:, :, 1:], nominal.expand(-1, len(self.late), -1, -1)]
-        under_way = effects_of(torch.cat(every, 1), weights, self.delays)
+        late = steps_late(weights, self.prior, self.delays)
+        under_way = effects_of(torch.cat(every, 1), weights, late, self.delays)
         return torch.cat([now, read, linear[:, :, 0], acted[:, self.late]], 1), under_way
 
 

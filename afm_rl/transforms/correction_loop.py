@@ -25,12 +25,11 @@ from afm_rl.faults import fault_of, safe_action
 from afm_rl.learning.watching import Watching
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms.arrival import simulated_observations, warn_unseen
-from afm_rl.transforms.memory import begin, computable, correct, corrector_for, observe
+from afm_rl.transforms.memory import LATE, begin, computable, correct, corrector_for, observe
 
 Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str
 State = Callable[[Any, Any], Any]
 Observe = Callable[[np.ndarray], Any]
-LATE = ("predict", "leave")
 AS_EXPECTED = "as the model expects"
 SHOWN = {
     "planned": "planned_action",

@@ -16,6 +16,9 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.faults import check_numbers, safe_action
 
+LATE = ("predict", "leave")
+"""What a policy is shown while its actions act late: the state at arrival, or the measured one."""
+
 
 def corrector_for(
     owner: str,
