@@ -155,11 +155,14 @@ class ActionFlow(PairCorrector):
 
     def answer(self, parts: Fields, planned: Tensor, box: Tensor) -> Answer:
         """Ask the :class:`~afm_rl.correction.tick.Tick`."""
-        return self.tick(*self._read(parts), *(x.to(self.tick.scale) for x in (planned, box)))
+        sent = self.normalise(parts["sent"])
+        given = (*self._read(parts), sent, planned, box)
+        return self.tick(*(x.to(self.tick.scale) for x in given))
 
     def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
         """Return the forecasts of all models, and what is under way."""
-        lead, given = executed.shape[:-1], [*self._read(parts), self.normalise(executed)]
+        ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
+        lead, given = executed.shape[:-1], [*self._read(parts), self.normalise(ahead)]
         rows = math.prod(lead)
         pairs, losses, noise, place, unit = (x.reshape(rows, *x.shape[len(lead) :]) for x in given)
         weights = Belief(losses, losses, noise).weights(self.tick.prior)

@@ -35,8 +35,8 @@ def steps_late(weights: Tensor, prior: Tensor, delays: Tensor) -> Tensor:
 
     >>> weights = torch.tensor([[0.8, 0.1], [0.1, 0.8], [0.1, 0.1]])
     >>> even = torch.zeros(3, 1)
-    >>> steps_late(weights, even, torch.tensor([0, 1, 1])), steps_late(weights, even, torch.arange(3))
-    (tensor(1), tensor(0))
+    >>> steps_late(weights, even, torch.tensor([0, 1, 1]))
+    tensor(1)
     """
     most = max(delays.tolist())
     among = torch.stack([delays == k for k in range(most + 1)]).to(weights)  # (K, M)

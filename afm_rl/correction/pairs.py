@@ -90,8 +90,9 @@ class PairCorrector(Corrector):
         least_noise: float = 0.05,
         quiet: float = 1.0,
         tails: float = 1.0,
+        delay: int | Sequence[int] = 0,
     ) -> None:
-        super().__init__(action_low, action_high, recent)
+        super().__init__(action_low, action_high, recent, delay)
         self.memory = max(check_count("corrector.memory", memory), recent)
         self.models = ("nothing has changed", *models)
         self.odds = check_number("corrector.odds", odds, low=0.0)
@@ -124,7 +125,7 @@ class PairCorrector(Corrector):
             "acting": (size,),
             "losses": (count, size),
             "forecasts": (count, size),
-            "under_way": (self.most_late, size),
+            "under_way": (self.most_late + self.delay, size),
             "noise": (size,),
         }
 
@@ -190,15 +191,22 @@ class PairCorrector(Corrector):
         All models predict its effect alike, and are believed alike.
         """
         losses = parts["losses"][..., :1, :].expand_as(parts["losses"])
-        forecasts = self.normalise(action).unsqueeze(-2).expand_as(losses)
-        alike = {"planned": action, "executed": action, "acting": action}
+        commands = self.commands(parts, action)
+        acts = commands[..., -1 - self.delay, :]
+        forecasts = acts.unsqueeze(-2).expand_as(losses)
+        alike = {"planned": action, "executed": action, "acting": self.denormalise(acts)}
         alike |= {"losses": losses, "forecasts": forecasts}
-        return {**parts, **alike, "under_way": self.newest(parts, self.normalise(action))}
+        newest = commands.shape[-2] - parts["under_way"].shape[-2]
+        return {**parts, **alike, "under_way": commands[..., newest:, :]}
 
-    def newest(self, parts: Fields, unit: Tensor) -> Tensor:
-        """Return the newest commands with the present one ``(*B, A)``, ``(*B, K, A)``."""
-        sent = parts["pairs"][..., self.memory - self.most_late + 1 :, : self.action_size]
-        return torch.cat([sent, unit.unsqueeze(-2)], -2)[..., -self.most_late :, :]
+    def commands(self, parts: Fields, executed: Tensor) -> Tensor:
+        """Return all commands up to the present one, ``(*B, M + D + 1, A)``, in u.
+
+        Those that have acted, those that are known to wait, and ``executed`` ``(*B, A)``.
+        """
+        acted = parts["pairs"][..., : self.action_size]
+        ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
+        return torch.cat([acted, self.normalise(ahead)], -2)
 
     def watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> tuple[Tensor, ...]:
         """Return the memory with the newest pair, and what it is if the plan is executed.
@@ -254,7 +262,7 @@ class PairCorrector(Corrector):
         parts = self.unpack(memory, self.states_in(memory))
         weights = self.belief(parts).weights(self.prior.to(memory))
         steps = steps_late(weights, self.prior, self.delays)
-        return parts["state"], self.denormalise(parts["under_way"]), steps
+        return parts["state"], self.denormalise(parts["under_way"]), steps + self.delay
 
     def noise_in(self, memory: Tensor) -> Tensor:
         """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
@@ -296,7 +304,9 @@ class PairCorrector(Corrector):
     def reported(self, memory: Tensor, given: Tensor) -> Tensor:
         """Return the memory with forecasts moved by what was given more than sent."""
         _, planned, sent = self.latest(memory)
-        parts = self.unpack(super().executing(memory, planned, given), self.states_in(memory))
+        parts = self.unpack(super().reported(memory, given), self.states_in(memory))
+        if self.delay:
+            sent = self.unpack(memory, self.states_in(memory))["sent"][..., 0, :]
         more = self.normalise(given - sent).unsqueeze(-2)
         return self.pack({**parts, "forecasts": parts["forecasts"] + more})
 
@@ -304,13 +314,14 @@ class PairCorrector(Corrector):
         """Return the memory with forecasts of what is executed, where models are to be asked."""
         parts = self.unpack(memory, self.states_in(memory))
         awake = parts["misaligned"].squeeze(-1) == 1.0
-        calm = self.asleep(parts, executed)
-        found = [calm[name] for name in ("forecasts", "under_way")]
+        idle = self.asleep(parts, executed)
+        found = [idle[name] for name in ("forecasts", "under_way")]
         if not all_hold(~awake):
             use = rows_of(awake)
             asked = {name: part[use] for name, part in parts.items()}
             seen = self.foresee(asked, executed[use])
-            found = [put(*pair) for pair in ((x, awake, use, y) for x, y in zip(found, seen))]
+            pairs = zip(found, seen, strict=True)
+            found = [put(calm, awake, use, new) for calm, new in pairs]
         return self.pack({**parts, "forecasts": found[0], "under_way": found[1]})
 
     def _watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> Sequence[Tensor]:

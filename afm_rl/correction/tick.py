@@ -93,6 +93,7 @@ class Tick(nn.Module):
         losses: Tensor,
         noise: Tensor,
         place: Tensor,
+        sent: Tensor,
         planned: Tensor,
         box: Tensor,
     ) -> Answer:
@@ -103,6 +104,7 @@ class Tick(nn.Module):
             losses: of the models, ``(B, M + 1, A)``.
             noise: that no model explains, ``(B, A)``.
             place: where the missions are, ``(B, P)``.
+            sent: commands that are known to wait, the oldest first, ``(B, D, A)``.
             planned: in units of the action, ``(B, A)``.
             box: lowest and highest action, ``(B, 2, A)``.
         """
@@ -118,7 +120,9 @@ class Tick(nn.Module):
         action = self.decide(models, proposals, expected, wanted)
         action = torch.where(action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
-        forecasts, under_way = self.forecast(encoded, lines, weights, pairs, action)
+        forecasts, under_way = self.forecast(
+            encoded, lines, weights, pairs, torch.cat([sent, action.unsqueeze(1)], 1)
+        )
         return Answer(
             action * self.scale,
             predicted * self.scale,
@@ -214,28 +218,35 @@ class Tick(nn.Module):
         return torch.where(better, mixed, whole).squeeze(1)
 
     def forecast(
-        self, encoded: Encoded, lines: Lines, weights: Tensor, pairs: Tensor, executed: Tensor
+        self, encoded: Encoded, lines: Lines, weights: Tensor, pairs: Tensor, ahead: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now.
 
-        And those ``(B, K, A)`` that the newest commands have or will have, by the models that are
-        as late as is most probable.
+        And those ``(B, K + D, A)`` that the newest commands have or will have, by the models that
+        are as late as is most probable.
+
+        Args:
+            encoded: what the readings have read.
+            lines: the linear models.
+            weights: probabilities of all models, ``(B, M + 1, A)``.
+            pairs: what is remembered.
+            ahead: commands that wait, and the present one, ``(B, D + 1, A)``.
         """
-        size, now = len(self.scale), executed.unsqueeze(1)
-        sent = torch.cat([pairs[..., :size], now], -2)
-        acted = self.rows_acting @ sent[:, -self.rows_acting.shape[-1] :]  # (B, R, A)
-        newest = sent[:, sent.shape[1] - self.most_late :]
-        asked = torch.cat(
-            [acted.unsqueeze(2), newest.unsqueeze(1).expand(-1, acted.shape[1], -1, -1)], 2
-        )
+        sent, now = pairs[..., : len(self.scale)], ahead[:, :1]
+        acted = torch.cat([sent, now], 1)[:, -self.rows_acting.shape[-1] :]
+        acted = self.rows_acting @ acted  # (B, R, A)
+        every = torch.cat([sent, ahead], 1)
+        newest = every[:, every.shape[1] - self.most_late - ahead.shape[1] + 1 :]
+        shape = (-1, acted.shape[1], -1, -1)
+        asked = torch.cat([acted.unsqueeze(2), newest.unsqueeze(1).expand(shape)], 2)
         found = self.network.effect(encoded, asked.flatten(0, 1)).view_as(asked)
-        read, static = found[:, :, 0], found[:, :, 1:]
         linear = lines.effect(torch.cat([now, newest], 1))
+        forecasts = [now, found[:, :, 0], linear[:, :, 0], acted[:, self.late]]
         nominal = newest.unsqueeze(1)
-        every = [nominal, static, linear[:, :, 1:], nominal.expand(-1, len(self.late), -1, -1)]
-        late = steps_late(weights, self.prior, self.delays)
-        under_way = effects_of(torch.cat(every, 1), weights, late, self.delays)
-        return torch.cat([now, read, linear[:, :, 0], acted[:, self.late]], 1), under_way
+        late = nominal.expand(-1, len(self.late), -1, -1)
+        effects = torch.cat([nominal, found[:, :, 1:], linear[:, :, 1:], late], 1)
+        steps = steps_late(weights, self.prior, self.delays)
+        return torch.cat(forecasts, 1), effects_of(effects, weights, steps, self.delays)
 
 
 def points_of(count: int, size: int) -> Tensor:

@@ -73,6 +73,7 @@ class ActionFlowTransform(CarriedTransform):
             in a step, if that is known and not what they were sent: motors that lag.
         late: what policies find under ``in_keys`` while actions act late: ``"predict"``, the state
             in which the next action will act; ``"leave"``, the measured one.
+        delay: steps from an action to its effect that are known, one number or one per axis.
 
     Raises:
         ConfigurationError: for parts that do not fit each other, also when it is put around an
@@ -102,14 +103,16 @@ class ActionFlowTransform(CarriedTransform):
         extend_action_box: bool = True,
         reported_key: NestedKey | None = None,
         late: str = "predict",
+        delay: int | Sequence[int] | None = None,
     ) -> None:
+        self.delay = delay
         self.late = check_choice("transform.late", late, LATE)
         state = _one_key("in_keys", ["observation"] if in_keys is None else in_keys)
         action = _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv)
         super().__init__(state, action, prefix)
         self.__dict__["model"] = check_instance("transform.model", model, DynamicsModel)
         if corrector is not None:
-            corrector = corrector_for("transform", model, corrector, None)
+            corrector = corrector_for("transform", model, corrector, None, delay)
         self._corrector = corrector
         self.enabled = check_flag("transform.enabled", enabled)
         self.extend_action_box = check_flag("transform.extend_action_box", extend_action_box)
@@ -124,7 +127,9 @@ class ActionFlowTransform(CarriedTransform):
                     "ActionFlowTransform.corrector: the action box is not known yet; put the "
                     "transform around an environment first, or give a corrector"
                 )
-            self._corrector = corrector_for("transform", self.model, None, self._action_spec)
+            self._corrector = corrector_for(
+                "transform", self.model, None, self._action_spec, self.delay
+            )
         return self._corrector
 
     @property

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.vector import VectorEnv
+
+UNSEEN = (
+    "what is observed in the state in which they act is not known; give observe=, a function from "
+    "states (N, S) to observations, or late='leave'"
+)
 
 
 def simulated_observations(
@@ -51,12 +55,3 @@ def simulated_observations(
         return np.stack(found)
 
     return observe
-
-
-def warn_unseen() -> None:
-    """Warn that commands are late, and nothing says what is observed in a state."""
-    warnings.warn(
-        "ActionFlowWrapper: commands act late, but what will be observed when they act is not "
-        "known; give observe=, a function from states (N, S) to observations, or late='leave'",
-        stacklevel=4,
-    )

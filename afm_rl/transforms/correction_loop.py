@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
@@ -24,7 +25,7 @@ from afm_rl.errors import ConfigurationError, check_choice, check_flag
 from afm_rl.faults import fault_of, safe_action
 from afm_rl.learning.watching import Watching
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.transforms.arrival import simulated_observations, warn_unseen
+from afm_rl.transforms.arrival import UNSEEN, simulated_observations
 from afm_rl.transforms.memory import LATE, begin, computable, correct, corrector_for, observe
 
 Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str
@@ -54,6 +55,7 @@ class CorrectionLoop:
         source: environment, or vector of environments, that may have a simulation.
         late: see :class:`ActionFlowWrapper`, as the next one.
         observe: what is observed in states.
+        delay: steps that are known.
     """
 
     def __init__(
@@ -67,7 +69,9 @@ class CorrectionLoop:
         source: Any = None,
         late: str = "predict",
         observe: Observe | None = None,
+        delay: int | Sequence[int] | None = None,
     ) -> None:
+        self.delay = delay
         self.late = check_choice("wrapper.late", late, LATE)
         if not isinstance(actions, Box) or len(actions.shape) != 1 or actions.dtype.kind != "f":
             raise ConfigurationError(
@@ -92,6 +96,8 @@ class CorrectionLoop:
         elif observe is None and state is None:
             observe = _states
         self.seen_in: Observe | None = observe
+        if delay is not None and late == "predict" and observe is None:
+            raise ConfigurationError(f"ActionFlowWrapper: delay={delay!r}: {UNSEEN}")
         if state is None and isinstance(self.model, MuJoCoDynamics):
             state = _vector_state if isinstance(source, VectorEnv) else _env_state
         if state is None and not (isinstance(observations, Box) and len(observations.shape) == 1):
@@ -151,7 +157,9 @@ class CorrectionLoop:
             )
         low, high = (torch.as_tensor(x).to(states) for x in (self.space.low, self.space.high))
         self.spec = Bounded(low, high, low.shape, dtype=low.dtype)
-        self.corrector = corrector_for("ActionFlowWrapper", self.model, self.corrector, self.spec)
+        self.corrector = corrector_for(
+            "ActionFlowWrapper", self.model, self.corrector, self.spec, self.delay
+        )
         self.corrector.to(states.dtype)
 
     @torch.no_grad()
@@ -209,7 +217,7 @@ class CorrectionLoop:
         if not rows.any():
             return observations
         if self.seen_in is None:
-            warn_unseen()
+            warnings.warn(f"ActionFlowWrapper: commands act late: {UNSEEN}", stacklevel=3)
             return observations
         found = np.array(observations)
         found[rows] = self.seen_in(states.numpy())[rows]

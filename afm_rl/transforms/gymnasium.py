@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -51,6 +52,8 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
             ``info["afm"]["observation"]`` in any case. Rewards and ends stay the environment's own.
         observe: ``observe(states)`` returns what is observed in states ``(N, S)``, arrays both;
             None: the states, or what a gymnasium task with MuJoCo observes in them.
+        delay: steps from a command to its effect that are known, one number or one per actuator:
+            used from the first step on. What comes on top of it is found out.
 
     Raises:
         ConfigurationError: for spaces or a model that cannot be used, or do not fit each other;
@@ -73,14 +76,17 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         enabled: bool = True,
         late: str = "predict",
         observe: Observe | None = None,
+        delay: int | Sequence[int] | None = None,
     ) -> None:
         given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
-        given |= {"late": late, "observe": observe}
+        given |= {"late": late, "observe": observe, "delay": delay}
         RecordConstructorArgs.__init__(self, **given)
         gymnasium.Wrapper.__init__(self, env)
         inner: Any = env.unwrapped
         spaces = env.observation_space, env.action_space
-        self._loop = CorrectionLoop(*spaces, model, state, corrector, enabled, env, late, observe)
+        self._loop = CorrectionLoop(
+            *spaces, model, state, corrector, enabled, env, late, observe, delay
+        )
         simulated = isinstance(self._loop.model, MuJoCoDynamics)
         if simulated and hasattr(inner, "data") and env.action_space != inner.action_space:
             raise ConfigurationError(
@@ -92,7 +98,8 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         """Begin an episode with an empty memory."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._loop.begin(self._state(observation), seed=seed)
-        return observation, {**info, "afm": self._told(observation)}
+        info = {**info, "afm": self._told(observation)}
+        return self._loop.at_arrival(np.asarray(observation)[None])[0], info
 
     def step(self, action: Any):
         """Execute the corrected action."""
@@ -151,13 +158,16 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         enabled: bool = True,
         late: str = "predict",
         observe: Observe | None = None,
+        delay: int | Sequence[int] | None = None,
     ) -> None:
         given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
-        given |= {"late": late, "observe": observe}
+        given |= {"late": late, "observe": observe, "delay": delay}
         RecordConstructorArgs.__init__(self, **given)
         VectorWrapper.__init__(self, env)
         spaces = env.single_observation_space, env.single_action_space
-        self._loop = CorrectionLoop(*spaces, model, state, corrector, enabled, env, late, observe)
+        self._loop = CorrectionLoop(
+            *spaces, model, state, corrector, enabled, env, late, observe, delay
+        )
         self._mode = autoreset_mode_of(env)
         self._over = np.zeros(env.num_envs, dtype=bool)
 
@@ -170,7 +180,7 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         self._loop.begin(self._states(observations), rows, first)
         self._over &= ~rows
         told = {**self._loop.told, "observation": observations}
-        return observations, {**infos, "afm": told, "_afm": rows}
+        return self._loop.at_arrival(observations), {**infos, "afm": told, "_afm": rows}
 
     def step(self, actions: Any):
         """Execute the corrected actions."""
