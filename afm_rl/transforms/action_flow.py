@@ -163,6 +163,8 @@ class ActionFlowTransform(CarriedTransform):
         )
         tensordict.set(self.action_key, entries.get("executed_action").to(planned.dtype))
         kept = tensordict.get(self.prefix).select("observation", "arrival")
+        # Environments without a state of their own go on from what is under this key.
+        tensordict.set(self.observation_key, kept.get("observation"))
         return tensordict.set(self.prefix, entries.update(kept))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -196,7 +198,7 @@ class ActionFlowTransform(CarriedTransform):
         there, steps = arrival(self.corrector, memory, self.model)
         there = there.to(measured.dtype)
         late = (steps > 0).unsqueeze(-1) & self.enabled
-        return {"observation": measured, "arrival": torch.where(late, there, measured)}
+        return {"observation": measured.clone(), "arrival": torch.where(late, there, measured)}
 
     def _show(self, tensordict: TensorDictBase, there: Tensor) -> None:
         """Let policies find the state in which their action will act."""
