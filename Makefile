@@ -43,6 +43,9 @@ build/package:
 typecheck: $(VENV)/.with-test build/package ## Check types
 	@cd build/package && $(CURDIR)/$(BIN)/mypy --config-file $(CURDIR)/pyproject.toml \
 		--cache-dir $(CURDIR)/.mypy_cache --package afm_rl
+	@cd benchmarks/suites && MYPYPATH=$(CURDIR)/build/package $(CURDIR)/$(BIN)/mypy \
+		--config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache \
+		$(patsubst benchmarks/suites/%/,--package %,$(sort $(wildcard benchmarks/suites/*/)))
 
 check: lint typecheck test ## All of lint, typecheck and test
 

@@ -22,6 +22,8 @@ class Bar(tqdm):
     Args:
         *args: as of ``tqdm``.
         shown: show anything at all.
+        main: what this bar measures is the work itself; others measure what prepares it, such as a
+            training, and the share of the work done is 0 meanwhile.
         **settings: as of ``tqdm``.
 
     Attributes:
@@ -37,7 +39,8 @@ class Bar(tqdm):
     _lock = threading.RLock()
     monitor_interval = 0  # no thread that could hold the lock while a process forks
 
-    def __init__(self, *args: Any, shown: bool = True, **settings: Any) -> None:
+    def __init__(self, *args: Any, shown: bool = True, main: bool = False, **settings: Any) -> None:
+        self.main = main
         self.live, self.begun = sys.stderr.isatty() and Bar.listener is None, False
         often = 0.1 if self.live else 1.0 if Bar.listener else 10.0
         form = BAR if self.live else LINE
@@ -52,7 +55,8 @@ class Bar(tqdm):
             super().display(msg, pos)
         elif self.begun and msg is None:
             if Bar.listener:
-                Bar.listener(str(self), self.n / self.total if self.total else 0.0)
+                share = self.n / self.total if self.main and self.total else 0.0
+                Bar.listener(str(self), share)
             else:
                 print(self, file=sys.stderr, flush=True)
 

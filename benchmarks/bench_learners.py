@@ -32,7 +32,6 @@ BEFORE, DURING, OTHER, AFTER, STAY = 100, 200, 100, 200, 20
 NOISE, FLOOR = 1e-5, 1e-4  # m, rad
 LEARNERS = {
     "rls": ["method=rls"],
-    "rls_affine": ["method=rls", "updater.shapes=false"],
     "rls_0.9": ["method=rls", "updater.forgetting=0.9"],
     "rls_0.995": ["method=rls", "updater.forgetting=0.995"],
     "rls_pe": ["method=rls_pe"],

@@ -22,7 +22,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.readings import HYPOTHESES, IDENTITY
 from afm_rl.dynamics import Dubins, DynamicsModel, Ensemble, KnownDynamics
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
@@ -30,7 +29,6 @@ from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform
 
 POPULATION, HORIZON, HIDDEN, ROUNDS = 1000, 5, (200, 200, 200), 40
-CORRECTING = [name for name in HYPOTHESES if name != IDENTITY]
 
 
 def ensemble(seed: int) -> Ensemble:
@@ -67,21 +65,21 @@ def main() -> None:
     planner = MPPI(world, horizon=HORIZON, population=POPULATION)
     env = TransformedEnv(world, planner.make_tensordict_primer())
     td = env.reset().set("goal", torch.ones(2))
-    cases = {  # model, robot, and what the flow may believe
-        "silent, over physics": (Dubins(), Dubins(), list(HYPOTHESES)),
-        "over physics": (Dubins(), model, CORRECTING),
-        "over the ensemble": (model, ensemble(1), CORRECTING),
-        "six actions": (Axes(1.0), Axes(-0.7), CORRECTING),
+    cases = {  # model and robot
+        "silent, over physics": (Dubins(), Dubins()),
+        "over physics": (Dubins(), model),
+        "over the ensemble": (model, ensemble(1)),
+        "six actions": (Axes(1.0), Axes(-0.7)),
     }
 
     def with_afm(
-        model: DynamicsModel, robot: DynamicsModel, hypotheses: list[str], compile: bool
+        model: DynamicsModel, robot: DynamicsModel, compile: bool
     ) -> tuple[Callable, Callable]:
         """Return a step with the correction, and the same one without."""
         size = model.action_size
         ends = (low, high) if size == 2 else (-torch.ones(size), torch.ones(size))
         place = [0, 1] if size == 2 else []
-        flow = ActionFlow(*ends, hypotheses, place=place, gate=1e-6, compile=compile)
+        flow = ActionFlow(*ends, place=place, compile=compile)
         plain = PlanningEnv(robot, GoalDistance(range(min(2, size))), *ends)
         env = TransformedEnv(plain, ActionFlowTransform(model, flow))
         start, alone = warm(env), warm(plain)

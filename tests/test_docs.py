@@ -87,10 +87,6 @@ def test_snippets_run(page, desk):
 @pytest.mark.parametrize(("page", "asked"), commands())
 def test_commands_can_be_run(page, asked, desk):
     write_files(page, desk)
-    if "--config-dir" in asked:
-        at = asked.index("--config-dir")
-        folder = desk / asked[at + 1]
-        asked = [*asked[:at], *asked[at + 2 :], f"hydra.searchpath=[file://{folder}]"]
     with checked(asked) as names, initialize_config_module("afm_rl.conf", version_base="1.3"):
         agent = build(compose("config", asked), names)
     assert len(agent.missions)
@@ -183,6 +179,6 @@ def test_imports_point_downwards(monkeypatch):
         if layers.floor_of(pair[0]) >= layers.floor_of(pair[1])
     }
     assert upwards == {}
-    # environments are found by name: only the command line imports them
-    assert {here for here, there in layers.imports() if there == "envs"} <= {"cli"}
+    # environments are found by name: only the command line and the page import them
+    assert {here for here, there in layers.imports() if there == "envs"} <= {"cli", "play"}
     assert layers.draw().count("<rect") == sum(map(len, layers.FLOORS))

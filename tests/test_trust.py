@@ -7,14 +7,8 @@ from pathlib import Path
 import pytest
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.trust import (
-    check_composed,
-    check_targets,
-    conf_folders,
-    find_code,
-    trusted,
-    trusting,
-)
+from afm_rl.targets import check_composed, check_targets, find_code
+from afm_rl.trust import conf_folders, trusted, trusting
 
 DANGEROUS = """
 os.system os.popen os.execv os.execvp os.spawnl os.remove os.unlink os.rename os.rmdir os.removedirs
@@ -40,7 +34,7 @@ afm_rl.planning.costs.torch.load afm_rl.missions.factories.torch.load
 afm_rl.storage.artefacts.write_whole
 afm_rl.missions.factories.load_artefact afm_rl.missions.run afm_rl.missions.build
 afm_rl.cli.main afm_rl.report.write_report afm_rl.dynamics.Ensemble.load_state_dict
-afm_rl.planning.MPPI.__init__ afm_rl.missions.checkpoint.write_whole afm_rl.missions.factories
+afm_rl.planning.MPPI.__init__ afm_rl.storage.checkpoints.remove_parts afm_rl.missions.factories
 afm_rl.learning.updater.os.system afm_rl_other.anything torch.optim.adam.torch.load afm_rl
 hydra_plugins.anything hydra._internal.core_plugins.basic_launcher.BasicLauncher
 """.split()
@@ -130,5 +124,5 @@ def test_a_package_that_is_not_there_is_named(tmp_path, monkeypatch, entry, word
 
 
 def test_names_are_checked_without_torch():
-    code = "import afm_rl.trust, sys; assert 'torch' not in sys.modules"
+    code = "import afm_rl.targets, sys; assert 'torch' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -11,7 +11,7 @@ from afm_rl.diagnosis.readers import TRANSITIONS, read_columns
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.missions.explained import effective_log
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.trust import find_code
+from afm_rl.targets import find_code
 
 
 def read_effective(path: Path, name: str) -> Log:

@@ -46,7 +46,7 @@ def main() -> None:
 def _run(options: argparse.Namespace) -> None:
     from afm_rl.errors import ConfigurationError
 
-    port = _free(options.port)
+    port = free_port(options.port)
     try:
         from afm_rl.play.page import Page
         from afm_rl.play.robots import make_robot
@@ -58,19 +58,18 @@ def _run(options: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     world = World(make_robot(options.robot, options.policy))
     page = Page(world, f"{options.robot}: alone and with AFM", port)
-    url = f"http://127.0.0.1:{page.server.get_port()}"
-    print(f"{NAME}: {options.robot} at {url}; Ctrl-C ends it", flush=True)
+    print(f"{NAME}: {options.robot} at {page.url}; Ctrl-C ends it", flush=True)
     if options.open:
-        webbrowser.open(url)
+        webbrowser.open(page.url)
     try:
         page.run()
     except KeyboardInterrupt:
         pass
     finally:
-        page.server.stop()
+        page.end()
 
 
-def _free(port: int) -> int:
+def free_port(port: int) -> int:
     """Return a port that is free, ``port`` itself unless it is 0."""
     from afm_rl.errors import ConfigurationError
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from afm_rl.cli.error_messages import told_by
+from afm_rl.errors import ArtefactError
 
 NAME = "afm-rl-report"
 ABOUT = """\
@@ -22,8 +23,8 @@ Join the results of runs, sweeps and studies; write tables (CSV, LaTeX), figures
 
 A folder is what `afm-rl` has written: missions.csv and measures.json, and steps.parquet for curves,
 maps and recovery times. A study may still be running: the report takes what is finished, and says
-which methods, cells and seeds are missing (missing.csv). Of a mission that stands in several
-folders, the last one counts.
+which methods, cells and seeds are missing (missing.csv). Where a job's folder was deleted, it says
+so and ends with status 2. Of a mission that stands in several folders, the last one counts.
 """
 
 
@@ -55,13 +56,16 @@ def main() -> None:
     options = parser.parse_args()
 
     from afm_rl.envs import load_track  # torch takes seconds: `--help` need not wait
-    from afm_rl.report.film import check_video, film_results
-    from afm_rl.report.write import write_report
+    from afm_rl.report import check_video, load_tracks, read_runs, write_films, write_report
 
     out = options.out or options.folders[0] / "report"
     chosen = {"baselines": options.baselines, "oracle": options.oracle, "figures": options.figures}
     with told_by(NAME):
-        if form := check_video(options.video or False):
-            film_results(options.folders, out / "video", form, load_track)
+        form, runs = check_video(options.video or False), read_runs(options.folders)
+        tracks = load_tracks(runs.missions["track"].unique(), load_track)
+        if form:
+            write_films(out / "video", runs, tracks, form)
         else:
-            write_report(options.folders, out, **chosen, load_track=load_track)
+            write_report(runs, out, tracks, **chosen)
+        if runs.lost:
+            raise ArtefactError("; ".join(runs.lost))

@@ -15,7 +15,8 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 
-from afm_rl.trust import check_composed, check_trust, conf_folders, trusted, trusting
+from afm_rl.targets import check_composed
+from afm_rl.trust import check_trust, conf_folders, trusted, trusting
 
 
 class TrustedFolders(SearchPathPlugin):

@@ -2,6 +2,7 @@
 
 from afm_rl.correction.action_flow import ActionFlow
 from afm_rl.correction.base import Correction, Corrector
+from afm_rl.correction.believing import Believer
 from afm_rl.correction.classical import ClassicalCorrector
 from afm_rl.correction.l1 import L1Augmentation
 from afm_rl.correction.least_squares import LeastSquares
@@ -13,6 +14,7 @@ from afm_rl.correction.weights import load_universal
 __all__ = [
     "ActionFlow",
     "AxisNetwork",
+    "Believer",
     "ClassicalCorrector",
     "Correction",
     "Corrector",

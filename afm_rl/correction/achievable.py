@@ -56,24 +56,32 @@ def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
     return unit * share if mode == "direction" else torch.where(share < LEAST, unit * share, unit)
 
 
-def extend(reach: Tensor, box: Tensor, mode: str) -> Tensor:
+def extend(reach: Tensor, box: Tensor, tried: Tensor, mode: str) -> Tensor:
     """Return the bounds ``(*B, 2, A)`` that plans should keep, given what can be reached.
 
-    All of the box where a plan is not cut but done slower: there it may ask for more. No slowness
-    helps where nothing can be had at all.
+    All of the box where a plan is not cut but done slower: there it may ask for more. But no
+    slowness helps where nothing can be reached at all; and where only a small part of the box was
+    tried, plans that stay within reach try more of it.
 
-    >>> box = torch.tensor([[-1.0], [1.0]])
-    >>> [extend(share * box, box, "mixed")[1].item() for share in (0.01, 0.25, 0.5)]
-    [0.009999999776482582, 1.0, 0.5]
+    Args:
+        reach: lowest and highest effect, ``(*B, 2, A)``.
+        box: lowest and highest action, ``(*B, 2, A)``.
+        tried: range of the actions that were tried, ``(*B, A)``.
+        mode: see :func:`saturate`.
+
+    >>> box, all_of_it = torch.tensor([[-1.0], [1.0]]), torch.tensor([2.0])
+    >>> [extend(share * box, box, all_of_it, "mixed")[1].item() for share in (0.0, 0.25, 0.5)]
+    [0.0, 1.0, 0.5]
     """
     if mode == "clip":
         return reach
-    share = reach.diff(dim=-2) / box.diff(dim=-2)
-    slower = (share > DEAD) & (torch.tensor(mode == "direction") | (share < LEAST))
-    widest = torch.stack(
-        [reach[..., 0, :].fmin(box[..., 0, :]), reach[..., 1, :].fmax(box[..., 1, :])], -2
-    )
-    return torch.where(slower, widest, reach)
+    width = box.diff(dim=-2)
+    share = reach.diff(dim=-2) / width
+    slower = (share > DEAD) & (tried.unsqueeze(-2) > 0.1 * width)
+    if mode == "mixed":
+        slower = slower & (share < LEAST)
+    (low, high), (least, most) = reach.unbind(-2), box.unbind(-2)
+    return torch.where(slower, torch.stack([low.fmin(least), high.fmax(most)], -2), reach)
 
 
 def intend(

@@ -12,9 +12,10 @@ from torch import Tensor
 from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.correction.base import Fields
 from afm_rl.correction.belief import Belief
+from afm_rl.correction.believing import Answer, Believer
 from afm_rl.correction.linear import LINEAR
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.pairs import Answer, PairCorrector
+from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.readings import READINGS, check_readings, late_ones, memory_of
 from afm_rl.correction.tick import Tick
 from afm_rl.correction.weights import load_universal
@@ -22,7 +23,7 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_flag, check_number
 
 
-class ActionFlow(PairCorrector):
+class ActionFlow(Believer):
     r"""The flow from noise around the planned action to the action that has its effect.
 
     A regime is described by pairs (executed, effective action), which mean the same for every
@@ -62,7 +63,7 @@ class ActionFlow(PairCorrector):
             tick runs as it is. Results agree to rounding.
         cache: folder of compiled ticks.
         network: the network; None: the universal one that comes with the package.
-        rules: of the belief, see :class:`~afm_rl.correction.PairCorrector`.
+        rules: of the belief, see :class:`~afm_rl.correction.Believer`.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -87,7 +88,7 @@ class ActionFlow(PairCorrector):
         action_high: Tensor,
         readings: Sequence[str] | None = None,
         rows: int | None = None,
-        memory: int = 40,
+        memory: int = 80,
         place: Sequence[int] = (),
         place_scale: float = 0.5,
         plain: float = -6.0,

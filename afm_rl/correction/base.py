@@ -191,6 +191,17 @@ class Corrector(nn.Module, ABC):
             box: lowest and highest action, ``(*B, 2, A)``.
         """
 
+    def predict(
+        self, memory: Tensor, action: Tensor, model: DynamicsModel
+    ) -> tuple[Tensor, Tensor]:
+        """Return the effect that an action ``(*B, A)`` will have, and its standard deviation.
+
+        Both ``(*B, A)``, in units of the action: what the model would have to be given so that it
+        expects what the robot will do. The memory ``(*B, P)`` is not changed. By default the
+        action itself, and no deviation.
+        """
+        return action, torch.zeros_like(action)
+
     def latest(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the present state, and the actions planned and executed last."""
         size, first = self.action_size, self.states_in(memory)

@@ -38,7 +38,7 @@ class Belief(NamedTuple):
         .. math::
 
             l_h &\leftarrow \alpha\,l_h + \log\Big(1 + \frac{(v - T_h)^2}{s^2 + \sigma^2}\Big) \\
-            s^2 &\leftarrow s^2 + \beta\,k\,\big(\min\{(v - T)^2 - \sigma^2, 9 s^2\} - s^2\big),
+            s^2 &\leftarrow s^2 + \beta\,k\,\big(\min\{(v - T)^2 - \sigma^2, 3 s^2\} - s^2\big),
             \qquad k = \frac{s^2}{s^2 + \sigma^2}
 
         with the forecasts :math:`T_h`, that of the model that is believed most, T, and no noise
@@ -62,7 +62,7 @@ class Belief(NamedTuple):
         losses = torch.where(valid.unsqueeze(-2) > 0, losses, self.losses)
         best = (losses - prior).argmin(-2, keepdim=True)
         excess = miss.gather(-2, best).squeeze(-2) - stated
-        excess = torch.minimum(excess.clamp_min(0.0), 9 * variance)
+        excess = torch.minimum(excess.clamp_min(0.0), 3 * variance)
         gain = rate * valid * variance / (variance + stated)
         noise = torch.lerp(variance, excess, gain).sqrt().clamp_min(floor)
         return self._replace(losses=losses, noise=noise)

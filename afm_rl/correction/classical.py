@@ -1,4 +1,4 @@
-"""What classical correctors share: one fit to all that is remembered, beside doing nothing."""
+"""What classical correctors share: one fit to all that is remembered, which always acts."""
 
 from __future__ import annotations
 
@@ -7,58 +7,80 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from afm_rl.correction.base import Fields
+from afm_rl.compiling.tracing import all_hold
+from afm_rl.correction.base import Correction, Fields, put, rows_of
 from afm_rl.correction.experts import Rows
-from afm_rl.correction.pairs import Answer, PairCorrector
+from afm_rl.correction.pairs import PairCorrector
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import check_number
 
 
 class ClassicalCorrector(PairCorrector):
-    """A corrector with one model, a fit to all pairs that it remembers.
-
-    On each axis its answer is executed while the fit is believed more than *nothing has changed*.
+    """A corrector that answers a plan from all pairs that it remembers, as the textbooks do.
 
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
+        gate: largest innovation of the remembered transitions at which it does nothing, in
+            standard deviations that the model states.
         window: transitions that are remembered, K.
-        rules: of the belief, see :class:`~afm_rl.correction.PairCorrector`.
     """
 
-    def __init__(
-        self, action_low: Tensor, action_high: Tensor, window: int, **rules: float
-    ) -> None:
-        super().__init__(action_low, action_high, window, window, ["fit"], **rules)
+    def __init__(self, action_low: Tensor, action_high: Tensor, gate: float, window: int) -> None:
+        quiet = check_number("corrector.gate", gate, low=0.0)
+        super().__init__(action_low, action_high, window, window, quiet=quiet)
 
     def rows(self, parts: Fields) -> Rows:
         """Return what is remembered as rows."""
         size = self.action_size
-        sizes = [size, size, size, 1, self.pair_size - 3 * size - 1]
+        sizes = [size, size, size, 1, self.tail]
         executed, effective, std, valid, _ = parts["pairs"].split(sizes, -1)
         return Rows(executed, effective, std, (valid > 0).to(executed))
 
-    def answer(self, parts: Fields, planned: Tensor, box: Tensor) -> Answer:
-        """Execute the fit's inverse where it is believed."""
-        weights = self.belief(parts).weights(self.prior.to(planned))
-        corrects = weights[..., 1, :] > weights[..., 0, :]
-        unit = self.normalise(planned)
-        found = torch.where(corrects, self.inverse(self.rows(parts), unit), unit)
-        forecasts, late = self.foresee(parts, self.denormalise(found))
-        predicted = torch.where(corrects, forecasts[..., 1, :], unit)
-        return Answer(
-            self.denormalise(found),
-            self.denormalise(predicted),
-            torch.zeros_like(planned),
-            box,
-            corrects.any(-1),
-            forecasts,
-            late,
-        )
+    def correct(
+        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
+    ) -> tuple[Tensor, Correction]:
+        """Answer where the model is contradicted."""
+        parts = self._watched(memory, model)
+        innovation, misaligned = self._innovation(parts)
+        found = self.unchanged(planned, innovation, box)
+        if not all_hold(~misaligned):
+            use = rows_of(misaligned)
+            rows = self.rows({"pairs": parts["pairs"][use]})
+            unit = self.inverse(rows, self.normalise(planned[use]))
+            executed, predicted = (
+                put(planned, misaligned, use, self.denormalise(part))
+                for part in (unit, self.effect(rows, unit))
+            )
+            found = found._replace(executed=executed, predicted=predicted, misaligned=misaligned)
+        parts |= {"planned": planned, "executed": found.executed, "acting": found.predicted}
+        parts["misaligned"] = misaligned.unsqueeze(-1).to(planned.dtype)
+        return self.pack(parts), found
 
-    def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the effects by both models; nothing is late."""
-        unit = self.normalise(executed)
-        forecasts = torch.stack([unit, self.effect(self.rows(parts), unit)], -2)
-        return forecasts, parts["under_way"]
+    def predict(
+        self, memory: Tensor, action: Tensor, model: DynamicsModel
+    ) -> tuple[Tensor, Tensor]:
+        """Return the effect that an action will have by the fit, and how far that was off."""
+        parts = self._watched(memory, model)
+        rows, unit = self.rows(parts), self.normalise(action)
+        misaligned = self._innovation(parts)[1].unsqueeze(-1)
+        fitted = torch.stack([self.effect(rows, u) for u in rows.executed.unbind(-2)], -2)
+        miss = (rows.effective - fitted).square() * rows.valid
+        std = (miss.sum(-2) / rows.valid.sum(-2).clamp_min(1.0)).sqrt()
+        mean = torch.where(misaligned, self.effect(rows, unit), unit)
+        return self.denormalise(mean), self.denormalise(std)
+
+    def _watched(self, memory: Tensor, model: DynamicsModel) -> Fields:
+        """Return the parts with the newest pairs, older ones marked where a change begins."""
+        parts = self.look(memory, model)
+        count = 1 if model.taught_in is None else self.recent
+        surprise = parts["pairs"][..., -1:, -self.tail] > self.quiet
+        begins = (parts["misaligned"] != 1.0) & surprise
+        return parts | {"pairs": self.aged(parts["pairs"], begins, count)}
+
+    def _innovation(self, parts: Fields) -> tuple[Tensor, Tensor]:
+        innovation = parts["pairs"][..., -self.recent :, -self.tail].amax(-1)
+        return innovation, innovation > self.quiet
 
     @abstractmethod
     def inverse(self, rows: Rows, planned: Tensor) -> Tensor:

@@ -49,7 +49,7 @@ class L1Augmentation(ClassicalCorrector):
     each tick, the limit :math:`A_s \to 0`, and that disturbance is read from the model's
     one-tick error (:func:`~afm_rl.dynamics.inverse.effective_action`): any model and robot will
     do, and what no action can do (the unmatched part) is left out. Unlike in the literature
-    it acts only while it is believed, and the filter remembers K ticks only: :math:`e^{-K \omega \Delta t}` of a
+    there is a gate, and the filter remembers K ticks only: :math:`e^{-K \omega \Delta t}` of a
     lasting disturbance is missed.
 
     A gain g is a disturbance :math:`(g - 1) u`, which is countered as long as
@@ -64,8 +64,8 @@ class L1Augmentation(ClassicalCorrector):
         dt: control tick (s).
         bandwidth: of the low-pass, :math:`\omega` (rad/s).
         window: transitions that can be remembered, K.
+        gate: innovation at which it does nothing, in standard deviations that the model states.
         saturation: ``"clip"``, as is customary, ``"direction"`` or ``"mixed"``.
-        rules: of the belief, see :class:`~afm_rl.correction.PairCorrector`.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -81,10 +81,10 @@ class L1Augmentation(ClassicalCorrector):
         dt: float,
         bandwidth: float = 5.0,
         window: int = 24,
+        gate: float = 5.0,
         saturation: str = "clip",
-        **rules: float,
     ) -> None:
-        super().__init__(action_low, action_high, window, **rules)
+        super().__init__(action_low, action_high, gate, window)
         self.dt = check_number("corrector.dt", dt, low=0.0, open_low=True)
         self.bandwidth = check_number("corrector.bandwidth", bandwidth, low=0.0, open_low=True)
         self.saturation = check_choice("corrector.saturation", saturation, MODES)

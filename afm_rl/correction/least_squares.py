@@ -35,8 +35,8 @@ class LeastSquares(ClassicalCorrector):
         form: ``"gain"`` or ``"gain_offset"``, each axis for itself, or ``"affine"``.
         window: transitions that are remembered, K.
         forgetting: weight of a transition relative to the next one, in (0, 1].
+        gate: innovation at which it does nothing, in standard deviations that the model states.
         saturation: ``"clip"``, as is customary, ``"direction"`` or ``"mixed"``.
-        rules: of the belief, see :class:`~afm_rl.correction.PairCorrector`.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -52,10 +52,10 @@ class LeastSquares(ClassicalCorrector):
         form: str = "gain",
         window: int = 24,
         forgetting: float = 0.8,
+        gate: float = 5.0,
         saturation: str = "clip",
-        **rules: float,
     ) -> None:
-        super().__init__(action_low, action_high, window, **rules)
+        super().__init__(action_low, action_high, gate, window)
         self.form = check_choice("corrector.form", form, FORMS)
         self.forgetting = check_number(
             "corrector.forgetting", forgetting, low=0.0, high=1.0, open_low=True

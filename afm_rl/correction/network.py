@@ -64,7 +64,7 @@ class Encoded(NamedTuple):
         """
         count, models, axes = which.shape
         row = torch.arange(count, device=which.device).view(-1, 1, 1)
-        at = (row * (len(self.code) // count) + which).flatten(0, 1)
+        at = (row * (self.code.shape[0] // count) + which).flatten(0, 1)
         axis = torch.arange(axes, device=which.device)
         parts = {name: part[at, axis] for name, part in self.experts._asdict().items()}
         parts["inverse"] = invert_matrix(parts["matrix"])

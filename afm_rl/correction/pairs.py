@@ -1,77 +1,36 @@
-"""Transitions as pairs of executed and effective action, and what is believed of them."""
+"""Transitions as pairs of executed and effective action."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from afm_rl.compiling.tracing import all_hold
-from afm_rl.correction.arrival import steps_late
-from afm_rl.correction.base import Correction, Corrector, Fields, put, rows_of
-from afm_rl.correction.belief import Belief, mean_and_std
+from afm_rl.correction.base import Corrector, Fields
 from afm_rl.correction.experts import LIMIT
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import check_count, check_number
 
-OLD = 0.5  # what "valid" becomes where a change has begun since
-
-
-class Answer(NamedTuple):
-    """What the models make of plans, in units of the action."""
-
-    executed: Tensor
-    """The action, ``(B, A)``."""
-    predicted: Tensor
-    """The effect that is expected of it, ``(B, A)``."""
-    spread: Tensor
-    """Standard deviation of the proposals, ``(B, A)``."""
-    bounds: Tensor
-    """Lowest and highest effect that an action may have, ``(B, 2, A)``."""
-    corrects: Tensor
-    """Is any model believed more than that nothing has changed? ``(B)``."""
-    forecasts: Tensor
-    """The effects that the models expect of what acts now, shares of the largest action,
-    ``(B, M, A)``; the first is that of *nothing has changed*."""
-    under_way: Tensor
-    """The effects that the newest K commands have or will have, likewise, ``(B, K, A)``."""
-
 
 class PairCorrector(Corrector):
-    r"""A corrector that believes in models of the actuators as far as they predict.
-
-    It remembers pairs (executed, effective action), shares of the largest action, and holds a
-    :class:`~afm_rl.correction.belief.Belief` over M models of them; the first is *nothing has
-    changed*. No loss is negative, so while that model's own loss is below its ``odds`` no other one
-    can outweigh it: then the planned action is executed, and nothing more is computed. When it
-    is exceeded, the pairs from before are marked as old: "valid" is halved.
+    """A corrector that remembers pairs (executed, effective action), shares of the largest.
 
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
         recent: newest transitions, R: a model that learns is asked about them again at every step.
         memory: pairs that are remembered.
-        models: names of the models but the first.
         place: number of state coordinates that are remembered with a pair.
-        worth: prior log-odds of these models among themselves; all alike if None.
-        delays: steps from a command to its effect by these models; none late if None.
-        odds: prior log-odds of *nothing has changed* against all other models together: one
-            surprise that its Student-t distribution gives e^-odds is no reason to act.
-        discount: of the losses; .95 looks back on twenty steps.
-        noise: standard deviation that no model explains, at first, a share of the largest action.
-        noise_rate: share of its square that is renewed at every step.
-        least_noise: its floor: effects nearer than that are all the same.
-        quiet: normalised innovation up to which a transition needs no explanation.
+        quiet: innovation, in standard deviations that the model states, up to which a transition
+            needs no explanation.
+        delay: steps from an action to its effect that are known, see
+            :class:`~afm_rl.correction.Corrector`.
     """
 
     is_valid: Tensor
     is_command: Tensor
-    prior: Tensor
-    delays: Tensor
 
     def __init__(
         self,
@@ -79,71 +38,33 @@ class PairCorrector(Corrector):
         action_high: Tensor,
         recent: int,
         memory: int,
-        models: Sequence[str],
         place: int = 0,
-        worth: Sequence[float] | None = None,
-        delays: Sequence[int] | None = None,
-        odds: float = 3.0,
-        discount: float = 0.95,
-        noise: float = 0.1,
-        noise_rate: float = 0.1,
-        least_noise: float = 0.05,
         quiet: float = 1.0,
-        tails: float = 1.0,
         delay: int | Sequence[int] = 0,
     ) -> None:
         super().__init__(action_low, action_high, recent, delay)
         self.memory = max(check_count("corrector.memory", memory), recent)
-        self.models = ("nothing has changed", *models)
-        self.odds = check_number("corrector.odds", odds, low=0.0)
-        self.discount = check_number("corrector.discount", discount, low=0.0, high=1.0)
-        self.noise_rate = check_number("corrector.noise_rate", noise_rate, low=0.0, high=1.0)
-        self.least_noise = check_number(
-            "corrector.least_noise", least_noise, low=0.0, open_low=True
-        )
-        self.noise = check_number("corrector.noise", noise, low=self.least_noise)
-        self.tails = check_number("corrector.tails", tails, low=0.0, open_low=True)
         self.quiet = check_number("corrector.quiet", quiet, low=0.0)
         self.pair_size, self.tail = 3 * self.action_size + 2 + place, 1 + place
         is_valid = torch.arange(self.pair_size) == 3 * self.action_size
         self.register_buffer("is_valid", is_valid, persistent=False)
         is_command = torch.arange(self.pair_size) < self.action_size
         self.register_buffer("is_command", is_command, persistent=False)
-        among = torch.zeros(len(models)) if worth is None else torch.tensor(worth)
-        prior = torch.cat([torch.tensor([self.odds]), among.log_softmax(0)]).unsqueeze(-1)
-        self.register_buffer("prior", prior, persistent=False)
-        late = torch.tensor([0, *(delays or [0] * len(models))])
-        self.register_buffer("delays", late, persistent=False)
-        self.most_late = max(late.tolist())
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the pairs: u, its effect, std, valid, innovation, place."""
-        size, count = self.action_size, len(self.models)
         return {
             **super().shapes(state_size),
             "pairs": (self.memory, self.pair_size),
-            "acting": (size,),
-            "losses": (count, size),
-            "forecasts": (count, size),
-            "under_way": (self.most_late + self.delay, size),
-            "noise": (size,),
+            "acting": (self.action_size,),
         }
-
-    def begin(self, state: Tensor) -> Tensor:
-        """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
-        parts = self.unpack(super().begin(state), state.shape[-1])
-        return self.pack({**parts, "noise": torch.full_like(parts["noise"], self.noise)})
 
     def place_of(self, state: Tensor) -> Tensor:
         """Return the coordinates of states that are remembered with pairs; none by default."""
         return state[..., :0]
 
-    def belief(self, parts: Fields) -> Belief:
-        """Return the belief in the parts of a memory."""
-        return Belief(parts["losses"], parts["forecasts"], parts["noise"])
-
     def look(self, memory: Tensor, model: DynamicsModel) -> Fields:
-        """Return the parts of the memory with the newest pairs and the belief after them.
+        """Return the parts of the memory with the newest pairs.
 
         A model that stays as it is needs to be asked about the newest transition only, one that
         learns about all R.
@@ -171,169 +92,20 @@ class PairCorrector(Corrector):
             -1,
         )
         sound = (valid == 1.0) & rows.isfinite().all(-1, keepdim=True)
-        rows = torch.where(sound | self.is_command, rows, 0.0)
-        _, effect, std, came, _ = rows[..., -1, :].split(
-            [size, size, size, 1, self.pair_size - 3 * size - 1], -1
-        )
-        rules = (self.prior.to(rows), self.discount, self.noise_rate, self.least_noise, self.tails)
-        belief = self.belief(parts).update(effect, std, came, *rules)
-        awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
-        begins = (parts["misaligned"] != 1.0) & awake
         older = parts["pairs"][..., 1 : self.memory - count + 1, :]
-        older = torch.where(self.is_valid & begins.unsqueeze(-1), OLD * older, older)
-        parts["pairs"] = torch.cat([older, rows], -2)
-        parts["misaligned"] = awake.to(rows)
-        return parts | belief._asdict()
+        rows = torch.where(sound | self.is_command, rows, 0.0)  # what was sent is known
+        return parts | {"pairs": torch.cat([older, rows], -2)}
 
-    def asleep(self, parts: Fields, action: Tensor) -> Fields:
-        """Return the parts if ``action`` ``(*B, A)`` is executed, and nothing has changed.
+    def aged(self, pairs: Tensor, begins: Tensor, newest: int) -> Tensor:
+        """Return pairs ``(*B, M, D)`` with those before the newest marked as old.
 
-        All models predict its effect alike, and are believed alike.
-        """
-        losses = parts["losses"][..., :1, :].expand_as(parts["losses"])
-        commands = self.commands(parts, action)
-        acts = commands[..., -1 - self.delay, :]
-        forecasts = acts.unsqueeze(-2).expand_as(losses)
-        alike = {"planned": action, "executed": action, "acting": self.denormalise(acts)}
-        alike |= {"losses": losses, "forecasts": forecasts}
-        newest = commands.shape[-2] - parts["under_way"].shape[-2]
-        return {**parts, **alike, "under_way": commands[..., newest:, :]}
-
-    def commands(self, parts: Fields, executed: Tensor) -> Tensor:
-        """Return all commands up to the present one, ``(*B, M + D + 1, A)``, in u.
-
-        Those that have acted, those that are known to wait, and ``executed`` ``(*B, A)``.
-        """
-        acted = parts["pairs"][..., : self.action_size]
-        ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
-        return torch.cat([acted, self.normalise(ahead)], -2)
-
-    def watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> tuple[Tensor, ...]:
-        """Return the memory with the newest pair, and what it is if the plan is executed.
-
-        Returns:
-            Both, is any other model to be asked? ``(*B)``, and the innovation ``(*B)``.
-        """
-        parts = self.look(memory, model)
-        innovation = parts["pairs"][..., -1, -self.tail]
-        awake = parts["misaligned"].squeeze(-1) == 1.0
-        return self.pack(parts), self.pack(self.asleep(parts, planned)), awake, innovation
-
-    def decide(self, memory: Tensor, planned: Tensor, box: Tensor) -> tuple[Tensor, ...]:
-        """Return the next memories, and what to execute, of B missions with a surprise.
+        "valid" is halved: a change has begun since, which only those by place may ignore.
 
         Args:
-            memory: with the newest pair, ``(B, P)``.
-            planned: ``(B, A)``.
-            box: lowest and highest action, ``(B, 2, A)``.
-
-        Returns:
-            The next memory, and the parts of an :class:`Answer` but the last two.
+            pairs: the oldest first.
+            begins: does a change begin? ``(*B, 1)``.
+            newest: number of pairs that are of the change.
         """
-        parts = self.unpack(memory, self.states_in(memory))
-        answer = self.answer(parts, planned, box)
-        weights = self.belief(parts).weights(self.prior.to(memory))
-        acting = self.denormalise((weights * answer.forecasts.to(memory)).sum(-2))
-        parts |= {"planned": planned, "executed": answer.executed.to(memory), "acting": acting}
-        parts["forecasts"] = answer.forecasts.to(memory)
-        parts["under_way"] = answer.under_way.to(memory)
-        return (self.pack(parts), *answer[:-2])
-
-    def correct(
-        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
-    ) -> tuple[Tensor, Correction]:
-        """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
-        with torch.no_grad():
-            memory, idle, awake, innovation = self._watch(memory, planned, model)
-            found = self.unchanged(planned, innovation, box)
-            found = found._replace(noise=self.noise_in(memory))
-            if all_hold(~awake):
-                return idle, found
-            use = rows_of(awake)
-            after, *answer = self._decide(memory[use], planned[use], box[use])
-            given = dict(zip(Answer._fields[:-2], answer, strict=True))
-            given["misaligned"] = given.pop("corrects")
-            now = found._asdict()
-            changed = {name: put(now[name], awake, use, part) for name, part in given.items()}
-            return put(idle, awake, use, after), found._replace(**changed)
-
-    def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the state, the newest commands' effects, and how many of them are to come."""
-        parts = self.unpack(memory, self.states_in(memory))
-        weights = self.belief(parts).weights(self.prior.to(memory))
-        steps = steps_late(weights, self.prior, self.delays)
-        return parts["state"], self.denormalise(parts["under_way"]), steps + self.delay
-
-    def noise_in(self, memory: Tensor) -> Tensor:
-        """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
-        return self.denormalise(memory[..., -self.action_size :])
-
-    def believed(self, memory: Tensor) -> Tensor:
-        """Return how probable the :attr:`models` are, by axis, ``(*B, M, A)``."""
-        parts = self.unpack(memory, self.states_in(memory))
-        return self.belief(parts).weights(self.prior.to(memory))
-
-    def predict(
-        self, memory: Tensor, action: Tensor, model: DynamicsModel
-    ) -> tuple[Tensor, Tensor]:
-        """Return the effect that an action ``(*B, A)`` will have, and its standard deviation.
-
-        Both in units of the action, ``(*B, A)``: what the model would have to be given, so that it
-        expects what the robot will do. With a delay it is what acts now, of earlier commands.
-
-        Args:
-            memory: up to the present state, ``(*B, P)``; it is not changed.
-            action: what would be executed.
-            model: the dynamics model as it is now.
-        """
-        with torch.no_grad():
-            parts = self.asleep(self.look(memory, model), action)
-            awake = parts["misaligned"].squeeze(-1) == 1.0
-            if not all_hold(~awake):
-                parts = self.unpack(self._foresee(self.pack(parts), action), model.state_size)
-            weights = self.belief(parts).weights(self.prior.to(memory))
-            mean, std = mean_and_std(parts["forecasts"], weights)
-            return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))
-
-    def executing(
-        self, memory: Tensor, planned: Tensor, executed: Tensor, misaligned: Tensor | None = None
-    ) -> Tensor:
-        """Return the memory with the actions that are planned and executed now, ``(*B, A)``."""
-        return self._foresee(super().executing(memory, planned, executed, misaligned), executed)
-
-    def reported(self, memory: Tensor, given: Tensor) -> Tensor:
-        """Return the memory with forecasts moved by what was given more than sent."""
-        _, planned, sent = self.latest(memory)
-        parts = self.unpack(super().reported(memory, given), self.states_in(memory))
-        if self.delay:
-            sent = self.unpack(memory, self.states_in(memory))["sent"][..., 0, :]
-        more = self.normalise(given - sent).unsqueeze(-2)
-        return self.pack({**parts, "forecasts": parts["forecasts"] + more})
-
-    def _foresee(self, memory: Tensor, executed: Tensor) -> Tensor:
-        """Return the memory with forecasts of what is executed, where models are to be asked."""
-        parts = self.unpack(memory, self.states_in(memory))
-        awake = parts["misaligned"].squeeze(-1) == 1.0
-        idle = self.asleep(parts, executed)
-        found = [idle[name] for name in ("forecasts", "under_way")]
-        if not all_hold(~awake):
-            use = rows_of(awake)
-            asked = {name: part[use] for name, part in parts.items()}
-            seen = self.foresee(asked, executed[use])
-            pairs = zip(found, seen, strict=True)
-            found = [put(calm, awake, use, new) for calm, new in pairs]
-        return self.pack({**parts, "forecasts": found[0], "under_way": found[1]})
-
-    def _watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
-        return self.watch(memory, planned, model)
-
-    def _decide(self, *given: Tensor) -> Sequence[Tensor]:
-        return self.decide(*given)
-
-    @abstractmethod
-    def answer(self, parts: Fields, planned: Tensor, box: Tensor) -> Answer:
-        """Return what to execute for plans ``(*B, A)``, given the parts of memories."""
-
-    @abstractmethod
-    def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return forecasts ``(*B, M, A)`` and what is under way if ``executed`` is executed."""
+        is_old = torch.arange(self.memory, device=pairs.device) < self.memory - newest
+        old = self.is_valid & is_old.unsqueeze(-1) & begins.unsqueeze(-1)
+        return torch.where(old, 0.5 * pairs, pairs)

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from afm_rl.correction.achievable import MODES, attainable, extend
 from afm_rl.correction.arrival import effects_of, steps_late
 from afm_rl.correction.belief import Belief, mean_and_std
+from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.linear import LINEAR, Lines, fit_lines
 from afm_rl.correction.network import AxisNetwork, Encoded
-from afm_rl.correction.pairs import Answer
 from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows
 from afm_rl.correction.solver import midpoint
 from afm_rl.errors import check_choice, check_count, check_number
@@ -93,7 +93,7 @@ class Tick(nn.Module):
         losses: Tensor,
         noise: Tensor,
         place: Tensor,
-        sent: Tensor,
+        waiting: Tensor,
         planned: Tensor,
         box: Tensor,
     ) -> Answer:
@@ -104,7 +104,7 @@ class Tick(nn.Module):
             losses: of the models, ``(B, M + 1, A)``.
             noise: that no model explains, ``(B, A)``.
             place: where the missions are, ``(B, P)``.
-            sent: commands that are known to wait, the oldest first, ``(B, D, A)``.
+            waiting: commands that are known to come, the oldest first, ``(B, D, A)``.
             planned: in units of the action, ``(B, A)``.
             box: lowest and highest action, ``(B, 2, A)``.
         """
@@ -116,12 +116,14 @@ class Tick(nn.Module):
         expected = self.expect(models, proposals)
         reach = self.reach(models, expected)
         wanted = attainable(unit, *reach.unbind(-2), self.saturation)
-        bounds = extend(reach, ends, self.saturation)
-        action = self.decide(models, proposals, expected, wanted)
+        sent = pairs[..., : len(self.scale)]
+        tried = sent.amax(1) - sent.amin(1)
+        bounds = extend(reach, ends, tried, self.saturation)
+        action = self.decide(models, proposals, expected, wanted, noise)
         action = torch.where(action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
         forecasts, under_way = self.forecast(
-            encoded, lines, weights, pairs, torch.cat([sent, action.unsqueeze(1)], 1)
+            encoded, lines, weights, pairs, torch.cat([waiting, action.unsqueeze(1)], 1)
         )
         return Answer(
             action * self.scale,
@@ -152,7 +154,9 @@ class Tick(nn.Module):
     def most_likely(self, encoded: Encoded, lines: Lines, weights: Tensor) -> Models:
         """Return the most likely models of every axis."""
         still, read, linear, late = weights.split(self.counts, 1)
-        best = read.topk(self.likely, 1)
+        # Of models that are alike the first, on any machine and in any batch.
+        order = torch.arange(read.shape[1], device=read.device).view(-1, 1)
+        best = (read * (1 - 1e-4 * order)).topk(self.likely, 1)
         which = encoded.choose(best.indices)
         share = best.values / best.values.sum(1, keepdim=True).clamp_min(1e-30)
         share = read.sum(1, keepdim=True) * share
@@ -198,24 +202,31 @@ class Tick(nn.Module):
         mean, std = self.mean(models, foreseen)
         return torch.stack([(mean - std).amin(1), (mean + std).amax(1)], 1)
 
-    def decide(self, models: Models, proposals: Tensor, expected: Tensor, wanted: Tensor) -> Tensor:
-        r"""Return the actions ``(B, A)`` with the least expected squared miss.
+    def decide(
+        self, models: Models, proposals: Tensor, expected: Tensor, wanted: Tensor, noise: Tensor
+    ) -> Tensor:
+        r"""Return the actions ``(B, A)`` with the least expected loss.
 
-        .. math:: u_a = \operatorname{argmin}_u \sum_h w_{ha} (T_{ha}(u) - u^*_a)^2
+        .. math:: u_a = \operatorname{argmin}_u \sum_h w_{ha}
+                  \log\Big(1 + \frac{(T_{ha}(u) - u^*_a)^2}{s_a^2}\Big)
 
         over the proposals, axis by axis, if these actions together are no worse than the best
-        proposal as a whole, as they may be where one command moves several axes.
+        proposal as a whole, as they may be where one command moves several axes. The loss averages
+        models that differ by less than the noise s, and decides between those that differ by
+        more: half of two opposite answers would do nothing, and tell nothing.
         """
-        misses = (expected - wanted[:, None, None]).square()
-        cost = (models.weights.unsqueeze(2) * misses).sum(1)  # (B, C, A)
-        each = cost.argmin(1, keepdim=True)
-        mixed = proposals.gather(1, each)
+        cost = self.loss(models, expected, wanted, noise)  # (B, C, A)
+        mixed = proposals.gather(1, cost.argmin(1, keepdim=True))
         joint = cost.sum(-1).argmin(1)[:, None, None].expand_as(mixed)
-        whole = proposals.gather(1, joint)
-        again = (self.expect(models, mixed) - wanted[:, None, None]).square()
-        worth = (models.weights.unsqueeze(2) * again).sum(1).sum(-1, keepdim=True)
-        better = worth <= cost.gather(1, joint).sum(-1, keepdim=True) + 1e-9
-        return torch.where(better, mixed, whole).squeeze(1)
+        again = self.loss(models, self.expect(models, mixed), wanted, noise)
+        whole = cost.gather(1, joint).sum(-1, keepdim=True)
+        better = again.sum(-1, keepdim=True) <= whole + 1e-6
+        return torch.where(better, mixed, proposals.gather(1, joint)).squeeze(1)
+
+    def loss(self, models: Models, expected: Tensor, wanted: Tensor, noise: Tensor) -> Tensor:
+        """Return the expected loss ``(B, C, A)`` of effects ``(B, 1 + K + L, C, A)``."""
+        miss = (expected - wanted[:, None, None]).square() / noise[:, None, None].square()
+        return (models.weights.unsqueeze(2) * miss.log1p()).sum(1)
 
     def forecast(
         self, encoded: Encoded, lines: Lines, weights: Tensor, pairs: Tensor, ahead: Tensor

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-Status = Literal["healthy", "changed", "dead", "cannot tell"]
+Status = Literal["healthy", "changed", "dead", "cannot tell", "not measured", "not actuated"]
 Interval = tuple[float, float]
 
 
@@ -32,28 +32,38 @@ class Actuator:
     """Response per negative command, where ``gain`` is that of positive ones alone."""
     reversed: bool = False
     offset: float = math.nan
-    """b, in units of the response."""
+    """b, in units of the response; where all commands are far from 0, at the ``centre`` of them."""
     offset_interval: Interval = (-math.inf, math.inf)
+    centre: float = 0.0
+    """The command at which the offset is meant."""
     dead_zone: float = 0.0
     """Size of commands up to which nothing happens, in units of the command; 0: none was seen."""
-    saturation: float | None = None
-    """Size of commands beyond which nothing more happens; None: none was seen."""
+    limits: Interval | None = None
+    """Commands below and above which nothing more happens, both the same if one was seen only."""
     backlash: float = 0.0
     """Half of the play, in units of the command; 0: none was seen."""
     stick: float = 0.0
     """Change of the command up to which nothing moves, and then all at once; 0: none was seen."""
     rate: float | None = None
-    """Largest change per second, in units of the command; None: none was seen."""
+    """Largest change per second, in units of the response; None: none was seen."""
     every: int = 1
     """Every how many rows a command is taken over."""
     delay_s: float = 0.0
     """d (s); below 0 where the response comes before its command in the log."""
+    time_interval: Interval = (0.0, math.inf)
+    """95 % interval of delay and lag together (s)."""
+    made_up: bool = False
+    """Does a correction act so that delay and lag do no harm?"""
     lag_s: float = 0.0
     """Time constant of the lag (s)."""
     driven_by: str | None = None
     """Another actuator whose command has an influence, alone (swapped) or beside the own one."""
     coupling: Mapping[str, float] = field(default_factory=dict)
     """Response per command of other actuators."""
+    basis: tuple[str, str, float, float] | None = None
+    """Another actuator, ``sums`` or ``sides``, and two gains, where this is simpler: those of the
+    sum and the difference of both, or those of two sides of which one moves with the sum of both,
+    and the other one with their difference."""
     quantum: float = 0.0
     """Size of the steps in which the response moves, in its units; 0: none were seen."""
     turn: float = 0.0
@@ -63,13 +73,17 @@ class Actuator:
     noise: float = math.nan
     """Standard deviation of what the fit leaves, in units of the response."""
     unexplained: float = math.nan
-    """Share of the response's variance that the fit leaves."""
+    """Share of the response's variance that the fit leaves, lost rows included."""
     pattern: str = ""
     """What this share depends on, in words; empty if it looks like noise."""
     misfit: float = 0.0
     """Share of the response's variance that depends on it: what is wrong with the fit itself."""
     command_range: Interval = (math.nan, math.nan)
     """The commands between which 98 % of the rows are."""
+    copies: tuple[str, ...] = ()
+    """Actuators with the same command up to a factor: which of them is followed is not known."""
+    units: tuple[str, str] = ("", "")
+    """Of command and response, as text; empty if they are not known."""
     unit: float = 1.0
     """Gain of a healthy actuator: pi / 180 where commands are degrees and responses radians."""
     drift: Mapping[str, Interval] = field(default_factory=dict)
@@ -79,6 +93,11 @@ class Actuator:
     rows: int = 0
     """Rows that the numbers above are fitted to."""
     sentence: str = ""
+
+    @property
+    def saturation(self) -> float | None:
+        """Size of commands beyond which nothing more happens; None: none was seen."""
+        return None if self.limits is None else float(np.mean(np.abs(self.limits)))
 
     @property
     def reach(self) -> float:
@@ -125,7 +144,7 @@ class Diagnosis:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain lists and numbers; None where one is not known."""
-        parts = {"actuators": [asdict(actuator) for actuator in self.actuators]}
+        parts = {"actuators": [asdict(a) | {"saturation": a.saturation} for a in self.actuators]}
         return _plain(parts | {"step_s": self.step_s, "rows": self.rows, "notes": self.notes})
 
 

@@ -11,91 +11,158 @@ from typing import Any
 import numpy as np
 
 from afm_rl.diagnosis.intervals import half_widths
-from afm_rl.diagnosis.model import DOWN, Model, Problem, cut, fit_lines, refine, weight_of
+from afm_rl.diagnosis.model import (
+    DOWN,
+    GAIN_DRIFT,
+    OFFSET_DRIFT,
+    Model,
+    Problem,
+    costs,
+    cut,
+    fit_lines,
+    refine,
+    scale_of,
+    weight_of,
+)
 from afm_rl.diagnosis.response import Shape, respond
+from afm_rl.diagnosis.settings import Settings
 
-PENALTY = 10.0  # per number: twice the logarithm of the likelihood that it has to win
-VISIBLE = 0.02  # standard deviations of the response: what changes it less is left out
 FLOOR = 1e-7  # share of the variance: better fits are all the same
-MOST = 6  # numbers beside delay and lag
-REFINED = 3  # models with another number, of which the best numbers are looked for
-CLEAR = 4.5  # standard errors by which another command has to show
-COUPLED = 0.05  # share of the driver's influence
-QUICK = ("play", "stick", "rate", "hold")  # may be mistaken for delay and lag
-HOLDS = (2, 3, 4, 5, 6, 8, 10)  # rows
+QUICK = ("play", "stick", "hold")  # may be mistaken for delay and lag
+DYNAMICS = ("delay", "keep", "rate")
 COST = attrgetter("cost")
 NONE = Shape._field_defaults
 
 
-def fit_response(problem: Problem, driver: int, starts: Sequence[Shape]) -> Model:
+def fit_response(
+    problem: Problem, large: Problem, driver: int, starts: Sequence[Shape], settings: Settings
+) -> Model:
     """Return the simplest model that is not clearly worse than a more complicated one.
 
-    Forward: delay and lag, then the other numbers of a shape and other commands, whichever improves
-    the fit most, as long as it improves it clearly. Backward: what is no longer needed is left out.
+    Delay, lag and rate limit together first; then forward, whichever of the other numbers and
+    commands improves the fit most, as long as it improves it clearly; then backward, what is no
+    longer needed.
 
     Args:
-        problem: response and commands.
+        problem: response and commands, by which numbers are proposed.
+        large: by which they are found and judged, the same or more rows of it.
         driver: the command that is followed.
-        starts: delays and lags to begin with.
+        starts: delays, lags and rate limits to begin with.
+        settings: how clear it must be.
     """
-    model = _dynamics(problem, driver, starts)
-    for added in range(MOST):
-        found = [refine(problem, candidate) for candidate in larger(problem, model)]
-        better = min(found, key=COST, default=model)
-        if not (_needed(problem, better, model) and _visible(problem, better, model)):
-            return _smaller(problem, model) if added else model
-        model = better
-    return _smaller(problem, model)
+    options, whole = _dynamics(problem, driver, starts), large
+    if weight_of(problem, options[-1]) * problem.use.sum() > settings.enough:
+        large = problem
+    model = _simplest(large, options, settings)
+    added = 0
+    for step in (larger, _with_drift):  # a drift last, since it explains a little of everything
+        while added < settings.most:
+            found = [refine(large, other) for other in step(problem, model)]
+            better = min(found, key=COST, default=model)
+            if not (
+                needed(large, better, model, settings) and _visible(large, better, model, settings)
+            ):
+                break
+            model, added = better, added + 1
+    model = _smaller(large, model, settings) if added else model
+    return model if whole is large else refine(whole, model)
 
 
-def _dynamics(problem: Problem, driver: int, starts: Sequence[Shape]) -> Model:
-    """Return the simplest of no delay, a delay, a lag, and both that is needed."""
-    options = []
+def _dynamics(problem: Problem, driver: int, starts: Sequence[Shape]) -> list[Model]:
+    """Return the best models with none, some, and all of delay, lag and rate limit."""
+    options: dict[tuple[str, ...], list[Model]] = {(): [Model(driver, Shape())]}
     for start in starts:
-        options.append(Model(driver, start._replace(keep=0.0), ("delay",)))
-        if start.keep:
-            options.append(Model(driver, start, ("delay", "keep")))
-            options.append(Model(driver, start._replace(delay=0.0), ("keep",)))
-    model = refine(problem, Model(driver, Shape()))
-    for size in (1, 2):
-        some = [refine(problem, option) for option in options if option.size == size]
-        better = min(some, key=COST, default=model)
-        if better.size > model.size and _needed(problem, better, model):
-            model = better
-    return model
+        names = tuple(name for name in DYNAMICS if getattr(start, name) != NONE[name])
+        more = ("delay", *(name for name in names if name != "delay"))
+        for some in dict.fromkeys((names, more, more[1:], ("delay",))):
+            shape = Shape(**{name: getattr(start, name) for name in some})
+            options.setdefault(some, []).append(fit_lines(problem, Model(driver, shape, some)))
+    best = sorted((min(some, key=COST) for some in options.values()), key=lambda m: m.shape.rate)
+    found: list[Model] = []
+    for model in reversed(best):  # limits last: row after row takes time
+        if model.shape.rate == math.inf or model.cost < 2 * min(m.cost for m in found):
+            found.append(refine(problem, model))
+    return sorted(found, key=lambda model: (model.size, -model.cost))
 
 
-def _needed(problem: Problem, larger: Model, smaller: Model) -> bool:
+def _simplest(problem: Problem, models: Sequence[Model], settings: Settings) -> Model:
+    """Return the simplest of some models that is not clearly worse than a larger one.
+
+    Of those that explain as much, every machine has a delay, and few have a rate limit.
+    """
+    first, *others = [refine(problem, model) for model in models]
+    for size in sorted({other.size for other in others}):
+        best, *some = sorted((other for other in others if other.size == size), key=COST)
+        rows = problem.use.sum() * weight_of(problem, best)
+        alike = [m for m in some if rows * math.log((m.cost + FLOOR) / (best.cost + FLOOR)) < 4]
+        better = min(
+            (best, *alike), key=lambda m: ("rate" in m.active, "delay" not in m.active, m.cost)
+        )
+        if better.size > first.size and needed(problem, better, first, settings):
+            first = better
+    return first
+
+
+def needed(problem: Problem, more: Model, less: Model, settings: Settings) -> bool:
     """Return whether a model wins enough likelihood by the numbers that it has more.
 
-    Neighbouring residuals that are alike count as fewer rows.
+    Neighbouring residuals that are alike count as fewer rows; and the model has to be better all
+    over the log, not in one place.
     """
-    rows = problem.use.sum() * weight_of(problem, larger)
-    won = rows * math.log((smaller.cost + FLOOR) / (larger.cost + FLOOR))
-    return won > PENALTY * (larger.size - smaller.size)
+    y, use = problem.y, problem.use
+    residual = (y - more.predict(problem))[use]
+    scale = scale_of(residual)
+    gain = costs((y - less.predict(problem))[use], scale) - costs(residual, scale)
+    rows = use.sum() * weight_of(problem, more)
+    won = rows * math.log((less.cost + FLOOR) / (more.cost + FLOOR))
+    others = problem.u.shape[1] if len(more.others) > len(less.others) else 1
+    chance = 2 * math.log(others)  # another command is the best of many
+    enough = settings.price(rows) * (more.size - less.size) + chance
+    return won > enough and consistent(gain, settings, math.sqrt(chance))
 
 
-def _visible(problem: Problem, one: Model, other: Model) -> bool:
+def consistent(gain: np.ndarray, settings: Settings, chance: float = 0.0) -> bool:
+    """Return whether what rows gain is above 0 in most blocks of a log.
+
+    By ``chance`` standard errors more, where it is the best of many.
+    """
+    count = min(settings.blocks, len(gain) // 3)
+    if count < 2:
+        return False
+    blocks = np.array([block.mean() for block in np.array_split(gain, count)])
+    error = blocks.std(ddof=1) / math.sqrt(len(blocks))
+    return bool(blocks.mean() > (settings.consistent + 0.5 * chance) * error)
+
+
+def _visible(problem: Problem, one: Model, other: Model, settings: Settings) -> bool:
     apart = (one.predict(problem) - other.predict(problem))[problem.use]
-    return bool(apart.std() > VISIBLE)
+    return bool(apart.std() > settings.visible)
 
 
-def larger(problem: Problem, model: Model) -> Iterator[Model]:
-    """Yield models with one number more, each with a good beginning for it."""
+def _with_drift(problem: Problem, model: Model) -> Iterator[Model]:
+    """Yield the model with a gain, or an offset, that drifts."""
+    for kind in {GAIN_DRIFT, OFFSET_DRIFT} - {*model.others}:
+        some = replace(model, others=(*model.others, kind), gains=(*model.gains, 0.0))
+        yield fit_lines(problem, some)
+
+
+def larger(problem: Problem, model: Model, tried: int = 3) -> Iterator[Model]:
+    """Yield the best models with one number more, each with a good beginning for it."""
     own, shape = problem.u[:, model.driver], model.shape
     found = []
     for names, options in _beginnings(own, shape).items():
         for begin in _bases(model, names):
             trial = replace(begin, active=(*begin.active, *names.split()))
-            best = _best(problem, trial, options)
-            for width in (0.12, 0.03) if names in ("jump", "stick") else ():
-                near = getattr(best.shape, names) * np.linspace(1 - width, 1 + width, 9)
-                best = min(best, _best(problem, best, [{names: float(x)} for x in near]), key=COST)
-            found.append(best)
+            found.append(_best(problem, trial, options))
     if own.min() < 0 < own.max() and DOWN not in model.others:
         sides = replace(model, others=(*model.others, DOWN), gains=(*model.gains, 0.0))
         found.append(fit_lines(problem, sides))
-    yield from sorted(found, key=COST)[:REFINED]
+    for best in sorted(found, key=COST)[:tried]:
+        for width in (0.12, 0.03):
+            for name in {"jump", "stick"} & {*best.active} - {*model.active}:
+                near = getattr(best.shape, name) * np.linspace(1 - width, 1 + width, 9)
+                best = min(best, _best(problem, best, [{name: float(x)} for x in near]), key=COST)
+        yield best
     yield from _with_another(problem, model)
 
 
@@ -106,11 +173,11 @@ def _beginnings(own: np.ndarray, shape: Shape) -> dict[str, list[dict[str, Any]]
     grids: dict[str, Any] = {
         "delay": (0.5, 1.0, 2.0, 4.0),
         "keep": (0.4, 0.65, 0.85),
+        "cut": np.quantile(sizes, 0.98) * np.array([0.03, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9]),
         "low": low + (high - low) * np.array([0.08, 0.16, 0.25, 0.35, 0.45]),
         "high": high - (high - low) * np.array([0.08, 0.16, 0.25, 0.35, 0.45]),
         "play": (high - low) * np.array([0.02, 0.05, 0.1, 0.18, 0.28]),
-        "stick": float(sizes.max()) * np.geomspace(0.03, 0.8, 18),
-        "rate": np.geomspace(0.01, 1.0, 10),
+        "stick": float(sizes.max()) * np.geomspace(0.03, 0.8, 14),
     }
     if low < 0 < high and not shape.dead_zone and not shape.jump:
         grids["dead_zone"] = np.quantile(sizes, 0.98) * np.array([0.05, 0.1, 0.2, 0.35, 0.5, 0.7])
@@ -121,15 +188,18 @@ def _beginnings(own: np.ndarray, shape: Shape) -> dict[str, list[dict[str, Any]]
         for name, values in grids.items()
         if name not in taken
     }
-    if not {"low", "high"} & taken:
+    if taken & {"low", "high"}:
+        found.pop("cut", None)
+    if "cut" in taken:
+        found = {name: options for name, options in found.items() if name not in ("low", "high")}
+    elif not {"low", "high"} & taken:
         found["low high"] = [
             {"low": float(a), "high": float(b)}
             for a, b in zip(grids["low"], grids["high"], strict=True)
         ]
-        if low < 0 < high:  # a switch
-            found["low high"].append({"low": 0.03 * low, "high": 0.03 * high})
     if "hold" not in taken:
-        found["hold phase"] = [{"hold": n, "phase": k} for n in HOLDS for k in range(n)]
+        holds = (2, 3, 4, 5, 6, 8, 10)  # rows
+        found["hold phase"] = [{"hold": n, "phase": k} for n in holds for k in range(n)]
     return found
 
 
@@ -141,7 +211,7 @@ def _bases(model: Model, names: str) -> Iterator[Model]:
         return
     yield replace(model, active=rest, shape=model.shape._replace(delay=0.0, keep=0.0))
     delay = round(model.shape.delay)
-    for late in range(max(delay - 2, 1) if names == "hold phase" else max(delay, 1), delay + 1):
+    for late in range(max(delay - 2, 1), delay + 1) if names == "hold phase" else ():
         shape = model.shape._replace(delay=float(late), keep=0.0)
         yield replace(model, active=(*rest, "delay"), shape=shape)
 
@@ -151,8 +221,17 @@ def _best(problem: Problem, model: Model, options: Sequence[dict[str, Any]]) -> 
     return min((fit_lines(problem, replace(model, shape=shape)) for shape in shapes), key=COST)
 
 
-def _with_another(problem: Problem, model: Model) -> Iterator[Model]:
-    """Yield the model with the other command that shows best in what is left."""
+def _with_another(
+    problem: Problem, model: Model, clear: float = 4.5, coupled: float = 0.05
+) -> Iterator[Model]:
+    """Yield the model with the other command that shows best in what is left.
+
+    Args:
+        problem: response and commands.
+        model: what is known.
+        clear: standard errors by which the other command has to show: it is the best of several.
+        coupled: share of the driver's influence that matters.
+    """
     linear = model.shape.linear
     rest = [i for i in range(problem.u.shape[1]) if i not in (model.driver, *model.others)]
     rest = [i for i in rest if problem.u[:, i].std() > 0]
@@ -163,7 +242,7 @@ def _with_another(problem: Problem, model: Model) -> Iterator[Model]:
     design = np.column_stack([*parts, np.ones(use.sum())])
     others = np.column_stack([respond(problem.clock, problem.u[:, i], linear)[use] for i in rest])
     residual = problem.y[use] - model.predict(problem)[use]
-    both = np.column_stack([others, residual])
+    raw, both = others, np.column_stack([others, residual])
     both -= design @ np.linalg.lstsq(design, both, rcond=None)[0]
     others, residual = both[:, :-1], cut(both[:, -1])
     power = (others**2).sum(0)
@@ -173,9 +252,10 @@ def _with_another(problem: Problem, model: Model) -> Iterator[Model]:
     influence = np.abs(slope) * spread
     main = abs(model.gain) * parts[0].std()
     left = residual[:, None] - slope * others  # of each, were it the one
-    error = half_widths(left * others / np.maximum(power, 1e-300)) / 1.96
-    good = kept & (np.abs(slope) > CLEAR * error) & (influence > COUPLED * main)
-    if good.any():
+    error = half_widths(left * others / np.maximum(power, 1e-300), chosen=1.0) / 1.96
+    good = kept & (np.abs(slope) > clear * error) & (influence > coupled * main)
+    won = float(np.max(slope**2 * power, initial=0.0, where=good))
+    if won > 2 * _by_chance(raw, residual, design):
         best = int(np.argmax(np.where(good, slope**2 * power, -1.0)))
         yield replace(
             model,
@@ -184,7 +264,23 @@ def _with_another(problem: Problem, model: Model) -> Iterator[Model]:
         )
 
 
-def _smaller(problem: Problem, model: Model) -> Model:
+def _by_chance(
+    others: np.ndarray, residual: np.ndarray, design: np.ndarray, shifts: int = 12
+) -> float:
+    """Return what the best of other commands ``(N, A)`` wins where it cannot act.
+
+    That is what it wins when it is moved along the log, of as many places the most: slow series
+    that have nothing to do with each other look alike.
+    """
+    most = 0.0
+    for k in range(1, shifts):
+        moved = np.roll(others, k * len(others) // shifts, axis=0)
+        moved = moved - design @ np.linalg.lstsq(design, moved, rcond=None)[0]
+        most = max(most, float(((residual @ moved) ** 2 / ((moved**2).sum(0) + 1e-300)).max()))
+    return most
+
+
+def _smaller(problem: Problem, model: Model, settings: Settings) -> Model:
     """Leave out numbers that are not needed any more, one at a time."""
     while True:
         options = [
@@ -197,7 +293,7 @@ def _smaller(problem: Problem, model: Model) -> Model:
         ]
         found = [refine(problem, option) for option in options]
         better = min(found, key=COST, default=model)
-        if better is model or _needed(problem, model, better):
+        if better is model or needed(problem, model, better, settings):
             return model
         model = better
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import stdtrit
 
-ORDER = 12  # of the autoregression, at most
-CHOSEN = 1.25  # times the usual interval, where the same rows chose the model
-LEAST = 0.03  # of one minus the sum of its coefficients
+LEAST = 0.03
+"""Of one minus the sum of an autoregression's coefficients: no memory above 33 rows is believed."""
 
 
-def half_widths(influence: np.ndarray) -> np.ndarray:
+def half_widths(influence: np.ndarray, chosen: float = 1.25) -> np.ndarray:
     r"""Return half widths ``(P,)`` of 95 % intervals.
 
     The variance of the sum of N influences is N times their spectral density at frequency 0, which
@@ -21,9 +20,11 @@ def half_widths(influence: np.ndarray) -> np.ndarray:
     Args:
         influence: of each row on each parameter, ``(N, P)``: the estimate minus the truth is their
             sum.
+        chosen: times the usual interval, where the same rows chose the model; set by simulated
+            logs (``tests/diagnosis/score.py``).
 
     >>> noise = np.random.default_rng(0).standard_normal((10000, 1))
-    >>> half_widths(noise / 10000).round(3)
+    >>> half_widths(noise / 10000, chosen=1.0).round(3)
     array([0.02])
     """
     rows = len(influence)
@@ -36,7 +37,7 @@ def half_widths(influence: np.ndarray) -> np.ndarray:
         density = _density_at_zero(series, power)
         effective = max(rows * min(power / density, 1.0) - len(influence.T), 3.0)
         widths.append(stdtrit(effective, 0.975) * np.sqrt(rows * density))
-    return np.array(widths)
+    return chosen * np.array(widths)
 
 
 def independence(residual: np.ndarray) -> float:
@@ -46,9 +47,27 @@ def independence(residual: np.ndarray) -> float:
 
 
 def _density_at_zero(series: np.ndarray, power: float) -> float:
+    """Return the long-run variance, the largest of those that rows and means of rows show.
+
+    Residuals of steps that hold for seconds are alike for hundreds of rows, which no
+    autoregression of a few rows sees.
+    """
+    densities, rows = [], len(series)
+    for width in (1, 5, 25):
+        means = series[: rows // width * width].reshape(-1, width).mean(1)
+        if width > 1 and len(means) < 40:
+            break
+        some = means - means.mean()
+        left = float(some @ some) / len(some)
+        if left > 0:
+            densities.append(width * _autoregression(some, left))
+    return max(densities, default=power)
+
+
+def _autoregression(series: np.ndarray, power: float, most: int = 12) -> float:
     """Return the long-run variance by the autoregression with the least AIC (Levinson)."""
     rows = len(series)
-    order = max(min(ORDER, rows // 10), 1)
+    order = max(min(most, rows // 10), 1)
     lags = np.array([(series[k:] * series[: rows - k]).sum() for k in range(order + 1)]) / rows
     # The first order counts in any case, without its bias in few rows (Kendall 1954).
     first = lags[1] / power

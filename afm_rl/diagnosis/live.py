@@ -9,8 +9,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from afm_rl.diagnosis.findings import Actuator, Diagnosis
-from afm_rl.diagnosis.intervals import CHOSEN
-from afm_rl.diagnosis.words import MATTERS, judge
+from afm_rl.diagnosis.settings import Settings
+from afm_rl.diagnosis.words import judge
 from afm_rl.errors import ConfigurationError
 
 DELAYS = 5  # 0 to 4 steps
@@ -102,7 +102,7 @@ def _fit(
         slope = (weight * residual) @ rest / np.maximum(power, 1e-300)
         error = np.sqrt((residual**2).mean() / np.maximum((rest**2).sum(0), 1e-300))
         clear = (np.abs(slope) > CLEAR * error) & (power > 0.01 * whole)
-        clear &= np.abs(slope) * spread > MATTERS * max(spread[own], ROUNDING)
+        clear &= np.abs(slope) * spread > Settings().matters * max(spread[own], ROUNDING)
         clear[used] = False
         if not clear.any() or len(x) < len(used) + FEWEST:
             break
@@ -124,7 +124,7 @@ def _fit(
     inflation = (1 + min(alike, 0.9)) / (1 - min(alike, 0.9))
     scale = (weight * residual**2).sum() / freedom * inflation
     times = stdtrit(max(freedom / inflation, 2.0), 0.975)
-    width = CHOSEN * times * np.sqrt(scale * covariance.diagonal())
+    width = 1.25 * times * np.sqrt(scale * covariance.diagonal())
     least, most = float(x[:, driver].min()), float(x[:, driver].max())
     if not most > least:
         width = np.full_like(width, np.inf)

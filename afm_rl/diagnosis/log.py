@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -27,6 +28,9 @@ class Log:
         row: number of each row, ``(N,)``, where rows of a longer log are left out.
         read_from: rows of the file that this was read from; 0: as many as there are.
         notes: what a reader must know.
+        effort: how hard the motors were driven, ``(M,)`` each, such as their PWM.
+        computed: were responses computed from states, and not measured?
+        units: of all commands and responses, as text; empty if they are not known.
 
     Raises:
         ConfigurationError: for shapes that do not fit, numbers that are not finite, time that does
@@ -42,6 +46,9 @@ class Log:
     row: np.ndarray | None = None
     read_from: int = 0
     notes: tuple[str, ...] = ()
+    effort: Mapping[str, np.ndarray] = field(default_factory=dict)
+    computed: bool = False
+    units: tuple[str, str] = ("", "")
 
     def __post_init__(self) -> None:
         rows, size = len(self.command), len(self.names)

@@ -9,17 +9,15 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from afm_rl.diagnosis.intervals import CHOSEN, half_widths, independence
+from afm_rl.diagnosis.intervals import half_widths, independence
 from afm_rl.diagnosis.log import Clock
 from afm_rl.diagnosis.response import Shape, lagging, respond, shaped
 
-ROBUST = 2.0  # standard deviations: larger residuals count less
-LARGEST = {"delay": 60.0, "keep": 0.99}
 STEPS = {"delay": 0.05, "keep": 0.01, "rate": 0.003}  # of numeric derivatives, otherwise 0.01
 STEPPED = ("jump", "stick", "hold", "phase")  # the response changes by jumps with these
-CURVED = ("dead_zone", "low", "high", "play", "jump", "stick", "rate")
-LEAST_WEIGHT = 0.05  # independent rows that a row counts as
-DOWN = -1  # among the others: the driver's own command where it is negative
+CURVED = ("dead_zone", "cut", "low", "high", "play", "jump", "stick", "rate")
+DOWN, GAIN_DRIFT, OFFSET_DRIFT = -1, -2, -3
+"""Among the others: the response of negative commands, that times the time, and the time."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +29,16 @@ class Problem:
         u: commands ``(N, A)``, in half ranges.
         y: response ``(N,)``, in standard deviations.
         use: which rows count, ``(N,)``.
+        time: of the rows, -0.5 to 0.5, ``(N,)``.
+        begin: where each episode begins, in units of the driver, ``(N,)``; None: at its command.
     """
 
     clock: Clock
     u: np.ndarray
     y: np.ndarray
     use: np.ndarray
+    time: np.ndarray
+    begin: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -66,19 +68,23 @@ class Model:
 
     def parts(self, problem: Problem) -> list[np.ndarray]:
         """Return the responses at gain 1 to the driver and to the others, ``(N,)`` each."""
-        linear, clock = self.shape.linear, problem.clock
-        own = shaped(clock, problem.u[:, self.driver], self.shape)
+        clock, keep = problem.clock, self.shape.keep
+        before = shaped(clock, problem.u[:, self.driver], self.shape, problem.begin)
+        own = lagging(clock, before, keep)
+        odd = {
+            DOWN: lambda: lagging(clock, np.minimum(before, 0.0), keep),
+            GAIN_DRIFT: lambda: own * problem.time,
+            OFFSET_DRIFT: lambda: problem.time,
+        }
+        linear = self.shape.linear
         others = (
-            lagging(clock, np.minimum(own, 0.0), self.shape.keep)
-            if i == DOWN
-            else respond(clock, problem.u[:, i], linear)
-            for i in self.others
+            odd[i]() if i < 0 else respond(clock, problem.u[:, i], linear) for i in self.others
         )
-        return [lagging(clock, own, self.shape.keep), *others]
+        return [own, *others]
 
     def led_by(self, own: int) -> Model:
         """Return the model with another of its commands as the driver, where both act alike."""
-        if own not in self.others or DOWN in self.others or {*CURVED} & {*self.active}:
+        if own not in self.others or min(self.others) < 0 or {*CURVED} & {*self.active}:
             return self
         gains = {self.driver: self.gain, **dict(zip(self.others, self.gains, strict=True))}
         gain = gains.pop(own)
@@ -96,7 +102,7 @@ class Model:
 def weight_of(problem: Problem, model: Model) -> float:
     """Return how many independent rows a row counts as, by what a model leaves."""
     residual = (problem.y - model.predict(problem))[problem.use]
-    return max(independence(cut(residual)), LEAST_WEIGHT)
+    return max(independence(cut(residual)), 0.002)
 
 
 def cut(residual: np.ndarray) -> np.ndarray:
@@ -106,16 +112,19 @@ def cut(residual: np.ndarray) -> np.ndarray:
 
 
 def scale_of(residual: np.ndarray) -> float:
-    """Return the standard deviation of residuals, whatever the outliers."""
-    return float(np.median(np.abs(residual))) / 0.6745
+    """Return the standard deviation of residuals, whatever a tenth of them is.
+
+    By their 85 % quantile: the median would take every transient of a step for an outlier.
+    """
+    return float(np.quantile(np.abs(residual), 0.85)) / 1.4395
 
 
-def mean_cost(residual: np.ndarray, scale: float | None = None) -> float:
-    """Return the robust mean square: residuals far beyond the scale count as their size."""
-    scale = ROBUST * (scale_of(residual) if scale is None else scale)
+def costs(residual: np.ndarray, scale: float | None = None) -> np.ndarray:
+    """Return squares, but where residuals are far beyond the scale rather their sizes."""
+    scale = 2.0 * (scale_of(residual) if scale is None else scale)
     if not scale > 1e-9:
-        return float((residual**2).mean())
-    return float((2 * scale**2 * (np.sqrt(1 + (residual / scale) ** 2) - 1)).mean())
+        return residual**2
+    return 2 * scale**2 * (np.sqrt(1 + (residual / scale) ** 2) - 1)
 
 
 def fit_lines(problem: Problem, model: Model, rounds: int = 0) -> Model:
@@ -131,7 +140,7 @@ def fit_lines(problem: Problem, model: Model, rounds: int = 0) -> Model:
     solution = np.linalg.solve(gram, design.T @ y)
     for _ in range(rounds):
         residual = y - design @ solution
-        scale = ROBUST * scale_of(residual)
+        scale = 2.0 * scale_of(residual)
         if not scale > 1e-9:
             break
         weight = 1 / np.sqrt(1 + (residual / scale) ** 2)
@@ -140,7 +149,7 @@ def fit_lines(problem: Problem, model: Model, rounds: int = 0) -> Model:
         gram += 1e-12 * gram.trace() * np.eye(len(gram))
         solution = np.linalg.solve(gram, heavy.T @ y)
     gains = tuple(float(g) for g in solution[1:-1])
-    cost = mean_cost(y - design @ solution)
+    cost = float(costs(y - design @ solution).mean())
     return replace(
         model, gain=float(solution[0]), offset=float(solution[-1]), gains=gains, cost=cost
     )
@@ -155,12 +164,13 @@ def refine(problem: Problem, model: Model) -> Model:
     own = problem.u[:, model.driver]
     most = max(float(np.abs(own).max()), 1e-6)
     residual = (problem.y - model.predict(problem))[use]
-    scale = max(ROBUST * scale_of(residual), 1e-4)
+    scale = max(2.0 * scale_of(residual), 1e-4)
     limits = {"dead_zone": (0.0, most), "play": (0.0, most), "low": (-most, most)}
+    limits["cut"] = (0.0, most)
     limits |= {"high": (-most, most), "rate": (1e-3, 2 * most)}
-    limits |= {name: (0.0, top) for name, top in LARGEST.items()}
+    limits |= {"keep": (0.0, 0.99), "delay": (0.0, max(60.0, 1.5 * model.shape.delay))}
     if model.shape.delay < 0:
-        limits["delay"] = (-LARGEST["delay"], 0.0)
+        limits["delay"] = (-60.0, 0.0)
     ends = np.array([limits[name] for name in model.smooth]).T
     wide = np.full(2 + len(model.others), np.inf)
     low, high = np.concatenate([-wide, ends[0]]), np.concatenate([wide, ends[1]])
@@ -169,7 +179,7 @@ def refine(problem: Problem, model: Model) -> Model:
         return (_with_values(model, values).predict(problem) - problem.y)[use]
 
     def slope(values: np.ndarray) -> np.ndarray:
-        return slopes(problem, _with_values(model, values))[use]
+        return slopes(problem, _with_values(model, values), central=False)[use]
 
     begin = np.clip(values_of(model), low + 1e-9, high - 1e-9)
     found = least_squares(
@@ -206,9 +216,11 @@ def _with_values(model: Model, values: np.ndarray) -> Model:
     )
 
 
-def slopes(problem: Problem, model: Model) -> np.ndarray:
+def slopes(problem: Problem, model: Model, central: bool = True) -> np.ndarray:
     """Return derivatives of the prediction by :func:`values_of`, ``(N, P)``."""
     parts = model.parts(problem)
+    gains = (model.gain, *model.gains)
+    middle = model.offset + np.sum([g * x for g, x in zip(gains, parts, strict=True)], 0)
     columns = [parts[0], np.ones(len(problem.y)), *parts[1:]]
     here = values_of(model)
     first = len(here) - len(model.smooth)
@@ -221,23 +233,26 @@ def slopes(problem: Problem, model: Model) -> np.ndarray:
             down[place] = max(down[place], 0.0)
         if name == "keep":
             up[place] = min(up[place], 0.995)
-        ends = [_with_values(model, x).predict(problem) for x in (up, down)]
-        columns.append((ends[0] - ends[1]) / (up[place] - down[place]))
+        if not central:
+            down = here
+        upper = _with_values(model, up).predict(problem)
+        lower = _with_values(model, down).predict(problem) if central else middle
+        columns.append((upper - lower) / (up[place] - down[place]))
     return np.column_stack(columns)
 
 
-def interval_widths(problem: Problem, model: Model) -> np.ndarray:
-    """Return half widths of the 95 % intervals of :func:`values_of`, ``(P,)``.
+def interval_widths(problem: Problem, model: Model, centre: float = 0.0) -> np.ndarray:
+    """Return half widths of the 95 % intervals of three numbers, ``(3,)``.
 
+    These are the gain, the response to the command ``centre``, and delay and lag together (steps).
     The uncertainty of a delay that was found to be none counts, too.
     """
-    count = len(values_of(model))
     if not {"delay", "keep"} & set(model.active):
         model = replace(model, active=(*model.active, "delay"))
     use = problem.use
     columns = slopes(problem, model)[use]
     residual = (problem.y - model.predict(problem))[use]
-    scale = ROBUST * scale_of(residual)
+    scale = 2.0 * scale_of(residual)
     share = (residual / max(scale, 1e-9)) ** 2
     pull = residual / np.sqrt(1 + share)
     stiff = ((1 + share) ** -1.5).mean()
@@ -248,5 +263,12 @@ def interval_widths(problem: Problem, model: Model) -> np.ndarray:
     values = np.maximum(values, 1e-10)
     inverse = (vectors / values) @ vectors.T / size
     freedom = math.sqrt(len(residual) / max(len(residual) - len(size), 1))
-    widths = half_widths((columns / size * pull[:, None]) @ inverse) * freedom
-    return CHOSEN * widths[:count]
+    influence = (columns / size * pull[:, None]) @ inverse
+    late = np.zeros(len(influence))
+    for place, name in enumerate(model.smooth, len(influence.T) - len(model.smooth)):
+        keep = model.shape.keep
+        by = {"delay": 1.0, "keep": 1 / (max(keep, 0.05) * math.log(max(keep, 0.05)) ** 2)}
+        late += by.get(name, 0.0) * influence[:, place]
+    three = (influence[:, 0], influence[:, 1] + centre * influence[:, 0], late)
+    widths = half_widths(np.column_stack(three)) * freedom
+    return widths

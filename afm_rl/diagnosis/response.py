@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
@@ -19,6 +19,8 @@ class Shape(NamedTuple):
     """Share of the distance to the command that is left after a step: exp(-step / lag)."""
     dead_zone: float = 0.0
     """Size of commands up to which nothing happens."""
+    cut: float = np.inf
+    """Size of commands beyond which nothing more happens."""
     low: float = -np.inf
     """Lowest command that is followed."""
     high: float = np.inf
@@ -30,11 +32,16 @@ class Shape(NamedTuple):
     stick: float = 0.0
     """Change of the command up to which nothing moves; then the command is reached at once."""
     rate: float = np.inf
-    """Largest change per step."""
+    """Largest change of the response per step."""
     hold: int = 1
     """Rows between two commands that are taken over."""
     phase: int = 0
     """First of the rows that are taken over."""
+
+    @property
+    def endless(self) -> bool:
+        """Is it so slow, in half ranges per step, that it never arrives? Then it is a sum."""
+        return self.keep > 0.985 or self.rate < 0.003
 
     @property
     def linear(self) -> Shape:
@@ -42,22 +49,36 @@ class Shape(NamedTuple):
         return Shape(self.delay, self.keep, hold=self.hold, phase=self.phase)
 
 
-def respond(clock: Clock, command: np.ndarray, shape: Shape) -> np.ndarray:
+def respond(
+    clock: Clock, command: np.ndarray, shape: Shape, begin: np.ndarray | None = None
+) -> np.ndarray:
     r"""Return the response ``(N,)`` to commands ``(N,)`` at gain 1.
 
     .. math:: x_k = e^{-\Delta_k/\tau} x_{k-1} + (1 - e^{-\Delta_k/\tau})\,
-        z(\mathrm{clip}(p(u(t_k - d))))
+        r_k, \qquad r_k = r_{k-1} + \mathrm{clip}(z(\mathrm{clip}(p(u(t_k - d)))) - r_{k-1}, \pm R)
 
-    with the play p, the cut, and the dead zone :math:`z(u) = \mathrm{sign}(u)\max(|u| - z, 0)`.
+    with the play p, the cut, the dead zone :math:`z(u) = \mathrm{sign}(u)\max(|u| - z, 0)`, and the
+    largest change R per step.
+
+    Args:
+        clock: of the rows.
+        command: of one actuator.
+        shape: the numbers.
+        begin: the response before the first command of each row's episode arrives, ``(N,)``; None:
+            at rest at the first command.
 
     >>> clock = Clock(np.arange(4.0), np.zeros(4, dtype=int), np.arange(4))
     >>> respond(clock, np.array([0.0, 1.0, 0.2, 0.2]), Shape(delay=1.0, dead_zone=0.5))
     array([0. , 0. , 0.5, 0. ])
+    >>> respond(clock, np.ones(4), Shape(delay=1.0, rate=0.5), np.zeros(4))
+    array([0. , 0.5, 1. , 1. ])
     """
-    return lagging(clock, shaped(clock, command, shape), shape.keep)
+    return lagging(clock, shaped(clock, command, shape, begin), shape.keep)
 
 
-def shaped(clock: Clock, command: np.ndarray, shape: Shape) -> np.ndarray:
+def shaped(
+    clock: Clock, command: np.ndarray, shape: Shape, begin: np.ndarray | None = None
+) -> np.ndarray:
     """Return the response ``(N,)`` before the lag."""
     if shape.delay or shape.hold > 1:
         command = look_back(clock, command, shape)
@@ -65,13 +86,26 @@ def shaped(clock: Clock, command: np.ndarray, shape: Shape) -> np.ndarray:
         command = np.where(np.abs(command) > shape.jump, command, 0.0)
     if shape.play:
         command = follow_with_play(command, shape.play, clock.start)
-    if shape.stick or shape.rate < np.inf:
-        command = follow_step_by_step(command, shape.stick, shape.rate, clock.start)
-    if shape.low > -np.inf or shape.high < np.inf:
-        command = np.clip(command, shape.low, shape.high)
+    if shape.stick:
+        command = follow_with_stiction(command, shape.stick, clock.start)
+    low, high = max(shape.low, -shape.cut), min(shape.high, shape.cut)
+    if low > -np.inf or high < np.inf:
+        command = np.clip(command, low, high)
     if shape.dead_zone:
         command = command - np.clip(command, -shape.dead_zone, shape.dead_zone)
+    if begin is not None:
+        command = begin_at(clock, command, begin, shape.delay)
+    if shape.rate < np.inf:
+        command = limit_rate(command, shape.rate, clock.start)
     return command
+
+
+def begin_at(clock: Clock, values: np.ndarray, begin: np.ndarray, delay: float) -> np.ndarray:
+    """Return values ``(N, ...)`` with those before the first command of an episode replaced."""
+    waited = (clock.time - clock.time[clock.start] - delay + 1).clip(0.0, 1.0)
+    waited[clock.start == np.arange(len(waited))] = 0.0
+    share = waited.reshape(-1, *(1 for _ in values.shape[1:]))
+    return begin + share * (values - begin)
 
 
 def look_back(clock: Clock, values: np.ndarray, shape: Shape) -> np.ndarray:
@@ -125,25 +159,56 @@ def follow_with_play(command: np.ndarray, width: float, start: np.ndarray) -> np
     return low
 
 
-def follow_step_by_step(
-    command: np.ndarray, stick: float, rate: float, start: np.ndarray
-) -> np.ndarray:
+def follow_with_stiction(command: np.ndarray, stick: float, start: np.ndarray) -> np.ndarray:
     """Return what stays where it is until the command is farther away than ``stick``.
 
-    Then it moves there, by at most ``rate`` per row.
-
     >>> one = np.zeros(4, dtype=int)
-    >>> follow_step_by_step(np.array([0.0, 0.1, 0.3, 0.2]), 0.2, np.inf, one)
+    >>> follow_with_stiction(np.array([0.0, 0.1, 0.3, 0.2]), 0.2, one)
     array([0. , 0. , 0.3, 0.3])
-    >>> follow_step_by_step(np.array([0.0, 1.0, 1.0, 0.0]), 0.0, 0.5, one)
-    array([0. , 0.5, 1. , 0.5])
     """
+    if _many(start):
+        return _side_by_side(command, start, lambda x, u: np.where(np.abs(u - x) > stick, u, x))
     place, places = 0.0, []
     for row, (value, first) in enumerate(zip(command.tolist(), start.tolist(), strict=True)):
-        way = value - place
-        if first == row or stick < abs(way) <= rate:
+        if first == row or abs(value - place) > stick:
             place = value
-        elif abs(way) > stick:
-            place += rate if way > 0 else -rate
         places.append(place)
     return np.array(places)
+
+
+def limit_rate(target: np.ndarray, rate: Any, start: np.ndarray) -> np.ndarray:
+    """Return what moves towards targets ``(N, ...)`` by at most ``rate``, a number or ``(...)``.
+
+    >>> limit_rate(np.array([0.0, 1.0, 1.0, 0.0]), 0.5, np.zeros(4, dtype=int))
+    array([0. , 0.5, 1. , 0.5])
+    """
+    if target.ndim > 1 or _many(start):
+        return _side_by_side(
+            target, start, lambda x, u: np.minimum(np.maximum(u, x - rate), x + rate)
+        )
+    place, places = 0.0, []
+    for row, (value, first) in enumerate(zip(target.tolist(), start.tolist(), strict=True)):
+        if first == row or -rate <= value - place <= rate:
+            place = value
+        else:
+            place += rate if value > place else -rate
+        places.append(place)
+    return np.array(places)
+
+
+def _many(start: np.ndarray, least: int = 12) -> bool:
+    """Return whether a step of all episodes at once is faster than rows one after the other."""
+    length = np.bincount(start).max()
+    return bool(length * least < len(start))
+
+
+def _side_by_side(values: np.ndarray, start: np.ndarray, move: Any) -> np.ndarray:
+    """Return ``x_k = move(x_{k-1}, value_k)``, from the first value of each episode on."""
+    found = values.copy()
+    begins = np.unique(start)
+    lengths = np.diff(np.append(begins, len(start)))
+    begins, lengths = begins[order := np.argsort(-lengths)], lengths[order]
+    for k in range(1, int(lengths[0])):
+        rows = begins[: np.searchsorted(-lengths, -k)] + k
+        found[rows] = move(found[rows - 1], values[rows])
+    return found

@@ -1,22 +1,20 @@
-"""Which delay and lag, and which command, explain a response best: a first look by lines."""
+"""Which dynamics, and which command, explain a response best: a first look on a grid."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from afm_rl.diagnosis.log import Clock, Log, clocks_of
-from afm_rl.diagnosis.response import Shape, lagging, look_back
+from afm_rl.diagnosis.response import Shape, begin_at, lagging, limit_rate, look_back
+from afm_rl.diagnosis.settings import Settings
 
-LONGEST = 40  # steps of delay
-EARLIEST = 5  # steps by which a response may come before its command in the log
-LAGS = (0.0, 1.0, 2.5, 6.0, 15.0)  # steps
-OTHERS = 0.5  # share of the squared residual that another command may leave, to be the driver
-RIDGE = 1e-9
-OUTLIERS = 4.0  # times the distance from the median to the far quantile: where responses are cut
+TINY = 1e-300
 
 
 class Lead(NamedTuple):
@@ -30,10 +28,12 @@ class Lead(NamedTuple):
     """exp(-step / lag)"""
     driver: int
     """The command that the response follows."""
-    gains: np.ndarray
-    """Of all commands together, ``(A,)``."""
     left: float
-    """Share of the variance that the driver leaves."""
+    """Share of the variance that all commands together leave."""
+    line: tuple[float, float] | None = None
+    """Gain and offset of the driver alone, if it explains anything."""
+    starts: tuple[Shape, ...] = ()
+    """Of each kind of dynamics the best on the grid."""
 
     def clock_of(self, log: Log) -> Clock:
         """Return the clock of a log, of which a part may have fewer."""
@@ -41,66 +41,166 @@ class Lead(NamedTuple):
         return clocks[min(self.clock, len(clocks) - 1)]
 
 
-def find_leads(log: Log, actuators: Sequence[int]) -> list[Lead]:
+def find_leads(log: Log, actuators: Sequence[int], settings: Settings) -> list[Lead]:
     """Return where to begin with each of some actuators."""
-    found = [_scan(log, clock, log.response[:, actuators]) for clock in clocks_of(log)]
+    delays = _delays(log, settings)
+    found = [
+        _scan(log, clock, log.response[:, actuators], delays, settings) for clock in clocks_of(log)
+    ]
     leads = []
     for place, j in enumerate(actuators):
         options = [_choose(scan, place, j, k) for k, scan in enumerate(found)]
         leads.append(min(options, key=lambda lead: lead.left))
-    return leads
+    return [
+        _with_starts(log, j, lead, delays, settings)
+        for j, lead in zip(actuators, leads, strict=True)
+    ]
 
 
-def _scan(log: Log, clock: Clock, response: np.ndarray) -> tuple[np.ndarray, ...]:
+def rows_enough(log: Log, settings: Settings) -> np.ndarray:
+    """Return the numbers of the rows to look at: all, or every k-th of a quick logger.
+
+    Where commands are another ones in every row, none can be left out: then lines behind delays and
+    lags explain less.
+    """
+    rows = np.arange(len(log.command))
+    every = round(1 / log.step / settings.quickest) if log.step != 1.0 else 1
+    if every < 2 or len(rows) < 100 * every:
+        return rows
+    start = np.maximum.accumulate(np.where(log.begins, rows, 0))
+    some = rows[(rows - start) % every == 0]
+    moved = [int(j) for j in np.flatnonzero(np.ptp(log.command, axis=0) > 0)]
+    if not moved:
+        return rows
+    left = [
+        np.median(
+            [lead.left for lead in find_leads(part.thinned(settings.searched), moved, settings)]
+        )
+        for part in (log, only(log, some))
+    ]
+    return some if left[1] < 1.1 * left[0] + 1e-3 else rows
+
+
+def only(log: Log, rows: np.ndarray) -> Log:
+    """Return a log of some rows, which still follow each other."""
+    return replace(
+        log,
+        command=log.command[rows],
+        response=log.response[rows],
+        t=log.seconds[rows],
+        episode=np.cumsum(log.begins)[rows],
+        row=None,
+    )
+
+
+def _delays(log: Log, settings: Settings) -> np.ndarray:
+    """Return delays to try (steps): each of the first 20, then 8 % more each time."""
+    episode = len(log.command) / log.begins.sum()
+    longest = max(settings.longest_s / log.step if log.t is not None else 0, settings.longest)
+    longest = min(longest, len(log.command) / 10, episode / 4)
+    many = 20 * 1.08 ** np.arange(100)
+    delays = np.unique(np.concatenate([np.arange(-settings.earliest, 20), many.round()])).astype(
+        int
+    )
+    return delays[delays <= max(longest, 1)]
+
+
+def _scan(
+    log: Log, clock: Clock, response: np.ndarray, delays: np.ndarray, settings: Settings
+) -> tuple[np.ndarray, ...]:
     """Fit lines with every delay and lag to responses ``(N, R)``.
 
     Returns:
         the grid of (delay, keep), ``(G, 2)``; the share of variance that each single command
-        leaves, ``(G, R, A)``; that all together leave, ``(G, R)``; the gains of these,
-        ``(G, R, A)``.
+        leaves, ``(G, R, A)``; that all together leave, ``(G, R)``; the lines of single commands,
+        ``(G, 2, R, A)``.
     """
-    u = log.command - log.command.mean(0)
-    u /= np.maximum(u.std(0), 1e-12)
-    y = _without_outliers(response)
-    longest = int(min(LONGEST, len(u) // 10))
-    inside = np.arange(len(u)) - clock.start >= longest
-    if inside.mean() < 0.5:  # many short episodes
-        longest = int(min(longest, 8))
-        inside = np.arange(len(u)) - clock.start >= longest
-    y = y[inside] - y[inside].mean(0)
-    power = np.maximum((y**2).sum(0), 1e-300)
+    u, y = log.command, without_outliers(response)
+    centre, spread = u.mean(0), np.maximum(u.std(0), 1e-12)
+    u = (u - centre) / spread
+    inside = np.arange(len(u)) - clock.start >= delays.max()
+    middle = y[inside].mean(0)
+    y = y[inside] - middle
+    power = np.maximum((y**2).sum(0), TINY)
     size = u.shape[1]
-    grid, singles, joint, slopes = [], [], [], []
-    for lag in (lag for lag in LAGS if lag * 10 < len(u)):
+    grid, singles, joint, lines = [], [], [], []
+    for lag in (lag for lag in settings.lags if lag * 10 < len(u)):
         keep = math.exp(-1 / lag) if lag else 0.0
         slow = lagging(clock, u, keep) if keep else u
-        for delay in range(0 if keep else -EARLIEST, (longest // 2 if keep else longest) + 1):
-            x = look_back(clock, slow, Shape(delay))[inside]
-            x = x - x.mean(0)
+        for delay in delays[delays >= 0] if keep else delays:
+            x = look_back(clock, slow, Shape(float(delay)))[inside]
+            level = x.mean(0)
+            x = x - level
             gram, cross = x.T @ x, x.T @ y
-            own = np.maximum(gram.diagonal(), 1e-300)
+            own = np.maximum(gram.diagonal(), TINY)
             singles.append(1 - (cross**2 / own[:, None] / power).T)
-            solution = np.linalg.solve(gram + RIDGE * gram.trace() * np.eye(size) + 1e-300, cross)
+            solution = np.linalg.solve(gram + 1e-9 * gram.trace() * np.eye(size) + TINY, cross)
             joint.append(1 - (solution * cross).sum(0) / power)
-            slopes.append(solution.T)
+            slope = (cross / own[:, None]).T / spread
+            lines.append((slope, middle[:, None] - slope * (centre + level * spread)))
             grid.append((delay, keep))
-    scale = np.maximum(log.command.std(0), 1e-12)
-    return np.array(grid), np.array(singles), np.array(joint), np.array(slopes) / scale
+    return np.array(grid), np.array(singles), np.array(joint), np.array(lines)
 
 
 def _choose(scan: tuple[np.ndarray, ...], place: int, j: int, clock: int) -> Lead:
-    """Choose for one response: the own command, unless another one is much better."""
-    grid, single, joint, slopes = scan
+    """Choose for one response: the own command, unless another one leaves less than half."""
+    grid, single, joint, lines = scan
     left = np.maximum(single[:, place].min(0), 1e-12)  # of each command with its best dynamics
-    driver = int(left.argmin()) if left.min() < OTHERS * left[j] else j
+    driver = int(left.argmin()) if left.min() < 0.5 * left[j] else j
     # The dynamics are those of all commands together; the driver may be one of several.
-    best = int(joint[:, place].argmin())
+    best, alone = int(joint[:, place].argmin()), int(single[:, place, driver].argmin())
+    gain, offset = lines[alone, :, place, driver]
+    line = (float(gain), float(offset)) if left[driver] < 0.7 and gain else None
     delay, keep = grid[best]
-    gains, rest = slopes[best, place], float(joint[best, place])
-    return Lead(clock, float(delay), float(keep), driver, gains, rest)
+    return Lead(clock, float(delay), float(keep), driver, float(joint[best, place]), line)
 
 
-def _without_outliers(y: np.ndarray) -> np.ndarray:
-    """Cut what is far from everything else."""
+def _with_starts(log: Log, j: int, lead: Lead, delays: np.ndarray, settings: Settings) -> Lead:
+    """Return the lead with the best of each kind of dynamics: delay, lag, rate limit together."""
+    plain = [Shape(lead.delay, lead.keep)]
+    if lead.keep:
+        plain.append(Shape(lead.delay + 0.5 / -math.log(lead.keep)))
+    if lead.line is None or lead.delay < 0:
+        return lead._replace(starts=tuple(plain))
+    clock = lead.clock_of(log)
+    u, y = log.command[:, lead.driver], without_outliers(log.response[:, j, None])[:, 0]
+    begin = beginning(clock, u, log.response[:, j], lead.line)
+    rates = np.array(settings.rates) * max(0.5 * float(np.ptp(u)), 1e-12)
+    here = begin_at(clock, u, begin, 0.0)
+    fast = limit_rate(np.repeat(here[:, None], len(rates), 1), rates, clock.start)
+    late = delays[delays >= 0]
+    found: dict[tuple[bool, bool], tuple[float, Shape]] = {}
+    for lag, limited in product((0.0, 1.5, 4.0, 12.0), (False, True)):
+        keep = math.exp(-1 / lag) if lag else 0.0
+        slow = lagging(clock, fast if limited else here[:, None], keep)
+        for delay in late:
+            x = look_back(clock, slow, Shape(float(delay)))
+            x = begin_at(clock, x, begin[:, None], float(delay))
+            x = x - x.mean(0)
+            cross = (y - y.mean()) @ x
+            won = cross**2 / np.maximum((x**2).sum(0), TINY)
+            best = int(won.argmax())
+            shape = Shape(float(delay), keep, rate=float(rates[best]) if limited else math.inf)
+            kind = (bool(keep), limited)
+            if kind not in found or won[best] > found[kind][0]:
+                found[kind] = (float(won[best]), shape)
+    return lead._replace(starts=(*plain, *(shape for _, shape in found.values())))
+
+
+def beginning(clock: Clock, u: np.ndarray, y: np.ndarray, line: tuple[float, float]) -> np.ndarray:
+    """Return where each episode begins, as its first response shows, in units of the command.
+
+    Args:
+        clock: of the rows.
+        u: command, ``(N,)``.
+        y: response, ``(N,)``.
+        line: gain and offset.
+    """
+    gain, offset = line
+    return np.clip((y[clock.start] - offset) / gain, u.min(), u.max())
+
+
+def without_outliers(y: np.ndarray, far: float = 4.0) -> np.ndarray:
+    """Cut responses ``(N, R)`` that are farther from the median than 4 times the far quantile."""
     low, middle, high = np.quantile(y, [0.02, 0.5, 0.98], axis=0)
-    return np.clip(y, middle + OUTLIERS * (low - middle), middle + OUTLIERS * (high - middle))
+    return np.clip(y, middle + far * (low - middle), middle + far * (high - middle))

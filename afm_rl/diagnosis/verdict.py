@@ -2,39 +2,37 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from afm_rl.diagnosis.changes import Part, find_parts
+from afm_rl.diagnosis.checks import SUMMED, Doubt, copies_of, echoes, effort_notes, find_doubts
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
+from afm_rl.diagnosis.kinds import agree, small_twins
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.lost import without_lost
-from afm_rl.diagnosis.model import DOWN
-from afm_rl.diagnosis.parts import SEARCHED, Part, find_parts, predict, settle
-from afm_rl.diagnosis.pattern import find_pattern
-from afm_rl.diagnosis.search import Lead, find_leads
-from afm_rl.diagnosis.words import MISFIT, UNITS, judge
+from afm_rl.diagnosis.numbers import numbers_of, quantum_of
+from afm_rl.diagnosis.scale import Scaled, scale
+from afm_rl.diagnosis.search import find_leads, only, rows_enough
+from afm_rl.diagnosis.settings import Settings
+from afm_rl.diagnosis.together import shared_delay, unit_of, with_basis
+from afm_rl.diagnosis.words import judge
 from afm_rl.diagnosis.wrap import unwrapped
 
-ALIKE = 0.1  # deviation of the median gain of all actuators from such a gain
-FEW = 0.1  # share of the rows: a response with more values moves freely
-EXACT = 0.01  # of a step, by which steps may differ
-LOOSE = 0.1  # share of the variance: a response of which less is left follows its command
-CLOSE = 0.3  # times what is left of the response: rates of change of which less is left follow
-ENDLESS = 0.985  # share of the way that is left after a step: no lag, but a sum
-CREEPS = 0.003  # half ranges per step: what is no faster never arrives
-COPY = 0.999  # correlation of two commands that cannot be told apart
+Parts = dict[int, Sequence[Part]]
 
 
-def diagnose(log: Log) -> Diagnosis:
+def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     """Say what each actuator of a log does.
 
-    Each response is fitted by the model of :class:`Actuator`: first lines with every delay, lag
-    and command, then the numbers that its response needs, by robust nonlinear least squares.
-    The log is split where an actuator changed. Intervals take residuals that depend on each other
-    into account, and commands that hardly differ.
+    Each response is fitted by the model of :class:`Actuator`: delay, lag and rate limit together on
+    a grid, then the numbers that its response needs, by robust nonlinear least squares. The log is
+    split where an actuator changed. Intervals take residuals that depend on each other into
+    account, and commands that hardly differ. Then the actuators are judged together: a delay that
+    all share is that of the loop.
 
     >>> u = np.random.default_rng(0).uniform(-1, 1, (400, 2))
     >>> y = u * [1.0, -0.5] + 0.01 * np.random.default_rng(1).standard_normal((400, 2))
@@ -42,170 +40,104 @@ def diagnose(log: Log) -> Diagnosis:
     shoulder: healthy
     elbow: reversed, 50 % of the command
     """
-    read, (log, turns) = log, unwrapped(log, SEARCHED)
-    reach, spread = _reach(log.command), _spread(log.response)
-    moved = np.ptp(log.command, axis=0) > 0
-    scaled = replace(log, command=log.command / reach, response=log.response / spread)
-    leads = find_leads(scaled.thinned(SEARCHED), range(len(log.names)))
-    summed = _summed(scaled, leads)
-    lost = [0.0] * len(leads)
-    quanta = [_quantum(response) for response in log.response.T]
-    for j, lead in enumerate(leads):
-        scaled, lost[j] = without_lost(scaled, j, lead, repeats=not quanta[j])
-    parts = [find_parts(scaled, j, lead) for j, lead in enumerate(leads)]
-    fitted = np.empty_like(scaled.response)
-    found: list[list[Actuator]] = []
-    for j, own in enumerate(parts):
-        found.append([_report(log, scaled, part, j, reach, spread) for part in own])
+    settings = settings or Settings()
+    if log.computed:
+        settings = replace(settings, travel=0.0)
+    exact, same = echoes(log), copies_of(log.command)
+    rows = rows_enough(log, settings)
+    read = log if len(rows) == len(log.command) else only(log, rows)
+    straight, turns = unwrapped(read, settings)
+    scaled = scale(straight)
+    clean, parts, doubts = _explain(scaled, exact, settings)
+    found, fitted = [], np.repeat(straight.response.mean(0)[None], len(rows), 0)
+    for j, name in enumerate(log.names):
+        own = parts.get(j, ())
+        numbers = [numbers_of(scaled, clean, part, j, settings) for part in own]
+        numbers = numbers or [Actuator(name=name, rows=len(log.command))]
+        how: dict[str, Any] = {"units": log.units, "copies": tuple(log.names[i] for i in same[j])}
+        how |= {"turn": turns.get(j, 0.0), "quantum": quantum_of(straight.response[:, j])}
+        lost = float((clean.response[:, j] != scaled.log.response[:, j]).mean())
+        found.append([replace(actuator, lost=lost, **how) for actuator in numbers])
         for part in own:
-            rows = slice(part.first, part.last)
-            fitted[rows, j] = predict(scaled, j, part)[rows]
-    unit, since = _unit([own[-1] for own in found]), log.since
-    actuators = []
-    for j, numbers in enumerate(found):
-        shape = parts[j][-1].model.shape
-        endless = {j} if shape.keep > ENDLESS or shape.rate < CREEPS else set()
-        how = (log.step, log.usual_delay, _doubt(scaled, j, moved, summed | endless))
-        whole = [
-            replace(a, unit=unit, lost=lost[j], quantum=quanta[j], turn=turns.get(j, 0.0))
-            for a in numbers
-        ]
-        said = [judge(actuator, *how) for actuator in whole]
-        changes = tuple(
-            Change(t=float(since[part.first]), before=before, after=after)
-            for part, before, after in zip(parts[j][1:], said[:-1], said[1:], strict=True)
-            if before.sentence != after.sentence  # otherwise too small to be told
-        )
-        actuators.append(judge(replace(said[-1], changes=changes), *how))
+            fitted[part.rows, j] = part.predict(clean, j)[part.rows] * scaled.spread[j]
+    found = unit_of(found)
+    if all(len(own) == 1 for own in found):
+        found = [[actuator] for actuator in with_basis([one for (one,) in found], settings)]
+    usual, shared = shared_delay([own[-1] for own in found], log, settings)
+    times = {j: [float(read.since[part.first]) for part in own] for j, own in parts.items()}
+    notes = [f"{log.names[j]}: an angle that jumps by {turns[j]:.4g}; unwrapped" for j in turns]
+    if len(rows) < len(log.command):
+        notes.append(f"every {round(len(log.command) / len(rows))}th row is looked at")
+    fitted += read.response - straight.response
     return Diagnosis(
-        actuators=tuple(actuators),
+        actuators=_judged(found, times, doubts, usual, scaled, log.step, settings),
         step_s=log.step,
         rows=len(log.command),
-        notes=log.notes,
-        fitted=fitted * spread + read.response - log.response,
+        notes=(*log.notes, *shared, *effort_notes(log), *notes),
+        fitted=fitted[np.searchsorted(rows, np.arange(len(log.command)), side="right") - 1],
     )
 
 
-def _reach(command: np.ndarray) -> np.ndarray:
-    """Return half of the range of each command, ``(A,)``; 1 if it does not change."""
-    low, high = np.quantile(command, [0.01, 0.99], axis=0)
-    reach = 0.5 * np.where(high > low, high - low, np.ptp(command, axis=0))
-    return np.where(reach > 0, reach, 1.0)
+def _explain(
+    scaled: Scaled, exact: Sequence[bool], settings: Settings
+) -> tuple[Log, Parts, dict[int, Doubt]]:
+    """Return the log without lost rows, what explains each response, and why nothing does."""
+    log, names = scaled.log, scaled.raw.names
+    leads = find_leads(log.thinned(settings.searched), range(len(names)), settings)
+    doubts = find_doubts(log, leads, scaled.reach, exact, settings)
+    clean, parts = log, Parts()
+    for j, lead in enumerate(leads):
+        if j not in doubts:
+            parts[j] = find_parts(log, j, lead, settings)
+            repeats = not quantum_of(scaled.raw.response[:, j])
+            clean, lost = without_lost(clean, j, lead, parts[j], repeats)
+            if lost:
+                parts[j] = find_parts(clean, j, lead, settings)
+    parts = agree(clean, parts, scaled.reach, settings)
+    for j, own in parts.items():
+        if any(part.model.shape.endless for part in own):
+            doubts[j] = SUMMED
+    return clean, parts, doubts
 
 
-def _spread(response: np.ndarray) -> np.ndarray:
-    """Return a standard deviation of each response that outliers hardly change, ``(A,)``."""
-    low, high = np.quantile(response, [0.02, 0.98], axis=0)
-    spread = np.clip(response, low, high).std(0)
-    spread = np.where(spread > 0, spread, response.std(0))
-    return np.where(spread > 1e-12 * (1e-300 + np.abs(response).max(0)), spread, 1.0)
+def _judged(
+    found: Sequence[Sequence[Actuator]],
+    times: Mapping[int, Sequence[float]],
+    doubts: Mapping[int, Doubt],
+    usual: Sequence[float],
+    scaled: Scaled,
+    step: float,
+    settings: Settings,
+) -> tuple[Actuator, ...]:
+    """Return the last part of each actuator with its status, its sentence, and its changes.
 
-
-def _quantum(response: np.ndarray) -> float:
-    """Return the size of the steps of a response, 0 if it moves freely."""
-    values = np.unique(response)
-    steps = np.diff(values)
-    if not 3 <= len(values) < FEW * len(response) or not steps.min() > 1e-6 * np.ptp(values):
-        return 0.0
-    size = float(np.median(steps))
-    whole = steps / size
-    return size if np.abs(whole - whole.round()).max() < EXACT else 0.0
-
-
-def _summed(log: Log, leads: Sequence[Lead]) -> set[int]:
-    """Return the actuators whose responses do not follow, but change as the commands say."""
-    odd = [j for j, lead in enumerate(leads) if lead.left > LOOSE]
-    rates = np.diff(log.response, axis=0, prepend=log.response[:1])
-    rates[log.begins] = 0.0
-    found = find_leads(replace(log, response=rates / _spread(rates)).thinned(SEARCHED), odd)
-    close = (rate.left < CLOSE * leads[j].left for j, rate in zip(odd, found, strict=True))
-    return {j for j, good in zip(odd, close, strict=True) if good}
-
-
-def _doubt(log: Log, j: int, moved: np.ndarray, summed: set[int]) -> str:
-    """Return why nothing can be told of an actuator, if so."""
-    if not moved[j]:
-        return "its command does not change"
-    if j in summed:
-        return "its response moves as if it added up its command; log its rate of change"
-    u = log.command - log.command.mean(0)
-    power = np.sqrt((u**2).sum(0))
-    alike = np.abs(u.T @ u[:, j]) / np.maximum(power * power[j], 1e-300)
-    copies = [name for i, name in enumerate(log.names) if i != j and alike[i] > COPY]
-    return f"its command is that of {copies[0]}, up to a factor" if copies else ""
-
-
-def _unit(actuators: Sequence[Actuator]) -> float:
-    """Return the gain of healthy actuators: 1, or that of two known units if most have it."""
-    gains = np.array([abs(a.gain) for a in actuators])
-    clear = [a.gain_interval[0] * a.gain_interval[1] > 0 and abs(a.gain) > 1e-4 for a in actuators]
-    if not any(clear):
-        return 1.0
-    middle = float(np.median(gains[clear]))
-    return next((unit for unit in UNITS.values() if abs(middle / unit - 1) < ALIKE), 1.0)
-
-
-def _report(
-    log: Log, scaled: Log, part: Part, j: int, reach: np.ndarray, spread: np.ndarray
-) -> Actuator:
-    """Return the numbers of a part in the units of the log."""
-    part, problem, intervals = settle(scaled, j, part)
-    model, shape = part.model, part.model.shape
-    unit = reach[model.driver]
-    scale = spread[j] / unit
-    gain, offset = model.gain * scale, model.offset * spread[j]
-    gains, offsets = intervals[0] * scale, intervals[1] * spread[j]
-    y = problem.y[problem.use]
-    residual = y - model.predict(problem)[problem.use]
-    total = float(y.var())
-    left = min(float(residual.var()) / total, 1.0) if total > 0 else 0.0
-    pattern, share = find_pattern(problem, model) if left > MISFIT else ("", 0.0)
-    rows = slice(part.first, part.last)
-    low, high = np.quantile(log.command[rows, model.driver], [0.01, 0.99])
-    coupling = {
-        log.names[i]: float(g * spread[j] / reach[i])
-        for i, g in zip(model.others, model.gains, strict=True)
-        if i != DOWN
-    }
-    down = [g for i, g in zip(model.others, model.gains, strict=True) if i == DOWN]
-    largest = max(coupling, key=lambda name: abs(coupling[name]), default=None)
-    dead_zone = shape.dead_zone or shape.jump
-    for end, beyond, sign in ((shape.low, low, 1), (-shape.high, -high, -1)):
-        if math.isfinite(end) and 0 < end and -0.1 * end * unit < beyond:
-            # One direction only: what is not followed are the small commands.
-            shift = sign * gain * end * unit
-            dead_zone, offset, offsets = end, offset + shift, offsets + shift
-    limits = [end for end in (shape.low, shape.high) if math.isfinite(end)]
-    ends = [abs(end) * unit for end in limits if abs(end) != dead_zone]
-    drift = {}
-    for name, value, change in zip(
-        ("gain", "offset"), (gain, offset), np.multiply(part.drift, (scale, spread[j])), strict=True
-    ):
-        if change:
-            drift[name] = (float(value - change / 2), float(value + change / 2))
-    return Actuator(
-        name=log.names[j],
-        gain=float(gain),
-        gain_interval=(float(gains[0]), float(gains[1])),
-        gain_down=float((model.gain + down[0]) * scale) if down else None,
-        reversed=bool(gains[1] < 0 and (not down or model.gain + down[0] < 0)),
-        offset=float(offset),
-        offset_interval=(float(offsets[0]), float(offsets[1])),
-        dead_zone=float(dead_zone * unit),
-        saturation=float(np.mean(ends)) if ends else None,
-        backlash=float(shape.play * unit),
-        stick=float(shape.stick * unit),
-        rate=float(shape.rate * unit / log.step) if shape.rate < math.inf else None,
-        every=shape.hold,
-        delay_s=shape.delay * log.step,
-        lag_s=-log.step / math.log(shape.keep) if shape.keep > 1e-6 else 0.0,
-        driven_by=log.names[model.driver] if model.driver != j else largest,
-        coupling=coupling,
-        noise=float(residual.std() * spread[j]),
-        unexplained=left,
-        pattern=pattern,
-        misfit=share * left,
-        command_range=(float(low), float(high)),
-        drift=drift,
-        rows=part.rows,
-    )
+    Args:
+        found: the parts of each actuator.
+        times: when they begin (s).
+        doubts: why nothing can be said of some.
+        usual: delay and lag that are no fault (s).
+        scaled: the log.
+        step: time between two of its rows (s).
+        settings: what matters.
+    """
+    actuators, small = [], small_twins(scaled.raw.names, scaled.reach)
+    for j, numbers in enumerate(found):
+        how: dict[str, Any] = {
+            "step": step,
+            "timed": step != 1.0,
+            "usual_delay": usual[j],
+            "settings": settings,
+        }
+        how |= {"doubt": doubts.get(j)}
+        said = [judge(actuator, **how) for actuator in numbers]
+        changes = tuple(
+            Change(t=time, before=before, after=after)
+            for time, before, after in zip(times.get(j, ())[1:], said[:-1], said[1:], strict=True)
+            if before.sentence != after.sentence  # otherwise too small to be told
+            and "cannot tell" not in (before.status, after.status)
+        )
+        last = judge(replace(said[-1], changes=changes), **how)
+        if j in small and last.status == "changed" and not last.reversed:
+            last = judge(last, **how | {"doubt": ("cannot tell", small[j])})
+        actuators.append(last)
+    return tuple(actuators)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from afm_rl.diagnosis.findings import Actuator, Interval, Status
 from afm_rl.diagnosis.pattern import OWN
+from afm_rl.diagnosis.settings import Settings
 
 UNITS = {
     "degrees for radians": 180 / math.pi,
@@ -18,33 +19,16 @@ UNITS = {
     "rad/s for rpm": math.pi / 30,
 }
 """Gain of a healthy actuator whose response is in another unit than its command."""
-MATTERS = 0.05
-"""Share of the gain, or of half the range of commands: smaller deviations are no fault."""
-SWITCH = 0.2
-"""Share of half the range of commands: what saturates below switches."""
-DEAD = 0.1
-"""Share of the usual gain: an actuator whose whole interval is below does not answer."""
-VAGUE = 0.25
-"""Share of the usual gain: where the interval is wider to either side, nothing can be told."""
-LATE = 0.5
-"""Steps: smaller delays and lags are no fault."""
-FOLLOWS = 0.6
-"""Share of the variance: a response of which less is unexplained does follow, however little."""
-LEFT = 0.05
-"""Share of the variance: what leaves more than that unexplained says so."""
-MISFIT = 0.005
-"""Share of the variance: what is unexplained and no noise is told if it is more than that."""
-UNKNOWN = 0.1, 0.3
-"""Share of the variance that is predicted, or unexplained: no known fault fits."""
-MOVES = 0.9
-"""Share of the variance: a response of which more is unexplained has another cause."""
-NO_FAULT, FEW = "no known fault", 3  # parts of a log
-SURE = 1.45
-"""Times the 95 % interval: what a fault has to exceed, so that few are false (99.95 %)."""
+NO_FAULT = "no known fault"
 
 
 def judge(
-    actuator: Actuator, step: float = 1.0, usual_delay: float = 0.0, doubt: str = ""
+    actuator: Actuator,
+    step: float = 1.0,
+    usual_delay: float = 0.0,
+    doubt: tuple[Status, str] | None = None,
+    timed: bool = False,
+    settings: Settings | None = None,
 ) -> Actuator:
     """Return the actuator with its status and its sentence.
 
@@ -55,56 +39,80 @@ def judge(
         actuator: with all numbers.
         step: time between two rows (s).
         usual_delay: delay and lag of the healthy robot (s).
-        doubt: why nothing can be told, if the log shows so.
+        doubt: status and reason, if the log cannot tell.
+        timed: is the step known in seconds?
+        settings: what matters.
 
     >>> elbow = Actuator(name="elbow", gain=-0.62, gain_interval=(-0.63, -0.61), reversed=True,
     ...                  command_range=(-1.0, 1.0), delay_s=0.04)
-    >>> judge(elbow, step=0.02).sentence
-    'elbow: reversed, 62 % of the command, 2 steps late'
+    >>> judge(elbow, step=0.02, timed=True).sentence
+    'elbow: reversed, 62 % of the command, 2 steps (0.04 s) late'
     """
-    faults = list(_faults(actuator, step, usual_delay))
-    low, high = actuator.gain_interval
-    width = 0.5 * (high - low) / actuator.unit
-    size = abs(actuator.gain) / actuator.unit
-    status: Status
-    own = any(name in actuator.pattern for name in OWN)
-    coarse = actuator.noise < 0.5 * actuator.quantum  # that is what is left
-    noticed = bool(actuator.pattern) and actuator.unexplained > MISFIT and not coarse
-    unclear = low <= 0.0 <= high
-    if doubt:
-        status, faults = "cannot tell", [f"cannot tell: {doubt}"]
-    elif actuator.misfit > UNKNOWN[0] or noticed and actuator.unexplained > UNKNOWN[1]:
-        closest = "" if unclear else _closest(faults)
-        status, faults = "changed", [f"{NO_FAULT}: {_rest(actuator)}{closest}"]
-    elif (
-        max(-low, high)
-        < (VAGUE if unclear or actuator.unexplained > MOVES else DEAD) * actuator.unit
-        and actuator.driven_by is None
-        and actuator.gain_down is None
-        and not (outside(widened((low, high))) and actuator.unexplained < FOLLOWS)
-        and not own
-    ):
-        status, faults = "dead", ["does not answer its command"]
-    elif not width < VAGUE * max(1.0, size) and not (faults and not unclear):
-        status, faults = "cannot tell", [f"cannot tell: {_reason(actuator)}"]
-    else:
-        status = "changed" if faults or noticed else "healthy"
-        if faults and actuator.unexplained > UNKNOWN[1]:
-            faults = [_rest(actuator) + _closest(faults)]
-        elif noticed or actuator.unexplained > LEFT:
-            faults = [*(faults or [f"{'nearly ' if noticed else ''}healthy"]), _rest(actuator)]
-    if actuator.changes:
+    s = settings or Settings()
+    status, faults = _judged(actuator, step, usual_delay, doubt, timed, s)
+    if actuator.changes and not doubt:
         now = ", ".join(faults) or "healthy"
         first, *more = actuator.changes
-        story = f"changed at {first.t:.4g} s: {_said(first.before)}, then "
-        story += "".join(f"{_said(c.before)}; at {c.t:.4g} s " for c in more)
+        when = [_when(change.t, step, timed) for change in actuator.changes]
+        story = f"changed at {when[0]}: {_said(first.before)}, then "
+        story += "".join(
+            f"{_said(c.before)}; at {at} " for c, at in zip(more, when[1:], strict=True)
+        )
+        if not more and first.before.status == "healthy":
+            story, now = "", f"{now}, since {when[0]}"
         parts = [now, *(_said(c.before) for c in actuator.changes)]
-        if len(parts) > FEW and any(NO_FAULT in part for part in parts):
+        since = len(parts) == 2 and first.before.status == "healthy"
+        if any(NO_FAULT in part for part in parts) and not since:
             story, now = f"{NO_FAULT}: ", f"no explanation holds longer than a part of {len(parts)}"
         faults = [story + now]
         status = "dead" if status == "dead" else "changed"
     sentence = f"{actuator.name}: {', '.join(faults) or 'healthy'}"
+    if actuator.copies and status in ("healthy", "changed"):
+        sentence += f" (if it follows its own command: {_copied(actuator)} the same up to a factor)"
     return replace(actuator, status=status, sentence=sentence)
+
+
+def _judged(
+    actuator: Actuator,
+    step: float,
+    usual_delay: float,
+    doubt: tuple[Status, str] | None,
+    timed: bool,
+    s: Settings,
+) -> tuple[Status, list[str]]:
+    """Return the status of an actuator that did not change, and what is wrong with it."""
+    faults = list(_faults(actuator, step, usual_delay, timed, s))
+    low, high = actuator.gain_interval
+    width = 0.5 * (high - low) / actuator.unit
+    size = abs(actuator.gain) / actuator.unit
+    coarse = actuator.noise < 0.5 * actuator.quantum  # that is what is left
+    left = actuator.unexplained - actuator.lost
+    noticed = bool(actuator.pattern) and left > 0.005 and not coarse
+    unclear = low <= 0.0 <= high
+    follows = left < 0.6  # of the variance: that little is the command, for certain
+    if doubt:
+        return doubt[0], [f"{doubt[0]}: {doubt[1]}"]
+    if actuator.misfit > 0.1 or noticed and left > s.unknown:
+        closest = "" if unclear or not width < s.vague * max(1.0, size) else _closest(faults)
+        return "changed", [f"{NO_FAULT}: {_rest(actuator)}{closest}"]
+    if (
+        max(-low, high) < (s.vague if unclear or left > 0.9 else s.dead) * actuator.unit
+        and actuator.driven_by is None
+        and actuator.gain_down is None
+        and not (outside(widened((low, high), s)) and follows)
+        and not any(name in actuator.pattern for name in OWN)
+    ):
+        return "dead", ["does not answer its command"]
+    if not width < s.vague * max(1.0, size):
+        return "cannot tell", [f"cannot tell: {_reason(actuator)}"]
+    if not faults and not noticed:
+        return "healthy", ["healthy", _rest(actuator)] if left > s.left else []
+    if faults and left > s.unknown:
+        return "changed", [_rest(actuator) + _closest(faults)]
+    status: Status = "changed" if faults or left > s.left else "healthy"
+    if noticed or left > s.left:
+        faults = [*(faults or ["nearly healthy"]), _rest(actuator)]
+    return status, faults
 
 
 def _said(actuator: Actuator) -> str:
@@ -115,102 +123,142 @@ def _closest(faults: list[str]) -> str:
     return f"; closest: {', '.join(faults)}" if faults else ""
 
 
+def _copied(actuator: Actuator) -> str:
+    first, *more = actuator.copies
+    return f"that of {first} is" if not more else f"those of {len(actuator.copies)} others are"
+
+
 def _rest(actuator: Actuator) -> str:
     """Return how much is unexplained, and what it depends on."""
-    share = (
-        f"{100 * actuator.unexplained:.2g}"
-        if actuator.unexplained < 0.1
-        else (f"{100 * actuator.unexplained:.0f}")
-    )
+    share = 100 * actuator.unexplained
+    text = f"{share:.2g}" if share < 10 else f"{share:.0f}"
     on = f" ({actuator.pattern})" if actuator.pattern else ""
-    return f"{share} % of its motion unexplained{on}"
+    return f"{text} % of its motion unexplained{on}"
 
 
 def _reason(actuator: Actuator) -> str:
+    """Return why the gain is not known, and what would tell."""
+    low, high = (100 * end / actuator.unit for end in actuator.gain_interval)
     if not actuator.reach > 0:
-        return "its command hardly changes"
-    if actuator.unexplained < FOLLOWS and actuator.pattern:
-        return _rest(actuator)
-    return "its command does not stand out from the noise or from other commands"
+        return "its command hardly changes; move it"
+    if not math.isfinite(low + high):
+        return "its command does not stand out from others; move it alone"
+    if actuator.unexplained < 0.6:
+        known = f"its gain is anything from {low:.0f} to {high:.0f} %"
+        return f"{known}; more moves, in both directions, would tell"
+    return (
+        "its command does not stand out from the noise or from other commands; larger moves, of "
+        "it alone, would tell"
+    )
 
 
-def _faults(actuator: Actuator, step: float, usual_delay: float) -> Iterator[str]:
+def _faults(
+    actuator: Actuator, step: float, usual_delay: float, timed: bool, s: Settings
+) -> Iterator[str]:
     """Yield what is wrong, in words."""
     unit, reach = actuator.unit, actuator.reach
-    low, high = (end / unit for end in widened(actuator.gain_interval))
+    low, high = (end / unit for end in widened(actuator.gain_interval, s))
     share = abs(actuator.gain) / unit
+    small = max(s.matters * reach, actuator.quantum / unit)
+    command, response = (f" {text}" if text else "" for text in actuator.units)
+    moves = "the moves of its command" if actuator.centre else "the command"
     other = actuator.driven_by
     if other is not None and other not in actuator.coupling:
         yield f"follows the command of {other}"
     if actuator.reversed:
         yield "reversed"
         low, high = -high, -low
-    cut = actuator.saturation
-    switches = cut is not None and cut < SWITCH * reach
+    ends = actuator.limits
+    switches = ends is not None and ends[1] > ends[0] and ends[1] - ends[0] < 0.4 * reach
     down = actuator.gain if actuator.gain_down is None else actuator.gain_down
     if switches:
         yield "switches between two responses, whatever the size of its command"
-    elif abs(down - actuator.gain) > MATTERS * unit:
+    elif abs(down - actuator.gain) > s.matters * unit:
         sides = 100 * actuator.gain / unit, 100 * down / unit
         yield f"{sides[0]:.0f} % of positive commands, {sides[1]:.0f} % of negative ones"
     elif "gain" in actuator.drift:
         pass
-    elif not low <= 1.0 <= high and abs(share - 1.0) > MATTERS:
-        odd = [name for name, gain in UNITS.items() if abs(share / gain - 1.0) < MATTERS]
+    elif actuator.basis is not None:
+        name, kind, p, q = actuator.basis
+        what = ("of their sum", "of their difference")
+        if kind == "sides":
+            what = ("on one side", "on the other side")
+        p, q = 100 * p / unit, 100 * q / unit
+        yield f"with {name} as one: {p:.0f} % {what[0]}, {q:.0f} % {what[1]}"
+    elif not low <= 1.0 <= high and abs(share - 1.0) > s.matters:
+        odd = [name for name, gain in UNITS.items() if abs(share / gain - 1.0) < s.matters]
         yield (
-            f"{share:.3g} times its command: {odd[0]}"
-            if odd
-            else (f"{100 * share:.0f} % of the command")
+            f"{share:.3g} times its command: {odd[0]}" if odd else f"{100 * share:.0f} % of {moves}"
         )
-    for name, gain in actuator.coupling.items():
+    for name, gain in actuator.coupling.items() if actuator.basis is None else ():
         yield f"takes in {100 * gain / unit:+.0f} % of the command of {name}"
     if (
         "offset" not in actuator.drift
         and not switches
-        and outside(widened(actuator.offset_interval))
-        and abs(actuator.offset) > MATTERS * unit * reach
+        and outside(widened(actuator.offset_interval, s))
+        and abs(actuator.offset) > s.matters * unit * reach
     ):
-        yield f"offset {actuator.offset:+.3g}"
-    if actuator.quantum > MATTERS * unit * reach:
-        yield f"moves in steps of {actuator.quantum:.3g}"
-    if actuator.dead_zone > max(MATTERS * reach, actuator.quantum / unit):
-        yield f"no motion for commands below {actuator.dead_zone:.3g}"
-    if cut is not None and not switches:
-        yield f"no more for commands beyond {cut:.3g}"
-    if actuator.backlash > max(MATTERS * reach, actuator.quantum / unit):
-        yield f"play of {2 * actuator.backlash:.3g}"
-    if actuator.stick > max(MATTERS * reach, actuator.quantum / unit):
-        yield f"sticks for changes below {actuator.stick:.3g}"
+        at = f" at {actuator.centre:.3g}{command}" if actuator.centre else ""
+        range_ = 100 * abs(actuator.offset) / (2 * reach * unit)
+        yield f"offset {actuator.offset:+.3g}{response} ({range_:.0f} % of its range){at}"
+    if actuator.quantum > s.matters * unit * reach:
+        yield f"moves in steps of {actuator.quantum:.3g}{response}"
+    if actuator.dead_zone > small:
+        yield f"no motion for commands below {actuator.dead_zone:.3g}{command}"
+    if ends is not None and not switches:
+        yield f"no more for commands {_beyond(ends, actuator, command)}"
+    if actuator.backlash > small:
+        yield f"play of {2 * actuator.backlash:.3g}{command}"
+    if actuator.stick > small:
+        yield f"sticks for changes below {actuator.stick:.3g}{command}"
     if actuator.rate is not None:
-        yield f"no faster than {actuator.rate:.3g} per second"
+        yield f"no faster than {actuator.rate:.3g}{response} per second"
     if actuator.every > 1:
         yield f"takes over one of {actuator.every} commands only"
-    if actuator.delay_s < -LATE * step:
-        yield f"answers {_steps(-actuator.delay_s / step)} before its command in the log"
-    if actuator.delay_s > usual_delay + LATE * step:
-        yield f"{_steps(actuator.delay_s / step)} late"
-    if actuator.delay_s + actuator.lag_s > usual_delay + LATE * step and (
-        actuator.lag_s > LATE * step
-    ):
-        yield f"a lag of {_steps(actuator.lag_s / step)}"
-    if actuator.turn:
-        yield f"jumps by {actuator.turn:.4g}: an angle that is not unwrapped"
+    yield from _timing(actuator, step, usual_delay, timed, s)
     if actuator.lost:
         yield f"does not follow in {100 * actuator.lost:.0f} % of the rows"
     for name, (begin, end) in actuator.drift.items():
-        yield f"{name} drifts from {begin:.3g} to {end:.3g}"
+        yield f"{name} drifts from {begin:.3g} to {end:.3g}{response if name == 'offset' else ''}"
 
 
-def widened(interval: Interval) -> Interval:
+def _timing(
+    actuator: Actuator, step: float, usual_delay: float, timed: bool, s: Settings
+) -> Iterator[str]:
+    """Yield what is wrong with the time that an actuator takes."""
+    delay, lag, late = actuator.delay_s, actuator.lag_s, s.late * step
+    if widened(actuator.time_interval, s)[0] < usual_delay < delay + lag:
+        usual_delay = delay + lag  # it may as well be the usual one
+    made_up = ", made up for" if actuator.made_up else ""
+    if delay < -late:
+        yield f"answers {_steps(-delay, step, timed)} before its command in the log"
+    if delay > usual_delay + late:
+        yield f"{_steps(delay, step, timed)} late{made_up}"
+    if delay + lag > usual_delay + late and lag > late:
+        yield f"a lag of {_steps(lag, step, timed)}{made_up}"
+
+
+def _beyond(ends: Interval, actuator: Actuator, unit: str) -> str:
+    """Return between which commands something happens, in words."""
+    low, high = ends
+    if low < high and not abs(low + high) < 0.1 * (high - low):
+        return f"below {low:.3g}{unit} or above {high:.3g}{unit}"
+    if low < high or actuator.command_range[0] < 0.0 < actuator.command_range[1]:
+        return f"beyond {actuator.saturation:.3g}{unit}"
+    upper = high > sum(actuator.command_range) / 2
+    return f"{'above' if upper else 'below'} {high:.3g}{unit}"
+
+
+def widened(interval: Interval, settings: Settings) -> Interval:
     """Return the interval that a fault has to exceed.
 
-    >>> widened((-1.0, 1.0))
+    >>> widened((-1.0, 1.0), Settings())
     (-1.45, 1.45)
     """
     low, high = interval
     if high - low == float("inf"):
         return interval
-    middle, half = 0.5 * (low + high), 0.5 * SURE * (high - low)
+    middle, half = 0.5 * (low + high), 0.5 * settings.sure * (high - low)
     return middle - half, middle + half
 
 
@@ -219,11 +267,21 @@ def outside(interval: Interval) -> bool:
     return not interval[0] <= 0.0 <= interval[1]
 
 
-def _steps(count: float) -> str:
-    """Return a number of steps in words.
+def _when(time: float, step: float, timed: bool) -> str:
+    """Return a time since the log began in words.
 
-    >>> _steps(1.04), _steps(2.5)
-    ('1 step', '2.5 steps')
+    >>> _when(2.0, 0.1, True)
+    'step 20 (2 s)'
     """
-    text = f"{count:.1f}".removesuffix(".0")
-    return f"{text} step{'' if text == '1' else 's'}"
+    return f"step {time / step:.0f}" + (f" ({time:.4g} s)" if timed else "")
+
+
+def _steps(time: float, step: float, timed: bool) -> str:
+    """Return a time in steps and, where these are known, seconds.
+
+    >>> _steps(1.04, 1.0, False), _steps(0.05, 0.02, True)
+    ('1 step', '2.5 steps (0.05 s)')
+    """
+    text = f"{time / step:.1f}".removesuffix(".0")
+    seconds = f" ({time:.2g} s)" if timed else ""
+    return f"{text} step{'' if text == '1' else 's'}{seconds}"

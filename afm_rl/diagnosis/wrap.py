@@ -10,13 +10,12 @@ import numpy as np
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.response import Shape, respond
 from afm_rl.diagnosis.search import find_leads
+from afm_rl.diagnosis.settings import Settings
 
 TURNS = (2 * math.pi, 360.0)
-LARGER = 1.05  # times a turn: what moves farther does not wrap
-BETTER = 0.3  # times the variance that lines leave: what unwrapping has to reach
 
 
-def unwrapped(log: Log, rows: int) -> tuple[Log, dict[int, float]]:
+def unwrapped(log: Log, settings: Settings) -> tuple[Log, dict[int, float]]:
     """Return the log without jumps by a turn, and the turns of the actuators that had them.
 
     A response is unwrapped if the commands explain it far better then; so is a command that wraps
@@ -24,7 +23,7 @@ def unwrapped(log: Log, rows: int) -> tuple[Log, dict[int, float]]:
 
     Args:
         log: as it was written.
-        rows: at most so many are looked at for an explanation.
+        settings: of the search for an explanation.
     """
     turns: dict[int, float] = {}
     for j in range(len(log.names)):
@@ -36,10 +35,13 @@ def unwrapped(log: Log, rows: int) -> tuple[Log, dict[int, float]]:
         if _turn(log.command[:, j]) == turn:
             both = _with(options[0], "command", j, np.unwrap(log.command[:, j], period=turn))
             options.append(both)
-        left = [find_leads(option.thinned(rows), [j])[0].left for option in (log, *options)]
+        left = [
+            find_leads(option.thinned(settings.searched), [j], settings)[0].left
+            for option in (log, *options)
+        ]
         best = int(np.argmin(left))
-        if best and left[best] < BETTER * left[0]:
-            log = _near_line(options[best - 1], j, turn, rows)
+        if best and left[best] < 0.3 * left[0]:
+            log = _near_line(options[best - 1], j, turn, settings)
             if best == 1:
                 turns[j] = turn
     return log, turns
@@ -48,7 +50,7 @@ def unwrapped(log: Log, rows: int) -> tuple[Log, dict[int, float]]:
 def _turn(values: np.ndarray) -> float | None:
     """Return by which turn some values jump, if by any."""
     jump, reach = np.abs(np.diff(values)).max(), np.ptp(values)
-    return next((turn for turn in TURNS if 0.5 * turn < jump and reach < LARGER * turn), None)
+    return next((turn for turn in TURNS if 0.5 * turn < jump and reach < 1.05 * turn), None)
 
 
 def _with(log: Log, kind: str, j: int, values: np.ndarray) -> Log:
@@ -57,9 +59,9 @@ def _with(log: Log, kind: str, j: int, values: np.ndarray) -> Log:
     return replace(log, **{kind: table})
 
 
-def _near_line(log: Log, j: int, turn: float, rows: int) -> Log:
+def _near_line(log: Log, j: int, turn: float, settings: Settings) -> Log:
     """Return the log with each response of an actuator in the turn that is next to a line."""
-    (lead,) = find_leads(log.thinned(rows), [j])
+    (lead,) = find_leads(log.thinned(settings.searched), [j], settings)
     x = respond(lead.clock_of(log), log.command[:, lead.driver], Shape(lead.delay, lead.keep))
     y = log.response[:, j]
     slope = np.cov(x, y)[0, 1] / max(float(x.var()), 1e-300)

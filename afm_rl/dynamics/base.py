@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
-from afm_rl.dynamics.derivatives import derivative, linearised
+from afm_rl.dynamics.derivatives import derivative, linearised, pushed_forward
 from afm_rl.errors import check_count
 from afm_rl.spaces.manifold import Manifold
 
@@ -137,3 +137,10 @@ class DynamicsModel(nn.Module, ABC):
     def select_(self, index: Tensor) -> DynamicsModel:
         """Keep the missions in ``index`` only, in place (see :meth:`expand_`)."""
         return self
+
+
+def jacobian_of_linearised(model: DynamicsModel, state: Tensor, action: Tensor) -> Tensor:
+    """Return :meth:`DynamicsModel.jacobian` of a model with a closed :meth:`~.linearise`."""
+    ahead, _, by_action = model.linearise(state, action)
+    origin = state.unsqueeze(-2)
+    return pushed_forward(lambda s: model.manifold.difference(s, origin), ahead, by_action)[1]

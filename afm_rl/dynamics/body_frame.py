@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import roma
 import torch
 from torch import Tensor
-
-from afm_rl.spaces.rotations import rotate, rotate_slope
 
 VELOCITY, ATTITUDE = slice(3, 6), slice(6, 10)  # of a state, see RigidBodySpace
 
@@ -23,15 +22,22 @@ def to_world(state: Tensor) -> Tensor:
     >>> (to_world(quarter) @ torch.arange(13.0))[3:6].round()
     tensor([-4.,  3.,  5.])
     """
-    axes, whole = (torch.eye(size, dtype=state.dtype, device=state.device) for size in (3, 13))
-    turned = rotate(state[..., ATTITUDE].unsqueeze(-2), axes).mT
+    whole = torch.eye(13, dtype=state.dtype, device=state.device)
     matrix = whole.repeat(*state.shape[:-1], 1, 1)
-    matrix[..., VELOCITY, VELOCITY] = turned
+    matrix[..., VELOCITY, VELOCITY] = roma.unitquat_to_rotmat(state[..., ATTITUDE])
     return matrix
 
 
 def to_world_slope(state: Tensor, rate: Tensor) -> Tensor:
-    """Return how a rate ``(*B, 13)``, turned, changes with the state, ``(*B, 13, 13)``."""
+    r"""Return how a rate ``(*B, 13)``, turned, changes with the state, ``(*B, 13, 13)``.
+
+    :math:`\mathrm d(q \otimes a \otimes \bar q) = 2\,\mathrm{vec}(\mathrm dq \otimes a \otimes
+    \bar q)` for the acceleration a.
+    """
+    push = torch.nn.functional.pad(rate[..., VELOCITY], (0, 1)).unsqueeze(-2)
+    back = roma.quat_conjugation(state[..., ATTITUDE]).unsqueeze(-2)
+    steps = torch.eye(4, dtype=state.dtype, device=state.device)
     slope = state.new_zeros(*state.shape, state.shape[-1])
-    slope[..., VELOCITY, ATTITUDE] = rotate_slope(state[..., ATTITUDE], rate[..., VELOCITY])
+    turned = roma.quat_product(steps, roma.quat_product(push, back))
+    slope[..., VELOCITY, ATTITUDE] = 2 * turned[..., :3].mT
     return slope

@@ -8,21 +8,19 @@ from torch import Tensor, nn
 from afm_rl.compiling.tracing import may_look
 from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.dynamics.derivatives import linearised
-from afm_rl.dynamics.hammerstein import PLAIN, shaped, shaped_slope
 from afm_rl.dynamics.per_mission import PerMissionModel
 from afm_rl.errors import ConfigurationError
 
-CALIBRATION = ("matrix", "bias", "shape", "offset")
+CALIBRATION = ("matrix", "bias", "offset")
 
 
 class Calibrated(PerMissionModel):
-    r"""A frozen model behind a static map of its action and in front of an offset.
+    r"""A frozen model behind an affine map of its action and in front of an offset.
 
     .. math:: f(s, a) = \mathrm{model}(s,\ a') \oplus c,\qquad
-              a' = h \odot (D\,\psi(a / h) + b)
+              a' = h \odot (D\,a / h + b)
 
-    with h the half ranges of the action. D, b and the static shape :math:`\psi`
-    (:func:`~afm_rl.dynamics.hammerstein.shaped`) describe what other actions can undo (*matched*
+    with h the half ranges of the action. D and b describe what other actions can undo (*matched*
     uncertainty), c what no action can (*unmatched*). For missions whose calibration is the
     identity, predictions are those of the model to the bit.
 
@@ -47,7 +45,6 @@ class Calibrated(PerMissionModel):
     half_range: Tensor
     matrix: Tensor
     bias: Tensor
-    shape: Tensor
     offset: Tensor
 
     def __init__(self, model: DynamicsModel, half_range: Tensor) -> None:
@@ -67,15 +64,14 @@ class Calibrated(PerMissionModel):
         self.register_buffer("half_range", half_range, persistent=False)
         self.register_buffer("matrix", torch.eye(size))
         self.register_buffer("bias", torch.zeros(size))
-        self.register_buffer("shape", torch.tensor(PLAIN))
         self.register_buffer("offset", torch.zeros(model.manifold.tangent_size))
 
     def calibrate_(self, **calibration: Tensor) -> None:
         """Set parts of the calibration, in place.
 
         Args:
-            calibration: any of ``matrix`` ``(*L, A, A)``, ``bias`` ``(*L, A)``, ``shape``
-                ``(*L, 3)`` and ``offset`` ``(*L, D)``.
+            calibration: any of ``matrix`` ``(*L, A, A)``, ``bias`` ``(*L, A)`` and ``offset``
+                ``(*L, D)``.
         """
         for name, value in calibration.items():
             now = self.get_buffer(name)
@@ -85,11 +81,8 @@ class Calibrated(PerMissionModel):
         """Return a', what the model is asked about, for actions ``(*L, *N, A)``."""
         unit = action / self.half_range
         matrix, moved = self._wide(self.matrix, action), self._wide(self.bias, action)
-        command = unit
-        if _any(self.shape != self.shape.new_tensor(PLAIN)):
-            command = shaped(unit, self._wide(self.shape, action))
         for axis in range(self.action_size):  # faster than products of very small matrices
-            moved = torch.addcmul(moved, matrix[..., axis], command[..., axis, None])
+            moved = torch.addcmul(moved, matrix[..., axis], unit[..., axis, None])
         return action + self.half_range * (moved - unit)  # plus exactly 0 for the identity
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
@@ -153,9 +146,8 @@ class Calibrated(PerMissionModel):
 
     def _slope(self, action: Tensor) -> Tensor:
         """Return the derivative of a' ``(*L, *N, A, A)``."""
-        matrix, shape = self._wide(self.matrix, action), self._wide(self.shape, action)
-        bend = shaped_slope(action / self.half_range, shape)
-        return self.half_range.unsqueeze(-1) * matrix * (bend / self.half_range).unsqueeze(-2)
+        matrix = self._wide(self.matrix, action)
+        return self.half_range.unsqueeze(-1) * matrix / self.half_range
 
     def _wide(self, part: Tensor, like: Tensor) -> Tensor:
         """Insert dimensions into ``(*L, ...)`` so that it goes with ``(*L, *N, ...)``."""

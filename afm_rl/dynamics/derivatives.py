@@ -33,6 +33,27 @@ def derivative(
     return value, torch.zeros_like(value) if slope is None else slope
 
 
+def pushed_forward(
+    function: Callable[[Tensor], Tensor], point: Tensor, slope: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return a function's value at a point, and its derivative by what the point depends on.
+
+    Args:
+        function: takes ``(*B, K, S)``, returns ``(*B, K, R)``.
+        point: ``(*B, S)``.
+        slope: derivative of the point by K parameters, ``(*B, S, K)``.
+
+    Returns:
+        ``(*B, R)`` and ``(*B, R, K)``.
+
+    >>> pushed_forward(torch.square, torch.tensor([3.0]), torch.tensor([[1.0, 2.0]]))
+    (tensor([9.]), tensor([[ 6., 12.]]))
+    """
+    columns = slope.mT
+    value, moved = derivative(function, (point.unsqueeze(-2).expand_as(columns),), (columns,))
+    return value[..., 0, :], moved.mT
+
+
 def linearised(
     function: Callable[[Tensor, Tensor], Tensor], state: Tensor, action: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:

@@ -21,11 +21,11 @@ class HeldHybrid(HeldRate):
         turned: whether the network speaks in the frame of a rigid body, see
             :func:`~afm_rl.dynamics.body_frame.to_world`.
 
-    >>> from afm_rl.dynamics.rates import FunctionRate
+    >>> from afm_rl.dynamics.rates import HeldFunction
     >>> from afm_rl.dynamics.residual import draw_network
     >>> from afm_rl.spaces.manifold import Manifold
     >>> action, network = torch.zeros(1, 7, 1), draw_network(torch.ones(1, 10), 3, 2, 2)
-    >>> nominal = FunctionRate(lambda x, u: -x + u, Manifold(2)).hold(action)
+    >>> nominal = HeldFunction(action, lambda x, u: -x + u, Manifold(2))
     >>> held = HeldHybrid(nominal, network, action, features=None)
     >>> held.tangent(torch.zeros(1, 7, 2), torch.eye(2, 3).expand(1, 7, 2, 3))[1].shape
     torch.Size([1, 7, 2, 3])
@@ -52,6 +52,9 @@ class HeldHybrid(HeldRate):
         if self.turned:
             value = (to_world(state) @ value.unsqueeze(-1)).squeeze(-1)
         return self.nominal(state) + value
+
+    def finish(self, state: Tensor) -> Tensor:
+        return self.nominal.finish(state)
 
     def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
         rate, turn = self.nominal.tangent(state, through)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
-from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.dynamics.base import DynamicsModel, jacobian_of_linearised
 from afm_rl.dynamics.hybrid_rate import HeldHybrid
 from afm_rl.dynamics.per_mission import PerMissionModel
 from afm_rl.dynamics.quadrotor import Quadrotor
-from afm_rl.dynamics.quadrotor_equations import QuadrotorRate
-from afm_rl.dynamics.rates import FunctionRate, Rate, on_tangent
+from afm_rl.dynamics.quadrotor_equations import HeldFlight
+from afm_rl.dynamics.rates import HeldFunction, HeldRate
 from afm_rl.dynamics.residual import Network, draw_network, network_shapes
-from afm_rl.dynamics.runge_kutta import runge_kutta, runge_kutta_tangent, undisturbed
+from afm_rl.dynamics.runge_kutta import runge_kutta, runge_kutta_linearised
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
 
 
@@ -73,7 +74,7 @@ class KNODE(PerMissionModel):
     ) -> None:
         super().__init__(nominal.manifold, nominal.action_size)
         self.nominal = nominal
-        self.rate = _rate_of(nominal, rate)
+        self.hold = _held_rate_of(nominal, rate)
         given = getattr(nominal, "dt", None) if dt is None else dt
         if given is None:
             raise ConfigurationError(
@@ -166,40 +167,25 @@ class KNODE(PerMissionModel):
             ``(*L, *N, S)``.
         """
         rows, held, batch = self._held(state, action, newest)
-        ahead = self.rate.finish(runge_kutta(held, rows, dt, substeps))
+        ahead = held.finish(runge_kutta(held, rows, dt, substeps))
         return ahead.reshape(*batch, self.state_size)
 
     def slope(self, state: Tensor, action: Tensor, newest: Network | None = None) -> Tensor:
-        """Return the derivative of the rate of change by state and action.
-
-        Args:
-            state: ``(*L, *N, S)``.
-            action: ``(*L, *N, A)``.
-            newest: a network that counts as pushed; None for the pool as it is.
-
-        Returns:
-            ``(*L, *N, S, S + A)``.
-        """
+        """Return the derivative of the rate of change by the state, ``(*L, *N, S, S)``."""
         rows, held, batch = self._held(state, action, newest)
-        slope = held.tangent(rows, undisturbed(rows, self.action_size))[1]
-        return slope.reshape(*batch, *slope.shape[-2:])
+        size = self.state_size
+        eye = torch.eye(size, size + self.action_size, dtype=rows.dtype, device=rows.device)
+        slope = held.tangent(rows, eye.expand(*rows.shape[:-1], *eye.shape))[1]
+        return slope[..., :size].reshape(*batch, size, size)
 
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        ahead, through = self._through(state, action, slice(None))
-        size = self.state_size
-        return ahead, through[..., :size], through[..., size:]
+        rows, held, batch = self._held(state, action, None)
+        found = runge_kutta_linearised(held, rows, self.action_size, self.dt, self.substeps)
+        ahead, by_state, by_action = (part.reshape(*batch, *part.shape[2:]) for part in found)
+        return ahead, by_state, by_action
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
-        moved = self._through(state, action, slice(self.state_size, None))
-        return on_tangent(self.manifold, *moved, state)
-
-    def _through(self, state: Tensor, action: Tensor, columns: slice) -> tuple[Tensor, Tensor]:
-        """Return the next state and those columns of its derivative by state and action."""
-        rows, held, batch = self._held(state, action, None)
-        start = undisturbed(rows, self.action_size)[..., columns]
-        moved = runge_kutta_tangent(held.tangent, rows, start, self.dt, self.substeps)
-        ahead, through = self.rate.finish_tangent(*moved)
-        return ahead.reshape(*batch, -1), through.reshape(*batch, *through.shape[-2:])
+        return jacobian_of_linearised(self, state, action)
 
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return a single member's mean and unit variance, in the nominal model's units."""
@@ -259,16 +245,18 @@ class KNODE(PerMissionModel):
         whole = len(self.features) == self.state_size
         network = self._merged(newest, state)
         features = None if whole else self.features
-        hold = self.rate.hold(action)
-        return state, HeldHybrid(hold, network, action, features, self.turned), batch
+        held = HeldHybrid(self.hold(action), network, action, features, self.turned)
+        return state, held, batch
 
 
-def _rate_of(nominal: DynamicsModel, rate: Callable[[Tensor, Tensor], Tensor] | None) -> Rate:
-    """Return the rate of change behind a nominal model."""
+def _held_rate_of(
+    nominal: DynamicsModel, rate: Callable[[Tensor, Tensor], Tensor] | None
+) -> Callable[[Tensor], HeldRate]:
+    """Return what gives the rate of change of a nominal model under an action."""
     if rate is not None:
-        return FunctionRate(rate, nominal.manifold)
+        return partial(HeldFunction, function=rate, manifold=nominal.manifold)
     if isinstance(nominal, Quadrotor):
-        return QuadrotorRate(nominal.body)
+        return partial(HeldFlight, body=nominal.body)
     raise ConfigurationError(
         f"dynamics.rate=None: expected the rate of change of {type(nominal).__name__}; only that "
         "of a Quadrotor is known"

@@ -60,18 +60,25 @@ class KnownDynamics(DynamicsModel):
         """Return the next state ``(*B, S)``.
 
         Raises:
-            ConfigurationError: if the step function returns anything else.
+            ConfigurationError: if the step function fails, or returns anything else.
         """
-        ahead = self.step(state, action)
         batch = torch.broadcast_shapes(state.shape[:-1], action.shape[:-1])
+        try:
+            ahead = self.step(state, action)
+        except (IndexError, RuntimeError, TypeError, ValueError) as error:
+            raise self._refusal(f"fails ({error})", state, action) from error
         if not isinstance(ahead, Tensor) or ahead.shape != (*batch, state.shape[-1]):
             found = tuple(ahead.shape) if isinstance(ahead, Tensor) else type(ahead).__name__
-            raise ConfigurationError(
-                f"dynamics.step: returned {found} for states {tuple(state.shape)} and actions "
-                f"{tuple(action.shape)}; expected a tensor {(*batch, state.shape[-1])}: a step "
-                "function in torch that works on the last dimension, as in state[..., 0]"
-            )
+            raise self._refusal(f"returned {found}", state, action)
         return ahead
+
+    def _refusal(self, what: str, state: Tensor, action: Tensor) -> ConfigurationError:
+        batch = torch.broadcast_shapes(state.shape[:-1], action.shape[:-1])
+        return ConfigurationError(
+            f"dynamics.step: {what} for states {tuple(state.shape)} and actions "
+            f"{tuple(action.shape)}; expected a tensor {(*batch, state.shape[-1])}: a step "
+            "function in torch that works on the last dimension, as in state[..., 0]"
+        )
 
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return a single member's mean and unit variance, in units of ``noise_std``."""

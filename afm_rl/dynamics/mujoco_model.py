@@ -117,5 +117,11 @@ def state_names(model: Any) -> list[str]:
 
 
 def actuator_names(model: Any) -> list[str]:
-    """Return the names of actuators; those without one are called ``a_k``."""
-    return [model.actuator(k).name or f"a_{k}" for k in range(model.nu)]
+    """Return the names of actuators, those without one by the joint that they drive, or ``a_k``."""
+    names: list[str] = []
+    for k in range(model.nu):
+        name = model.actuator(k).name
+        if not name and model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT:
+            name = model.joint(model.actuator_trnid[k, 0]).name
+        names.append(name if name and name not in names else f"a_{k}")
+    return names

@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import roma
 import torch
 from torch import Tensor
 
 from afm_rl.spaces.manifold import Manifold, wrap_angle
-from afm_rl.spaces.rotations import (
-    quaternion_conjugate,
-    quaternion_exp,
-    quaternion_log,
-    quaternion_multiply,
-    quaternion_normalise,
-)
 
 
 class MuJoCoSpace(Manifold):
@@ -54,7 +48,7 @@ class MuJoCoSpace(Manifold):
     def project(self, raw: Tensor) -> Tensor:
         """Scale the quaternions in ``(*B, S)`` to length 1."""
         parts = self._parts(raw, 4)
-        parts[1::2] = [quaternion_normalise(part) for part in parts[1::2]]
+        parts[1::2] = [roma.quat_normalize(part) for part in parts[1::2]]
         return torch.cat(parts, -1)
 
     def difference(self, state: Tensor, origin: Tensor) -> Tensor:
@@ -66,8 +60,8 @@ class MuJoCoSpace(Manifold):
         parts = self._parts(raw, 4)
         for k, first in enumerate(self.quaternions):
             here, there = (x[..., first : first + 4].roll(-1, -1) for x in (origin, state))
-            turn = quaternion_multiply(quaternion_conjugate(here), there)
-            parts[2 * k + 1] = quaternion_log(turn)
+            turn = roma.quat_product(roma.quat_conjugation(here), there)
+            parts[2 * k + 1] = roma.unitquat_to_rotvec(turn)
         return torch.cat(parts, -1)
 
     def add(self, origin: Tensor, tangent: Tensor) -> Tensor:
@@ -75,7 +69,7 @@ class MuJoCoSpace(Manifold):
         turns = self._parts(tangent, 3)
         for k, first in enumerate(self.quaternions):
             here = origin[..., first : first + 4].roll(-1, -1)
-            turned = quaternion_multiply(here, quaternion_exp(turns[2 * k + 1]))
+            turned = roma.quat_product(here, roma.rotvec_to_unitquat(turns[2 * k + 1]))
             turns[2 * k + 1] = turned.roll(1, -1) - origin[..., first : first + 4]
         raw = origin + torch.cat(turns, -1)
         return torch.where(self.is_angle, wrap_angle(raw), raw)

@@ -7,13 +7,13 @@ from functools import partial
 
 from torch import Tensor
 
+from afm_rl.dynamics.base import jacobian_of_linearised
 from afm_rl.dynamics.known import KnownDynamics
-from afm_rl.dynamics.quadrotor_equations import QuadrotorRate, aligned, quadrotor_step
-from afm_rl.dynamics.rates import on_tangent
-from afm_rl.dynamics.runge_kutta import runge_kutta_tangent, undisturbed
+from afm_rl.dynamics.quadrotor_equations import HeldFlight, aligned, quadrotor_step
+from afm_rl.dynamics.runge_kutta import runge_kutta_linearised
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.spaces.airframe import QuadrotorBody
-from afm_rl.spaces.rotations import RigidBodySpace
+from afm_rl.spaces.rigid_body import RigidBodySpace
 
 
 class Quadrotor(KnownDynamics):
@@ -59,20 +59,11 @@ class Quadrotor(KnownDynamics):
 
     def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         state, action = aligned(state, action)
-        ahead, slope = self._through(state, action, undisturbed(state, self.action_size))
-        return ahead, slope[..., :13], slope[..., 13:]
+        rate = HeldFlight(action, self.body)
+        return runge_kutta_linearised(rate, state, 4, self.dt, self.substeps)
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
-        state, action = aligned(state, action)
-        still = undisturbed(state, self.action_size)[..., 13:]
-        return on_tangent(self.manifold, *self._through(state, action, still), state)
-
-    def _through(self, state: Tensor, action: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the next state ``(*B, 13)`` and its derivatives ``(*B, 13, K)``."""
-        rate = QuadrotorRate(self.body)
-        tangent = rate.hold(action).tangent
-        moved = runge_kutta_tangent(tangent, state, start, self.dt, self.substeps)
-        return rate.finish_tangent(*moved)
+        return jacobian_of_linearised(self, state, action)
 
 
 def check_body(body: QuadrotorBody | None) -> QuadrotorBody:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import roma
 import torch
 from torch import Tensor
 
 from afm_rl.compiling.tracing import cached
-from afm_rl.dynamics.rates import HeldRate, Rate
+from afm_rl.dynamics.rates import HeldRate
 from afm_rl.dynamics.runge_kutta import runge_kutta_path
 from afm_rl.spaces.airframe import QuadrotorBody
-from afm_rl.spaces.rotations import quaternion_normalise
 
 
 class _Tables(NamedTuple):
@@ -33,6 +33,10 @@ class HeldFlight(HeldRate):
         action: thrust (N) and moments (N m), ``(*B, 4)``.
         body: the quadrotor.
         wind: a further acceleration (m/s^2), ``(*B, 3)``.
+
+    >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
+    >>> HeldFlight(torch.zeros(4), QuadrotorBody())(level)[3:6]
+    tensor([ 0.0000,  0.0000, -9.8100])
     """
 
     def __init__(self, action: Tensor, body: QuadrotorBody, wind: Tensor | None = None) -> None:
@@ -59,6 +63,9 @@ class HeldFlight(HeldRate):
         rest[..., 7:, -3:] += tables.inverse.diag()
         return self._rate(state, sums), torch.cat([through[..., 3:6, :], rest], -2)
 
+    def finish(self, state: Tensor) -> Tensor:
+        return unit(state)
+
     def _sums(self, state: Tensor) -> Tensor:
         """Return the sums of products that b_3, q' and w' are made of, ``(*B, 10)``."""
         tables = self.tables
@@ -68,36 +75,6 @@ class HeldFlight(HeldRate):
 
     def _rate(self, state: Tensor, sums: Tensor) -> Tensor:
         return torch.cat([state[..., 3:6], torch.addcmul(self.offset, self.gain, sums)], -1)
-
-
-class QuadrotorRate(Rate):
-    """A quadrotor's rate of change, with derivatives in closed form.
-
-    Args:
-        body: the quadrotor.
-
-    >>> rate = QuadrotorRate(QuadrotorBody())
-    >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
-    >>> rate.hold(torch.zeros(4))(level)[3:6]
-    tensor([ 0.0000,  0.0000, -9.8100])
-    """
-
-    def __init__(self, body: QuadrotorBody) -> None:
-        self.body = body
-
-    def hold(self, action: Tensor) -> HeldFlight:
-        return HeldFlight(action, self.body)
-
-    def finish(self, state: Tensor) -> Tensor:
-        return unit(state)
-
-    def finish_tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Scale the quaternions: :math:`d(q/|q|) = (dq - \hat q (\hat q \cdot dq)) / |q|`."""
-        size = state[..., 6:10].square().sum(-1, keepdim=True).sqrt().unsqueeze(-1)
-        state = unit(state)
-        turned, rows = state[..., 6:10].unsqueeze(-1), through[..., 6:10, :]
-        rows = (rows - turned * (turned * rows).sum(-2, keepdim=True)) / size
-        return state, torch.cat([through[..., :6, :], rows, through[..., 10:, :]], -2)
 
 
 def quadrotor_rate(
@@ -169,7 +146,7 @@ def quadrotor_path(
 
 def unit(state: Tensor) -> Tensor:
     """Scale the quaternions in states ``(*B, 13)`` to length 1."""
-    turned = quaternion_normalise(state[..., 6:10])
+    turned = roma.quat_normalize(state[..., 6:10])
     return torch.cat([state[..., :6], turned, state[..., 10:]], -1)
 
 

@@ -7,6 +7,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from afm_rl.dynamics.derivatives import pushed_forward
+from afm_rl.dynamics.rates import HeldRate
+
 
 def runge_kutta(
     rate: Callable[[Tensor], Tensor], state: Tensor, dt: float, substeps: int
@@ -45,51 +48,39 @@ def runge_kutta_path(
     return path
 
 
-def undisturbed(state: Tensor, actions: int) -> Tensor:
-    """Return the derivative of a start ``(*B, S)`` by itself and A actions, ``(*B, S, S + A)``.
-
-    >>> undisturbed(torch.zeros(2), 1)
-    tensor([[1., 0., 0.],
-            [0., 1., 0.]])
-    """
-    size = state.shape[-1]
-    eye = torch.eye(size, size + actions, dtype=state.dtype, device=state.device)
-    return eye.expand(*state.shape[:-1], *eye.shape)
-
-
-def runge_kutta_tangent(
-    tangent: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
-    state: Tensor,
-    through: Tensor,
-    dt: float,
-    substeps: int,
-) -> tuple[Tensor, Tensor]:
-    r"""Integrate :math:`x' = f(x, u)` together with derivatives of x.
+def runge_kutta_linearised(
+    rate: HeldRate, state: Tensor, actions: int, dt: float, substeps: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Integrate :math:`x' = f(x, u)` together with the derivatives of x by its start and u.
 
     The chain rule through the stages:
     :math:`dk_i = \tfrac{\partial f}{\partial x}(x_i)\,dx_i + \tfrac{\partial f}{\partial u}(x_i)`.
 
     Args:
-        tangent: gives f and df at a state ``(*B, S)`` and its derivatives ``(*B, S, K)``.
+        rate: f under an action that is held.
         state: where to start, ``(*B, S)``.
-        through: derivatives of the start by K parameters, ``(*B, S, K)``.
+        actions: number of action components, A.
         dt: time (s).
         substeps: number of steps.
 
     Returns:
-        The state ``(*B, S)`` and its derivatives ``(*B, S, K)``.
+        The state ``(*B, S)``, put back into the state space, and its derivatives ``(*B, S, S)``
+        and ``(*B, S, A)``.
 
-    >>> def decay(x, dx):
-    ...     return -x, -dx
-    >>> runge_kutta_tangent(decay, torch.ones(1), torch.eye(1), 1.0, 4)[1]
-    tensor([[0.3679]])
+    >>> from afm_rl.dynamics.rates import HeldFunction
+    >>> from afm_rl.spaces.manifold import Manifold
+    >>> decay = HeldFunction(torch.zeros(1), lambda x, u: u - x, Manifold(1))
+    >>> [part.item() for part in runge_kutta_linearised(decay, torch.ones(1), 1, 1.0, 4)]
+    [0.3678..., 0.3678..., 0.6321...]
     """
-    step = dt / substeps
+    size, step = state.shape[-1], dt / substeps
+    eye = torch.eye(size, size + actions, dtype=state.dtype, device=state.device)
+    through = eye.expand(*state.shape[:-1], *eye.shape)
     for _ in range(substeps):
         total, slope = torch.zeros_like(state), torch.zeros_like(through)
         here, there = state, through
         for weight, reach in ((1, 0.5), (2, 0.5), (2, 1.0), (1, 0.0)):
-            change, turn = tangent(here, there)
+            change, turn = rate.tangent(here, there)
             total = torch.add(total, change, alpha=weight)
             slope = torch.add(slope, turn, alpha=weight)
             if reach:
@@ -97,4 +88,5 @@ def runge_kutta_tangent(
                 there = torch.add(through, turn, alpha=reach * step)
         state = torch.add(state, total, alpha=step / 6)
         through = torch.add(through, slope, alpha=step / 6)
-    return state, through
+    state, through = pushed_forward(rate.finish, state, through)
+    return state, through[..., :size], through[..., size:]

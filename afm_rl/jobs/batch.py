@@ -5,16 +5,15 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
-from typing import Protocol
 
 from omegaconf import DictConfig
 from yaml import safe_dump
 
 from afm_rl.errors import ConfigurationError
+from afm_rl.jobs.executor import Executor
 from afm_rl.jobs.layout import JOBS, MISSIONS, RECORD, is_batch, recorded
-from afm_rl.jobs.process import Ends, Job
+from afm_rl.jobs.process import Job
 from afm_rl.jobs.progress import Board
 from afm_rl.jobs.run import begin, needs_run
 from afm_rl.jobs.tables import write_tables
@@ -22,25 +21,11 @@ from afm_rl.storage.files import locked, remove_parts, write_whole
 from afm_rl.storage.manifest import MANIFEST, write_manifest
 from afm_rl.trust import trusted
 
-LONGEST = 120  # characters of the name of a job's folder
-
-
-class Pool(Protocol):
-    """Where jobs run."""
-
-    def run(self, jobs: Sequence[Job]) -> Ends:
-        """Run jobs, in any order.
-
-        Yields:
-            Each job that is over, with the reason if it failed; and, at least twice a second,
-            None. When the iterator is closed, jobs that still run are ended.
-        """
-
 
 def run_batch(
     folder: Path,
     configs: Mapping[str, DictConfig],
-    pool: Pool,
+    executor: Executor,
     *,
     command: str = "",
     overwrite: bool = False,
@@ -55,7 +40,7 @@ def run_batch(
     Args:
         folder: the batch's own; more jobs extend a batch that is there.
         configs: settings of each job, by name; each of one method, with its label.
-        pool: where the jobs run.
+        executor: where the jobs run.
         command: what the user asked, for people.
         overwrite: run jobs again that have results; these stay until the new ones are whole.
         progress: show progress.
@@ -82,15 +67,8 @@ def run_batch(
             begin(job.folder, configs[job.name])
         if len(waiting) < len(jobs):
             echo(f"{len(jobs) - len(waiting)} of {len(jobs)} jobs have results already")
-        failures: dict[str, str] = {}
-        with Board(waiting, len(jobs), progress, echo) as board, closing(pool.run(waiting)) as ends:
-            for end in ends:
-                if end is not None:
-                    job, failure = end
-                    board.end(job, failure)
-                    if failure:
-                        failures[job.name] = failure
-                board.look()
+        with Board(waiting, len(jobs), progress, echo) as board:
+            failures = executor.run(waiting, board)
         write_tables(folder)
         return failures
 
@@ -105,15 +83,19 @@ def _record(folder: Path, jobs: Sequence[Job], command: str) -> None:
     write_manifest(folder, [RECORD])
 
 
-def file_name(name: str) -> str:
+def file_name(name: str, longest: int = 120) -> str:
     """Return a name for the folder of a job: readable, and another one for every job.
+
+    Args:
+        name: of the job.
+        longest: characters that are kept of it.
 
     >>> file_name("physics+planner.horizon=5")
     'physics+planner.horizon=5'
     >>> file_name("physics+tracks=[a/b]")
     'physics+tracks=_a_b_-32a2f2'
     """
-    plain = re.sub(r"[^-+.,=\w]", "_", name).lstrip(".")[:LONGEST]
+    plain = re.sub(r"[^-+.,=\w]", "_", name).lstrip(".")[:longest]
     if plain == name:
         return name
     return f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:6]}"

@@ -35,7 +35,7 @@ from pathlib import Path
 from yaml import YAMLError, safe_load
 
 from afm_rl.errors import ArtefactError
-from afm_rl.storage.manifest import MANIFEST
+from afm_rl.storage.manifest import MANIFEST, read_verified
 
 JOBS, RECORD, UNFINISHED = "jobs", "jobs.yaml", "unfinished"
 MISSIONS, STEPS, COMPUTE = "missions.csv", "steps.parquet", "compute.csv"
@@ -52,31 +52,27 @@ def is_finished(folder: Path) -> bool:
     return (folder / MANIFEST).is_file()
 
 
-def run_folders(folder: Path) -> list[Path]:
-    """Return the folders of the runs of a batch, finished or not, or the folder of a run itself.
-
-    They come in the order of ``jobs.yaml``; those that it does not name follow by name.
+def job_folders(folder: Path) -> list[Path]:
+    """Return the folders of a batch's jobs, finished or not, in the order of ``jobs.yaml``.
 
     Raises:
-        ArtefactError: if ``jobs.yaml`` cannot be read.
+        ArtefactError: if that is damaged.
     """
-    if not is_batch(folder):
-        return [folder]
-    there = sorted(path for path in (folder / JOBS).iterdir() if path.is_dir())
-    rank = {name: place for place, name in enumerate(recorded(folder))}
-    return sorted(there, key=lambda path: rank.get(path.name, len(rank)))
+    return [folder / JOBS / name for name in recorded(folder)]
 
 
 def recorded(folder: Path) -> list[str]:
     """Return the names of a batch's jobs in the order of the tables, from ``jobs.yaml``.
 
     Raises:
-        ArtefactError: if it cannot be read.
+        ArtefactError: if it is damaged.
     """
     path = folder / RECORD
     if not path.exists():
         return []
+    # Without a manifest it is about to be written anew.
+    data = read_verified(folder, RECORD) if is_finished(folder) else path.read_bytes()
     try:
-        return [str(name) for name in safe_load(path.read_bytes())["jobs"]]
+        return [str(name) for name in safe_load(data)["jobs"]]
     except (YAMLError, TypeError, KeyError, UnicodeDecodeError, RecursionError):
         raise ArtefactError(f"{path}: damaged; delete it") from None

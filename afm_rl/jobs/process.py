@@ -5,6 +5,7 @@ Imported wherever a job is waited for, also on the nodes of a cluster: without t
 
 from __future__ import annotations
 
+import importlib
 import json
 import multiprocessing
 import os
@@ -12,16 +13,17 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Generator
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.context import ForkServerProcess, SpawnProcess
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from afm_rl.errors import AFMError, causes
-from afm_rl.jobs.layout import LOG, UNFINISHED, is_finished
+from afm_rl.errors import AFMError, ConfigurationError, causes
+from afm_rl.jobs.layout import CONFIG, LOG, UNFINISHED, is_finished
 from afm_rl.storage.files import locked
 from afm_rl.trust import trust
 
@@ -50,10 +52,6 @@ class Job:
         return self.name
 
 
-Ends = Generator[tuple[Job, str | None] | None, None, None]
-"""Jobs that are over, with the reason if they failed, and None from time to time."""
-
-
 def start(job: Job) -> Process:
     """Start the process of a job. It ends, with a checkpoint, when this process ends."""
     for name in (FAILURE, PROGRESS):  # of an earlier attempt
@@ -67,25 +65,23 @@ def start(job: Job) -> Process:
     return process
 
 
-def run(job: Job) -> str | None:
-    """Run a job in a process of its own, and wait for it.
-
-    Returns:
-        Why there are no results; None if there are.
-    """
+def run(job: Job) -> None:
+    """Run a job in a process of its own, and wait for it: what a node of a cluster does."""
     process = start(job)
     process.join()
-    return reason(job, process)
+    if not is_done(job) and not said(job):
+        (job.folder / UNFINISHED / FAILURE).write_text(last_words(process.exitcode or 0))
 
 
-def reason(job: Job, process: Process) -> str | None:
-    """Say why a job whose process has ended has no results; None if it has."""
-    new = job.folder / UNFINISHED
-    if process.exitcode == 0 and is_finished(job.folder) and not new.exists():
-        return None
-    if (new / FAILURE).exists():
-        return (new / FAILURE).read_text()
-    return last_words(process.exitcode or 0)
+def is_done(job: Job) -> bool:
+    """Return whether a job has its results."""
+    return is_finished(job.folder) and not (job.folder / UNFINISHED / CONFIG).exists()
+
+
+def said(job: Job) -> str:
+    """Return why a job has no results, as it said itself; "" if it could not."""
+    path = job.folder / UNFINISHED / FAILURE
+    return path.read_text() if path.exists() else ""
 
 
 def last_words(status: int) -> str:
@@ -124,7 +120,7 @@ def work(job: Job) -> None:
 
 def _finish(folder: Path) -> None:
     from afm_rl.jobs.run import Stop, finish
-    from afm_rl.missions.checkpoint import Stopped
+    from afm_rl.missions.run import Stopped
     from afm_rl.progress import Bar
 
     def report(line: str, share: float) -> None:
@@ -133,8 +129,8 @@ def _finish(folder: Path) -> None:
             part.write_text(json.dumps({"line": line, "share": share}))
             os.replace(part, path)
 
-    path = folder / UNFINISHED / PROGRESS
-    with Stop().on(signal.SIGTERM) as stop, locked(folder, wait=True):
+    path, stop = folder / UNFINISHED / PROGRESS, Stop()
+    with handled(stop, signal.SIGTERM), locked(folder, wait=True):
         # The lock: an orphan of a command that was killed may be in its last step.
         threading.Thread(target=_end_with_parent, daemon=True).start()
         Bar.listener = report
@@ -143,6 +139,17 @@ def _finish(folder: Path) -> None:
             finish(folder, stop=stop)
         except Stopped:
             return
+
+
+@contextmanager
+def handled(handler: Any, *numbers: signal.Signals) -> Iterator[None]:
+    """Have a handler called when one of these signals arrives."""
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, former in before.items():
+            signal.signal(number, former)
 
 
 def _end_with_parent() -> None:
@@ -163,3 +170,17 @@ def explain(error: BaseException) -> str:
         return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
     text = " ".join(str(cause).split())  # may end in what a MemoryError says: nothing
     return f"{text} {type(cause.__cause__).__name__}" if text.endswith(":") else text
+
+
+def needs(package: str, extra: str) -> ModuleType:
+    """Import a package that comes with one of our extras.
+
+    Raises:
+        ConfigurationError: if it is not installed.
+    """
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise ConfigurationError(
+            f"launcher: needs the package {package}: pip install 'afm-rl[{extra}]'"
+        ) from error

@@ -5,9 +5,7 @@ from __future__ import annotations
 import io
 import os
 import shutil
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
@@ -19,19 +17,14 @@ from afm_rl._version import __version__
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.jobs.layout import COMPUTE, CONFIG, MISSIONS, STEPS, UNFINISHED, is_batch, is_finished
 from afm_rl.missions import Agent, Results, build, prepare, run
-from afm_rl.missions.settings import differences, influential
 from afm_rl.storage import measures
 from afm_rl.storage.csv_text import csv_text
-from afm_rl.storage.files import remove_parts, sync_folder, write_whole
+from afm_rl.storage.files import sync_folder, write_whole
 from afm_rl.storage.manifest import MANIFEST, check_manifest, read_manifest, write_manifest
+from afm_rl.storage.settings import differences, influential
 
-REPLACED = "replaced.json"  # the manifest of results that are being replaced
-SHOWN = (
-    "diagnosis",
-    "figures",
-    "video",
-    "tensorboard",
-)  # folders of what is drawn from the results
+READY = "ready"  # the folder of new results, inside that of unfinished ones
+SHOWN = ("diagnosis", "figures", "video", "tensorboard")  # folders drawn from the results
 FILES = (CONFIG, MISSIONS, STEPS, COMPUTE, measures.FILE)
 
 
@@ -51,15 +44,15 @@ def needs_run(folder: Path, cfg: DictConfig, overwrite: bool = False) -> bool:
     """
     if is_batch(folder):
         raise ConfigurationError(f"hydra.run.dir={folder}: holds jobs; choose another folder")
+    begun = folder / UNFINISHED / CONFIG
     if overwrite:
         return True
-    begun = folder / UNFINISHED / CONFIG
-    if is_finished(folder):
+    if begun.exists():
+        _check_same(begun, cfg, __version__)
+    elif is_finished(folder):
         check_manifest(folder)
         _check_same(folder / CONFIG, cfg, read_manifest(folder)["version"])
         return False
-    if begun.exists():
-        _check_same(begun, cfg, __version__)
     elif any((folder / name).exists() for name in FILES):
         raise ConfigurationError(
             f"hydra.run.dir={folder}: holds results without {MANIFEST}; choose another folder, or "
@@ -90,14 +83,13 @@ def begin(folder: Path, cfg: DictConfig) -> None:
         folder: of the run.
         cfg: settings of one method, with its label.
     """
-    new = folder / UNFINISHED
-    if (new / CONFIG).exists():
+    path = folder / UNFINISHED / CONFIG
+    if path.exists():
         try:
-            _check_same(new / CONFIG, cfg, __version__)
+            _check_same(path, cfg, __version__)
         except (ArtefactError, ConfigurationError):
-            shutil.rmtree(new)
-    if not is_finished(new):
-        write_whole(new / CONFIG, OmegaConf.to_yaml(cfg, resolve=True).encode())
+            shutil.rmtree(path.parent)
+    write_whole(path, OmegaConf.to_yaml(cfg, resolve=True).encode())
 
 
 def finish(
@@ -124,26 +116,50 @@ def finish(
     new, stop = folder / UNFINISHED, stop or Stop()
     if not (new / CONFIG).exists():  # another process has finished it meanwhile
         return
-    if not is_finished(new):
-        cfg = OmegaConf.create(safe_load((new / CONFIG).read_bytes()))
-        agent = agent or build(cfg)
-        prepare(agent, cfg.cache, progress, echo)
-        every, keep = cfg.checkpoints.every, cfg.checkpoints.keep
-        with stop.between_steps():
-            results = run(agent, progress, new, every, keep, lambda loop: stop.asked)
-        _write_results(new, results)
-    _publish(new, folder)
+    cfg = OmegaConf.create(safe_load((new / CONFIG).read_bytes()))
+    agent = agent or build(cfg)
+    prepare(agent, cfg.cache, progress, echo)
+    every, keep, stop.waits = cfg.checkpoints.every, cfg.checkpoints.keep, not stop.asked
+    try:
+        results = run(agent, progress, new, every, keep, lambda loop: stop.asked)
+    finally:
+        stop.waits = False
+    _publish(folder, results)
 
 
-def _write_results(folder: Path, results: Results) -> None:
-    missions, buffer = results.missions, io.BytesIO()
-    results.steps.to_parquet(buffer, index=False, compression="zstd")
-    write_whole(folder / STEPS, buffer.getvalue())
-    write_whole(folder / measures.FILE, results.measures.to_json().encode())
-    write_whole(folder / COMPUTE, csv_of(compute(missions)))
-    # Times differ from run to run: without them the same missions make the same file.
-    write_whole(folder / MISSIONS, csv_of(missions.drop(columns="seconds")))
-    write_manifest(folder, FILES)
+def _publish(folder: Path, results: Results) -> None:
+    """Replace what a folder holds by new results. If this is interrupted, ``finish`` does it again.
+
+    The new files are on the disk before an old one is touched. From the removal of the old manifest
+    to the arrival of the new one the folder counts as unfinished, so a mixture is never read.
+    """
+    new = folder / UNFINISHED
+    missions, steps = results.missions, io.BytesIO()
+    results.steps.to_parquet(steps, index=False, compression="zstd")
+    files = {
+        CONFIG: (new / CONFIG).read_bytes(),
+        # Times differ from run to run: without them the same missions make the same file.
+        MISSIONS: csv_of(missions.drop(columns="seconds")),
+        STEPS: steps.getvalue(),
+        COMPUTE: csv_of(compute(missions)),
+        measures.FILE: results.measures.to_json().encode(),
+    }
+    shutil.rmtree(new / READY, ignore_errors=True)
+    for name, data in files.items():
+        write_whole(new / READY / name, data)
+    write_manifest(new / READY, files)
+    (folder / MANIFEST).unlink(missing_ok=True)
+    for name in SHOWN:
+        shutil.rmtree(folder / name, ignore_errors=True)
+    for name in (*files, MANIFEST):
+        os.replace(new / READY / name, folder / name)
+    sync_folder(folder)
+    (new / READY).rmdir()
+    for path in new.iterdir():
+        if path.name != CONFIG:
+            path.unlink()
+    (new / CONFIG).unlink()  # the last one: as long as it is there, there is something to do
+    new.rmdir()
 
 
 def csv_of(table: pd.DataFrame) -> bytes:
@@ -163,47 +179,16 @@ def compute(missions: pd.DataFrame) -> pd.DataFrame:
     return rows.groupby("method", sort=False)[columns].sum().reset_index()
 
 
-def _publish(new: Path, folder: Path) -> None:
-    """Move finished results to their place. If this is interrupted, it is done again.
-
-    From the removal of the old manifest to the arrival of the new one the folder counts as
-    unfinished: a mixture of old and new files is never read.
-    """
-    remove_parts(folder)
-    if is_finished(folder):
-        os.replace(folder / MANIFEST, new / REPLACED)
-    files = _names(new, MANIFEST)
-    for name in set(_names(new, REPLACED)) - set(files):
-        (folder / name).unlink(missing_ok=True)
-    for name in SHOWN:
-        shutil.rmtree(folder / name, ignore_errors=True)
-    for name in files:
-        if name != CONFIG and (new / name).exists():  # it has not been moved yet
-            os.replace(new / name, folder / name)
-    write_whole(folder / CONFIG, (new / CONFIG).read_bytes())
-    for path in new.iterdir():
-        if path.name not in (CONFIG, MANIFEST):
-            path.unlink()
-    os.replace(new / MANIFEST, folder / MANIFEST)
-    sync_folder(folder)
-    (new / CONFIG).unlink()  # the last one: as long as it is there, there is something to do
-    new.rmdir()
-
-
-def _names(folder: Path, manifest: str) -> list[str]:
-    """Return the files that a manifest names; none if it is damaged or not there."""
-    try:
-        return [*read_manifest(folder, manifest)["files"]]
-    except ArtefactError:
-        return []
-
-
 class Stop:
-    """Ends a run when it is told to: between two steps of its missions, else at once."""
+    """Ends a run when it is told to: between two steps of its missions, else at once.
+
+    Attributes:
+        asked: whether it was told to.
+        waits: whether there is a step to wait for.
+    """
 
     def __init__(self) -> None:
-        self.asked = False
-        self._waits = False
+        self.asked, self.waits = False, False
 
     def __call__(self, number: int = 0, frame: FrameType | None = None) -> None:
         """Ask the run to end; a handler of signals.
@@ -212,24 +197,5 @@ class Stop:
             KeyboardInterrupt: if there is no step to wait for, or if asked twice.
         """
         again, self.asked = self.asked, True
-        if again or not self._waits:
+        if again or not self.waits:
             raise KeyboardInterrupt
-
-    @contextmanager
-    def between_steps(self) -> Iterator[None]:
-        """While missions run, let them complete their step."""
-        self._waits = not self.asked
-        try:
-            yield
-        finally:
-            self._waits = False
-
-    @contextmanager
-    def on(self, *numbers: signal.Signals) -> Iterator[Stop]:
-        """Ask for the end when one of these signals arrives."""
-        before = {number: signal.signal(number, self) for number in numbers}
-        try:
-            yield self
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)

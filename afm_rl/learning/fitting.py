@@ -17,8 +17,6 @@ from afm_rl.learning.nll import gaussian_nll
 from afm_rl.progress import Bar
 from afm_rl.spaces.keys import as_keys
 
-TOLERATED = 1 / 3  # unexplained share of the variance above which there is a warning
-
 
 @dataclass(frozen=True)
 class FitReport:
@@ -36,7 +34,7 @@ class FitReport:
     def warn(self) -> None:
         """Warn of coordinates of which more than a third of the variance is left."""
         rows = zip(self.names, self.rms, self.unexplained, strict=True)
-        bad = [f"{n} ({100 * u:.0f} %, error {e:.3g})" for n, e, u in rows if not u <= TOLERATED]
+        bad = [f"{n} ({100 * u:.0f} %, error {e:.3g})" for n, e, u in rows if not u <= 1 / 3]
         if bad:
             warnings.warn(
                 f"the model leaves more than a third of the variance of {', '.join(bad)} "

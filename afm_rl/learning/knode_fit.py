@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
 from afm_rl.dynamics.body_frame import to_world
 from afm_rl.dynamics.knode import KNODE
-from afm_rl.dynamics.residual import Network
+from afm_rl.dynamics.residual import Network, residual
 from afm_rl.spaces.manifold import wrap_angle
 
 Triple = tuple[Tensor, Tensor, Tensor]  # states, actions, next states
@@ -32,10 +32,9 @@ def fit_network(
     .. math:: \tfrac12\,\mathrm{mean}\,\|x^+ - \hat x^+\|^2 + \lambda \|\theta\|^2
 
     The half is the published one, where the mean also counts the first, equal column. Missions
-    are independent. Fast: the prediction is that of the model without the network, plus its
-    output at the start of the row, held and propagated to first order in the network:
-    :math:`h (I + \tfrac{h A}{2} + \tfrac{(h A)^2}{6}) N`, A the derivative of the rate by the
-    state. Exact: one Runge-Kutta step with the network.
+    are independent. Exact: :math:`\hat x^+` is one Runge-Kutta step with the network. Fast: it is
+    that of the model without the network, plus its output at the start of the row, held and
+    propagated to first order, :func:`first_order`.
 
     Args:
         model: whose pool the network will join, as the newest; stays as it is.
@@ -62,81 +61,57 @@ def fit_network(
     >>> bool((after - pushed).abs().max() < 0.002)
     True
     """
-    shapes = [part.shape[1:] for part in network]
-    sizes = [shape.numel() for shape in shapes]
-    flat = nn.Parameter(torch.cat([part.detach().flatten(1) for part in network], 1))
-    optimizer = torch.optim.Adam([flat], lr=lr, fused=True)
-    state, action, after = (part.detach() for part in rows)
-    counted = counts.reshape(len(flat), -1, 1).to(flat)
-    share = counted / (state.shape[-1] * counted.sum(1, keepdim=True).clamp_min(1.0))
-    gradient = (_exact if exact else _fast)(model, (state, action, after), share, dt)
-
-    def unpacked() -> Network:
-        parts = flat.detach().split(sizes, 1)
-        return Network(*(p.unflatten(1, s) for p, s in zip(parts, shapes, strict=True)))
-
-    for _ in range(epochs):
-        slopes = torch.cat([part.flatten(1) for part in gradient(unpacked())], 1)
-        flat.grad = slopes.add_(flat.detach(), alpha=2 * l2)
-        optimizer.step()
-    return Network(*(part.clone() for part in unpacked()))
+    learnt = Network(*(nn.Parameter(part.detach().clone()) for part in network))
+    # Weight decay of Adam is the gradient of the second term.
+    optimizer = torch.optim.Adam(learnt, lr=lr, weight_decay=2 * l2, fused=True)
+    counted = counts.reshape(len(learnt.inner), -1, 1).to(learnt.inner)
+    share = counted / (model.state_size * counted.sum(1, keepdim=True).clamp_min(1.0))
+    errors = (through_integration if exact else first_order)(model, rows, dt)
+    with torch.enable_grad():
+        for _ in range(epochs):
+            optimizer.zero_grad(set_to_none=True)
+            error = errors(learnt).reshape(*share.shape[:2], -1)
+            ((share * error.square()).sum() / 2).backward()
+            optimizer.step()
+    return Network(*(part.detach() for part in learnt))
 
 
-Gradient = Callable[[Network], Sequence[Tensor]]
-
-
-def _exact(model: KNODE, rows: Triple, share: Tensor, dt: float) -> Gradient:
-    """Return the gradient of the data term as a function of the network."""
+def through_integration(model: KNODE, rows: Triple, dt: float) -> Callable[[Network], Tensor]:
+    """Return the errors of rows ``(*L, n, S)`` as a function of the newest network."""
     state, action, after = rows
-    lead = model.lead
 
-    def gradient(network: Network) -> Sequence[Tensor]:
-        with torch.enable_grad():
-            leaves = [part.requires_grad_() for part in network]
-            newest = Network(*(part.reshape(*lead, *part.shape[1:]) for part in leaves))
-            ahead = model.advance(state, action, dt, newest=newest)
-            error = _difference(model, ahead, after).square().reshape(*share.shape[:2], -1)
-            return torch.autograd.grad((share * error).sum() / 2, leaves)
+    def errors(network: Network) -> Tensor:
+        newest = Network(*(part.reshape(*model.lead, *part.shape[1:]) for part in network))
+        return _difference(model, model.advance(state, action, dt, newest=newest), after)
 
-    return gradient
+    return errors
 
 
 @torch.no_grad()
-def _fast(model: KNODE, rows: Triple, share: Tensor, dt: float) -> Gradient:
-    """Do so to first order in the network's output, in closed form."""
+def first_order(model: KNODE, rows: Triple, dt: float) -> Callable[[Network], Tensor]:
+    r"""Return them ``(l, n, S)`` to first order in the network's output N.
+
+    .. math:: \hat x^+ = x_0^+ + h (I + \tfrac{h A}{2} + \tfrac{(h A)^2}{6}) N
+
+    with :math:`x_0^+` the prediction without it, and A the derivative of the rate by the state.
+    """
     state, action, after = rows
     none = Network(*(torch.zeros_like(part[..., 0, :, :]) for part in model.networks))
     gap = _difference(model, after, model.advance(state, action, dt, newest=none))
-    size = model.state_size
-    eye = torch.eye(size, dtype=gap.dtype, device=gap.device)
-    moved = dt * model.slope(state, action, none)[..., :size]
+    moved = dt * model.slope(state, action, none)
+    eye = torch.eye(model.state_size, dtype=gap.dtype, device=gap.device)
     reach = dt * (eye + moved @ (eye + moved / 3) / 2)
     if model.turned:
         reach = reach @ to_world(state)
     inputs = torch.cat([state[..., model.features], action], -1)
-    rows_of = share.shape[:2]
-    inputs, gap = (part.reshape(*rows_of, -1) for part in (inputs, gap))
-    reach = reach.reshape(*rows_of, size, size)
-    # The error is quadratic in the output y: its gradient is share * (R' R y - R' gap).
-    square, pull = share.unsqueeze(-1) * (reach.mT @ reach), share * _times(reach.mT, gap)
+    missions = model.lead.numel()
+    inputs, gap = (part.reshape(missions, -1, part.shape[-1]) for part in (inputs, gap))
+    reach = reach.reshape(*gap.shape, -1)
 
-    def gradient(network: Network) -> Sequence[Tensor]:
-        units = torch.baddbmm(network.inner_bias, inputs, network.inner).tanh()
-        output = torch.baddbmm(network.outer_bias, units, network.outer)
-        by_output = _times(square, output) - pull
-        by_inner = (by_output @ network.outer.mT) * (1 - units.square())
-        return (
-            inputs.mT @ by_inner,
-            by_inner.sum(1, keepdim=True),
-            units.mT @ by_output,
-            by_output.sum(1, keepdim=True),
-        )
+    def errors(network: Network) -> Tensor:
+        return (reach @ residual(inputs, network).unsqueeze(-1)).squeeze(-1) - gap
 
-    return gradient
-
-
-def _times(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector.unsqueeze(-1)).squeeze(-1)
+    return errors
 
 
 def _difference(model: KNODE, state: Tensor, origin: Tensor) -> Tensor:

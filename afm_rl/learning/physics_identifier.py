@@ -17,10 +17,6 @@ from afm_rl.learning.learner import Learner
 from afm_rl.learning.nll import GaussianNLLLoss
 from afm_rl.mission_state import MissionState
 
-MOST_CANDIDATES = 1000
-LOST = 20.0  # nats that a candidate loses whose simulation breaks off
-MARGIN = 3.0  # nats by which another candidate must be better than the one that is believed
-
 
 class Belief(NamedTuple):
     """What is known of the body of each mission."""
@@ -44,7 +40,7 @@ class PhysicsIdentifier(Learner):
 
     with :math:`v_\theta` the action that explains the transition best. The logarithm forgives
     outliers. The candidate with the least :math:`c_\theta` becomes the model's physics once it is
-    better by three nats. Transitions that the present physics explain to within the gate teach
+    better by ``margin``. Transitions that the present physics explain to within the gate teach
     nothing and cost the search for that one action, so a nominal body stays nominal, to the bit.
 
     Beside an action flow transform it learns what the transform cannot undo. A mass that acts on
@@ -55,11 +51,14 @@ class PhysicsIdentifier(Learner):
         ranges: lowest and highest value of each parameter that may differ, by its name in
             :attr:`MuJoCoDynamics.physics_names <afm_rl.dynamics.MuJoCoDynamics>`.
         count: candidates per parameter, at equal distances; the nominal physics come on top. All
-            combinations are tried, at most 1000. What too coarse a grid leaves over looks like
+            combinations are tried, at most ``most``. What too coarse a grid leaves over looks like
             actuators.
         scale: half range of each action, ``(A,)``.
         gate: standard deviations of the model that an error which no action explains must exceed.
         forgetting: weight of a transition relative to the next one, in (0, 1].
+        margin: nats by which another candidate must be better than the one that is believed.
+        lost: nats that a candidate loses whose simulation breaks off.
+        most: candidates at most, all of which are simulated.
         mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
 
     Raises:
@@ -94,6 +93,9 @@ class PhysicsIdentifier(Learner):
         count: int = 97,
         gate: float = 3.0,
         forgetting: float = 0.95,
+        margin: float = 3.0,
+        lost: float = 20.0,
+        most: int = 1000,
         mask_key: NestedKey | None = None,
     ) -> None:
         super().__init__(loss, mask_key)
@@ -103,7 +105,9 @@ class PhysicsIdentifier(Learner):
                 f"updater: PhysicsIdentifier needs MuJoCoDynamics, got {type(model).__name__}; "
                 "choose dynamics=physics with a robot in MuJoCo, or updater=rls"
             )
-        self.register_buffer("candidates", _candidates(model, ranges, count), persistent=False)
+        self.register_buffer(
+            "candidates", _candidates(model, ranges, count, most), persistent=False
+        )
         self.register_buffer(
             "scale", check_half_range(scale, loss.model.action_size), persistent=False
         )
@@ -111,6 +115,8 @@ class PhysicsIdentifier(Learner):
         self.forgetting = check_number(
             "updater.forgetting", forgetting, low=0.0, high=1.0, open_low=True
         )
+        self.margin = check_number("updater.margin", margin, low=0.0)
+        self.lost = check_number("updater.lost", lost, low=0.0)
         self.belief = MissionState(self._nothing(1))
 
     @property
@@ -154,13 +160,13 @@ class PhysicsIdentifier(Learner):
         rest = self._unmatched(
             [states, actions, afters], self.candidates.expand(len(states), -1, -1)
         )
-        new = rest.square().sum(-1).log1p().nan_to_num(nan=LOST, posinf=LOST).to(misfit)
+        new = rest.square().sum(-1).log1p().nan_to_num(nan=self.lost, posinf=self.lost).to(misfit)
         decayed = misfit.clone()
         decayed[mission] = self.forgetting * misfit[mission]
         misfit = decayed.index_add(0, mission, new)
         best = misfit.argmin(-1)
         least, now = (misfit.gather(1, k.unsqueeze(1)).squeeze(1) for k in (best, chosen))
-        self.belief.keep(Belief(misfit, torch.where(least + MARGIN < now, best, chosen)))
+        self.belief.keep(Belief(misfit, torch.where(least + self.margin < now, best, chosen)))
         self._tell()
 
     def _unmatched(self, transitions: Sequence[Tensor], physics: Tensor) -> Tensor:
@@ -169,7 +175,9 @@ class PhysicsIdentifier(Learner):
             return decompose_error(self.model, state, action, after, self.scale).unmatched
 
 
-def _candidates(model: MuJoCoDynamics, ranges: Mapping[str, Sequence[float]], count: int) -> Tensor:
+def _candidates(
+    model: MuJoCoDynamics, ranges: Mapping[str, Sequence[float]], count: int, most: int
+) -> Tensor:
     """Return rows of physics ``(K, P)``; the first is the nominal one."""
     names, count = model.physics_names, check_count("updater.count", count, low=2)
     if not isinstance(ranges, Mapping) or not ranges or not set(ranges) <= set(names):
@@ -178,10 +186,10 @@ def _candidates(model: MuJoCoDynamics, ranges: Mapping[str, Sequence[float]], co
             f"{{mass: [0.5, 2.0]}}; names are {', '.join(names)}"
         )
     total = count ** len(ranges)
-    if total > MOST_CANDIDATES:
+    if total > check_count("updater.most", most):
         raise ConfigurationError(
             f"updater.count={count}: {total} combinations of {len(ranges)} parameters, expected at "
-            f"most {MOST_CANDIDATES}; choose a lower count or fewer ranges"
+            f"most {most}; choose a lower count or fewer ranges"
         )
     axes = []
     for name, span in ranges.items():

@@ -10,22 +10,14 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from afm_rl.dynamics import Calibrated
-from afm_rl.errors import (
-    ConfigurationError,
-    check_choice,
-    check_count,
-    check_flag,
-    check_number,
-)
+from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
 from afm_rl.learning.error_decomposition import ErrorParts, decompose_error
 from afm_rl.learning.learner import Learner
-from afm_rl.learning.matched_fit import MatchedFit
+from afm_rl.learning.least_squares import Rows, advance, nothing
 from afm_rl.learning.nll import GaussianNLLLoss
-from afm_rl.learning.regime_memory import Rules
-from afm_rl.learning.unmatched_fit import UnmatchedFit
+from afm_rl.mission_state import MissionState
 
 PARTS = ("all", "matched", "unmatched")
-COUPLING, BIAS = 0.1, 0.1  # spread of the prior, relative to that of gains and in half ranges
 
 
 class RLSUpdater(Learner):
@@ -35,17 +27,14 @@ class RLSUpdater(Learner):
     explains (:func:`~afm_rl.learning.error_decomposition.decompose_error`). Then, with u the
     executed action in half ranges,
 
-    * *matched*: :math:`v = D\,\psi(u) + b`, a regression per action axis. The prior is wide for
-      gains and narrow for coupling and bias, so that two transitions are enough for a change of
-      gains, and fades. Where no affine map explains the latest transitions, a shape :math:`\psi`
-      is searched that does: a dead zone, a limit, or slip;
+    * *matched*: :math:`v = D u + b`, a regression per action axis. The prior is wide for gains
+      and narrow for coupling and bias, so that two transitions are enough for a change of gains,
+      and fades;
     * *unmatched*: the rest is c seen through the projection onto what no action reaches.
 
-    Both are fits to the latest transitions, made anew at each step. An innovation is taken for an
-    outlier until the next transition confirms it; then it is a change, and what was learnt before
-    is dropped. A fit that is not clearly better than the nominal model is not used, and once the
-    nominal model explains everything again the calibration is the identity, exactly
-    (:func:`~afm_rl.learning.regime_memory.advance`).
+    An innovation beyond the gate is a change: the fit starts anew with it. Once the nominal model
+    explains everything again the calibration is the identity, exactly
+    (:func:`~afm_rl.learning.least_squares.advance`).
 
     Missions learn from their own transitions, in one batch; with one calibration for all,
     simultaneous transitions count together. Transitions with a faulty or stale reading are
@@ -57,13 +46,12 @@ class RLSUpdater(Learner):
         part: ``"matched"``, ``"unmatched"`` or ``"all"``. Beside an action flow transform, which
             undoes what actions can undo, choose ``"unmatched"``: otherwise both correct the same.
         forgetting: weight of a transition relative to the next one, in (0, 1].
-        gate: normalised innovation beyond which a transition is suspect.
+        gate: normalised innovation beyond which a transition is a change.
         patience: transitions for which the nominal model is as good before a fit is dropped.
-        confirm: take an innovation for an outlier until the next transition confirms it.
-        restart: drop what was learnt before a confirmed change.
-        window: transitions that are kept; more are forgotten at once.
-        shapes: search shapes; False for affine maps only.
         spread: standard deviation of the prior of gains.
+        coupling: that of coupling, and of the bias in half ranges.
+        offset: that of c, in standard deviations of the model.
+        still: half ranges; smaller actions say nothing about slopes, and nothing is forgotten.
         mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
 
     Raises:
@@ -91,37 +79,30 @@ class RLSUpdater(Learner):
         forgetting: float = 0.97,
         gate: float = 5.0,
         patience: int = 10,
-        confirm: bool = True,
-        restart: bool = True,
-        window: int = 64,
-        shapes: bool = True,
         spread: float = 1.0,
+        coupling: float = 0.1,
+        offset: float = 100.0,
+        still: float = 0.05,
         mask_key: NestedKey | None = None,
     ) -> None:
         super().__init__(loss, mask_key)
-        model = loss.model
-        if not isinstance(model, Calibrated):
+        if not isinstance(loss.model, Calibrated):
             raise ConfigurationError(
-                f"updater: RLSUpdater teaches a Calibrated model, got {type(model).__name__}; "
+                f"updater: RLSUpdater teaches a Calibrated model, got {type(loss.model).__name__}; "
                 "choose dynamics=calibrated or dynamics=calibrated_pe"
             )
         self.part = check_choice("updater.part", part, PARTS)
-        rules = Rules(
-            check_count("updater.window", window),
-            check_number("updater.forgetting", forgetting, low=0.0, high=1.0, open_low=True),
-            check_number("updater.gate", gate, low=0.0, open_low=True),
-            check_count("updater.patience", patience),
-            check_flag("updater.confirm", confirm),
-            check_flag("updater.restart", restart),
+        self.forgetting = check_number(
+            "updater.forgetting", forgetting, low=0.0, high=1.0, open_low=True
         )
-        spread = check_number("updater.spread", spread, low=0.0, open_low=True)
-        size = model.action_size
-        widths = torch.full((size, size + 1), COUPLING * spread, dtype=torch.float64)
-        widths[:, :size].fill_diagonal_(spread)
-        widths[:, size] = BIAS
-        prior = widths.square().reciprocal()
-        self.matched = MatchedFit(prior, rules, check_flag("updater.shapes", shapes))
-        self.unmatched = UnmatchedFit(model.manifold.tangent_size, rules)
+        self.gate = check_number("updater.gate", gate, low=0.0, open_low=True)
+        self.patience = check_count("updater.patience", patience)
+        self.spread, self.coupling, self.offset = (
+            check_number(f"updater.{name}", value, low=0.0, open_low=True)
+            for name, value in (("spread", spread), ("coupling", coupling), ("offset", offset))
+        )
+        self.still = check_number("updater.still", still, low=0.0)
+        self.matched, self.unmatched = (MissionState(nothing(0, 1, 1)) for _ in range(2))
 
     @property
     def model(self) -> Calibrated:
@@ -131,9 +112,10 @@ class RLSUpdater(Learner):
     def start(self, tensordict: TensorDictBase | None = None) -> None:
         """Forget the transitions so far; the calibration stays until the next one."""
         super().start(tensordict)
-        missions = math.prod(self.model.lead)
-        self.matched.clear(missions)
-        self.unmatched.clear(missions, self.model.bias.device)
+        missions, device = math.prod(self.model.lead), self.model.bias.device
+        size = self.model.action_size
+        self.matched.keep(nothing(missions, size, size + 1, device))
+        self.unmatched.keep(nothing(missions, 1, self.model.manifold.tangent_size, device))
 
     def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Learn from transitions ``(*L, *N)``, where ``learn`` says so."""
@@ -157,15 +139,40 @@ class RLSUpdater(Learner):
         calibration: dict[str, Tensor] = {}
         if self.part != "unmatched":
             unit = torch.where(valid.unsqueeze(-1), flat(action / model.half_range), 0.0)
-            self.matched.learn(unit, parts, valid)
-            names = ("matrix", "bias", "shape")
-            calibration.update(zip(names, self.matched.calibration(), strict=True))
+            theta = self._advance(self.matched, self._matched(unit, parts, valid))
+            linear, calibration["bias"] = theta[..., :-1], theta[..., -1]
+            calibration["matrix"] = linear + torch.eye(model.action_size).to(linear)
         if self.part != "matched":
-            self.unmatched.learn(flat(offset), parts, valid)
-            calibration["offset"] = self.unmatched.calibration()
+            theta = self._advance(self.unmatched, self._unmatched(flat(offset), parts, valid))
+            calibration["offset"] = theta.squeeze(1)
         model.calibrate_(
             **{name: part.reshape((*lead, *part.shape[1:])) for name, part in calibration.items()}
         )
+
+    def _advance(self, state: MissionState, rows: Rows) -> Tensor:
+        """Take in the latest transitions; return what they say, 0 where the nominal model holds."""
+        fit = advance(state.parts, rows, self.forgetting, self.gate, self.patience)
+        state.keep(fit)
+        return torch.where(fit.active[:, None, None], fit.solution()[0], 0.0)
+
+    def _matched(self, unit: Tensor, parts: ErrorParts, valid: Tensor) -> Rows:
+        """Return the regressions of v - u on u and 1."""
+        size = unit.shape[-1]
+        widths = unit.new_full((size, size + 1), self.coupling)
+        widths[:, :size] *= self.spread
+        widths[:, :size].fill_diagonal_(self.spread)
+        prior = widths.square().reciprocal().expand(len(unit), -1, -1)
+        features = torch.cat([unit, torch.ones_like(unit[..., :1])], -1)
+        exciting = (unit.abs() > self.still).any(-1)
+        return Rows(features, parts.effective - unit, parts.weight, valid, exciting, prior)
+
+    def _unmatched(self, offset: Tensor, parts: ErrorParts, valid: Tensor) -> Rows:
+        """Return the regression of the rest on what shows of c, both in standard deviations."""
+        across = parts.projection / parts.noise.unsqueeze(-2)
+        total = parts.unmatched + (across @ offset.unsqueeze(-1)).squeeze(-1)
+        y = total.flatten(1).unsqueeze(-1)
+        prior = (self.offset * parts.noise.mean(1, keepdim=True)).square().reciprocal()
+        return Rows(across.flatten(1, 2), y, torch.ones_like(y), valid, valid, prior)
 
 
 def _wide(valid: Tensor, like: Tensor) -> Tensor:

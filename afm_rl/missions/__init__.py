@@ -1,7 +1,7 @@
 """Missions: compose an agent from a configuration and run it."""
 
 from afm_rl.missions.build import Agent, build
-from afm_rl.missions.collected import Collection
+from afm_rl.missions.collection import Collection
 from afm_rl.missions.laps import LapScore
 from afm_rl.missions.prepare import prepare
 from afm_rl.missions.return_score import ReturnScore

@@ -31,13 +31,12 @@ from afm_rl.missions.selection import (
     select_tracks,
 )
 from afm_rl.planning import Cost, PlanningEnv
+from afm_rl.targets import check_targets
 from afm_rl.transforms import ActionFlowTransform, Guard
-from afm_rl.trust import check_targets
 
 TRANSFORM = ("enabled", "extend_action_box")
 """Settings of whatever corrector is chosen."""
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
-MOST_STEPS, MOST_MISSIONS = 10_000_000, 1_000_000
 DEFAULTS = {
     **{"seeds": 1, "budget": 5000, "label": None, "faults": "hold"},
     "device": "cpu",
@@ -125,9 +124,9 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
         tracks = select_tracks(settings["tracks"], robot)
         regimes = select_regimes(settings["regimes"], robot)
     seeds = select_seeds(settings["seeds"])
-    budget = check_count("budget", settings["budget"], high=MOST_STEPS)
+    budget = check_count("budget", settings["budget"], high=10_000_000)
     total = len(tracks) * len(regimes) * len(seeds)
-    check_count("seeds: missions, for all tracks and regimes", total, high=MOST_MISSIONS)
+    check_count("seeds: missions, for all tracks and regimes", total, high=1_000_000)
     faults = check_choice("faults", settings["faults"], ("hold", "skip", "raise"))
     with blaming("robot.env"):
         env = robot.env(
@@ -192,7 +191,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     if hasattr(planner, "make_tensordict_primer"):
         chain.append(planner.make_tensordict_primer())
     whole = TransformedEnv(env, Compose(*chain))
-    check_cost(cost, model, whole, getattr(planner, "stages", None))
+    check_cost(cost, whole, getattr(planner, "stages", None))
     check_keys("planner", planner, whole)
     if transform is not None:
         check_keys("planner", planner, whole, ["box_key"])
@@ -202,7 +201,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
         robot=robot,
         env=whole,
         missions=missions,
-        regime_names=name_regimes(tracks, regimes, seeds, robot),
+        regime_names=name_regimes(tracks, regimes, seeds),
         model=model,
         planner=planner,
         updater=updater,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from itertools import cycle, islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -17,48 +17,13 @@ from torchrl.envs import Compose, TransformedEnv
 
 from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import Ensemble
-from afm_rl.errors import ConfigurationError, check_count, check_counts
+from afm_rl.errors import ConfigurationError
 from afm_rl.learning import collect, fit_ensemble
+from afm_rl.missions.collection import Collection
+from afm_rl.missions.robot import Robot
 from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.planning.costs import KnownReward
 from afm_rl.regimes import Schedule
-
-if TYPE_CHECKING:
-    from afm_rl.missions.robot import Robot
-
-EPISODES = 8  # at a time
-
-
-@dataclass(frozen=True, kw_only=True)
-class Collection:
-    """How transitions are collected, with nominal dynamics if not told otherwise.
-
-    Args:
-        planner: makes a planner from a :class:`~afm_rl.planning.PlanningEnv`.
-        rounds: transitions of each round: random actions first, then those of the planner, in the
-            model that was learned from all rounds before.
-        cost: to plan with, or what makes it from the robot; the robot's reward if None.
-        fit: settings of :func:`~afm_rl.learning.fit_ensemble`.
-        regimes: one for each episode of a round, by turns, from its first step on: domain
-            randomisation. Parameters that are not named are nominal.
-        seed: of the episodes.
-    """
-
-    planner: Callable[[PlanningEnv], TensorDictModuleBase]
-    rounds: Sequence[int] = (2000, 1000)
-    cost: Cost | Callable[[Robot], Cost] | None = None
-    fit: Mapping[str, Any] = field(default_factory=dict)
-    regimes: Sequence[Mapping[str, float]] = ()
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Check counts.
-
-        Raises:
-            ConfigurationError: for numbers that cannot be used.
-        """
-        check_counts("robot.data.rounds", self.rounds, least=1)
-        check_count("robot.data.seed", self.seed, low=0)
 
 
 def transitions(
@@ -67,8 +32,12 @@ def transitions(
     seed: int,
     planner: TensorDictModuleBase | None = None,
     regimes: Sequence[Mapping[str, float]] = (),
+    episodes: int = 8,
 ) -> TensorDictBase:
-    """Return transitions by a planner or by random actions, under ``regimes`` by turns."""
+    """Return transitions by a planner or by random actions, under ``regimes`` by turns.
+
+    ``episodes`` of them run at a time.
+    """
     make = partial(
         robot.env,
         tracks=list(robot.tracks)[:1],
@@ -77,12 +46,12 @@ def transitions(
         max_steps=frames,
         action_low=robot.action_low,
         action_high=robot.action_high,
-        batch_size=[EPISODES],
+        batch_size=[episodes],
         seed=10_000 * (seed + 1),  # missions are counted from 0
     )
     env = make()
     if regimes:
-        turns = islice(cycle(regimes), EPISODES)
+        turns = islice(cycle(regimes), episodes)
         env = make(missions=torch.stack([env.mission(regime=regime) for regime in turns]))
     env = env.to(device_of(robot.model))
     if planner is not None and hasattr(planner, "make_tensordict_primer"):

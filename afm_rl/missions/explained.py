@@ -13,9 +13,6 @@ from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions.robot import Robot
 
-UNSEEN = 1.0  # half ranges: effective actions with a larger standard deviation are left out
-LONGEST, LONGEST_STIFF = 3000, 400  # newest steps, which are looked at: a simulator takes its time
-
 
 @torch.no_grad()
 def effective_log(
@@ -25,6 +22,7 @@ def effective_log(
     actions: np.ndarray,
     t: np.ndarray | None = None,
     episode: np.ndarray | None = None,
+    unseen: float = 1.0,
 ) -> Log:
     """Return what states ``(N, S)`` show of actions ``(N, A)``: responses are effective actions.
 
@@ -38,6 +36,7 @@ def effective_log(
         actions: as they were executed.
         t: times (s), ``(N,)``.
         episode: numbers of episodes, ``(N,)``.
+        unseen: half ranges; effective actions with a larger standard deviation are left out.
 
     Raises:
         ConfigurationError: if too few states show what an action did.
@@ -52,7 +51,7 @@ def effective_log(
     )
     scale = action.abs().amax(0).clamp_min(1e-9)
     seen = effective_action(model, state, action, after, scale)
-    known = (seen.std < UNSEEN * scale).all(-1).numpy()
+    known = (seen.std < unseen * scale).all(-1).numpy()
     kept = rows[known]
     return Log(
         names=names,
@@ -60,21 +59,25 @@ def effective_log(
         response=seen.action.double().numpy()[known],
         t=kept.astype(float) if t is None else t[kept],
         episode=border[kept],
+        computed=True,
         notes=("responses are effective actions, through the model of the healthy robot",),
     )
 
 
-def explain_mission(robot: Robot, steps: pd.DataFrame) -> tuple[Diagnosis, Log]:
+def explain_mission(
+    robot: Robot, steps: pd.DataFrame, newest: int | None = None
+) -> tuple[Diagnosis, Log]:
     """Return what the steps of one mission show of the robot's actuators, and the log of these.
 
     Args:
         robot: its nominal physics says what a healthy one does.
         steps: of one mission, in order.
+        newest: how many steps are looked at; None: 3000, or 400 where a simulator takes its time.
 
     Raises:
         ConfigurationError: if there are too few steps, or none shows what an action did.
     """
-    steps = steps[-(LONGEST_STIFF if robot.model.stiff else LONGEST) :]
+    steps = steps[-(newest or (400 if robot.model.stiff else 3000)) :]
     columns = [list(robot.state_names), [f"executed_{name}" for name in robot.action_names]]
     states, actions = (steps[names].to_numpy(dtype=float) for names in columns)
     finite = np.isfinite(states).all(1) & np.isfinite(actions).all(1)

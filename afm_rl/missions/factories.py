@@ -233,7 +233,8 @@ def least_squares(robot: Robot, dynamics: Part, **settings: Any) -> LeastSquares
 
 def l1(robot: Robot, dynamics: Part, dt: float | None = None, **settings: Any) -> L1Augmentation:
     """Return L1 adaptive augmentation, which needs no training."""
-    return L1Augmentation(*robot.action_box, dt=robot.dt if dt is None else dt, **settings)
+    step: Any = robot.dt if dt is None else dt  # None is refused, by name
+    return L1Augmentation(*robot.action_box, dt=step, **settings)
 
 
 def _training(

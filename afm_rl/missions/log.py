@@ -8,8 +8,6 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-FIRST_ROWS = 4096
-
 
 class StepLog:
     """One row per mission and step, kept in memory until a table is asked for.
@@ -17,6 +15,7 @@ class StepLog:
     Args:
         columns: names of the values.
         whole: the columns that hold whole numbers.
+        room: rows that there is room for at first.
 
     >>> log = StepLog(["x", "reached"], whole=["reached"])
     >>> log.add(torch.tensor([4, 7]), 0, torch.tensor([[0.5, 1.0], [0.6, 2.0]]))
@@ -24,12 +23,12 @@ class StepLog:
     [[4.0, 0.0, 0.5, 1.0], [7.0, 0.0, 0.6000000238418579, 2.0]]
     """
 
-    def __init__(self, columns: Sequence[str], whole: Sequence[str] = ()) -> None:
+    def __init__(self, columns: Sequence[str], whole: Sequence[str] = (), room: int = 4096) -> None:
         self.columns = list(columns)
         self.whole = list(whole)
         self._count = 0
-        self._values = torch.empty(FIRST_ROWS, len(self.columns))
-        self._keys = torch.empty(FIRST_ROWS, 2, dtype=torch.int64)  # mission, step
+        self._values = torch.empty(room, len(self.columns))
+        self._keys = torch.empty(room, 2, dtype=torch.int64)  # mission, step
 
     def __len__(self) -> int:
         return self._count
@@ -62,7 +61,7 @@ class StepLog:
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         self._count = len(state["keys"])
-        spare = max(self._count, FIRST_ROWS)
+        spare = max(self._count, len(self._keys))
         self._values, self._keys = (
             torch.cat([rows, rows.new_empty(spare, rows.shape[-1])])
             for rows in (state["values"], state["keys"])

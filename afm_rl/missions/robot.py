@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.missions.collected import Collection
+from afm_rl.missions.collection import Collection
 from afm_rl.missions.laps import LapScore
 from afm_rl.missions.score import Score
 from afm_rl.regimes import Regime, Schedule

@@ -14,16 +14,18 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
-from afm_rl.errors import NonFiniteError
+from afm_rl.errors import AFMError, NonFiniteError
 from afm_rl.missions.build import Agent
-from afm_rl.missions.checkpoint import Checkpoints, Stopped
 from afm_rl.missions.log import StepLog
-from afm_rl.missions.state import Loop, leave, unsaved
+from afm_rl.missions.state import Loop, leave, owner, restore, snapshot
+from afm_rl.missions.unsaved import unsaved
 from afm_rl.progress import Bar
+from afm_rl.storage.checkpoints import Checkpoints
 from afm_rl.storage.measures import Measures
 
-ALIGNED = 5.0  # innovation, in standard deviations, up to which a model counts as aligned
-STILL = 0.1  # innovation up to which a repeated reading shows a robot at rest, as foreseen
+
+class Stopped(AFMError):
+    """Missions were told to stop before their end."""
 
 
 @dataclass
@@ -77,7 +79,7 @@ def run(
     """
     with torch.random.fork_rng(devices=[]):  # TorchRL's own planners draw from the global one
         torch.manual_seed(0)
-        kept = None if checkpoint is None else Checkpoints(checkpoint, agent, every, keep)
+        kept = None if checkpoint is None else Checkpoints(checkpoint, owner(agent), every, keep)
         return _run(agent, progress, kept, stopped)
 
 
@@ -89,12 +91,12 @@ def _run(
 ) -> Results:
     state = None if checkpoints is None else checkpoints.read()  # before the agent is changed
     loop = _start(agent)
-    if checkpoints is not None and state is not None:
-        checkpoints.resume(loop, state)
+    if state is not None:
+        restore(agent, loop, state)
     total, clock, budget = len(agent.missions), time.perf_counter(), agent.settings["budget"]
     most = min(budget, getattr(agent.base_env, "max_steps", budget))
     with Bar(
-        total=total * most, initial=_done(loop, most), desc=agent.label, shown=progress
+        total=total * most, initial=_done(loop, most), desc=agent.label, shown=progress, main=True
     ) as bar:
         while len(loop.ids):
             ids = loop.ids
@@ -106,8 +108,8 @@ def _run(
             bar.set_postfix_str(ended, refresh=False)
             bar.update(_done(loop, most) - bar.n)
             stop = stopped is not None and stopped(loop)
-            if checkpoints is not None:
-                checkpoints.write(loop) if stop else checkpoints.write_if_due(loop)
+            if checkpoints is not None and (stop or checkpoints.due):
+                checkpoints.write(loop.step, snapshot(agent, loop))
             if stop:
                 raise Stopped(f"stopped before step {loop.step}")
     return Results(_missions(agent, loop.ends), loop.log.table(), agent.robot.metrics.measures)
@@ -134,14 +136,22 @@ def _start(agent: Agent) -> Loop:
     return Loop(td, torch.arange(total, device=agent.device), ends, log, unsaved=unsaved(agent))
 
 
-def _advance(agent: Agent, loop: Loop) -> None:
-    """Take one step with every mission that runs, in place."""
+def _advance(agent: Agent, loop: Loop, aligned: float = 5.0, still: float = 0.1) -> None:
+    """Take one step with every mission that runs, in place.
+
+    Args:
+        agent: whose missions they are.
+        loop: where they stand.
+        aligned: innovation (standard deviations) up to which a model counts as aligned, where
+            nothing corrects.
+        still: innovation up to which a repeated reading shows a robot at rest, as foreseen.
+    """
     td, ids = agent.env.step(agent.planner(loop.td)), loop.ids
     errors, innovation = _errors(agent, td)
     guard = td["next", "guard"]
-    fault = guard["held"] | ~(guard["sound"] | (innovation < STILL))
+    fault = guard["held"] | ~(guard["sound"] | (innovation < still))
     loss = agent.updater(td)["loss"]
-    loop.log.add(ids, loop.step, _row(agent, td, errors, innovation, loss, fault))
+    loop.log.add(ids, loop.step, _row(agent, td, errors, innovation > aligned, loss, fault))
     if agent.faults == "raise" and bool(fault.any()):
         raise NonFiniteError(
             f"step {loop.step}: missions {ids[fault].tolist()}: a reading or a plan is missing, "
@@ -198,10 +208,10 @@ def _columns(agent: Agent) -> list[str]:
     ]
 
 
-def _row(agent: Agent, td: TensorDictBase, errors, innovation, loss, fault) -> Tensor:
+def _row(agent: Agent, td: TensorDictBase, errors, astray, loss, fault) -> Tensor:
     """Return one step's values ``(B, C)``, in the order of :func:`_columns`."""
     transform = agent.transform
-    flag = innovation > ALIGNED if transform is None else td["next", transform.key("misaligned")]
+    flag = astray if transform is None else td["next", transform.key("misaligned")]
     figures = (*errors, flag, loss, td["regime_active"], fault)
     scalars = torch.stack([x.float() for x in figures], -1)
     score, executed = agent.robot.metrics, td.get(agent.executed_key)

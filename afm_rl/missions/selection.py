@@ -10,12 +10,11 @@ import torch
 from tensordict import TensorDictBase
 
 from afm_rl.errors import ConfigurationError, check_choice, check_count
-from afm_rl.missions.families import Family, Listed, find_family
+from afm_rl.missions.families import Family, Fixed, Listed, find_family
 from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Schedule
 
-Entry = Family | Listed | Mapping[str, Any] | Sequence[Mapping[str, float]]
-MOST_SEEDS = 100_000
+Entry = Family | Listed | Fixed
 PLAN = ("phases", "at", "ramp")
 
 
@@ -43,7 +42,7 @@ def select_regimes(regimes: Any, robot: Robot) -> list[Entry]:
         ConfigurationError: naming the parameter that is unknown or cannot have its value.
     """
     if regimes == "none":
-        return [{}]
+        regimes = [{}]
     if regimes == "paper":
         regimes = list(robot.paper_regimes)
     if regimes == "families":
@@ -57,47 +56,51 @@ def select_regimes(regimes: Any, robot: Robot) -> list[Entry]:
             f"{', '.join(robot.families) or 'no families'}, or a list of families and of mappings "
             f"such as {example} with parameters {', '.join(robot.regime.names)}"
         )
-    return [_checked(entry, robot) for entry in regimes]
+    return [_entry(entry, robot) for entry in regimes]
 
 
-def _checked(entry: Any, robot: Robot) -> Entry:
-    """Return one entry of the list, with a family in place of its name."""
+def _entry(entry: Any, robot: Robot) -> Entry:
+    """Return one entry of the list."""
     if isinstance(entry, str):
         return find_family(entry, robot)
     planned = isinstance(entry, Mapping) and "phases" in entry
-    if planned:
-        for key in entry:
-            check_choice("regimes: setting", key, PLAN)
-        for key in ("phases", "at"):
-            if not isinstance(entry.get(key, []), list):
-                raise ConfigurationError(f"regimes: {key}={entry[key]!r}: expected a list")
-        check_count("regimes: ramp", entry.get("ramp", 0), low=0)
-    phases = entry["phases"] if planned else entry
-    for phase in phases if isinstance(phases, list) else [phases]:
+    given = dict(entry) if planned else {"phases": entry}
+    for key in given:
+        check_choice("regimes: setting", key, PLAN)
+    for key in ("phases", "at") if planned else ():
+        if not isinstance(given.get(key, []), list):
+            raise ConfigurationError(f"regimes: {key}={given[key]!r}: expected a list")
+    check_count("regimes: ramp", given.get("ramp", 0), low=0)
+    regime = given.pop("phases")
+    words = []
+    for phase in regime if isinstance(regime, list) else [regime]:
         if not isinstance(phase, Mapping):
             raise ConfigurationError(
                 f"regimes: {phase!r}: expected a mapping of {', '.join(robot.regime.names)}"
             )
-        robot.regime.encode(phase)
-    return entry
+        words.append(robot.regime.describe(robot.regime.encode(phase)))
+    if given.get("at"):
+        words.append("at " + ", ".join(f"{value:g}" for value in given["at"]))
+    if given.get("ramp"):
+        words.append(f"ramp {given['ramp']}")
+    return Fixed("; ".join(words), {"regime": regime, **given})
 
 
 def select_seeds(seeds: Any) -> list[int]:
     """Return seeds: a count, or a list."""
-    if isinstance(seeds, int) and not isinstance(seeds, bool) and 1 <= seeds <= MOST_SEEDS:
+    if isinstance(seeds, int) and not isinstance(seeds, bool) and 1 <= seeds <= 100_000:
         return list(range(seeds))
     whole = isinstance(seeds, list) and all(type(s) is int and 0 <= s < 2**63 for s in seeds)
     if not whole or not seeds or len(set(seeds)) < len(seeds):
         raise ConfigurationError(
-            f"seeds={seeds!r}: expected a count in 1..{MOST_SEEDS}, or a list of distinct whole "
-            "numbers"
+            f"seeds={seeds!r}: expected a count in 1..100000, or a list of distinct whole numbers"
         )
     return seeds
 
 
 def fit_schedule(schedule: Schedule, regimes: Sequence[Entry]) -> Schedule:
     """Return the schedule with room for the phases of every regime."""
-    own = [len(_arguments(entry, seed=0).get("at") or ()) + 1 for entry in regimes]
+    own = [len(entry.mission(seed=0).get("at") or ()) + 1 for entry in regimes]
     return schedule.padded(max(own))
 
 
@@ -107,35 +110,12 @@ def build_missions(
     """Return every combination as one tensordict ``(B,)`` for ``env.reset``."""
     cells = product(range(len(tracks)), regimes, seeds)
     return torch.stack(
-        [env.mission(track, seed, **_arguments(entry, seed)) for track, entry, seed in cells]
+        [env.mission(track, seed, **one.mission(seed)) for track, one, seed in cells]
     )
 
 
 def name_regimes(
-    tracks: Sequence[str], regimes: Sequence[Entry], seeds: Sequence[int], robot: Robot
+    tracks: Sequence[str], regimes: Sequence[Entry], seeds: Sequence[int]
 ) -> list[str]:
     """Return the regime of every combination in words, in the order of :func:`build_missions`."""
-    names = [_name(entry, robot) for entry in regimes]
-    return [name for _, name, _ in product(tracks, names, seeds)]
-
-
-def _arguments(entry: Entry, seed: int) -> dict[str, Any]:
-    """Return what ``env.mission`` is told of a regime."""
-    if isinstance(entry, Family | Listed):
-        return entry.mission(seed)
-    if isinstance(entry, Mapping) and "phases" in entry:
-        return {"regime": entry["phases"], **{key: entry[key] for key in PLAN[1:] if key in entry}}
-    return {"regime": entry}
-
-
-def _name(entry: Entry, robot: Robot) -> str:
-    if isinstance(entry, Family | Listed):
-        return entry.name
-    told = _arguments(entry, seed=0)
-    phases = told["regime"] if isinstance(told["regime"], list) else [told["regime"]]
-    words = [robot.regime.describe(robot.regime.encode(phase)) for phase in phases]
-    if told.get("at"):
-        words.append("at " + ", ".join(f"{value:g}" for value in told["at"]))
-    if told.get("ramp"):
-        words.append(f"ramp {told['ramp']}")
-    return "; ".join(words)
+    return [entry.name for _, entry, _ in product(tracks, regimes, seeds)]

@@ -9,11 +9,11 @@ from typing import Any
 
 from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.missions.collected import Collection
+from afm_rl.missions.collection import Collection
 from afm_rl.missions.return_score import ReturnScore
 from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Compose, Physics, Regime, Schedule, actuator_regimes
-from afm_rl.trust import CODE, find_code
+from afm_rl.targets import CODE, find_code
 
 
 class TaskRobot(Robot):

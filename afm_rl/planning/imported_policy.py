@@ -29,7 +29,7 @@ ACTORS = (
 )
 
 
-def policy_from_sb3(file: Path, normaliser: Path | None = None) -> StoredPolicy:
+def policy_from_sb3(file: str | Path, normaliser: str | Path | None = None) -> StoredPolicy:
     """Return the deterministic policy of a model that Stable-Baselines3 saved.
 
     Of PPO, A2C, TRPO, SAC, TQC, TD3, DDPG and ARS, in this and older versions, with feed-forward
@@ -71,7 +71,7 @@ def policy_from_sb3(file: Path, normaliser: Path | None = None) -> StoredPolicy:
 
 
 def policy_from_cleanrl(
-    file: Path, space: Box, normaliser: tuple[Tensor, float] | None = None
+    file: str | Path, space: Box, normaliser: tuple[Tensor, float] | None = None
 ) -> StoredPolicy:
     """Return the deterministic policy of an agent that CleanRL saved (``.cleanrl_model``).
 
@@ -93,7 +93,7 @@ def policy_from_cleanrl(
     return _policy(state, low, high, about, file)
 
 
-def read_normaliser(file: Path) -> tuple[Tensor, float]:
+def read_normaliser(file: str | Path) -> tuple[Tensor, float]:
     """Return mean and standard deviation ``(2, O)`` and clip of a saved ``VecNormalize``.
 
     The file is a pickle. It is not unpickled: its stream of operations is read for the numbers that
@@ -103,8 +103,9 @@ def read_normaliser(file: Path) -> tuple[Tensor, float]:
         ConfigurationError: if there is no such file.
         ArtefactError: if there are no such numbers in it.
     """
-    content, found = _existing(file).read_bytes(), {}
-    wanted, word, began, known = "", None, False, {}
+    content, wanted, word, began = _existing(file).read_bytes(), "", None, False
+    found: dict[str, Any] = {}
+    known: dict[Any, str | None] = {}
     try:
         for code, value, _ in pickletools.genops(content):
             if "PUT" in code.name or code.name == "MEMOIZE":  # words that come again have a number
@@ -128,7 +129,7 @@ def read_normaliser(file: Path) -> tuple[Tensor, float]:
         ) from error
 
 
-def _existing(file: Path) -> Path:
+def _existing(file: str | Path) -> Path:
     if not Path(file).is_file():
         raise ConfigurationError(f"{file}: no such file")
     return Path(file)
@@ -139,7 +140,7 @@ def _numbers(text: str) -> Tensor:
     return torch.tensor([float(word) for word in text.strip("[]").split()])
 
 
-def _read_weights(content: bytes, file: Path) -> Mapping[str, Tensor]:
+def _read_weights(content: bytes, file: str | Path) -> Mapping[str, Tensor]:
     """Read named tensors, and nothing but tensors."""
     try:
         # The one place: formats of others. weights_only refuses whatever is not a tensor.
@@ -151,7 +152,7 @@ def _read_weights(content: bytes, file: Path) -> Mapping[str, Tensor]:
 
 
 def _policy(
-    state: Mapping[str, Tensor], low: Tensor, high: Tensor, about: dict[str, Any], file: Path
+    state: Mapping[str, Tensor], low: Tensor, high: Tensor, about: dict[str, Any], file: str | Path
 ) -> StoredPolicy:
     names, own = [name for name in state if name.endswith(".weight")], []
     for hidden, last, *usual in ACTORS:

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_choice, check_count
-from afm_rl.planning.conic import load_casadi, solve_conic
+from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
-from afm_rl.planning.riccati import LQProblem, LQSolution, solve_lq
+from afm_rl.planning.riccati import LQProblem, solve_lq
 from afm_rl.planning.tracking import QuadraticCost
 from afm_rl.spaces.keys import as_key
 from afm_rl.spaces.manifold import Manifold, wrap_angle
-
-SOLVERS: dict[str, Callable[[LQProblem], LQSolution]] = {"riccati": solve_lq, "hpipm": solve_conic}
 
 
 def linear_quadratic(
@@ -85,8 +82,6 @@ class MPC(RecedingHorizonPlanner):
         first_iterations: linearisations at the first tick of a flight.
         bounded: indices of the action components whose box the plan respects; None for
             all. Others are only projected when the action is applied.
-        qp: ``"riccati"``, :func:`solve_lq`, or ``"hpipm"``, :func:`solve_conic`, a reference
-            that needs casadi.
         memory_key: where ``states`` ``(*B, N + 1, S)`` and ``actions`` ``(*B, N, A)`` are kept.
         action_key: where the action goes.
 
@@ -119,7 +114,6 @@ class MPC(RecedingHorizonPlanner):
         iterations: int = 1,
         first_iterations: int = 5,
         bounded: Sequence[int] | None = None,
-        qp: str = "riccati",
         memory_key: NestedKey = "mpc",
         action_key: NestedKey = "action",
     ) -> None:
@@ -142,9 +136,6 @@ class MPC(RecedingHorizonPlanner):
         self.first_iterations = check_count(
             "planner.first_iterations", first_iterations, high=10_000
         )
-        self.qp = check_choice("planner.qp", qp, SOLVERS)
-        if qp == "hpipm":
-            load_casadi()
         space = self.action_spec.space
         within = list(range(size)) if bounded is None else list(bounded)
         if not all(isinstance(i, int) and 0 <= i < size for i in within):
@@ -165,7 +156,8 @@ class MPC(RecedingHorizonPlanner):
     @torch.no_grad()
     def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
         """Return the action, and states ``(*B, N + 1, S)`` and actions ``(*B, N, A)``."""
-        measured, task = td.get(self.env.observation_key), self._task(td)
+        measured, *entries = self.env.entries(td)
+        task = self._task(td.batch_size, entries)
         shifted = [torch.cat([old[..., 1:, :], old[..., -1:, :]], -2) for old in self._recall(td)]
         states, actions = (old.to(measured) for old in shifted)
         new = (states == 0).flatten(-2).all(-1) & (actions == 0).flatten(-2).all(-1)
@@ -206,26 +198,23 @@ class MPC(RecedingHorizonPlanner):
         """Return states and actions after one Gauss-Newton step, and whether it is exact."""
         states, actions = guess
         low, high = self.low.to(actions), self.high.to(actions)
-        found = SOLVERS[self.qp](linear_quadratic(self.env, states, actions, task, low, high))
+        found = solve_lq(linear_quadratic(self.env, states, actions, task, low, high))
         actions = torch.minimum(torch.maximum(actions + found.controls, low), high)  # rounding
         return [states + found.states, actions], found.exact
 
-    def _task(self, td: TensorDictBase) -> list[Tensor]:
+    def _task(self, batch: torch.Size, entries: Sequence[Tensor]) -> list[Tensor]:
         """Return the cost's entries, each ``(*B, N + 1, size)`` or ``(*B, 1, size)``.
 
         Raises:
             ConfigurationError: for an entry of another shape.
         """
-        cost, batch = self.env.cost, td.batch_size
-        task = []
-        for key, size in zip(cost.in_keys, cost.in_sizes, strict=True):
-            entry = td.get(key, None)
+        cost, task = self.env.cost, []
+        for key, size, entry in zip(cost.in_keys, cost.in_sizes, entries, strict=True):
             held, staged = (*batch, size), (*batch, self.horizon + 1, size)
-            if entry is None or entry.shape not in (held, staged):
-                given = "is missing" if entry is None else f"has shape {tuple(entry.shape)}"
+            if entry.shape not in (held, staged):
                 raise ConfigurationError(
-                    f"planner: {key!r} {given}; expected {held}, held over the horizon, or "
-                    f"{staged}, one per stage"
+                    f"planner: {key!r} has shape {tuple(entry.shape)}; expected {held}, held over "
+                    f"the horizon, or {staged}, one per stage"
                 )
             task.append(entry.unsqueeze(-2) if entry.shape == held else entry)
         return task

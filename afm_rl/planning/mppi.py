@@ -17,8 +17,6 @@ from afm_rl.planning.receding import action_spec_of
 from afm_rl.planning.sampling_planner import SamplingPlanner
 from afm_rl.spaces.keys import as_key
 
-BOUND = 2.0  # exploration noise is truncated at two standard deviations
-
 
 def smooth(plan: Tensor, past: Tensor, beta: float, low: Tensor, high: Tensor) -> Tensor:
     r"""Filter plans in time, within the action box.
@@ -100,6 +98,7 @@ class MPPI(SamplingPlanner):
         sigma: standard deviation of the noise, as a fraction of the half range of each
             action (``noise="scaled"``).
         beta: weight of the new action in the smoothing, in (0, 1].
+        truncate: standard deviations at which the noise is cut off.
         noise: ``"scaled"``, or ``"unit"``: standard deviation 1 whatever the action's unit,
             as in the published runs, where sigma had no effect.
         past: the action that smoothing starts from: ``"previous"``, the one last planned,
@@ -141,6 +140,7 @@ class MPPI(SamplingPlanner):
         temperature: float = 0.001,
         sigma: float = 1.0,
         beta: float = 0.6,
+        truncate: float = 2.0,
         noise: str = "scaled",
         past: str = "previous",
         backend: str | None = None,
@@ -167,6 +167,7 @@ class MPPI(SamplingPlanner):
         self.temperature = check_number("planner.temperature", temperature, low=0, open_low=True)
         self.sigma = check_number("planner.sigma", sigma, low=0.0, high=100.0)
         self.beta = check_number("planner.beta", beta, low=0.0, high=1.0, open_low=True)
+        self.truncate = check_number("planner.truncate", truncate, low=0.0, open_low=True)
         self.noise = check_choice("planner.noise", noise, ("scaled", "unit"))
         self.past = check_choice("planner.past", past, ("previous", "shifted"))
         self.compiles = check_flag("planner.compile", compile)
@@ -184,12 +185,12 @@ class MPPI(SamplingPlanner):
         low, high, scale = self._box(td)
         best = shifted
         for _ in range(self.iterations):
-            eps = self._noise(td, mean, self.population, BOUND)
+            eps = self._noise(td, mean, self.population, self.truncate)
             raw = eps.mul_(rows_like(scale, eps)).add_(best.unsqueeze(-3))
             plans = smooth(raw, past.unsqueeze(-2), self.beta, low, high)
             if self._as_machine_code:
-                task = [td.get(key) for key in self.env.cost.in_keys]
-                given = td.get(self.env.observation_key), plans, *task
+                state, *task = self.env.entries(td)
+                given = state, plans, *task
                 found, finite = self._machine_code(MPPI.improved, *given, model=self.env.dynamics)
                 best = self._sound(finite, found, best)
             else:

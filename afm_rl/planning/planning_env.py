@@ -8,13 +8,28 @@ import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import ModelBasedEnvBase
+from torchrl.envs import EnvBase, ModelBasedEnvBase
 
 from afm_rl.compiling.devices import device_of, moved
-from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_instance
+from afm_rl.dynamics import DynamicsModel, KnownDynamics
+from afm_rl.errors import AFMError, ConfigurationError, check_instance
 from afm_rl.planning.costs import Cost
 from afm_rl.spaces.keys import as_key
+
+
+def raise_missing(env: EnvBase, tensordict: TensorDictBase) -> None:
+    """Say which entry a planner looks for in vain.
+
+    Raises:
+        ConfigurationError: always, unless all entries of the planning environment are there.
+    """
+    for key in env.observation_spec.keys(True, True):
+        if tensordict.get(key, None) is None:
+            there = [name for name in tensordict.keys(True, True) if "next" not in name]
+            raise ConfigurationError(
+                f"planner: reads {key!r}, but the environment gives {there}; say where the state "
+                "is by PlanningEnv(observation_key=...), and what the cost reads by its in_keys"
+            )
 
 
 class PlanningEnv(ModelBasedEnvBase):
@@ -31,6 +46,10 @@ class PlanningEnv(ModelBasedEnvBase):
         observation_key: where the state is.
         action_key: where the action is.
         observe: what a policy sees of states ``(*B, S)``, ``(*B, O)``; the states if None.
+
+    Raises:
+        ConfigurationError: for bounds that do not fit, and for a step function or a cost that is
+            not batched; at a plan, for an entry that the environment does not give.
 
     >>> from afm_rl.dynamics import Dubins
     >>> from afm_rl.planning import GoalDistance
@@ -65,6 +84,7 @@ class PlanningEnv(ModelBasedEnvBase):
                 f"action bounds {low.tolist()}, {high.tolist()}: expected {dynamics.action_size} "
                 "finite numbers each, low < high"
             )
+        self._try(1.0 * low)
         if self.observation_key in cost.in_keys:
             raise ConfigurationError(
                 f"cost.in_keys={cost.in_keys}: {self.observation_key!r} holds the state already"
@@ -80,6 +100,46 @@ class PlanningEnv(ModelBasedEnvBase):
         spec = Bounded(low, high, shape=low.shape, dtype=low.dtype)
         self.full_action_spec = Composite({as_key(action_key): spec})
         self.reward_spec = Unbounded((1,), dtype=low.dtype, device=device)
+
+    def _try(self, low: Tensor) -> None:
+        """Try step function and cost on a batch whose size is no other size.
+
+        Raises:
+            ConfigurationError: if one of them is not batched.
+        """
+        model, low = self.dynamics, low.to(self.device)
+        batch = max(model.state_size, model.action_size) + 2, 1
+        state, action = low.new_zeros(*batch, model.state_size), low.expand(*batch, -1)
+        task = [low.new_zeros(*batch, size) for size in self.cost.in_sizes]
+        with torch.no_grad():
+            if type(model).forward is KnownDynamics.forward:  # of others the shape is known
+                model(state, action)
+            try:
+                found = self.cost(state, action, state, *task)
+            except AFMError:
+                raise
+            except Exception as error:  # of somebody else's function
+                raise ConfigurationError(
+                    f"cost: {error}; tried with states {tuple(state.shape)}"
+                ) from error
+        shape = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
+        if shape != batch:
+            raise ConfigurationError(
+                f"cost: returned {shape} for states {tuple(state.shape)} and actions "
+                f"{tuple(action.shape)}; expected a tensor {batch}, one number per step: a "
+                "function in torch that works on the last dimension, as in state[..., 0]"
+            )
+
+    def entries(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """Return the state ``(*B, S)`` and the entries of the task, as the environment gives them.
+
+        Raises:
+            ConfigurationError: if one is missing.
+        """
+        found = [tensordict.get(key, None) for key in (self.observation_key, *self.cost.in_keys)]
+        if any(entry is None for entry in found):
+            raise_missing(self, tensordict)
+        return found
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PlanningEnv:
         """Move the specs too: a planner that is moved moves its modules only."""
@@ -97,16 +157,16 @@ class PlanningEnv(ModelBasedEnvBase):
         return start
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        state, action = tensordict.get(self.observation_key), tensordict.get(self.action_key)
-        task = {key: tensordict.get(key) for key in self.cost.in_keys}
+        state, *task = self.entries(tensordict)
+        action = tensordict.get(self.action_key)
         next_state = self.dynamics(state, action)
-        cost = self.cost(state, action, next_state, *task.values())
+        cost = self.cost(state, action, next_state, *task)
         done = torch.zeros((*cost.shape, 1), dtype=torch.bool, device=cost.device)
         ends = {"done": done, "terminated": done.clone()}
         out = TensorDict(ends, tensordict.batch_size, device=tensordict.device)
         out.set(self.observation_key, next_state)
         out.set("reward", -cost.unsqueeze(-1))
-        for key, value in task.items():
+        for key, value in zip(self.cost.in_keys, task, strict=True):
             out.set(key, value)
         return out
 

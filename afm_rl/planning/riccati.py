@@ -7,9 +7,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-SWEEPS = 300  # active sets tried; a handful do unless most components are at a bound
-PATIENCE = 3.0  # sweeps without progress before exchanges are made one by one
-
 
 class LQProblem(NamedTuple):
     r"""A linear-quadratic problem over N stages, in deviations from a trajectory.
@@ -56,7 +53,7 @@ class LQSolution(NamedTuple):
     """``(*B)`` boolean: is this the minimum, or merely within the bounds?"""
 
 
-def solve_lq(problem: LQProblem, sweeps: int = SWEEPS) -> LQSolution:
+def solve_lq(problem: LQProblem, sweeps: int = 300, patience: float = 3.0) -> LQSolution:
     r"""Solve linear-quadratic problems, all of a batch at once.
 
     A primal-dual active-set method: a Riccati sweep solves the problem in which some control
@@ -73,7 +70,8 @@ def solve_lq(problem: LQProblem, sweeps: int = SWEEPS) -> LQSolution:
 
     Args:
         problem: what to solve, float32 or float64.
-        sweeps: most active sets to try.
+        sweeps: most active sets to try; a handful do unless most components are at a bound.
+        patience: sweeps without progress before components change sides one at a time.
 
     >>> one = torch.ones(1, 1)
     >>> problem = LQProblem(  # one stage: move a point to 0, at a price
@@ -89,7 +87,7 @@ def solve_lq(problem: LQProblem, sweeps: int = SWEEPS) -> LQSolution:
     low, high = flat.low - tiny * flat.low.abs(), flat.high + tiny * flat.high.abs()
     at_low = at_high = torch.zeros_like(flat.r, dtype=torch.bool)
     fewest = torch.full_like(flat.start[:, 0], torch.inf)
-    credit = torch.full_like(fewest, PATIENCE)
+    credit = torch.full_like(fewest, patience)
     for _ in range(sweeps):
         held = at_low | at_high
         at = torch.where(at_low, flat.low, torch.where(at_high, flat.high, 0.0))
@@ -100,7 +98,7 @@ def solve_lq(problem: LQProblem, sweeps: int = SWEEPS) -> LQSolution:
         count = wrong.sum((0, 2)).to(fewest)
         if not bool(count.any()):
             break
-        credit = torch.where(count < fewest, PATIENCE, credit - 1.0)
+        credit = torch.where(count < fewest, patience, credit - 1.0)
         fewest = torch.minimum(count, fewest)
         wrong = torch.where((credit < 0.0).unsqueeze(-1), _last(wrong), wrong)
         at_low, at_high = torch.where(wrong, now_low, at_low), torch.where(wrong, now_high, at_high)

@@ -118,8 +118,8 @@ class SamplingPlanner(RecedingHorizonPlanner):
         if self.hold > 1:
             plans = plans.repeat_interleave(self.hold, -2)
         if self.backend == "fast":
-            task = [td.get(key) for key in self.env.cost.in_keys]
-            returns = self.env.returns(td.get(self.env.observation_key), plans, *task)
+            state, *task = self.env.entries(td)
+            returns = self.env.returns(state, plans, *task)
             return returns.to(plans)  # states may be in double precision, plans in single
         batch = plans.shape[:-2]
         start = td.select(*self.env.observation_spec.keys(True, True), strict=False)

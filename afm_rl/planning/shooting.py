@@ -11,21 +11,26 @@ from torchrl.modules import CEMPlanner, MPPIPlanner
 from torchrl.objectives.value import TDLambdaEstimator
 
 from afm_rl.errors import ConfigurationError, check_count, check_instance, check_number
+from afm_rl.planning.planning_env import raise_missing
 
 
-def _check_elites(elites: int, population: int) -> int:
-    if check_count("planner.elites", elites) > population:
-        raise ConfigurationError(
-            f"planner.elites={elites}: expected at most planner.population={population}"
-        )
-    return elites
+def _check(env: EnvBase, horizon: int, population: int, iterations: int, elites: int) -> None:
+    """Check what both planners share.
 
-
-def _check_action_key(env: EnvBase) -> None:
+    Raises:
+        ConfigurationError: for a setting or environment that cannot be used.
+    """
     if check_instance("planner.env", env, EnvBase).action_keys != ["action"]:
         raise ConfigurationError(
             f"planner: TorchRL's planners write 'action', but {type(env).__name__} reads "
             f"{env.action_keys}; rename it, or choose MPPI or ICEM"
+        )
+    check_count("planner.horizon", horizon, high=10_000)
+    check_count("planner.population", population, high=1_000_000)
+    check_count("planner.iterations", iterations, high=10_000)
+    if check_count("planner.elites", elites) > population:
+        raise ConfigurationError(
+            f"planner.elites={elites}: expected at most planner.population={population}"
         )
 
 
@@ -51,14 +56,12 @@ class CEM(CEMPlanner):
         iterations: int = 3,
         elites: int = 30,
     ) -> None:
-        _check_action_key(env)
-        check_count("planner.horizon", horizon, high=10_000)
-        check_count("planner.population", population, high=1_000_000)
-        check_count("planner.iterations", iterations, high=10_000)
-        super().__init__(env, horizon, iterations, population, _check_elites(elites, population))
+        _check(env, horizon, population, iterations, elites)
+        super().__init__(env, horizon, iterations, population, elites)
 
     def planning(self, tensordict: TensorDictBase) -> Tensor:
         """Plan on the entries needed: the base class copies all of them per candidate."""
+        raise_missing(self.env, tensordict)
         return super().planning(tensordict.select(*self.in_keys))
 
 
@@ -85,12 +88,8 @@ class TorchRLMPPI(MPPIPlanner):
         elites: int = 30,
         temperature: float = 1.0,
     ) -> None:
-        _check_action_key(env)
-        check_count("planner.horizon", horizon, high=10_000)
-        check_count("planner.population", population, high=1_000_000)
-        check_count("planner.iterations", iterations, high=10_000)
+        _check(env, horizon, population, iterations, elites)
         check_number("planner.temperature", temperature, low=0.0, open_low=True)
-        _check_elites(elites, population)
         keys = list(env.observation_spec.keys(True, True))
         value = TensorDictModule(
             lambda observation: torch.zeros_like(observation[..., :1]), keys[:1], ["state_value"]
@@ -100,4 +99,5 @@ class TorchRLMPPI(MPPIPlanner):
 
     def planning(self, tensordict: TensorDictBase) -> Tensor:
         """Plan on the entries needed: the base class copies all of them per candidate."""
+        raise_missing(self.env, tensordict)
         return super().planning(tensordict.select(*self.env.observation_spec.keys(True, True)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from afm_rl.planning.law import LawPlanner
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.storage.artefacts import digest_of, read_tensors, save_tensors
 
-ACTIVATIONS = {
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "relu": nn.functional.relu,
     "tanh": torch.tanh,
     "elu": nn.functional.elu,
@@ -116,8 +116,7 @@ def save_policy(file: Path, policy: StoredPolicy, description: Mapping[str, Any]
     """Write a policy, its weights in half precision; ``description`` says how it was made."""
     kept = {name: value.half() for name, value in policy.named_parameters()}
     kept |= dict(policy.named_buffers())
-    form = {name: str(x) if x == math.inf else x for name, x in policy.form.items()}
-    save_tensors(Path(file), kept, {**description, "kind": "policy", "form": form})
+    save_tensors(Path(file), kept, {**description, "kind": "policy", "form": policy.form})
 
 
 def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
@@ -130,11 +129,10 @@ def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
     tensors, description = read_tensors(Path(file))
     if description.get("kind") != "policy" or "form" not in description:
         raise ArtefactError(f"{file}: holds no policy; make one with save_policy")
-    form = {name: math.inf if x == "inf" else x for name, x in description["form"].items()}
     count = range(sum(name.startswith("weights") for name in tensors))
     layers = [(tensors[f"weights.{index}"], tensors[f"biases.{index}"]) for index in count]
-    rest = {"normaliser": tensors.get("normaliser"), **form}
-    return StoredPolicy(layers, tensors["low"], tensors["high"], **rest), description
+    box, normaliser = (tensors["low"], tensors["high"]), tensors.get("normaliser")
+    return StoredPolicy(layers, *box, normaliser=normaliser, **description["form"]), description
 
 
 class PolicyPlanner(LawPlanner):

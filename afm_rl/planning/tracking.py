@@ -109,6 +109,7 @@ class TrackingCost(QuadraticCost):
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, *task: Tensor) -> Tensor:
         """Return the cost ``(*B)`` of an action and of the state that it leads to."""
+        self._check_sizes(next_state, action)
         off = self._gap(next_state, *task).square() @ self.weights.to(next_state)
         return off + action.square() @ self.action_weights.to(action)
 
@@ -116,13 +117,7 @@ class TrackingCost(QuadraticCost):
         self, states: Tensor, actions: Tensor, *task: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the expansion, which is exact."""
-        sizes = (states.shape[-1], actions.shape[-1])
-        if sizes != (len(self.weights), len(self.action_weights)):
-            raise ConfigurationError(
-                f"cost: weights for {len(self.weights)} state coordinates and "
-                f"{len(self.action_weights)} action components, but there are "
-                f"{sizes[0]} and {sizes[1]}"
-            )
+        self._check_sizes(states, actions)
         state_twice = 2.0 * self.weights.to(states)
         action_twice = 2.0 * self.action_weights.to(actions)
         return (
@@ -131,6 +126,15 @@ class TrackingCost(QuadraticCost):
             action_twice.diag().expand(*actions.shape, -1),
             action_twice * actions,
         )
+
+    def _check_sizes(self, states: Tensor, actions: Tensor) -> None:
+        sizes = states.shape[-1], actions.shape[-1]
+        if sizes != (len(self.weights), len(self.action_weights)):
+            raise ConfigurationError(
+                f"cost: weights for {len(self.weights)} state coordinates and "
+                f"{len(self.action_weights)} action components, but there are "
+                f"{sizes[0]} and {sizes[1]}"
+            )
 
     def _gap(self, state: Tensor, *reference: Tensor) -> Tensor:
         """Return by how much states ``(*B, S)`` miss the targets."""

@@ -30,7 +30,7 @@ class Faults:
 def presets(actuators: int) -> dict[str, dict[str, float]]:
     """Return faults by name."""
     every, other = range(actuators), actuators // 2
-    found = {
+    found: dict[str, dict[str, float]] = {
         "healthy": {},
         "reverse one": {"gain_0": -1.0},
         "reverse all": {f"gain_{k}": -1.0 for k in every},
@@ -72,7 +72,7 @@ class Actuators(gymnasium.Wrapper):
 
     def reset(self, **options: Any):
         """Begin with actuators that were not used yet."""
-        shape = self.regime.history, *self.action_space.shape
+        shape = self.regime.history, len(self.half)
         self.past = torch.zeros(shape, dtype=torch.float64)
         return self.env.reset(**options)
 

@@ -31,9 +31,10 @@ class Page:
     """
 
     def __init__(self, world: World, title: str, port: int) -> None:
-        self.world, self.title = world, title
+        self.world, self.ended = world, False
         with redirect_stdout(io.StringIO()):  # the command says where the page is
             self.server = viser.ViserServer("127.0.0.1", port, label=title, verbose=False)
+        self.url = f"http://127.0.0.1:{self.server.get_port()}"
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.server.scene.set_up_direction("+z")
         self.server.initial_camera.position = (1.0, -6.0, 3.0)
@@ -114,14 +115,22 @@ class Page:
             series, data = (uplot.Series(label="step"), *lines), (empty,) * 4
             self.commands = gui.add_uplot(data, series, title="Command", **PLOT)
 
-    def run(self, seconds: float = float("inf")) -> None:
-        """Let the world go on and draw it, until interrupted."""
-        end, worded = time.monotonic() + seconds, 0.0
-        done = time.monotonic()  # up to when the world has been simulated
-        while (now := time.monotonic()) < end:
+    def end(self) -> None:
+        """End the page, and :meth:`run`."""
+        if self.ended:
+            return
+        self.ended = True
+        with redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def run(self) -> None:
+        """Let the world go on and draw it, until :meth:`end` or an interrupt."""
+        worded = done = time.monotonic()  # up to when the world has been simulated
+        while not self.ended:
+            now = time.monotonic()
             step = self.world.robot.dt / self.speed.value
             done = now if self.pause.value else max(done, now - FRAME - step)
-            while not self.pause.value and done + step <= now < end:
+            while not self.pause.value and done + step <= now:
                 self.world.step()
                 done += step
                 if time.monotonic() > now + FRAME:  # slower than life
@@ -165,7 +174,7 @@ class Page:
         state = "**corrects**" if afm["corrects"] else "does nothing"
         lines = [f"AFM {state}; innovation {afm['innovation']:.2f}"]
         lines += [f"{name}: {afm[name]}" for name in ("belief", "noise", "delay") if name in afm]
-        words = str(afm["diagnosis"])
+        words = str(sides[1].env.diagnosis)
         for k, name in enumerate(self.world.robot.names):
             words = words.replace(f"actuator {k}:", f"{name}:").replace(f"a_{k}:", f"{name}:")
         words = words.replace("\n", "  \n")

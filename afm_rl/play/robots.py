@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,16 +11,19 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.wrappers import TransformObservation
 from scipy.linalg import solve_discrete_are
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
-from afm_rl.dynamics import Dubins, MuJoCoDynamics
+from afm_rl.correction import ActionFlow
+from afm_rl.dynamics import Dubins, MuJoCoDynamics, Quadrotor
 from afm_rl.envs.task.pendulum import pendulum_step
 from afm_rl.errors import ConfigurationError, check_choice
-from afm_rl.planning import MPPI, GoalDistance, PlanningEnv, load_policy
+from afm_rl.planning import MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost, load_policy
 
 Acting = Callable[[np.ndarray], np.ndarray]
+LONG, NEAR = 3600.0, 3.0  # s, of a flight; m, from its reference, beyond which it is lost
 POLICIES = Path(__file__).parents[2] / "examples" / "policies" / "zoo"
 
 
@@ -35,6 +39,7 @@ class Robot:
         dt: seconds a step.
         names: of the actuators.
         score: what is counted of an episode: the name of an info, or ``reward``.
+        corrector: makes the correction; the universal one in units of the box, if None comes of it.
     """
 
     make: Callable[[], gymnasium.Env]
@@ -44,6 +49,7 @@ class Robot:
     dt: float
     names: list[str]
     score: str = "reward"
+    corrector: Callable[[], Any] = lambda: None
 
 
 def make_robot(name: str, file: Path | None = None) -> Robot:
@@ -124,6 +130,23 @@ def _cart_pole(file: Path | None) -> Robot:
     return _gymnasium("InvertedPendulum-v5", lambda: act, {})
 
 
+def _planned(planner: Any, parts: dict[str, tuple[int, ...]]) -> Acting:
+    """Return a policy that plans; what it sees are ``parts``, by key and shape, in a row."""
+    memory = planner.make_tensordict_primer()(TensorDict({}))
+    sizes = [math.prod(shape) for shape in parts.values()]
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        nonlocal memory
+        values = torch.as_tensor(seen).float().split(sizes)
+        for (key, shape), value in zip(parts.items(), values, strict=True):
+            memory[key] = value.reshape(shape)
+        planned = planner(memory)
+        memory = step_mdp(planned)
+        return planned["action"].numpy()
+
+    return act
+
+
 def _ugv(file: Path | None) -> Robot:
     """The ground robot on its track, by MPPI."""
     low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
@@ -131,16 +154,7 @@ def _ugv(file: Path | None) -> Robot:
 
     def policy() -> Acting:
         planner = MPPI(PlanningEnv(dynamics, GoalDistance(), low, high), population=512)
-        memory = [planner.make_tensordict_primer()(TensorDict({}))]
-
-        def act(seen: np.ndarray) -> np.ndarray:
-            parts = torch.as_tensor(seen).float().split([3, 2])
-            td = memory[0].update(dict(zip(("observation", "goal"), parts, strict=True)))
-            td = planner(td)
-            memory[0] = step_mdp(td)
-            return td["action"].numpy()
-
-        return act
+        return _planned(planner, {"observation": (3,), "goal": (2,)})
 
     def make() -> gymnasium.Env:
         return gymnasium.make("afm_rl/UGVTrack-v0", max_episode_steps=-1)
@@ -152,6 +166,38 @@ def _ugv(file: Path | None) -> Robot:
     return Robot(make, policy, model, push, 0.2, ["speed", "turn"], score="reached")
 
 
+def _quadrotor(file: Path | None) -> Robot:
+    """A small quadrotor that flies in a circle, by model predictive control."""
+    name, ahead = "afm_rl/CrazyflieTrack-v0", 20
+    dynamics, level = Quadrotor(dt=0.05), [0.0] * 9 + [1.0] + [0.0] * 3
+    cost = TrackingCost([1.0] * 13, [1.0] * 4, coordinates=range(6), rest=level)
+    box: Any = gymnasium.make(name).action_space
+    unit = torch.tensor([0.575, 3e-4, 3e-4, 1e-4])  # what flights use of the box
+
+    def make() -> gymnasium.Env:
+        env = gymnasium.make(name, max_episode_steps=-1, duration=LONG, horizon=ahead, limit=NEAR)
+        shape = (13 + 6 * (ahead + 1),)
+        space = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
+
+        def seen(observation: np.ndarray) -> np.ndarray:  # and the circle ahead
+            ahead_of: Any = env.unwrapped
+            return np.append(observation[:13], ahead_of._data["reference"].numpy().ravel())
+
+        return TransformObservation(env, seen, space)
+
+    def policy() -> Acting:
+        low, high = torch.from_numpy(box.low), torch.from_numpy(box.high)
+        planner = MPC(PlanningEnv(dynamics, cost, low, high), horizon=ahead, bounded=[0])
+        return _planned(planner, {"observation": (13,), "reference": (ahead + 1, 6)})
+
+    def push(inner: Any, direction: float) -> None:
+        inner._data["pose"][3] += 0.5 * direction
+
+    model = {"model": dynamics, "state": lambda env, seen: seen[:13]}
+    names = ["thrust", "roll", "pitch", "yaw"]
+    return Robot(make, policy, model, push, 0.05, names, corrector=lambda: ActionFlow(-unit, unit))
+
+
 ROBOTS: dict[str, Callable[[Path | None], Robot]] = {
     "half_cheetah": _from_file("half_cheetah_tqc"),
     "hopper": _from_file("hopper_trpo"),
@@ -161,4 +207,5 @@ ROBOTS: dict[str, Callable[[Path | None], Robot]] = {
     "pendulum": _from_file("pendulum_sac"),
     "cart_pole": _cart_pole,
     "ugv": _ugv,
+    "quadrotor": _quadrotor,
 }

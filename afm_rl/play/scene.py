@@ -25,7 +25,6 @@ class MuJoCoFigure:
 
     def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
         self.inner, self.place, model = inner, place, inner.model
-        self.label = place + [0.0, 0.0, 1.8]
         self.root = server.scene.add_frame(f"/{name}", show_axes=False, position=place)
         solid = np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
         self.bodies = {
@@ -56,6 +55,7 @@ class MuJoCoFigure:
         _, y, z = self.floor.position
         self.floor.position = (self.place[0] - shift[0] % 1.0, y, z)
         self.root.position = self.place - shift
+        self.label = self.place + [0.0, 0.0, data.xpos[1, 2] + 0.5]
         for body, frame in self.bodies.items():
             frame.position, frame.wxyz = data.xpos[body], data.xquat[body]
 
@@ -64,8 +64,9 @@ class PendulumFigure:
     """The rod of gymnasium's pendulum, which stands up at angle 0."""
 
     def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
-        self.inner, height = inner, np.array([0.0, 0.0, 1.2])
-        self.label = place + 2.5 * height
+        self.inner, height = inner, np.array([0.0, 0.0, 1.0])
+        place = -place[[1, 0, 2]]  # one beside the other
+        self.label = place + 2.3 * height
         self.root = server.scene.add_frame(f"/{name}", show_axes=False, position=place + height)
         rod = trimesh.creation.capsule(height=1.0, radius=0.08)
         rod.apply_translation([0.0, 0.0, 0.5 - rod.bounds.mean(0)[2]])
@@ -115,12 +116,36 @@ class GroundFigure:
         self.label = self.root.position + [0, 0, 0.4]
 
 
+class FlyingFigure:
+    """A quadrotor as a cross, and the circle that it flies."""
+
+    def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
+        self.inner, self.place = inner, 0.2 * place + [0.0, 0.0, 1.0]
+        self.root = server.scene.add_frame(f"/{name}", show_axes=False)
+        for arm, turn in enumerate((1, -1)):
+            wxyz = (np.cos(np.pi / 8), 0.0, 0.0, turn * np.sin(np.pi / 8))
+            server.scene.add_box(f"/{name}/{arm}", COLOURS[name], (0.5, 0.06, 0.06), wxyz=wxyz)
+        self.goal = server.scene.add_icosphere(
+            f"/goal/{name}", 0.06, opacity=0.5, color=COLOURS[name]
+        )
+
+    def draw(self) -> None:
+        """Put the quadrotor and its reference where they are."""
+        pose = self.inner._data["pose"].tolist()
+        self.root.position = self.place + pose[:3]
+        self.root.wxyz = (pose[9], *pose[6:9])
+        self.goal.position = self.place + self.inner._data["reference"][0, :3].tolist()
+        self.label = self.root.position + [0.0, 0.0, 0.3]
+
+
 def figure_of(server: Any, name: str, inner: Any) -> Any:
     """Return what draws the robot of an environment."""
     place = np.array([0.0, LANE if name == "alone" else -LANE, 0.0])
     if hasattr(inner, "data"):
         return MuJoCoFigure(server, name, inner, place)
-    kind = GroundFigure if hasattr(inner, "native") else PendulumFigure
+    if not hasattr(inner, "native"):
+        return PendulumFigure(server, name, inner, place)
+    kind = GroundFigure if hasattr(inner.native, "tracks") else FlyingFigure
     return kind(server, name, inner, place)
 
 
@@ -132,7 +157,7 @@ def ways_of(model: Any) -> list[int]:
     return [k for k in (0, 1) if slides[k : k + 1].any() and model.jnt_axis[k].argmax() == k]
 
 
-def shape_of(model: Any, geom: int) -> trimesh.Trimesh:
+def shape_of(model: Any, geom: Any) -> trimesh.Trimesh:
     """Return the shape of a geom, in its own frame."""
     kind, size = model.geom_type[geom], model.geom_size[geom]
     kinds = mujoco.mjtGeom

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from afm_rl import ActionFlowWrapper
 from afm_rl.play.actuators import Actuators, Faults
 from afm_rl.play.robots import Robot
+from afm_rl.transforms.gymnasium import ActionFlowWrapper
 
 SIDES = ("alone", "AFM")
 KEPT = 400  # steps that are drawn as curves
@@ -24,7 +24,8 @@ class Side:
         self.robot, self.act = robot, robot.policy()
         self.env: Any = Actuators(robot.make(), faults)
         if corrected:
-            self.env = ActionFlowWrapper(self.env, **robot.model)
+            model, corrector = robot.model, robot.corrector()
+            self.env = ActionFlowWrapper(self.env, **model, corrector=corrector)
         self.rewards: deque[float] = deque(maxlen=KEPT)
         self.commands: deque[np.ndarray] = deque(maxlen=KEPT)
         self.falls = 0

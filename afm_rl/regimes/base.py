@@ -13,8 +13,6 @@ from torch import Tensor
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes.settings import draw_between
 
-SEARCH_POINTS, SEARCH_ROUNDS, SEARCH_SHRINK = 64, 8, 0.45
-
 
 class Regime(ABC):
     """A family of regimes: the effective action as a function of action and parameters.
@@ -85,11 +83,11 @@ class Regime(ABC):
         search that narrows around the best of a grid of points; families with a closed form
         override it.
         """
-        grid = torch.quasirandom.SobolEngine(len(low)).draw(SEARCH_POINTS).to(low)
+        grid = torch.quasirandom.SobolEngine(len(low)).draw(64).to(low)
         centre, span = ((low + high) / 2).expand_as(action), high - low
         wide = [part.unsqueeze(-2) for part in (parameters, state)]
-        for shrink in range(SEARCH_ROUNDS):
-            reach = span * SEARCH_SHRINK**shrink
+        for shrink in range(8):  # to 0.2 % of the box
+            reach = span * 0.45**shrink
             points = centre.unsqueeze(-2) + (grid - 0.5) * reach
             points = torch.cat([centre.unsqueeze(-2), points], -2)
             points = torch.minimum(torch.maximum(points, low), high)

@@ -8,7 +8,7 @@ import numpy as np
 
 from afm_rl.diagnosis.log import Log
 from afm_rl.replay.simple import SIMPLE
-from afm_rl.replay.table import AFM, Table, errors_of, sentences_of
+from afm_rl.replay.table import AFM, Table, errors_of, removed_by, slow_in
 
 __all__ = ["Table", "replay"]
 
@@ -36,5 +36,4 @@ def replay(log: Log, seen: Callable[[float], object] = lambda share: None) -> Ta
     found = {name: p(log.command, log.response, missing > 0) for name, p in SIMPLE.items()}
     corrector = watcher(len(log.names))
     found[AFM], std = believe_log(corrector, log.command, log.response, missing, seen)
-    sentences = tuple(sentences_of(log, found))
-    return Table(log, found, std, errors_of(log, found), sentences)
+    return Table(log, found, std, errors_of(log, found), removed_by(log, found), slow_in(log))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,19 +26,40 @@ class Table:
         errors: a row for each actuator, stretch of time and predictor: ``actuator``, ``stretch``,
             ``from``, ``to`` (s), ``predictor``, ``rows``, and of the absolute error ``median`` and
             ``p90`` with the ends of their 95 % intervals, ``median_low`` and so on.
-        sentences: what a correction would have done for each actuator.
+        removed: share of each actuator's median error that a correction would have removed; 0
+            where it may be chance, below 0 where it would have added.
+        slow: actuators whose commands act in later rows, see :func:`slow_in`.
     """
 
     log: Log
     predictions: Mapping[str, np.ndarray]
     std: np.ndarray
     errors: pd.DataFrame
-    sentences: tuple[str, ...]
+    removed: Mapping[str, float]
+    slow: tuple[str, ...] = ()
 
     @property
     def sentence(self) -> str:
         """What a correction would have done."""
-        return f"A correction would have removed {'; '.join(self.sentences)}."
+        gone = {name: share for name, share in self.removed.items() if share > 0}
+        said = [f"{100 * gone[name]:.0f} % of the error of {name}" for name in gone]
+        none = [name for name, share in self.removed.items() if share == 0]
+        more = [f"{-100 * s:.0f} % to that of {name}" for name, s in self.removed.items() if s < 0]
+        said += [f"none of {_listed(none)}"] if none else []
+        both = [("removed", said, ","), ("added", more, "")]
+        parts = [f"{done} {_listed(what, comma)}" for done, what, comma in both if what]
+        return f"A correction would have {', and '.join(parts)}."
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader must know."""
+        if not self.slow:
+            return ()
+        return (
+            f"{_listed(self.slow)}: commands act in later rows. What is known of the next row is "
+            "then not what another command would change at once; log rows that are as far apart as "
+            "a command takes to act.",
+        )
 
     def rows(self) -> pd.DataFrame:
         """Return a row for each row of the log: ``t``, and of each actuator four columns.
@@ -104,13 +125,14 @@ def quantile_with_interval(values: np.ndarray, share: float) -> tuple[float, flo
     return float(ends[0]), middle, float(ends[1])
 
 
-def sentences_of(log: Log, predictions: Mapping[str, np.ndarray], least: float = 0.1) -> list[str]:
-    """Return for each actuator which share of its error a correction would have removed.
+def removed_by(
+    log: Log, predictions: Mapping[str, np.ndarray], least: float = 0.1
+) -> dict[str, float]:
+    """Return for each actuator which share of its median error a correction would have removed.
 
-    The share is that of the median error. It is *none* where it is less than ``least``, or where
-    the medians' difference may be chance.
+    It is 0 where it is smaller than ``least``, or where the difference of the errors may be chance.
     """
-    said = []
+    found = {}
     for j, name in enumerate(log.names):
         alone, corrected = (
             np.abs(predictions[kind][:, j] - log.response[:, j]) for kind in (ALONE, AFM)
@@ -118,10 +140,35 @@ def sentences_of(log: Log, predictions: Mapping[str, np.ndarray], least: float =
         before, after = float(np.median(alone)), float(np.median(corrected))
         low, _, high = quantile_with_interval(alone - corrected, 0.5)
         share = 1 - after / before if before > 0 else 0.0
-        if share >= least and low > 0:
-            said.append(f"{100 * share:.0f} % of the error of {name}")
-        elif share <= -least and high < 0:
-            said.append(f"none of {name}, but added {-100 * share:.0f} %")
-        else:
-            said.append(f"none of {name}")
-    return said
+        clear = low > 0 if share > 0 else high < 0
+        found[name] = share if clear and abs(share) >= least else 0.0
+    return found
+
+
+def slow_in(log: Log, share: float = 0.5) -> tuple[str, ...]:
+    r"""Return the actuators of which less than a ``share`` of a command acts in its own row.
+
+    By least squares, :math:`y_k = a y_{k-1} + b u_k + c u_{k-1} + d`: what acts at once is b, what
+    acts in the end :math:`(b + c) / (1 - a)`.
+
+    >>> u = np.random.default_rng(0).uniform(-1, 1, (60, 1))
+    >>> slow_in(Log(("pan",), u, 0.5 * u)), slow_in(Log(("pan",), u, np.roll(u, 1, axis=0)))
+    ((), ('pan',))
+    """
+    slow, known = [], ~log.begins[1:]
+    for name, u, y in zip(log.names, log.command.T, log.response.T, strict=True):
+        columns = np.c_[y[:-1], u[1:], u[:-1], np.ones(len(u) - 1)]
+        a, b, c, _ = np.linalg.lstsq(columns[known], y[1:][known])[0]
+        if abs(b * (1 - a)) < share * abs(b + c):
+            slow.append(name)
+    return tuple(slow)
+
+
+def _listed(parts: Sequence[str], before_and: str = "") -> str:
+    """Return a list in words.
+
+    >>> _listed(["a", "b", "c"]), _listed(["a"])
+    ('a, b and c', 'a')
+    """
+    *first, last = parts
+    return f"{', '.join(first)}{before_and} and {last}" if first else last

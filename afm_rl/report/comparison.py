@@ -6,16 +6,13 @@ import math
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from afm_rl.report import style
-from afm_rl.report.summary import count_budgets, summarise
+from afm_rl.report.means import count_budgets, summarise
 from afm_rl.storage.measures import Measure, Measures
 
-PANELS = 3
-SPREAD = 0.26  # of a row: how far single missions lie off its middle
 CAPTION = (
     "Large markers are means over all missions of a method, small dots single missions. Lines are "
     "95 % intervals of the stratified bootstrap, seeds drawn anew within cells; a mean without one "
@@ -23,7 +20,7 @@ CAPTION = (
 )
 
 
-def draw_comparison(missions: pd.DataFrame, measures: Measures) -> Figure:
+def draw_comparison(missions: pd.DataFrame, measures: Measures, panels: int = 3) -> Figure:
     """Return a figure of the means of each method, one panel for each of the first measures.
 
     Large markers are means, with 95 % bootstrap intervals where there are any; small dots
@@ -31,26 +28,36 @@ def draw_comparison(missions: pd.DataFrame, measures: Measures) -> Figure:
 
     Args:
         missions: one row per mission.
-        measures: what methods are compared by; the first three are shown.
+        measures: what methods are compared by.
+        panels: how many measures are shown.
     """
     means, counted = summarise(missions, measures), count_budgets(missions, measures)
-    styles, shown = style.method_styles(means["method"]), measures.each[:PANELS]
+    styles, shown = style.method_styles(means["method"]), measures.each[:panels]
     if len(means) > style.FEW:
         styles = dict.fromkeys(styles, style.Style(style.NOMINAL, "-", "o"))
     figure = style.new_figure(1.6 + 2.9 * len(shown), 1.1 + 0.42 * len(means))
-    panels = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
-    for axes, measure in zip(panels, shown, strict=True):
+    grid = figure.subplots(1, len(shown), sharey=True, squeeze=False)[0]
+    for axes, measure in zip(grid, shown, strict=True):
+        name, scale = measure.column, measure.scale
         for place, row in enumerate(means.to_dict("records")):
-            single = counted.loc[counted["method"] == row["method"], measure.column]
-            _draw_row(axes, place, row, measure, single, styles[row["method"]])
-        axes.set_xlim(*_limits(measure, counted[measure.column]))
+            look = styles[row["method"]]
+            single = scale * counted.loc[counted["method"] == row["method"], name]
+            apart = 0.26 * np.linspace(-1, 1, len(single)) if len(single) > 1 else 0.0
+            dots: style.Look = {"color": look.color, "alpha": 0.3, "markersize": 4}
+            axes.plot(single, place + apart, ".", **dots, gid="single")
+            low, mean, high = (scale * row[key] for key in (f"{name}_low", name, f"{name}_high"))
+            if math.isfinite(low):
+                ends: style.Look = {"color": look.color, "linewidth": 1.8, "markeredgewidth": 1.8}
+                axes.plot([low, high], [place] * 2, "-|", **ends, markersize=11, gid="interval")
+            (dot,) = axes.plot(mean, place, look.marker, color=look.color, markersize=6.5)
+            dot.set(markeredgecolor="white", zorder=3, clip_on=False, gid="mean")
+        axes.set_xlim(*_limits(measure, counted[name]))
         axes.xaxis.set_major_locator(MaxNLocator(5))
-        axes.set_xlabel(f"{measure.label}\n{measure.better} is better", fontsize=style.NORMAL)
-        style.dress(axes)
-        style.grid(axes, "x")
+        label = f"{measure.label}\n{measure.better} is better"
+        style.dress(axes, label, lines="x", size=style.NORMAL)
     names = [style.literal(f"{row.method} (n = {row.missions})") for row in means.itertuples()]
-    panels[0].set_yticks(range(len(means)), names, fontsize=style.NORMAL)
-    panels[0].set_ylim(len(means) - 0.5, -0.5)
+    grid[0].set_yticks(range(len(means)), names, fontsize=style.NORMAL)
+    grid[0].set_ylim(len(means) - 0.5, -0.5)
     style.footnote(figure, "mean with 95 % bootstrap interval; small dots are single missions")
     return figure
 
@@ -63,19 +70,3 @@ def _limits(measure: Measure, values: pd.Series) -> tuple[float, float]:
     low, high = min(0.0, measure.scale * values.min()), max(0.0, measure.scale * values.max())
     margin = 0.04 * (high - low) if high > low else 1.0
     return (low - margin if low < 0 else 0.0), (high + margin if high > 0 else 0.0)
-
-
-def _draw_row(
-    axes: Axes, place: int, means: dict, measure: Measure, single: pd.Series, look: style.Style
-) -> None:
-    name, scale, color = measure.column, measure.scale, look.color
-    offset = SPREAD * np.linspace(-1, 1, len(single)) if len(single) > 1 else 0.0
-    axes.plot(
-        scale * single, place + offset, ".", color=color, alpha=0.3, markersize=4, gid="single"
-    )
-    low, mean, high = (scale * means[key] for key in (f"{name}_low", name, f"{name}_high"))
-    if math.isfinite(low):
-        (bar,) = axes.plot([low, high], [place, place], "-|", color=color, gid="interval")
-        bar.set(linewidth=1.8, markersize=11, markeredgewidth=1.8)
-    (dot,) = axes.plot(mean, place, look.marker, color=color, markersize=6.5, gid="mean")
-    dot.set(markeredgecolor="white", zorder=3, clip_on=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import math
 from collections.abc import Iterator
@@ -21,14 +20,14 @@ from afm_rl.diagnosis import Actuator, Diagnosis, Log
 from afm_rl.replay import Table as Replayed
 from afm_rl.report import style
 from afm_rl.report.console import WIDE
+from afm_rl.report.figures import Picture
 from afm_rl.report.replay import errors_table, pictures_of
 from afm_rl.report.table import Table
 from afm_rl.report.write import render_page
 from afm_rl.storage.files import write_whole
 
-SHOWN = 300  # rows of the first panel
-POINTS = 3000  # of the others
 LOOKS = {"healthy": "green", "changed": "bold red", "dead": "bold red", "cannot tell": "yellow"}
+LOOKS |= {"not measured": "yellow", "not actuated": "yellow"}
 CAPTION = (
     "Left: an excerpt of command, response and fit. Middle: response against command; the line is "
     "a healthy actuator. Right: what the fit leaves, over the whole log."
@@ -145,12 +144,15 @@ def write_diagnosis(
 def _page(diagnosis: Diagnosis, log: Log, source: str, replayed: Replayed | None) -> str:
     shown = _table(diagnosis)
     tables = [Table("actuators", "All actuators", NOTE, shown, shown)]
-    figures = []
-    for place, actuator in enumerate(diagnosis.actuators):
-        png = style.png_bytes(draw_actuator(diagnosis, log, place))
-        data = base64.b64encode(png).decode()
-        sentence = actuator.sentence
-        figures.append({"name": place, "title": sentence, "caption": CAPTION, "data": data})
+    figures = [
+        Picture(
+            str(place),
+            actuator.sentence,
+            CAPTION,
+            style.png_bytes(draw_actuator(diagnosis, log, place)),
+        )
+        for place, actuator in enumerate(diagnosis.actuators)
+    ]
     summary = (
         f"{diagnosis.rows} rows of {len(diagnosis.actuators)} actuators, a row every "
         f"{diagnosis.step_s:.4g} s, from {source}."
@@ -159,13 +161,16 @@ def _page(diagnosis: Diagnosis, log: Log, source: str, replayed: Replayed | None
     if replayed is not None:
         tables.append(errors_table(replayed))
         figures += list(pictures_of(replayed))
-        notes.append(replayed.sentence)
+        notes += [replayed.sentence, *replayed.notes]
     content = {"title": "Diagnosis of the actuators", "summary": summary, "notes": notes}
     return render_page(**content, figures=figures, tables=tables, references=[])
 
 
-def draw_actuator(diagnosis: Diagnosis, log: Log, place: int) -> Figure:
-    """Return the figure of one actuator: an excerpt, response against command, and residual."""
+def draw_actuator(diagnosis: Diagnosis, log: Log, place: int, points: int = 3000) -> Figure:
+    """Return the figure of one actuator: an excerpt, response against command, and residual.
+
+    The latter two have ``points`` dots at most.
+    """
     actuator = diagnosis.actuators[place]
     driver = _driver(actuator, log, place)
     u, y = log.command[:, driver], log.response[:, place]
@@ -179,7 +184,7 @@ def draw_actuator(diagnosis: Diagnosis, log: Log, place: int) -> Figure:
     left.plot(t[rows], y[rows], color=style.COLOURS[0], linewidth=1.4, label="response")
     fitted = {"color": style.REGIME, "linewidth": 1.1, "linestyle": (0, (4, 1.5))}
     left.plot(t[rows], fit[rows], label="fit", **fitted)
-    some = np.unique(np.linspace(0, len(t) - 1, min(POINTS, len(t))).astype(int))
+    some = np.unique(np.linspace(0, len(t) - 1, min(points, len(t))).astype(int))
     dots = {"s": 3, "linewidths": 0, "rasterized": True}
     middle.scatter(u[some], y[some], color=style.COLOURS[0], alpha=0.35, **dots)
     ends = np.array(actuator.command_range)
@@ -190,11 +195,8 @@ def draw_actuator(diagnosis: Diagnosis, log: Log, place: int) -> Figure:
             if axes is right or t[rows][0] <= change.t <= t[rows][-1]:
                 axes.axvline(change.t, color=style.REGIME, linewidth=1.0, linestyle=":")
     labels = (("t (s)", ""), ("command", "response"), ("t (s)", "residual"))
-    for axes, (x_label, y_label) in zip((left, middle, right), labels, strict=True):
-        axes.set_xlabel(x_label, fontsize=style.SMALL)
-        axes.set_ylabel(y_label, fontsize=style.SMALL)
-        style.dress(axes)
-        style.grid(axes)
+    for axes, (below, beside) in zip((left, middle, right), labels, strict=True):
+        style.dress(axes, below, beside, "both")
     style.legend_above(figure, *left.get_legend_handles_labels())
     return figure
 
@@ -205,8 +207,8 @@ def _driver(actuator: Actuator, log: Log, place: int) -> int:
     return place if other is None or other in actuator.coupling else log.names.index(other)
 
 
-def _excerpt(actuator: Actuator, t: np.ndarray) -> slice:
+def _excerpt(actuator: Actuator, t: np.ndarray, most: int = 300) -> slice:
     """Return rows around the last change, or the first ones."""
     middle = int(np.searchsorted(t, actuator.changes[-1].t)) if actuator.changes else 0
-    first = max(0, min(middle - SHOWN // 2, len(t) - SHOWN))
-    return slice(first, first + SHOWN)
+    first = max(0, min(middle - most // 2, len(t) - most))
+    return slice(first, first + most)

@@ -11,21 +11,24 @@ from tempfile import TemporaryDirectory
 import pandas as pd
 from torch.utils.tensorboard import SummaryWriter
 
-from afm_rl.report.frames import cell_names, steps_of
+from afm_rl.report.cells import steps_of, with_cells
 from afm_rl.storage.files import write_whole
 from afm_rl.storage.measures import Measures
 
-POINTS = 500  # per curve
-SINGLE = 8  # missions of each method with curves of their own
 # TensorBoard orders groups by name: whether plans came true stands first.
 GROUPS = {"miss": "came_true", "unforeseen": "came_true", "error": "model", "loss": "model"}
 FILE = "events.out.tfevents.0.afm_rl"  # TensorBoard looks for "tfevents" in the name
 
 
 def write_events(
-    folder: Path, missions: pd.DataFrame, steps: pd.DataFrame, measures: Measures
+    folder: Path,
+    missions: pd.DataFrame,
+    steps: pd.DataFrame,
+    measures: Measures,
+    points: int = 500,
+    most: int = 8,
 ) -> list[Path]:
-    """Write a sub-folder per method, and in it one for each of its first eight missions.
+    """Write a sub-folder per method, and in it one for each of its first missions.
 
     A method's curves are means over the missions that are still running: ``came_true/miss``, the
     distance from the plan, ``came_true/unforeseen``, that from the prediction of model and
@@ -38,26 +41,27 @@ def write_events(
         missions: one row per mission.
         steps: one row per mission and step.
         measures: what methods are compared by.
+        points: of a curve.
+        most: missions of a method with curves of their own.
 
     Returns:
         The files written.
     """
-    stride = math.ceil((int(steps["t"].max()) + 1) / POINTS)
-    titles = cell_names(missions) + ", seed " + missions["seed"].astype(str)
-    named, final = missions.assign(title=titles), [measure.column for measure in measures]
-    last = list(steps)[list(steps).index("regime_active") :]  # and what the score logs
-    logged = [*(name for name in GROUPS if name in steps), "misaligned", *last]
-    groups = named.groupby("method", sort=False)
+    stride = math.ceil((int(steps["t"].max()) + 1) / points)
+    final, columns = [measure.column for measure in measures], list(steps)
+    last = columns[columns.index("regime_active") :]  # and what the score logs
+    logged = ["t", *(name for name in GROUPS if name in steps), "misaligned", *last]
+    groups = with_cells(missions).groupby("method", sort=False)
     written = []
     for name, (_, group) in zip(folder_names(groups.groups), groups, strict=True):
-        own, place = steps[steps["mission"].isin(group["mission"])], Path(folder) / name
-        curve = curves(own[["t", *logged]], stride)
-        written.append(_write(place / FILE, curve, group[final].mean()))
-        single = group[: SINGLE if len(group) > 1 else 0]
+        own, place = steps[steps["mission"].isin(group["mission"])], folder / name
+        written.append(_write(place, curves(own[logged], stride), group[final].mean()))
+        single = group[: most if len(group) > 1 else 0]
+        titles = folder_names(single["cell"] + ", seed " + single["seed"].astype(str))
         rows = steps_of(own, single["mission"])
-        for title, (_, row) in zip(folder_names(single["title"]), single.iterrows(), strict=True):
-            curve = curves(rows[row["mission"]][["t", *logged]], stride)
-            written.append(_write(place / title / FILE, curve, row[final]))
+        for title, (_, row) in zip(titles, single.iterrows(), strict=True):
+            curve = curves(rows[row["mission"]][logged], stride)
+            written.append(_write(place / title, curve, row[final]))
     return written
 
 
@@ -88,7 +92,7 @@ def folder_names(names: Iterable[str]) -> list[str]:
     return folders
 
 
-def _write(path: Path, curve: pd.DataFrame, final: pd.Series) -> Path:
+def _write(folder: Path, curve: pd.DataFrame, final: pd.Series) -> Path:
     with TemporaryDirectory() as scratch:
         with SummaryWriter(scratch) as writer:
             for name, value in final.items():
@@ -98,5 +102,5 @@ def _write(path: Path, curve: pd.DataFrame, final: pd.Series) -> Path:
                 for step, value in values.items():
                     writer.add_scalar(tag, value, step)
         (file,) = Path(scratch).iterdir()
-        write_whole(path, file.read_bytes())
-    return path
+        write_whole(folder / FILE, file.read_bytes())
+    return folder / FILE

@@ -1,47 +1,124 @@
-"""The figures of a report, and what they and the recovery table need of the steps."""
+"""The figures of a run and of a report, and what a report needs of the steps."""
 
 from __future__ import annotations
 
-from collections.abc import Collection as AnyOf
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import base64
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
-from afm_rl.report import comparison, heatmaps, learning, shares, space_plot, style
-from afm_rl.report.collect import Collection
+from afm_rl.report import comparison, learning, shares, space_plot, style, trajectory
 from afm_rl.report.recovery import MEASURES, recovery_times
-from afm_rl.report.results_files import read_steps
+from afm_rl.report.runs import Runs
 from afm_rl.report.track_plot import DrawableTrack
 from afm_rl.storage.measures import Measures
 
-CELLS = 4  # of a track: curves and maps of more say less
-POINTS = 240  # of each curve of progress
+
+class Picture(NamedTuple):
+    """A figure as a file."""
+
+    name: str
+    title: str
+    caption: str
+    png: bytes
+
+    @property
+    def data(self) -> str:
+        """The file as text, for a page."""
+        return base64.b64encode(self.png).decode()
 
 
-@dataclass
-class Excerpts:
-    """Excerpts of the steps of all methods.
+def draw_run(
+    missions: pd.DataFrame,
+    steps: pd.DataFrame,
+    measures: Measures,
+    tracks: Sequence[DrawableTrack] = (),
+) -> Iterator[Picture]:
+    """Yield the figures of a run: paths, whether plans came true, and all missions.
 
-    Attributes:
-        grid: numbers of steps ``(G,)`` at which progress is known.
-        recovery: recovery times, with ``method``, ``cell``, ``seed``.
-        progress: per method, the share of what there is to reach by then, ``(B, G)``, one row per
-            mission; methods without steps are not here.
-        cells: per method, the cells of these missions, ``(B,)``.
-        places: where robots were (m), ``(N, 2)``, by cell and method.
+    Args:
+        missions: one row per mission.
+        steps: one row per mission and step.
+        measures: what methods are compared by.
+        tracks: tracks to draw, found by name.
     """
+    yield from _paths("{}", "Paths", missions, steps, measures, tracks)
+    figure = learning.draw_learning(missions, steps, measures.error_unit)
+    title = "How far plans came true"
+    yield Picture("learning", title, learning.CAPTION, style.png_bytes(figure))
+    if missions["method"].duplicated().any():
+        yield _summary(missions, measures)
 
-    grid: np.ndarray
-    recovery: list[pd.DataFrame] = field(default_factory=list)
-    progress: dict[str, np.ndarray] = field(default_factory=dict)
-    cells: dict[str, pd.Series] = field(default_factory=dict)
-    places: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
+
+def draw_report(
+    runs: Runs,
+    missions: pd.DataFrame,
+    progress: pd.DataFrame,
+    tracks: Sequence[DrawableTrack] = (),
+) -> Iterator[Picture]:
+    """Yield the figures of a report, in the order of the page.
+
+    Where there are more than six methods, figures of lines and maps come in several pages.
+
+    Args:
+        runs: the results.
+        missions: one row per mission, from :func:`~.means.count_budgets`.
+        progress: from :func:`read_excerpts`.
+        tracks: tracks to draw; a map whose track is not here has no road.
+    """
+    measures = runs.measures
+    yield _summary(missions, measures)
+    chosen = missions[missions["cell"].isin(telling_cells(missions, measures))]
+    traced = traced_missions(chosen[chosen["file"] >= 0])
+    traces = runs.steps(traced) if len(traced) else pd.DataFrame()
+    for track, own in traced.groupby("track", sort=False):
+        head = f"How far plans came true on {track}"
+        for name, title, methods in _pages(f"learning_{track}", head, own["method"]):
+            rows = own[own["method"].isin(methods)]
+            figure = learning.draw_learning(rows, traces, measures.error_unit)
+            yield Picture(name, title, learning.CAPTION, style.png_bytes(figure))
+    if (spent := measures.budget) and missions["finished"].any():
+        ratio, caption = shares.ratios(missions, spent), shares.PROFILE_CAPTION
+        for name, title, methods in _pages("profile", "Performance profile", missions["method"]):
+            figure = shares.draw_profile(missions, ratio, spent, style.method_styles(methods))
+            yield Picture(name, title, caption.format(name=spent.name), style.png_bytes(figure))
+    of, known = measures.headlines[0].title, progress.index.get_level_values("method")
+    for name, title, methods in _pages("progress", "Progress", known):
+        figure = shares.draw_progress(progress, style.method_styles(methods), of)
+        caption = shares.PROGRESS_CAPTION.format(name=of)
+        yield Picture(name, title, caption, style.png_bytes(figure))
+    for track, own in traced.groupby("track", sort=False):
+        for name, title, methods in _pages(f"{{}}_{track}", f"Paths on {track}", own["method"]):
+            rows = own[own["method"].isin(methods)]
+            yield from _paths(name, title, rows, traces, measures, tracks)
 
 
-def telling_cells(missions: pd.DataFrame, measures: Measures) -> list[str]:
+def _summary(missions: pd.DataFrame, measures: Measures) -> Picture:
+    figure = comparison.draw_comparison(missions, measures)
+    return Picture("summary", "All missions", comparison.CAPTION, style.png_bytes(figure))
+
+
+def _paths(
+    name: str,
+    title: str,
+    missions: pd.DataFrame,
+    steps: pd.DataFrame,
+    measures: Measures,
+    tracks: Sequence[DrawableTrack],
+) -> Iterator[Picture]:
+    """Yield where robots went, on a map or in space, if they have places."""
+    if set(space_plot.COLUMNS) <= set(steps):
+        figure, caption = space_plot.draw_space(missions, steps), space_plot.CAPTION
+        yield Picture(name.format("space"), title, caption, style.png_bytes(figure))
+    elif {"x", "y"} <= set(steps):
+        figure = trajectory.draw_trajectories(missions, steps, measures, tracks)
+        png, caption = style.png_bytes(figure), trajectory.CAPTION
+        yield Picture(name.format("trajectory"), title, caption, png)
+
+
+def telling_cells(missions: pd.DataFrame, measures: Measures, most: int = 4) -> list[str]:
     """Return on each track the cells in which methods differ most, by the first measure.
 
     >>> from afm_rl.storage.measures import Measure
@@ -53,7 +130,7 @@ def telling_cells(missions: pd.DataFrame, measures: Measures) -> list[str]:
     column = measures.headlines[0].column
     means = missions.groupby(["track", "cell", "method"], sort=False)[column].mean()
     spread = means.groupby(["track", "cell"], sort=False).std().fillna(0.0)
-    chosen = spread.sort_values(ascending=False, kind="stable").groupby("track").head(CELLS)
+    chosen = spread.sort_values(ascending=False, kind="stable").groupby("track").head(most)
     return [cell for track, cell in spread.index if (track, cell) in chosen.index]
 
 
@@ -70,36 +147,33 @@ def traced_missions(missions: pd.DataFrame) -> pd.DataFrame:
     return missions.merge(chosen, on=["cell", "seed"])
 
 
-def excerpts(collection: Collection, mapped: AnyOf[str]) -> Excerpts:
-    """Read the steps of each method in turn and keep excerpts.
+def read_excerpts(runs: Runs, points: int = 240) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Read the steps of each method in turn and keep what a report needs of them.
 
     Args:
-        collection: the results.
-        mapped: cells to keep places of.
+        runs: the results.
+        points: of each curve of progress.
+
+    Returns:
+        Recovery times, with ``method``; and the share of what there is to reach, one row per
+        ``method`` and ``cell`` of a mission (its index), one column per number of steps. There are
+        no rows where missions make no progress, or have no steps.
     """
-    known = collection.missions[collection.missions["file"] >= 0]
+    known, progress = runs.with_steps, runs.measures.progress
     last = known["steps"].max() + 1 if len(known) else 1
-    found, progress = Excerpts(np.linspace(0, last, POINTS)), collection.measures.progress
-    columns = [*MEASURES, "regime_active", "x", "y", *(progress or ())[:1]]
+    grid, times, keys, rows = np.linspace(0, last, points), [], [], []
+    columns = [*MEASURES, "regime_active", *(progress or ())[:1]]
     for method, missions in known.groupby("method", sort=False):
-        steps = dict(iter(read_steps(collection.files, missions, columns).groupby("mission")))
-        own = missions[missions["mission"].isin(list(steps))]
-        places: dict[str, list[np.ndarray]] = {}
-        for mission in own.to_dict("records"):
-            rows = steps[mission["mission"]]
-            named = {name: mission[name] for name in ("method", "cell", "seed")}
-            found.recovery.append(recovery_times(rows).assign(**named))
-            where = rows[["x", "y"]].to_numpy(dtype=float)
-            where = where[np.isfinite(where).all(-1)]
-            if mission["cell"] in mapped and len(where):
-                places.setdefault(mission["cell"], []).append(where)
-        if progress and len(own):
-            each = own.set_index("mission").iterrows()
-            lines = [share_reached(steps[n], row, found.grid, progress) for n, row in each]
-            found.progress[str(method)], found.cells[str(method)] = np.array(lines), own["cell"]
-        for cell, parts in places.items():
-            found.places[cell, str(method)] = np.concatenate(parts)
-    return found
+        steps = dict(iter(runs.steps(missions, columns).groupby("mission")))
+        own = missions[missions["mission"].isin(list(steps))].set_index("mission")
+        for number, mission in own.iterrows():
+            times.append(recovery_times(steps[number]).assign(method=method))
+            if progress:
+                keys.append((method, mission["cell"]))
+                rows.append(share_reached(steps[number], mission, grid, progress))
+    index = pd.MultiIndex.from_tuples(keys, names=["method", "cell"])
+    shares = pd.DataFrame(rows, index, grid)
+    return pd.concat(times) if times else recovery_times(pd.DataFrame()), shares
 
 
 def share_reached(
@@ -121,69 +195,13 @@ def share_reached(
     return reached / mission[total]
 
 
-def draw_all(
-    missions: pd.DataFrame,
-    collection: Collection,
-    found: Excerpts,
-    tracks: list[DrawableTrack],
-) -> Iterator[tuple[str, str, str, Figure]]:
-    """Yield name, title, caption and figure, in the order of the page.
-
-    Where there are more than six methods, figures of lines and maps come in several pages.
-
-    Args:
-        missions: one row per mission, from :func:`~afm_rl.report.summary.count_budgets`.
-        collection: the results.
-        found: from :func:`excerpts`.
-        tracks: tracks to draw; a map whose track is not here has no road.
-    """
-    measures, known = collection.measures, {track.name: track for track in tracks}
-    figure = comparison.draw_comparison(missions, measures)
-    yield "summary", "All missions", comparison.CAPTION, figure
-    chosen = missions[missions["cell"].isin(telling_cells(missions, measures))]
-    traced = traced_missions(chosen[chosen["file"] >= 0])
-    traces = read_steps(collection.files, traced) if len(traced) else pd.DataFrame()
-    space = set(space_plot.COLUMNS) <= set(traces)
-    for track, own in traced.groupby("track", sort=False):
-        for page, methods in _pages(
-            f"learning_{track}", f"How far plans came true on {track}", own
-        ):
-            rows = own[own["method"].isin(methods)]
-            figure = learning.draw_learning(rows, traces, measures.error_unit)
-            yield *page, learning.CAPTION, figure
-    if (spent := measures.budget) and missions["finished"].any():
-        ratio, caption = shares.ratios(missions, spent), shares.PROFILE_CAPTION
-        for page, methods in _pages("profile", "Performance profile", missions):
-            figure = shares.draw_profile(missions, ratio, spent, style.method_styles(methods))
-            yield *page, caption.format(name=spent.name), figure
-    name, known_missions = measures.headlines[0].title, missions[missions["file"] >= 0]
-    for page, methods in _pages("progress", "Progress", known_missions) if found.progress else ():
-        styles = style.method_styles(methods)
-        figure = shares.draw_progress(found.grid, found.progress, found.cells, styles, name)
-        yield *page, shares.PROGRESS_CAPTION.format(name=name), figure
-    for track, own in missions.groupby("track", sort=False):
-        places = {key: found.places[key] for key in found.places if key[0] in set(own["cell"])}
-        for page, methods in _pages(f"space_{track}", f"Paths on {track}", own) if space else ():
-            rows = traced[(traced["track"] == track) & traced["method"].isin(methods)]
-            yield *page, space_plot.CAPTION, space_plot.draw_space(rows, traces)
-        if places and not space:
-            drawn = heatmaps.draw_heatmaps(places, known.get(str(track)))
-            pages = _pages(f"heat_{track}", f"Places on {track}", [m for _, m in places])
-            for (page, _), figure in zip(pages, drawn, strict=True):
-                yield *page, heatmaps.CAPTION.format(track=track), figure
-
-
-def _pages(
-    name: str, title: str, missions: pd.DataFrame | list[str]
-) -> Iterator[tuple[tuple[str, str], list[str]]]:
+def _pages(name: str, title: str, methods: Iterable[str]) -> Iterator[tuple[str, str, list[str]]]:
     """Yield name and title of each of several figures, and the methods in it.
 
     >>> list(_pages("profile", "Profile", ["a"]))
-    [(('profile', 'Profile'), ['a'])]
+    [('profile', 'Profile', ['a'])]
     """
-    methods = missions["method"] if isinstance(missions, pd.DataFrame) else missions
     groups = style.groups_of_methods(methods)
     for number, group in enumerate(groups, 1):
-        one = (name, title)
-        some = (f"{name}_{number}", f"{title}, page {number} of {len(groups)}")
-        yield (some if len(groups) > 1 else one), group
+        some = f"{name}_{number}", f"{title}, page {number} of {len(groups)}"
+        yield *(some if len(groups) > 1 else (name, title)), group

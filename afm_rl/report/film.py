@@ -14,21 +14,18 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.report.collect import collect
+from afm_rl.report.cells import steps_of
 from afm_rl.report.events import folder_names
-from afm_rl.report.frames import first_missions, steps_of
 from afm_rl.report.learning import last_step
-from afm_rl.report.results_files import read_steps
+from afm_rl.report.runs import Runs
 from afm_rl.report.scenes import COLUMNS, Scene, map_scene, space_scene
 from afm_rl.report.style import FEW
-from afm_rl.report.track_plot import DrawableTrack, LoadTrack, load_tracks
+from afm_rl.report.track_plot import DrawableTrack
 from afm_rl.storage.files import write_whole
 
 FRAMES, RATE = 150, 15  # at most; per second
-DPI, COLOURS = 100, 128
 LAST = 1500  # ms, how long the last frame of a GIF stays
 Draw = Callable[[pd.DataFrame], Iterable[np.ndarray]]
-TOGETHER = "all_methods"  # file name
 
 
 def check_video(video: bool | str) -> str | None:
@@ -55,8 +52,7 @@ def check_video(video: bool | str) -> str | None:
 
 def write_films(
     folder: Path,
-    missions: pd.DataFrame,
-    steps: pd.DataFrame,
+    runs: Runs,
     tracks: Sequence[DrawableTrack] = (),
     form: str = "gif",
     echo: Callable[[str], object] = print,
@@ -71,8 +67,7 @@ def write_films(
 
     Args:
         folder: where to; made if it is not there.
-        missions: one row per mission.
-        steps: one row per mission and step; see :data:`~.scenes.COLUMNS`.
+        runs: the results; see :data:`~.scenes.COLUMNS` for what their steps must have.
         tracks: tracks to draw, found by name.
         form: ``"gif"`` or ``"mp4"``.
         echo: receives one line per film.
@@ -82,83 +77,51 @@ def write_films(
         The files written.
 
     Raises:
-        ConfigurationError: if a column is missing, or the folder cannot be written.
+        ConfigurationError: if there are no steps, a column is missing, or the folder cannot be
+            written.
     """
-    roads = {track.name: track for track in tracks}
-    first = first_missions(missions).drop_duplicates("method")
+    first = runs.with_steps.drop_duplicates("method")
+    if first.empty:
+        where = ", ".join(map(str, runs.folders))
+        raise ConfigurationError(f"{where}: no steps.parquet; films are drawn from it")
+    steps, roads = runs.steps(first), {track.name: track for track in tracks}
     rows = steps_of(steps, first["mission"])
-    if draw is not None:
-        names, written = folder_names([TOGETHER, *first["method"]])[1:], []
-        for mission, name in zip(first.itertuples(), names, strict=True):
-            own = rows[mission.mission]
-            written.append(folder / f"{name}.{form}")
-            write_whole(written[-1], ENCODERS[form](draw(own.iloc[_shown(len(own))])))
-            echo(f"wrote {written[-1]}")
-        return written
     space = {"z", "goal_z"} <= set(steps.dropna(axis=1, how="all"))
-    written = []
+    together, *names = folder_names(["all_methods", *first["method"]])
+    written: list[Path] = []
 
-    def write(name: str, scene: Scene, count: int) -> None:
+    def write(name: str, pictures: Iterable[np.ndarray]) -> None:
         written.append(folder / f"{name}.{form}")
-        write_whole(written[-1], ENCODERS[form](frames(scene, count)))
+        write_whole(written[-1], ENCODERS[form](pictures))
         echo(f"wrote {written[-1]}")
 
     cell = first["cell"].iloc[0]
-    together = first[first["cell"] == cell][:FEW]
-    if len(together) > 1 and not space:
-        runs = {m.method: _checked(rows, m.mission, steps) for m in together.itertuples()}
-        end = last_step(together)
-        runs = {name: own[own["t"] <= end] for name, own in runs.items()}
-        scene = map_scene(cell, runs, roads.get(together["track"].iloc[0]))
-        write(TOGETHER, scene, max(map(len, runs.values())))
-    names = folder_names([TOGETHER, *first["method"]])[1:]
+    beside = first[first["cell"] == cell][:FEW]
+    if draw is None and len(beside) > 1 and not space:
+        end = last_step(beside)
+        parts = {m.method: _checked(rows, m.mission, steps) for m in beside.itertuples()}
+        parts = {name: own[own["t"] <= end] for name, own in parts.items()}
+        scene = map_scene(cell, parts, roads.get(beside["track"].iloc[0]))
+        write(together, frames(scene, max(map(len, parts.values()))))
     for mission, name in zip(first.itertuples(), names, strict=True):
+        if draw is not None:
+            own = rows[mission.mission]
+            write(name, draw(own.iloc[_shown(len(own))]))
+            continue
         own, title = _checked(rows, mission.mission, steps), f"{mission.method}: {mission.cell}"
-        if space:
-            scene = space_scene(title, own)
-        else:
-            scene = map_scene(title, {mission.method: own}, roads.get(mission.track))
-        write(name, scene, len(own))
+        road = roads.get(mission.track)
+        scene = space_scene(title, own) if space else map_scene(title, {mission.method: own}, road)
+        write(name, frames(scene, len(own)))
     return written
 
 
-def film_results(
-    folders: Sequence[str | Path],
-    out: Path,
-    form: str = "gif",
-    load_track: LoadTrack | None = None,
-    echo: Callable[[str], object] = print,
-) -> list[Path]:
-    """Write films of results on disk, see :func:`write_films`.
-
-    Args:
-        folders: of runs, comparisons, sweeps or studies.
-        out: where to.
-        form: ``"gif"`` or ``"mp4"``.
-        load_track: returns a track by name, to draw roads; may raise a ConfigurationError.
-        echo: receives one line per film.
-
-    Raises:
-        ConfigurationError: if a folder cannot be used, or holds no steps.
-    """
-    collection = collect(folders)
-    known = collection.missions[collection.missions["file"] >= 0]
-    if known.empty:
-        raise ConfigurationError(
-            f"{', '.join(map(str, folders))}: no steps.parquet; films are drawn from it"
-        )
-    first = known.drop_duplicates("method")
-    tracks = load_tracks(first["track"].unique(), load_track)
-    return write_films(out, first, read_steps(collection.files, first), tracks, form, echo)
-
-
-def frames(scene: Scene, count: int) -> Iterator[np.ndarray]:
+def frames(scene: Scene, count: int, dpi: int = 100) -> Iterator[np.ndarray]:
     """Yield the pictures ``(height, width, 3)`` of a mission of ``count`` steps.
 
     What does not move is drawn once; the rest is drawn over it.
     """
     figure, canvas = scene.figure, cast(FigureCanvasAgg, scene.figure.canvas)
-    figure.set_dpi(DPI)
+    figure.set_dpi(dpi)
     scene.show(0)  # texts take the room that they need
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
@@ -202,14 +165,14 @@ def _gif(pictures: Iterable[np.ndarray]) -> bytes:
     return buffer.getvalue()
 
 
-def _palette(picture: np.ndarray) -> Image.Image:
+def _palette(picture: np.ndarray, colours: int = 128) -> Image.Image:
     """Return the most common colours, no two almost alike, so that areas keep theirs exactly."""
     packed = picture.astype(np.int64) @ [65536, 256, 1]  # far faster than unique rows
     values, counts = np.unique(packed, return_counts=True)
     common = values[np.argsort(-counts, kind="stable"), None] // [65536, 256, 1] % 256
     _, first = np.unique(common // 8, axis=0, return_index=True)
     palette = Image.new("P", (1, 1))
-    palette.putpalette([int(value) for value in common[np.sort(first)[:COLOURS]].ravel()])
+    palette.putpalette([int(value) for value in common[np.sort(first)[:colours]].ravel()])
     return palette
 
 

@@ -5,24 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import ArrayLike
 
 from afm_rl.report.table import Table, number
 
 STAY = 20  # steps that the error must stay low
-QUANTILE, FACTOR = 0.95, 1.5  # of the errors before the first change: the nominal level
-FLOOR = 1e-4  # m, rad: below this every robot counts as well predicted
-MEASURES = {
+MEASURES = {  # columns, by what they measure
     "miss": "motion",
     "unforeseen": "agent",
     "error": "model",
-}  # columns, by what they measure
+}
 NOTE = (
     "Steps from a change of the regime until the one-step error is back under the nominal level "
     f"for the first time, and until it stays there for {STAY} steps. The nominal level of a "
-    f"mission is {FACTOR} times the {100 * QUANTILE:.0f}th percentile of its errors before the "
-    f"first change, at least "
-    f"{FLOOR:g}. Medians are over all changes, those never recovered from included as ∞; "
+    "mission is 1.5 times the 95th percentile of its errors before the first change, at least "
+    "0.0001. Medians are over all changes, those never recovered from included as ∞; "
     f"changes with fewer than {STAY} steps to the next one or to the end are left "
     "out. Three errors: that of the motion, against the plan; "
     "that of the agent, against the prediction of model and correction together; and that of the "
@@ -47,9 +43,8 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
     >>> recovery_times(steps).to_dict("records")
     [{'of': 'model', 'change': 1, 'first': 7.0, 'time': 7.0}]
     """
-    active = steps["regime_active"].to_numpy()
-    changes = np.flatnonzero(np.diff(active)) + 1
-    rows = []
+    active = steps["regime_active"].to_numpy() if len(steps) else []
+    changes, rows = np.flatnonzero(np.diff(active)) + 1, []
     for column, of in MEASURES.items():
         if len(changes) and column in steps and steps[column].notna().all():
             times = _times(steps[column].to_numpy(dtype=float), changes)
@@ -59,22 +54,26 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
     return table.astype(kinds)  # also without rows: tables are joined
 
 
-def _times(error: np.ndarray, changes: np.ndarray) -> list[tuple[int, float, float]]:
-    """Return changes, from 1, and their two times; ``changes`` are places in ``error``."""
-    level = max(FLOOR, FACTOR * float(np.quantile(error[: changes[0]], QUANTILE)))
+def _times(
+    error: np.ndarray, changes: np.ndarray, factor: float = 1.5, floor: float = 1e-4
+) -> list[tuple[int, float, float]]:
+    """Return changes, from 1, and their two times.
+
+    Args:
+        error: of each step.
+        changes: places in ``error``.
+        factor: nominal level over the 95th percentile before the first change.
+        floor: least level (m, rad): below it every robot counts as well predicted.
+    """
+    level = max(floor, factor * float(np.quantile(error[: changes[0]], 0.95)))
     times = []
     for count, (start, end) in enumerate(zip(changes, [*changes[1:], len(error)], strict=True)):
         if end - start >= STAY:
             low = error[start:end] <= level
             stays = sliding_window_view(low, STAY).all(-1)
-            times.append((count + 1, _first(low), _first(stays)))
+            first, time = (float(f.argmax()) if f.any() else np.inf for f in (low, stays))
+            times.append((count + 1, first, time))
     return times
-
-
-def _first(flags: ArrayLike) -> float:
-    """Return the place of the first flag that is set, or infinity."""
-    places = np.flatnonzero(flags)
-    return float(places[0]) if len(places) else np.inf
 
 
 def recovery_table(times: pd.DataFrame) -> Table:
@@ -83,13 +82,17 @@ def recovery_table(times: pd.DataFrame) -> Table:
     Args:
         times: rows of :func:`recovery_times` with a column ``method``; at least one.
     """
+
+    def share(of: float) -> object:
+        return lambda steps: steps.quantile(of, interpolation="lower")
+
     by = times.groupby(["method", "of", "change"], sort=False)
     numbers = by.agg(
         changes=("time", "size"),
-        first=("first", lambda steps: steps.quantile(0.5, interpolation="lower")),
-        median=("time", lambda steps: steps.quantile(0.5, interpolation="lower")),
-        lower_quartile=("time", lambda steps: steps.quantile(0.25, interpolation="lower")),
-        upper_quartile=("time", lambda steps: steps.quantile(0.75, interpolation="lower")),
+        first=("first", share(0.5)),
+        median=("time", share(0.5)),
+        lower_quartile=("time", share(0.25)),
+        upper_quartile=("time", share(0.75)),
         never=("time", lambda steps: float(np.isinf(steps).mean())),
     ).reset_index()
     low, high = (numbers[f"{end}_quartile"].map(number) for end in ("lower", "upper"))

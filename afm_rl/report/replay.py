@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
@@ -18,6 +17,7 @@ from rich.text import Text
 from afm_rl.replay import Table as Replayed
 from afm_rl.replay.table import AFM, ALONE, SHARES
 from afm_rl.report import style
+from afm_rl.report.figures import Picture
 from afm_rl.report.table import Table
 from afm_rl.storage.csv_text import csv_text
 from afm_rl.storage.files import write_whole
@@ -40,7 +40,7 @@ def print_replay(replayed: Replayed, file: IO[str] | None = None) -> None:
     >>> from afm_rl.replay.table import errors_of
     >>> u = np.linspace(-1, 1, 40)[:, None]
     >>> log, found = Log(("pan",), u, 0.5 * u), {ALONE: u, AFM: 0.5 * u}
-    >>> table = Replayed(log, found, 0 * u, errors_of(log, found), ("all",))
+    >>> table = Replayed(log, found, 0 * u, errors_of(log, found), {"pan": 1.0})
     >>> print_replay(table)  # doctest: +NORMALIZE_WHITESPACE
     <BLANKLINE>
      actuator  error   as commanded       AFM
@@ -48,7 +48,7 @@ def print_replay(replayed: Replayed, file: IO[str] | None = None) -> None:
      pan       median  0.26 [0.01, 0.50]  0.00 [0.00, 0.00]
      pan       p90     0.45 [0.37, 0.50]  0.00 [0.00, 0.00]
     <BLANKLINE>
-    A correction would have removed all.
+    A correction would have removed 100 % of the error of pan.
     """
     console = Console(file=file, width=1000, highlight=False)
     grid = Grid(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
@@ -58,7 +58,8 @@ def print_replay(replayed: Replayed, file: IO[str] | None = None) -> None:
     for texts in shown.to_numpy():
         grid.add_row(*(Text(text) for text in texts))
     console.print(grid)
-    console.print(Text(replayed.sentence), soft_wrap=True)
+    for line in (replayed.sentence, *replayed.notes):
+        console.print(Text(line), soft_wrap=True)
 
 
 def errors_table(replayed: Replayed, stretches: bool = True) -> Table:
@@ -137,8 +138,7 @@ def _running(values: np.ndarray, rows: np.ndarray, window: int) -> list[float]:
     return [float(np.median(values[max(0, row + 1 - window) : row + 1])) for row in rows]
 
 
-def pictures_of(replayed: Replayed) -> Iterator[dict[str, object]]:
-    """Yield what a page needs of the figure: name, title, caption and the picture itself."""
+def pictures_of(replayed: Replayed) -> Iterator[Picture]:
+    """Yield the figure as a picture for a page."""
     figure, caption = draw_replay(replayed)
-    data = base64.b64encode(style.png_bytes(figure)).decode()
-    yield {"name": "replay", "title": replayed.sentence, "caption": caption, "data": data}
+    yield Picture("replay", replayed.sentence, caption, style.png_bytes(figure))

@@ -1,8 +1,9 @@
-"""What a film shows: a figure, and how it looks at a step."""
+"""What a film shows: a figure, and how its parts move from step to step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,30 +15,30 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch, Polygon
 
 from afm_rl.report import style
-from afm_rl.report.frames import action_names
-from afm_rl.report.space_plot import GOAL, POSITION, REFERENCE, dress_space, mark_regimes
+from afm_rl.report.cells import action_names
+from afm_rl.report.space_plot import GOAL, POSITION, dress_space, mark_regimes
+from afm_rl.report.style import BEFORE, CHANGED, EXECUTED, PLANNED, REFERENCE, START, TARGET
 from afm_rl.report.track_plot import DrawableTrack, draw_road, view
-from afm_rl.report.trajectory import CHANGED, NOMINAL, START, changed_stretch, positions
+from afm_rl.report.trajectory import changed_stretch, positions
 
 COLUMNS = ("x", "y", "goal_x", "goal_y", "error", "misaligned", "regime_active")  # at least
-PLANNED: dict[str, Any] = {"color": "#0072b2", "linewidth": 6.0}
-EXECUTED: dict[str, Any] = {"color": "#cc79a7", "linewidth": 2.5}
-TARGET: dict[str, Any] = {"marker": "*", "color": "#009e73", "markersize": 13, "linestyle": ""}
 BODY = np.array([[1.0, 0.0], [-0.8, 0.65], [-0.4, 0.0], [-0.8, -0.65]])  # seen from above
-SIZE, ARROW = 0.022, 0.13  # robot and longest arrow, as parts of the map
 GRID = 0.16  # inches: sides of pictures are multiples of 16 pixels, as video codecs want them
-AHEAD = 0.5  # s, how long arrows turn
-LEAST = 1e-6  # smallest distance that is told apart from none
+Moves = dict[Artist, Callable[[int], object]]
 
 
 class Scene(NamedTuple):
     """A figure whose moving parts can be set to any step."""
 
     figure: Figure
-    moving: Sequence[Artist]
-    """All that differs from frame to frame."""
-    show: Callable[[int], None]
-    """Sets the moving parts to a row of the table of steps, or of the longest of several."""
+    moving: Moves
+    """All that differs from frame to frame, in the order of drawing, and what sets it to a row of
+    the table of steps, or of the longest of several."""
+
+    def show(self, row: int) -> None:
+        """Set all moving parts to a row."""
+        for move in self.moving.values():
+            move(row)
 
 
 def map_scene(
@@ -55,102 +56,100 @@ def map_scene(
             ``error`` otherwise.
         track: the road.
     """
-    paths = {method: positions(steps) for method, steps in runs.items()}
-    box = view(track, list(paths.values()))
-    tall = 5.6 * np.clip((box.top - box.bottom) / (box.right - box.left), 0.4, 1.2)
+    box = view(track, [positions(steps) for steps in runs.values()])
+    tall = 5.6 * np.clip(box.ratio, 0.4, 1.2)
     figure = style.new_figure(6.4, GRID * round((tall + 2.3) / GRID))
     upper, lower = figure.subplots(2, 1, height_ratios=[tall, 1.1])
-    upper.set(xlim=(box.left, box.right), ylim=(box.bottom, box.top), aspect="equal")
-    upper.set(xlabel="x (m)", ylabel="y (m)")
-    style.dress(upper)
+    upper.set(xlim=box[:2], ylim=box[2:], aspect="equal")
+    style.dress(upper, "x (m)", "y (m)", size=style.LARGE)
     if track is not None:
         draw_road(upper, track)
-    column, label = _distance(runs)
-    styles, alone = style.method_styles(runs), len(runs) == 1
-    span = max(box.right - box.left, box.top - box.bottom)
-    timeline = _timeline([lower], max(runs.values(), key=len), alone)
-    lower.set(yscale="log", ylabel=label)
-    moving: list[Artist] = [*timeline]
-    shows, handles, labels = [], [], []
+    planned = all("miss" in steps and steps["miss"].notna().all() for steps in runs.values())
+    column, label = ("miss", "the plan") if planned else ("error", "the model")
+    styles, alone, longest = style.method_styles(runs), len(runs) == 1, max(runs.values(), key=len)
+    label = f"{'distance from' if planned else 'error of'}\n{label}"
+    moving = _cursors({label: lower}, longest, alone)
+    lower.set_yscale("log")
+    handles: dict[str, Artist] = {}
     for method, steps in runs.items():
         look = style.Style(style.NOMINAL, "-", "o") if alone else styles[method]
-        upper.plot(*paths[method][:1].T, **START, zorder=3)
+        upper.plot(*positions(steps)[:1].T, **START, zorder=3)
         width = 0.9 if alone else 2.2 - 0.25 * look.place
-        (line,) = lower.plot(steps["t"], steps[column].clip(lower=LEAST), linewidth=width)
+        (line,) = lower.plot(steps["t"], steps[column].clip(lower=1e-6), linewidth=width)
         line.set(color=look.color, linestyle=look.linestyle)
-        robot = _Robot(upper, steps, look.color, span, alone)
-        moving += robot.moving
-        shows.append(robot.show)
-        handles += robot.handles if alone else [look.handle()]
-        labels += robot.labels if alone else [method]
-    style.legend_above(figure, handles, labels, style.literal(title))
-    words = _words(upper)
-    longest = max(runs.values(), key=len)
-
-    def show(row: int) -> None:
-        for each in shows:
-            each(row)
-        _tell(longest.iloc[row], timeline, words, alone)
-
-    return Scene(figure, [*moving, words], show)
+        parts, named = _robot(upper, steps, look.color, max(box.span), alone)
+        moving |= parts
+        handles |= named if alone else {method: look.handle()}
+    style.legend_above(figure, [*handles.values()], [*handles], title)
+    return Scene(figure, moving | _words(upper, longest, alone))
 
 
-def _distance(runs: Mapping[str, pd.DataFrame]) -> tuple[str, str]:
-    """Return which distance to draw over time, and what it is."""
-    if all("miss" in steps and steps["miss"].notna().all() for steps in runs.values()):
-        return "miss", "distance from\nthe plan"
-    return "error", "error of\nthe model"
+def _robot(
+    axes: Axes, steps: pd.DataFrame, color: str, span: float, alone: bool
+) -> tuple[Moves, dict[str, Artist]]:
+    """Draw a robot on a map; return what moves, and what stands in the legend.
+
+    Its line so far, its body, and alone its target and actions. One that has ended stays where it
+    is.
+    """
+    path = positions(steps)
+    moved = np.diff(path, axis=0, prepend=path[:1])
+    heading = (
+        steps["theta"].to_numpy(dtype=float) if "theta" in steps else np.arctan2(*moved.T[::-1])
+    )
+    stretch = changed_stretch(steps["regime_active"].to_numpy())
+    changed = np.where(stretch[:, None], path, np.nan)
+    (before,) = axes.plot([], [], **BEFORE | {"color": color}, zorder=4)
+    (under,) = axes.plot(
+        [], [], **(CHANGED if alone else {"color": color, "linewidth": 2.4}), zorder=4
+    )
+    body = Polygon(BODY, facecolor=color, edgecolor="white", linewidth=0.8, zorder=7)
+    axes.add_patch(body)
+
+    def turn(row: int) -> None:
+        row = min(row, len(path) - 1)
+        cos, sin = np.cos(heading[row]), np.sin(heading[row])
+        body.set_xy(path[row] + 0.022 * span * BODY @ np.array([[cos, sin], [-sin, cos]]))
+
+    moving: Moves = {
+        before: lambda row: before.set_data(*path[: row + 1].T),
+        under: lambda row: under.set_data(*changed[: row + 1].T),
+        body: turn,
+    }
+    handles: dict[str, Artist] = {"nominal": before, "changed regime": under}
+    if alone:
+        goals = steps[["goal_x", "goal_y"]].to_numpy()
+        (target,) = axes.plot([], [], **TARGET, zorder=5)
+        moving[target] = lambda row: target.set_data(*goals[row : row + 1].T)
+        handles["target"] = target
+    if alone and {"v", "omega"} <= set(action_names(steps)):
+        looks = {"planned": PLANNED, "executed": EXECUTED}
+        for (kind, look), course in zip(looks.items(), _courses(steps, heading), strict=True):
+            head: style.Look = {"arrowstyle": "-|>", "mutation_scale": 9 + look["linewidth"]}
+            arrow = FancyArrowPatch((0, 0), (0, 0), shrinkA=0, shrinkB=0, zorder=6, **head, **look)
+            axes.add_patch(arrow)
+            moving[arrow] = partial(_point, arrow, path, path + 0.13 * span * course)
+            handles[f"{kind} action"] = Line2D([], [], **look)
+    return moving, handles
 
 
-class _Robot:
-    """One robot on a map: its line so far, its body, and alone its target and actions."""
+def _point(arrow: FancyArrowPatch, starts: np.ndarray, ends: np.ndarray, row: int) -> None:
+    arrow.set_positions(starts[row], ends[row])
 
-    def __init__(
-        self, axes: Axes, steps: pd.DataFrame, color: str, span: float, alone: bool
-    ) -> None:
-        self.path, self.span = positions(steps), span
-        moved = np.diff(self.path, axis=0, prepend=self.path[:1])
-        self.heading = (
-            steps["theta"].to_numpy(dtype=float)
-            if "theta" in steps
-            else np.arctan2(moved[:, 1], moved[:, 0])
-        )
-        self.changed = np.where(
-            changed_stretch(steps["regime_active"].to_numpy())[:, None], self.path, np.nan
-        )
-        (self.before,) = axes.plot([], [], **NOMINAL | {"color": color}, zorder=4)
-        after = CHANGED if alone else {"color": color, "linewidth": 2.4}
-        (self.under,) = axes.plot([], [], **after, zorder=4)
-        self.body = Polygon(BODY, facecolor=color, edgecolor="white", linewidth=0.8, zorder=7)
-        axes.add_patch(self.body)
-        self.moving: list[Artist] = [self.before, self.under, self.body]
-        self.handles, self.labels = [self.before, self.under], ["nominal", "changed regime"]
-        self.arrows: list[FancyArrowPatch] = []
-        self.target = None
-        if alone:
-            self.goals = steps[["goal_x", "goal_y"]].to_numpy()
-            (self.target,) = axes.plot([], [], **TARGET, zorder=5)
-            self.handles, self.labels = [*self.handles, self.target], [*self.labels, "target"]
-            self.moving.append(self.target)
-        if alone and {"v", "omega"} <= set(action_names(steps)):
-            self.courses = _courses(steps, self.heading) * ARROW * span
-            self.arrows = [_arrow(axes, PLANNED), _arrow(axes, EXECUTED)]
-            self.handles += [Line2D([], [], **PLANNED), Line2D([], [], **EXECUTED)]
-            self.labels += ["planned action", "executed action"]
-            self.moving += self.arrows
 
-    def show(self, row: int) -> None:
-        """Go to a row; a robot that has ended stays where it is."""
-        row = min(row, len(self.path) - 1)
-        here = self.path[row]
-        self.before.set_data(*self.path[: row + 1].T)
-        self.under.set_data(*self.changed[: row + 1].T)
-        if self.target is not None:
-            self.target.set_data(*self.goals[row : row + 1].T)
-        for arrow, course in zip(self.arrows, self.courses if self.arrows else (), strict=True):
-            arrow.set_positions(here, here + course[row])
-        cos, sin = np.cos(self.heading[row]), np.sin(self.heading[row])
-        self.body.set_xy(here + SIZE * self.span * BODY @ np.array([[cos, sin], [-sin, cos]]))
+def _courses(steps: pd.DataFrame, heading: np.ndarray, ahead: float = 0.5) -> np.ndarray:
+    """Return arrows ``(2, T, 2)`` of planned and executed actions, the longest of size 1.
+
+    They turn for ``ahead`` seconds.
+    """
+    kinds = ("planned", "executed")
+    fast, turning = (
+        np.stack([steps[f"{kind}_{name}"].to_numpy(dtype=float) for kind in kinds])
+        for name in ("v", "omega")
+    )
+    angle = heading + ahead * turning
+    longest = max(float(np.nanmax(np.abs(fast))), 1e-6)
+    return np.stack([np.cos(angle), np.sin(angle)], -1) * (fast / longest)[..., None]
 
 
 def space_scene(title: str, steps: pd.DataFrame) -> Scene:
@@ -171,73 +170,61 @@ def space_scene(title: str, steps: pd.DataFrame) -> Scene:
 
     height.plot(steps["t"], steps["goal_z"], **REFERENCE)
     height.plot(steps["t"], steps["z"], color=style.NOMINAL, linewidth=1.2)
-    height.set(ylabel="height (m)")
-    looks = (PLANNED | {"linewidth": 3.0}, EXECUTED | {"linewidth": 1.2})
-    for kind, look in zip(("planned", "executed"), looks, strict=True):
-        effort.plot(steps["t"], steps[f"{kind}_{action}"], **look)
-    effort.set(ylabel=style.literal(action))
-    cursors = _timeline([height, effort], steps, True)
+    looks = {
+        f"planned {action}": PLANNED | {"linewidth": 3.0},
+        f"executed {action}": EXECUTED | {"linewidth": 1.2},
+    }
+    for name, look in looks.items():
+        effort.plot(steps["t"], steps[name.replace(" ", "_", 1)], **look)
+    cursors = _cursors({"height (m)": height, action: effort}, steps, True)
 
     (line,) = space.plot([], [], [], color=style.NOMINAL, linewidth=1.4)
     (robot,) = space.plot([], [], [], "o", color=style.REGIME, markersize=7)
     (goal,) = space.plot([], [], [], **TARGET)
-    words = _words(space)
-    handles = [Line2D([], [], **REFERENCE), line, robot, goal]
-    handles += [Line2D([], [], **look) for look in looks]
-    labels = ["reference", "path", "now", "set-point", f"planned {action}", f"executed {action}"]
-    style.legend_above(figure, handles, labels, style.literal(title))
-
-    def show(row: int) -> None:
-        line.set_data_3d(*path[: row + 1].T)
-        robot.set_data_3d(*path[row : row + 1].T)
-        goal.set_data_3d(*wanted[row : row + 1].T)
-        _tell(steps.iloc[row], cursors, words, True)
-
-    return Scene(figure, [line, goal, robot, *cursors, words], show)
+    handles = {"reference": Line2D([], [], **REFERENCE), "path": line, "now": robot}
+    handles |= {"set-point": goal}
+    handles |= {name: Line2D([], [], **look) for name, look in looks.items()}
+    style.legend_above(figure, [*handles.values()], [*handles], title)
+    moving: Moves = {
+        line: lambda row: line.set_data_3d(*path[: row + 1].T),
+        goal: lambda row: goal.set_data_3d(*wanted[row : row + 1].T),
+        robot: lambda row: robot.set_data_3d(*path[row : row + 1].T),
+    }
+    return Scene(figure, moving | cursors | _words(space, steps, True))
 
 
-def _courses(steps: pd.DataFrame, heading: np.ndarray) -> np.ndarray:
-    """Return arrows ``(2, T, 2)`` of planned and executed actions, the longest of size 1."""
-    kinds = ("planned", "executed")
-    fast, turning = (
-        np.stack([steps[f"{kind}_{name}"].to_numpy(dtype=float) for kind in kinds])
-        for name in ("v", "omega")
-    )
-    angle = heading + AHEAD * turning
-    longest = max(float(np.nanmax(np.abs(fast))), LEAST)
-    return np.stack([np.cos(angle), np.sin(angle)], -1) * (fast / longest)[..., None]
+def _cursors(panels: Mapping[str, Axes], steps: pd.DataFrame, alone: bool) -> Moves:
+    """Dress axes over time, by their labels; return the lines that mark now.
 
-
-def _arrow(axes: Axes, look: dict[str, Any]) -> FancyArrowPatch:
-    head: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 9 + look["linewidth"]}
-    arrow = FancyArrowPatch((0, 0), (0, 0), shrinkA=0, shrinkB=0, zorder=6, **head, **look)
-    axes.add_patch(arrow)
-    return arrow
-
-
-def _timeline(panels: Sequence[Axes], steps: pd.DataFrame, alone: bool) -> list[Line2D]:
-    """Dress axes over time; return the lines that mark now. Methods change at different steps."""
+    Methods change at different steps: changes are marked of a method ``alone``.
+    """
     if alone:
-        mark_regimes(panels, steps)
-    for axes in panels:
-        style.dress(axes)
-        axes.set_xlim(0, max(int(steps["t"].iloc[-1]), 1))
-    panels[-1].set_xlabel("step")
-    return [axes.axvline(0, color=style.REGIME, linewidth=1.2) for axes in panels]
+        mark_regimes([*panels.values()], steps)
+    moving: Moves = {}
+    t, lowest = steps["t"].to_numpy(), list(panels)[-1]
+    for label, axes in panels.items():
+        style.dress(axes, "step" if label == lowest else "", label, size=style.LARGE)
+        axes.set_xlim(0, max(int(t[-1]), 1))
+        line = axes.axvline(0, color=style.REGIME, linewidth=1.2)
+        moving[line] = partial(_mark, line, t)
+    return moving
 
 
-def _words(axes: Any) -> Any:
-    """Return an empty line above axes."""
+def _mark(line: Line2D, t: np.ndarray, row: int) -> None:
+    line.set_xdata([t[row]] * 2)
+
+
+def _words(axes: Any, steps: pd.DataFrame, alone: bool) -> Moves:
+    """Return a line above axes that says the step and what is known of it."""
     speak = axes.text2D if hasattr(axes, "text2D") else axes.text
-    return speak(0.0, 1.01, "", transform=axes.transAxes, fontsize=style.NORMAL)
+    words = speak(0.0, 1.01, "", transform=axes.transAxes, fontsize=style.NORMAL)
 
+    def tell(row: int) -> None:
+        step = steps.iloc[row]
+        text = f"step {int(step['t'])}"
+        if alone:
+            text += ": changed regime" if step["regime_active"] else ": nominal"
+            text += ", misaligned" if step["misaligned"] else ""
+        words.set_text(text)
 
-def _tell(step: Any, cursors: Sequence[Line2D], words: Any, alone: bool) -> None:
-    """Move the cursors, and write the step and what is known of it."""
-    for cursor in cursors:
-        cursor.set_xdata([step["t"], step["t"]])
-    text = f"step {int(step['t'])}"
-    if alone:
-        text += ": changed regime" if step["regime_active"] else ": nominal"
-        text += ", misaligned" if step["misaligned"] else ""
-    words.set_text(text)
+    return {words: tell}

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -25,8 +24,6 @@ PROGRESS_CAPTION = (
     "its end a mission keeps its share. Higher and further left is better. Bands: 95 % intervals, "
     "seeds drawn anew within cells (none where all cells have one seed)."
 )
-WIDEST = 20.0  # tau at most
-RESAMPLES = 500  # the band is as wide as a line: no need for more
 
 
 def ratios(missions: pd.DataFrame, spent: Measure) -> pd.Series:
@@ -43,7 +40,11 @@ def ratios(missions: pd.DataFrame, spent: Measure) -> pd.Series:
 
 
 def draw_profile(
-    missions: pd.DataFrame, ratio: pd.Series, spent: Measure, styles: Mapping[str, style.Style]
+    missions: pd.DataFrame,
+    ratio: pd.Series,
+    spent: Measure,
+    styles: Mapping[str, style.Style],
+    widest: float = 20.0,
 ) -> Figure:
     """Return a figure of the share of missions within a factor of the least.
 
@@ -52,64 +53,70 @@ def draw_profile(
         ratio: from :func:`ratios`, of all methods.
         spent: what missions spend.
         styles: the methods to draw, and how.
+        widest: largest factor that is shown.
     """
     finite = ratio[np.isfinite(ratio)]
-    limit = float(np.clip(finite.max() if len(finite) else 2.0, 2.0, WIDEST))
-    figure, axes = _axes(f"tau: {spent.name} / fewest {spent.name} of any method")
-    taus, lines = np.geomspace(1.0, limit, 200), {}
-    for method, look in styles.items():
+    limit = float(np.clip(finite.max() if len(finite) else 2.0, 2.0, widest))
+    taus, shares, counts = np.geomspace(1.0, limit, 200), {}, {}
+    for method in styles:
         own = ratio[missions["method"] == method]
-        share = 100 * np.searchsorted(np.sort(own), taus * (1 + 1e-9), side="right") / len(own)
-        line = look.line(axes, taus, share, gid="profile", drawstyle="steps-post", clip_on=False)
-        lines[f"{method} (n = {len(own)})"] = line
+        counts[method] = len(own)
+        shares[method] = np.searchsorted(np.sort(own), taus * (1 + 1e-9), side="right") / len(own)
+    steps: style.Look = {"gid": "profile", "drawstyle": "steps-post", "clip_on": False}
+    figure = _draw(taus, shares, counts, styles, steps)
+    (axes,) = figure.axes
     axes.set(xscale="log", xlim=(1.0, limit))
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda tau, _: f"{tau:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_ylabel("missions finished within tau (%)", fontsize=style.NORMAL)
-    style.legend_above(figure, list(lines.values()), list(lines))
+    below = f"tau: {spent.name} / fewest {spent.name} of any method"
+    style.dress(axes, below, "missions finished within tau (%)", "both", style.NORMAL)
     return figure
 
 
 def draw_progress(
-    grid: np.ndarray,
-    shares: Mapping[str, np.ndarray],
-    cells: Mapping[str, pd.Series],
-    styles: Mapping[str, style.Style],
-    name: str,
+    progress: pd.DataFrame, styles: Mapping[str, style.Style], name: str, resamples: int = 500
 ) -> Figure:
     """Return a figure of the mean share of what was reached against the number of steps.
 
     Args:
-        grid: numbers of steps ``(G,)``.
-        shares: per method, ``(B, G)``, one row per mission.
-        cells: per method, the cell of each mission, ``(B,)``.
+        progress: shares, one row per ``method`` and ``cell`` of a mission (the index), one column
+            per number of steps.
         styles: the methods to draw, and how.
         name: what is reached.
+        resamples: draws of the bootstrap; the band is as wide as a line, no need for more.
     """
-    figure, axes = _axes("steps")
-    lines = {}
+
+    def mean(samples: list[np.ndarray]) -> np.ndarray:
+        return np.concatenate(samples, -1).mean(-1)
+
+    grid = progress.columns.to_numpy(dtype=float)
+    own = {method: progress.loc[[method]] for method in styles}
+    means = {method: rows.to_numpy().mean(0) for method, rows in own.items()}
+    counts = {method: len(rows) for method, rows in own.items()}
+    figure = _draw(grid, means, counts, styles, {"gid": "progress"})
+    (axes,) = figure.axes
     for method, look in styles.items():
-        samples = split(shares[method], cells[method])
-        bounds = resampled_bounds(samples, _mean, RESAMPLES)
-        axes.fill_between(grid, *(100 * bounds), color=look.color, alpha=0.15, linewidth=0)
-        line = look.line(axes, grid, 100 * shares[method].mean(0), gid="progress")
-        lines[f"{method} (n = {len(shares[method])})"] = line
+        samples = split(own[method].to_numpy(), own[method].index.get_level_values("cell"))
+        low, high = resampled_bounds(samples, mean, resamples)
+        band: style.Look = {"color": look.color, "alpha": 0.15, "linewidth": 0}
+        axes.fill_between(grid, 100 * low, 100 * high, **band)
     axes.set_xlim(0, grid[-1])
-    axes.set_ylabel(f"{name} (%)", fontsize=style.NORMAL)
-    style.legend_above(figure, list(lines.values()), list(lines))
+    style.dress(axes, "steps", f"{name} (%)", "both", style.NORMAL)
     return figure
 
 
-def _mean(samples: list[np.ndarray]) -> np.ndarray:
-    return np.concatenate(samples, -1).mean(-1)
-
-
-def _axes(label: str) -> tuple[Figure, Axes]:
+def _draw(
+    x: np.ndarray,
+    shares: Mapping[str, np.ndarray],
+    counts: Mapping[str, int],
+    styles: Mapping[str, style.Style],
+    look: style.Look,
+) -> Figure:
+    """Return a figure of one line per method, in percent."""
     figure = style.new_figure(7.0, 4.6)
     axes = figure.subplots()
     axes.set_ylim(0, 103)
-    axes.set_xlabel(label, fontsize=style.NORMAL)
-    style.grid(axes)
-    style.dress(axes)
-    return figure, axes
+    lines = [styles[method].line(axes, x, 100 * shares[method], **look) for method in styles]
+    style.legend_above(figure, lines, [f"{name} (n = {counts[name]})" for name in styles])
+    return figure

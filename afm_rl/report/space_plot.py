@@ -12,13 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from afm_rl.report import style
-from afm_rl.report.frames import action_names, first_missions, left_out, steps_of
+from afm_rl.report.cells import action_names, steps_of
 from afm_rl.report.learning import regime_changes
 
-CELLS = 3
 POSITION, GOAL = ["x", "y", "z"], ["goal_x", "goal_y", "goal_z"]
 COLUMNS = [*POSITION, *GOAL, "regime_active"]  # of the steps
-REFERENCE: dict[str, Any] = {"color": style.FAINT, "linestyle": ":", "linewidth": 1.2}
 CAPTION = (
     "One seed: the path and the reference, the error of the height, the first component of the "
     "action (thin: planned; thick: executed), and the distance to the reference. Crosses and "
@@ -26,49 +24,46 @@ CAPTION = (
 )
 
 
-def draw_space(missions: pd.DataFrame, steps: pd.DataFrame) -> Figure:
+def draw_space(missions: pd.DataFrame, steps: pd.DataFrame, cells: int = 3) -> Figure:
     """Return a figure of paths in space, methods over each other, cells below each other.
 
     Each row holds the path, the error of the height, the first component of the action (planned:
     thin; executed: thick) and the distance to the reference. Of each method and cell, only the
-    first seed is drawn, of six methods and three cells at most.
+    first seed is drawn, of six methods at most.
 
     Args:
         missions: one row per mission.
         steps: one row per mission and step, with :data:`COLUMNS` (m) and actions.
+        cells: how many are shown.
     """
-    first, styles = first_missions(missions), style.method_styles(missions["method"])
-    styles = dict([*styles.items()][: style.FEW])
-    cells = list(first["cell"].unique())[:CELLS]
-    shown = first[first["cell"].isin(cells) & first["method"].isin(list(styles))]
+    shown, styles, left_out = style.excerpt(missions, cells)
     flights, action = steps_of(steps, shown["mission"]), action_names(steps)[0]
-    figure = style.new_figure(12.5, 3.0 * len(cells) + 0.8)
-    grid = figure.add_gridspec(len(cells), 4, width_ratios=[1.15, 1, 1, 1])
+    rows = shown["cell"].nunique()
+    figure = style.new_figure(12.5, 3.0 * rows + 0.8)
+    grid = figure.add_gridspec(rows, 4, width_ratios=[1.15, 1, 1, 1])
     labels = ("error of the height (m)", action, "distance to the reference (m)")
     for row, (cell, group) in enumerate(shown.groupby("cell", sort=False)):
         space = figure.add_subplot(grid[row, 0], projection="3d")
         panels = [figure.add_subplot(grid[row, k]) for k in (1, 2, 3)]
-        panels[0].set_title(style.literal(str(cell)), fontsize=style.NORMAL, loc="left")
         for axes, label in zip(panels, labels, strict=True):
-            axes.set_ylabel(style.literal(label), fontsize=style.SMALL)
-            axes.set_xlabel("step" * (row == len(cells) - 1), fontsize=style.SMALL)
-            style.grid(axes, "y")
-            style.dress(axes)
+            style.dress(axes, "step" * (row == rows - 1), label, "y")
+        panels[0].set_title(style.literal(str(cell)), fontsize=style.NORMAL, loc="left")
         for mission in group.itertuples():
-            _draw_path(space, flights[mission.mission], styles[mission.method])
-            _draw_over_time(panels, flights[mission.mission], styles[mission.method], action)
+            flight, look = flights[mission.mission], styles[mission.method]
+            _draw_path(space, flight, look)
+            _draw_over_time(panels, flight, look, action)
         dress_space(space)
         mark_regimes(panels, flights[group["mission"].iloc[0]])
         panels[2].set_yscale("log", nonpositive="mask")
     handles = [look.handle() for look in styles.values()]
     handles += [
-        Line2D([], [], **REFERENCE),
+        Line2D([], [], **style.REFERENCE),
         Line2D([], [], color=style.FAINT, marker="X", linestyle=""),
         Line2D([], [], color=style.FAINT, linewidth=0.7),
     ]
     marks = ["reference", "a regime begins or ends", f"planned {action} (thin)"]
     style.legend_above(figure, handles, [*styles, *marks])
-    style.footnote(figure, left_out(missions, shown))
+    style.footnote(figure, left_out)
     return figure
 
 
@@ -86,8 +81,8 @@ def changes(steps: pd.DataFrame) -> list[int]:
     return steps.loc[begun, "t"].tolist()
 
 
-def _draw_path(space: Axes, flight: pd.DataFrame, look: style.Style) -> None:
-    space.plot(*flight[GOAL].to_numpy().T, **REFERENCE, gid="reference")
+def _draw_path(space: Any, flight: pd.DataFrame, look: style.Style) -> None:
+    space.plot(*flight[GOAL].to_numpy().T, **style.REFERENCE, gid="reference")
     flown = flight[POSITION].to_numpy()
     space.plot(*flown.T, color=look.color, linestyle=look.linestyle, linewidth=1.2, gid="path")
     turns = flown[flight["t"].isin(changes(flight))]
@@ -128,7 +123,7 @@ def mark_regimes(panels: Sequence[Axes], steps: pd.DataFrame) -> None:
     """
     active, t = steps["regime_active"].to_numpy(dtype=bool), steps["t"].to_numpy()
     for axes in panels:
-        look: dict[str, Any] = {"color": style.BAND, "alpha": 0.15, "linewidth": 0}
+        look: style.Look = {"color": style.BAND, "alpha": 0.15, "linewidth": 0}
         axes.fill_between(t, 0, 1, where=active, **look, transform=axes.get_xaxis_transform())
         for step in changes(steps):
             line = axes.axvline(step, color=style.FAINT, linewidth=0.8, linestyle="--")

@@ -13,11 +13,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.stats import bootstrap, trim_mean
 
-LEVEL = 0.95
-RESAMPLES = 2000
-ROOM = 4_000_000  # numbers that are in memory at a time
 Bounds = tuple[float, float]
-NONE: Bounds = (math.nan, math.nan)
 
 
 def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -57,6 +53,24 @@ def stratified_interval(
     return float(low), float(high)
 
 
+def estimate(
+    name: str,
+    values: pd.Series,
+    strata: pd.Series,
+    statistic: Callable[..., np.ndarray] = np.mean,
+) -> dict[str, float]:
+    """Return a statistic and its interval as entries of a row; missing values are left out.
+
+    >>> estimate("a", pd.Series([1.0, 3.0, math.nan]), pd.Series(["x", "y", "y"]))
+    {'a': 2.0, 'a_low': nan, 'a_high': nan}
+    """
+    known = values.notna()
+    sample = values[known].to_numpy(dtype=float)
+    low, high = stratified_interval(sample, strata[known], statistic)
+    middle = float(statistic(sample)) if len(sample) else math.nan
+    return {name: middle, f"{name}_low": low, f"{name}_high": high}
+
+
 def split(values: np.ndarray, strata: ArrayLike) -> list[np.ndarray]:
     """Return the rows ``(N, ...)`` of each stratum."""
     groups = pd.Series(np.asarray(strata)).groupby(np.asarray(strata)).indices
@@ -66,10 +80,11 @@ def split(values: np.ndarray, strata: ArrayLike) -> list[np.ndarray]:
 def resampled_bounds(
     samples: Sequence[np.ndarray],
     statistic: Callable[[list[np.ndarray]], np.ndarray],
-    resamples: int = RESAMPLES,
+    resamples: int = 2000,
     work: int = 1,
+    room: int = 4_000_000,
 ) -> np.ndarray:
-    """Return the percentile interval of a statistic of several samples, each drawn anew.
+    """Return the 95 % percentile interval of a statistic of several samples, each drawn anew.
 
     Args:
         samples: ``(N_k, ...)`` each.
@@ -77,14 +92,14 @@ def resampled_bounds(
             ``(..., R)``.
         resamples: how many draws.
         work: numbers that the statistic makes of one number.
+        room: numbers that are in memory at a time.
 
     Returns:
         Lower and upper bound, ``(2, ...)``; NaN where no draw changes the statistic.
     """
     drawn = [k for k, sample in enumerate(samples) if len(sample) > 1]  # others cannot vary
-    shape = samples[0].shape[1:] if len(samples) else ()
     if not drawn:
-        return np.full((2, *shape), math.nan)
+        return np.full((2, *(samples[0].shape[1:] if len(samples) else ())), math.nan)
 
     def with_the_rest(*parts: np.ndarray, axis: int) -> np.ndarray:
         lead = parts[0].shape[:-1]
@@ -99,10 +114,10 @@ def resampled_bounds(
         [samples[k] for k in drawn],
         with_the_rest,
         n_resamples=resamples,
-        batch=max(1, min(resamples, ROOM // max(size, 1))),
+        batch=max(1, min(resamples, room // max(size, 1))),
         vectorized=True,
         axis=0,
-        confidence_level=LEVEL,
+        confidence_level=0.95,
         method="percentile",
         rng=0,
     )
@@ -132,7 +147,7 @@ def probability_of_improvement(mine: pd.DataFrame, other: pd.DataFrame) -> tuple
     ranks = [frame.groupby("cell")["rank"].agg(np.array) for frame in (mine, other)]
     cells = ranks[0].index.intersection(ranks[1].index)
     if cells.empty:
-        return math.nan, NONE
+        return math.nan, (math.nan, math.nan)
 
     def share_won(samples: list[np.ndarray]) -> np.ndarray:
         pairs = zip(samples[: len(cells)], samples[len(cells) :], strict=True)
@@ -140,6 +155,5 @@ def probability_of_improvement(mine: pd.DataFrame, other: pd.DataFrame) -> tuple
         return np.mean([part.mean((-2, -1)) for part in won], axis=0)
 
     samples = [rank[cell].astype(float) for rank in ranks for cell in cells]
-    most = max(len(sample) for sample in samples)
-    low, high = resampled_bounds(samples, share_won, work=most)
+    low, high = resampled_bounds(samples, share_won, work=max(map(len, samples)))
     return float(share_won(samples)), (float(low), float(high))

@@ -12,17 +12,20 @@ import io
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
+from afm_rl.report.cells import first_missions
+
+Look = dict[str, Any]
 DPI = 150
 SMALL, NORMAL, LARGE = 8.0, 9.0, 10.0  # font sizes (pt)
 NOMINAL, REGIME, BAND = "#222222", "#d55e00", "#e69f00"  # before and after; under the regime
-FAINT = "#888888"
+FAINT, GOOD, ROAD = "#888888", "#009e73", "#e4e4e4"
 
 FEW = 6  # methods in a figure
 COLOURS = ("#0072b2", "#009e73", "#cc79a7", "#000000", "#56b4e9", "#e69f00")
@@ -36,6 +39,19 @@ LINES: tuple[Any, ...] = (
 )
 MARKERS = "osD^vP"
 
+BEFORE: Look = {"color": NOMINAL, "linewidth": 1.1}  # a path, and its stretch under the regime
+CHANGED: Look = {"color": REGIME, "linewidth": 1.6}
+BROAD: Look = {"color": BAND, "linewidth": 8.0, "alpha": 0.35}
+REFERENCE: Look = {"color": FAINT, "linestyle": ":", "linewidth": 1.2}
+POINT: Look = {"linestyle": "", "markeredgewidth": 1.0}
+START = POINT | {"marker": "o", "color": "white", "markeredgecolor": "black", "markersize": 6}
+FINISHED = POINT | {"marker": "o", "color": GOOD, "markeredgecolor": "white", "markersize": 10}
+TICK = POINT | {"marker": r"$\checkmark$", "color": "white", "markeredgewidth": 0, "markersize": 5}
+GIVEN_UP = POINT | {"marker": "X", "color": "black", "markeredgecolor": "white", "markersize": 9}
+TARGET: Look = {"marker": "*", "color": GOOD, "markersize": 13, "linestyle": ""}
+PLANNED: Look = {"color": "#0072b2", "linewidth": 6.0}  # actions
+EXECUTED: Look = {"color": "#cc79a7", "linewidth": 2.5}
+
 
 class Style(NamedTuple):
     """How one method is drawn in every figure."""
@@ -46,25 +62,26 @@ class Style(NamedTuple):
     place: int = 0
     """Which one of a figure's methods it is."""
 
+    @property
+    def width(self) -> float:
+        """Width of its lines: later ones are thinner, so that earlier ones show on both sides."""
+        return 2.6 - 0.3 * self.place
+
     def line(self, axes: Axes, x: Any, y: Any, gid: str, **look: Any) -> Line2D:
         """Draw a line that can be told from others on the same points.
 
-        Later lines are thinner, so that earlier ones show on both sides of them, and the markers of
-        different methods stand in different places.
+        The markers of different methods stand in different places, three or four on each line.
         """
-        width, apart = 2.6 - 0.3 * self.place, 0.28
-        (line,) = axes.plot(x, y, color=self.color, linestyle=self.linestyle, linewidth=width)
+        apart = 0.28 * len(x)
+        first = int(0.02 * len(x) + apart * self.place / FEW)
+        (line,) = axes.plot(x, y, color=self.color, linestyle=self.linestyle, linewidth=self.width)
         line.set(marker=self.marker, markersize=5.0, markeredgecolor="white", markeredgewidth=0.5)
-        values = np.asarray(y, dtype=float)
-        seen = bool((np.isfinite(values) & (values != 0)).any())  # a logarithmic scale hides zeros
-        line.set(
-            markevery=(0.02 + apart * self.place / FEW, apart) if seen else [], gid=gid, **look
-        )
+        line.set(markevery=(first, max(1, int(apart))), gid=gid, **look)
         return line
 
     def handle(self) -> Line2D:
         """Return what stands for the method in a legend."""
-        look: dict[str, Any] = {"color": self.color, "linestyle": self.linestyle}
+        look: Look = {"color": self.color, "linestyle": self.linestyle}
         return Line2D([], [], marker=self.marker, markersize=5, linewidth=1.7, **look)
 
 
@@ -93,25 +110,56 @@ def groups_of_methods(methods: Iterable[str]) -> list[list[str]]:
     return [names[first : first + size] for first in range(0, len(names), size or 1)]
 
 
-def new_figure(width: float, height: float, layout: str = "constrained") -> Figure:
+def excerpt(missions: pd.DataFrame, cells: int) -> tuple[pd.DataFrame, dict[str, Style], str]:
+    """Return what a figure shows of some missions.
+
+    Args:
+        missions: one row per mission.
+        cells: how many are shown.
+
+    Returns:
+        The first mission of each method and cell, of the first six methods; how these methods are
+        drawn; and a sentence on what is left out.
+    """
+    first, names = first_missions(missions), list(dict.fromkeys(missions["method"]))[:FEW]
+    chosen = first["cell"].isin(first["cell"].unique()[:cells]) & first["method"].isin(names)
+    missing = len(missions) - chosen.sum()
+    note = f"{missing} of {len(missions)} missions not shown" if missing else ""
+    return first[chosen], method_styles(names), note
+
+
+def new_figure(width: float, height: float) -> Figure:
     """Return an empty white figure of ``width`` by ``height`` inches."""
-    figure = Figure((width, height), dpi=DPI, layout=layout, facecolor="white")  # type: ignore[arg-type]
+    figure = Figure((width, height), dpi=DPI, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     return figure
-
-
-def dress(axes: Axes) -> None:
-    """Give axes the common look: small ticks, a light frame."""
-    axes.tick_params(which="both", labelsize=SMALL, length=2.5, color=FAINT)
-    axes.tick_params(which="minor", length=1.5)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set_color(FAINT)
 
 
 def grid(axes: Axes, axis: Literal["both", "x", "y"] = "both") -> None:
     """Draw faint lines behind everything."""
     axes.grid(axis=axis, color="#eeeeee", linewidth=0.6)
     axes.set_axisbelow(True)
+
+
+def dress(axes: Any, x: str = "", y: str = "", lines: Any = None, size: float = SMALL) -> None:
+    """Give axes the common look: small ticks, a light frame, labels, faint lines behind all.
+
+    Args:
+        axes: to be dressed.
+        x: label.
+        y: label.
+        lines: ``"x"``, ``"y"``, ``"both"``, or None for no lines.
+        size: of the labels (pt).
+    """
+    axes.tick_params(which="both", labelsize=SMALL, length=2.5, color=FAINT)
+    axes.tick_params(which="minor", length=1.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(FAINT)
+    for label, write in ((x, axes.set_xlabel), (y, axes.set_ylabel)):
+        if label:
+            write(literal(label), fontsize=size)
+    if lines:
+        grid(axes, lines)
 
 
 def legend_above(
@@ -126,7 +174,7 @@ def legend_above(
         [literal(label) for label in labels],
         loc="outside upper center",
         ncols=columns,
-        title=title,
+        title=title if title is None else literal(title),
         title_fontsize=LARGE,
         fontsize=SMALL,
         frameon=False,

@@ -1,19 +1,20 @@
-"""Tables as files: for programs, for papers, for readers."""
+"""One table and its views: CSV, LaTeX, a terminal; the page has its own, in ``page.html``."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import pandas as pd
+from rich import box
+from rich.table import Table as Grid
+from rich.text import Text
 
 from afm_rl.storage.csv_text import csv_text
-from afm_rl.storage.measures import Measure
 
 # What LaTeX writes another way; the escapes of pandas leave these alone.
 LATEX = {"±": r"$\pm$", "∞": r"$\infty$"}
-Places = frozenset[tuple[int, int]]
 ESCAPES = str.maketrans(
     {sign: f"\\{sign}" for sign in "%_#&${}"}
     | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -39,7 +40,7 @@ class Table:
     note: str
     numbers: pd.DataFrame
     shown: pd.DataFrame
-    bold: Places = field(default_factory=frozenset)
+    bold: frozenset[tuple[int, int]] = field(default_factory=frozenset)
     align: str = ""
 
     def to_csv(self) -> str:
@@ -66,6 +67,17 @@ class Table:
             text = text.replace(sign, command)
         return text
 
+    def to_grid(self, columns: Sequence[int] | None = None, caption: str | None = None) -> Grid:
+        """Return some columns of the table, or all, for the terminal."""
+        grid = Grid(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False, caption=caption)
+        chosen = range(self.shown.shape[1]) if columns is None else columns
+        for column in chosen:
+            grid.add_column(Text(self.shown.columns[column]), justify="right" if column else "left")
+        for row, texts in enumerate(self.shown.to_numpy()):
+            looks = ("bold" if (row, column) in self.bold else "" for column in chosen)
+            grid.add_row(*(Text(texts[c], look) for c, look in zip(chosen, looks, strict=True)))
+        return grid
+
 
 def number(value: float, digits: int = 0) -> str:
     """Return a number as text; a dash if there is none.
@@ -75,33 +87,29 @@ def number(value: float, digits: int = 0) -> str:
     """
     if math.isnan(value):
         return "-"
-    return "∞" if value == math.inf else f"{value:.{digits}f}"
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    return f"{value:.{digits}f}"
 
 
-def interval_text(measure: Measure, row: Mapping[str, float], name: str, digits: int) -> str:
-    """Return an entry of a row as text, in the unit of a measure, with its interval.
-
-    >>> share = Measure("share", "share", "share", "%", scale=100)
-    >>> interval_text(share, {"a": 0.5, "a_low": 0.4, "a_high": 0.6}, "a", 1)
-    '50.0 [40.0, 60.0]'
-    """
-    middle, low, high = (
-        measure.text(row[key], digits) for key in (name, f"{name}_low", f"{name}_high")
-    )
-    return middle if low == "-" else f"{middle} [{low}, {high}]"
-
-
-def best_places(values: pd.DataFrame, signs: Mapping[str, int]) -> Places:
-    """Return the places of the best value of each column, unless all are alike.
+def interval_text(
+    row: Mapping[str, float], name: str, digits: int, scale: float = 1.0, sign: str = ""
+) -> str:
+    """Return an entry of a row as text, with its interval.
 
     Args:
-        values: numbers, one row per row of the table.
-        signs: 1 for each column of ``values`` in which the highest is best, -1 for the lowest;
-            in this order they are the table's columns from the third on.
+        row: has the entries ``name``, ``name_low`` and ``name_high``.
+        name: of the entry.
+        digits: after the point.
+        scale: what the numbers are multiplied by.
+        sign: ``"+"`` writes the sign of positive numbers, too.
+
+    >>> row = {"a": 0.5, "a_low": -0.4, "a_high": 0.6}
+    >>> interval_text(row, "a", 1, 100), interval_text(row, "a", 1, sign="+")
+    ('50.0 [-40.0, 60.0]', '+0.5 [-0.4, +0.6]')
     """
-    places = set()
-    for place, (name, sign) in enumerate(signs.items(), 2):
-        column = sign * values[name].reset_index(drop=True)
-        if column.nunique() > 1:
-            places |= {(int(row), place) for row in column.index[column == column.max()]}
-    return frozenset(places)
+    values = (row[key] for key in (name, f"{name}_low", f"{name}_high"))
+    middle, low, high = (
+        (sign if value >= 0 else "") + number(scale * value, digits) for value in values
+    )
+    return middle if low == "-" else f"{middle} [{low}, {high}]"

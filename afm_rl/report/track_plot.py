@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -10,10 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 
 from afm_rl.errors import ConfigurationError
-
-ROAD, WAYPOINT = "#e4e4e4", "#9a9a9a"
-MARGIN, STRAY = 0.04, 0.15  # of the road's extent: always shown around it; shown of who strays
-FINENESS = 16  # discs per road width
+from afm_rl.report.style import ROAD
 
 
 class Box(NamedTuple):
@@ -23,6 +21,16 @@ class Box(NamedTuple):
     right: float
     bottom: float
     top: float
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Width and height."""
+        return self.right - self.left, self.top - self.bottom
+
+    @property
+    def ratio(self) -> float:
+        """Height over width."""
+        return self.span[1] / self.span[0]
 
 
 class DrawableTrack(Protocol):
@@ -45,41 +53,24 @@ class DrawableTrack(Protocol):
         """Width of the road."""
 
 
-LoadTrack = Callable[[str], DrawableTrack]
-
-
-def load_tracks(names: Iterable[str], load_track: LoadTrack | None) -> list[DrawableTrack]:
-    """Return the tracks that can be loaded; a map without its road is a map."""
+def load_tracks(
+    names: Iterable[str], load_track: Callable[[str], DrawableTrack]
+) -> list[DrawableTrack]:
+    """Return the tracks that can be loaded by name; a map without its road is a map."""
     tracks = []
-    for name in names if load_track else ():
-        try:
-            tracks.append(load_track(str(name)))  # type: ignore[misc]
-        except ConfigurationError:
-            continue
+    for name in names:
+        with suppress(ConfigurationError):
+            tracks.append(load_track(str(name)))
     return tracks
-
-
-def resample(points: np.ndarray, spacing: float) -> np.ndarray:
-    """Return points ``(N, 2)`` along a closed line ``(M, 2)``, at most ``spacing`` apart.
-
-    >>> square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    >>> resample(square, 0.5).tolist()[:3]
-    [[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]]
-    """
-    closed = np.concatenate([points, points[:1]])
-    station = np.concatenate([[0.0], np.hypot(*np.diff(closed, axis=0).T).cumsum()])
-    count = max(2, int(np.ceil(station[-1] / spacing)))
-    wanted = np.arange(count) * (station[-1] / count)
-    return np.stack([np.interp(wanted, station, closed[:, k]) for k in range(2)], -1)
 
 
 def draw_road(axes: Axes, track: DrawableTrack) -> None:
     """Draw the road as a ribbon, with its waypoints.
 
-    The ribbon is a row of discs: its width is in metres whatever the size of the axes, and
+    The ribbon is a row of discs: it is as wide as the track says whatever the size of the axes, and
     sharp corners come out right.
     """
-    middle = resample(np.asarray(track.centerline, dtype=float), track.width / FINENESS)
+    middle = np.asarray(track.centerline, dtype=float)
     size = np.full(len(middle), float(track.width))
     discs = EllipseCollection(
         size, size, np.zeros(len(middle)), units="xy", offsets=middle, facecolors=ROAD, linewidths=0
@@ -87,28 +78,39 @@ def draw_road(axes: Axes, track: DrawableTrack) -> None:
     discs.set(offset_transform=axes.transData, gid="road", zorder=0.5)
     axes.add_collection(discs)
     x, y = np.asarray(track.waypoints, dtype=float).T
-    axes.plot(x, y, ".", color=WAYPOINT, markersize=3.5, zorder=1, gid="waypoints")
+    axes.plot(x, y, ".", color="#9a9a9a", markersize=3.5, zorder=1, gid="waypoints")
 
 
-def view(track: DrawableTrack | None, paths: Sequence[np.ndarray]) -> Box:
+def view(
+    track: DrawableTrack | None,
+    paths: Sequence[np.ndarray],
+    margin: float = 0.04,
+    stray: float = 0.15,
+) -> Box:
     """Return the area to show of a track and paths ``(N, 2)``.
 
     Paths that leave the road are followed a little way only: a robot that has gone astray
     must not shrink the road to a dot.
+
+    Args:
+        track: the road.
+        paths: where robots went (m).
+        margin: shown around all, as a part of the longer side.
+        stray: shown of those who leave the road, as a part of the road's sides.
     """
     points = np.concatenate([path[np.isfinite(path).all(-1)] for path in paths])
     if track is None:
         edge, stray = points, 0.0
     else:
         line, half = np.asarray(track.centerline, dtype=float), track.width / 2
-        edge, stray = np.concatenate([line - half, line + half]), STRAY
+        edge = np.concatenate([line - half, line + half])
     low, high = (edge.min(0), edge.max(0)) if len(edge) else (np.zeros(2), np.ones(2))
     span = np.maximum(high - low, 1e-3)
     if len(points):
         low = np.minimum(low, np.maximum(points.min(0), low - stray * span))
         high = np.maximum(high, np.minimum(points.max(0), high + stray * span))
-    margin = MARGIN * span.max()
-    (left, bottom), (right, top) = (low - margin).tolist(), (high + margin).tolist()
+    around = margin * span.max()
+    (left, bottom), (right, top) = (low - around).tolist(), (high + around).tolist()
     return Box(left, right, bottom, top)
 
 

@@ -14,22 +14,15 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from afm_rl.report import style
-from afm_rl.report.frames import first_missions, left_out, outcome, steps_of
-from afm_rl.report.track_plot import MARGIN, Box, DrawableTrack, distance_to, draw_road, view
+from afm_rl.report.cells import outcome, steps_of
+from afm_rl.report.track_plot import Box, DrawableTrack, distance_to, draw_road, view
 from afm_rl.storage.measures import Measures
 
-PANELS = 12
-WIDE, TALL, NARROW = 9.9, 3.4, 1.9  # inches: all maps side by side; one map: at most, at least
-TITLES, ENDS, SIDE = 0.5, 0.95, 0.5  # inches: titles of a row; legend and footnote; labels
-
-NOMINAL: dict[str, Any] = {"color": style.NOMINAL, "linewidth": 1.1}
-CHANGED: dict[str, Any] = {"color": style.REGIME, "linewidth": 1.6}
-BAND: dict[str, Any] = {"color": style.BAND, "linewidth": 8.0, "alpha": 0.35}
-POINT: dict[str, Any] = {"linestyle": "", "markeredgewidth": 1.0}
-START = POINT | {"marker": "o", "color": "white", "markeredgecolor": "black", "markersize": 6}
-FINISHED = POINT | {"marker": "o", "color": "#009e73", "markeredgecolor": "white", "markersize": 10}
-TICK = POINT | {"marker": r"$\checkmark$", "color": "white", "markeredgewidth": 0, "markersize": 5}
-GIVEN_UP = POINT | {"marker": "X", "color": "black", "markeredgecolor": "white", "markersize": 9}
+CAPTION = (
+    "One seed: the line that each robot drove, methods side by side, cells below each other, and "
+    "its measures. The stretch under the changed regime is broad. A robot that leaves the road is "
+    "followed a little way only."
+)
 
 
 def draw_trajectories(
@@ -37,10 +30,11 @@ def draw_trajectories(
     steps: pd.DataFrame,
     measures: Measures,
     tracks: Sequence[DrawableTrack] = (),
+    panels: int = 24,
 ) -> Figure:
     """Return a figure of driven lines, methods side by side, cells below each other.
 
-    Only the first seed is drawn, and at most 12 panels of 6 methods; the footnote says how much is
+    Only the first seed is drawn, and 6 methods at most; the footnote says how much is
     left out. The stretch under the changed regime has another colour and a broad band under it.
 
     Args:
@@ -48,29 +42,34 @@ def draw_trajectories(
         steps: one row per mission and step, with ``x`` and ``y`` (m).
         measures: those whose values stand above each map, the headlines.
         tracks: the tracks that the missions name; one that is not here is not drawn.
+        panels: maps at most.
     """
-    first = first_missions(missions)
-    methods = list(first["method"].unique())[: style.FEW]
-    cells = list(first["cell"].unique())[: PANELS // len(methods)]
-    shown = first[first["method"].isin(methods) & first["cell"].isin(cells)]
+    count = min(missions["method"].nunique(), style.FEW)
+    shown, styles, left_out = style.excerpt(missions, panels // count)
     paths, known = steps_of(steps, shown["mission"]), {track.name: track for track in tracks}
     views = {
         cell: view(known.get(rows["track"].iloc[0]), [positions(paths[m]) for m in rows.mission])
-        for cell, rows in shown.groupby("cell")
+        for cell, rows in shown.groupby("cell", sort=False)
     }
-    figure, panels = _maps(methods, cells, views)
+    figure, maps = _maps(list(styles), views)
     for mission in shown.to_dict("records"):
-        axes = panels[mission["cell"], mission["method"]]
-        track = known.get(mission["track"])
+        axes, track = maps[mission["cell"], mission["method"]], known.get(mission["track"])
         if track is not None:
             draw_road(axes, track)
         ended = outcome(mission)
         finished = bool(mission[ended]) == (ended == "finished")
         draw_path(axes, paths[mission["mission"]], finished, track)
         _title(axes, mission, measures)
-    title = style.literal(cells[0]) if len(cells) == 1 else None
-    style.legend_above(figure, *_legend(), title)
-    style.footnote(figure, left_out(missions, shown))
+    looks = {
+        "nominal": [style.BEFORE],
+        "changed regime": [style.BROAD, style.CHANGED],
+        "start": [style.START],
+        "finished": [style.FINISHED, style.TICK],
+        "not finished": [style.GIVEN_UP],
+    }
+    handles = [tuple(Line2D([], [], **look) for look in each) for each in looks.values()]
+    style.legend_above(figure, handles, list(looks), next(iter(views)) if len(views) == 1 else None)
+    style.footnote(figure, left_out)
     return figure
 
 
@@ -105,27 +104,29 @@ def draw_path(
     path = positions(steps)
     changed = changed_stretch(steps["regime_active"].to_numpy())
     x, y = np.where(changed[:, None], path, np.nan).T
-    axes.plot(x, y, **BAND, solid_capstyle="round", zorder=1.5, gid="band")
-    axes.plot(*path.T, **NOMINAL, zorder=2, gid="nominal")
-    axes.plot(x, y, **CHANGED, zorder=2.5, gid="changed")
+    axes.plot(x, y, **style.BROAD, solid_capstyle="round", zorder=1.5, gid="band")
+    axes.plot(*path.T, **style.BEFORE, zorder=2, gid="nominal")
+    axes.plot(x, y, **style.CHANGED, zorder=2.5, gid="changed")
     whole = path[np.isfinite(path).all(-1)]
     if not len(whole):
         return
-    axes.plot(*whole[:1].T, **START, zorder=4, gid="start")
-    end = _last_inside(axes, whole)
-    axes.plot(*end, **(FINISHED if finished else GIVEN_UP), zorder=4)
-    axes.lines[-1].set_gid("finished" if finished else "given up")
+    axes.plot(*whole[:1].T, **style.START, zorder=4, gid="start")
+    end, look = _last_inside(axes, whole), style.FINISHED if finished else style.GIVEN_UP
+    axes.plot(*end, **look, zorder=4, gid="finished" if finished else "given up")
     if finished:
-        axes.plot(*end, **TICK, zorder=5)
+        axes.plot(*end, **style.TICK, zorder=5)
     elif track is not None and (end != whole[-1]).any():
         _write_distance(axes, end, distance_to(track, whole[-1]))
 
 
-def _last_inside(axes: Axes, path: np.ndarray) -> np.ndarray:
-    """Return the last point of a path ``(T, 2)`` that is well inside the view."""
+def _last_inside(axes: Axes, path: np.ndarray, inset: float = 0.02) -> np.ndarray:
+    """Return the last point of a path ``(T, 2)`` that is well inside the view.
+
+    ``inset`` is half of what a view shows around all: no end that it was made for is farther out.
+    """
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
-    inset = MARGIN / 2 * (high - low).max()  # no end that the view was made for is farther out
-    inside = ((path > low + inset) & (path < high - inset)).all(-1)
+    edge = inset * (high - low).max()
+    inside = ((path > low + edge) & (path < high - edge)).all(-1)
     return path[inside][-1] if inside.any() else (low + high) / 2
 
 
@@ -147,43 +148,32 @@ def _write_distance(axes: Axes, end: np.ndarray, distance: float) -> None:
     )
 
 
-def _legend() -> tuple[list[Any], list[str]]:
-    """Return what the lines and markers of a path mean."""
-    looks = ((NOMINAL,), (BAND, CHANGED), (START,), (FINISHED, TICK), (GIVEN_UP,))
-    handles = [tuple(Line2D([], [], **look) for look in each) for each in looks]
-    return handles, ["nominal", "changed regime", "start", "finished", "not finished"]
-
-
 def _maps(
-    methods: Sequence[str], cells: Sequence[str], views: Mapping[str, Box]
+    methods: Sequence[str], views: Mapping[str, Box]
 ) -> tuple[Figure, dict[tuple[str, str], Axes]]:
-    """Return a figure with axes by cell and method; those of a row show the same area."""
-    width = max(NARROW, min(WIDE / len(methods), 1.5 * TALL))
-    ratios = [
-        (views[cell].top - views[cell].bottom) / (views[cell].right - views[cell].left)
-        for cell in cells
-    ]
-    tall = [min(width * ratio, TALL) for ratio in ratios]
-    height = sum(tall) + TITLES * len(cells) + ENDS
-    figure = style.new_figure(max(width * len(methods) + SIDE, 5.0), height)
-    grid = figure.add_gridspec(len(cells), len(methods), height_ratios=tall)
-    panels = {}
-    for row, cell in enumerate(cells):
-        box, last = views[cell], row == len(cells) - 1
+    """Return a figure with axes by cell and method; those of a row show the same area.
+
+    All maps side by side are 9.9 inches wide; one is 1.9 wide at least and 3.4 tall at most.
+    """
+    most = 3.4
+    width = max(1.9, min(9.9 / len(methods), 1.5 * most))
+    tall = [min(width * box.ratio, most) for box in views.values()]
+    height = sum(tall) + 0.5 * len(views) + 0.95  # titles of the rows; legend and footnote
+    figure = style.new_figure(max(width * len(methods) + 0.5, 5.0), height)
+    grid = figure.add_gridspec(len(views), len(methods), height_ratios=tall)
+    maps = {}
+    for row, (cell, box) in enumerate(views.items()):
+        head = cell.replace(", ", "\n") + "\n" if len(views) > 1 else ""
         for column, method in enumerate(methods):
             axes = figure.add_subplot(grid[row, column], aspect="equal")
-            axes.set(xlim=(box.left, box.right), ylim=(box.bottom, box.top))
-            style.dress(axes)
+            axes.set(xlim=box[:2], ylim=box[2:])
+            below = "x (m)" if row == len(views) - 1 else ""
+            style.dress(axes, below, "" if column else f"{head}y (m)")
             axes.xaxis.set_major_locator(MaxNLocator(4))
             axes.yaxis.set_major_locator(MaxNLocator(4))
             axes.tick_params(labelleft=column == 0)
-            if last:
-                axes.set_xlabel("x (m)", fontsize=style.SMALL)
-            if column == 0:
-                head = style.literal(cell).replace(", ", "\n") + "\n" if len(cells) > 1 else ""
-                axes.set_ylabel(f"{head}y (m)", fontsize=style.SMALL)
-            panels[cell, method] = axes
-    return figure, panels
+            maps[cell, method] = axes
+    return figure, maps
 
 
 def _title(axes: Axes, mission: Mapping[str, Any], measures: Measures) -> None:

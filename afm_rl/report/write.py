@@ -1,8 +1,7 @@
-"""Everything that several folders of results say, as tables, figures and one page."""
+"""Results as files: figures and curves of a run; tables, figures and one page of many."""
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -11,25 +10,21 @@ from typing import Any
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
 
-from afm_rl.errors import ArtefactError
-from afm_rl.report import style
-from afm_rl.report.collect import Collection, collect
-from afm_rl.report.comparisons import (
-    aggregate,
+from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.report.events import folder_names, write_events
+from afm_rl.report.figures import draw_report, draw_run, read_excerpts
+from afm_rl.report.means import aggregate, budget_notes, compare, count_budgets
+from afm_rl.report.recovery import recovery_table
+from afm_rl.report.runs import Runs
+from afm_rl.report.stranger import LONGEST, read_text
+from afm_rl.report.tables import (
     cell_table,
-    compare,
     comparison_tables,
-    rank_missions,
+    missing_lines,
+    missing_table,
     summary_table,
 )
-from afm_rl.report.events import folder_names
-from afm_rl.report.figures import draw_all, excerpts, telling_cells
-from afm_rl.report.missing_runs import find_missing, missing_lines, missing_table
-from afm_rl.report.recovery import recovery_table
-from afm_rl.report.results_files import LONGEST, read_text
-from afm_rl.report.summary import budget_notes, count_budgets
-from afm_rl.report.table import Table
-from afm_rl.report.track_plot import LoadTrack, load_tracks
+from afm_rl.report.track_plot import DrawableTrack
 from afm_rl.storage.csv_text import csv_text
 from afm_rl.storage.files import write_whole
 from afm_rl.storage.measures import Measures
@@ -42,20 +37,72 @@ REFERENCES = (
     "E. D. Dolan, J. J. Moré: Benchmarking optimization software with performance profiles. "
     "Mathematical Programming 91, 2002.",
 )
-BASELINES = ("online_pe", "adaptive_affine")
+
+
+def write_run(
+    folder: str | Path,
+    missions: pd.DataFrame,
+    steps: pd.DataFrame,
+    measures: Measures,
+    tracks: Sequence[DrawableTrack] = (),
+    *,
+    figures: bool = True,
+    tensorboard: bool = True,
+    echo: Callable[[str], object] = print,
+) -> list[Path]:
+    """Write figures and TensorBoard events of one method or several.
+
+    Files: ``figures/trajectory.png`` (if the steps have ``x`` and ``y``) or, of robots in space,
+    ``figures/space.png``, ``figures/learning.png``, ``figures/summary.png`` (if a method has more
+    than one mission), and event files under ``tensorboard/``. Each is written whole or not at
+    all; files of the same name are replaced, others left alone.
+
+    Args:
+        folder: where to; made if it is not there.
+        missions: one row per mission.
+        steps: one row per mission and step.
+        measures: what methods are compared by.
+        tracks: tracks to draw, found by name.
+        figures: draw figures.
+        tensorboard: write events.
+        echo: receives one line per thing written.
+
+    Returns:
+        The files written.
+
+    Raises:
+        ConfigurationError: if the tables do not fit each other, or the folder cannot be written.
+    """
+    folder, number = Path(folder), missions["mission"]
+    if number.empty or not number.is_unique or not number.isin(steps["mission"]).all():
+        raise ConfigurationError(
+            f"missions: mission={number.tolist()[:20]}: expected at least one mission, each with a "
+            "number of its own and with steps; number the missions of all methods through before "
+            "joining their tables"
+        )
+    written = []
+    if tensorboard:
+        written += write_events(folder / "tensorboard", missions, steps, measures)
+        echo(f"wrote {folder / 'tensorboard'} (tensorboard --logdir {folder / 'tensorboard'})")
+    for picture in draw_run(missions, steps, measures, tracks) if figures else ():
+        written.append(folder / "figures" / f"{picture.name}.png")
+        write_whole(written[-1], picture.png)
+        echo(f"wrote {written[-1]}")
+    return written
 
 
 def write_report(
-    folders: Sequence[str | Path],
+    runs: Runs,
     out: str | Path,
+    tracks: Sequence[DrawableTrack] = (),
     *,
     baselines: Sequence[str] | None = None,
+    usual: Sequence[str] = ("online_pe", "adaptive_affine"),
     oracle: str = "oracle",
     figures: bool = True,
-    load_track: LoadTrack | None = None,
     echo: Callable[[str], object] = print,
 ) -> Path:
-    """Join the results of runs and studies; write tables, figures and ``index.html``.
+    """Write tables, figures and ``index.html`` of the results of runs and studies.
 
     Files in ``out``: ``index.html``, which holds everything; ``tables/NAME.csv`` and
     ``tables/NAME.tex`` (for LaTeX with ``booktabs``); ``figures/NAME.png``; ``missing.csv``.
@@ -63,50 +110,51 @@ def write_report(
     incomplete: the report names what is missing.
 
     Args:
-        folders: of runs, comparisons, sweeps or studies; of a mission that stands in several, the
-            last one counts.
+        runs: from :func:`~.runs.read_runs`.
         out: where to; made if it is not there.
-        baselines: methods that the others are compared with. None: those of
-            :data:`BASELINES` that there are, or else the first method.
+        tracks: tracks to draw, found by name; a map whose track is not here has no road.
+        baselines: methods that the others are compared with. None: those of ``usual`` that there
+            are, or else the first method.
+        usual: see ``baselines``.
         oracle: the method that knows the regime.
         figures: draw figures.
-        load_track: returns a track by name, to draw roads; may raise a ConfigurationError.
         echo: receives one line per thing to know.
 
     Returns:
         The path of ``index.html``.
 
     Raises:
-        ConfigurationError: if a folder or a file in it cannot be used, or ``out`` cannot be
-            written.
+        ConfigurationError: if a file cannot be used, or ``out`` cannot be written.
         ArtefactError: if a file is damaged.
     """
-    collection, out = collect(folders), Path(out)
-    measures = collection.measures
-    missions = count_budgets(collection.missions, measures)
-    notes = [*collection.notes, *budget_notes(collection.missions, measures)]
-    notes += [f"{folder}: {sentence}" for folder in folders for sentence in _diagnosed(folder)]
+    out, measures = Path(out), runs.measures
+    missions, missing = count_budgets(runs.missions, measures), runs.missing
+    cells = missions["cell"].nunique()
+    notes = [*runs.lost, *runs.notes, *budget_notes(runs.missions, measures)]
+    notes += [f"{folder}: {sentence}" for folder in runs.folders for sentence in _found(folder)]
     if baselines is None:
-        baselines = [name for name in BASELINES if name in collection.methods]
-        baselines = baselines or collection.methods[:1]
+        baselines = [name for name in usual if name in runs.methods] or runs.methods[:1]
     notes += [
         f"There are no missions of {name}: comparisons with it are left out."
         for name in baselines
-        if name not in collection.methods
+        if name not in runs.methods
     ]
-    missing = find_missing(missions, collection.plan)
-    cells = pd.concat([missions["cell"], collection.plan["cell"]]).nunique()
     summary = (
-        f"{len(missions)} missions of {len(collection.methods)} methods in "
-        f"{missions['cell'].nunique()} cells, from {', '.join(map(str, folders))}; "
-        f"{len(missing)} missions are missing."
+        f"{len(missions)} missions of {len(runs.methods)} methods in {cells} cells, from "
+        f"{', '.join(map(str, runs.folders))}; {len(missing)} missions are missing."
     )
     lost = [missing_table(missing, cells)] if len(missing) else []
     for line in (summary, *notes, *(line for table in lost for line in missing_lines(table))):
         echo(line)
 
-    found = excerpts(collection, telling_cells(missions, measures) if figures else [])
-    tables = [*_tables(missions, collection, found.recovery, baselines, oracle), *lost]
+    recovery, progress = read_excerpts(runs)
+    tables = [
+        summary_table(aggregate(missions, measures, oracle), measures, oracle),
+        *comparison_tables(compare(missions, measures, baselines), measures),
+        *([recovery_table(recovery)] if len(recovery) else []),
+        cell_table(missions, measures),
+        *lost,
+    ]
     for table in tables:
         (name,) = folder_names([table.name])
         write_whole(out / "tables" / f"{name}.csv", table.to_csv().encode())
@@ -115,14 +163,12 @@ def write_report(
     echo(f"wrote {len(tables)} tables: {out / 'tables'}")
     pictures = []
     if figures:
-        tracks = load_tracks(missions["track"].unique(), load_track)
-        for name, title, caption, figure in draw_all(missions, collection, found, tracks):
-            png = style.png_bytes(figure)
-            write_whole(out / "figures" / f"{folder_names([name])[0]}.png", png)
-            data = base64.b64encode(png).decode()
-            pictures.append({"name": name, "title": title, "caption": caption, "data": data})
+        for picture in draw_report(runs, missions, progress, tracks):
+            pictures.append(picture)
+            path = out / "figures" / f"{folder_names([picture.name])[0]}.png"
+            write_whole(path, picture.png)
         echo(f"wrote {len(pictures)} figures: {out / 'figures'}")
-    title = f"Results: {len(collection.methods)} methods, {missions['cell'].nunique()} cells"
+    title = f"Results: {len(runs.methods)} methods, {cells} cells"
     content = {"title": title, "summary": summary, "notes": notes, "tables": tables}
     page = render_page(**content, figures=pictures, references=REFERENCES)
     write_whole(out / "index.html", page.encode())
@@ -130,37 +176,21 @@ def write_report(
     return out / "index.html"
 
 
-def _diagnosed(folder: str | Path) -> list[str]:
-    """Return what a run found of its robot's actuators, one sentence each."""
-    path = Path(folder) / "diagnosis" / "diagnosis.json"
-    if not path.is_file():
-        return []
+def _found(folder: Path) -> Iterator[str]:
+    """Yield what a run found of its robot's actuators, one sentence each."""
+    path = folder / "diagnosis" / "diagnosis.json"
     try:
-        found = json.loads(read_text(path))["actuators"]
-        return [str(actuator["sentence"])[:LONGEST] for actuator in found]
+        for actuator in json.loads(read_text(path))["actuators"] if path.is_file() else ():
+            yield str(actuator["sentence"])[:LONGEST]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ArtefactError(f"{path}: damaged; delete it") from error
 
 
 def render_page(**content: Any) -> str:
-    """Return the page of a report: title, summary, notes, figures, tables and references."""
+    """Return a page that needs no other file: title, summary, notes, figures, tables, references.
+
+    Figures have the attributes or entries ``name``, ``title``, ``caption`` and ``data``, the PNG
+    file in base 64.
+    """
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(**content)
-
-
-def _tables(
-    missions: pd.DataFrame,
-    collection: Collection,
-    recovery: Sequence[pd.DataFrame],
-    baselines: Sequence[str],
-    oracle: str,
-) -> Iterator[Table]:
-    """Yield the tables in the order of the page."""
-    measures: Measures = collection.measures
-    means = aggregate(missions, measures, collection.compute, oracle)
-    yield summary_table(means, measures, oracle)
-    ranked = rank_missions(missions, measures)
-    yield from comparison_tables(compare(ranked, measures, baselines), measures)
-    if sum(map(len, recovery)):
-        yield recovery_table(pd.concat(recovery))
-    yield cell_table(missions, measures)

@@ -51,8 +51,8 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return tensors, json.loads(text)
 
 
-def load_artefact(path: Path, module: nn.Module, description: Mapping[str, Any]) -> None:
-    """Load a module's state, if it is whole and fits.
+def load_artefact(path: Path, module: nn.Module, description: Mapping[str, Any]) -> dict[str, Any]:
+    """Load a module's state, if it is whole and fits; return the file's description.
 
     Args:
         path: file written by :func:`save_artefact`.
@@ -78,6 +78,7 @@ def load_artefact(path: Path, module: nn.Module, description: Mapping[str, Any])
             f"{found.get(apart[0])}, expected {needed.get(apart[0])}"
         )
     module.load_state_dict(tensors)
+    return stored
 
 
 def cached(
@@ -103,9 +104,7 @@ def cached(
     path = Path(folder) / f"{description['name']}-{digest}.safetensors"
     with locked(path.parent, f".{path.name}.lock", wait=True):  # the second one need not train
         if path.exists():
-            load_artefact(path, module, description)
-            with safe_open(path, framework="pt") as file:
-                return json.loads(file.metadata()["description"])["held_out_error"], True
+            return load_artefact(path, module, description)["held_out_error"], True
         remove_parts(path.parent, path.name)
         error = train()
         save_artefact(path, module, {**description, "held_out_error": error})

@@ -17,6 +17,7 @@ from afm_rl.errors import ArtefactError
 from afm_rl.storage.files import write_whole
 
 MANIFEST = "manifest.json"
+_REMEDY = "restore it, or delete the folder and run the same command again"
 
 
 def write_manifest(folder: str | Path, names: Iterable[str | Path] | None = None) -> None:
@@ -40,7 +41,8 @@ def write_manifest(folder: str | Path, names: Iterable[str | Path] | None = None
     folder = Path(folder)
     roots = [folder] if names is None else [folder / name for name in names]
     files = {path.relative_to(folder).as_posix() for root in roots for path in _files(root)}
-    sums = {name: _sum(folder / name) for name in sorted(files - {MANIFEST})}
+    names = sorted(files - {MANIFEST})
+    sums = {name: hashlib.sha256(_bytes(folder / name)).hexdigest() for name in names}
     write_whole(folder / MANIFEST, _text({"version": __version__, "files": sums}).encode())
 
 
@@ -61,29 +63,50 @@ def check_manifest(folder: str | Path) -> dict[str, str]:
         ArtefactError: if there is no manifest, or the manifest or a file that it names is damaged
             or missing; the message names the file.
     """
-    folder = Path(folder)
     files = read_manifest(folder)["files"]
     for name, expected in files.items():
-        path = folder / name
-        if not path.is_file():
-            raise ArtefactError(f"{path}: missing, although {MANIFEST} names it; {_REMEDY}")
-        if _sum(path) != expected:
-            raise ArtefactError(
-                f"{path}: damaged: its SHA-256 is not the one in {MANIFEST}; {_REMEDY}"
-            )
+        _verified(Path(folder) / name, expected)
     return files
 
 
-_REMEDY = "restore it, or delete the folder and run the same command again"
+def read_verified(folder: str | Path, name: str) -> bytes:
+    r"""Return the content of one file, if the manifest of its folder has its SHA-256.
+
+    Args:
+        folder: the one with the manifest.
+        name: of the file, relative to ``folder``.
+
+    Raises:
+        ArtefactError: if there is no manifest, the manifest or the file is damaged, or the
+            manifest does not name the file.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = Path(folder, "missions.csv").write_text("mission,steps\n")
+    ...     write_manifest(folder)
+    ...     read_verified(folder, "missions.csv")
+    b'mission,steps\n'
+    """
+    path, expected = Path(folder) / name, read_manifest(folder)["files"].get(name)
+    if expected is None:
+        raise ArtefactError(f"{path}: {MANIFEST} does not name it; {_REMEDY}")
+    return _verified(path, expected)
 
 
-def read_manifest(folder: str | Path, name: str = MANIFEST) -> dict[str, Any]:
+def _verified(path: Path, expected: str) -> bytes:
+    data = _bytes(path)
+    if hashlib.sha256(data).hexdigest() != expected:
+        raise ArtefactError(f"{path}: damaged: its SHA-256 is not the one in {MANIFEST}; {_REMEDY}")
+    return data
+
+
+def read_manifest(folder: str | Path) -> dict[str, Any]:
     """Return ``version`` and ``files`` of a manifest, without looking at the files.
 
     Raises:
         ArtefactError: if there is none, or it is damaged.
     """
-    path = Path(folder) / name
+    path = Path(folder) / MANIFEST
     try:
         text = path.read_bytes().decode()
     except FileNotFoundError:
@@ -117,12 +140,11 @@ def _inside(name: str) -> bool:
     return not path.is_absolute() and ".." not in path.parts
 
 
-def _sum(path: Path) -> str:
+def _bytes(path: Path) -> bytes:
     try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return path.read_bytes()
     except OSError as error:
-        raise ArtefactError(f"{path}: cannot be read: {error.strerror}") from error
+        raise ArtefactError(f"{path}: cannot be read: {error.strerror}; {_REMEDY}") from error
 
 
 def _text(content: Mapping[str, Any]) -> str:

@@ -232,7 +232,11 @@ class CorrectionLoop:
         pairs = self.corrector.unpack(memory, self.states.shape[-1])["pairs"][:, : 3 * size + 1]
         executed, effective, std, valid = (x.numpy() for x in pairs.split([size, size, size, 1], 1))
         use, step = valid[:, 0] > 0, getattr(self.model, "dt", 1.0)
-        return str(explain(executed[use], effective[use], self.names, std[use], step))
+        found = str(explain(executed[use], effective[use], self.names, std[use], step))
+        late = int(self.corrector.under_way(memory)[2])
+        if late and self.late == "predict" and self.enabled:
+            found += f"\nlateness: {late} step{'s' * (late > 1)}, made up for"
+        return found
 
     def _tell(self) -> dict[str, np.ndarray]:
         """Return what is known of the newest step, ``(N, ...)`` each."""

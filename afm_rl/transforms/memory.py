@@ -49,8 +49,8 @@ def corrector_for(
         corrector = ActionFlow(low, high, delay=delay or 0)
     elif delay is not None:
         raise ConfigurationError(
-            f"{owner}.delay={delay!r}: a corrector was given too; say it there, by "
-            f"{type(corrector).__name__}(..., delay={delay!r})"
+            f"{owner}.delay={delay!r}: a corrector was given too; say it there, as in "
+            f"ActionFlow(low, high, delay={delay!r})"
         )
     check_instance(f"{owner}.corrector", corrector, Corrector)
     if corrector.action_size != model.action_size:

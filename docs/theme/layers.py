@@ -15,10 +15,9 @@ ROOT = Path(__file__).resolve().parents[2]
 FLOORS = [
     {"cli": 2},
     {"jobs": 2},
-    {"missions": 2, "report": 4},
+    {"play": 0, "missions": 2, "report": 4},
     {"envs": 0, "transforms": 2, "replay": 4},
     {"correction": 2, "planning": 3},
-    {"flow": 2},
     {"learning": 2},
     {"dynamics": 2},
     {"regimes": 2, "diagnosis": 4},

@@ -16,7 +16,6 @@ from afm_rl.errors import check_count
 
 ROAD, LINE, ROBOT, GOAL, TRAIL = "#dddddd", "#999999", "#0072b2", "#d55e00", "#56b4e9"
 DPI = 64  # a power of two, so that sizes in inches are exact
-MARGIN = 2.0  # m between the course and the edge of the picture
 OUTLINE = torch.tensor([[0.6, 0.0], [-0.4, 0.35], [-0.2, 0.0], [-0.4, -0.35]])  # robot (m)
 
 
@@ -40,6 +39,7 @@ class TrackCanvas:
         track: what to draw.
         pixels: length of the longer side. Either side becomes a multiple of 16, the block of
             video encoders.
+        margin: between the course and the edge of the picture (m).
 
     >>> from afm_rl.envs.courses.tracks import load_track
     >>> frame = TrackCanvas(load_track("ethz_2"), pixels=128).draw(torch.zeros(3), torch.ones(2))
@@ -47,10 +47,10 @@ class TrackCanvas:
     (dtype('uint8'), 3, 128)
     """
 
-    def __init__(self, track: Track, pixels: int = 480) -> None:
+    def __init__(self, track: Track, pixels: int = 480, margin: float = 2.0) -> None:
         self.pixels = check_count("pixels", pixels, low=16)
         points = torch.cat([track.centerline, track.waypoints])
-        edge = MARGIN + track.width / 2
+        edge = margin + track.width / 2
         low, high = points.amin(0) - edge, points.amax(0) + edge
         metre = self.pixels / float((high - low).max())  # in pixels
         size = 16 * torch.ceil((high - low) * metre / 16)

@@ -16,8 +16,6 @@ from afm_rl.errors import ConfigurationError
 MAPS = Path(__file__).with_name("maps")
 # The ETHZ 1:43 race tracks (Liniger et al. 2015), six times as large: start x, y and width (m).
 CATALOGUE = {"ethz_1": ((-5.07, 6.59), 2.2), "ethz_2": ((7.2, 5.4), 2.8)}
-SPACING = 3.5  # m between the waypoints of a user's polygon
-DRAWN = 0.05  # m between the points of a centre line
 
 
 def load_track(source: str | Path) -> Track:
@@ -62,7 +60,7 @@ def _from_catalogue(name: str) -> Track:
     return replace(_along(name, pieces, first + stations[:, 0]), width=width)
 
 
-def _from_corners(name: str, corners: Tensor) -> Track:
+def _from_corners(name: str, corners: Tensor, spacing: float = 3.5) -> Track:
     check_closed(corners[:, :2], name, "vertex")
     if (corners[:, 2] < 0).any():
         low = float(corners[:, 2].min())
@@ -70,7 +68,7 @@ def _from_corners(name: str, corners: Tensor) -> Track:
     origin = local_origin(corners[:, :2])  # first, so that nothing is rounded far from zero
     pieces = round_corners(corners[:, :2] - origin, corners[:, 2], name)
     length = float(pieces.length.sum())
-    count = max(2, round(length / SPACING))
+    count = max(2, round(length / spacing))
     stations = torch.arange(count, dtype=corners.dtype) * (length / count)
     return replace(_along(name, pieces, stations), origin=origin)
 
@@ -84,9 +82,9 @@ def _from_points(name: str, points: Tensor) -> Track:
     return replace(_along(name, pieces, corners), waypoints=points, origin=origin)
 
 
-def _along(name: str, pieces: Pieces, stations: Tensor) -> Track:
-    """Put waypoints at ``stations`` and start at the first of them."""
+def _along(name: str, pieces: Pieces, stations: Tensor, drawn: float = 0.05) -> Track:
+    """Put waypoints at ``stations``, and points of the centre line every ``drawn`` m."""
     poses = poses_at(pieces, stations)
-    dense = torch.arange(0.0, float(pieces.length.sum()), DRAWN, dtype=stations.dtype)
+    dense = torch.arange(0.0, float(pieces.length.sum()), drawn, dtype=stations.dtype)
     line = poses_at(pieces, dense)[:, :2].contiguous()
     return Track(name, poses[:, :2].contiguous(), poses[0], line)

@@ -11,7 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from afm_rl.dynamics.quadrotor import check_body
-from afm_rl.envs.courses.references import Reference, check_reference, find_reference
+from afm_rl.envs.courses.flights import find_reference
+from afm_rl.envs.courses.reference import Reference, check_reference
 from afm_rl.envs.missions.env import MissionEnv
 from afm_rl.envs.missions.noise import flight_noise
 from afm_rl.envs.missions.settings import (

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from afm_rl.envs.courses.references import Reference
+from afm_rl.envs.courses.reference import Reference
 from afm_rl.envs.missions.gym import MissionGym
 from afm_rl.envs.quadrotor.env import CrazyflieTrack
 from afm_rl.errors import ConfigurationError

@@ -7,19 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import roma
 import torch
 from torch import Tensor
 
 from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.envs.task.sources import EXACT, Limits
+from afm_rl.envs.task.simulated import EXACT, Limits
 from afm_rl.envs.task.task import Reward, Task, trust
 from afm_rl.errors import check_count
-from afm_rl.spaces.rotations import quaternion_exp, quaternion_multiply, rotate
 
 MODEL = Path(__file__).with_name("arm.xml")
 JOINTS = 7
 SKIP = 5  # simulation steps per action: 50 ms
-SPREAD = 0.5  # rad, of goals around the middle pose
 
 
 def chain(model: Any, site: str) -> tuple[Tensor, Tensor]:
@@ -38,11 +37,11 @@ def tip_of(angles: Tensor, offsets: Tensor, axes: Tensor) -> Tensor:
     >>> tip_of(torch.tensor([torch.pi / 2]), offsets, axes).round(decimals=4)
     tensor([0., 1., 1.])
     """
-    turned = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(angles)
+    turned = torch.eye(3).to(angles)
     place = offsets[0].to(angles)
     for axis, offset, angle in zip(axes, offsets[1:], angles.unbind(-1), strict=True):
-        turned = quaternion_multiply(turned, quaternion_exp(axis.to(angles) * angle.unsqueeze(-1)))
-        place = place + rotate(turned, offset.to(angles))
+        turned = turned @ roma.rotvec_to_rotmat(axis.to(angles) * angle.unsqueeze(-1))
+        place = place + turned @ offset.to(angles)
     return place
 
 
@@ -68,6 +67,7 @@ def arm_task(
     steps: int = 100,
     action_low: Limits = None,
     action_high: Limits = None,
+    spread: float = 0.5,
 ) -> Task:
     """Return the task: bring the joints to angles that are drawn by seed, and stay there.
 
@@ -79,6 +79,7 @@ def arm_task(
         steps: length of an episode, of 50 ms each.
         action_low: lowest angles; -2 rad if None.
         action_high: highest angles.
+        spread: of goals around the middle pose (rad).
 
     >>> arm_task().start(3)[1].shape
     torch.Size([7])
@@ -92,7 +93,7 @@ def arm_task(
 
     def start(seed: int) -> tuple[Tensor, Tensor]:
         drawn = 2 * torch.rand(JOINTS, generator=torch.Generator().manual_seed(seed)) - 1
-        return first, first[:JOINTS] + SPREAD * drawn
+        return first, first[:JOINTS] + spread * drawn
 
     low = world.action_low.tolist() if action_low is None else action_low
     high = world.action_high.tolist() if action_high is None else action_high

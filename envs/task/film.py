@@ -12,11 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-HEIGHT, WIDTH = 480, 640  # MuJoCo's own buffer
-DPI = 80
+SIZE = 480, 640  # height and width of MuJoCo's own buffer, pixels
 PLANE, CAPSULE, CYLINDER = 0, 3, 5  # MuJoCo's numbers of kinds of geoms
-DOT = 0.05  # half length of a disc, in radii
-AROUND = 1.5  # how much more than the robot a picture shows
 BODY, FIXED = "#0072b2", "#999999"
 
 
@@ -33,7 +30,7 @@ def film(model: Any, states: np.ndarray) -> Iterator[np.ndarray]:
         yield from _bones(model, states)
         return
     data, camera = mujoco.MjData(model), 0 if model.ncam else -1
-    with mujoco.Renderer(model, HEIGHT, WIDTH) as renderer:
+    with mujoco.Renderer(model, *SIZE) as renderer:
         for row in states:
             data.qpos = row[: model.nq]
             mujoco.mj_forward(model, data)
@@ -62,23 +59,23 @@ def _bones(model: Any, states: np.ndarray) -> Iterator[np.ndarray]:
     own = ends[:, moving] if moving.any() else ends
     spread = np.ptp(own.reshape(-1, 3), axis=0)
     across = [0, 2] if spread[2] > spread[1] else [0, 1]
-    size = AROUND * np.ptp(own[..., across], axis=(1, 2)).max() + 4 * float(wide.max()) + 1e-3
+    size = 1.5 * np.ptp(own[..., across], axis=(1, 2)).max() + 4 * float(wide.max()) + 1e-3
     middle = own[..., across].mean((1, 2))
     if np.ptp(middle, axis=0).max() < size:  # it stays: so does the picture
         box = own[..., across].reshape(-1, 2)
         middle = np.repeat((box.min(0) + box.max(0))[None] / 2, len(states), 0)
         size = max(size, 1.2 * np.ptp(box, axis=0).max())
-    figure = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
+    figure = _sheet()
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.1, 0.1, 0.85, 0.85), aspect="equal")
     axes.set(xlabel="xyz"[across[0]] + " (m)", ylabel="xyz"[across[1]] + " (m)")
-    points = 72 * 0.85 * HEIGHT / DPI / size  # of a metre
+    points = 72 * 0.85 * figure.get_figheight() / size  # of a metre
     look = {"capstyle": "round", "linewidths": np.maximum(2 * wide * points, 2.0)}
     colours = [BODY if moves else FIXED for moves in moving]
     lines: Any = axes.add_collection(LineCollection([], colors=colours, **look))
     for now, (x, y) in zip(ends[..., across], middle, strict=True):
         lines.set_segments(list(now))
-        wider = size * WIDTH / HEIGHT / 2
+        wider = size * SIZE[1] / SIZE[0] / 2
         axes.set(xlim=(x - wider, x + wider), ylim=(y - size / 2, y + size / 2))
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -94,7 +91,7 @@ def segments(model: Any, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     data, solid = mujoco.MjData(model), _solid(model)
     long = np.isin(model.geom_type[solid], (CAPSULE, CYLINDER))
-    half = np.where(long, model.geom_size[solid, 1], DOT * model.geom_size[solid, 0])[:, None]
+    half = np.where(long, model.geom_size[solid, 1], 0.05 * model.geom_size[solid, 0])[:, None]
     ends = []
     for row in states:
         data.qpos = row[: model.nq]
@@ -112,7 +109,7 @@ def curves(t: np.ndarray, states: np.ndarray, names: Sequence[str]) -> Iterator[
         states: rows, ``(T, S)``.
         names: of the coordinates.
     """
-    figure = Figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI, layout="constrained")
+    figure = _sheet(layout="constrained")
     canvas = FigureCanvasAgg(figure)
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     lines = []
@@ -126,6 +123,11 @@ def curves(t: np.ndarray, states: np.ndarray, names: Sequence[str]) -> Iterator[
             line.set_data(t[:end], column[:end])
         canvas.draw()
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _sheet(dpi: int = 80, **look: Any) -> Figure:
+    height, width = SIZE
+    return Figure(figsize=(width / dpi, height / dpi), dpi=dpi, **look)
 
 
 def _solid(model: Any) -> np.ndarray:

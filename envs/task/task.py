@@ -19,7 +19,6 @@ Contexts = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
 ENDLESS = 1e30  # what unbounded specs say
 PROBE = 2, 3  # batch in which a reward is tried
 NOWHERE = torch.zeros(0)  # the goal of a task without one
-FINE = 0.1  # error of a model of one's own, at most, in effects that the largest actions have
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,11 +158,11 @@ class Task:
     def _check_finite(self, reward: Tensor, ahead: Tensor) -> None:
         """Refuse a reward that would be the best of all where others are negative."""
         if not bool(reward.isfinite().all()):
-            first = (~reward.isfinite()).flatten().nonzero()[0]
+            first = int((~reward.isfinite()).flatten().nonzero()[0])
+            where = ahead.reshape(-1, ahead.shape[-1])[first].tolist()
             raise NonFiniteError(
                 f"{self.name}: the reward is {reward.flatten()[first].item():g} in the state "
-                f"{ahead.flatten(0, -2)[first].tolist()[0]}; expected finite numbers: mend "
-                "robot.reward, or the environment that gives it"
+                f"{where}; expected a finite number: mend robot.reward, or the environment"
             )
 
     def _models(self, physics: Tensor) -> list[Any]:
@@ -197,7 +196,7 @@ def trust(
     state: Tensor,
     low: Sequence[float],
     high: Sequence[float],
-    share: float = FINE,
+    share: float = 0.1,
 ) -> KnownDynamics:
     """Bound a model's noise by a share of what actions effect in a step.
 

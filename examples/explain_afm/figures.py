@@ -29,9 +29,9 @@ TRAPS = {
     "patches of ground on which driving is reversed": "regimes=[{patch_v_gain: -1}]",
 }
 NAMES = {
-    "identity": "no correction",
+    "nothing has changed": "nothing has changed",
     "recent": "recent",
-    "newest": "newest",
+    "varied": "varied",
     "delay_2": "two steps late",
     "nearest": "nearest in place",
     "here": "the one nearest",
@@ -62,25 +62,22 @@ def draw_progress(axes: Axes, budget: int) -> None:
 
 
 @torch.no_grad()
-def draw_losses(axes: Axes, regimes: str, budget: int) -> None:
-    """Draw the discounted loss of hypotheses, and which one is believed."""
+def draw_belief(axes: Axes, regimes: str, budget: int) -> None:
+    """Draw how probable the models are, for the driving."""
     agent = agent_of("method=afm_physics", regimes, f"budget={budget}")
     start = agent.env.reset(agent.missions, set_state=False)
     rollout = agent.env.rollout(budget, agent.planner, auto_reset=False, tensordict=start)
     flow, entries = agent.transform.corrector, rollout["next", "afm"][0]
-    losses = flow.unpack(entries["memory"], agent.model.state_size)["losses"]
-    believed, active = (losses + flow.tick.penalty).argmin(-1), entries["innovation"] > flow.gate
-    first = int(active.int().argmax()) - 5
+    believed = flow.believed(entries["memory"])[..., 0]
+    first = int(entries["misaligned"].int().argmax()) - 5
     styles = method_styles(NAMES)
-    for k, name in enumerate([*flow.hypotheses, "identity"]):
+    for k, name in enumerate(flow.models):
         if name not in NAMES:
             continue
-        times = first + torch.arange(len(losses[first : first + 80]))
-        shown = losses[first : first + 80, k]
+        shown = believed[first : first + 80, k]
+        times = first + torch.arange(len(shown))
         styles[name].line(axes, times, shown, gid=name, label=NAMES[name], linewidth=1.2)
-        rows = [int(t) for t in times if active[t] and believed[t] == k]
-        axes.plot(rows, [-0.25] * len(rows), "s", ms=3, color=styles[name].color)
-    axes.set(xlabel="step", ylabel="discounted loss $L$", ylim=(-0.5, None))
+    axes.set(xlabel="step", ylabel="probability", ylim=(0, 1))
 
 
 def main() -> None:
@@ -101,7 +98,7 @@ def main() -> None:
     pair = figure.subplots(1, 2)
     for axes, (title, regimes) in zip(pair, TRAPS.items(), strict=True):
         dress(axes)
-        draw_losses(axes, regimes, asked.budget)
+        draw_belief(axes, regimes, asked.budget)
         axes.set_title(title, fontsize=9)
     figure.legend(
         *pair[1].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=7

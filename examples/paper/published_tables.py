@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from afm_rl.report.collect import collect
-from afm_rl.report.frames import cell_names
+from afm_rl.report import read_runs
+from afm_rl.report.cells import cell_names
 from afm_rl.report.table import Table
 from afm_rl.storage.files import write_whole
 
@@ -92,7 +92,7 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, help="where to (FOLDER/report/tables, of the first)")
     options = parser.parse_args()
     out = options.out or options.folders[0] / "report" / "tables"
-    for each in tables(collect(options.folders).missions):
+    for each in tables(read_runs(options.folders).missions):
         write_whole(out / f"{each.name}.csv", each.to_csv().encode())
         write_whole(out / f"{each.name}.tex", each.to_latex().encode())
         print(f"{each.title}. {each.note}\n{each.shown.to_string(index=False)}\n")

@@ -15,19 +15,15 @@ COLUMNS = (  # the last ones, after the parameters
 ).split()
 
 
-def test_the_paper_s_study_is_one_line(process, program, afm_rl, tmp_path, quick):
-    small = [*quick, "budget=20"]
-    done = process(program, *STUDY.split(), f"hydra.run.dir={tmp_path}/one", *small)
+def test_the_paper_s_study_is_one_line(process, program, tmp_path, quick):
+    small = [*quick, "budget=8"]
+    done = process(program, *STUDY.split(), f"hydra.run.dir={tmp_path}/study", *small)
     assert (done.returncode, done.stderr) == (0, "")
-    missions = pd.read_csv(tmp_path / "one" / "missions.csv")
+    missions = pd.read_csv(tmp_path / "study" / "missions.csv")
     assert len(missions) == 110
     assert list(missions)[-len(COLUMNS) :] == COLUMNS
     assert not missions.duplicated(["track", "v_gain", "omega_gain", "seed"]).any()
     assert missions.groupby("track").size().to_dict() == {"ethz_1": 55, "ethz_2": 55}
-    # The same line in another process gives the same numbers, bit for bit.
-    assert afm_rl(*STUDY.split(), f"hydra.run.dir={tmp_path}/other", *small).status == 0
-    steps = [pd.read_parquet(tmp_path / name / "steps.parquet") for name in ("one", "other")]
-    pd.testing.assert_frame_equal(*steps, check_exact=True)
 
 
 def test_help_lists_groups_and_choices_and_needs_no_torch(process):
@@ -40,11 +36,10 @@ def test_help_lists_groups_and_choices_and_needs_no_torch(process):
     assert "afm_physics" in done.stdout and "seeds" in done.stdout
 
 
-def test_a_mistake_is_one_line_and_status_2(process, program):
-    done = process(program, "planner.horizon=-1", "method=physics")
-    assert done.returncode == 2
-    assert done.stderr == "afm-rl: planner.horizon=-1: expected a whole number of at least 1\n"
-    assert done.stdout == ""
+def test_a_mistake_is_one_line_and_status_2(afm_rl):
+    done = afm_rl("planner.horizon=-1", "method=physics")
+    assert (done.status, done.out) == (2, "")
+    assert done.err == "afm-rl: planner.horizon=-1: expected a whole number of at least 1\n"
 
 
 def test_a_choice_that_is_not_there_is_one_line_too(process):

@@ -79,7 +79,7 @@ def test_a_report_of_a_run(call, run_folder):
     assert (done.status, done.err) == (0, "")
     assert done.out.splitlines()[0].startswith("4 missions of 2 methods in 1 cells")
     assert done.out.splitlines()[-1] == f"Report: {run_folder}/report/index.html"
-    assert (run_folder / "report" / "figures" / "heat_ethz_2.png").exists()
+    assert (run_folder / "report" / "figures" / "trajectory_ethz_2.png").exists()
 
 
 def test_what_a_run_found_of_its_actuators(call, run_folder):
@@ -134,7 +134,7 @@ def test_what_is_no_mistake_is_not_hidden(call, run_folder, monkeypatch):
     def broken(*_, **settings):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("afm_rl.report.write.write_report", broken)
+    monkeypatch.setattr("afm_rl.report.write_report", broken)
     with pytest.raises(RuntimeError, match="a bug"):
         call(run_folder)
 
@@ -150,7 +150,7 @@ def test_a_reader_that_leaves_is_no_mistake(call, run_folder, monkeypatch):
     def left(*_, **settings):
         raise BrokenPipeError
 
-    monkeypatch.setattr("afm_rl.report.write.write_report", left)
+    monkeypatch.setattr("afm_rl.report.write_report", left)
     with os.fdopen(os.dup(1), "w") as pipe:  # as if standard output were one
         monkeypatch.setattr(sys, "stdout", pipe)
         assert call(run_folder).status == 1

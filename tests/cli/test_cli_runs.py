@@ -4,8 +4,8 @@ import pandas as pd
 import pytest
 from omegaconf import OmegaConf
 
-from afm_rl.jobs.tables import read_steps
 from afm_rl.missions import build, prepare, run
+from afm_rl.report import read_runs
 
 COLUMNS = (
     "seed success_rate steps reached targets finished faults regime"  # after parameters
@@ -45,7 +45,9 @@ def test_bare_compares_four_methods(afm_rl, tmp_path, small_training):
     assert missions["method"].tolist() == methods
     assert missions["mission"].tolist() == [0, 1, 2, 3]
     assert missions["track"].eq("ethz_2").all()
-    assert read_steps(tmp_path)["mission"].tolist() == [k for k in range(4) for _ in range(6)]
+    assert read_runs([tmp_path]).steps()["mission"].tolist() == [
+        k for k in range(4) for _ in range(6)
+    ]
     assert sorted(path.name for path in (tmp_path / "jobs").iterdir()) == sorted(methods)
     assert (tmp_path / "figures" / "trajectory.png").stat().st_size > 1000
     assert sorted(path.name for path in (tmp_path / "tensorboard").iterdir()) == sorted(methods)
@@ -91,7 +93,7 @@ def test_results_are_not_overwritten_unless_told(afm_rl, tmp_path, quick):
 
 
 def stored(folder):
-    return pd.read_csv(folder / "missions.csv"), read_steps(folder)
+    return pd.read_csv(folder / "missions.csv"), read_runs([folder]).steps()
 
 
 def assert_same_results(left, right):

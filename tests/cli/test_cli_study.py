@@ -24,16 +24,16 @@ def methods(jobs):
 
 
 @pytest.mark.parametrize(
-    ("study", "budget", "count", "last"),
+    ("study", "more", "budget", "count", "last"),
     [
-        ("ugv", 5000, 13, "oracle"),
-        ("ugv_paper", 5000, 5, "afm_paper"),
-        ("ugv_families", 3000, 13, "oracle"),
+        ("ugv", [], 5000, 13, "oracle"),
+        ("ugv_paper", [], 5000, 5, "afm_paper"),
+        ("ugv_families", ["compare=[physics,oracle]"], 3000, 2, "oracle"),
     ],
 )
-def test_the_studies(afm_rl, asked, study, budget, count, last, monkeypatch, tmp_path):
+def test_the_studies(afm_rl, asked, study, more, budget, count, last, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    done = afm_rl(f"study={study}", "planner.population=77")
+    done = afm_rl(f"study={study}", *more, "planner.population=77")
     assert done.status == 0, done.err
     ((folder, jobs, _, how),) = asked
     assert folder == tmp_path / "outputs" / "study" / study
@@ -117,17 +117,6 @@ def test_mistakes_are_one_line(afm_rl, tmp_path, settings, named):
     assert done.status == 2
     assert named in done.err and done.err.count("\n") == 1
     assert not any((tmp_path / "run").glob("*"))
-
-
-def test_jobs_that_failed_are_listed(afm_rl, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "afm_rl.cli.launch.run_batch", lambda *args, **how: {"oracle+seed=3": "out of luck"}
-    )
-    done = afm_rl(*TINY, f"hydra.run.dir={tmp_path}")
-    assert done.status == 1
-    assert f"Results: {tmp_path}" in done.out
-    assert "afm-rl: oracle+seed=3: failed: out of luck\n" in done.err
-    assert "afm-rl: 1 of 10 jobs failed" in done.err
 
 
 def test_damaged_files_are_one_line(afm_rl, tmp_path, monkeypatch):

@@ -47,7 +47,7 @@ physics         robot.paper_regimes=[],regimes=paper     regimes=[]
 online_pe       dynamics.pretrain.samples=10             dynamics.pretrain.samples=10 256
 online_pe       updater.optimizer.lr=0                   updater lr=0
 afm_physics     corrector.memory=10                           corrector.memory=10
-afm_physics     corrector.hypotheses=[late]                   corrector.hypotheses='late' recent
+afm_physics     corrector.readings=[late]                     corrector.readings='late' recent
 afm_physics     corrector.train={step:1}                      corrector.train 'step' iterations
 afm_physics     corrector.checkpoint=missing                  corrector.checkpoint missing
 """
@@ -179,7 +179,7 @@ def test_a_misspelt_setting_suggests_the_nearest_one(refuse):
     table = {
         "planner.horizn=3": "did you mean planner.horizon?",
         "planer=cem": "did you mean planner?",
-        "method=afm_physics corrector.gat=3": "did you mean corrector.gate?",
+        "method=afm_physics corrector.od=3": "did you mean corrector.odds?",
         "method=physics horizon=3": "did you mean planner.horizon?",
         "xyzxyz=3": "afm-rl --cfg job shows all settings",
     }

@@ -1,14 +1,16 @@
 """Jobs, each in a process of its own, from the command line."""
 
+import multiprocessing
 import os
 import signal
-import subprocess
 import sys
 import time
 
+import coverage
 import pandas as pd
 import pytest
 
+from afm_rl import cli
 from afm_rl.storage.manifest import check_manifest
 
 SABOTAGE = """
@@ -39,21 +41,18 @@ REASONS = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_jobs_that_fail_or_die_take_no_other_with_them(
-    process, program, afm_rl, tmp_path, quick, monkeypatch
-):
+def test_jobs_that_fail_or_die_take_no_other_with_them(afm_rl, tmp_path, quick, monkeypatch):
     (tmp_path / "sabotage.py").write_text(SABOTAGE)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
     command = ["method=physics", "budget=3", "trust=[sabotage]", *quick]
-    done = process(program, "-m", *command, f"cost._target_={','.join(COSTS)}")
+    done = afm_rl("-m", *command, f"cost._target_={','.join(COSTS)}")
     (sweep,) = (tmp_path / "multirun").iterdir()
     names = [f"physics+cost._target_={cost}" for cost in COSTS]
-    *lines, last = done.stderr.splitlines()
+    *lines, last = done.err.splitlines()
     assert last.startswith("afm-rl: 4 of 6 jobs failed (")
     assert sorted(lines) == sorted(f"afm-rl: {names[n]}: failed: {w}" for n, w in REASONS.items())
-    assert done.returncode == 1
+    assert done.status == 1
     finished = {path.parent.name for path in sweep.glob("jobs/*/manifest.json")}
     assert finished == {names[0], names[5]}
     assert "Traceback" in (sweep / "jobs" / names[3] / "log.txt").read_text()
@@ -65,29 +64,40 @@ def test_jobs_that_fail_or_die_take_no_other_with_them(
         assert check_manifest(alone)[name] == check_manifest(sweep / "jobs" / names[0])[name]
 
 
-@pytest.mark.slow
+def command_line(arguments, log):
+    """Be the command line, in a process of its own."""
+    if measured := coverage.Coverage.current():
+        measured.stop()  # a signal inside coverage's lock leaves it locked, for ever
+    for number in (1, 2):
+        os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT), number)
+    sys.stdout = sys.stderr = open(2, "w", buffering=1, closefd=False)
+    sys.argv[1:] = arguments
+    cli.main()
+
+
 @pytest.mark.parametrize("kind", ["run", "study"])
-def test_ctrl_c_keeps_what_was_done(process, program, tmp_path, kind):
-    """Interrupted once on the way, and taken up by the same program under its other name."""
-    settings = ["tracks=ethz_1", "regimes=[{v_gain: -1.0}]", "seeds=1", "budget=200"]
+def test_ctrl_c_keeps_what_was_done(afm_rl, tmp_path, kind, monkeypatch):
+    """Interrupted once on the way, and taken up by the same command."""
+    monkeypatch.chdir(tmp_path)
+    settings = ["tracks=ethz_1", "regimes=[{v_gain: -1.0}]", "seeds=1", "budget=100"]
     settings += ["hydra.run.dir=mine", "method=physics", "figures=false", "tensorboard=false"]
     settings += ["study=ugv"] * (kind == "study")
-    env = os.environ | {"OMP_NUM_THREADS": "1"}
-    how = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
-    folder = tmp_path / "mine"
-    with subprocess.Popen(
-        [program, *settings, "checkpoints.every=0"], cwd=tmp_path, env=env, **how
-    ) as running:
-        while not list(folder.rglob("checkpoint-*")):
-            assert running.poll() is None
-            time.sleep(0.02)
-        running.send_signal(signal.SIGINT)
-        said = running.stderr.read().splitlines()
-    assert running.returncode == 130, said
+    folder, log = tmp_path / "mine", tmp_path / "log.txt"
+    running = multiprocessing.get_context("fork").Process(
+        target=command_line, args=([*settings, "checkpoints.every=0"], log)
+    )
+    running.start()
+    while not list(folder.rglob("checkpoint-*")):
+        assert running.is_alive(), log.read_text()
+        time.sleep(0.02)
+    os.kill(running.pid, signal.SIGINT)
+    running.join()
+    said = log.read_text().splitlines()
+    assert running.exitcode == 130, said
     assert said[-1].startswith("afm-rl: interrupted; what was done is in")
     assert list(folder.rglob("checkpoint-*")) and not list(folder.rglob("missions.csv"))
-    done = process(sys.executable, "-m", "afm_rl.cli", *settings)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.rstrip().endswith(f"Results: {folder}")
+    done = afm_rl(*settings)
+    assert (done.status, done.err) == (0, "")
+    assert done.out.rstrip().endswith(f"Results: {folder}")
     assert len(pd.read_csv(folder / "missions.csv")) == 1
     assert not list(folder.rglob("checkpoint-*"))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from afm_rl.cli.launchers import ray_cluster
+from afm_rl.jobs import ray_cluster
 
 ray = pytest.importorskip("ray")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -27,11 +27,15 @@ def test_jobs_run_on_both_nodes_and_one_that_dies_takes_no_other_with_it(
 
         import ray
 
+        from afm_rl.storage.manifest import write_manifest
+
         if "seeds=3" in job.name:
             os._exit(3)
         (job.folder / f"{job.name}.node").write_text(ray.get_runtime_context().get_node_id())
         while len(list(job.folder.parent.glob("*/*.node"))) < 2:  # needs both at the same time
             time.sleep(0.1)
+        (job.folder / "unfinished" / "config.yaml").unlink()
+        write_manifest(job.folder, [])
 
     monkeypatch.setattr(ray_cluster, "run", meet)
     where = ["launcher=ray", f"hydra.launcher.address={address}", f"hydra.sweep.dir={tmp_path}"]
@@ -46,11 +50,3 @@ def test_jobs_run_on_both_nodes_and_one_that_dies_takes_no_other_with_it(
 def known_nodes(address):
     with ray.init(address):
         return ray.nodes()
-
-
-def test_a_cluster_of_this_machine_for_the_time_of_the_sweep(afm_rl, tmp_path, quick):
-    command = ["method=physics", "budget=2", *quick, f"hydra.sweep.dir={tmp_path}"]
-    done = afm_rl("-m", *command, "launcher=ray")
-    assert (done.status, done.err) == (0, "")
-    assert (tmp_path / "missions.csv").is_file()
-    assert not ray.is_initialized()

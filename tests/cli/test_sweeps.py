@@ -2,7 +2,6 @@
 
 import os
 import sys
-from contextlib import nullcontext
 from types import ModuleType, SimpleNamespace
 
 import pandas as pd
@@ -10,12 +9,11 @@ import pytest
 import yaml
 
 from afm_rl.cli import launch
-from afm_rl.cli.launchers import slurm
-from afm_rl.cli.launchers.base import needs
 from afm_rl.cli.overrides import with_sweep_folder
 from afm_rl.errors import ConfigurationError
-from afm_rl.jobs.local import LocalPool
-from afm_rl.jobs.run import _publish
+from afm_rl.jobs import submitit_cluster
+from afm_rl.jobs.executor import LocalExecutor
+from afm_rl.jobs.process import needs
 from afm_rl.storage.manifest import write_manifest
 
 SWEEP = ["-m", "method=physics", "planner.horizon=3,5"]
@@ -26,11 +24,12 @@ def pretend(job):
     new = job.folder / "unfinished"
     label = yaml.safe_load((new / "config.yaml").read_text())["label"]
     row = {"mission": 0, "method": label, "seed": 0, "steps": 4}
-    pd.DataFrame([row]).to_csv(new / "missions.csv", index=False)
+    pd.DataFrame([row]).to_csv(job.folder / "missions.csv", index=False)
     row = {"method": label, "missions": 1, "steps": 5, "seconds": 1.0}
-    pd.DataFrame([row]).to_csv(new / "compute.csv", index=False)
-    write_manifest(new)
-    _publish(new, job.folder)
+    pd.DataFrame([row]).to_csv(job.folder / "compute.csv", index=False)
+    (new / "config.yaml").rename(job.folder / "config.yaml")
+    new.rmdir()
+    write_manifest(job.folder)
 
 
 @pytest.fixture
@@ -38,16 +37,16 @@ def ran(monkeypatch):
     """Have jobs done at once, unless ``failing`` names one; return what was run."""
     calls = SimpleNamespace(jobs=[], failing="none")
 
-    def run(self, jobs):
+    def start(self, jobs):
         for job in jobs:
             calls.jobs.append(job)
-            if calls.failing in job.name:
-                yield job, "out of luck"
-            else:
+            if calls.failing not in job.name:
                 pretend(job)
-                yield job, None
+        return jobs
 
-    monkeypatch.setattr(LocalPool, "run", run)
+    ways = {"start": start, "is_over": lambda *_: True, "last_words": lambda *_: "out of luck"}
+    for name, way in {**ways, "close": lambda *_: None}.items():
+        monkeypatch.setattr(LocalExecutor, name, way)
     monkeypatch.setattr(launch, "report", lambda folder, *_: print(f"Results: {folder}"))
     return calls
 
@@ -142,9 +141,8 @@ def test_an_own_configuration_goes_to_the_jobs(sweep, ran, tmp_path):
 def test_an_interrupted_sweep_says_how_to_go_on(sweep, monkeypatch, tmp_path):
     def interrupt(self, jobs):
         raise KeyboardInterrupt
-        yield
 
-    monkeypatch.setattr(LocalPool, "run", interrupt)
+    monkeypatch.setattr(LocalExecutor, "start", interrupt)
     done = sweep(*SWEEP, "launcher=basic")
     assert done.status == 130 and done.err.count("\n") == 1
     assert done.err.startswith(f"afm-rl: interrupted; what was done is in {tmp_path}/sweep")
@@ -222,24 +220,40 @@ def slurm_cluster(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path / "bin"), prepend=os.pathsep)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["submitit_local", "submitit_slurm"])
-def test_submitit_survives_jobs_whose_process_the_cluster_ends(
-    sweep, slurm_cluster, launcher, monkeypatch, tmp_path
+def leave(job):
+    """Run on a node: one job leaves results, the process of the other one ends at once."""
+    import os
+
+    from afm_rl.storage.manifest import write_manifest
+
+    if "seeds=2" in job.name:
+        os._exit(3)
+    if "SUBMITIT_FOLDER" in os.environ:  # nobody else may plant a pickle there
+        assert os.stat(os.environ["SUBMITIT_FOLDER"]).st_mode & 0o77 == 0
+    (job.folder / "unfinished" / "config.yaml").unlink()
+    write_manifest(job.folder, [])
+
+
+def test_a_job_whose_process_the_cluster_ends_takes_no_other_with_it(
+    sweep, slurm_cluster, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(slurm, "POLL", 0.1)
-
-    def leave(job):  # here and not above: functions inside others are sent whole
-        import os
-
-        return os._exit(3) if "seeds=2" in job.name else None
-
-    monkeypatch.setattr(slurm, "run", leave)
-    done = sweep("-m", "method=physics", "seeds=1,2", f"launcher={launcher}")
+    monkeypatch.setattr(submitit_cluster.SubmititExecutor, "tick", 0.1)
+    leave.__module__ = "__main__"  # so that it is sent whole: nodes have no tests
+    monkeypatch.setattr(submitit_cluster, "run", leave)
+    done = sweep("-m", "method=physics", "seeds=1,2", "launcher=submitit_slurm")
     assert done.status == 1
     assert "physics+seeds=1: done" in done.out
-    assert "afm-rl: physics+seeds=2: failed: " in done.err
-    assert f"{tmp_path}/sweep/.submitit/" in done.err and "1 of 2 jobs failed" in done.err
+    assert "afm-rl: physics+seeds=2: failed: it ended in state OUT_OF_MEMORY before" in done.err
+    assert "1 of 2 jobs failed" in done.err
+    assert not list(tmp_path.glob("sweep/.submitit-*"))  # no pickle stays
+
+
+@pytest.mark.slow
+def test_submitit_runs_jobs_on_this_machine(sweep, quick, tmp_path):
+    command = ["method=physics", "budget=2", "regimes=none", *quick]
+    done = sweep("-m", *command, "launcher=submitit_local")
+    assert (done.status, done.err) == (0, "")
+    assert (tmp_path / "sweep" / "jobs" / "physics" / "missions.csv").is_file()
 
 
 def test_a_cluster_that_is_not_there(sweep, monkeypatch, tmp_path):
@@ -256,18 +270,22 @@ def test_ray_survives_nodes_that_die(sweep, monkeypatch):
         pass
 
     def get(job):
-        if "seeds=2" in job.name:
-            raise RayError("The node died.\nA long story follows.")
+        raise RayError("The node died.\nA long story follows.")
+
+    def remote(job):
+        if "seeds=2" not in job.name:
+            leave(job)
+        return job
 
     asked = []
     fake = ModuleType("ray")
     fake.exceptions = SimpleNamespace(RayError=RayError)
-    fake.init = lambda address, **settings: asked.append(address) or nullcontext()
-    fake.remote = lambda **resources: lambda run: SimpleNamespace(remote=lambda job: job)
-    fake.wait = lambda running, timeout: (running[:1], running[1:])
-    fake.get = get
+    fake.init = lambda address, **settings: asked.append(address)
+    fake.remote = lambda **resources: lambda run: SimpleNamespace(remote=remote)
+    fake.wait = lambda handles, timeout: (handles, [])
+    fake.get, fake.shutdown = get, lambda: asked.append("over")
     monkeypatch.setitem(sys.modules, "ray", fake)
     done = sweep("-m", "method=physics", "seeds=1,2", "launcher=ray", "hydra.launcher.address=auto")
-    assert (done.status, asked) == (1, ["auto"])
+    assert (done.status, asked) == (1, ["auto", "over"])
     assert "physics+seeds=1: done" in done.out
     assert "afm-rl: physics+seeds=2: failed: The node died.\n" in done.err

@@ -7,7 +7,7 @@ from fake_gpu import DEVICE, FakeGPU
 LEARNING = {"learner.forward", "mission_state.follow"}  # the latter where missions have changed
 WAITING = {  # what waits for the device at a step, see docs/howto/gpu.md
     "MPC": {"mpc._choose", "mpc._plan", "riccati.solve_lq"},
-    "RLSUpdater": LEARNING | {"matched_fit._look"},
+    "RLSUpdater": LEARNING,
     **dict.fromkeys(("OnlineUpdater", "StreamXUpdater", "UnmatchedUpdater"), LEARNING),
 }
 

@@ -6,14 +6,14 @@ import torch
 from afm_rl.compiling import machine_code
 from afm_rl.correction import ActionFlow
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.readings import HYPOTHESES
+from afm_rl.correction.readings import READINGS
 
 
 def flow_of(cache, **settings):
     network = AxisNetwork(width=8, latent=8)
-    # Among samples or hypotheses that are as good, rounding would decide.
-    distinct = [name for name in HYPOTHESES if name not in ("long", "nearest")]
-    settings |= {"source_std": 0.0, "hypotheses": distinct, "place": [0]}
+    # Among samples or readings that are as good, rounding would decide.
+    distinct = [name for name in READINGS if name not in ("long", "nearest")]
+    settings |= {"source_std": 0.0, "readings": distinct, "place": [0]}
     flow = ActionFlow(-torch.ones(1), torch.ones(1), network=network, cache=cache, **settings)
     return flow.double()
 
@@ -28,10 +28,10 @@ def test_what_is_compiled_says_the_same_for_any_number_of_missions(
 ):
     code = flow_of(tmp_path, compile=True)
     for batch in [(), (3,), (2, 2)]:
-        planned = plans(6, *batch, 1).double()
+        planned = plans(12, *batch, 1, size=1.0).double()
         expected, _ = drive(flow_of(tmp_path), line(1), reversed_drive, planned)
         found, _ = drive(code, line(1), reversed_drive, planned)
-        assert expected[-1][1:].double().mean() > 0.9  # nearly always it corrects
+        assert expected[5][4:].double().mean() > 0.5  # mostly it corrects
         for one, other in zip(found, expected, strict=True):
             torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
     assert len(set(traced)) == 3  # observe, look, decide

@@ -19,7 +19,7 @@ class Watching(Corrector):
     """Keeps three transitions, and corrects nothing."""
 
     def __init__(self, low=LOW, high=HIGH):
-        super().__init__(low, high, gate=1.0, recent=3)
+        super().__init__(low, high, recent=3)
 
     def correct(self, memory, planned, model, box):
         return self.executing(memory, planned, planned), self.unchanged(
@@ -95,15 +95,22 @@ def test_a_mission_begins_with_its_state_and_nothing_else(corrector, batch):
     state = torch.rand(*batch, 3)
     memory = corrector.begin(state)
     assert memory.shape == (*batch, corrector.memory_size(3))
-    assert torch.equal(memory[..., :3], state) and not memory[..., 3:].any()
+    assert torch.equal(memory[..., :3], state)
+    parts = corrector.unpack(memory, 3)
+    noise = parts.pop("noise", None)
+    assert noise is None or (noise == corrector.noise).all()
+    assert not any(part.any() for name, part in parts.items() if name != "state")
 
 
 def test_another_action_can_be_noted(corrector):
     memory = torch.rand(4, corrector.memory_size(3))
     planned, executed = torch.rand(2, 4, 2)
-    parts = corrector.unpack(memory, 3) | {"planned": planned, "executed": executed}
-    found = corrector.executing(memory, planned, executed)
-    assert torch.equal(found, corrector.pack(parts))
+    found = corrector.unpack(corrector.executing(memory, planned, executed), 3)
+    assert torch.equal(found.pop("planned"), planned)
+    assert torch.equal(found.pop("executed"), executed)
+    found.pop("forecasts", None)  # of what is executed now
+    parts = corrector.unpack(memory, 3)
+    assert all(torch.equal(part, parts[name]) for name, part in found.items())
 
 
 def test_transitions_are_kept_oldest_first():
@@ -151,8 +158,8 @@ def test_corrections_have_the_shapes_that_are_promised(corrector, batch, dtype):
     model, box = Dubins(), torch.stack([LOW, HIGH]).to(dtype).expand(*batch, 2, 2)
     state = torch.zeros(*batch, 3, dtype=dtype)
     memory = corrector.begin(state)
-    shapes = Correction(*[(2,)] * 3, (2, 2), (), ())
-    for _ in range(3):
+    shapes = Correction(*[(2,)] * 3, (2, 2), (), (), (2,))
+    for _ in range(5):
         plan = 0.5 * torch.ones(*batch, 2, dtype=dtype)
         memory, found = corrector.correct(memory, plan, model, box)
         for part, shape in zip(found, shapes, strict=True):

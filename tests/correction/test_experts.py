@@ -95,34 +95,6 @@ def test_each_explains_what_it_can_express(example):
     assert (experts.residuals[..., list(exact)].abs() < 0.05).all()
 
 
-@pytest.mark.parametrize(
-    ("count", "spread", "noise", "explained"),
-    [(12, 1.0, 0.0, True), (3, 1.0, 0.0, True), (2, 1.0, 0.0, False), (12, 1e-3, 0.0, False)]
-    + [(3, 1.0, 0.1, False), (12, 1.0, 0.1, False)],
-)
-def test_a_line_explains_rows_if_they_are_several_different_and_exact(
-    count, spread, noise, explained
-):
-    torch.manual_seed(1)
-    executed = spread * torch.linspace(-1, 1, 12).reshape(1, 12, 1).expand(1, 12, 2)
-    offset = torch.tensor([0.2, -0.1]) if noise == 0 else 0.0
-    gain = 0.5 if noise == 0 else 1.0
-    effective = gain * executed + offset + noise * torch.randn(1, 12, 2)
-    valid = (torch.arange(12) >= 12 - count).float().reshape(1, 12, 1)
-    rows = Rows(executed * valid, effective * valid, torch.zeros(1, 12, 2), valid)
-    line, nominal = fit_experts(rows).explained()
-    assert line.tolist() == [explained] and nominal.tolist() == [False]
-
-
-@pytest.mark.parametrize(("count", "nominal"), [(3, True), (2, False)])
-def test_rows_with_their_nominal_effect_need_no_line(count, nominal):
-    executed = torch.linspace(-1, 1, 12).reshape(1, 12, 1).expand(1, 12, 2)
-    valid = (torch.arange(12) >= 12 - count).float().reshape(1, 12, 1)
-    executed = executed * valid
-    rows = Rows(executed, executed, torch.zeros(1, 12, 2), valid)
-    assert [part.item() for part in fit_experts(rows).explained()] == [False, nominal]
-
-
 def test_the_fits_are_those_of_the_single_functions():
     executed, effective = drawn(5, 12, 3), 2 * drawn(5, 12, 3, seed=1)
     std, valid = 0.3 * drawn(5, 12, 3, seed=2).abs(), (drawn(5, 12, 1, seed=3) > -0.5).double()

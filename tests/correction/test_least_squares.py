@@ -53,7 +53,7 @@ def test_recent_pairs_outweigh_old_ones():
 def test_the_corrected_action_has_the_planned_effect(line, drive, plans, form):
     corrector = LeastSquares(LOW, HIGH, form=form, forgetting=0.95)
     planned = plans(10, 5, 2, size=0.5)
-    (executed, predicted, spread, *_, misaligned), effects = drive(
+    (executed, predicted, spread, _, _, misaligned, _), effects = drive(
         corrector, line(2), REGIMES[form], planned
     )
     assert misaligned[1:].all() and not spread.any()

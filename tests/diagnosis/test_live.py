@@ -26,7 +26,7 @@ def test_each_fault_is_named():
         "2: follows the command of 1",
         "3: does not answer its command",
         "4: 2 steps late",
-        "5: offset +0.3",
+        "5: offset +0.3 (16 % of its range)",
         "6: takes in +40 % of the command of 0",
     ]
 

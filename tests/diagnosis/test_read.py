@@ -39,6 +39,7 @@ def lerobot(tmp_path, request):
     for episode in range(2):
         u = rng.uniform(-1, 1, (100, 2)).astype(np.float32)
         y = np.concatenate([u[:1], u[:-1]]) * np.array([1, -1], dtype=np.float32)
+        y += np.float32(1e-3) * rng.standard_normal(y.shape).astype(np.float32)
         columns = {"action": list(u), "observation.state": list(y), "episode_index": episode}
         columns |= {"timestamp": (np.arange(100) / 30).astype(np.float32)}
         episodes.append(pd.DataFrame(columns))

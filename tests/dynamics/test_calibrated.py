@@ -1,12 +1,9 @@
 """A model behind a calibration of its action."""
 
-import math
-
 import pytest
 import torch
 
 from afm_rl.dynamics import Calibrated, Dubins, Quadrotor
-from afm_rl.dynamics.hammerstein import PLAIN, shaped, shaped_slope
 from afm_rl.errors import ConfigurationError
 
 HALF = torch.tensor([1.0, 1.5])
@@ -25,10 +22,9 @@ def calibrated(base=None, missions=None, dtype=torch.float64):
         return torch.randn((*model.lead, *shape), generator=draw, dtype=dtype)
 
     size = base.action_size
-    shape = torch.tensor([0.1, 0.7, 0.4], dtype=dtype) + 0.01 * normal(3).abs()
     matrix, bias = torch.eye(size) + 0.3 * normal(size, size), 0.1 * normal(size)
     offset = 0.01 * normal(base.manifold.tangent_size)
-    model.calibrate_(matrix=matrix, bias=bias, shape=shape, offset=offset)
+    model.calibrate_(matrix=matrix, bias=bias, offset=offset)
     return model
 
 
@@ -86,7 +82,7 @@ def test_what_it_predicts(transitions, missions):
         lead = model.lead
         return part.reshape(*lead, *(1,) * (2 - len(lead)), *part.shape[len(lead) :])
 
-    unit = shaped(action / model.half_range, wide(model.shape))
+    unit = action / model.half_range
     moved = (wide(model.matrix) @ unit.unsqueeze(-1)).squeeze(-1) + wide(model.bias)
     moved = moved * model.half_range
     expected = model.manifold.add(model.model(state, moved), wide(model.offset))
@@ -107,8 +103,6 @@ def test_what_it_predicts(transitions, missions):
 def test_derivatives_are_those_of_the_prediction(base, make, offset, transitions):
     state, action = make(3, 2) if make else transitions(3, 2, dtype=torch.float64)
     model = calibrated(base.double(), missions=3)
-    if make:  # its actions are small against the half ranges
-        model.calibrate_(shape=torch.tensor(PLAIN))
     if not offset:
         model.calibrate_(offset=torch.zeros(model.manifold.tangent_size))
     ahead, by_state, by_action = model.linearise(state, action)
@@ -150,22 +144,3 @@ def test_what_cannot_be_calibrated(make_ensemble):
     for half in (torch.ones(3), torch.tensor([1.0, 0.0])):
         with pytest.raises(ConfigurationError, match="dynamics.half_range=.*2 numbers > 0"):
             Calibrated(Dubins(), half)
-
-
-@pytest.mark.parametrize(
-    ("shape", "expected"),
-    [
-        (PLAIN, [-0.8, -0.1, 0.0, 0.3, 0.9]),
-        ((0.2, math.inf, 0.0), [-0.6, 0.0, 0.0, 0.1, 0.7]),
-        ((0.0, 0.5, 0.0), [-0.5, -0.1, 0.0, 0.3, 0.5]),
-        ((0.2, 0.5, 0.0), [-0.3, 0.0, 0.0, 0.1, 0.3]),
-        ((0.0, math.inf, 1.0), [u * math.exp(-abs(u)) for u in (-0.8, -0.1, 0.0, 0.3, 0.9)]),
-    ],
-)
-def test_shapes_and_their_slopes(shape, expected):
-    unit = torch.tensor([-0.8, -0.1, 0.0, 0.3, 0.9], dtype=torch.float64)
-    shape = torch.tensor(shape, dtype=torch.float64)
-    torch.testing.assert_close(shaped(unit, shape), torch.tensor(expected, dtype=torch.float64))
-    step = 1e-7
-    slope = (shaped(unit + step, shape) - shaped(unit - step, shape)) / (2 * step)
-    torch.testing.assert_close(shaped_slope(unit, shape), slope, atol=1e-6, rtol=0)

@@ -4,6 +4,7 @@ import copy
 
 import numpy as np
 import pytest
+import roma
 import torch
 
 from afm_rl.dynamics import Dubins, DynamicsModel, Oracle, Quadrotor
@@ -12,7 +13,6 @@ from afm_rl.dynamics.quadrotor_equations import quadrotor_path, quadrotor_rate, 
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import flight_regimes
 from afm_rl.spaces.airframe import QuadrotorBody, mix, saturate, unmix
-from afm_rl.spaces.rotations import body_z_axis, quaternion_normalise, rotate
 
 BODY = QuadrotorBody()
 INERTIA = torch.tensor(BODY.inertia, dtype=torch.float64)
@@ -28,7 +28,7 @@ def level(*batch, dtype=torch.float64):
 def flights(*batch, seed=0):
     generator = torch.Generator().manual_seed(seed)
     state = torch.randn(*batch, 13, generator=generator, dtype=torch.float64)
-    state[..., 6:10] = quaternion_normalise(state[..., 6:10])
+    state[..., 6:10] = roma.quat_normalize(state[..., 6:10])
     action = torch.randn(*batch, 4, generator=generator, dtype=torch.float64) * SCALE
     action[..., 0] += BODY.hover_thrust
     return state, action
@@ -124,16 +124,16 @@ def test_the_rate_is_that_of_a_rigid_body():
     state, action = flights(50)
     found = quadrotor_rate(state, action, BODY)
     turn, spin = state[:, 6:10], state[:, 10:]
-    push = body_z_axis(turn) * action[:, :1] / BODY.mass
+    push = roma.unitquat_to_rotmat(turn)[..., 2] * action[:, :1] / BODY.mass
     push[:, 2] -= BODY.gravity
     torch.testing.assert_close(found[:, :3], state[:, 3:6])
     torch.testing.assert_close(found[:, 3:6], push)
     # in the body frame the quaternion changes by half the rate
-    flow = torch.func.jvp(lambda q: rotate(q, spin), (turn,), (found[:, 6:10],))[1]
+    flow = torch.func.jvp(lambda q: roma.quat_action(q, spin), (turn,), (found[:, 6:10],))[1]
     torch.testing.assert_close(flow, torch.zeros_like(flow), rtol=0, atol=1e-12)
     lever = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64).expand_as(spin)
-    flow = torch.func.jvp(lambda q: rotate(q, lever), (turn,), (found[:, 6:10],))[1]
-    torch.testing.assert_close(flow, rotate(turn, torch.linalg.cross(spin, lever)))
+    flow = torch.func.jvp(lambda q: roma.quat_action(q, lever), (turn,), (found[:, 6:10],))[1]
+    torch.testing.assert_close(flow, roma.quat_action(turn, torch.linalg.cross(spin, lever)))
     turning = INERTIA * found[:, 10:] + torch.linalg.cross(spin, INERTIA * spin)
     torch.testing.assert_close(turning, action[:, 1:], rtol=1e-12, atol=1e-18)
 
@@ -145,7 +145,7 @@ def test_angular_momentum_and_energy_are_conserved_without_moments():
     state[10:] = torch.tensor([3.0, 0.1, -2.0])
     path = quadrotor_path(state, torch.zeros(4), 2.0, 1000, body)
     spin = path[:, 10:]
-    momentum = rotate(path[:, 6:10], inertia * spin)
+    momentum = roma.quat_action(path[:, 6:10], inertia * spin)
     torch.testing.assert_close(momentum, momentum[:1].expand_as(momentum), rtol=1e-8, atol=1e-14)
     energy = (inertia * spin.square()).sum(-1)
     torch.testing.assert_close(energy, energy[:1].expand_as(energy), rtol=1e-8, atol=0)
@@ -198,32 +198,16 @@ def test_states_and_actions_broadcast():
 
 
 @pytest.mark.parametrize("substeps", [1, 3])
-@pytest.mark.parametrize("batch", [(), (6,), (2, 3)])
-def test_linearisation_matches_finite_differences(batch, substeps):
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+def test_closed_forms_and_forward_differentiation_agree(batch, substeps):
     model, (state, action) = Quadrotor(substeps=substeps), flights(*batch)
     state = state + 0.01  # no unit quaternion: raw coordinates are free
-    ahead, by_state, by_action = model.linearise(state, action)
-    assert by_state.shape == (*batch, 13, 13)
-    assert by_action.shape == (*batch, 13, 4)
-    torch.testing.assert_close(ahead, model(state, action))
-    for column in range(13):
-        step = torch.zeros(13, dtype=torch.float64).index_fill(0, torch.tensor(column), 1e-6)
-        slope = (model(state + step, action) - model(state - step, action)) / 2e-6
-        torch.testing.assert_close(by_state[..., column], slope, rtol=1e-6, atol=1e-7)
-    for column in range(4):
-        step = 1e-3 * SCALE * torch.eye(4, dtype=torch.float64)[column]
-        slope = (model(state, action + step) - model(state, action - step)) / (2 * step.sum())
-        torch.testing.assert_close(by_action[..., column], slope, rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize("batch", [(), (6,), (2, 3)])
-def test_closed_form_and_forward_differentiation_agree(batch):
-    model, (state, action) = Quadrotor(substeps=2), flights(*batch)
-    for closed, automatic in zip(
-        model.linearise(state, action),
-        DynamicsModel.linearise(model, state, action),
-        strict=True,
-    ):
+    found = *model.linearise(state, action), model.jacobian(state, action)
+    wanted = (
+        *DynamicsModel.linearise(model, state, action),
+        DynamicsModel.jacobian(model, state, action),
+    )
+    for closed, automatic in zip(found, wanted, strict=True):
         torch.testing.assert_close(closed, automatic)
 
 
@@ -250,16 +234,9 @@ def test_missions_are_linearised_with_parameters_of_their_own():
         torch.testing.assert_close(by_action[row, ..., 0], nominal[..., 0] / factor)
 
 
-def test_the_jacobian_lives_on_the_tangent_space():
-    model, (state, action) = Quadrotor(), flights(5)
-    found = model.jacobian(state, action)
-    assert found.shape == (5, 12, 4)
-    for column in range(4):
-        step = 1e-3 * SCALE * torch.eye(4, dtype=torch.float64)[column]
-        ends = [model.manifold.difference(model(state, action + s * step), state) for s in (1, -1)]
-        slope = (ends[0] - ends[1]) / (2 * step.sum())
-        torch.testing.assert_close(found[..., column], slope, rtol=1e-6, atol=1e-6)
-    assert model.jacobian(level(), torch.zeros(4, dtype=torch.float64)).isfinite().all()
+def test_the_jacobian_at_rest_is_finite():
+    found = Quadrotor().jacobian(level(), torch.zeros(4, dtype=torch.float64))
+    assert found.shape == (12, 4) and found.isfinite().all()
 
 
 def test_noise_is_one_number_per_direction():

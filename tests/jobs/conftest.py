@@ -8,6 +8,32 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
+from afm_rl.jobs.executor import Executor
+from afm_rl.jobs.run import finish
+
+
+class Here(Executor):
+    """Runs jobs in this process, one after the other."""
+
+    tick = 0.0
+
+    def start(self, jobs):
+        for job in jobs:
+            finish(job.folder, echo=lambda line: None)
+        return jobs
+
+    def is_over(self, handle):
+        return True
+
+    def close(self, handles):
+        pass
+
+
+@pytest.fixture
+def here():
+    """An executor that runs jobs in this process."""
+    return Here()
+
 
 @functools.cache
 def _composed(method):

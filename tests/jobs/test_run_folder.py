@@ -1,7 +1,8 @@
 """A run's folder holds its old results or its new ones, whole, or says that it is unfinished."""
 
+import errno
+import functools
 import os
-import random
 import shutil
 import signal
 import time
@@ -11,8 +12,9 @@ import pytest
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.jobs.layout import is_finished
-from afm_rl.jobs.run import Stop, begin, finish, needs_run
-from afm_rl.missions.checkpoint import Stopped
+from afm_rl.jobs.process import handled
+from afm_rl.jobs.run import Stop, _publish, begin, finish, needs_run
+from afm_rl.missions.run import Stopped
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import check_manifest, extend_manifest
 
@@ -85,15 +87,14 @@ def test_the_folder_of_a_batch_is_refused(configure, tmp_path):
         needs_run(tmp_path, configure(), overwrite=True)
 
 
-@pytest.mark.parametrize("name", ["missions.csv", "steps.parquet", "config.yaml", "compute.csv"])
-def test_damaged_results_are_refused_and_named(configure, tmp_path, name):
-    before, dice = go(tmp_path, configure())[name], random.Random(0)
-    for _ in range(100):
-        damaged = bytearray(before)
-        damaged[dice.randrange(len(before))] ^= 1 << dice.randrange(8)
-        (tmp_path / name).write_bytes(damaged)
+def test_damaged_results_are_refused_and_named(configure, tmp_path):
+    before = go(tmp_path, configure())
+    for name in RESULTS:  # tests/test_manifest.py flips many bits
+        (tmp_path / name).write_bytes(before[name][:-1])
         with pytest.raises(ArtefactError, match=f"{name}: damaged"):
             needs_run(tmp_path, configure())
+        (tmp_path / name).write_bytes(before[name])
+    assert not needs_run(tmp_path, configure())
 
 
 @pytest.mark.parametrize("text", [b"", b"a: [", b"- 3", b"\xff", b"[" * 9999])
@@ -146,50 +147,87 @@ def test_an_unfinished_run_of_other_settings_is_refused_or_replaced(configure, t
     )
 
 
+CHANGES = ("replace", "unlink", "rmdir", "fsync")  # of the disk
+
+
+def killed_at(monkeypatch, count, work):
+    """Do some work; return whether it was killed before a change of the disk, counted from 0."""
+    left = count
+
+    def change(real, *args, **settings):
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise Killed
+        return real(*args, **settings)
+
+    with monkeypatch.context() as patched:
+        for name in CHANGES:
+            patched.setattr(os, name, functools.partial(change, getattr(os, name)))
+        try:
+            work()
+        except Killed:
+            return True
+    return False
+
+
 def test_new_results_replace_old_ones_whole_or_not_at_all(configure, tmp_path, monkeypatch):
     """A kill before each change of the disk in turn: never a mixture, and nothing is lost."""
-    state = tmp_path / "state"
-    old, new = go(state, configure()), go(tmp_path / "new", configure(seeds=[5]))
+    state, cfg, results = tmp_path / "state", configure(seeds=[5]), []
+    old, new = go(state, configure()), go(tmp_path / "new", cfg)
     (state / "figures").mkdir()
     (state / "figures" / "old.png").write_bytes(b"old")
     extend_manifest(state, ["figures"])
-    begin(state, configure(seeds=[5]))
-    with monkeypatch.context() as patched, pytest.raises(ZeroDivisionError):
-        patched.setattr("afm_rl.jobs.run._publish", lambda *folders: 1 / 0)
+    begin(state, cfg)
+    with monkeypatch.context() as patched:
+        patched.setattr("afm_rl.jobs.run._publish", lambda folder, found: results.append(found))
         finish(state, echo=lambda line: None)
-    real = {name: getattr(os, name) for name in ("replace", "unlink", "rmdir")}
+
+    def publish():
+        if (folder / "unfinished" / "config.yaml").exists():  # as `finish` does
+            _publish(folder, *results)
+
     for kills in range(99):
         folder = shutil.copytree(state, tmp_path / str(kills))
-        left = kills
-
-        def change(name, *args, **settings):
-            nonlocal left
-            left -= 1
-            if left < 0:
-                raise Killed
-            return real[name](*args, **settings)
-
         killed = False
-        for _ in range(2):  # killed twice at the same place
-            with monkeypatch.context() as patched:
-                left = kills
-                for name in real:
-                    patched.setattr(os, name, lambda *a, _n=name, **more: change(_n, *a, **more))
-                try:
-                    finish(folder, echo=lambda line: None)
-                except Killed:
-                    killed = True
+        for _ in range(2):  # twice at the same place
+            killed |= killed_at(monkeypatch, kills, publish)
             if is_finished(folder):
                 check_manifest(folder)
                 now = files(folder)
                 assert any(all(now[name] == each[name] for name in SAME) for each in (old, new))
-        finish(folder, echo=lambda line: None)
+        publish()
         now = files(folder)
         assert now.keys() == new.keys() and all(now[name] == new[name] for name in SAME)
         check_manifest(folder)
         if not killed:
             break
-    assert 9 < kills < 99
+    assert 20 < kills < 99
+
+
+@pytest.mark.parametrize("when", range(0, 16, 3))
+def test_a_full_disk_leaves_the_old_results(configure, tmp_path, monkeypatch, when):
+    """The disk is full at one write after another; what was there stays, whole."""
+    old, room = go(tmp_path, configure()), when
+
+    def full(number):
+        nonlocal room
+        room -= 1
+        if room < 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(number)
+
+    real = os.fsync
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ConfigurationError, match="cannot write .*: No space left on device"):
+        go(tmp_path, configure(seeds=[5], **{"checkpoints.every": 0}), overwrite=True)
+    monkeypatch.undo()
+    now = files(tmp_path)
+    assert {name: now[name] for name in old} == old
+    assert not [name for name in now if "/." in name]  # no part of a file
+    check_manifest(tmp_path)
+    new = go(tmp_path, configure(seeds=[5]), overwrite=True)
+    assert new.keys() == old.keys() and new["missions.csv"] != old["missions.csv"]
 
 
 def test_a_failure_half_way_leaves_the_old_results(configure, tmp_path, monkeypatch):
@@ -219,7 +257,8 @@ def test_folders_that_cannot_be_written_are_named(tmp_path):
 
 def test_a_signal_waits_for_the_step_and_a_second_one_does_not():
     stop, before = Stop(), signal.getsignal(signal.SIGTERM)
-    with stop.on(signal.SIGTERM), stop.between_steps():
+    with handled(stop, signal.SIGTERM):
+        stop.waits = True
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.01)
         assert stop.asked

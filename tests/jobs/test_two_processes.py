@@ -4,8 +4,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from afm_rl.jobs.batch import run_batch
-from afm_rl.jobs.layout import run_folders
-from afm_rl.jobs.local import LocalPool
+from afm_rl.jobs.executor import LocalExecutor
+from afm_rl.jobs.layout import job_folders
 from afm_rl.storage.manifest import check_manifest
 
 METHODS = ["physics", "online_pe", "afm_physics", "stream_x_pe", "adaptive_gain", "rls", "oracle"]
@@ -22,19 +22,17 @@ SMALL = {
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_same_bytes(configure, tmp_path):
-    """The first one trains the parts, the second one finds them in the cache."""
+def test_two_processes_give_the_same_bytes(configure, tmp_path, here):
+    """New processes train the parts, this old one finds them in the cache."""
     jobs = {}
     for method in METHODS:
-        cfg = configure(method, budget=200, cache=str(tmp_path / "cache"))
+        cfg = configure(method, budget=60, cache=str(tmp_path / "cache"))
         for key in SMALL.keys() - {k for k in SMALL if OmegaConf.select(cfg, k) is None}:
             OmegaConf.update(cfg, key, SMALL[key])
         jobs[method] = cfg
-    for folder in ("one", "other"):
-        assert run_batch(tmp_path / folder, jobs, LocalPool(2), echo=lambda line: None) == {}
-    for one, other in zip(
-        *(run_folders(tmp_path / name) for name in ("one", "other")), strict=True
-    ):
+    assert run_batch(tmp_path / "new", jobs, LocalExecutor(2), echo=lambda line: None) == {}
+    assert run_batch(tmp_path / "old", jobs, here, echo=lambda line: None) == {}
+    for one, other in zip(*(job_folders(tmp_path / name) for name in ("new", "old")), strict=True):
         sums = check_manifest(one), check_manifest(other)
         for name in ("missions.csv", "steps.parquet"):
             assert sums[0][name] == sums[1][name], one.name

@@ -19,7 +19,7 @@ from afm_rl.learning import (
 )
 from afm_rl.planning import ICEM, MPPI, KnownReward, PlanningEnv
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.spaces.rotations import RigidBodySpace
+from afm_rl.spaces.rigid_body import RigidBodySpace
 
 SHORT = {"epochs": 2, "batch_size": 64}
 

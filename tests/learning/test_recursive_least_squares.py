@@ -7,10 +7,9 @@ import torch
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Calibrated, Dubins
-from afm_rl.dynamics.hammerstein import PLAIN, shaped
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, RLSUpdater
-from afm_rl.learning.least_squares import least_squares
+from afm_rl.learning.least_squares import Rows, advance, nothing
 
 HALF = torch.tensor([1.0, 1.5], dtype=torch.float64)
 EYE = torch.eye(2, dtype=torch.float64)
@@ -27,16 +26,15 @@ class World:
         self.draw, self.dtype = torch.Generator().manual_seed(seed), dtype
         self.errors = []
 
-    def drive(self, steps, matrix=EYE, bias=0.0, shape=PLAIN, wind=0.0, batch=None, **more):
+    def drive(self, steps, matrix=EYE, bias=0.0, wind=0.0, batch=None, **more):
         """Take random actions; remember how well each was predicted, ``(*batch)``."""
         batch = self.model.lead if batch is None else batch
-        shape = torch.tensor(shape, dtype=self.dtype)
         for _ in range(steps):
             state, unit = (
                 2 * torch.rand(*batch, size, generator=self.draw, dtype=self.dtype) - 1
                 for size in (3, 2)
             )
-            worth = (matrix.to(self.dtype) @ shaped(unit, shape).unsqueeze(-1)).squeeze(-1) + bias
+            worth = (matrix.to(self.dtype) @ unit.unsqueeze(-1)).squeeze(-1) + bias
             half = self.model.half_range
             after = Dubins()(state, worth * half) + wind
             sound = torch.ones(batch, dtype=torch.bool)  # also where the robot did not move
@@ -61,10 +59,7 @@ class World:
         """Is the calibration the identity, exactly?"""
         model = self.model
         told = torch.equal(model.matrix, EYE.to(self.dtype).expand_as(model.matrix))
-        told = told and not model.bias.any() and not model.offset.any()
-        return told and torch.equal(
-            model.shape, torch.tensor(PLAIN).to(model.shape).expand_as(model.shape)
-        )
+        return told and not model.bias.any() and not model.offset.any()
 
 
 GAINS = torch.diag(torch.tensor([-1.0, 0.5], dtype=torch.float64))
@@ -78,86 +73,62 @@ TURN = torch.tensor([[0.5, -0.9], [0.9, 0.5]], dtype=torch.float64)
         ({"matrix": TURN}, 8),
         ({"bias": torch.tensor([0.3, -0.2], dtype=torch.float64)}, 8),
         ({"matrix": TURN @ GAINS, "bias": torch.tensor([0.3, -0.2], dtype=torch.float64)}, 10),
-        ({"shape": (0.3, math.inf, 0.0)}, 30),
-        ({"shape": (0.0, 0.4, 0.0), "matrix": GAINS}, 30),
-        ({"shape": (0.0, math.inf, 3.0), "matrix": 4 * GAINS}, 30),
     ],
-    ids=["gains", "coupling", "bias", "affine", "dead zone", "limit", "slip"],
+    ids=["gains", "coupling", "bias", "affine"],
 )
 @pytest.mark.parametrize("missions", [None, 3])
 def test_regimes_are_learnt_and_left_again(regime, steps, missions):
     world = World(missions)
     world.drive(20)
     assert world.plain and not torch.stack(world.errors).any()
-    world.drive(60, **regime)
+    world.drive(30, **regime)
     assert 2 <= world.recovered(20, level=1e-4) <= steps
-    world.drive(10)
-    assert world.recovered(80, level=0.0) == 2 and world.plain
-    if "shape" not in regime:
-        return
+    world.drive(5)
+    assert world.recovered(50, level=0.0) == 1 and world.plain
     world.drive(20, **regime)
-    world.drive(20, matrix=GAINS)  # straight into another one
-    torch.testing.assert_close(world.model.matrix, GAINS.expand_as(world.model.matrix))
-    assert (world.model.shape[..., 2] == 0).all()
+    world.drive(20, matrix=-TURN)  # straight into another one
+    torch.testing.assert_close(world.model.matrix, -TURN.expand_as(world.model.matrix))
 
 
-def test_the_fit_is_exact_without_noise():
+def test_the_recursion_is_weighted_least_squares():
     draw = torch.Generator().manual_seed(0)
-    truth = torch.randn(5, 2, 3, generator=draw, dtype=torch.float64)
-    features = torch.randn(5, 20, 3, generator=draw, dtype=torch.float64)
-    weight = 0.9 ** torch.arange(19, -1, -1).double().reshape(20, 1).expand(5, 20, 2)
-    prior, mean = torch.full((5, 2, 3), 1e-12).double(), torch.zeros(5, 2, 3).double()
-    theta, covariance = least_squares(features, features @ truth.mT, weight, prior, mean)
-    torch.testing.assert_close(theta, truth)
-    gram = (weight[..., :1] * features).mT @ features
-    torch.testing.assert_close(
-        covariance @ gram.unsqueeze(1), torch.eye(3).double().expand(5, 2, 3, 3)
-    )
+    features, y = (torch.randn(5, 9, n, generator=draw).double() for n in (3, 2))
+    weight = torch.rand(5, 9, 2, generator=draw).double() + 1e3
+    yes, prior = torch.ones(5, 1).bool(), torch.rand(5, 2, 3, generator=draw).double()
+    fit = nothing(5, 2, 3)
+    for row in zip(*(part.split(1, 1) for part in (features, y, weight)), strict=True):
+        fit = advance(fit, Rows(*row, yes, yes, prior), forgetting=0.9, gate=1e-3)
+        fit = fit._replace(level=fit.level + 1e9)  # a change only at first
+    theta, covariance = fit.solution()
+    root = (weight * (0.9 ** torch.arange(8, -1, -1)).unsqueeze(-1)).sqrt()
+    for g in range(2):
+        tall = torch.cat(
+            [root[..., g, None] * features, torch.diag_embed((prior[:, g] / 512).sqrt())], 1
+        )
+        wide = torch.cat([root[..., g] * y[..., g], torch.zeros(5, 3)], 1).unsqueeze(-1)
+        expected = torch.linalg.lstsq(tall, wide).solution.squeeze(-1)
+        torch.testing.assert_close(theta[:, g], expected)
+        torch.testing.assert_close(
+            covariance[:, g] @ (tall.mT @ tall), torch.eye(3).double().expand(5, 3, 3)
+        )
 
 
 @pytest.mark.parametrize("regime", [{}, {"matrix": GAINS}], ids=["nominal", "changed"])
-def test_an_outlier_moves_nothing(regime):
+def test_an_outlier_does_harm_for_a_few_steps(regime):
     world = World()
     world.drive(20, **regime)
-    before = world.model.state_dict()
     world.drive(1, wind=torch.tensor([20.0, -20.0, 0.5]), **regime)
-    assert all(torch.equal(now, before[name]) for name, now in world.model.state_dict().items())
-    world.drive(20, **regime)
-    assert torch.stack(world.errors[21:]).max() < 1e-5
-
-
-def test_without_confirmation_an_outlier_does_harm():
-    world = World(confirm=False)
-    world.drive(20, matrix=GAINS)
-    world.drive(1, wind=torch.tensor([20.0, -20.0, 0.5]), matrix=GAINS)
-    world.drive(1, matrix=GAINS)
-    assert world.errors[-1] > 1e-2
-
-
-def test_without_restarts_the_past_fades_slowly():
-    quick, slow = World(shapes=False), World(shapes=False, restart=False)
-    for world in (quick, slow):
-        world.drive(40, matrix=GAINS)
-        world.drive(20, matrix=TURN)
-    assert quick.errors[-1] < 1e-5 < 1e-3 < slow.errors[-1]
+    world.drive(40, **regime)
+    assert world.recovered(21) <= 20
 
 
 def test_it_goes_home_once_the_nominal_model_is_as_good():
-    world = World(shapes=False)
-    for step in range(60):  # gains that come back slowly: no surprise tells
-        share = min(1.0, step / 40)
+    world = World()
+    for step in range(40):  # gains that come back slowly: no surprise tells
+        share = min(1.0, step / 30)
         world.drive(1, matrix=torch.lerp(GAINS.abs(), EYE, share))
-    world.drive(60)
+    world.drive(30)
     assert world.plain
-
-
-def test_what_explains_nothing_is_not_believed():
-    world = World(shapes=False)
-    noise = torch.Generator().manual_seed(5)
-    for _ in range(100):  # actuators that do as they please
-        matrix = torch.randn(2, 2, generator=noise, dtype=torch.float64)
-        world.drive(1, matrix=matrix)
-    assert (~world.updater.matched.memory.parts.better).all() and world.plain
 
 
 def test_what_no_action_explains_becomes_the_offset():
@@ -165,7 +136,7 @@ def test_what_no_action_explains_becomes_the_offset():
     for part in ("unmatched", "all"):
         world = World(missions=3, part=part)
         world.drive(10)
-        world.drive(60, wind=wind)
+        world.drive(25, wind=wind)
         torch.testing.assert_close(world.model.offset, wind.expand(3, 3), atol=1e-4, rtol=0)
         assert world.errors[-1].max() < 1e-3
         world.drive(20)
@@ -193,7 +164,7 @@ def test_missions_learn_for_themselves_and_leave_one_by_one():
     alone = World()
     alone.drive(1)
     alone.updater.start()
-    assert alone.updater.matched.memory.parts.age.tolist() == [0]
+    assert alone.updater.matched.parts.age.tolist() == [0]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -284,11 +255,10 @@ def test_a_mask_says_what_to_learn_from():
         ({"forgetting": 0.0}, "updater.forgetting=0.0"),
         ({"gate": 0.0}, "updater.gate=0.0"),
         ({"patience": 0}, "updater.patience=0"),
-        ({"confirm": 1}, "updater.confirm=1"),
-        ({"restart": None}, "updater.restart=None"),
-        ({"window": 0}, "updater.window=0"),
-        ({"shapes": 1}, "updater.shapes=1"),
         ({"spread": 0.0}, "updater.spread=0.0"),
+        ({"coupling": -1.0}, "updater.coupling=-1.0"),
+        ({"offset": 0.0}, "updater.offset=0.0"),
+        ({"still": -0.1}, "updater.still=-0.1"),
     ],
     ids=str,
 )
@@ -302,17 +272,15 @@ def test_other_models_are_refused():
         RLSUpdater(GaussianNLLLoss(Dubins()))
 
 
-@pytest.mark.parametrize("shape", [PLAIN, (0.3, math.inf, 0.0)], ids=["affine", "dead zone"])
-def test_a_mission_alone_learns_the_same_to_the_bit(shape):
+def test_a_mission_alone_learns_the_same_to_the_bit():
     draw = torch.Generator().manual_seed(3)
     state, unit, matrix = (
         torch.randn(shape, generator=draw, dtype=torch.float64)
-        for shape in ((70, 7, 3), (70, 7, 2), (7, 2, 2))
+        for shape in ((40, 7, 3), (40, 7, 2), (7, 2, 2))
     )
-    unit = unit.clamp(-1, 1)
-    worth = (matrix @ shaped(unit, torch.tensor(shape).double()).unsqueeze(-1)).squeeze(-1)
-    worth = torch.where((torch.arange(70) < 50)[:, None, None], worth, unit)
-    after = Dubins()(state, worth * HALF) + 1e-3 * torch.randn(70, 7, 3, generator=draw).double()
+    worth = (matrix @ unit.unsqueeze(-1)).squeeze(-1)
+    worth = torch.where((torch.arange(40) < 25)[:, None, None], worth, unit)
+    after = Dubins()(state, worth * HALF) + 1e-3 * torch.randn(40, 7, 3, generator=draw).double()
 
     def learnt(missions):
         world = World(len(missions))
@@ -321,5 +289,5 @@ def test_a_mission_alone_learns_the_same_to_the_bit(shape):
         return torch.stack(world.errors)
 
     together = learnt(range(7))
-    for mission in range(7):
+    for mission in (0, 3, 6):
         assert torch.equal(learnt([mission])[:, 0], together[:, mission])

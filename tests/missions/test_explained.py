@@ -31,7 +31,7 @@ def drive(steps):
 def test_a_mission_is_explained():
     found, log = explain_mission(ROBOT, drive(300))
     assert str(found).splitlines() == [
-        "v: changed at 30 s: healthy, then reversed, 60 % of the command",
+        "v: reversed, 60 % of the command, since step 150 (30 s)",
         "omega: healthy",
     ]
     assert len(log.command) == 299 and log.step == pytest.approx(0.2)

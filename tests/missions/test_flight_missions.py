@@ -9,7 +9,7 @@ import torch
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, run
-from afm_rl.missions.checkpoint import Stopped
+from afm_rl.missions.run import Stopped
 
 QUICK = {"robot.schedule.times": [0.1, 0.3], "budget": 12}
 
@@ -124,7 +124,7 @@ def test_a_lost_flight_leaves_the_batch(fly):
 
 
 def test_a_thrust_that_cannot_be_negative_is_corrected_as_a_share_of_the_largest(fly):
-    flown = fly("method=afm_physics", "corrector.hypotheses=[recent]")
+    flown = fly("method=afm_physics", "corrector.readings=[recent]")
     flow, robot = flown.agent.transform.corrector, flown.agent.robot
     torch.testing.assert_close(flow.scale, torch.tensor(robot.action_high))
     steps = flown.steps
@@ -192,19 +192,19 @@ def test_a_network_may_be_trained_before_the_flight(make_agent, randomised):
     assert np.isfinite(run(agent).steps.to_numpy(dtype=float)).all()
 
 
-def test_robots_say_which_hypotheses_make_sense(composed):
+def test_robots_say_which_readings_make_sense(composed):
     chosen = composed("robot=quadrotor", "method=afm_physics").corrector
-    assert list(chosen.hypotheses) == ["identity", "recent", "newest", "varied"]
-    assert composed("robot=ugv", "method=afm_physics").corrector.hypotheses is None
+    assert list(chosen.readings) == ["recent", "newest", "varied"]
+    assert composed("robot=ugv", "method=afm_physics").corrector.readings is None
     learning = composed("robot=quadrotor", "method=afm_online_knode").corrector
-    assert list(learning.hypotheses) == ["identity", "newest"]
-    own = composed("robot=quadrotor", "method=afm_physics", "corrector.hypotheses=[recent]")
-    assert list(own.corrector.hypotheses) == ["recent"]
+    assert list(learning.readings) == ["newest"]
+    own = composed("robot=quadrotor", "method=afm_physics", "corrector.readings=[recent]")
+    assert list(own.corrector.readings) == ["recent"]
 
 
 def test_before_it_learns_a_model_shares_the_flow_of_the_physics(configure):
     methods = ("afm_physics", "afm_online_knode", "afm_rls", "afm_offline_knode")
-    same = {"corrector.train": {"iterations": 5}, "corrector.hypotheses": ["recent"]}
+    same = {"corrector.train": {"iterations": 5}, "corrector.readings": ["recent"]}
     agents = [build(configure("robot=quadrotor", f"method={method}", **same)) for method in methods]
     first, *others, offline = [agent.trainings[-1].settings for agent in agents]
     assert others == [first, first] and offline != first

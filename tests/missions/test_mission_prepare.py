@@ -45,7 +45,7 @@ def test_only_what_the_result_depends_on_is_part_of_the_key(prepared, cache):
     prepared(cache)
     _, lines = prepared(cache, "planner=mppi_paper", "seeds=3", budget=3)
     assert all("from the cache" in line for line in lines)
-    after = {f"corrector.{name}": value for name, value in {"gate": 9.0, "samples": 2}.items()}
+    after = {f"corrector.{name}": value for name, value in {"odds": 9.0, "samples": 2}.items()}
     after["dynamics.propagation"] = "sample"
     _, lines = prepared(cache, **after)
     assert all("from the cache" in line for line in lines)

@@ -126,7 +126,10 @@ def test_seconds_are_shared_out_among_the_missions(drive, ring):
 OTHERS = {"sysid", "afm_sysid"}  # need MuJoCo, and all with a KNODE a quadrotor
 METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
 METHODS = [name for name in METHODS if name not in OTHERS and "knode" not in name]
-NAIVE = {"corrector.hypotheses": ["recent"]}  # whatever is believed, it is corrected
+NAIVE = {
+    "corrector.readings": ["recent"],
+    "corrector.odds": 0.0,
+}  # whatever is believed, it is corrected
 
 
 @pytest.mark.parametrize("method", METHODS)

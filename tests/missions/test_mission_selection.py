@@ -36,6 +36,7 @@ def test_tracks_that_cannot_be_used(robot, written):
 
 def test_the_regimes_of_the_paper(robot):
     chosen = select_regimes("paper", robot)
+    chosen = [entry.mission(seed=0)["regime"] for entry in chosen]
     assert len(chosen) == 11
     assert {"v_gain": -1.0, "omega_gain": 2.0} in chosen
     assert {"v_gain": 0.1, "omega_gain": -1.5} in chosen
@@ -52,13 +53,16 @@ def test_the_regimes_of_the_paper(robot):
         ([{}], [{}]),
         (
             [{"phases": [{}, {"delay": 1}], "at": [0.5]}],
-            [{"phases": [{}, {"delay": 1}], "at": [0.5]}],
+            [{"regime": [{}, {"delay": 1}], "at": [0.5]}],
         ),
-        ({"phases": [{}, {}, {}], "ramp": 5}, [{"phases": [{}, {}, {}], "ramp": 5}]),
+        ({"phases": [{}, {}, {}], "ramp": 5}, [{"regime": [{}, {}, {}], "ramp": 5}]),
     ],
 )
 def test_regimes(robot, written, chosen):
-    assert select_regimes(written, robot) == chosen
+    found = [entry.mission(seed=0) for entry in select_regimes(written, robot)]
+    assert found == [
+        one if isinstance(one, dict) and "regime" in one else {"regime": one} for one in chosen
+    ]
 
 
 def test_families_are_chosen_by_name(robot):
@@ -67,7 +71,9 @@ def test_families_are_chosen_by_name(robot):
     (slip,) = select_regimes("slip", robot)
     assert isinstance(slip, Family) and slip.name == "slip"
     mixed = select_regimes(["drift", {"v_gain": -1.0}, "slip"], robot)
-    assert [mixed[0].name, mixed[1], mixed[2]] == ["drift", {"v_gain": -1.0}, slip]
+    assert [mixed[0].name, mixed[1].given, mixed[2]] == [
+        *("drift", {"regime": {"v_gain": -1.0}}, slip)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -113,7 +119,8 @@ def test_seeds_that_cannot_be_used(written):
 
 def test_every_combination_is_a_mission(robot):
     env = robot.env(tracks=["ethz_1", "ethz_2"], regime=robot.regime, schedule=robot.schedule)
-    regimes = [{}, {"v_gain": -1.0}, [{"v_gain": 2.0}, {}, {"omega_gain": 0.5}]]
+    written = [{}, {"v_gain": -1.0}, [{"v_gain": 2.0}, {}, {"omega_gain": 0.5}]]
+    regimes = select_regimes(written, robot)
     missions = build_missions(env, ["ethz_1", "ethz_2"], regimes, [4, 9])["mission"]
     assert missions.batch_size == (12,)
     assert missions["track"].tolist() == [0] * 6 + [1] * 6
@@ -147,7 +154,7 @@ def test_regimes_have_names(robot):
         {"phases": [{}, {"v_gain": 2.0}], "at": [0.25], "ramp": 9},
         {"phases": [{"v_gain": 2.0}], "at": []},
     ]
-    names = name_regimes(["a", "b"], select_regimes(written, robot), [0, 1], robot)
+    names = name_regimes(["a", "b"], select_regimes(written, robot), [0, 1])
     assert names[::2] == names[1::2] and names[:12] == names[12:]
     assert names[:12:2] == [
         "slip",

@@ -26,7 +26,7 @@ METHODS = {
     "adaptive_gain": set(),
     "online_pe": LEARNING,
     "afm_stream_x_pe": LEARNING,
-    "rls": LEARNING | {"matched_fit._look"},
+    "rls": LEARNING,
 }
 
 

@@ -12,8 +12,8 @@ from hydra import compose, initialize_config_module
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, prepare, run
-from afm_rl.missions.checkpoint import Stopped
 from afm_rl.missions.return_score import _measured
+from afm_rl.missions.run import Stopped
 from afm_rl.progress import Bar
 
 FLIP = "regimes=[{gain_0: -1}]"
@@ -187,7 +187,7 @@ def mine(tmp_path, monkeypatch):
 
 @pytest.mark.filterwarnings("ignore:the model leaves")
 def test_an_environment_of_mine_learns_and_goes_on_where_it_was_stopped(mine, tmp_path):
-    chosen = [*BOAT, "method=afm_frozen_pe", "seeds=3", "false_alarms=null"]
+    chosen = [*BOAT, "method=afm_frozen_pe", "seeds=3"]
 
     def agent():
         made = mine(*chosen)
@@ -297,7 +297,7 @@ def test_mistakes_in_code_of_mine_are_said_in_one_line(mine, overrides, message)
     [
         ("<mujoco><bodi/></mujoco>", "robot.xml='<mujoco><bodi/></mujoco>': .*unrecognized"),
         ("<mujoco/>", "expected actuators, found none"),
-        (MODEL.replace('ctrlrange="-1 1"', ""), "robot: mjcf: actions a_0 have no limits"),
+        (MODEL.replace('ctrlrange="-1 1"', ""), "robot: mjcf: actions x have no limits"),
         ("nothing.xml", "robot.xml=nothing.xml: no such file"),
     ],
 )

@@ -50,12 +50,6 @@ def test_only_the_thrust_needs_a_bound():
     torch.testing.assert_close(whole["action"], thrust["action"], rtol=0, atol=1e-6)
 
 
-def test_both_solvers_fly_the_same():
-    pytest.importorskip("casadi")
-    first, second = (fly(pilot(qp=qp), 6, start="rest") for qp in ("riccati", "hpipm"))
-    torch.testing.assert_close(first["next", "pose"], second["next", "pose"], rtol=0, atol=1e-4)
-
-
 def test_a_flight_that_starts_upside_down_still_gets_sound_actions():
     planner = pilot()
     td = TensorDict({"observation": torch.zeros(13), "reference": torch.zeros(6)})

@@ -7,9 +7,10 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from afm_rl.dynamics import Dubins
+from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import GoalDistance, PlanningEnv
+from afm_rl.planning import CEM, ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv, TorchRLMPPI
+from afm_rl.spaces.manifold import Manifold
 
 
 @pytest.fixture
@@ -86,3 +87,38 @@ def test_whole_numbers_bound_real_actions():
 def test_impossible_boxes_are_refused(low, high):
     with pytest.raises(ConfigurationError, match="action bounds .* expected 2 finite numbers"):
         PlanningEnv(Dubins(), GoalDistance(), low, high)
+
+
+PLANNERS = {"mppi": MPPI, "icem": ICEM, "cem": CEM, "torchrl_mppi": TorchRLMPPI}
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+@pytest.mark.parametrize(
+    ("keys", "cost", "missing"),
+    [
+        ({"observation_key": ("robot", "pose")}, GoalDistance(), r"\('robot', 'pose'\)"),
+        ({}, GoalDistance(in_keys=["gaol"]), "'gaol'"),
+    ],
+)
+def test_an_entry_that_the_environment_lacks_is_named(box, name, keys, cost, missing):
+    planner = PLANNERS[name](PlanningEnv(Dubins(), cost, *box, **keys))
+    words = rf"planner: reads {missing}, but the environment gives \['observation', 'goal'\]; say"
+    with pytest.raises(ConfigurationError, match=words):
+        planner(TensorDict({"observation": torch.zeros(1, 3), "goal": torch.zeros(1, 2)}, [1]))
+
+
+def single(state, action):
+    """A step of one robot: it reads the first dimension, not the last one."""
+    return torch.stack([state[0] + action[0], state[1] + action[1]])
+
+
+def test_functions_that_are_not_batched_are_refused_before_a_plan(box):
+    model = KnownDynamics(single, Manifold(2), action_size=2)
+    near = KnownReward(lambda state, action, after: -after[0].abs())
+    batched = KnownDynamics(lambda state, action: state + action, Manifold(2), action_size=2)
+    with pytest.raises(ConfigurationError, match=r"step: returned .*\(4, 1, 2\): a step fu"):
+        PlanningEnv(model, GoalDistance(), *box)
+    with pytest.raises(ConfigurationError, match=r"cost: returned .* a tensor \(4, 1\), one"):
+        PlanningEnv(batched, near, *box)
+    with pytest.raises(ConfigurationError, match="dynamics.step: fails .* step function in torch"):
+        model(torch.zeros(1, 2), torch.zeros(1, 2))

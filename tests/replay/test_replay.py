@@ -12,7 +12,7 @@ from afm_rl.diagnosis.readers import read_log
 from afm_rl.replay import replay
 from afm_rl.replay.belief import believe, identity, watcher
 from afm_rl.replay.simple import affine, arx, running_gain
-from afm_rl.replay.table import AFM, ALONE, quantile_with_interval
+from afm_rl.replay.table import AFM, ALONE, Table, quantile_with_interval
 
 LOGS = Path(__file__).parents[2] / "examples" / "real_logs"
 
@@ -30,10 +30,10 @@ def replayed():
 
 
 def test_what_a_correction_would_have_removed(replayed):
-    first, second = replayed.sentences
-    share = int(first.split(" ")[0])
-    assert share > 85 and first.endswith("% of the error of arm") and second == "none of hand"
-    assert replayed.sentence == f"A correction would have removed {first}; {second}."
+    share = round(100 * replayed.removed["arm"])
+    assert share > 85 and replayed.removed["hand"] == 0 and not replayed.slow
+    said = f"A correction would have removed {share} % of the error of arm, and none of hand."
+    assert replayed.sentence == said
     miss = np.abs(replayed.predictions[AFM] - replayed.log.response)[20:]
     assert np.median(miss) < 0.04
     assert 0.5 < np.mean(miss < replayed.std[20:])  # the noise is learnt
@@ -124,6 +124,29 @@ def test_errors_are_those_of_the_rows(replayed):
     assert errors.loc[("arm", "2", ALONE), "p90"] == np.quantile(miss[30:60], 0.9)
     assert (errors["median_low"] <= errors["median"]).all()
     assert (errors["p90"] <= errors["p90_high"]).all()
+
+
+def test_sentences():
+    log = make(rows=30)
+
+    def say(*shares):
+        return Table(log, {}, log.command, None, dict(zip("abc", shares, strict=False))).sentence
+
+    assert say(0.5, 0.7) == (
+        "A correction would have removed 50 % of the error of a, and 70 % of the error of b."
+    )
+    assert say(0.0, 0.0) == "A correction would have removed none of a and b."
+    assert say(0.5, 0.0, -0.2) == (
+        "A correction would have removed 50 % of the error of a, and none of b, and added 20 % to "
+        "that of c."
+    )
+    assert say(-0.2) == "A correction would have added 20 % to that of a."
+
+
+def test_slow_actuators_are_named():
+    u = np.repeat(np.random.default_rng(0).uniform(-1, 1, (10, 1)), 12, axis=0)
+    table = replay(Log(("arm",), u, lfilter([0.1], [1.0, -0.9], u, axis=0)))
+    assert table.slow == ("arm",) and table.notes[0].startswith("arm: commands act in later rows")
 
 
 def test_intervals_hold_what_they_promise():

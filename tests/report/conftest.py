@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from afm_rl.storage.csv_text import csv_text
 from afm_rl.storage.manifest import write_manifest
 from afm_rl.storage.measures import Measure, Measures
 
@@ -108,17 +109,28 @@ def laps():
 
 
 @pytest.fixture
-def run_folder(tmp_path):
+def store(tmp_path):
     """Write the folder of a run: tables, measures and manifest."""
 
-    def write(name="run", change=lambda missions: missions, measures=LAPS, **chosen):
-        from afm_rl.report import write_run
+    def write(name, missions, steps, measures=LAPS):
+        folder = tmp_path / name
+        folder.mkdir(parents=True)
+        (folder / "missions.csv").write_text(csv_text(missions))
+        (folder / "measures.json").write_text(measures.to_json())
+        steps.to_parquet(folder / "steps.parquet", index=False)
+        write_manifest(folder)
+        return folder
 
+    return write
+
+
+@pytest.fixture
+def run_folder(store):
+    """Write the folder of a run of made-up results."""
+
+    def write(name="run", change=lambda missions: missions, **chosen):
         missions, steps = results(**chosen)
-        quiet = {"figures": False, "tensorboard": False, "echo": lambda line: None}
-        write_run(tmp_path / name, change(missions), steps, measures, **quiet)
-        write_manifest(tmp_path / name)
-        return tmp_path / name
+        return store(name, change(missions), steps)
 
     return write
 

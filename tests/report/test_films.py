@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.report import check_video, film_results, write_films, write_run
+from afm_rl.report import check_video, read_runs, write_films
 from afm_rl.report.film import ENCODERS, FRAMES, LAST, frames
 from afm_rl.report.scenes import map_scene, space_scene
 from afm_rl.storage.manifest import write_manifest
@@ -155,10 +155,10 @@ def test_a_film_moves_and_its_background_does_not(drive, ring):
 
 @pytest.mark.parametrize(("length", "expected"), [(1, 1), (2, 2), (FRAMES + 70, FRAMES)])
 def test_long_missions_are_shown_in_strides(length, expected):
-    scene = space_scene("title", fly(length)[1])
-    rows = []
-    watched = scene._replace(show=lambda row: (rows.append(row), scene.show(row)))
-    assert len(list(frames(watched, length))) == expected
+    scene, rows = space_scene("title", fly(length)[1]), []
+    watched = {part: lambda row, move=move: move(row) for part, move in scene.moving.items()}
+    watched[next(iter(watched))] = rows.append
+    assert len(list(frames(scene._replace(moving=watched), length))) == expected
     assert rows[1] == 0 and rows[-1] == length - 1
 
 
@@ -168,74 +168,67 @@ def test_places_that_are_not_finite_are_left_out(drive):
     assert len(list(frames(scene, 40))) == 40
 
 
-def test_one_film_per_method_and_one_of_all(tmp_path, make_results, ring):
+@pytest.fixture
+def film(tmp_path, store):
+    """Write films of missions and steps that are stored first; return their paths."""
+
+    def write(missions, steps, *tracks, **settings):
+        name, laps = f"run{len(list(tmp_path.glob('run*')))}", "success_rate" in missions
+        runs = read_runs([store(name, missions, steps, *([] if laps else [MSE]))])
+        return write_films(tmp_path / "films", runs, tracks, **{"echo": quiet} | settings)
+
+    return write
+
+
+def test_one_film_per_method_and_one_of_all(film, tmp_path, make_results, ring):
     said = []
     missions, steps = make_results(methods=("oracle", "adaptive"), v_gains=(-1.0, 2.0))
     missions["method"] = missions["method"].replace("oracle", "a/b")
-    steps = steps[steps["t"] % 20 == 0]
-    written = write_films(tmp_path / "new", missions, steps, [ring], echo=said.append)
+    written = film(missions, steps[steps["t"] % 20 == 0], ring, echo=said.append)
     names = ["all_methods.gif", "a_b.gif", "adaptive.gif"]
-    assert written == [tmp_path / "new" / name for name in names]
+    assert written == [tmp_path / "films" / name for name in names]
     assert said == [f"wrote {path}" for path in written]
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == sorted(names)
+    assert sorted(path.name for path in (tmp_path / "films").iterdir()) == sorted(names)
     for path in written:
         assert path.stat().st_size < 500_000
 
 
-def test_films_are_made_from_a_folder_alone(tmp_path, make_results, laps, ring):
-    missions, steps = make_results(methods=("oracle",))
-    steps = steps[steps["t"] < 5]
-    write_run(tmp_path, missions, steps, laps, figures=False, tensorboard=False, echo=quiet)
-    write_manifest(tmp_path)
-    direct = write_films(tmp_path / "one", missions, steps, [ring], echo=quiet)
-    stored = film_results([tmp_path], tmp_path / "two", load_track=lambda name: ring, echo=quiet)
-    assert [path.read_bytes() for path in stored] == [path.read_bytes() for path in direct]
-
-
-def test_films_of_flights_from_a_folder(tmp_path):
-    missions, steps = fly(6)
-    write_run(tmp_path, missions, steps, MSE, figures=False, tensorboard=False, echo=quiet)
-    write_manifest(tmp_path)
-    (path,) = film_results([tmp_path], tmp_path / "films", echo=quiet)
-    assert len(pictures(path.read_bytes())[0]) == 6
-
-
-def test_a_folder_without_steps_is_refused(tmp_path):
-    missions, steps = fly(6)
-    write_run(tmp_path, missions, steps, MSE, figures=False, tensorboard=False, echo=quiet)
-    (tmp_path / "steps.parquet").unlink()
-    write_manifest(tmp_path)
+def test_a_folder_without_steps_is_refused(tmp_path, store):
+    folder = store("run", *fly(6), MSE)
+    (folder / "steps.parquet").unlink()
+    write_manifest(folder)
     with pytest.raises(ConfigurationError, match=r"no steps\.parquet; films"):
-        film_results([tmp_path], tmp_path / "films", echo=quiet)
+        write_films(tmp_path / "films", read_runs([folder]), echo=quiet)
 
 
 @pytest.mark.parametrize("lost", ["x", "regime_active", "goal_x"])
-def test_what_a_film_needs_is_asked_for(tmp_path, make_results, lost):
+def test_what_a_film_needs_is_asked_for(film, tmp_path, make_results, lost):
     missions, steps = make_results(methods=("oracle",))
     for without in (steps.drop(columns=lost), steps.assign(**{lost: np.nan})):
         with pytest.raises(ConfigurationError, match=f"video: the steps lack {lost}"):
-            write_films(tmp_path, missions, without, echo=quiet)
-    assert not list(tmp_path.iterdir())
+            film(missions, without)
+    assert not (tmp_path / "films").exists()
 
 
-def test_a_film_that_breaks_off_leaves_the_old_one(tmp_path, monkeypatch):
+def test_a_film_that_breaks_off_leaves_the_old_one(film, tmp_path, monkeypatch):
     def broken(pictures):
         next(iter(pictures))
         raise RuntimeError("a bug")
 
-    (old,) = write_films(tmp_path, *fly(3), echo=quiet)
+    (old,) = film(*fly(3))
+    assert len(pictures(old.read_bytes())[0]) == 3
     before = old.read_bytes()
     monkeypatch.setitem(ENCODERS, "gif", broken)
     with pytest.raises(RuntimeError, match="a bug"):
-        write_films(tmp_path, *fly(3), echo=quiet)
-    assert old.read_bytes() == before and list(tmp_path.iterdir()) == [old]
+        film(*fly(3))
+    assert old.read_bytes() == before and list((tmp_path / "films").iterdir()) == [old]
 
 
-def test_the_other_form_is_a_video(tmp_path):
+def test_the_other_form_is_a_video(film):
     pytest.importorskip("imageio_ffmpeg")
     from imageio.v3 import improps
 
-    (path,) = write_films(tmp_path, *fly(8), form=check_video("mp4"), echo=quiet)
+    (path,) = film(*fly(8), form=check_video("mp4"))
     assert path.suffix == ".mp4"
     assert improps(path, plugin="FFMPEG").shape[1:] == (448, 960, 3)
 
@@ -253,7 +246,7 @@ def test_unknown_forms_are_refused(video):
         check_video(video)
 
 
-def test_a_robot_that_is_drawn_by_others(make_results, tmp_path):
+def test_a_robot_that_is_drawn_by_others(film, make_results):
     missions, steps = make_results(methods=("physics", "oracle"))
     asked = []
 
@@ -261,7 +254,7 @@ def test_a_robot_that_is_drawn_by_others(make_results, tmp_path):
         asked.append(len(own))
         return [np.full((16, 16, 3), k, np.uint8) for k in (0, 100, 200)]
 
-    paths = write_films(tmp_path, missions, steps, draw=draw, echo=quiet)
+    paths = film(missions, steps, draw=draw)
     assert [path.name for path in paths] == ["physics.gif", "oracle.gif"]
     assert all(count <= FRAMES for count in asked)
     assert len(pictures(paths[0].read_bytes())[0]) == 3

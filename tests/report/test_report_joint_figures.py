@@ -5,45 +5,38 @@ import warnings
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.text import Text
 
-from afm_rl.report.collect import collect
+from afm_rl.report import read_runs
 from afm_rl.report.figures import (
-    draw_all,
-    excerpts,
+    draw_report,
+    read_excerpts,
     share_reached,
     telling_cells,
     traced_missions,
 )
-from afm_rl.report.heatmaps import draw_heatmaps
+from afm_rl.report.means import count_budgets
 from afm_rl.report.shares import draw_profile, draw_progress, ratios
-from afm_rl.report.style import method_styles, png_bytes
-from afm_rl.report.summary import count_budgets
+from afm_rl.report.style import method_styles
 
 
 @pytest.fixture
 def joined(run_folder, laps):
-    """Results of a run's folder: missions, the collection, and excerpts of its steps."""
+    """Results of a run's folder: missions, the runs, recovery times and progress."""
 
     def make(**chosen):
-        collection = collect([run_folder(**chosen)])
-        missions = count_budgets(collection.missions, laps)
-        return missions, collection, excerpts(collection, telling_cells(missions, laps))
+        runs = read_runs([run_folder(**chosen)])
+        return count_budgets(runs.missions, laps), runs, *read_excerpts(runs)
 
     return make
 
 
-def texts(figure):
-    return [text.get_text() for text in figure.findobj(Text) if text.get_text()]
-
-
-def test_pictures_are_whole_and_legible(joined, ring):
+def test_pictures_are_whole(joined, ring):
+    missions, runs, _, progress = joined(seeds=2)
     with warnings.catch_warnings(action="error"):
-        drawn = {name: figure for name, *_, figure in draw_all(*joined(seeds=2), [ring])}
-        assert list(drawn) == ["summary", "learning_ring", "profile", "progress", "heat_ring"]
-        for figure in drawn.values():
-            png_bytes(figure)
-            assert min(text.get_fontsize() for text in figure.findobj(Text)) >= 7
+        drawn = [*draw_report(runs, missions, progress, [ring])]
+    names = ["summary", "learning_ring", "profile", "progress", "trajectory_ring"]
+    assert [picture.name for picture in drawn] == names
+    assert all(picture.png.startswith(b"\x89PNG") and picture.caption for picture in drawn)
 
 
 def test_the_profile_counts_missions_within_a_factor(joined, artists, laps):
@@ -61,10 +54,9 @@ def test_the_profile_counts_missions_within_a_factor(joined, artists, laps):
 
 
 def test_progress_is_the_mean_share_of_targets(joined, artists, make_results):
-    missions, _, found = joined(methods=["physics", "oracle"], seeds=2)
-    assert found.progress["oracle"].shape == (2, len(found.grid))
-    styles = method_styles(missions["method"])
-    (axes,) = draw_progress(found.grid, found.progress, found.cells, styles, "targets").axes
+    missions, _, _, progress = joined(methods=["physics", "oracle"], seeds=2)
+    assert progress.loc["oracle"].shape == (2, 240)
+    (axes,) = draw_progress(progress, method_styles(missions["method"]), "targets").axes
     physics, oracle = artists(axes, "progress")
     _, steps = make_results(["oracle"])
     reached = steps["reached"].to_numpy()
@@ -81,8 +73,7 @@ def test_before_the_first_step_logged_nothing_is_known_but_the_first():
 
 
 def test_recovery_is_gathered_for_every_mission(joined):
-    *_, found = joined(seeds=2)
-    times = pd.concat(found.recovery)
+    _, _, times, _ = joined(seeds=2)
     assert set(times["method"]) == {"physics", "adaptive", "oracle"}
     oracle = times[(times["method"] == "oracle") & (times["of"] == "model")]
     assert oracle["time"].eq(0).all() and oracle["change"].tolist() == [1, 2, 1, 2]
@@ -92,24 +83,6 @@ def test_the_traced_seed_is_the_one_that_most_methods_have(joined):
     missions, *_ = joined(seeds=3)
     some = missions[(missions["seed"] > 0) | (missions["method"] == "oracle")]
     assert traced_missions(some)["seed"].tolist() == [1, 1, 1]
-
-
-def test_maps_count_every_step_inside(joined, ring, artists):
-    _, _, found = joined(methods=["adaptive", "oracle"], seeds=2)
-    (figure,) = draw_heatmaps(found.places, ring)
-    adaptive, oracle, bar = figure.axes
-    for axes, count in ((adaptive, 2 * 120), (oracle, 2 * 100)):
-        (mesh,) = axes.collections[-1:]
-        assert mesh.get_array().sum() == count
-        assert artists(axes, "road")
-    assert bar.get_ylabel() == "steps in a square"
-
-
-def test_a_method_missing_in_a_cell_has_an_empty_map(joined):
-    _, _, found = joined(methods=["adaptive", "oracle"], v_gains=[-1.0, 2.0])
-    del found.places["ring, v_gain = 2", "oracle"]
-    (figure,) = draw_heatmaps(found.places)
-    assert texts(figure).count("missing") == 1
 
 
 def test_curves_and_maps_show_where_methods_differ_most(joined, laps):

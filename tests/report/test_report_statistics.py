@@ -7,27 +7,29 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from afm_rl.report import summarise
-from afm_rl.report.comparisons import (
+from afm_rl.report.means import (
     aggregate,
-    cell_table,
+    budget_notes,
     compare,
-    comparison_tables,
+    count_budgets,
     pair,
     rank_missions,
-    summary_table,
+    summarise,
 )
-from afm_rl.report.missing_runs import find_missing, missing_lines, missing_table
 from afm_rl.report.statistics import (
     interquartile_mean,
     probability_of_improvement,
     resampled_bounds,
     stratified_interval,
 )
-from afm_rl.report.summary import budget_notes, count_budgets
+from afm_rl.report.tables import (
+    cell_table,
+    comparison_tables,
+    missing_lines,
+    missing_table,
+    summary_table,
+)
 from afm_rl.storage.measures import Measure, Measures
-
-NOTHING = pd.DataFrame(columns=["seconds", "missions"])
 
 
 def rows(method, cell, outcomes):
@@ -57,7 +59,7 @@ def missions(laps):
         *rows("oracle", "a", [(1.0, 99), (1.0, 99)]),
         *rows("oracle", "b", [(1.0, 199), (0.5, 499)]),
     ]
-    return rank_missions(count_budgets(pd.DataFrame(table), laps), laps)
+    return count_budgets(pd.DataFrame(table), laps)
 
 
 def test_given_up_missions_cost_the_budget_of_their_cell(laps):
@@ -72,7 +74,7 @@ def test_given_up_missions_cost_the_budget_of_their_cell(laps):
 
 
 def test_the_console_and_the_report_give_the_same_interval(missions, laps):
-    short, long = summarise(missions, laps), aggregate(missions, laps, NOTHING, "oracle")
+    short, long = summarise(missions, laps), aggregate(missions, laps, "oracle")
     for column in ("success_rate_low", "success_rate_high", "steps_low", "steps_high"):
         pd.testing.assert_series_equal(short[column], long[column])
     plain = scipy.stats.bootstrap(
@@ -174,7 +176,7 @@ def test_nothing_shared_no_probability():
 
 
 def test_aggregates_are_those_found_by_hand(missions, laps):
-    means = aggregate(missions, laps, NOTHING, "oracle").set_index("method")
+    means = aggregate(missions, laps, "oracle").set_index("method")
     ours = means.loc["ours"]
     assert (ours["missions"], ours["cells"], ours["finished"]) == (4, 2, 0.75)
     assert ours["success_rate"] == 0.875
@@ -195,7 +197,7 @@ def test_the_table_of_aggregates_is_bold_for_the_best_but_the_oracle(missions, l
     last = pd.DataFrame(rows("base", "b", [(0.5, 499)])).assign(seed=1)
     spared = pd.DataFrame(rows("spared", "a", [(1.0, 9)]))
     whole = count_budgets(pd.concat([missions, last, spared], ignore_index=True), laps)
-    means = aggregate(whole, laps, NOTHING, "oracle")
+    means = aggregate(whole, laps, "oracle")
     table = summary_table(means, laps, "oracle")
     assert table.shown["method"].tolist() == ["ours", "base", "oracle", "spared"]
     assert table.shown.loc[0, "success (%)"] == "87.5 [75.0, 100.0]"
@@ -205,15 +207,15 @@ def test_the_table_of_aggregates_is_bold_for_the_best_but_the_oracle(missions, l
 
 
 def test_no_oracle_no_ratio(missions, laps):
-    table = summary_table(aggregate(missions, laps, NOTHING, "nobody"), laps, "nobody")
+    table = summary_table(aggregate(missions, laps, "nobody"), laps, "nobody")
     assert not any("nobody" in head for head in table.shown)
 
 
-def test_speed_comes_from_the_study_or_from_the_missions(missions, laps):
-    study = pd.DataFrame({"seconds": [36.0], "missions": [4]}, index=["ours"])
-    means = aggregate(missions, laps, study, "oracle").set_index("method")
-    assert means["per_hour"].to_dict() == {"ours": 400.0, "base": 360.0, "oracle": 360.0}
-    timeless = aggregate(missions.drop(columns="seconds"), laps, NOTHING, "oracle")
+def test_missions_per_hour_are_those_whose_time_was_counted(missions, laps):
+    some = missions.assign(seconds=[36.0] * 3 + [np.nan] + [10.0] * 7)
+    means = aggregate(some, laps, "oracle").set_index("method")
+    assert means["per_hour"].to_dict() == {"ours": 100.0, "base": 360.0, "oracle": 360.0}
+    timeless = aggregate(missions.drop(columns="seconds"), laps, "oracle")
     assert timeless["per_hour"].isna().all()
 
 
@@ -261,16 +263,16 @@ def test_cells_times_methods(missions, laps):
     assert alone.shown.loc[1, "base"] == "-"
 
 
-def test_what_is_missing_is_counted(missions, laps):
-    plan = pd.DataFrame({"method": ["online"], "cell": ["a"], "seed": [5]})
-    missing = find_missing(missions, plan)
-    assert len(missing) == 1 + 4 + 4  # base: b, seed 1; seed 5 of all four; all of online's
+def test_what_is_missing_is_counted():
+    rows = [("ours", "a", 5), ("base", "a", 5), ("base", "b", 5), ("on", "a", 0), ("on", "b", 0)]
+    missing = pd.DataFrame(rows, columns=["method", "cell", "seed"])
     table = missing_table(missing, cells=2)
-    lines = missing_lines(table)
-    assert "missing: ours: 1 missions, seeds 5, cells a" in lines
-    assert len(lines) == len(table.shown)
-    assert table.numbers is missing
-    assert table.shown["missions"].astype(int).sum() == 9
+    assert table.numbers is missing and table.shown["missions"].tolist() == ["1", "2", "2"]
+    assert missing_lines(table) == [
+        "missing: ours: 1 missions, seeds 5, cells a",
+        "missing: base: 2 missions, seeds 5, cells all 2",
+        "missing: on: 2 missions, seeds 0, cells all 2",
+    ]
 
 
 def test_many_missing_cells_are_not_all_named():
@@ -283,8 +285,8 @@ def test_missions_without_a_value_are_left_out_of_its_mean():
     late = Measures((Measure("recovery", "recovery", "recovery", "steps", "lower"),))
     values = {"recovery": [3.0, np.nan, 5.0], "finished": True, "cell": "a", "seed": [0, 1, 2]}
     missions = pd.DataFrame({"method": "x", "track": "a"} | values)
-    (row,) = aggregate(missions, late, NOTHING, "x").to_dict("records")
+    (row,) = aggregate(missions, late, "x").to_dict("records")
     assert row["recovery"] == 4.0 and row["recovery_low"] == 3.0
     empty = missions.assign(recovery=np.nan)
-    table = summary_table(aggregate(empty, late, NOTHING, "x"), late, "x")
+    table = summary_table(aggregate(empty, late, "x"), late, "x")
     assert table.shown["recovery (steps)"].tolist() == ["-"]

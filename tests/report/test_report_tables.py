@@ -5,7 +5,7 @@ import io
 import pandas as pd
 import pytest
 
-from afm_rl.report import print_summary, summarise, summarise_cells
+from afm_rl.report import print_summary, summarise
 
 
 class Terminal(io.StringIO):
@@ -57,7 +57,8 @@ def test_the_index_of_the_frame_plays_no_part(four, laps, table):
 
 
 def test_cells_are_summarised_one_by_one(four, laps, table):
-    cells = summarise_cells(four.assign(v_gain=[-1.0, -1.0, 2.0, 2.0]), laps)
+    two = four.assign(v_gain=[-1.0, -1.0, 2.0, 2.0])
+    cells = summarise(two, laps, ["cell", "method"])
     assert cells[["cell", "method", "success_rate"]].to_numpy().tolist() == [
         ["ring, v_gain = -1", "a", 0.25],
         ["ring, v_gain = -1", "b", 1.0],

@@ -1,6 +1,7 @@
 """The whole report: files, page, LaTeX."""
 
 import base64
+import os
 import re
 from html.parser import HTMLParser
 
@@ -8,8 +9,9 @@ import pandas as pd
 import pytest
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.report import write_report, write_run
-from afm_rl.report.table import Table, best_places
+from afm_rl.report import read_runs, write_report, write_run
+from afm_rl.report.events import FILE
+from afm_rl.report.table import Table
 from afm_rl.storage.manifest import write_manifest
 from afm_rl.storage.measures import Measure, Measures
 
@@ -20,18 +22,17 @@ def report(tmp_path, ring):
 
     def write(*folders, **settings):
         said = []
-
-        def load(name):
-            if name != "ring":
-                raise ConfigurationError(f"{name}: no such track")
-            return ring
-
-        settings = {"load_track": load, "baselines": ["physics"]} | settings
-        page = write_report(folders, tmp_path / "out", echo=said.append, **settings)
+        settings = {"baselines": ["physics"]} | settings
+        runs, out = read_runs(folders), tmp_path / "out"
+        page = write_report(runs, out, [ring], echo=said.append, **settings)
         assert page == tmp_path / "out" / "index.html"
         return tmp_path / "out", said
 
     return write
+
+
+def quiet(line):
+    pass
 
 
 def files(folder):
@@ -61,10 +62,11 @@ class Page(HTMLParser):
         self.texts.append(data)
 
 
-def test_everything_is_written(run_folder, report):
-    folder, said = report(run_folder(seeds=2, v_gains=[-1.0, 2.0]))
+def test_everything_is_written_the_same_each_time(run_folder, report):
+    source = run_folder(seeds=2, v_gains=[-1.0, 2.0])
+    folder, said = report(source)
     tables = ["aggregate", "against_physics", "recovery", "cells"]
-    figures = ["summary", "learning_ring", "profile", "progress", "heat_ring"]
+    figures = ["summary", "learning_ring", "profile", "progress", "trajectory_ring"]
     assert files(folder) == {
         "index.html",
         "missing.csv",
@@ -74,9 +76,12 @@ def test_everything_is_written(run_folder, report):
     assert said[0].startswith("12 missions of 3 methods in 2 cells")
     assert said[-1] == f"Report: {folder / 'index.html'}"
     assert pd.read_csv(folder / "missing.csv").empty
+    before = {name: (folder / name).read_bytes() for name in files(folder)}
+    report(source)
+    assert {name: (folder / name).read_bytes() for name in files(folder)} == before
 
 
-def test_the_page_needs_nothing_else(run_folder, report):
+def test_the_page_needs_nothing_else_and_its_contents_lead_somewhere(run_folder, report):
     folder, _ = report(run_folder(seeds=2))
     text = (folder / "index.html").read_text(encoding="utf-8")
     page = Page(text)
@@ -88,14 +93,10 @@ def test_the_page_needs_nothing_else(run_folder, report):
     assert all(source.startswith(prefix) for source in sources)
     assert {base64.b64decode(source.removeprefix(prefix)) for source in sources} == pictures
     assert sum(tag == "figcaption" for tag, _ in page.found) == len(sources)
-
-
-def test_the_contents_lead_somewhere(run_folder, report):
-    folder, _ = report(run_folder(seeds=2))
-    found = Page((folder / "index.html").read_text()).found
-    names = [attrs["id"] for _, attrs in found if "id" in attrs]
-    links = [attrs["href"].removeprefix("#") for tag, attrs in found if tag == "a"]
-    assert links == names and len(set(names)) == len(names) > 8
+    names = [attrs["id"] for _, attrs in page.found if "id" in attrs]
+    links = [attrs["href"].removeprefix("#") for tag, attrs in page.found if tag == "a"]
+    assert links == names and len(set(names)) == len(names)
+    assert [name.split("-")[0] for name in names] == ["figure"] * 5 + ["table"] * 4
 
 
 def test_names_are_no_markup(run_folder, report):
@@ -184,16 +185,14 @@ def rewards():
     )
 
 
-def test_a_third_kind_of_robot_needs_no_change(tmp_path, make_results, rewards, report):
+def test_a_third_kind_of_robot_needs_no_change(tmp_path, store, make_results, rewards, report):
     missions, steps = make_results(seeds=2)
     new = {"return": -10.0 * missions["steps"], "after": 0.5, "recovery_steps": [3, 4, 5, 9, 9, 9]}
     missions = missions.drop(columns=["success_rate", "reached", "targets"]).assign(**new)
     steps = steps.drop(columns=["x", "y", "theta", "goal_x", "goal_y", "reached"])
-    write_run(tmp_path / "run", missions, steps, rewards, echo=lambda line: None)
-    write_manifest(tmp_path / "run")
-    drawn = {path.name for path in (tmp_path / "run" / "figures").iterdir()}
-    assert drawn == {"learning.png", "summary.png"}
-    folder, _ = report(tmp_path / "run")
+    drawn = write_run(tmp_path / "drawn", missions, steps, rewards, tensorboard=False, echo=quiet)
+    assert {path.name for path in drawn} == {"learning.png", "summary.png"}
+    folder, _ = report(store("run", missions, steps, rewards))
     assert {name for name in files(folder) if name.endswith(".png")} == {
         "figures/summary.png",
         "figures/learning_ring.png",
@@ -204,20 +203,11 @@ def test_a_third_kind_of_robot_needs_no_change(tmp_path, make_results, rewards, 
     assert "return" in page.texts and not {"steps", "success (%)"} & set(page.texts)
 
 
-def test_kinds_of_missions_do_not_mix(run_folder, make_results, report, rewards, tmp_path):
+def test_kinds_of_missions_do_not_mix(run_folder, make_results, report, rewards, store):
     missions, steps = make_results(["oracle"])
     missions = missions.assign(**{"return": 1.0, "after": 1.0, "recovery_steps": 1})
-    write_run(tmp_path / "other", missions, steps, rewards, echo=lambda line: None, figures=False)
-    write_manifest(tmp_path / "other")
     with pytest.raises(ConfigurationError, match="hold missions of different kinds"):
-        report(run_folder(), tmp_path / "other")
-
-
-def test_figures_come_first(run_folder, report):
-    folder, _ = report(run_folder(seeds=2))
-    found = Page((folder / "index.html").read_text()).found
-    names = [attrs["id"] for _, attrs in found if "id" in attrs]
-    assert [name.split("-")[0] for name in names] == ["figure"] * 5 + ["table"] * 4
+        report(run_folder(), store("other", missions, steps, rewards))
 
 
 def test_budgets_are_said(run_folder, report):
@@ -233,7 +223,7 @@ def test_many_methods_fill_several_figures(run_folder, make_results, report):
 
     folder, _ = report(run_folder(change=many, methods=["oracle"] * 7))
     names = {name for name in files(folder) if name.endswith(".png")}
-    for name in ("learning_ring", "profile", "progress", "heat_ring"):
+    for name in ("learning_ring", "profile", "progress", "trajectory_ring"):
         assert {f"figures/{name}_1.png", f"figures/{name}_2.png"} <= names
 
 
@@ -247,30 +237,49 @@ def test_names_that_are_formulas_stay_texts(run_folder, report):
     assert strange in Page((folder / "index.html").read_text()).texts
 
 
-@pytest.mark.parametrize("load", [None, "own"])
-def test_tracks_that_cannot_be_loaded_have_no_road(run_folder, report, load):
-    settings = {} if load else {"load_track": None}
-    folder, _ = report(run_folder(tracks=["elsewhere"]), **settings)
-    assert "figures/heat_elsewhere.png" in files(folder)
+def test_tracks_that_are_not_known_have_no_road(run_folder, report):
+    folder, _ = report(run_folder(tracks=["elsewhere"]))
+    assert "figures/trajectory_elsewhere.png" in files(folder)
 
 
-def test_writing_again_replaces(run_folder, report):
-    source = run_folder(seeds=2)
-    folder, _ = report(source)
-    before = {name: (folder / name).read_bytes() for name in files(folder)}
-    report(source)
-    assert {name: (folder / name).read_bytes() for name in files(folder)} == before
+def test_the_figures_and_curves_of_a_run(tmp_path, make_results, laps, ring):
+    said = []
+    written = write_run(str(tmp_path), *make_results(seeds=2), laps, [ring], echo=said.append)
+    names = {path.relative_to(tmp_path).as_posix() for path in written}
+    assert names == files(tmp_path) and len(said) == 4
+    assert {name for name in names if "_seed_" not in name} == {
+        *(f"figures/{name}.png" for name in ("trajectory", "learning", "summary")),
+        *(f"tensorboard/{method}/{FILE}" for method in ("physics", "adaptive", "oracle")),
+    }
+    before = {name: (tmp_path / name).read_bytes() for name in names}
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(ConfigurationError, match="No space"):
+        patch.setattr(os, "fsync", full)
+        write_run(tmp_path, *make_results(v_gains=[0.5]), laps, [ring], echo=quiet)
+    assert {name: (tmp_path / name).read_bytes() for name in files(tmp_path)} == before
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda missions, steps: (missions[:0], steps),
+        lambda missions, steps: (missions.assign(mission=0), steps),
+        lambda missions, steps: (missions, steps[steps["mission"] != 1]),
+    ],
+)
+def test_tables_that_do_not_fit_write_nothing(tmp_path, make_results, laps, spoil):
+    with pytest.raises(ConfigurationError, match="each with a number of its own and with steps"):
+        write_run(tmp_path / "run", *spoil(*make_results()), laps, echo=quiet)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_folder_that_cannot_be_written(run_folder, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigurationError, match="cannot write"):
-        write_report([run_folder()], tmp_path / "file" / "report", echo=lambda line: None)
-
-
-def test_the_best_is_not_marked_where_all_are_alike():
-    values = pd.DataFrame({"a": [1.0, 1.0], "b": [2.0, 1.0]}, index=[7, 7])
-    assert best_places(values, {"a": 1, "b": -1}) == {(1, 3)}
+        write_report(read_runs([run_folder()]), tmp_path / "file" / "report", echo=quiet)
 
 
 def test_signs_become_commands():

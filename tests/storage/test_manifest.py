@@ -10,7 +10,13 @@ import torch
 from safetensors.torch import save_file
 
 from afm_rl.errors import ArtefactError
-from afm_rl.storage.manifest import MANIFEST, check_manifest, extend_manifest, write_manifest
+from afm_rl.storage.manifest import (
+    MANIFEST,
+    check_manifest,
+    extend_manifest,
+    read_verified,
+    write_manifest,
+)
 
 KINDS = [
     *("missions.csv", "compute.csv", "steps.parquet", "config.yaml", "model.safetensors"),
@@ -49,11 +55,18 @@ def test_any_flipped_bit_is_found_and_the_file_named(folder, kind):
         damaged = bytearray(whole)
         damaged[dice.randrange(len(whole))] ^= 1 << dice.randrange(8)
         path.write_bytes(damaged)
-        with pytest.raises(ArtefactError) as found:
-            check_manifest(folder)
-        assert str(path) in str(found.value)
+        for look in (check_manifest, lambda folder: read_verified(folder, kind)):
+            with pytest.raises(ArtefactError) as found:
+                look(folder)
+            assert str(path) in str(found.value)
     path.write_bytes(whole)
+    assert kind == MANIFEST or read_verified(folder, kind) == whole
     check_manifest(folder)
+
+
+def test_files_that_the_manifest_does_not_name_are_not_verified(folder):
+    with pytest.raises(ArtefactError, match="does not name it"):
+        read_verified(folder, "jobs/physics/manifest.json")
 
 
 @pytest.mark.parametrize("kind", KINDS)

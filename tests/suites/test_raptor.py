@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+import roma
 import torch
 from flight import Raptor
 from tensordict import TensorDict
@@ -12,7 +13,6 @@ from afm_rl.dynamics import Quadrotor
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning import GoalDistance, PlanningEnv
 from afm_rl.spaces.airframe import QuadrotorBody, unmix
-from afm_rl.spaces.rotations import quaternion_normalise
 
 pytest.importorskip("foundation_policy")
 
@@ -35,7 +35,7 @@ def test_it_is_the_controller_of_rotorpy():
     for _ in range(5):
         state = 0.2 * torch.randn(2, 13, generator=draws)
         upright = torch.tensor([0.0, 0.0, 0.0, 1.0])
-        state[:, 6:10] = quaternion_normalise(state[:, 6:10] + upright)
+        state[:, 6:10] = roma.quat_normalize(state[:, 6:10] + upright)
         reference = torch.randn(2, 2, 6, generator=draws)
         td = TensorDict({"observation": state, "reference": reference, **kept}, [2])
         mine(td)

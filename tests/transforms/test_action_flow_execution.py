@@ -29,7 +29,7 @@ class Stub(Corrector):
     """Gives a fixed kind of answer once it has seen a transition."""
 
     def __init__(self, answer=torch.neg, low=LOW, high=HIGH, **others):
-        super().__init__(low, high, gate=0.0, recent=2)
+        super().__init__(low, high, recent=2)
         self.answer, self.others, self.asked = answer, others, []
 
     def correct(self, memory, planned, model, box):

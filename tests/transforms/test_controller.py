@@ -36,7 +36,7 @@ def planner_of(kind=MPPI, **settings):
 
 def policy_of(corrector=None):
     torch.manual_seed(0)
-    # Among samples or hypotheses that are as good, rounding would decide.
+    # Among samples or readings that are as good, rounding would decide.
     network = AxisNetwork(width=8, latent=8)
     flow = ActionFlow(LOW, HIGH, ["recent"], source_std=0.0, network=network)
     return ActionFlowPolicy(Dubins(), planner_of().action_spec, corrector or flow)

@@ -74,7 +74,7 @@ def test_mujoco_in_a_vector_of_one_process_or_of_several():
         envs = ActionFlowVectorWrapper(kind(makers), "mujoco")
         envs.reset(seed=0)
         ran.append([envs.step(each) for each in actions[:25]])
-        assert "a_0: reversed" in envs.diagnosis[1]
+        assert "joint0: reversed" in envs.diagnosis[1]
         ran[-1] += [envs.step(each) for each in actions[25:]]
         envs.close()
     for (seen, *_, infos), (other, *_, told) in zip(*ran, strict=True):

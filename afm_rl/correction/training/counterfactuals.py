@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor
 
 from afm_rl.compiling.devices import device_of
 from afm_rl.correction.achievable import intend
 from afm_rl.correction.base import Corrector
-from afm_rl.correction.experts import LIMIT, Rows
+from afm_rl.correction.experts import LIMIT, Rows, fit_experts
+from afm_rl.correction.solver import midpoint
 from afm_rl.correction.training.prior import Draw, Drawn, draw_actions, draw_masks
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.regimes import Regime
 from afm_rl.spaces.sampling import draw_states
+
+if TYPE_CHECKING:
+    from afm_rl.correction.action_flow import ActionFlow
 
 
 def draw_counterfactuals(
@@ -94,3 +101,39 @@ def imagine(
     slope = model.jacobian(state[out], inside[out])
     change[out] += (slope @ (effect - inside)[out].unsqueeze(-1)).squeeze(-1)
     return model.manifold.add(expected, change)
+
+
+class Windows:
+    """The loss of an action flow on the windows of one robot.
+
+    Args:
+        flow: the corrector.
+        plans: for each window.
+    """
+
+    def __init__(self, flow: ActionFlow, plans: int = 4) -> None:
+        self.flow, self.plans = flow, plans
+
+    def draw(
+        self,
+        model: DynamicsModel,
+        regime: Regime,
+        states: tuple[Tensor, Tensor] | Tensor,
+        count: int,
+        generator: torch.Generator,
+    ) -> Drawn:
+        """Return ``count`` windows with their plans and answers."""
+        size = (count, self.flow.recent, self.plans)
+        mode = self.flow.tick.saturation
+        with torch.no_grad():
+            return draw_counterfactuals(self.flow, model, regime, states, size, mode, generator)
+
+    @torch.no_grad()
+    def error(self, drawn: Drawn) -> float:
+        """Return the RMS error of the flow's mean action, a share of the largest one."""
+        tick, network = self.flow.tick, self.flow.network
+        known = network.encode(drawn.rows, fit_experts(drawn.rows))
+        least, most = (end.to(drawn.planned) for end in (self.flow.lowest, self.flow.highest))
+        asked = network.ask(known, drawn.planned, tick.saturation)
+        ends = midpoint(partial(network.velocity, asked), drawn.planned, tick.steps)
+        return float((ends.clamp(least, most) - drawn.intended).square().mean().sqrt())

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -13,8 +12,11 @@ from torch import Tensor, nn
 
 from afm_rl.compiling.devices import device_of
 from afm_rl.correction.achievable import MODES
+from afm_rl.correction.action_flow import ActionFlow
 from afm_rl.correction.experts import Rows, fit_experts
 from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.paper_flow import PaperFlow
+from afm_rl.correction.training.counterfactuals import Windows
 from afm_rl.correction.training.prior import Drawn
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import (
@@ -122,32 +124,8 @@ class CFMLoss(InPlaceLoss):
         return self._reduced((velocity + EFFECT_WEIGHT * effect).view(batch), tensordict)
 
 
-class Trainable(Protocol):
-    """A flow that can be trained on the imagined faults of a robot."""
-
-    def parameters(self) -> Iterable[nn.Parameter]: ...
-
-    def training_loss(
-        self,
-        model: DynamicsModel,
-        regime: Regime,
-        states: States,
-        count: int,
-        generator: torch.Generator,
-    ) -> Tensor: ...
-
-    def held_out_error(
-        self,
-        model: DynamicsModel,
-        regime: Regime,
-        states: States,
-        count: int,
-        generator: torch.Generator,
-    ) -> float: ...
-
-
 def train_flow(
-    flow: Trainable,
+    flow: ActionFlow | PaperFlow,
     model: DynamicsModel,
     regime: Regime,
     states: States,
@@ -193,11 +171,21 @@ def train_flow(
     else:
         states = states.to(device)
 
+    world, windows = (model, regime, states), None
+    if isinstance(flow, ActionFlow):
+        windows = Windows(flow)
+
     def loss() -> Tensor:
-        return flow.training_loss(model, regime, states, batch_size, generator)
+        if windows is None:
+            return flow.training_loss(*world, batch_size, generator)
+        drawn = windows.draw(*world, batch_size, generator)
+        velocity, effect = flow_losses(flow.network, drawn, flow.tick.saturation, generator)
+        return (velocity + EFFECT_WEIGHT * effect).mean()
 
     optimise(list(flow.parameters()), loss, iterations, lr, progress)
-    return flow.held_out_error(model, regime, states, 2048, generator)
+    if windows is None:
+        return flow.held_out_error(*world, 2048, generator)
+    return windows.error(windows.draw(*world, 2048, generator))
 
 
 def check_states(states: States, model: DynamicsModel) -> None:

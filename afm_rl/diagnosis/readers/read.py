@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,6 +19,8 @@ from afm_rl.errors import ConfigurationError, printable
 PAIRS = ("command", "response")
 TRANSITIONS = ("action", "state")
 LOST = 0.5  # share of the rows that may be dropped because a number is missing
+EFFORT = re.compile(r"(pwm|thrust|throttle|motor|esc)[._]?\d*")
+"""Columns that say how hard the motors are driven, if at all."""
 LARGEST = 1e30  # squares of larger numbers leave single precision
 
 READERS: dict[str, Callable[[Path], Source]] = {
@@ -99,6 +102,7 @@ def read_log(
             row=found.row if found.read_from > len(found.first) else None,
             read_from=found.read_from,
             notes=found.notes,
+            effort=found.effort,
         )
 
 
@@ -137,7 +141,8 @@ def read_columns(
         border = found[source.episode].values if source.episode else None
         number = found[wanted[0][0]].row
         number = np.arange(len(first)) if number is None else number
-        return _complete(source, names, first, second, number, time, border, notes)
+        done = _complete(source, names, first, second, number, time, border, notes)
+        return replace(done, effort=_effort(source))
 
 
 @contextmanager
@@ -155,6 +160,17 @@ def _about(path: str | Path) -> Iterator[None]:
         raise ConfigurationError(f"{path}: nested too deeply; expected a log") from error
     except MemoryError as error:
         raise ConfigurationError(f"{path}: not enough memory; log less at a time") from error
+
+
+def _effort(source: Source, most: int = 16) -> dict[str, np.ndarray]:
+    """Return how hard the motors were driven, as far as that was logged in numbers."""
+    names = [name for name in source.names if EFFORT.fullmatch(name)][:most]
+    try:
+        found = source.read(names) if names else {}
+    except ConfigurationError:
+        return {}
+    kept = {name: series.values[np.isfinite(series.values)] for name, series in found.items()}
+    return {printable(name): values for name, values in kept.items() if len(values)}
 
 
 def _held(series: Series, clock: np.ndarray) -> Series:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import stat
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -50,19 +52,10 @@ class Source:
             return [printable(name) for name in self.names]
         lines = []
         for topic, count in sorted(self.topics.items()):
-            last: dict[str, str] = {}  # place of each array's last entry
-            for name in self.names:
-                if name.startswith(f"{topic}."):
-                    field, _, place = name[len(topic) + 1 :].partition("[0]")
-                    array, _, end = field.rpartition("[")
-                    if end.removesuffix("]").isdigit() and array in last:
-                        last[array] = end.removesuffix("]")
-                    elif name.endswith("[0]"):
-                        last[field] = "0"
-                    else:
-                        last[field + ("[0]" + place if place else "")] = ""
-            fields = [f"{field}[0..{end}]" if end else field for field, end in last.items()]
-            lines.append(printable(f"{topic} ({count} messages): {', '.join(fields)}", 2000))
+            own = [name[len(topic) + 1 :] for name in self.names if name.startswith(f"{topic}.")]
+            fields = Counter(re.sub(r"\[\d+\]$", "[]", name) for name in own)
+            shown = ", ".join(f.replace("[]", f"[0..{n - 1}]") for f, n in fields.items())
+            lines.append(printable(f"{topic} ({count} messages): {shown}", 2000))
         return lines
 
 
@@ -89,6 +82,7 @@ class Columns:
         read_from: rows of the file.
         frame: time between command and response of a healthy robot (s).
         notes: what a reader must know.
+        effort: how hard the motors were driven, ``(M,)`` each.
     """
 
     names: tuple[Sequence[str], Sequence[str]]
@@ -100,6 +94,7 @@ class Columns:
     read_from: int
     frame: float = 0.0
     notes: tuple[str, ...] = ()
+    effort: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 class Unchosen(ConfigurationError):

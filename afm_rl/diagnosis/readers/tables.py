@@ -62,6 +62,7 @@ def _large(path: Path) -> tuple[list[tuple[int, int, int]], tuple[str, ...]]:
             while start < end:
                 piece = file.read(min(1 << 24, end - start))
                 before, start = before + piece.count(b"\n"), start + len(piece)
+    before -= 1  # the head line
     blocks = blocks_of(before)
     if len(blocks) == 1:
         return [], ()

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import roma
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -16,7 +17,6 @@ from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.spaces.airframe import QuadrotorBody, saturate
 from afm_rl.spaces.keys import as_key
-from afm_rl.spaces.rotations import body_z_axis, quaternion_conjugate, rotate
 
 LEAST = 1.0  # m/s^2 upwards: with less, tilting would not steer
 
@@ -71,7 +71,8 @@ def geometric_wrench(
     wanted = acceleration - gains.position * (position - reference[..., :3])
     wanted = wanted - gains.velocity * (velocity - reference[..., 3:])
     force = _within_means(wanted, body, tilt)
-    thrust = body.mass * (force * body_z_axis(quaternion)).sum(-1, keepdim=True)
+    turned = roma.unitquat_to_rotmat(quaternion)  # R
+    thrust = body.mass * (force * turned[..., 2]).sum(-1, keepdim=True)
     thrust = thrust.clamp_min(0.0)  # less would cost the moments that turn an upset body back
 
     unit = torch.eye(3, dtype=state.dtype, device=state.device)
@@ -79,7 +80,7 @@ def geometric_wrench(
     second = torch.linalg.cross(third, unit[0].expand_as(third))
     second = second / second.norm(dim=-1, keepdim=True)
     axes = torch.stack([torch.linalg.cross(second, third), second, third], -2)
-    seen = rotate(quaternion_conjugate(quaternion).unsqueeze(-2), axes)  # rows: columns of R' R_d
+    seen = axes @ turned  # rows: columns of R' R_d
     error = torch.linalg.cross(seen, unit.expand_as(seen)).sum(-2) / 2
     inertia = torch.tensor(body.inertia, dtype=state.dtype, device=state.device)
     moment = inertia * (-gains.attitude * error - gains.rate * rate)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import cast
 
+import roma
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -13,7 +14,6 @@ from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.learning.learner import Learner
 from afm_rl.learning.nll import GaussianNLLLoss
 from afm_rl.spaces.airframe import saturate
-from afm_rl.spaces.rotations import body_z_axis
 
 
 def inverse_mass(
@@ -126,7 +126,8 @@ class MassEstimator(Learner):
         body = physics.body
         state, action, after = (transitions.get(key) for key in self.loss.in_keys)
         thrust = saturate(action, body)[..., 0]
-        axis = (body_z_axis(state[..., 6:10]) + body_z_axis(after[..., 6:10])) / 2
+        turns = (roma.unitquat_to_rotmat(part[..., 6:10])[..., 2] for part in (state, after))
+        axis = sum(turns) / 2
         enough = thrust >= self.least_thrust * body.hover_thrust
         speeds = state[..., 3:6], after[..., 3:6]
         seen = inverse_mass(*speeds, axis, thrust.where(enough, 1.0), physics.dt, body.gravity)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import roma
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -13,7 +14,6 @@ from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.spaces.airframe import QuadrotorBody, mix
-from afm_rl.spaces.rotations import quaternion_conjugate, rotate
 
 HIDDEN = 16  # numbers of its recurrent layer
 MOTORS = (-45.0, -135.0, 135.0, 45.0)  # directions of its motors, degrees
@@ -69,9 +69,7 @@ class Raptor(RecedingHorizonPlanner):
         state, wanted = td.get(self.observation_key), td.get(self.reference_key)
         hidden, last = self._recall(td)
         miss = state[..., :6] - wanted.reshape(*td.batch_size, -1, 6)[..., 0, :]
-        # Rows of R' are the world's axes seen by the body: its columns are R's rows.
-        axes = torch.eye(3, dtype=state.dtype, device=state.device)
-        seen = rotate(quaternion_conjugate(state[..., 6:10]).unsqueeze(-2), axes)
+        seen = roma.unitquat_to_rotmat(state[..., 6:10])
         parts = [miss[..., :3], seen.flatten(-2), miss[..., 3:], state[..., 10:], last]
         numbers = torch.cat(parts, -1).reshape(-1, 22).cpu().numpy()
         recurrent = self.policy.layers[1]

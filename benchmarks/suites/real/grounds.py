@@ -1,12 +1,12 @@
-"""The twelve measures of the real ground robots: who predicts the motion of a window best?
+"""Real ground robots: who predicts best what the next command will do?
 
-    python benchmarks/suites/real/grounds.py --data DIR
+    python benchmarks/suites/real/grounds.py --figure docs/images/three_grounds.png
 
-DIR has `warthog_asphalt.parquet`, `warthog_gravel.parquet`, `warthog_ice.parquet`, and
-`marmotte_boreal.parquet`. Each steady window of 2 s is a row: the commanded motion of the body, and
-the motion that it had, v (m/s) and yaw rate (rad/s). A row is predicted from its command and from
-earlier rows. Twelve measures: median and 90th percentile of the absolute error, of both axes, on
-three grounds.
+A Warthog on asphalt, gravel and ice, and a tracked Marmotte (`examples/real_logs`). A row is a
+steady window of 2 s: the commanded motion of the body, and the motion that it had, v (m/s) and yaw
+rate (rad/s). It is predicted from its command and from earlier rows. Twelve measures: median and
+90th percentile of the absolute error, of both axes, on the Warthog's three grounds. The figure
+replays the three one after the other, as if the robot had driven from one to the next.
 """
 
 from __future__ import annotations
@@ -16,47 +16,38 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow.parquet as parquet
+from matplotlib.figure import Figure
 
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.diagnosis.log import Log
+from afm_rl.diagnosis import Log
+from afm_rl.diagnosis.readers import read_log
+from afm_rl.replay import replay
 from afm_rl.replay.belief import believe
 from afm_rl.replay.simple import SIMPLE, Predictor
+from afm_rl.replay.table import AFM, ALONE
+from afm_rl.report import style
+from afm_rl.storage.files import write_whole
 
+LOGS = Path(__file__).parents[3] / "examples" / "real_logs"
 GROUNDS = ("warthog_asphalt", "warthog_gravel", "warthog_ice")
 TRACKS = "marmotte_boreal"
-NAMES = ("v", "yaw_rate")
-SHARES = (0.5, 0.9)
+SHARES = {"median": 0.5, "p90": 0.9}
 
 
-def windows_of(file: Path) -> Log:
-    """Return the steady windows of a file as a log of the body's motion, a row each."""
-    table = parquet.read_table(file)
-    about = {key.decode(): value.decode() for key, value in table.schema.metadata.items()}
-    radius, base = float(about["wheel_radius_m"]), float(about["baseline_m"])
-    rows = table.to_pandas()
-    rows = rows[rows["steady"]].groupby("window", sort=False).first().astype(float)
-    left, right = rows["command.left"], rows["command.right"]
-    motion = radius * np.column_stack([(left + right) / 2, (right - left) / base])
-    response = rows[[f"window.{name}" for name in NAMES]].to_numpy()
-    return Log(NAMES, motion, response)
-
-
-def errors(data: Path, predict: Predictor) -> pd.Series:
-    """Return median and 90th percentile of the absolute error, by ground, axis and share.
+def errors(predict: Predictor) -> pd.Series:
+    """Return median and 90th percentile of the absolute error, by log, axis and measure.
 
     Args:
-        data: the folder.
         predict: ``predict(command, response, begins) -> prediction``, arrays ``(N, 2)``; that of a
             row may depend on its command and on earlier rows.
     """
     found = {}
     for ground in (*GROUNDS, TRACKS):
-        log = windows_of(data / f"{ground}.parquet")
+        log = read_log(LOGS / f"{ground}.csv")
         miss = np.abs(predict(log.command, log.response, log.begins) - log.response)
-        for name, column in zip(NAMES, miss.T, strict=True):
-            for share in SHARES:
-                found[ground.partition("_")[2], name, share] = float(np.quantile(column, share))
+        for name, column in zip(log.names, miss.T, strict=True):
+            for kind, share in SHARES.items():
+                found[ground, name, kind] = float(np.quantile(column, share))
     return pd.Series(found)
 
 
@@ -71,30 +62,72 @@ def by(corrector: PairCorrector) -> Predictor:
     return predict
 
 
-def compare(data: Path, **others: Predictor) -> pd.DataFrame:
+def replayed(command: np.ndarray, response: np.ndarray, begins: np.ndarray) -> np.ndarray:
+    """Return what ``afm-rl-diagnose --replay`` predicts."""
+    return replay(Log(("v", "yaw_rate"), command, response)).predictions[AFM]
+
+
+def compare(**others: Predictor) -> pd.DataFrame:
     """Return the errors of the simple predictors, and of others, a column each."""
-    return pd.DataFrame({name: errors(data, p) for name, p in (SIMPLE | others).items()})
-
-
-def twelve(data: Path, corrector: PairCorrector) -> tuple[pd.DataFrame, int]:
-    """Return the table with a column ``AFM``, and in how many of the twelve it is within 10 %."""
-    table = compare(data, AFM=by(corrector))
-    return table, within(table, "AFM")
+    return pd.DataFrame({name: errors(p) for name, p in (SIMPLE | others).items()})
 
 
 def within(table: pd.DataFrame, name: str, share: float = 0.1) -> int:
     """Return in how many of the twelve measures ``name`` is within a share of the best simple."""
-    twelve = table.drop(TRACKS.partition("_")[2], level=0)
+    twelve = table.drop(TRACKS, level=0)
     return int((twelve[name] <= (1 + share) * twelve[list(SIMPLE)].min(axis=1)).sum())
+
+
+def twelve(corrector: PairCorrector) -> tuple[pd.DataFrame, int]:
+    """Return the table with a column ``AFM``, and in how many of the twelve it is within 10 %."""
+    table = compare(AFM=by(corrector))
+    return table, within(table, AFM)
+
+
+def one_drive() -> Log:
+    """Return the three grounds one after the other."""
+    parts = [read_log(LOGS / f"{ground}.csv") for ground in GROUNDS]
+    command, response = (
+        np.concatenate([getattr(log, kind) for log in parts]) for kind in ("command", "response")
+    )
+    return Log(parts[0].names, command, response, 2.0 * np.arange(len(command)))
+
+
+def draw(log: Log, window: int = 15) -> Figure:
+    """Return the running median of the error over ``window`` rows."""
+    table = replay(log)
+    figure = style.new_figure(7.0, 3.6)
+    looks = {ALONE: style.FAINT, "affine least squares": style.COLOURS[1], AFM: style.COLOURS[0]}
+    for axes, j in zip(figure.subplots(2, 1, sharex=True), range(2), strict=True):
+        for name, colour in looks.items():
+            miss = pd.Series(np.abs(table.predictions[name] - log.response)[:, j])
+            running = miss.rolling(window, min_periods=1).median()
+            axes.plot(log.seconds, running, color=colour, label=name)
+        for k, ground in enumerate(GROUNDS):
+            start = k * len(log.command) / len(GROUNDS) * 2
+            axes.axvline(start, color=style.REGIME, linewidth=0.8, linestyle=":")
+            if j == 0:
+                text = ground.partition("_")[2]
+                axes.text(start + 5, axes.get_ylim()[1], text, fontsize=style.SMALL, va="top")
+        axes.set_ylabel(("v (m/s)", "yaw rate (rad/s)")[j], fontsize=style.SMALL)
+        axes.set_ylim(bottom=0)
+        style.dress(axes)
+        style.grid(axes)
+    axes.set_xlabel("time on the ground (s)", fontsize=style.SMALL)
+    style.legend_above(figure, *axes.get_legend_handles_labels())
+    return figure
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, required=True)
-    table = compare(parser.parse_args().data)
+    parser.add_argument("--figure", type=Path, help="where to draw the three grounds")
+    options = parser.parse_args()
+    table = compare(AFM=replayed)
     print(table.round(3).to_string())
     for name in table:
         print(f"{name}: within 10 % of the best simple one in {within(table, name)} of 12")
+    if options.figure is not None:
+        write_whole(options.figure, style.png_bytes(draw(one_drive())))
 
 
 if __name__ == "__main__":

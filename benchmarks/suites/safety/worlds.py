@@ -169,7 +169,7 @@ SITUATIONS: dict[str, dict[str, float]] = {
     "noise 0.01": {"noise": 0.01},
     "noise 0.05": {"noise": 0.05},
     "noise 0.2": {"noise": 0.2},
-    "noise 0.5": {"noise": 0.5},
+    "noise 0.1": {"noise": 0.1},
     "outliers 1 %": {"outliers": 0.01},
     "outliers 5 %": {"outliers": 0.05},
     "quantised 0.05": {"quantum": 0.05},

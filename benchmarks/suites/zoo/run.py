@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
-from faults import FaultyVector
+from faults import FaultyVector, faults_of
 from methods import METHODS
-from show import draw, print_tables
+from show import draw, ordered, print_tables, shares
 from task import Task
 
 from afm_rl.storage.files import write_whole
@@ -44,8 +44,10 @@ def main() -> None:
         for method in args.methods:
             complete(task, method, faults, args)
     results = read(args.out)
-    print_tables(results)
-    draw(results, args.out / "zoo.png")
+    if {"alone", "none"} <= set(results["method"]) | set(results["fault"]):
+        results = shares(ordered(results, list(METHODS), list(faults_of(2))))
+        print_tables(results)
+        draw(results, args.out / "zoo.png")
 
 
 def read(out: Path) -> pd.DataFrame:

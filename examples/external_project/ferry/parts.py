@@ -71,6 +71,6 @@ class Reverse(Corrector):
         return self.executing(memory, planned, chosen, against), found
 
 
-def reverse(robot, dynamics, gate: float) -> Reverse:
+def reverse(robot, dynamics, recent: int) -> Reverse:
     """Make the corrector for a robot's actions."""
-    return Reverse(*robot.action_box, gate=gate, recent=1)
+    return Reverse(*robot.action_box, recent=recent)

@@ -5,7 +5,7 @@ import torch
 
 from afm_rl.correction import ActionFlow, PaperFlow
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.training.counterfactuals import draw_counterfactuals, imagine
+from afm_rl.correction.training.counterfactuals import Windows, draw_counterfactuals, imagine
 from afm_rl.dynamics import Dubins, Quadrotor
 from afm_rl.regimes import ActionGain, MassFactor
 
@@ -80,7 +80,7 @@ def test_training_states_lie_on_the_manifold(monkeypatch, generator):
     low, high = torch.tensor([0.0, -1.0, -1.0, -1.0]), torch.ones(4)
     states = torch.zeros(13), torch.ones(13)
     flow = ActionFlow(low, high, network=AxisNetwork(width=16, latent=8))
-    flow.training_loss(Quadrotor(), MassFactor(), states, 8, generator)
+    Windows(flow).draw(Quadrotor(), MassFactor(), states, 8, generator)
     assert seen
     for state in seen:
         torch.testing.assert_close(state[..., 6:10].norm(dim=-1), torch.ones(state.shape[:-1]))

@@ -121,7 +121,7 @@ def test_pretraining_helps_and_follows_the_seed():
         fresh = network()
         pretrain(fresh, 30, batch_size=24, seed=1)
         trained.append(fresh)
-    assert error(trained[0]) < 0.8 * error(network())
+    assert error(trained[0]) < 0.9 * error(network())
     for one, other in zip(*(net.parameters() for net in trained), strict=True):
         assert torch.equal(one, other)
 

@@ -1,0 +1,182 @@
+"""What a log cannot tell: commands that do not move, responses that nobody measured or caused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from afm_rl.diagnosis.findings import Status
+from afm_rl.diagnosis.log import Log
+from afm_rl.diagnosis.response import follow_with_stiction
+from afm_rl.diagnosis.search import Lead, find_leads, without_outliers
+from afm_rl.diagnosis.settings import Settings
+
+Doubt = tuple[Status, str]
+SUMMED: Doubt = (
+    "cannot tell",
+    "its response moves as if it added up its command; log its rate of change",
+)
+
+
+def find_doubts(
+    log: Log, leads: Sequence[Lead], reach: np.ndarray, exact: Sequence[bool], settings: Settings
+) -> dict[int, Doubt]:
+    """Return why nothing can be said of some actuators, by number.
+
+    Args:
+        log: scaled.
+        leads: of the actuators.
+        reach: half range of each command, ``(A,)``.
+        exact: is the response of an actuator its command in every row?
+        settings: which actuator is idle?
+    """
+    doubts: dict[int, Doubt] = {}
+    idle = bool(log.effort) and all(np.ptp(values) == 0 for values in log.effort.values())
+    summed = _summed(log, leads, settings)
+    ranges = reach * (np.ptp(log.command, axis=0) > 0)
+    usual = float(np.median(ranges[ranges > 0])) if len(ranges) > 2 and ranges.any() else 0.0
+    for j, lead in enumerate(leads):
+        u, y = log.command[:, j], log.response[:, j]
+        if not np.ptp(u) > 0:
+            doubts[j] = "cannot tell", "its command does not change; move it"
+        elif idle:
+            name, values = next(iter(log.effort.items()))
+            doubts[j] = "not actuated", f"{name} is {values[0]:.4g} all the time; is it armed?"
+        elif exact[j] and not log.computed:
+            doubts[j] = (
+                "not measured",
+                "its response is its command, digit by digit; log what a sensor reads",
+            )
+        elif lead.left > 0.1 and _causes(log, y, u) and not _causes(log, u, y):
+            doubts[j] = (
+                "not actuated",
+                "its command answers its response, and not the other way round; is it armed?",
+            )
+        elif ranges[j] < settings.moves * usual:
+            share = 100 * ranges[j] / usual
+            doubts[j] = "cannot tell", f"its command moves by {share:.1g} % of the usual; move it"
+        elif lead.left > 0.01 and travel(log, j) < settings.travel and _still(u) > 0.8:
+            doubts[j] = (
+                "cannot tell",
+                f"its command moves {round(travel(log, j))} times only; move it up and down",
+            )
+        elif j in summed:
+            doubts[j] = SUMMED
+    return doubts
+
+
+def effort_notes(log: Log, often: float = 0.2) -> tuple[str, ...]:
+    """Return which motors were driven as hard as can be in more than a fifth of the rows.
+
+    >>> pwm = {"pwm_1": np.minimum(np.arange(100.0), 60.0)}
+    >>> effort_notes(Log(("a",), np.zeros((100, 1)), np.zeros((100, 1)), effort=pwm))
+    ('pwm_1 is at its limit, 60, in 40 % of the rows: no more can be commanded',)
+    """
+    return tuple(
+        f"{name} is at its limit, {values.max():.5g}, in {100 * share:.0f} % of the rows: no more "
+        "can be commanded"
+        for name, values in log.effort.items()
+        if (share := float((values == values.max()).mean())) > often and len(set(values)) > 9
+    )
+
+
+def echoes(log: Log, rows: Sequence[int] = (0, 1)) -> list[bool]:
+    """Return which responses are exactly their commands, of the same row or of the one before."""
+    apart = np.cumsum(log.begins)
+    found = np.zeros(len(log.names), dtype=bool)
+    for late in rows:
+        u, y = log.command[: len(apart) - late], log.response[late:]
+        same = apart[late:] == apart[: len(apart) - late]
+        found |= (u == y)[same].all(0)
+    return list(found & (np.ptp(log.command, axis=0) > 0))
+
+
+def travel(log: Log, j: int, rows: slice = slice(None), least: float = 0.1) -> float:
+    """Return how far a command moves in some rows, in its ranges.
+
+    Moves below a tenth of its range do not count.
+
+    >>> u = np.sin(np.arange(100.0) / 10)[:, None]
+    >>> round(travel(Log(("a",), u, u), 0))
+    3
+    """
+    size = max(float(_range_of(log.command)[j]), 1e-300)
+    u = log.command[rows, j]
+    places = follow_with_stiction(u, least * size, np.zeros(len(u), dtype=int))
+    return float(np.abs(np.diff(places)).clip(max=size).sum() / size)
+
+
+def _range_of(command: np.ndarray) -> np.ndarray:
+    """Return the range of each command ``(N, A)`` but for one in a hundred rows at each end."""
+    low, high = np.quantile(command, [0.01, 0.99], axis=0)
+    return np.where(high > low, high - low, np.ptp(command, axis=0))
+
+
+def _still(command: np.ndarray) -> float:
+    """Return the share of rows in which a command stands still."""
+    return float((np.abs(np.diff(command)) < 1e-3 * np.ptp(command)).mean())
+
+
+def copies_of(command: np.ndarray, alike_from: float = 0.999) -> list[list[int]]:
+    """Return for each command the others that are the same up to a factor, by their correlation."""
+    u = command - command.mean(0)
+    power = np.sqrt((u**2).sum(0))
+    alike = np.abs(u.T @ u) / np.maximum(np.outer(power, power), 1e-300)
+    np.fill_diagonal(alike, 0.0)
+    return [[int(i) for i in np.flatnonzero(row > alike_from)] for row in alike]
+
+
+def _causes(log: Log, cause: np.ndarray, effect: np.ndarray, past: int = 8) -> bool:
+    """Return whether the past of one series predicts another beyond its own past (Granger 1969).
+
+    A tenth of what the own past leaves must be predicted in rows that were held out, with the past
+    8 rows or each fifth of the past 40.
+    """
+    if not (np.ptp(cause) > 0 and np.ptp(effect) > 0):
+        return False
+    cause, effect = ((x - x.mean()) / x.std() for x in (cause, effect))
+    place = np.arange(len(effect)) - np.maximum.accumulate(
+        np.where(log.begins, np.arange(len(effect)), 0)
+    )
+    shares = []
+    for every in (1, 5):
+        rows = np.flatnonzero(place >= past * every)
+        if len(rows) < 20 * past:
+            continue
+        late = np.arange(1, past + 1) * every
+        own, other = (series[rows[:, None] - late] for series in (effect, cause))
+        alone = np.column_stack([np.ones(len(rows)), own])
+        test = np.arange(len(rows)) * 20 // len(rows) % 2 == 0
+        missed = [
+            sum(_missed(x, effect[rows], some) for some in (test, ~test))
+            for x in (alone, np.column_stack([alone, other]))
+        ]
+        shares.append(1 - missed[1] / max(missed[0], 1e-300))
+    return max(shares, default=0.0) > 0.1
+
+
+def _missed(x: np.ndarray, y: np.ndarray, test: np.ndarray) -> float:
+    """Return the squared error in some rows of lines that are fitted to the others."""
+    gram = x[~test].T @ x[~test]
+    gram += 1e-9 * gram.trace() / len(gram) * np.eye(len(gram))
+    line = np.linalg.solve(gram, x[~test].T @ y[~test])
+    return float(((y - x @ line)[test] ** 2).sum())
+
+
+def _summed(log: Log, leads: Sequence[Lead], settings: Settings) -> set[int]:
+    """Return the actuators whose responses do not follow, but change as the commands say."""
+    odd = [j for j, lead in enumerate(leads) if lead.left > 0.1]
+    if not odd:
+        return set()
+    rates = np.diff(log.response, axis=0, prepend=log.response[:1])
+    rates[log.begins] = 0.0
+    spread = without_outliers(rates).std(0)
+    changes = replace(log, response=rates / np.where(spread > 0, spread, 1.0))
+    found = find_leads(changes.thinned(settings.searched), odd, settings)
+    return {
+        j
+        for j, rate in zip(odd, found, strict=True)
+        if rate.left < 0.3 * leads[j].left and rate.driver == j
+    }

@@ -1,0 +1,118 @@
+"""What was found, as numbers in the units of the log."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from afm_rl.diagnosis.changes import Part, problem_of
+from afm_rl.diagnosis.findings import Actuator
+from afm_rl.diagnosis.likely import likely_intervals
+from afm_rl.diagnosis.log import Log
+from afm_rl.diagnosis.model import DOWN, GAIN_DRIFT, OFFSET_DRIFT
+from afm_rl.diagnosis.pattern import find_pattern
+from afm_rl.diagnosis.scale import Scaled, ends_of, middle_of
+from afm_rl.diagnosis.settings import Settings
+
+
+def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Settings) -> Actuator:
+    """Return the numbers of a part in the units of the log.
+
+    Args:
+        scaled: the log.
+        clean: without lost rows.
+        part: what was found.
+        j: number of the actuator.
+        settings: what matters.
+    """
+    log, reach, spread = scaled.raw, scaled.reach, scaled.spread
+    model, shape = part.model, part.model.shape
+    problem = problem_of(clean.part(part.rows).thinned(settings.refined), j, part.lead, settings)
+    unit = reach[model.driver]
+    scale = spread[j] / unit
+    command = log.command[:, model.driver]
+    low, high = (float(end[0]) for end in ends_of(command[:, None]))
+    centre = middle_of(command)
+    intervals = likely_intervals(problem, model, part, centre / unit, settings)
+    extra = dict(zip(model.others, model.gains, strict=True))
+    usual = sum(g * middle_of(log.command[:, i]) / reach[i] for i, g in extra.items() if i >= 0)
+    gain, offset = model.gain * scale, (model.offset + model.gain * centre / unit) * spread[j]
+    gains, offsets = intervals[0] * scale, (intervals[1] + usual) * spread[j]
+    offset += usual * spread[j]
+    away = np.abs(log.response[part.rows, j] - command[part.rows])
+    held = command[part.rows].std() < 0.1 * unit and away.max() < settings.matters * unit
+    if held:  # as a healthy one would
+        gain, offset, gains, offsets = 1.0, centre, np.ones(2), np.full(2, centre)
+    y = problem.y[problem.use]
+    residual = y - model.predict(problem)[problem.use]
+    rows = np.flatnonzero(problem_of(scaled.log, j, part, settings).use)
+    rows = rows[(rows >= part.first) & (rows < part.last)]
+    whole = (scaled.log.response[:, j] - part.predict(clean, j))[rows]
+    total = float(scaled.log.response[rows, j].var())
+    left = min(float(whole.var()) / total, 1.0) if total > 0 else 0.0
+    left *= not held
+    noticed = residual.var() > 0.005 * total and not held
+    pattern, share = find_pattern(problem, model) if noticed else ("", 0.0)
+    coupling = {log.names[i]: float(g * spread[j] / reach[i]) for i, g in extra.items() if i >= 0}
+    largest = max(coupling, key=lambda name: abs(coupling[name]), default=None)
+    dead_zone = shape.dead_zone or shape.jump
+    for end, beyond, sign in ((shape.low, low, 1), (-shape.high, -high, -1)):
+        if math.isfinite(end) and 0 < end and -0.1 * end * unit < beyond and not centre:
+            # One direction only: what is not followed are the small commands.
+            shift = sign * gain * end * unit
+            dead_zone, offset, offsets = end, offset + shift, offsets + shift
+    limits = (shape.low, shape.high, -shape.cut, shape.cut)
+    ends = [end * unit for end in limits if math.isfinite(end) and abs(end) != dead_zone]
+    drift = {}
+    for name, kind, value, size in (
+        ("gain", GAIN_DRIFT, gain, scale),
+        ("offset", OFFSET_DRIFT, offset, spread[j]),
+    ):
+        if kind in extra:
+            change = extra[kind] * size
+            drift[name] = (float(value - change / 2), float(value + change / 2))
+    return Actuator(
+        name=log.names[j],
+        gain=float(gain),
+        gain_interval=(float(gains[0]), float(gains[1])),
+        gain_down=float((model.gain + extra[DOWN]) * scale) if DOWN in extra else None,
+        reversed=bool(gains[1] < 0 and model.gain + extra.get(DOWN, 0.0) < 0),
+        offset=float(offset),
+        offset_interval=(float(offsets[0]), float(offsets[1])),
+        centre=centre,
+        dead_zone=float(dead_zone * unit),
+        limits=(float(min(ends)), float(max(ends))) if ends else None,
+        backlash=float(shape.play * unit),
+        stick=float(shape.stick * unit),
+        rate=float(abs(gain) * shape.rate * unit / log.step) if shape.rate < math.inf else None,
+        every=shape.hold,
+        delay_s=shape.delay * log.step,
+        time_interval=(float(intervals[2, 0] * log.step), float(intervals[2, 1] * log.step)),
+        lag_s=-log.step / math.log(shape.keep) if shape.keep > 1e-6 else 0.0,
+        driven_by=log.names[model.driver] if model.driver != j else largest,
+        coupling=coupling,
+        noise=float(residual.std() * spread[j]),
+        unexplained=left,
+        pattern=pattern,
+        misfit=share * left,
+        command_range=(float(low), float(high)),
+        drift=drift,
+        rows=len(part),
+    )
+
+
+def quantum_of(response: np.ndarray, few: float = 0.1) -> float:
+    """Return the size of the steps of a response, 0 if it moves freely.
+
+    Args:
+        response: ``(N,)``.
+        few: share of the rows: a response with more values moves freely.
+    """
+    values = np.unique(response)
+    steps = np.diff(values)
+    if not 3 <= len(values) < few * len(response) or not steps.min() > 1e-6 * np.ptp(values):
+        return 0.0
+    size = float(np.median(steps))
+    whole = steps / size
+    return size if np.abs(whole - whole.round()).max() < 0.01 else 0.0

@@ -1,0 +1,122 @@
+"""What actuators have in common: the unit of their responses, and the delay of the loop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from afm_rl.diagnosis.findings import Actuator
+from afm_rl.diagnosis.log import Log
+from afm_rl.diagnosis.settings import Settings
+from afm_rl.diagnosis.words import UNITS
+
+
+def unit_of(found: Sequence[Sequence[Actuator]]) -> list[list[Actuator]]:
+    """Return the parts of all actuators with the gain of a healthy one.
+
+    That is 1, or that of two known units if most have it.
+    """
+    last = [parts[-1] for parts in found]
+    gains = np.array([abs(a.gain) for a in last])
+    clear = [a.gain_interval[0] * a.gain_interval[1] > 0 and abs(a.gain) > 1e-4 for a in last]
+    unit = 1.0
+    if any(clear):
+        middle = float(np.median(gains[clear]))
+        unit = next((gain for gain in UNITS.values() if abs(middle / gain - 1) < 0.1), 1.0)
+    return [[_in_unit(part, unit) for part in parts] for parts in found]
+
+
+def _in_unit(actuator: Actuator, unit: float) -> Actuator:
+    """Return the actuator with its healthy gain, and the offset from a healthy response."""
+    usual = unit * actuator.centre
+    low, high = actuator.offset_interval
+    return replace(
+        actuator,
+        unit=unit,
+        offset=actuator.offset - usual,
+        offset_interval=(low - usual, high - usual),
+        drift={
+            name: (a - usual, b - usual) if name == "offset" else (a, b)
+            for name, (a, b) in actuator.drift.items()
+        },
+    )
+
+
+def with_basis(actuators: Sequence[Actuator], settings: Settings) -> list[Actuator]:
+    r"""Return the actuators, pairs of them in the basis in which two gains say all.
+
+    The gains of a pair are a matrix :math:`M`. Left and right wheels of which the sum follows by
+    p and the difference by q have :math:`M_{11} = M_{22} = (p + q)/2, M_{12} = M_{21} = (p - q)/2`.
+    Speed and rate of turn of which one side follows by p and the other one by q have
+    :math:`M_{11} = M_{22} = (p + q)/2`, and :math:`M_{12} M_{21} = (p - q)^2/4`.
+    """
+    found = {a.name: a for a in actuators}
+    for one in actuators:
+        other = found.get(one.driven_by or "")
+        if other is None or set(one.coupling) != {other.name} or set(other.coupling) != {one.name}:
+            continue
+        across, back = one.coupling[other.name], other.coupling[one.name]
+        slack = 2 * settings.matters * one.unit + max(_half(one), _half(other))
+        if abs(one.gain - other.gain) > slack or across * back <= 0 or one.changes:
+            continue
+        same = abs(across - back) < slack and 0.5 < one.reach / other.reach < 2
+        middle = 0.5 * (one.gain + other.gain)
+        apart = 0.5 * (across + back) if same else math.sqrt(across * back)
+        gains = (middle + apart, middle - apart)
+        kind = "sums" if same else "sides"
+        found[one.name] = replace(one, basis=(other.name, kind, *gains))
+    return list(found.values())
+
+
+def _half(actuator: Actuator) -> float:
+    return 0.5 * (actuator.gain_interval[1] - actuator.gain_interval[0])
+
+
+def shared_delay(
+    actuators: Sequence[Actuator], log: Log, settings: Settings
+) -> tuple[list[float], tuple[str, ...]]:
+    """Return delay and lag that are no fault of each actuator (s), and what to say of the loop.
+
+    Where all that are known are late, that is the loop's: bus, controller, logger. Arms and hands
+    may have a loop each: what a fifth of the actuators share is no fault of one, and what one is
+    later than all of these is.
+    """
+    known = [a for a in actuators if _is_timed(a, log.step)]
+    times = np.array([max(a.delay_s, 0.0) + a.lag_s for a in known])
+    usual = [log.usual_delay] * len(actuators)
+    late = log.usual_delay + settings.late * log.step
+    if len(times) < 2 or (times > late).mean() < (1.0 if len(times) < 5 else 0.8):
+        return usual, ()
+    alike = np.abs(times - times[:, None]) <= np.maximum(settings.shared * times, log.step)
+    shared = alike.sum(1) > max(1.0, 0.2 * len(times))
+    if shared.sum() < 0.6 * len(times):
+        return usual, ()
+    middle, most = float(np.median(times)), float(times[shared].max())
+    near = times[(times <= most) & (times > late)]
+    delay, lag = (float(np.median([getattr(a, n) for a in known])) for n in ("delay_s", "lag_s"))
+    parts = [f"a delay of {_span([delay], log)}", f"a lag of {_span([lag], log)}"]
+    kept = [text for text, time in zip(parts, (delay, lag), strict=True) if time > 0.1 * middle]
+    note = (
+        f"all actuators are {_span(near, log)} behind their commands ({' and '.join(kept)}): that "
+        "is the loop's, and no fault of one of them"
+    )
+    return [max(most, log.usual_delay)] * len(actuators), (note,)
+
+
+def _is_timed(actuator: Actuator, step: float) -> bool:
+    """Return whether delay and lag of an actuator are known."""
+    low, high = actuator.time_interval
+    follows = actuator.gain_interval[0] * actuator.gain_interval[1] > 0
+    return follows and high - low < max(low + high, 2 * step)
+
+
+def _span(times: Sequence[float] | np.ndarray, log: Log) -> str:
+    """Return from which time to which, in steps and, if these are known, seconds."""
+    low, high = min(times), max(times)
+    texts = [f"{time / log.step:.2g}" for time in (low, high)]
+    seconds = [f"{time:.2g}" for time in (low, high)]
+    steps, known = (" to ".join(dict.fromkeys(some)) for some in (texts, seconds))
+    return f"{steps} steps" + (f" ({known} s)" if log.step != 1.0 else "")

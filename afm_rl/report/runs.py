@@ -1,0 +1,180 @@
+"""Folders of results become one table, :class:`Runs`; all that a report shows is a view of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.report.folders import (
+    RECORD,
+    STEPS,
+    Plan,
+    has_results,
+    read_joined_plan,
+    read_measures,
+    read_missions,
+    read_plan,
+    run_folders,
+)
+from afm_rl.report.stranger import read_numbers
+from afm_rl.storage.manifest import MANIFEST, check_manifest
+from afm_rl.storage.measures import Measures
+
+KEY = ["method", "cell", "seed"]
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What one folder of results holds, or several together.
+
+    Attributes:
+        folders: where they were read.
+        missions: one row per mission, numbered through. Beside the columns of the files there are
+            ``cell`` (track and regime in words), ``seconds`` (the time of its run in equal
+            shares, where it was counted), ``file`` (place of its steps in ``files``, -1 if there
+            are none) and ``own`` (its number in that file).
+        measures: what methods are compared by.
+        files: the files of steps.
+        plan: methods, each with seeds that it was to have, in every cell.
+        notes: what a reader must know of the data, one sentence each.
+        lost: what is said of each job that ``jobs.yaml`` names and that is not there.
+    """
+
+    folders: list[Path]
+    missions: pd.DataFrame
+    measures: Measures
+    files: list[Path]
+    plan: Plan
+    notes: list[str]
+    lost: list[str]
+
+    @property
+    def methods(self) -> list[str]:
+        """Names of the methods, in the order in which they first occur."""
+        return list(self.missions["method"].unique())
+
+    @property
+    def with_steps(self) -> pd.DataFrame:
+        """The missions whose steps are there."""
+        return self.missions[self.missions["file"] >= 0]
+
+    @property
+    def missing(self) -> pd.DataFrame:
+        """What is missing, one row per ``method``, ``cell`` and ``seed``.
+
+        Every method is to have each cell and seed that any method has or was to have.
+        """
+        there = self.missions[KEY]
+        planned = pd.DataFrame(
+            [(method, seed) for method, seeds in self.plan for seed in seeds],
+            columns=["method", "seed"],
+        )
+        cells = there[["cell"]].drop_duplicates()
+        wanted = pd.concat([there, planned.merge(cells, how="cross")]) if len(planned) else there
+        places = wanted[["cell", "seed"]].drop_duplicates()
+        every = wanted[["method"]].drop_duplicates().merge(places, how="cross")
+        both = every.merge(there, how="left", on=KEY, indicator=True)
+        return both.loc[both["_merge"] == "left_only", KEY].reset_index(drop=True)
+
+    def steps(
+        self, missions: pd.DataFrame | None = None, columns: Sequence[str] | None = None
+    ) -> pd.DataFrame:
+        """Return steps, one row per mission and step, in their order.
+
+        Args:
+            missions: rows of the table of missions; None: all.
+            columns: what to read beside ``mission`` and ``t``; a column that a file lacks is NaN.
+                None: all.
+
+        Raises:
+            ConfigurationError: if a file cannot be read, or holds something else than numbers.
+        """
+        rows = self.with_steps if missions is None else missions[missions["file"] >= 0]
+        names = None if columns is None else list(dict.fromkeys(["mission", "t", *columns]))
+        parts = []
+        for place, own in rows.groupby("file"):
+            number = own.set_index("own")["mission"].astype("int32")
+            part = read_numbers(self.files[place], number.index.tolist(), names)
+            parts.append(part.assign(mission=part["mission"].map(number)))
+        joined = pd.concat(parts) if parts else pd.DataFrame(columns=names or ["mission", "t"])
+        ordered = joined.reindex(columns=names or list(joined))
+        return ordered.sort_values(["mission", "t"], ignore_index=True)
+
+
+def read_runs(folders: Sequence[str | Path]) -> Runs:
+    """Read the folders of runs, comparisons, sweeps and studies, and join them.
+
+    Files that a manifest names are checked against it first. Where two folders hold the same
+    mission (method, cell and seed), the later one counts; ``notes`` says so.
+
+    Raises:
+        ConfigurationError: if there is no folder, a folder holds no results or results of another
+            kind of mission, or a file cannot be used.
+        ArtefactError: if a file is damaged.
+    """
+    if not folders:
+        raise ConfigurationError("folders=[]: expected at least one folder of results")
+    paths, names = [Path(folder) for folder in folders], ", ".join(map(str, folders))
+    files: list[Path] = []
+    tables: list[pd.DataFrame] = []
+    plan: Plan = []
+    notes: list[str] = []
+    lost: list[str] = []
+    measures: Measures | None = None
+    for place, folder in enumerate(paths):
+        runs, gone = run_folders(folder)
+        if runs != [folder] and not (folder / MANIFEST).is_file():
+            notes.append(f"{folder} has no {MANIFEST}: whether a job is missing cannot be known.")
+        again = (
+            f"missing, although {RECORD} names it; the command that made the folder runs it again"
+        )
+        lost += [f"{job}: {again}" for job in gone]
+        plan += read_joined_plan(folder) if gone else []
+        for run in runs:
+            if not has_results(run):
+                plan += read_plan(run)
+                notes.append(f"{run} has no results yet.")
+                continue
+            check_manifest(run)
+            plan += read_plan(run)
+            declared = read_measures(run)
+            if declared != (measures or declared):
+                raise ConfigurationError(
+                    f"{names}: hold missions of different kinds; report on each alone"
+                )
+            measures, missions = declared, read_missions(run, declared)
+            missions = missions.assign(own=missions["mission"], file=-1, folder=place)
+            if (run / STEPS).is_file():
+                missions["file"] = len(files)
+                files.append(run / STEPS)
+            tables.append(missions)
+    tables = [table for table in tables if len(table)]
+    if measures is None or not tables:
+        said = f" ({'; '.join(lost)})" if lost else ""
+        raise ConfigurationError(
+            f"{names}: no mission is finished yet; expected at least one{said}"
+        )
+    missions = pd.concat(tables, ignore_index=True)
+    twice = missions[missions.duplicated(KEY, keep="last")]
+    notes += [
+        f"{method}: {len(rows)} missions of {paths[place]} stand twice; "
+        "the ones that were read last count."
+        for (place, method), rows in twice.groupby(["folder", "method"], sort=False)
+    ]
+    missions = missions.drop_duplicates(KEY, keep="last")
+    order = {name: place for place, name in enumerate(missions["method"].unique())}
+    missions = missions.assign(rank=missions["method"].map(order))
+    # Seeds side by side, also where each is a job of its own.
+    missions = missions.sort_values(["rank", "folder", "own", "seed"], kind="stable")
+    missions = missions.assign(mission=range(len(missions))).reset_index(drop=True)
+    missions = missions.drop(columns=["folder", "rank"])
+    if without := int((missions["file"] < 0).sum()):
+        notes.append(
+            f"{without} of {len(missions)} missions have no {STEPS}: curves, maps and "
+            "recovery times leave them out."
+        )
+    return Runs(paths, missions, measures, files, plan, notes, lost)

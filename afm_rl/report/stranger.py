@@ -1,0 +1,154 @@
+"""Files that a stranger may have written: bounded, checked, and named if they are refused.
+
+Nothing in them is executed or interpolated.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow
+import pyarrow.parquet as parquet
+import yaml
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.storage.csv_text import plain_text
+
+WORDS = ["method", "track", "regime"]  # text, whatever they look like
+LONGEST = 500  # letters of a word
+MEGABYTE = 2**20
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def read_text(path: Path, most: int = 4 * MEGABYTE) -> str:
+    """Return a UTF-8 text file of at most so many bytes.
+
+    Raises:
+        ConfigurationError: if it cannot be read, is larger, or is not UTF-8.
+    """
+    try:
+        if path.stat().st_size > most:
+            raise ConfigurationError(
+                f"{path}: {path.stat().st_size} bytes; expected {most} at most"
+            )
+        return path.read_bytes().decode("utf-8")
+    except FileNotFoundError:
+        raise ConfigurationError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ConfigurationError(f"{path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f"{path}: no UTF-8 text: {error.reason}") from error
+
+
+def read_settings(path: Path, deepest: int = 50) -> dict[str, Any]:
+    """Return a YAML file that holds a mapping, ``${...}`` in it left as it is.
+
+    Values only: tags of other types are refused, and so are aliases, which grow without bounds,
+    and more than ``deepest`` levels.
+
+    Raises:
+        ConfigurationError: if it cannot be read, or holds something else.
+    """
+    text, depth = read_text(path), 0
+    try:
+        for event in yaml.parse(text, LOADER):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.AliasEvent):
+                raise yaml.YAMLError("aliases (*name) are not read")
+            if depth > deepest:
+                raise yaml.YAMLError(f"more than {deepest} levels")
+        found = yaml.load(text, LOADER)
+    except (yaml.YAMLError, ValueError, OverflowError) as error:
+        raise ConfigurationError(f"{path}: damaged: {_first_line(error)}") from error
+    if not isinstance(found, dict):
+        raise ConfigurationError(f"{path}: damaged; expected a mapping")
+    return found
+
+
+def read_table(path: Path, numbers: Sequence[str], others: Sequence[str] = ()) -> pd.DataFrame:
+    """Return a CSV file that has at least these columns.
+
+    Args:
+        path: the file.
+        numbers: columns of numbers, or of nothing where there is none; never infinite.
+        others: columns of any kind.
+
+    Raises:
+        ConfigurationError: if it cannot be read, a column is missing, or a value is of the wrong
+            kind.
+    """
+    text = io.StringIO(read_text(path, 256 * MEGABYTE))
+    try:
+        table = pd.read_csv(text, dtype=dict.fromkeys(WORDS, str))
+    except (ValueError, OverflowError, pd.errors.ParserError) as error:
+        raise ConfigurationError(f"{path}: no table of values: {_first_line(error)}") from error
+    missing = [name for name in [*others, *numbers] if name not in table]
+    if missing:
+        raise ConfigurationError(f"{path}: columns {', '.join(missing)} are missing")
+    for name in numbers:
+        values = table[name]
+        if values.notna().any() and not (_is_number(values) and not np.isinf(values).any()):
+            raise ConfigurationError(f"{path}: {name}: expected a finite number in each row")
+    for name in (word for word in WORDS if word in table):
+        texts = table[name]
+        if len(texts) and (texts.isna().any() or texts.str.len().max() > LONGEST):
+            raise ConfigurationError(
+                f"{path}: {name}: expected a text of 1 to {LONGEST} letters in each row"
+            )
+        table[name] = texts.map(plain_text)
+    return table
+
+
+def read_numbers(
+    path: Path, missions: Sequence[int], columns: Sequence[str] | None = None
+) -> pd.DataFrame:
+    """Return the steps of some missions from a Parquet file that holds numbers only.
+
+    Only the missions and columns asked for stay in memory.
+
+    Args:
+        path: the file; at most 8 GiB when unpacked.
+        missions: their numbers in this file.
+        columns: those that the file lacks are left out. None: all.
+
+    Raises:
+        ConfigurationError: if it cannot be read, or holds something else than numbers.
+    """
+    most = 8192 * MEGABYTE
+    try:
+        file = parquet.ParquetFile(path)
+        size = sum(
+            file.metadata.row_group(k).total_byte_size for k in range(file.metadata.num_row_groups)
+        )
+        there = list(file.schema_arrow.names)
+    except (OSError, ValueError, pyarrow.ArrowException) as error:
+        raise ConfigurationError(f"{path}: damaged, or no Parquet file") from error
+    if size > most:
+        raise ConfigurationError(f"{path}: {size} bytes unpacked; expected {most} at most")
+    wanted = there if columns is None else [name for name in columns if name in there]
+    if not {"mission", "t"} <= set(wanted) or len(set(there)) < len(there):
+        raise ConfigurationError(f"{path}: expected the columns mission and t, each name once")
+    try:
+        chosen = [("mission", "in", list(missions))]
+        found = parquet.read_table(path, columns=wanted, filters=chosen)
+        steps = found.to_pandas(ignore_metadata=True)
+    except (OSError, ValueError, MemoryError, pyarrow.ArrowException) as error:
+        raise ConfigurationError(f"{path}: damaged: {_first_line(error)}") from error
+    strange = [name for name in steps if not _is_number(steps[name])]
+    if strange or steps[["mission", "t"]].isna().any(axis=None):
+        raise ConfigurationError(f"{path}: {', '.join(strange) or 't'}: expected numbers")
+    return steps
+
+
+def _is_number(values: pd.Series) -> bool:
+    return pd.api.types.is_numeric_dtype(values) and not pd.api.types.is_complex_dtype(values)
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0][:200]

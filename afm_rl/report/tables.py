@@ -1,0 +1,159 @@
+"""The tables of a report: all missions, against a baseline, cell by cell, what is missing."""
+
+from __future__ import annotations
+
+from textwrap import shorten
+
+import pandas as pd
+
+from afm_rl.report.cells import outcome
+from afm_rl.report.means import summarise
+from afm_rl.report.table import Table, interval_text, number
+from afm_rl.storage.measures import Measures
+
+BOOTSTRAP = (
+    "Brackets are 95 % intervals of the stratified bootstrap (Agarwal et al. 2021): seeds are "
+    "drawn anew within each cell; there is none where no cell has two missions or where all are "
+    "alike. "
+)
+ALL_NOTE = (
+    "IQM is the interquartile mean, the mean of the middle half of the missions. "
+    + BOOTSTRAP
+    + "{ratio}"
+    "Methods with different numbers of missions were not given the same task: compare them by "
+    "pairs. Bold: the best of those with the most missions, {oracle} apart."
+)
+RATIO_NOTE = (
+    "A mission that did not finish counts with its budget. The ratio of {name} to those of "
+    "{oracle} is a geometric mean over missions of the same cell and seed (n pairs), once where "
+    "{oracle} finished and once over all. "
+)
+PAIRS_NOTE = (
+    "Differences are means over missions of the same cell and seed (n pairs). P(better) is the "
+    "probability that a mission of the method does better than one of the baseline in the same "
+    "cell, all seeds against all (Agarwal et al. 2021): {order}; a tie counts half. "
+    + BOOTSTRAP
+    + "Bold "
+    "where 0, or a probability of 1/2, lies outside the interval."
+)
+CELL_NOTE = "Means: {names}. Bold: the best of a cell."
+MISSING_NOTE = (
+    "Every method is expected to have every cell and seed that any method has, and all that was to "
+    "be run."
+)
+
+
+def summary_table(means: pd.DataFrame, measures: Measures, oracle: str = "") -> Table:
+    """Return :func:`~.means.aggregate`, or as much of it as there is, as a table.
+
+    The best of all complete methods is bold, but for the oracle: it knows what no other method
+    knows and does not compete, and neither does a method that was spared some cells.
+    """
+    rows, ended = [], outcome(means)
+    signs = {f"{ended} (%)": (ended, 1 if ended == "finished" else -1)}
+    for row in means.to_dict("records"):
+        shown = {"method": row["method"], "missions": str(row["missions"])}
+        shown[f"{ended} (%)"] = number(100 * row[ended])
+        for measure in measures:
+            for name, word in ((measure.column, ""), (f"{measure.column}_iqm", ", IQM")):
+                if name in means:
+                    signs[measure.head + word] = name, measure.sign
+                    text = interval_text(row, name, measure.digits, measure.scale)
+                    shown[measure.head + word] = text
+        if (spent := measures.budget) and "ratio" in means:
+            for name, words in (("ratio", "where it finished"), ("ratio_all", "all")):
+                head, count = f"{spent.name} / {oracle}, {words}", row[f"{name}_pairs"]
+                shown[head] = f"{interval_text(row, name, 2)} (n = {count})"
+                signs[head] = name, -1
+        if "faults" in means and means["faults"].any():
+            shown["faults"] = number(row["faults"])
+        for name, word in (("per_hour", "missions per hour"), ("seconds", "seconds")):
+            if name in means:
+                shown[word] = number(row[name], int(name == "seconds"))
+        rows.append(shown)
+    table, bold = pd.DataFrame(rows), set()
+    complete = (means["missions"] == means["missions"].max()) & (means["method"] != oracle)
+    for head, (name, sign) in signs.items():
+        rivals = (sign * means[name].astype(float)).where(complete).reset_index(drop=True)
+        if rivals.nunique() > 1:
+            column = table.columns.get_loc(head)
+            bold |= {(row, column) for row in rivals.index[rivals == rivals.max()]}
+    ratio = RATIO_NOTE.format(name=measures.budget.name, oracle=oracle) if measures.budget else ""
+    note = ALL_NOTE.format(ratio=ratio, oracle=oracle)
+    return Table("aggregate", "All missions of each method", note, means, table, frozenset(bold))
+
+
+def comparison_tables(numbers: pd.DataFrame, measures: Measures) -> list[Table]:
+    """Return :func:`~.means.compare` as one table per baseline."""
+    tables = []
+    nulls = {measure.column: 0.0 for measure in measures} | {"better": 0.5}
+    order = ", then among equals ".join(f"{m.better} {m.name} first" for m in measures.headlines)
+    groups = numbers.groupby("baseline", sort=False) if len(numbers) else ()
+    for baseline, group in groups:
+        shown, bold = [], set()
+        for place, row in enumerate(group.to_dict("records")):
+            texts = {"method": row["method"], "n pairs": str(row["pairs"])}
+            for measure in measures:
+                text = interval_text(row, measure.column, measure.digits, measure.scale, "+")
+                texts[measure.head] = text
+            shown.append(texts | {"P(better)": interval_text(row, "better", 2)})
+            for column, (name, null) in enumerate(nulls.items(), 2):
+                if row[f"{name}_low"] > null or row[f"{name}_high"] < null:
+                    bold.add((place, column))
+        name, title = f"against_{baseline}", f"Differences from {baseline}"
+        note = PAIRS_NOTE.format(order=order)
+        own = group.reset_index(drop=True)
+        tables.append(Table(name, title, note, own, pd.DataFrame(shown), frozenset(bold)))
+    return tables
+
+
+def cell_table(missions: pd.DataFrame, measures: Measures) -> Table:
+    """Return the means of each method (a column) in each cell (a row), by the headline measures."""
+    timeless = missions.drop(columns="seconds", errors="ignore")  # the same file for the same runs
+    numbers = summarise(timeless, measures, ["cell", "method"])
+    heads, rows, bold = ["cell", *missions["method"].unique()], [], set()
+    short = measures.headlines
+    for place, (cell, group) in enumerate(numbers.groupby("cell", sort=False)):
+        texts, rank = dict.fromkeys(heads, "-") | {"cell": cell}, {}
+        for row in group.to_dict("records"):
+            # Many numbers side by side: whole percentages are enough.
+            parts = [m.text(row[m.column], 0 if m.scale > 1 else m.digits) for m in short]
+            texts[row["method"]] = " / ".join(parts)
+            rank[row["method"]] = tuple(m.sign * row[m.column] for m in short)
+        rows.append(texts)
+        if len(set(rank.values())) > 1:
+            best = max(rank.values())
+            bold |= {(place, heads.index(name)) for name in rank if rank[name] == best}
+    note = CELL_NOTE.format(names=" / ".join(measure.head for measure in short))
+    return Table("cells", "Cell by cell", note, numbers, pd.DataFrame(rows), frozenset(bold))
+
+
+def missing_table(missing: pd.DataFrame, cells: int) -> Table:
+    """Return the table of what is missing, one row per method and set of seeds.
+
+    Args:
+        missing: one row per ``method``, ``cell`` and ``seed``.
+        cells: how many there are in all.
+    """
+    rows = []
+    seeds = missing.groupby(["method", "cell"], sort=False)["seed"].agg(tuple).reset_index()
+    for (method, numbers), group in seeds.groupby(["method", "seed"], sort=False):
+        names = f"all {cells}" if len(group) == cells else "; ".join(group["cell"])
+        row = {"method": method, "missions": str(len(group) * len(numbers))}
+        rows.append(row | {"seeds": ", ".join(map(str, numbers)), "cells": names})
+    shown, align = pd.DataFrame(rows), r"lrlp{0.6\textwidth}"
+    return Table("missing", "Missing missions", MISSING_NOTE, missing, shown, align=align)
+
+
+def missing_lines(table: Table, width: int = 60) -> list[str]:
+    """Say in one line per row of :func:`missing_table` what is missing.
+
+    >>> missing = pd.DataFrame({"method": ["a", "a"], "cell": ["oval", "ring"], "seed": [1, 1]})
+    >>> missing_lines(missing_table(missing, cells=3))
+    ['missing: a: 2 missions, seeds 1, cells oval; ring']
+    """
+    return [
+        f"missing: {row['method']}: {row['missions']} missions, "
+        f"seeds {shorten(row['seeds'], width)}, cells {shorten(row['cells'], width)}"
+        for row in table.shown.to_dict("records")
+    ]

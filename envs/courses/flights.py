@@ -1,0 +1,192 @@
+"""Reference flights that have a name: standing still, circles, figures of eight, waypoints."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from afm_rl.envs.courses.reference import Reference
+from afm_rl.envs.courses.table import load_reference
+from afm_rl.envs.courses.track import check_near, local_origin
+from afm_rl.errors import ConfigurationError, check_flag, check_number
+
+
+class Hover(Reference):
+    """Standing still.
+
+    Args:
+        position: where (m).
+
+    Raises:
+        ConfigurationError: unless it is three finite numbers.
+
+    >>> Hover([0.0, 0.0, 1.0]).at(torch.tensor(2.0))
+    tensor([0., 0., 1., 0., 0., 0.])
+    """
+
+    def __init__(self, position: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        self.name = "hover"
+        self.position = _points("hover: position", [position])[0]
+
+    def at(self, time: Tensor) -> Tensor:
+        here = torch.cat([self.position, torch.zeros_like(self.position)]).to(time)
+        return here.expand(*time.shape, 6)
+
+
+class Circle(Reference):
+    r"""A level circle about the origin at constant speed.
+
+    .. math:: r = R (\cos \varphi, \sin \varphi, 0),\quad \varphi = v t / R
+
+    Args:
+        radius: R (m).
+        speed: v (m/s).
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+
+    >>> Circle(radius=2.0, speed=0.5).at(torch.zeros(()))
+    tensor([2.0000, 0.0000, 0.0000, -0.0000, 0.5000, 0.0000])
+    """
+
+    def __init__(self, radius: float = 2.0, speed: float = 0.8) -> None:
+        self.radius = check_number("circle: radius", radius, low=0.0, open_low=True)
+        self.speed = check_number("circle: speed", speed, low=0.0)
+        self.name = f"circle_{self.radius:g}m_{self.speed:g}mps"
+
+    def at(self, time: Tensor) -> Tensor:
+        angle = time * (self.speed / self.radius)
+        cos, sin, none = angle.cos(), angle.sin(), torch.zeros_like(angle)
+        here = torch.stack([cos, sin, none], -1) * self.radius
+        return torch.cat([here, torch.stack([-sin, cos, none], -1) * self.speed], -1)
+
+
+class FigureEight(Reference):
+    r"""A level figure of eight, which starts in its centre.
+
+    .. math:: r = (a \sin \varphi, b \sin 2 \varphi, 0),\quad \varphi = 2 \pi t / P
+
+    Args:
+        length: half length a (m).
+        width: half width b (m).
+        period: P (s).
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+
+    >>> FigureEight(period=4.0).at(torch.ones(()))[:2].round(decimals=4)
+    tensor([1., -0.])
+    """
+
+    def __init__(self, length: float = 1.0, width: float = 0.5, period: float = 8.0) -> None:
+        names = ("length", "width", "period")
+        for name, value in zip(names, (length, width, period), strict=True):
+            check_number(f"figure_8: {name}", value, low=0.0, open_low=True)
+        self.length, self.width, self.pulse = length, width, 2 * math.pi / period
+        self.name = f"figure_8_{period:g}s"
+
+    def at(self, time: Tensor) -> Tensor:
+        angle = time * self.pulse
+        none, fast = torch.zeros_like(angle), self.width * 2 * self.pulse
+        here = [self.length * angle.sin(), self.width * (2 * angle).sin(), none]
+        speed = [self.length * self.pulse * angle.cos(), fast * (2 * angle).cos(), none]
+        return torch.stack(here + speed, -1)
+
+
+class Waypoints(Reference):
+    """Straight lines from point to point at constant speed; then the last point, at rest.
+
+    Args:
+        points: two or more points x, y, z (m), no two neighbours the same.
+        speed: speed (m/s).
+        closed: whether to go on to the first point and start again.
+        name: how missions call it.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+
+    >>> line = Waypoints([[0, 0, 0], [2, 0, 0]], speed=0.5)
+    >>> line.at(torch.tensor([1.0, 9.0]))[:, [0, 3]]
+    tensor([[0.5000, 0.5000],
+            [2.0000, 0.0000]])
+    """
+
+    def __init__(
+        self,
+        points: Sequence[Sequence[float]],
+        speed: float = 0.5,
+        closed: bool = False,
+        name: str = "waypoints",
+    ) -> None:
+        self.name = name
+        corners = _points("waypoints: points", points)
+        self.closed = check_flag("waypoints: closed", closed)
+        speed = check_number("waypoints: speed", speed, low=0.0, open_low=True)
+        if self.closed:
+            corners = torch.cat([corners, corners[:1]])
+        lengths = corners.diff(dim=0).norm(dim=-1)
+        if len(corners) < 2 or not lengths.gt(0).all():
+            raise ConfigurationError(
+                f"waypoints: points={points!r}: expected two or more, each unlike the one before"
+            )
+        self.starts = corners
+        self.times = torch.cat([lengths.new_zeros(1), lengths.cumsum(0) / speed])
+        moving = corners.diff(dim=0) / lengths[:, None] * speed
+        self.velocities = torch.cat([moving, torch.zeros_like(moving[:1])])
+
+    def at(self, time: Tensor) -> Tensor:
+        starts, times, velocities = (x.to(time) for x in (self.starts, self.times, self.velocities))
+        if self.closed:
+            time = time.remainder(times[-1])
+        leg = torch.searchsorted(times, time.contiguous(), right=True).sub(1).clamp(min=0)
+        moved = (time - times[leg]).unsqueeze(-1) * velocities[leg]
+        return torch.cat([starts[leg] + moved, velocities[leg]], -1)
+
+
+def _points(name: str, points: Sequence[Sequence[float]]) -> Tensor:
+    """Return points ``(N, 3)`` in double precision."""
+    try:
+        rows = torch.as_tensor(points, dtype=torch.float64)
+    except (TypeError, ValueError):
+        rows = torch.zeros(0)
+    if rows.dim() != 2 or rows.shape[-1] != 3 or not rows.isfinite().all():
+        raise ConfigurationError(f"{name}={points!r}: expected finite numbers x, y, z (m)")
+    check_near(rows, name)
+    return rows - local_origin(rows)
+
+
+NUMBER = r"(\d+(?:\.\d+)?)"
+NAMED: dict[str, Callable[..., Reference]] = {
+    "hover": Hover,
+    f"circle_{NUMBER}m_{NUMBER}mps": Circle,
+    f"figure_8_{NUMBER}s": lambda period: FigureEight(period=period),
+}
+
+
+def find_reference(name: str) -> Reference:
+    """Return a reference by its name, or from a CSV file.
+
+    Args:
+        name: ``hover``, ``circle_2m_0.8mps`` (radius, speed), ``figure_8_8s`` (period), or the path
+            of a CSV file; see :func:`load_reference`.
+
+    Raises:
+        ConfigurationError: if there is no such reference, or the file cannot be used.
+
+    >>> find_reference("circle_3m_1.2mps").speed
+    1.2
+    """
+    for pattern, make in NAMED.items():
+        found = re.fullmatch(pattern, name)
+        if found:
+            return make(*map(float, found.groups()))
+    if not name.lower().endswith(".csv"):
+        raise ConfigurationError(
+            f"tracks={name!r}: expected hover, a circle such as circle_2m_0.8mps (radius, speed), "
+            "a figure of eight such as figure_8_8s (period), or the path of a CSV file"
+        )
+    return load_reference(name)

@@ -1,0 +1,113 @@
+"""Tasks of one's own: an MJCF file, or a step function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
+from afm_rl.envs.task.simulated import Limits, simulated, state_of
+from afm_rl.envs.task.task import NOWHERE, Reward, Task, trust
+from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.spaces.manifold import Manifold
+
+
+def mujoco_task(
+    xml: str | Path | None,
+    reward: Reward | None,
+    steps: int = 1000,
+    frame_skip: int = 1,
+    start_noise: float = 0.01,
+    action_low: Limits = None,
+    action_high: Limits = None,
+) -> Task:
+    """Return a task with a robot of one's own: an MJCF file, and a reward.
+
+    Args:
+        xml: file, or text that begins with ``<``.
+        reward: see :class:`~afm_rl.envs.Task`.
+        steps: length of an episode.
+        frame_skip: simulation steps per action.
+        start_noise: standard deviation of positions and velocities at the start, around the
+            model's own (its first keyframe if it has one).
+        action_low: lowest action; the actuators' control range if None.
+        action_high: highest action.
+
+    Raises:
+        ConfigurationError: for a file or a setting that cannot be used.
+    """
+    if xml is None or reward is None:
+        missing = "robot.xml" if xml is None else "robot.reward"
+        raise ConfigurationError(
+            f"{missing}: expected a setting; robot=mujoco needs robot.xml=FILE and "
+            "robot.reward=MODULE.FUNCTION"
+        )
+    noise = check_number("robot.start_noise", start_noise, low=0.0)
+    skip = check_count("robot.frame_skip", frame_skip)
+    try:
+        world = MuJoCoDynamics(xml, skip)
+    except ConfigurationError as error:
+        raise ConfigurationError(str(error).replace("dynamics.model", "robot.xml")) from error
+    import mujoco
+
+    data = mujoco.MjData(world.mjcf)
+    if world.mjcf.nkey:
+        mujoco.mj_resetDataKeyframe(world.mjcf, data, 0)
+    first, size = state_of(data), world.manifold.tangent_size
+
+    def start(seed: int) -> tuple[Tensor, Tensor]:
+        drawn = torch.randn(size, generator=torch.Generator().manual_seed(seed)).double()
+        return world.manifold.add(first, noise * drawn), NOWHERE
+
+    name = "mjcf" if str(xml).lstrip().startswith("<") else Path(xml).stem
+    low, high = action_low or world.action_low.tolist(), action_high or world.action_high.tolist()
+    trust(world, first, low, high)
+    return simulated(name, world, start, {"reward": reward}, steps, low, high)
+
+
+def function_task(
+    step: Callable[[Tensor, Tensor], Tensor],
+    reward: Reward,
+    action_low: Sequence[float],
+    action_high: Sequence[float],
+    start: Sequence[float],
+    start_noise: float = 0.01,
+    angles: Sequence[int] = (),
+    steps: int = 1000,
+    dt: float = 0.1,
+) -> Task:
+    """Return a task whose world is a step function.
+
+    Args:
+        step: ``step(state, action) -> next_state``, batched.
+        reward: see :class:`~afm_rl.envs.Task`.
+        action_low: lowest action, ``(A,)``.
+        action_high: highest action, ``(A,)``.
+        start: first state, ``(S,)``.
+        start_noise: its standard deviation.
+        angles: state coordinates that wrap at +-pi.
+        steps: length of an episode.
+        dt: time of a step (s).
+    """
+    first = torch.tensor([float(value) for value in start])
+
+    def begin(seed: int) -> tuple[Tensor, Tensor]:
+        drawn = torch.randn(len(first), generator=torch.Generator().manual_seed(seed))
+        return first + start_noise * drawn, NOWHERE
+
+    world = KnownDynamics(step, Manifold(len(first), angles), len(action_low))
+    return Task(
+        name=getattr(step, "__name__", "function"),
+        world=trust(world, first, action_low, action_high),
+        start=begin,
+        reward=reward,
+        low=action_low,
+        high=action_high,
+        dt=dt,
+        steps=steps,
+        state_names=[f"s_{k}" for k in range(len(first))],
+        action_names=[f"a_{k}" for k in range(len(action_low))],
+    )

@@ -1,0 +1,48 @@
+"""What is said of real robots, and what is not: the parts of their logs that are shipped."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from afm_rl.diagnosis import diagnose
+from afm_rl.diagnosis.readers import read_log
+
+LOGS = Path(__file__).parents[2] / "examples" / "real_logs"
+
+
+def test_heavy_wheels():
+    """Dead time .3 to .45 s, 63 % after .75 to 1 s, no more than 13 to 14 rad/s."""
+    found = diagnose(read_log(LOGS / "warthog_ice_wheels.parquet"))
+    for wheel in found.actuators:
+        assert wheel.gain == pytest.approx(1, abs=0.08) and not wheel.reversed
+        assert 0.2 < wheel.delay_s < 0.55 and wheel.delay_s + wheel.lag_s < 1.0
+        assert 12.5 < wheel.saturation < 14.2
+        assert wheel.lost == 0 and not wheel.changes and wheel.unexplained < 0.03
+    assert "that is the loop's" in found.notes[-1] and "late" not in str(found)
+
+
+def test_a_flight_with_a_weak_battery():
+    found = diagnose(read_log(LOGS / "crazyflie_ramp.parquet"))
+    x, y, z, yaw = found.actuators
+    assert x.delay_s + x.lag_s == pytest.approx(0.5, abs=0.06) and x.gain == pytest.approx(
+        1, abs=0.05
+    )
+    assert [a.status for a in (y, z, yaw)] == ["cannot tell"] * 3
+    assert not any(a.changes for a in found.actuators)
+
+
+def test_arms_that_a_person_moves():
+    log = read_log(LOGS / "unitree_g1")
+    kinds = ("ShoulderRoll", "ShoulderYaw", "Elbow", "WristYaw", "HandMiddle", "HandIndex")
+    some = [log.names.index(f"k{side}{kind}") for side in ("Left", "Right") for kind in kinds]
+    names = tuple(log.names[j] for j in some)
+    part = replace(log, names=names, command=log.command[:, some], response=log.response[:, some])
+    found = diagnose(part)
+    assert any("that is the loop's" in note for note in found.notes)
+    by_name = {a.name: a for a in found.actuators}
+    assert not any(a.reversed or a.status == "dead" for a in found.actuators)
+    idle = [by_name[f"kLeft{name}"] for name in ("ShoulderRoll", "ShoulderYaw", "HandMiddle")]
+    assert [a.status for a in idle] == ["cannot tell"] * 3
+    busy = [by_name[f"kRight{name}"] for name in ("ShoulderYaw", "Elbow", "WristYaw")]
+    assert [a.status for a in busy] == ["healthy"] * 3

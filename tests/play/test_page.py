@@ -1,0 +1,114 @@
+"""The page in a real browser: a slider reverses a motor, and one robot of two falls."""
+
+import shutil
+import threading
+import time
+
+import pytest
+
+from afm_rl.play import World, make_robot
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
+FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
+FLAGS += ["--enable-unsafe-swiftshader", "--disable-background-networking"]
+FLAGS += ["--disable-component-update", "--disable-sync", "--no-first-run"]
+LONG = 120_000  # ms, for slow machines
+
+
+@pytest.fixture
+def page_of():
+    """Make the page of a robot."""
+    pytest.importorskip("viser")
+    from afm_rl.cli.play import free_port
+    from afm_rl.play.page import Page
+
+    pages = []
+
+    def make(name):
+        pages.append(Page(World(make_robot(name)), name, free_port(0)))
+        return pages[-1]
+
+    yield make
+    for page in pages:
+        page.end()
+
+
+@pytest.fixture
+def served(page_of):
+    """A page of carts with poles, which runs."""
+    page = page_of("cart_pole")
+    running = threading.Thread(target=page.run)
+    running.start()
+    yield page
+    page.end()
+    running.join()
+
+
+@pytest.fixture
+def browser():
+    """Headless Chromium."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this machine")
+    with playwright.sync_playwright() as tool:
+        chromium = tool.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield chromium
+        chromium.close()
+
+
+def until(holds):
+    """Wait for something, and fail after a long time."""
+    end = time.monotonic() + LONG / 1000
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def opened(browser, served, errors):
+    """Open the page, and wait until its controls are there."""
+    page = browser.new_page(viewport={"width": 900, "height": 600})
+    page.set_default_timeout(LONG)
+    page.on("console", lambda said: errors.append(said.text) if said.type == "error" else 0)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(served.url)
+    page.wait_for_selector("canvas")
+    page.get_by_text("Push", exact=True).wait_for()
+    return page
+
+
+@pytest.mark.parametrize("name", ["hopper", "pendulum", "ugv", "quadrotor"])
+def test_robots_are_drawn_and_described(name, page_of):
+    page = page_of(name)
+    page.choose("reverse one")
+    for _ in range(20):
+        page.world.step()
+    page.draw()
+    page.say()
+    effect = page.world.sides["AFM"].effect
+    assert page.world.faults.values["gain_0"] == -1.0
+    executed = page.world.sides["AFM"].info["afm"]["executed"]
+    assert effect[0] == pytest.approx(-executed[0], rel=1e-5)
+    assert "| alone | AFM |" in page.words.content and "AFM " in page.words.content
+    for figure in page.figures.values():
+        assert all(abs(number) < 1e3 for number in figure.root.position)
+    page.choose("healthy")
+    assert page.world.faults.values["gain_0"] == 1.0
+
+
+def test_a_slider_reverses_a_motor(served, browser):
+    alone, corrected = served.world.sides.values()
+    errors, gain = [], "xpath=//*[text()='Gain']/following::input[not(@type='hidden')][1]"
+    page = opened(browser, served, errors)
+    assert alone.falls == 0
+    page.locator(gain).fill("-1")
+    page.locator(gain).press("Enter")
+    until(lambda: served.world.faults.values.get("gain_0") == -1.0)
+    page.get_by_text("Push", exact=True).click()
+    until(lambda: alone.falls > 1 and corrected.steps > 100)
+    assert corrected.falls == 0
+    page.get_by_text("reversed").first.wait_for()
+    page.close()  # ends nothing
+    steps = corrected.steps
+    page = opened(browser, served, errors)  # another page of the same world
+    until(lambda: page.locator(gain).input_value() == "-1" and corrected.steps > steps)
+    assert not errors

@@ -1,0 +1,81 @@
+"""Two robots share policy and faults; one of them is corrected."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+from afm_rl.cli.play import main
+from afm_rl.play import Actuators, World, make_robot
+from afm_rl.play.actuators import Faults, presets
+
+pytest.importorskip("mujoco")
+
+
+def test_a_reversed_cart_falls_unless_it_is_corrected():
+    world = World(make_robot("cart_pole"))
+    for _ in range(5):
+        world.step()
+    alone, corrected = world.sides.values()
+    assert alone.total == corrected.total == 5.0
+    world.faults.values = {"gain_0": -1.0}
+    for _ in range(40):
+        world.step()
+    assert alone.falls > 0 and corrected.falls == 0
+    _, executed, effect = np.array(corrected.commands).swapaxes(0, 1)
+    np.testing.assert_allclose(executed[-40:], -effect[-40:], rtol=1e-6)
+    world.push()
+    world.reset()
+    assert alone.falls == alone.steps == 0
+    np.testing.assert_array_equal(alone.observation, corrected.observation)
+
+
+@pytest.mark.parametrize("name", ["hopper", "pendulum", "ugv"])
+def test_healthy_robots_do_the_same(name):
+    world = World(make_robot(name))
+    for _ in range(5):
+        world.step()
+    alone, corrected = world.sides.values()
+    assert alone.steps == corrected.steps == 5
+    assert not corrected.info["afm"]["corrects"]
+    if name != "ugv":  # whose planner draws its candidates
+        assert alone.rewards == corrected.rewards
+    world.push()
+
+
+def test_actuators_do_what_is_set():
+    faults = Faults({"delay": 1, "gain_0": 0.5, "from_0": 1, "from_1": 0})
+    env = Actuators(gymnasium.make("Reacher-v5"), faults)
+    env.reset(seed=0)
+    env.step(np.array([0.2, 0.8]))
+    assert env.effect.tolist() == [0.0, 0.0]
+    env.step(np.array([0.0, 0.0]))
+    np.testing.assert_allclose(env.effect, [0.4, 0.2], rtol=1e-6)
+    faults.values, faults.noise = {}, 0.1
+    env.step(np.array([0.3, 0.3]))
+    assert 0 < np.abs(env.effect - 0.3).max() < 0.5
+
+
+def test_presets_are_faults_of_any_robot():
+    for count in (1, 2, 6):
+        env = Actuators(gymnasium.make("HalfCheetah-v5" if count == 6 else "Pendulum-v1"), Faults())
+        if count == 6:
+            for values in presets(6).values():
+                env.regime.encode(values)
+        assert "swap" in presets(count) or count == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--robot", "dog"], "--robot='dog'"),
+        (["--policy", "nothing.safetensors"], "no such file"),
+        (["--port", "70000"], "--port=70000"),
+        (["--port", "x"], "invalid int"),
+    ],
+)
+def test_mistakes_end_in_one_line(arguments, words, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["afm-rl-play", *arguments])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and words in said and said.count("\n") == 1
