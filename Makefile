@@ -45,7 +45,7 @@ typecheck: $(VENV)/.with-test build/package ## Check types
 		--cache-dir $(CURDIR)/.mypy_cache --package afm_rl
 	@cd benchmarks/suites && MYPYPATH=$(CURDIR)/build/package $(CURDIR)/$(BIN)/mypy \
 		--config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache \
-		$(patsubst benchmarks/suites/%/,--package %,$(sort $(wildcard benchmarks/suites/*/)))
+		$(patsubst benchmarks/suites/%/__init__.py,--package %,$(wildcard benchmarks/suites/*/__init__.py))
 
 check: lint typecheck test ## All of lint, typecheck and test
 

@@ -48,7 +48,7 @@ def launch(cfg: DictConfig) -> None:
     jobs = jobs_of(cfg, cast(DictConfig, hydra))
     agents = [build(job) for job in {job.label: job for job in jobs.values()}.values()]
     if cfg.get("study") is None and len(jobs) == 1:
-        _run_alone(folder, *jobs.values(), *agents)
+        _run_alone(folder, next(iter(jobs.values())), agents[0])
         show(folder, cfg, agents, film)
         return
     launcher = instantiate(hydra.launcher)

@@ -71,7 +71,7 @@ class ActionFlow(Believer):
     >>> flow = ActionFlow(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
     >>> from afm_rl.dynamics import Dubins
     >>> memory, state = flow.begin(torch.zeros(3)), torch.zeros(3)
-    >>> for _ in range(3):  # both motors are reversed
+    >>> for _ in range(8):  # both motors are reversed
     ...     plan, box = torch.tensor([0.5, 0.2]), torch.tensor([[-1.0, -1.5], [1.0, 1.5]])
     ...     memory, found = flow.correct(memory, plan, Dubins(), box)
     ...     state = Dubins()(state, -found.executed)
@@ -96,7 +96,7 @@ class ActionFlow(Believer):
         samples: int = 16,
         source_std: float = 0.3,
         steps: int = 1,
-        saturation: str = "clip",
+        saturation: str = "mixed",
         compile: bool = False,
         cache: str | Path = "~/.cache/afm_rl",
         network: AxisNetwork | None = None,

@@ -42,9 +42,9 @@ class Believer(PairCorrector):
     r"""A corrector that believes in models of the actuators as far as they predict.
 
     It holds a :class:`~afm_rl.correction.belief.Belief` over M models of the pairs that it
-    remembers; the first is *nothing has changed*. No loss is negative, so while that model's own loss is below its ``odds`` no other one
-    can outweigh it: then the planned action is executed, and nothing more is computed. When it
-    is exceeded, the pairs from before are marked as old: "valid" is halved.
+    remembers; the first is *nothing has changed*. No loss is negative, so while that model's own
+    loss is below its ``odds`` no other one can outweigh it: then the planned action is executed,
+    and nothing more is computed. When it is exceeded, the pairs from before are marked as old.
 
     Args:
         action_low: lowest action, ``(A,)``.
@@ -234,10 +234,8 @@ class Believer(PairCorrector):
             model: the dynamics model as it is now.
         """
         with torch.no_grad():
-            parts = self.asleep(self.look(memory, model), action)
-            awake = parts["misaligned"].squeeze(-1) == 1.0
-            if not all_hold(~awake):
-                parts = self.unpack(self._foresee(self.pack(parts), action), model.state_size)
+            seen = self._foresee(self.pack(self.look(memory, model)), action)
+            parts = self.unpack(seen, model.state_size)
             weights = self.belief(parts).weights(self.prior.to(memory))
             mean, std = mean_and_std(parts["forecasts"], weights)
             return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))
@@ -257,6 +255,7 @@ class Believer(PairCorrector):
         more = self.normalise(given - sent).unsqueeze(-2)
         return self.pack({**parts, "forecasts": parts["forecasts"] + more})
 
+    @torch.no_grad()
     def _foresee(self, memory: Tensor, executed: Tensor) -> Tensor:
         """Return the memory with forecasts of what is executed, where models are to be asked."""
         parts = self.unpack(memory, self.states_in(memory))

@@ -115,12 +115,14 @@ class Tick(nn.Module):
         proposals, spread = self.propose(models, unit, ends)
         expected = self.expect(models, proposals)
         reach = self.reach(models, expected)
-        wanted = attainable(unit, *reach.unbind(-2), self.saturation)
+        low, high = reach.unbind(-2)
+        wanted = attainable(unit, low, high, self.saturation)
         sent = pairs[..., : len(self.scale)]
         tried = sent.amax(1) - sent.amin(1)
         bounds = extend(reach, ends, tried, self.saturation)
         action = self.decide(models, proposals, expected, wanted, noise)
-        action = torch.where(action.isfinite().all(-1, True), action, unit)
+        changed = weights[:, 0] < 0.5  # else the plan, to the bit
+        action = torch.where(changed & action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
         forecasts, under_way = self.forecast(
             encoded, lines, weights, pairs, torch.cat([waiting, action.unsqueeze(1)], 1)
@@ -130,7 +132,7 @@ class Tick(nn.Module):
             predicted * self.scale,
             spread * self.scale,
             bounds * self.scale,
-            (weights.argmax(1) > 0).any(-1),
+            changed.any(-1),
             forecasts,
             under_way,
         )

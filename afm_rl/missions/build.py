@@ -148,6 +148,11 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
 
     dynamics = as_part("dynamics", make("dynamics", robot), DynamicsModel)
     model = dynamics.module
+    if not isinstance(settings["corrector"], Mapping):
+        raise ConfigurationError(
+            f"corrector={settings['corrector']!r}: expected the settings of a corrector, such as "
+            "those of corrector=afm"
+        )
     own = {key: value for key, value in settings["corrector"].items() if key not in TRANSFORM}
     around = {key: value for key, value in settings["corrector"].items() if key in TRANSFORM}
     with blaming("corrector"):

@@ -53,7 +53,7 @@ def blaming(group: str) -> Iterator[None]:
         place = place if place.startswith(group) else f"{group}.{place}"
         raise ConfigurationError(f"{place}: {text}") from error
     except MISTAKES as error:
-        raise ConfigurationError(f"{group}: {error}") from error
+        raise ConfigurationError(f"{group}: {str(error) or type(error).__name__}") from error
 
 
 def check_training(

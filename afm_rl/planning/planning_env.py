@@ -119,8 +119,9 @@ class PlanningEnv(ModelBasedEnvBase):
             except AFMError:
                 raise
             except Exception as error:  # of somebody else's function
+                said = str(error) or type(error).__name__
                 raise ConfigurationError(
-                    f"cost: {error}; tried with states {tuple(state.shape)}"
+                    f"cost: {said}; tried with states {tuple(state.shape)}"
                 ) from error
         shape = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
         if shape != batch:

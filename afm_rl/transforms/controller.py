@@ -47,8 +47,8 @@ class Controller(nn.Module):
     >>> planner = MPPI(PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5]))
     >>> controller = Controller(planner, ActionFlowPolicy(Dubins(), planner.action_spec))
     >>> controller.sizes
-    {'memory': 526, 'observation': 3, 'goal': 2, 'noise': 3000}
-    >>> memory, noise = torch.zeros(526), controller.draw()
+    {'memory': 944, 'observation': 3, 'goal': 2, 'noise': 3000}
+    >>> memory, noise = torch.zeros(944), controller.draw()
     >>> memory, action = controller(memory, torch.zeros(3), torch.ones(2), noise)
     >>> action.shape
     torch.Size([2])

@@ -171,6 +171,10 @@ class CorrectionLoop:
             self._explore(planned)
         else:
             memory, how = self.entries.get("memory"), (self.spec, self.enabled)
+            # A policy knows no effects beyond the space, as a planner may: these are cut first.
+            space = self.spec.space
+            inside = planned.clamp(space.low.to(planned), space.high.to(planned))
+            planned = torch.where(planned.isfinite(), inside, planned)
             self.entries = correct(memory, planned, self.model, self.corrector, *how)
         self.told = self._tell()
         return self.told["executed"].astype(self.space.dtype)

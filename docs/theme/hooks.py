@@ -18,7 +18,6 @@ FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>',
 API = {
     "Transforms and policies": "transforms",
     "Correction": "correction",
-    "The flow": "flow",
     "Planning": "planning",
     "Dynamics": "dynamics",
     "Learning": "learning",

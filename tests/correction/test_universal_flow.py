@@ -9,7 +9,7 @@ import torch
 from afm_rl.correction import ActionFlow
 
 SIZES = [1, 2, 6, 17]
-STEPS = 56
+STEPS, MANY = 20, 56
 ENOUGH = {"gains": 20, "two swapped": 48}  # steps; of all others 8
 
 
@@ -50,7 +50,7 @@ FAULTS = [(name, size) for name in REGIMES for size in SIZES if (name, size) != 
 
 @pytest.mark.parametrize(("name", "size"), FAULTS)
 def test_faults_are_corrected_within_few_steps(line, drive, plans, name, size):
-    planned = plans(STEPS, 4, size, size=0.5)
+    planned = plans(MANY, 4, size, size=0.5)
     found, effects = drive(flow_of(size), line(size), REGIMES[name], planned)
     after = ENOUGH.get(name, 8)
     can = (planned.abs() <= 1).all(-1)
@@ -64,7 +64,7 @@ def test_faults_are_corrected_within_few_steps(line, drive, plans, name, size):
 
 @pytest.mark.parametrize("name", ["bias", "two swapped"])
 def test_what_one_map_explains_is_undone_exactly(line, drive, plans, name):
-    planned = plans(STEPS, 8, 3, size=0.5)
+    planned = plans(MANY, 8, 3, size=0.5)
     _, effects = drive(flow_of(3), line(3), REGIMES[name], planned)
     assert miss_of(effects, planned, 36).median() < 5e-4
 

@@ -55,7 +55,7 @@ def test_each_fault_is_named():
 @pytest.mark.parametrize("kind", ["white", "steps", "walk", "smooth"])
 def test_healthy_logs_raise_no_alarm(kind):
     for seed, sort in enumerate(["gauss", "heavy", "red"]):
-        log = log_of([Fault()] * 4, 600, kind, 0.05, sort, seed)
+        log = log_of([Fault()] * 3, 500, kind, 0.05, sort, seed)
         assert not [a for a in diagnose(log).actuators if a.status in ("changed", "dead")]
 
 
@@ -174,7 +174,7 @@ ODD = {
 
 
 def test_faults_that_are_no_number_of_the_model_have_words():
-    log = log_of([Fault()] * (1 + len(ODD)), 1200, "walk", scale=0.0, seed=5)
+    log = log_of([Fault()] * (1 + len(ODD)), 800, "walk", scale=0.0, seed=5)
     rng, y = np.random.default_rng(5), log.response.copy()
     for j, make in enumerate(ODD.values()):
         y[:, j] = make(log.command[:, j], rng)
@@ -298,7 +298,7 @@ def test_outliers_and_a_coarse_sensor_do_not_matter():
 
 
 def test_long_logs_of_seven_joints():
-    log = log_of([Fault(), Fault(gain=-0.5)] * 3 + [Fault(delay=2)], 30_000, "white")
+    log = log_of([Fault(), Fault(gain=-0.5)] * 3 + [Fault(delay=2)], 20_000, "white")
     found = diagnose(log)
     assert [a.status for a in found.actuators] == ["healthy", "changed"] * 3 + ["changed"]
 

@@ -93,7 +93,6 @@ def test_without_a_reference_all_coordinates_have_targets_of_their_own():
         {"rest": [0.0]},
         {"rest": [0.0, math.inf, 0.0]},
         {"in_keys": []},
-        {"saturation": "none"},
     ],
     ids=str,
 )

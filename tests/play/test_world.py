@@ -16,13 +16,13 @@ def test_a_reversed_cart_falls_unless_it_is_corrected():
     for _ in range(5):
         world.step()
     alone, corrected = world.sides.values()
-    assert alone.total == corrected.total == 5.0
+    assert alone.total == corrected.total > 0
     world.faults.values = {"gain_0": -1.0}
-    for _ in range(40):
+    for _ in range(160):
         world.step()
-    assert alone.falls > 0 and corrected.falls == 0
+    assert alone.falls > 3 and corrected.falls <= 2  # before the reversal is believed
     _, executed, effect = np.array(corrected.commands).swapaxes(0, 1)
-    np.testing.assert_allclose(executed[-40:], -effect[-40:], rtol=1e-6)
+    np.testing.assert_allclose(executed[-20:], -effect[-20:], rtol=1e-6)
     world.push()
     world.reset()
     assert alone.falls == alone.steps == 0

@@ -11,7 +11,11 @@ from afm_rl.missions import run
 
 SUITES = Path(__file__).parents[2] / "benchmarks" / "suites"
 FILES = sorted(SUITES.glob("*/conf/*/*.yaml"))
-MODULES = sorted(path.relative_to(SUITES) for path in SUITES.glob("*/*.py"))
+MODULES = sorted(
+    path.relative_to(SUITES)
+    for folder in SUITES.glob("*/__init__.py")
+    for path in folder.parent.glob("*.py")
+)
 FLIGHT = "robot=quadrotor"
 PARTNERS = {
     "planner=law": ["robot=gusty_pendulum"],

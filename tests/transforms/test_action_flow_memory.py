@@ -60,7 +60,8 @@ def test_it_is_empty_at_the_start_but_for_state_and_box(make):
     space = env.full_action_spec["action"].space
     bounds = torch.stack([space.low, space.high], -2)
     torch.testing.assert_close(entries.pop("effect_bounds"), bounds)
-    assert not memory[:, 3:].any() and not any(part.any() for part in entries.values())
+    begun = env.transform.corrector.begin(td["observation"])
+    assert torch.equal(memory, begun) and not any(part.any() for part in entries.values())
 
 
 def test_it_holds_the_latest_transitions_oldest_first(make, remembered):

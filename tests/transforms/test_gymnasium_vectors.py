@@ -65,7 +65,7 @@ def test_each_environment_gets_the_actions_of_a_wrapper_of_its_own(kind, mode):
 def test_mujoco_in_a_vector_of_one_process_or_of_several():
     pytest.importorskip("mujoco")
     ran, rng = [], np.random.default_rng(0)
-    actions = rng.uniform(-1, 1, (30, 2, 2)).astype(np.float32)
+    actions = rng.uniform(-1, 1, (40, 2, 2)).astype(np.float32)
     for kind in (SyncVectorEnv, processes):
         makers = [
             lambda turn=turn: turn(gymnasium.make("Reacher-v5", max_episode_steps=25))

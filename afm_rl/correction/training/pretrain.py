@@ -1,4 +1,6 @@
-"""Training of the universal flow: ``python -m afm_rl.correction.training.pretrain --out universal.safetensors``.
+"""Training of the universal flow.
+
+``python -m afm_rl.correction.training.pretrain --out universal.safetensors`` trains it.
 
 ``--evaluate`` prints the held-out errors of the weights of the package, by kind of regime and
 number of actions, as they stand in the model card; a training ends with the same table.

@@ -68,9 +68,9 @@ class Maps(NamedTuple):
     def inverse(self, planned: Tensor, mode: str) -> Tensor:
         """Return the actions ``(N, C, A)`` in [-1, 1] for planned effects ``(N, C, A)``.
 
-        What cannot be had is saturated as :func:`~afm_rl.correction.achievable.intend` does: as much of
-        its direction as there is (``"direction"``), every axis as far as it goes (``"clip"``), or
-        the first of both only where less than 30 % can be had (``"mixed"``).
+        What is out of reach is saturated as :func:`~afm_rl.correction.achievable.intend` does:
+        as much of its direction as there is (``"direction"``), every axis as far as it goes
+        (``"clip"``), or the first of both only where less than 30 % can be had (``"mixed"``).
         """
         bias = self.bias.unsqueeze(-2)
         still = torch.linalg.solve(self.matrix, -bias.mT).mT

@@ -171,20 +171,25 @@ def train_flow(
     else:
         states = states.to(device)
 
-    world, windows = (model, regime, states), None
-    if isinstance(flow, ActionFlow):
-        windows = Windows(flow)
+    world = model, regime, states
+    if isinstance(flow, PaperFlow):
+        paper = flow
+        optimise(
+            list(paper.parameters()),
+            lambda: paper.training_loss(*world, batch_size, generator),
+            iterations,
+            lr,
+            progress,
+        )
+        return paper.held_out_error(*world, 2048, generator)
+    windows, network, mode = Windows(flow), flow.network, flow.tick.saturation
 
     def loss() -> Tensor:
-        if windows is None:
-            return flow.training_loss(*world, batch_size, generator)
         drawn = windows.draw(*world, batch_size, generator)
-        velocity, effect = flow_losses(flow.network, drawn, flow.tick.saturation, generator)
+        velocity, effect = flow_losses(network, drawn, mode, generator)
         return (velocity + EFFECT_WEIGHT * effect).mean()
 
     optimise(list(flow.parameters()), loss, iterations, lr, progress)
-    if windows is None:
-        return flow.held_out_error(*world, 2048, generator)
     return windows.error(windows.draw(*world, 2048, generator))
 
 

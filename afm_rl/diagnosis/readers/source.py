@@ -121,11 +121,11 @@ def check_regular(path: Path) -> Path:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ConfigurationError(
-            f"{printable(str(path))}: {reason}; expected a log, see --help"
+            f"{printable(str(path), 1000)}: {reason}; expected a log, see --help"
         ) from error
     if not stat.S_ISREG(kind):
         raise ConfigurationError(
-            f"{printable(str(path))}: no regular file, but a device, a pipe or a folder; expected "
-            "a file"
+            f"{printable(str(path), 1000)}: no regular file, but a device, a pipe or a folder; "
+            "expected a file"
         )
     return path

@@ -5,7 +5,9 @@ import pandas as pd
 import pytest
 
 from afm_rl.envs import TaskEnv, gymnasium_task
-from afm_rl.envs.task.film import HEIGHT, WIDTH, can_render, film, segments
+from afm_rl.envs.task.film import SIZE, can_render, film, segments
+
+HEIGHT, WIDTH = SIZE
 
 mujoco = pytest.importorskip("mujoco")
 MODEL = """<mujoco><worldbody><geom type="plane" size="1 1 1"/>
