@@ -24,7 +24,8 @@ demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and f
 	@echo "Four methods meet that: the old physics alone (physics), an ensemble that learns from every"
 	@echo "step (online_pe), the old physics behind AFM (afm_physics), and an oracle that knows it."
 	@$(BIN)/afm-rl hydra.run.dir=outputs/demo overwrite=true budget=600 video=gif
-	@echo "Look at outputs/demo/figures/trajectory.png and at the film outputs/demo/video/all_methods.gif"
+	@echo "Look at outputs/demo/figures/trajectory.png: paths are black before the change, orange after it."
+	@echo "The film is outputs/demo/video/all_methods.gif"
 
 test: $(VENV)/.with-test ## Run all tests with coverage (at least 95 %)
 	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 \
