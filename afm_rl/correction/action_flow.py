@@ -132,7 +132,7 @@ class ActionFlow(Believer):
             names,
             rows,
             self.prior,
-            self.delays,
+            self.so_late,
             likely,
             samples,
             source_std,

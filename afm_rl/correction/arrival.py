@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 LEAST = 1e-3  # share of the best that every delay keeps on every axis: none decides alone
 
 
-def steps_late(weights: Tensor, prior: Tensor, delays: Tensor) -> Tensor:
+def steps_late(weights: Tensor, prior: Tensor, so_late: Tensor) -> Tensor:
     r"""Return the most probable delay of commands in steps, ``(*B)``.
 
     .. math:: k = \operatorname{argmax}_k \log p_k + \sum_a \log\frac{p_{ka}}{p_k}
@@ -31,32 +31,30 @@ def steps_late(weights: Tensor, prior: Tensor, delays: Tensor) -> Tensor:
     Args:
         weights: probabilities of the models on every axis, ``(*B, M, A)``.
         prior: log-odds of the models, ``(M, 1)``.
-        delays: of the models, ``(M,)``.
+        so_late: by which models actions are k steps late, ``(K + 1, M)``, 0 or 1.
 
     >>> weights = torch.tensor([[0.8, 0.1], [0.1, 0.8], [0.1, 0.1]])
     >>> even = torch.zeros(3, 1)
-    >>> steps_late(weights, even, torch.tensor([0, 1, 1]))
+    >>> steps_late(weights, even, torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]]))
     tensor(1)
     """
-    most = max(delays.tolist())
-    among = torch.stack([delays == k for k in range(most + 1)]).to(weights)  # (K, M)
+    among = so_late.to(weights)
     first = among @ prior.to(weights).softmax(-2)
     evidence = among @ weights / first.clamp_min(1e-30)
     evidence = (evidence / evidence.amax(-2, keepdim=True)).clamp_min(LEAST)
     return (first.log() + evidence.log().sum(-1, keepdim=True)).squeeze(-1).argmax(-1)
 
 
-def effects_of(models: Tensor, weights: Tensor, late: Tensor, delays: Tensor) -> Tensor:
+def effects_of(models: Tensor, weights: Tensor, late: Tensor, so_late: Tensor) -> Tensor:
     """Return the effects ``(*B, K, A)`` of commands by those models that are so late.
 
     Args:
         models: their effects by every model, ``(*B, M, K, A)``.
         weights: probabilities of the models, ``(*B, M, A)``.
         late: steps, ``(*B)``.
-        delays: of the models, ``(M,)``.
+        so_late: by which models actions are k steps late, ``(K + 1, M)``, 0 or 1.
     """
-    so_late = delays.unsqueeze(-1) == late[..., None, None]
-    among = torch.where(so_late, weights.clamp_min(1e-9), 0.0)
+    among = so_late.to(weights)[late].unsqueeze(-1) * weights.clamp_min(1e-9)
     among = among / among.sum(-2, keepdim=True)
     return (among.unsqueeze(-2) * models).sum(-3)
 
@@ -73,7 +71,7 @@ def arrival(corrector: Corrector, memory: Tensor, model: DynamicsModel) -> tuple
     """
     with torch.no_grad():
         state, effects, steps = corrector.under_way(memory)
-        if all_hold(steps == 0):
+        if not effects.shape[-2] or all_hold(steps == 0):
             return state, steps
         most = int(steps.max()) if may_look(steps) else effects.shape[-2]
         # Every mission's commands under way, the oldest first; what follows them is not looked at.

@@ -248,7 +248,7 @@ class Corrector(nn.Module, ABC):
         """Return the memory if actuators gave ``given`` ``(*B, A)`` of what they were sent."""
         _, planned, _ = self.latest(memory)
         if not self.delay:
-            return self.executing(memory, planned, given)
+            return Corrector.executing(self, memory, planned, given)
         parts = self.unpack(memory, self.states_in(memory))
         sent = torch.cat([given.unsqueeze(-2), parts["sent"][..., 1:, :]], -2)
         return self.pack({**parts, "sent": sent})

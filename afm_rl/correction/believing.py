@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.arrival import steps_late
@@ -66,7 +67,7 @@ class Believer(PairCorrector):
     """
 
     prior: Tensor
-    delays: Tensor
+    so_late: Tensor
 
     def __init__(
         self,
@@ -101,8 +102,8 @@ class Believer(PairCorrector):
         prior = torch.cat([torch.tensor([self.odds]), among.log_softmax(0)]).unsqueeze(-1)
         self.register_buffer("prior", prior, persistent=False)
         late = torch.tensor([0, *(delays or [0] * len(models))])
-        self.register_buffer("delays", late, persistent=False)
-        self.most_late = max(late.tolist())
+        self.register_buffer("so_late", one_hot(late).T.float(), persistent=False)
+        self.most_late = len(self.so_late) - 1
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the belief; its noise is the last part."""
@@ -208,7 +209,7 @@ class Believer(PairCorrector):
         """Return the state, the newest commands' effects, and how many of them are to come."""
         parts = self.unpack(memory, self.states_in(memory))
         weights = self.belief(parts).weights(self.prior.to(memory))
-        steps = steps_late(weights, self.prior, self.delays)
+        steps = steps_late(weights, self.prior, self.so_late)
         return parts["state"], self.denormalise(parts["under_way"]), steps + self.delay
 
     def noise_in(self, memory: Tensor) -> Tensor:

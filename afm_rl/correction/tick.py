@@ -46,7 +46,7 @@ class Tick(nn.Module):
     probes: Tensor
     prior: Tensor
     late: Tensor
-    delays: Tensor
+    so_late: Tensor
     rows_acting: Tensor
 
     def __init__(
@@ -56,7 +56,7 @@ class Tick(nn.Module):
         readings: Sequence[str],
         rows: int,
         prior: Tensor,
-        delays: Tensor,
+        so_late: Tensor,
         likely: int,
         samples: int,
         source_std: float,
@@ -73,14 +73,14 @@ class Tick(nn.Module):
         self.varied = sum(r.varied for r in chosen)
         self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings))]
         self.likely = min(check_count("corrector.likely", likely), len(chosen))
-        self.most_late = max(delays.tolist())
+        self.most_late = len(so_late) - 1
         late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "prior": prior,
-            "delays": delays,
+            "so_late": so_late,
             "late": torch.tensor(late, dtype=torch.long),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
@@ -258,8 +258,8 @@ class Tick(nn.Module):
         nominal = newest.unsqueeze(1)
         late = nominal.expand(-1, len(self.late), -1, -1)
         effects = torch.cat([nominal, found[:, :, 1:], linear[:, :, 1:], late], 1)
-        steps = steps_late(weights, self.prior, self.delays)
-        return torch.cat(forecasts, 1), effects_of(effects, weights, steps, self.delays)
+        steps = steps_late(weights, self.prior, self.so_late)
+        return torch.cat(forecasts, 1), effects_of(effects, weights, steps, self.so_late)
 
 
 def points_of(count: int, size: int) -> Tensor:

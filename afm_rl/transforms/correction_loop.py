@@ -224,7 +224,7 @@ class CorrectionLoop:
             warnings.warn(f"ActionFlowWrapper: commands act late: {UNSEEN}", stacklevel=3)
             return observations
         found = np.array(observations)
-        found[rows] = self.seen_in(states.numpy())[rows]
+        found[rows] = self.seen_in(states.numpy()[rows])
         return found
 
     def diagnosis(self, row: int) -> str:
