@@ -16,7 +16,7 @@ from afm_rl.correction.believing import Answer, Believer
 from afm_rl.correction.linear import LINEAR
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.correction.readings import READINGS, check_readings, late_ones, memory_of
+from afm_rl.correction.readings import READINGS, check_readings, late_ones, lay_out, memory_of
 from afm_rl.correction.tick import Tick
 from afm_rl.correction.weights import load_universal
 from afm_rl.dynamics import DynamicsModel
@@ -111,8 +111,11 @@ class ActionFlow(Believer):
         worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * len(late)
         delays = [READINGS[name].delay for name in names] + [0] * len(LINEAR)
         delays += [READINGS[name].delay for name in late]
+        acting = lay_out([READINGS[name] for name in late or names], rows).acting[: len(late)]
         super().__init__(
-            action_low, action_high, rows, memory, models, len(place), worth, delays, **rules
+            *(action_low, action_high, rows, memory, models, len(place)),
+            *(worth, delays, acting),
+            **rules,
         )
         self.readings, self.place = names, place
         self.place_scale = check_number(

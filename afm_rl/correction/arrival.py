@@ -27,6 +27,8 @@ def steps_late(weights: Tensor, prior: Tensor, so_late: Tensor) -> Tensor:
     .. math:: k = \operatorname{argmax}_k \log p_k + \sum_a \log\frac{p_{ka}}{p_k}
 
     One for all axes, from the evidence of all: an axis whose commands hardly change shows none.
+    None while *nothing has changed* is believed everywhere; else it is as probable, a priori, as
+    all else that is not late.
 
     Args:
         weights: probabilities of the models on every axis, ``(*B, M, A)``.
@@ -38,11 +40,14 @@ def steps_late(weights: Tensor, prior: Tensor, so_late: Tensor) -> Tensor:
     >>> steps_late(weights, even, torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]]))
     tensor(1)
     """
-    among = so_late.to(weights)
-    first = among @ prior.to(weights).softmax(-2)
-    evidence = among @ weights / first.clamp_min(1e-30)
+    among, share = so_late.to(weights), prior.to(weights).softmax(-2)
+    even = (among[:1, 1:] @ share[1:] / share[:1]).clamp_max(1.0)
+    even = torch.cat([even, torch.ones_like(share[1:])])  # against the odds of the first model
+    first = among @ (even * share)
+    evidence = among @ (even * weights) / first.clamp_min(1e-30)
     evidence = (evidence / evidence.amax(-2, keepdim=True)).clamp_min(LEAST)
-    return (first.log() + evidence.log().sum(-1, keepdim=True)).squeeze(-1).argmax(-1)
+    found = (first.log() + evidence.log().sum(-1, keepdim=True)).squeeze(-1).argmax(-1)
+    return torch.where((weights[..., 0, :] < 0.5).any(-1), found, 0)
 
 
 def effects_of(models: Tensor, weights: Tensor, late: Tensor, so_late: Tensor) -> Tensor:

@@ -56,6 +56,8 @@ class Believer(PairCorrector):
         place: number of state coordinates that are remembered with a pair.
         worth: prior log-odds of these models among themselves; all alike if None.
         delays: steps from a command to its effect by these models, K at most; none late if None.
+        acting: what commands weigh in what acts now by the last N models, which say that effects
+            are nominal but late, by age, the oldest first, ``(N, L)``.
         odds: prior log-odds of *nothing has changed* against all other models together: one
             surprise that its Student-t distribution gives e^-odds is no reason to act.
         discount: of the losses; .95 looks back on twenty steps.
@@ -68,6 +70,7 @@ class Believer(PairCorrector):
 
     prior: Tensor
     so_late: Tensor
+    acting: Tensor
 
     def __init__(
         self,
@@ -79,6 +82,7 @@ class Believer(PairCorrector):
         place: int = 0,
         worth: Sequence[float] | None = None,
         delays: Sequence[int] | None = None,
+        acting: Tensor | None = None,
         odds: float = 3.0,
         discount: float = 0.95,
         noise: float = 0.1,
@@ -104,6 +108,8 @@ class Believer(PairCorrector):
         late = torch.tensor([0, *(delays or [0] * len(models))])
         self.register_buffer("so_late", one_hot(late).T.float(), persistent=False)
         self.most_late = len(self.so_late) - 1
+        acting = torch.zeros(0, 1) if acting is None else acting
+        self.register_buffer("acting", acting, persistent=False)
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the belief; its noise is the last part."""
@@ -137,13 +143,20 @@ class Believer(PairCorrector):
     def asleep(self, parts: Fields, action: Tensor) -> Fields:
         """Return the parts if ``action`` ``(*B, A)`` is executed, and nothing has changed.
 
-        All models predict its effect alike, and are believed alike.
+        All models predict its effect alike, and are believed alike, but those that commands are
+        nothing but late: they keep what they predict better, as in a cumulative sum, and so are
+        found as soon as there is a surprise.
         """
-        losses = parts["losses"][..., :1, :].expand_as(parts["losses"])
-        commands = self.commands(parts, action)
-        acts = commands[..., -1 - self.delay, :]
-        alike = {"planned": action, "executed": action, "acting": self.denormalise(acts)}
-        alike |= {"losses": losses, "forecasts": acts.unsqueeze(-2).expand_as(losses)}
+        (count, length), losses = self.acting.shape, parts["losses"]
+        commands, first = self.commands(parts, action), losses[..., :1, :]
+        acted = commands[..., : commands.shape[-2] - self.delay, :]
+        late = self.acting.to(acted) @ acted[..., acted.shape[-2] - length :, :]
+        acts, others = acted[..., -1:, :], [*losses.shape[:-2], len(self.models) - count, -1]
+        better = torch.minimum(losses[..., others[-2] :, :], first)
+        alike = {"planned": action, "executed": action}
+        alike |= {"acting": self.denormalise(acts.squeeze(-2))}
+        alike |= {"losses": torch.cat([first.expand(others), better], -2)}
+        alike |= {"forecasts": torch.cat([acts.expand(others), late], -2)}
         newest = commands.shape[-2] - parts["under_way"].shape[-2]
         return {**parts, **alike, "under_way": commands[..., newest:, :]}
 
