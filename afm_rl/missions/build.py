@@ -176,9 +176,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     no_box = transform is None and "box_key" in settings["planner"]
     changed = {"box_key": None} if no_box else {}
     seen = "observation" if transform is None else transform.key("arrival")
-    world = PlanningEnv(
-        model, cost, *robot.action_box, observation_key=seen, observe=robot.observe
-    )
+    world = PlanningEnv(model, cost, *robot.action_box, observation_key=seen, observe=robot.observe)
     planner = make("planner", world, **changed)
     if hasattr(planner, "signature"):  # a file: its name does not tell what it holds
         trainings = [t._replace(settings=[*t.settings, planner.signature]) for t in trainings]
