@@ -16,7 +16,14 @@ from afm_rl.correction.believing import Answer, Believer
 from afm_rl.correction.linear import LINEAR
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.correction.readings import READINGS, check_readings, late_ones, lay_out, memory_of
+from afm_rl.correction.readings import (
+    READINGS,
+    Reading,
+    check_readings,
+    late_ones,
+    lay_out,
+    memory_of,
+)
 from afm_rl.correction.tick import Tick
 from afm_rl.correction.weights import load_universal
 from afm_rl.dynamics import DynamicsModel
@@ -109,12 +116,13 @@ class ActionFlow(Believer):
         models = [*names, *LINEAR, *(f"only {name}" for name in late_ones(names))]
         late = late_ones(names)
         worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * len(late)
-        delays = [READINGS[name].delay for name in names] + [0] * len(LINEAR)
-        delays += [READINGS[name].delay for name in late]
-        acting = lay_out([READINGS[name] for name in late or names], rows).acting[: len(late)]
+        read = [Reading(), *chosen, *[Reading()] * len(LINEAR), *(READINGS[name] for name in late)]
+        acting = lay_out(read, rows).acting
+        follows = [r.varied or r.near for r in read]
+        follows[1 + len(names) : len(follows) - len(late)] = [True] * len(LINEAR)
         super().__init__(
             *(action_low, action_high, rows, memory, models, len(place)),
-            *(worth, delays, acting),
+            *(worth, acting, follows),
             **rules,
         )
         self.readings, self.place = names, place
@@ -135,7 +143,7 @@ class ActionFlow(Believer):
             names,
             rows,
             self.prior,
-            self.so_late,
+            self.delays,
             likely,
             samples,
             source_std,
@@ -160,18 +168,19 @@ class ActionFlow(Believer):
     def answer(self, parts: Fields, planned: Tensor, box: Tensor) -> Answer:
         """Ask the :class:`~afm_rl.correction.tick.Tick`."""
         sent = self.normalise(parts["sent"])
-        given = (*self._read(parts), sent, planned, box)
-        return self.tick(*(x.to(self.tick.scale) for x in given))
+        late = parts["late"].squeeze(-1).long()
+        rest = (x.to(self.tick.scale) for x in (sent, planned, box))
+        return self.tick(*self._read(parts), late, *rest)
 
     def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
         """Return the forecasts of all models, and what is under way."""
         ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
         lead, given = executed.shape[:-1], [*self._read(parts), self.normalise(ahead)]
-        rows = math.prod(lead)
+        rows, steps = math.prod(lead), parts["late"].reshape(-1).long()
         pairs, losses, noise, place, unit = (x.reshape(rows, *x.shape[len(lead) :]) for x in given)
         weights = Belief(losses, losses, noise).weights(self.tick.prior)
-        read = self.tick.read(pairs, noise, place)
-        found = self.tick.forecast(*read, weights, pairs, unit.to(pairs))
+        read = self.tick.read(pairs, noise, place, steps)
+        found = self.tick.forecast(*read, weights, steps, pairs, unit.to(pairs))
         forecasts, late = (x.view(*lead, *x.shape[1:]).to(executed) for x in found)
         return forecasts, late
 

@@ -21,47 +21,77 @@ if TYPE_CHECKING:
 LEAST = 1e-3  # share of the best that every delay keeps on every axis: none decides alone
 
 
-def steps_late(weights: Tensor, prior: Tensor, so_late: Tensor) -> Tensor:
+def steps_late(weights: Tensor, prior: Tensor, delays: Tensor, before: Tensor, most: int) -> Tensor:
     r"""Return the most probable delay of commands in steps, ``(*B)``.
 
     .. math:: k = \operatorname{argmax}_k \log p_k + \sum_a \log\frac{p_{ka}}{p_k}
 
     One for all axes, from the evidence of all: an axis whose commands hardly change shows none.
-    None while *nothing has changed* is believed everywhere; else it is as probable, a priori, as
-    all else that is not late.
+    None while *nothing has changed* is believed everywhere; else that is as probable, a priori, as
+    all else that is not late. A delay that was found stays, as actuators' delays do, until the
+    evidence for another one exceeds the odds of *nothing has changed*.
 
     Args:
         weights: probabilities of the models on every axis, ``(*B, M, A)``.
         prior: log-odds of the models, ``(M, 1)``.
-        so_late: by which models actions are k steps late, ``(K + 1, M)``, 0 or 1.
+        delays: of the models now, ``(*B, M)``.
+        before: the delay until now, ``(*B)``.
+        most: the longest delay, K.
 
     >>> weights = torch.tensor([[0.8, 0.1], [0.1, 0.8], [0.1, 0.1]])
-    >>> even = torch.zeros(3, 1)
-    >>> steps_late(weights, even, torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]]))
+    >>> delays = torch.tensor([0, 1, 1])
+    >>> steps_late(weights, torch.zeros(3, 1), delays, torch.tensor(0), 1)
     tensor(1)
     """
-    among, share = so_late.to(weights), prior.to(weights).softmax(-2)
-    even = (among[:1, 1:] @ share[1:] / share[:1]).clamp_max(1.0)
-    even = torch.cat([even, torch.ones_like(share[1:])])  # against the odds of the first model
+    every = torch.arange(most + 1, device=weights.device)
+    among = (delays.unsqueeze(-2) == every.unsqueeze(-1)).to(weights)  # (*B, K + 1, M)
+    share = prior.to(weights).softmax(-2)
+    even = (among[..., :1, 1:] @ share[1:] / share[:1]).clamp_max(1.0)
+    even = torch.cat([even, torch.ones_like(share[1:]).expand(*even.shape[:-2], -1, 1)], -2)
     first = among @ (even * share)
     evidence = among @ (even * weights) / first.clamp_min(1e-30)
     evidence = (evidence / evidence.amax(-2, keepdim=True)).clamp_min(LEAST)
-    found = (first.log() + evidence.log().sum(-1, keepdim=True)).squeeze(-1).argmax(-1)
-    return torch.where((weights[..., 0, :] < 0.5).any(-1), found, 0)
+    first = (first / first.sum(-2, keepdim=True)).squeeze(-1)
+    stays = (before.unsqueeze(-1) == every).to(first)
+    kept = torch.where((before > 0).unsqueeze(-1), torch.lerp(first, stays, share[0]), first)
+    found = (kept.log() + evidence.log().sum(-1)).argmax(-1)
+    return torch.where((weights[..., 0, :] < 0.5).any(-1) | (before > 0), found, 0)
 
 
-def effects_of(models: Tensor, weights: Tensor, late: Tensor, so_late: Tensor) -> Tensor:
+def effects_of(models: Tensor, weights: Tensor, late: Tensor, delays: Tensor) -> Tensor:
     """Return the effects ``(*B, K, A)`` of commands by those models that are so late.
 
     Args:
         models: their effects by every model, ``(*B, M, K, A)``.
         weights: probabilities of the models, ``(*B, M, A)``.
         late: steps, ``(*B)``.
-        so_late: by which models actions are k steps late, ``(K + 1, M)``, 0 or 1.
+        delays: of the models, ``(*B, M)``.
     """
-    among = so_late.to(weights)[late].unsqueeze(-1) * weights.clamp_min(1e-9)
+    so_late = delays.unsqueeze(-1) == late[..., None, None]
+    among = torch.where(so_late, weights.clamp_min(1e-9), 0.0)
     among = among / among.sum(-2, keepdim=True)
     return (among.unsqueeze(-2) * models).sum(-3)
+
+
+def ago(commands: Tensor, late: Tensor) -> Tensor:
+    """Return the command ``(*B, A)`` that acts now, of all ``(*B, N, A)``, the newest last."""
+    row = (commands.shape[-2] - 1 - late)[..., None, None]
+    return commands.gather(-2, row.expand(*row.shape[:-1], commands.shape[-1])).squeeze(-2)
+
+
+def aligned(pairs: Tensor, late: Tensor, size: int) -> Tensor:
+    """Return pairs ``(*B, M, D)`` with the commands of so many steps before each effect.
+
+    >>> pairs = torch.tensor([[0.1, 7.0, 0.0, 1.0], [0.2, 8.0, 0.0, 1.0]])
+    >>> aligned(pairs, torch.tensor(1), 1)[..., [0, 3]]
+    tensor([[0.1000, 0.0000],
+            [0.1000, 1.0000]])
+    """
+    row = torch.arange(pairs.shape[-2], device=pairs.device) - late.unsqueeze(-1)
+    sent = pairs[..., :size]
+    sent = sent.gather(-2, row.clamp_min(0).unsqueeze(-1).expand_as(sent))
+    valid = pairs[..., 3 * size :][..., :1] * (row >= 0).unsqueeze(-1)
+    return torch.cat([sent, pairs[..., size : 3 * size], valid, pairs[..., 3 * size + 1 :]], -1)
 
 
 def arrival(corrector: Corrector, memory: Tensor, model: DynamicsModel) -> tuple[Tensor, Tensor]:

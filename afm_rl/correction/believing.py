@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import one_hot
 
 from afm_rl.compiling.tracing import all_hold
-from afm_rl.correction.arrival import steps_late
+from afm_rl.correction.arrival import ago, steps_late
 from afm_rl.correction.base import Correction, Fields, put, rows_of
 from afm_rl.correction.belief import Belief, mean_and_std
 from afm_rl.correction.pairs import PairCorrector
@@ -55,9 +54,9 @@ class Believer(PairCorrector):
         models: names of the models but the first.
         place: number of state coordinates that are remembered with a pair.
         worth: prior log-odds of these models among themselves; all alike if None.
-        delays: steps from a command to its effect by these models, K at most; none late if None.
-        acting: what commands weigh in what acts now by the last N models, which say that effects
-            are nominal but late, by age, the oldest first, ``(N, L)``.
+        acting: what commands weigh in what acts now by all M + 1 models, by age, the oldest first,
+            ``(M + 1, L)``: the newest one by all of them, if None.
+        follows: which of the M + 1 models take any delay that is believed; none if None.
         odds: prior log-odds of *nothing has changed* against all other models together: one
             surprise that its Student-t distribution gives e^-odds is no reason to act.
         discount: of the losses; .95 looks back on twenty steps.
@@ -69,7 +68,7 @@ class Believer(PairCorrector):
     """
 
     prior: Tensor
-    so_late: Tensor
+    delays: Tensor
     acting: Tensor
 
     def __init__(
@@ -81,8 +80,8 @@ class Believer(PairCorrector):
         models: Sequence[str],
         place: int = 0,
         worth: Sequence[float] | None = None,
-        delays: Sequence[int] | None = None,
         acting: Tensor | None = None,
+        follows: Sequence[bool] | None = None,
         odds: float = 3.0,
         discount: float = 0.95,
         noise: float = 0.1,
@@ -105,17 +104,19 @@ class Believer(PairCorrector):
         among = torch.zeros(len(models)) if worth is None else torch.tensor(worth)
         prior = torch.cat([torch.tensor([self.odds]), among.log_softmax(0)]).unsqueeze(-1)
         self.register_buffer("prior", prior, persistent=False)
-        late = torch.tensor([0, *(delays or [0] * len(models))])
-        self.register_buffer("so_late", one_hot(late).T.float(), persistent=False)
-        self.most_late = len(self.so_late) - 1
-        acting = torch.zeros(0, 1) if acting is None else acting
+        acting = torch.ones(len(self.models), 1) if acting is None else acting
         self.register_buffer("acting", acting, persistent=False)
+        # Of a model: the age of the command that weighs most; -1: the delay that is believed.
+        late = acting.shape[-1] - 1 - acting.argmax(-1)
+        late = late if follows is None else late.masked_fill(torch.tensor(follows), -1)
+        self.register_buffer("delays", late, persistent=False)
+        self.most_late = max(late.tolist())
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the belief; its noise is the last part."""
         size, count = self.action_size, len(self.models)
         belief = {"losses": (count, size), "forecasts": (count, size), "noise": (size,)}
-        late = {"under_way": (self.most_late + self.delay, size)}
+        late = {"late": (1,), "under_way": (self.most_late + self.delay, size)}
         return {**super().shapes(state_size), **late, **belief}
 
     def begin(self, state: Tensor) -> Tensor:
@@ -135,28 +136,49 @@ class Believer(PairCorrector):
         rules = (self.prior.to(newest), self.discount, self.noise_rate, self.least_noise)
         belief = self.belief(parts).update(effect, std, valid, *rules, self.tails)
         awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
+        before = parts["late"].squeeze(-1).long()
+        if not all_hold(~awake.squeeze(-1) & (before == 0)):
+            late, losses = self.delayed(belief, before)
+            parts["late"], belief = late.unsqueeze(-1).to(newest), belief._replace(losses=losses)
         begins = (parts["misaligned"] != 1.0) & awake
         count = 1 if model.taught_in is None else self.recent
         parts["pairs"] = self.aged(parts["pairs"], begins, count)
         return parts | belief._asdict() | {"misaligned": awake.to(newest)}
 
+    def delays_now(self, late: Tensor) -> Tensor:
+        """Return the delays of all models ``(*B, M)`` while ``late`` ``(*B)`` is believed."""
+        return torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
+
+    def delayed(self, belief: Belief, before: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the delay ``(*B)`` that is believed now, and the losses ``(*B, M, A)``.
+
+        Models that follow a new one begin as good as the best that had it already.
+        """
+        prior, now = self.prior.to(belief.losses), self.delays_now(before)
+        late = steps_late(belief.weights(prior), prior, now, before, self.most_late)
+        theirs = (self.delays == late.unsqueeze(-1)).unsqueeze(-1)
+        best = torch.where(theirs, belief.losses, torch.inf).amin(-2, keepdim=True)
+        begin = (self.delays < 0) & (late != before).unsqueeze(-1)
+        return late, torch.where(begin.unsqueeze(-1), best, belief.losses)
+
     def asleep(self, parts: Fields, action: Tensor) -> Fields:
         """Return the parts if ``action`` ``(*B, A)`` is executed, and nothing has changed.
 
-        All models predict its effect alike, and are believed alike, but those that commands are
-        nothing but late: they keep what they predict better, as in a cumulative sum, and so are
-        found as soon as there is a surprise.
+        All models predict effects as they are sent, now or late. They are believed alike, but
+        that late ones keep what they predict better, as in a cumulative sum: so they are found as
+        soon as there is a surprise. And a delay that is believed keeps what it predicts worse.
         """
-        (count, length), losses = self.acting.shape, parts["losses"]
-        commands, first = self.commands(parts, action), losses[..., :1, :]
+        losses, late = parts["losses"], parts["late"].squeeze(-1).long()
+        commands = self.commands(parts, action)
         acted = commands[..., : commands.shape[-2] - self.delay, :]
-        late = self.acting.to(acted) @ acted[..., acted.shape[-2] - length :, :]
-        acts, others = acted[..., -1:, :], [*losses.shape[:-2], len(self.models) - count, -1]
-        better = torch.minimum(losses[..., others[-2] :, :], first)
+        acts = self.acting.to(acted) @ acted[..., acted.shape[-2] - self.acting.shape[-1] :, :]
+        follows = (self.delays < 0).unsqueeze(-1)
+        acts = torch.where(follows, ago(acted, late).unsqueeze(-2), acts)
+        believed = (self.delays_now(late) == late.unsqueeze(-1)) & (late > 0).unsqueeze(-1)
+        best = torch.minimum(losses, losses[..., :1, :])
         alike = {"planned": action, "executed": action}
-        alike |= {"acting": self.denormalise(acts.squeeze(-2))}
-        alike |= {"losses": torch.cat([first.expand(others), better], -2)}
-        alike |= {"forecasts": torch.cat([acts.expand(others), late], -2)}
+        alike |= {"acting": self.denormalise(ago(acted, late)), "forecasts": acts}
+        alike |= {"losses": torch.where(believed.unsqueeze(-1), losses, best)}
         newest = commands.shape[-2] - parts["under_way"].shape[-2]
         return {**parts, **alike, "under_way": commands[..., newest:, :]}
 
@@ -221,9 +243,8 @@ class Believer(PairCorrector):
     def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the state, the newest commands' effects, and how many of them are to come."""
         parts = self.unpack(memory, self.states_in(memory))
-        weights = self.belief(parts).weights(self.prior.to(memory))
-        steps = steps_late(weights, self.prior, self.so_late)
-        return parts["state"], self.denormalise(parts["under_way"]), steps + self.delay
+        steps = parts["late"].squeeze(-1).long() + self.delay
+        return parts["state"], self.denormalise(parts["under_way"]), steps
 
     def noise_in(self, memory: Tensor) -> Tensor:
         """Return the noise that was learnt, ``(*B, A)``, in units of the action."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.correction.achievable import MODES, attainable, extend
-from afm_rl.correction.arrival import effects_of, steps_late
+from afm_rl.correction.arrival import ago, aligned, effects_of
 from afm_rl.correction.belief import Belief, mean_and_std
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
@@ -46,7 +46,7 @@ class Tick(nn.Module):
     probes: Tensor
     prior: Tensor
     late: Tensor
-    so_late: Tensor
+    delays: Tensor
     rows_acting: Tensor
 
     def __init__(
@@ -56,7 +56,7 @@ class Tick(nn.Module):
         readings: Sequence[str],
         rows: int,
         prior: Tensor,
-        so_late: Tensor,
+        delays: Tensor,
         likely: int,
         samples: int,
         source_std: float,
@@ -73,14 +73,14 @@ class Tick(nn.Module):
         self.varied = sum(r.varied for r in chosen)
         self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings))]
         self.likely = min(check_count("corrector.likely", likely), len(chosen))
-        self.most_late = len(so_late) - 1
+        self.most_late = max(delays.tolist())
         late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "prior": prior,
-            "so_late": so_late,
+            "delays": delays,
             "late": torch.tensor(late, dtype=torch.long),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
@@ -93,6 +93,7 @@ class Tick(nn.Module):
         losses: Tensor,
         noise: Tensor,
         place: Tensor,
+        late: Tensor,
         waiting: Tensor,
         planned: Tensor,
         box: Tensor,
@@ -104,12 +105,13 @@ class Tick(nn.Module):
             losses: of the models, ``(B, M + 1, A)``.
             noise: that no model explains, ``(B, A)``.
             place: where the missions are, ``(B, P)``.
+            late: steps that commands are late, ``(B,)``.
             waiting: commands that are known to come, the oldest first, ``(B, D, A)``.
             planned: in units of the action, ``(B, A)``.
             box: lowest and highest action, ``(B, 2, A)``.
         """
         unit, ends = planned / self.scale, box / self.scale
-        encoded, lines = self.read(pairs, noise, place)
+        encoded, lines = self.read(pairs, noise, place, late)
         weights = Belief(losses, losses, noise).weights(self.prior)
         models = self.most_likely(encoded, lines, weights)
         proposals, spread = self.propose(models, unit, ends)
@@ -124,9 +126,8 @@ class Tick(nn.Module):
         changed = weights[:, 0] < 0.5  # else the plan, to the bit
         action = torch.where(changed & action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
-        forecasts, under_way = self.forecast(
-            encoded, lines, weights, pairs, torch.cat([waiting, action.unsqueeze(1)], 1)
-        )
+        ahead = torch.cat([waiting, action.unsqueeze(1)], 1)
+        forecasts, under_way = self.forecast(encoded, lines, weights, late, pairs, ahead)
         return Answer(
             action * self.scale,
             predicted * self.scale,
@@ -137,7 +138,9 @@ class Tick(nn.Module):
             under_way,
         )
 
-    def read(self, pairs: Tensor, noise: Tensor, place: Tensor) -> tuple[Encoded, Lines]:
+    def read(
+        self, pairs: Tensor, noise: Tensor, place: Tensor, late: Tensor
+    ) -> tuple[Encoded, Lines]:
         """Return what is read in every reading, B R sets of rows, and the linear models."""
         away, size = None, len(self.scale)
         if self.by_place:
@@ -145,10 +148,11 @@ class Tick(nn.Module):
             away = (pairs[..., first:] - place.unsqueeze(-2)).square().sum(-1)
             away = torch.where(pairs[..., first - 2] > 0, away, torch.inf)
         layout = Layout(*(getattr(self, f"rows_{name}") for name in Layout._fields))
-        rows = read_rows(pairs, layout, size, away, self.varied)
+        follow = aligned(pairs, late, size)
+        rows = read_rows(pairs, layout, size, away, self.varied, follow)
         loud = torch.hypot(rows.std, noise[:, None, None]) * rows.valid
         rows = Rows(*(part.flatten(0, 1) for part in rows._replace(std=loud)))
-        sent, came, std, valid = pairs[..., : 3 * size + 1].split([size, size, size, 1], -1)
+        sent, came, std, valid = follow[..., : 3 * size + 1].split([size, size, size, 1], -1)
         sound = (valid == 1.0).to(pairs)
         lines = fit_lines(sent, came, torch.hypot(std, noise.unsqueeze(1)), sound)
         return self.network.encode(rows, fit_experts(rows)), lines
@@ -231,35 +235,45 @@ class Tick(nn.Module):
         return (models.weights.unsqueeze(2) * miss.log1p()).sum(1)
 
     def forecast(
-        self, encoded: Encoded, lines: Lines, weights: Tensor, pairs: Tensor, ahead: Tensor
+        self,
+        encoded: Encoded,
+        lines: Lines,
+        weights: Tensor,
+        late: Tensor,
+        pairs: Tensor,
+        ahead: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now.
 
         And those ``(B, K + D, A)`` that the newest commands have or will have, by the models that
-        are as late as is most probable.
+        are so late.
 
         Args:
             encoded: what the readings have read.
             lines: the linear models.
             weights: probabilities of all models, ``(B, M + 1, A)``.
+            late: steps that commands are late, ``(B,)``.
             pairs: what is remembered.
             ahead: commands that wait, and the present one, ``(B, D + 1, A)``.
         """
         sent, now = pairs[..., : len(self.scale)], ahead[:, :1]
-        acted = torch.cat([sent, now], 1)[:, -self.rows_acting.shape[-1] :]
-        acted = self.rows_acting @ acted  # (B, R, A)
+        acted = torch.cat([sent, now], 1)
+        acting = ago(acted, late).unsqueeze(1)
+        acted = self.rows_acting @ acted[:, -self.rows_acting.shape[-1] :]  # (B, R, A)
+        follows = (self.delays[1 : acted.shape[1] + 1] < 0).unsqueeze(-1)
+        acted = torch.where(follows, acting, acted)
         every = torch.cat([sent, ahead], 1)
         newest = every[:, every.shape[1] - self.most_late - ahead.shape[1] + 1 :]
         shape = (-1, acted.shape[1], -1, -1)
         asked = torch.cat([acted.unsqueeze(2), newest.unsqueeze(1).expand(shape)], 2)
         found = self.network.effect(encoded, asked.flatten(0, 1)).view_as(asked)
-        linear = lines.effect(torch.cat([now, newest], 1))
+        linear = lines.effect(torch.cat([acting, newest], 1))
         forecasts = [now, found[:, :, 0], linear[:, :, 0], acted[:, self.late]]
         nominal = newest.unsqueeze(1)
-        late = nominal.expand(-1, len(self.late), -1, -1)
-        effects = torch.cat([nominal, found[:, :, 1:], linear[:, :, 1:], late], 1)
-        steps = steps_late(weights, self.prior, self.so_late)
-        return torch.cat(forecasts, 1), effects_of(effects, weights, steps, self.so_late)
+        same = nominal.expand(-1, len(self.late), -1, -1)
+        effects = torch.cat([nominal, found[:, :, 1:], linear[:, :, 1:], same], 1)
+        delays = torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
+        return torch.cat(forecasts, 1), effects_of(effects, weights, late, delays)
 
 
 def points_of(count: int, size: int) -> Tensor:
