@@ -45,6 +45,7 @@ SMALL = {  # settings that are there are made small
 LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none --methods alone AFM "
     "--episodes 1 --steps 12",
+    "benchmarks/suites/zoo/film.py": "--seconds 0.2",
 }
 BUILT = {"method=afm_sysid"}  # takes seconds a step: built, and not run
 NEED = {"robot=gymnasium": "mujoco", "robot=dm_control": "dm_control"}
