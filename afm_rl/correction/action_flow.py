@@ -15,7 +15,14 @@ from afm_rl.correction.believing import Answer, Believer
 from afm_rl.correction.linear import LINEAR
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.correction.readings import READINGS, check_readings, late_ones, memory_of
+from afm_rl.correction.readings import (
+    READINGS,
+    Reading,
+    check_readings,
+    late_ones,
+    lay_out,
+    memory_of,
+)
 from afm_rl.correction.tick import Tick
 from afm_rl.correction.weights import load_universal
 from afm_rl.dynamics import DynamicsModel
@@ -108,7 +115,17 @@ class ActionFlow(Believer):
         late = late_ones(names)
         models = [*names, *LINEAR, *(f"only {name}" for name in late), "noisy readings"]
         worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * (len(late) + 1)
-        super().__init__(action_low, action_high, rows, memory, models, len(place), worth, **rules)
+        only, simple = (READINGS[name] for name in late), [Reading()] * len(LINEAR)
+        read = [Reading(), *chosen, *simple, *only, Reading()]
+        acting = lay_out(read, rows).acting
+        follows = [r.varied or r.near for r in read]
+        follows[1 + len(names) : len(follows) - len(late) - 1] = [True] * len(LINEAR)
+        follows[-1] = True
+        super().__init__(
+            *(action_low, action_high, rows, memory, models, len(place)),
+            *(worth, acting, follows),
+            **rules,
+        )
         self.readings, self.place = names, place
         self.place_scale = check_number(
             "corrector.place_scale", place_scale, low=0.0, open_low=True
@@ -129,6 +146,7 @@ class ActionFlow(Believer):
             self.worth,
             self.odds,
             self.least_noise,
+            self.delays,
             likely,
             samples,
             source_std,
@@ -152,19 +170,22 @@ class ActionFlow(Believer):
 
     def answer(self, parts: Fields, planned: Tensor, box: Tensor) -> Answer:
         """Ask the :class:`~afm_rl.correction.tick.Tick`."""
-        return self.tick(*self._read(parts), *(x.to(self.tick.scale) for x in (planned, box)))
+        sent = self.normalise(parts["sent"])
+        late = parts["late"].squeeze(-1).long()
+        rest = (x.to(self.tick.scale) for x in (sent, planned, box))
+        return self.tick(*self._read(parts), late, *rest)
 
-    def foresee(self, parts: Fields, executed: Tensor) -> Tensor:
-        """Return the forecasts of all models."""
-        pairs, _, noise, place = self._read(parts)
-        lead = pairs.shape[:-2]
-        flat = [
-            part.reshape(math.prod(lead), *part.shape[len(lead) :])
-            for part in (pairs, noise, place)
-        ]
-        unit = self.normalise(executed).to(pairs).reshape(-1, self.action_size)
-        forecasts = self.tick.forecast(*self.tick.read(*flat), flat[0], unit)
-        return forecasts.view(*lead, *forecasts.shape[1:]).to(executed)
+    def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the forecasts of all models, and what is under way."""
+        ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
+        lead, given = executed.shape[:-1], [*self._read(parts), self.normalise(ahead)]
+        rows, steps = math.prod(lead), parts["late"].reshape(-1).long()
+        pairs, losses, noise, place, unit = (x.reshape(rows, *x.shape[len(lead) :]) for x in given)
+        weights = self.tick.weights(losses, noise)
+        read = self.tick.read(pairs, noise, place, steps)
+        found = self.tick.forecast(*read, weights, steps, pairs, unit.to(pairs))
+        forecasts, late = (x.view(*lead, *x.shape[1:]).to(executed) for x in found)
+        return forecasts, late
 
     def _read(self, parts: Fields) -> list[Tensor]:
         given = [parts[name] for name in ("pairs", "losses", "noise")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -14,6 +15,8 @@ from afm_rl.compiling.tracing import may_look
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.faults import count_repeats, trusted
+
+LONGEST = 1000  # steps that a known delay may have: a typing error rather than a robot
 
 Fields = dict[str, Tensor]
 """The parts of a memory, by name."""
@@ -86,6 +89,8 @@ class Corrector(nn.Module, ABC):
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
         recent: transitions that are kept as they were observed, R.
+        delay: steps from an action to its effect that are known, one number or one per axis. Faster
+            axes are kept waiting for the slowest, so that actions have their effects together.
 
     Raises:
         ConfigurationError: for bounds or numbers that cannot be used.
@@ -94,8 +99,15 @@ class Corrector(nn.Module, ABC):
     scale: Tensor
     lowest: Tensor
     highest: Tensor
+    hold: Tensor
 
-    def __init__(self, action_low: Tensor, action_high: Tensor, recent: int) -> None:
+    def __init__(
+        self,
+        action_low: Tensor,
+        action_high: Tensor,
+        recent: int,
+        delay: int | Sequence[int] = 0,
+    ) -> None:
         super().__init__()
         low, high = torch.as_tensor(action_low), torch.as_tensor(action_high)
         fits = low.shape == high.shape and low.dim() == 1 and len(low)
@@ -110,6 +122,14 @@ class Corrector(nn.Module, ABC):
         ends = {"scale": scale, "lowest": low / scale, "highest": high / scale}
         for name, value in ends.items():
             self.register_buffer(name, value, persistent=False)
+        steps = [delay] * self.action_size if isinstance(delay, int) else list(delay)
+        if len(steps) != self.action_size:
+            raise ConfigurationError(
+                f"corrector.delay={delay!r}: expected one number of steps, or {self.action_size}"
+            )
+        steps = [check_count("corrector.delay", k, low=0, high=LONGEST) for k in steps]
+        self.delay, self.holds = max(steps), min(steps) < max(steps)
+        self.register_buffer("hold", self.delay - torch.tensor(steps), persistent=False)
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes of the parts of a memory; subclasses add theirs."""
@@ -121,6 +141,7 @@ class Corrector(nn.Module, ABC):
             "misaligned": (1,),
             "repeats": (1,),
             "transitions": (self.recent, 2 * state_size + 2 * size + 1),
+            "sent": (self.delay, size),
         }
 
     def memory_size(self, state_size: int) -> int:
@@ -134,7 +155,10 @@ class Corrector(nn.Module, ABC):
     def begin(self, state: Tensor) -> Tensor:
         """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
         size = self.memory_size(state.shape[-1]) - state.shape[-1]
-        return torch.cat([state, state.new_zeros(*state.shape[:-1], size)], -1)
+        memory = torch.cat([state, state.new_zeros(*state.shape[:-1], size)], -1)
+        parts = self.unpack(memory, state.shape[-1])
+        rest = self.denormalise(torch.zeros_like(self.lowest).clamp(self.lowest, self.highest))
+        return self.pack({**parts, "sent": rest.to(memory).expand_as(parts["sent"])})
 
     def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
         """Return the memory with the transition to ``next_state`` ``(*B, S)``.
@@ -145,7 +169,9 @@ class Corrector(nn.Module, ABC):
         state, count = parts["state"], parts["repeats"].squeeze(-1)
         after = count_repeats(next_state, state, count)
         valid = trusted(state, count) & trusted(next_state, after)
-        ends = [state, parts["planned"], parts["executed"], next_state, valid.unsqueeze(-1)]
+        sent = torch.cat([parts["sent"], parts["executed"].unsqueeze(-2)], -2)
+        acted, parts["sent"] = sent[..., 0, :], sent[..., 1:, :]
+        ends = [state, parts["planned"], acted, next_state, valid.unsqueeze(-1)]
         row = torch.cat(ends, -1).unsqueeze(-2)
         parts["repeats"] = after.unsqueeze(-1)
         parts["transitions"] = torch.cat([parts["transitions"][..., 1:, :], row], -2)
@@ -184,6 +210,16 @@ class Corrector(nn.Module, ABC):
         )
         return state, planned, executed
 
+    def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the state, the newest commands' effects, and how many of them are to come.
+
+        Returns:
+            ``(*B, S)``; ``(*B, K, A)``, in units of the action, the oldest first; ``(*B)``.
+        """
+        parts = self.unpack(memory, self.states_in(memory))
+        late = torch.full_like(parts["state"][..., 0], self.delay, dtype=torch.long)
+        return parts["state"], parts["sent"], late
+
     def executing(
         self,
         memory: Tensor,
@@ -211,7 +247,23 @@ class Corrector(nn.Module, ABC):
     def reported(self, memory: Tensor, given: Tensor) -> Tensor:
         """Return the memory if actuators gave ``given`` ``(*B, A)`` of what they were sent."""
         _, planned, _ = self.latest(memory)
-        return self.executing(memory, planned, given)
+        if not self.delay:
+            return Corrector.executing(self, memory, planned, given)
+        parts = self.unpack(memory, self.states_in(memory))
+        sent = torch.cat([given.unsqueeze(-2), parts["sent"][..., 1:, :]], -2)
+        return self.pack({**parts, "sent": sent})
+
+    def sending(self, memory: Tensor, executed: Tensor) -> Tensor:
+        """Return what is sent now if ``executed`` ``(*B, A)`` is to act when all axes can.
+
+        Itself, but on axes that are known to be faster than others.
+        """
+        if not self.holds:
+            return executed
+        waiting = self.unpack(memory, self.states_in(memory))["sent"]
+        every = torch.cat([waiting, executed.unsqueeze(-2)], -2)
+        which = (self.delay - self.hold).expand_as(executed).unsqueeze(-2)
+        return every.gather(-2, which).squeeze(-2)
 
     def unpack(self, memory: Tensor, state_size: int) -> Fields:
         """Return the parts of a memory."""

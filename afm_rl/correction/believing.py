@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.compiling.tracing import all_hold
+from afm_rl.correction.arrival import ago, steps_late
 from afm_rl.correction.base import Correction, Fields, put, rows_of
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.pairs import PairCorrector
@@ -33,6 +34,8 @@ class Answer(NamedTuple):
     forecasts: Tensor
     """The effects that the models expect of what acts now, shares of the largest action,
     ``(B, M, A)``; the first is that of *nothing has changed*."""
+    under_way: Tensor
+    """The effects that the newest commands have or will have, likewise, ``(B, K + D, A)``."""
 
 
 class Believer(PairCorrector):
@@ -51,6 +54,9 @@ class Believer(PairCorrector):
         models: names of the models but the first.
         place: number of state coordinates that are remembered with a pair.
         worth: prior log-odds of these models among themselves; all alike if None.
+        acting: what commands weigh in what acts now by all M + 1 models, by age, the oldest first,
+            ``(M + 1, L)``: the newest one by all of them, if None.
+        follows: which of the M + 1 models take any delay that is believed; none if None.
         odds: prior log-odds of *nothing has changed* against all other models together: one
             surprise that its Student-t distribution gives e^-odds is no reason to act.
         discount: of the losses; .95 looks back on twenty steps.
@@ -59,9 +65,12 @@ class Believer(PairCorrector):
         least_noise: its floor: effects nearer than that are all the same. In more noise a belief
             looks back longer.
         quiet: normalised innovation up to which a transition needs no explanation.
+        delay: steps that are known, D at most; those of the models come on top.
     """
 
     worth: Tensor
+    delays: Tensor
+    acting: Tensor
 
     def __init__(
         self,
@@ -72,6 +81,8 @@ class Believer(PairCorrector):
         models: Sequence[str],
         place: int = 0,
         worth: Sequence[float] | None = None,
+        acting: Tensor | None = None,
+        follows: Sequence[bool] | None = None,
         odds: float = 2.5,
         discount: float = 0.95,
         noise: float = 0.1,
@@ -79,8 +90,9 @@ class Believer(PairCorrector):
         least_noise: float = 0.02,
         quiet: float = 1.0,
         tails: float = 1.0,
+        delay: int | Sequence[int] = 0,
     ) -> None:
-        super().__init__(action_low, action_high, recent, memory, place, quiet)
+        super().__init__(action_low, action_high, recent, memory, place, quiet, delay)
         self.models = ("nothing has changed", *models)
         self.odds = check_number("corrector.odds", odds, low=0.0)
         self.discount = check_number("corrector.discount", discount, low=0.0, high=1.0)
@@ -92,12 +104,20 @@ class Believer(PairCorrector):
         self.tails = check_number("corrector.tails", tails, low=0.0, open_low=True)
         among = torch.zeros(len(models)) if worth is None else torch.tensor(worth)
         self.register_buffer("worth", among, persistent=False)
+        acting = torch.ones(len(self.models), 1) if acting is None else acting
+        self.register_buffer("acting", acting, persistent=False)
+        # Of a model: the age of the command that weighs most; -1: the delay that is believed.
+        late = acting.shape[-1] - 1 - acting.argmax(-1)
+        late = late if follows is None else late.masked_fill(torch.tensor(follows), -1)
+        self.register_buffer("delays", late, persistent=False)
+        self.most_late = max(late.tolist())
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the belief; its noise is the last part."""
         size, count = self.action_size, len(self.models)
         belief = {"losses": (count, size), "forecasts": (count, size), "noise": (size,)}
-        return {**super().shapes(state_size), **belief}
+        late = {"late": (1,), "under_way": (self.most_late + self.delay, size)}
+        return {**super().shapes(state_size), **late, **belief}
 
     def begin(self, state: Tensor) -> Tensor:
         """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
@@ -118,22 +138,63 @@ class Believer(PairCorrector):
         newest, size = parts["pairs"][..., -1, :], self.action_size
         _, effect, std, valid, _ = newest.split([size, size, size, 1, self.tail], -1)
         rules = (self.discount, self.noise_rate, self.least_noise, self.tails)
-        belief = self.belief(parts).update(effect, std, valid, self.prior(parts), *rules)
+        prior = self.prior(parts)
+        belief = self.belief(parts).update(effect, std, valid, prior, *rules)
         awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
+        before = parts["late"].squeeze(-1).long()
+        if not all_hold(~awake.squeeze(-1) & (before == 0)):
+            late, losses = self.delayed(belief, prior, before)
+            parts["late"], belief = late.unsqueeze(-1).to(newest), belief._replace(losses=losses)
         begins = (parts["misaligned"] != 1.0) & awake
         count = 1 if model.taught_in is None else self.recent
         parts["pairs"] = self.aged(parts["pairs"], begins, count)
         return parts | belief._asdict() | {"misaligned": awake.to(newest)}
 
+    def delays_now(self, late: Tensor) -> Tensor:
+        """Return the delays of all models ``(*B, M)`` while ``late`` ``(*B)`` is believed."""
+        return torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
+
+    def delayed(self, belief: Belief, prior: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the delay ``(*B)`` that is believed now, and the losses ``(*B, M, A)``.
+
+        Models that follow a new one begin as good as the best that had it already.
+        """
+        now = self.delays_now(before)
+        late = steps_late(belief.weights(prior), prior, now, before, self.most_late)
+        theirs = (self.delays == late.unsqueeze(-1)).unsqueeze(-1)
+        best = torch.where(theirs, belief.losses, torch.inf).amin(-2, keepdim=True)
+        begin = (self.delays < 0) & (late != before).unsqueeze(-1)
+        return late, torch.where(begin.unsqueeze(-1), best, belief.losses)
+
     def asleep(self, parts: Fields, action: Tensor) -> Fields:
         """Return the parts if ``action`` ``(*B, A)`` is executed, and nothing has changed.
 
-        All models predict its effect alike, and are believed alike.
+        All models predict effects as they are sent, now or late. They are believed alike, but
+        that late ones keep what they predict better, as in a cumulative sum: so they are found as
+        soon as there is a surprise. And a delay that is believed keeps what it predicts worse.
         """
-        losses = parts["losses"][..., :1, :].expand_as(parts["losses"])
-        forecasts = self.normalise(action).unsqueeze(-2).expand_as(losses)
-        alike = {"planned": action, "executed": action, "acting": action}
-        return {**parts, **alike, "losses": losses, "forecasts": forecasts}
+        losses, late = parts["losses"], parts["late"].squeeze(-1).long()
+        commands = self.commands(parts, action)
+        acted = commands[..., : commands.shape[-2] - self.delay, :]
+        acts = self.acting.to(acted) @ acted[..., acted.shape[-2] - self.acting.shape[-1] :, :]
+        follows = (self.delays < 0).unsqueeze(-1)
+        acts = torch.where(follows, ago(acted, late).unsqueeze(-2), acts)
+        believed = (self.delays_now(late) == late.unsqueeze(-1)) & (late > 0).unsqueeze(-1)
+        best = torch.minimum(losses, losses[..., :1, :])
+        alike = {"planned": action, "executed": action}
+        alike |= {"acting": self.denormalise(ago(acted, late)), "forecasts": acts}
+        alike |= {"losses": torch.where(believed.unsqueeze(-1), losses, best)}
+        newest = commands.shape[-2] - parts["under_way"].shape[-2]
+        return {**parts, **alike, "under_way": commands[..., newest:, :]}
+
+    def commands(self, parts: Fields, executed: Tensor) -> Tensor:
+        """Return all commands up to the present one, ``(*B, M + D + 1, A)``, in u.
+
+        Those that have acted, those that are known to wait, and ``executed`` ``(*B, A)``.
+        """
+        acted = parts["pairs"][..., : self.action_size]
+        ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
+        return torch.cat([acted, self.normalise(ahead)], -2)
 
     def watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> tuple[Tensor, ...]:
         """Return the memory with the newest pair, and what it is if the plan is executed.
@@ -155,7 +216,7 @@ class Believer(PairCorrector):
             box: lowest and highest action, ``(B, 2, A)``.
 
         Returns:
-            The next memory, and the parts of an :class:`Answer` but the forecasts.
+            The next memory, and the parts of an :class:`Answer` but the last two.
         """
         parts = self.unpack(memory, self.states_in(memory))
         answer = self.answer(parts, planned, box)
@@ -163,7 +224,8 @@ class Believer(PairCorrector):
         acting = self.denormalise((weights * answer.forecasts.to(memory)).sum(-2))
         parts |= {"planned": planned, "executed": answer.executed.to(memory), "acting": acting}
         parts["forecasts"] = answer.forecasts.to(memory)
-        return (self.pack(parts), *answer[:-1])
+        parts["under_way"] = answer.under_way.to(memory)
+        return (self.pack(parts), *answer[:-2])
 
     def correct(
         self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
@@ -177,11 +239,17 @@ class Believer(PairCorrector):
                 return idle, found
             use = rows_of(awake)
             after, *answer = self._decide(memory[use], planned[use], box[use])
-            given = dict(zip(Answer._fields[:-1], answer, strict=True))
+            given = dict(zip(Answer._fields[:-2], answer, strict=True))
             given["misaligned"] = given.pop("corrects")
             now = found._asdict()
             changed = {name: put(now[name], awake, use, part) for name, part in given.items()}
             return put(idle, awake, use, after), found._replace(**changed)
+
+    def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the state, the newest commands' effects, and how many of them are to come."""
+        parts = self.unpack(memory, self.states_in(memory))
+        steps = parts["late"].squeeze(-1).long() + self.delay
+        return parts["state"], self.denormalise(parts["under_way"]), steps
 
     def noise_in(self, memory: Tensor) -> Tensor:
         """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
@@ -221,7 +289,9 @@ class Believer(PairCorrector):
     def reported(self, memory: Tensor, given: Tensor) -> Tensor:
         """Return the memory with forecasts moved by what was given more than sent."""
         _, planned, sent = self.latest(memory)
-        parts = self.unpack(super().executing(memory, planned, given), self.states_in(memory))
+        parts = self.unpack(super().reported(memory, given), self.states_in(memory))
+        if self.delay:
+            sent = self.unpack(memory, self.states_in(memory))["sent"][..., 0, :]
         more = self.normalise(given - sent).unsqueeze(-2)
         return self.pack({**parts, "forecasts": parts["forecasts"] + more})
 
@@ -230,12 +300,14 @@ class Believer(PairCorrector):
         """Return the memory with forecasts of what is executed, where models are to be asked."""
         parts = self.unpack(memory, self.states_in(memory))
         awake = parts["misaligned"].squeeze(-1) == 1.0
-        calm = self.asleep(parts, executed)["forecasts"]
+        idle = self.asleep(parts, executed)
+        found = [idle[name] for name in ("forecasts", "under_way")]
         if not all_hold(~awake):
             use = rows_of(awake)
             asked = {name: part[use] for name, part in parts.items()}
-            calm = put(calm, awake, use, self.foresee(asked, executed[use]))
-        return self.pack({**parts, "forecasts": calm})
+            pairs = zip(found, self.foresee(asked, executed[use]), strict=True)
+            found = [put(calm, awake, use, new) for calm, new in pairs]
+        return self.pack({**parts, "forecasts": found[0], "under_way": found[1]})
 
     def _watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
         return self.watch(memory, planned, model)
@@ -248,5 +320,5 @@ class Believer(PairCorrector):
         """Return what to execute for plans ``(*B, A)``, given the parts of memories."""
 
     @abstractmethod
-    def foresee(self, parts: Fields, executed: Tensor) -> Tensor:
-        """Return the forecasts ``(*B, M, A)`` of what acts now if ``executed`` is executed."""
+    def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return forecasts ``(*B, M, A)`` and what is under way if ``executed`` is executed."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -23,9 +25,12 @@ class PairCorrector(Corrector):
         place: number of state coordinates that are remembered with a pair.
         quiet: innovation, in standard deviations that the model states, up to which a transition
             needs no explanation.
+        delay: steps from an action to its effect that are known, see
+            :class:`~afm_rl.correction.Corrector`.
     """
 
     is_valid: Tensor
+    is_command: Tensor
 
     def __init__(
         self,
@@ -35,13 +40,16 @@ class PairCorrector(Corrector):
         memory: int,
         place: int = 0,
         quiet: float = 1.0,
+        delay: int | Sequence[int] = 0,
     ) -> None:
-        super().__init__(action_low, action_high, recent)
+        super().__init__(action_low, action_high, recent, delay)
         self.memory = max(check_count("corrector.memory", memory), recent)
         self.quiet = check_number("corrector.quiet", quiet, low=0.0)
         self.pair_size, self.tail = 3 * self.action_size + 2 + place, 1 + place
         is_valid = torch.arange(self.pair_size) == 3 * self.action_size
         self.register_buffer("is_valid", is_valid, persistent=False)
+        is_command = torch.arange(self.pair_size) < self.action_size
+        self.register_buffer("is_command", is_command, persistent=False)
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the pairs: u, its effect, std, valid, innovation, place."""
@@ -85,7 +93,8 @@ class PairCorrector(Corrector):
         )
         sound = (valid == 1.0) & rows.isfinite().all(-1, keepdim=True)
         older = parts["pairs"][..., 1 : self.memory - count + 1, :]
-        return parts | {"pairs": torch.cat([older, torch.where(sound, rows, 0.0)], -2)}
+        rows = torch.where(sound | self.is_command, rows, 0.0)  # what was sent is known
+        return parts | {"pairs": torch.cat([older, rows], -2)}
 
     def aged(self, pairs: Tensor, begins: Tensor, newest: int) -> Tensor:
         """Return pairs ``(*B, M, D)`` with those before the newest marked as old.

@@ -135,7 +135,12 @@ def check_readings(names: Sequence[str], by_place: bool) -> list[str]:
 
 
 def read_rows(
-    pairs: Tensor, layout: Layout, size: int, away: Tensor | None, varied: int = 0
+    pairs: Tensor,
+    layout: Layout,
+    size: int,
+    away: Tensor | None,
+    varied: int = 0,
+    follow: Tensor | None = None,
 ) -> Rows:
     """Return the rows of each reading, ``(*B, H, K, A)``.
 
@@ -147,6 +152,8 @@ def read_rows(
         away: squared distance in place of each pair from here, ``(*B, M)``; None without
             readings by place.
         varied: number of readings by variety.
+        follow: the pairs that readings by variety and place read, if they are others: those of
+            commands with their late effects.
 
     >>> u = torch.tensor([[0.1], [0.2], [0.3]])
     >>> pairs = torch.cat([u, 10 * u, 0 * u, torch.ones(3, 1)], -1)
@@ -165,6 +172,7 @@ def read_rows(
     came = (came == 1.0).to(came)  # what was sound before a change tells nothing about it
     parts = [part.unflatten(-2, (-1, rows)) for part in (executed, effective, std, valid * came)]
     by_time = parts[0].shape[-3]
+    pairs = pairs if follow is None else follow
     found = [(_varied(pairs, size, rows), varied)] if varied else []
     if away is not None:
         found.append((_nearest(pairs, away, rows), len(layout.filled) - by_time - varied))

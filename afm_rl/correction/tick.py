@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.correction.achievable import MODES, attainable, extend
+from afm_rl.correction.arrival import ago, aligned, effects_of
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
@@ -45,6 +46,7 @@ class Tick(nn.Module):
     probes: Tensor
     worth: Tensor
     late: Tensor
+    delays: Tensor
     rows_acting: Tensor
 
     def __init__(
@@ -56,6 +58,7 @@ class Tick(nn.Module):
         worth: Tensor,
         odds: float,
         least_noise: float,
+        delays: Tensor,
         likely: int,
         samples: int,
         source_std: float,
@@ -73,12 +76,14 @@ class Tick(nn.Module):
         self.varied = sum(r.varied for r in chosen)
         self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings)), 1]
         self.likely = min(check_count("corrector.likely", likely), len(chosen))
+        self.most_late = max(delays.tolist())
         late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "worth": worth,
+            "delays": delays,
             "late": torch.tensor(late, dtype=torch.long),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
@@ -91,6 +96,8 @@ class Tick(nn.Module):
         losses: Tensor,
         noise: Tensor,
         place: Tensor,
+        late: Tensor,
+        waiting: Tensor,
         planned: Tensor,
         box: Tensor,
     ) -> Answer:
@@ -101,13 +108,14 @@ class Tick(nn.Module):
             losses: of the models, ``(B, M + 1, A)``.
             noise: that no model explains, ``(B, A)``.
             place: where the missions are, ``(B, P)``.
+            late: steps that commands are late, ``(B,)``.
+            waiting: commands that are known to come, the oldest first, ``(B, D, A)``.
             planned: in units of the action, ``(B, A)``.
             box: lowest and highest action, ``(B, 2, A)``.
         """
         unit, ends = planned / self.scale, box / self.scale
-        encoded, lines = self.read(pairs, noise, place)
-        prior = prior_of(self.worth, self.odds, noise, self.least_noise)
-        weights = Belief(losses, losses, noise).weights(prior)
+        encoded, lines = self.read(pairs, noise, place, late)
+        weights = self.weights(losses, noise)
         models = self.most_likely(encoded, lines, weights)
         proposals, spread = self.propose(models, unit, ends)
         expected = self.expect(models, proposals)
@@ -121,7 +129,8 @@ class Tick(nn.Module):
         changed = weights[:, 0] + weights[:, -1] < 0.5  # else the plan, to the bit
         action = torch.where(changed & action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
-        forecasts = self.forecast(encoded, lines, pairs, action)
+        ahead = torch.cat([waiting, action.unsqueeze(1)], 1)
+        forecasts, under_way = self.forecast(encoded, lines, weights, late, pairs, ahead)
         return Answer(
             action * self.scale,
             predicted * self.scale,
@@ -129,9 +138,17 @@ class Tick(nn.Module):
             bounds * self.scale,
             changed.any(-1),
             forecasts,
+            under_way,
         )
 
-    def read(self, pairs: Tensor, noise: Tensor, place: Tensor) -> tuple[Encoded, Lines]:
+    def weights(self, losses: Tensor, noise: Tensor) -> Tensor:
+        """Return the probabilities of the models, ``(B, M + 1, A)``."""
+        prior = prior_of(self.worth, self.odds, noise, self.least_noise)
+        return Belief(losses, losses, noise).weights(prior)
+
+    def read(
+        self, pairs: Tensor, noise: Tensor, place: Tensor, late: Tensor
+    ) -> tuple[Encoded, Lines]:
         """Return what is read in every reading, B R sets of rows, and the linear models."""
         away, size = None, len(self.scale)
         if self.by_place:
@@ -139,10 +156,11 @@ class Tick(nn.Module):
             away = (pairs[..., first:] - place.unsqueeze(-2)).square().sum(-1)
             away = torch.where(pairs[..., first - 2] > 0, away, torch.inf)
         layout = Layout(*(getattr(self, f"rows_{name}") for name in Layout._fields))
-        rows = read_rows(pairs, layout, size, away, self.varied)
+        follow = aligned(pairs, late, size)
+        rows = read_rows(pairs, layout, size, away, self.varied, follow)
         loud = torch.hypot(rows.std, noise[:, None, None]) * rows.valid
         rows = Rows(*(part.flatten(0, 1) for part in rows._replace(std=loud)))
-        sent, came, std, valid = pairs[..., : 3 * size + 1].split([size, size, size, 1], -1)
+        sent, came, std, valid = follow[..., : 3 * size + 1].split([size, size, size, 1], -1)
         sound = (valid == 1.0).to(pairs)
         lines = fit_lines(sent, came, torch.hypot(std, noise.unsqueeze(1)), sound)
         return self.network.encode(rows, fit_experts(rows)), lines
@@ -224,16 +242,50 @@ class Tick(nn.Module):
         miss = (expected - wanted[:, None, None]).square() / noise[:, None, None].square()
         return (models.weights.unsqueeze(2) * miss.log1p()).sum(1)
 
-    def forecast(self, encoded: Encoded, lines: Lines, pairs: Tensor, executed: Tensor) -> Tensor:
-        """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now."""
-        size, now = len(self.scale), executed.unsqueeze(1)
-        sent = torch.cat([pairs[..., :size], now], -2)
-        acted = self.rows_acting @ sent[:, -self.rows_acting.shape[-1] :]  # (B, R, A)
-        read = self.network.effect(encoded, acted.reshape(-1, 1, size)).view_as(acted)
-        linear = lines.effect(now).squeeze(2)
-        before, came, _, valid = pairs[..., : 3 * size + 1].split([size, size, size, 1], -1)
-        noisy = now + sensor_noise(before, came, (valid == 1.0).to(now))
-        return torch.cat([now, read, linear, acted[:, self.late], noisy], 1)
+    def forecast(
+        self,
+        encoded: Encoded,
+        lines: Lines,
+        weights: Tensor,
+        late: Tensor,
+        pairs: Tensor,
+        ahead: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now.
+
+        And those ``(B, K + D, A)`` that the newest commands have or will have, by the models that
+        are so late.
+
+        Args:
+            encoded: what the readings have read.
+            lines: the linear models.
+            weights: probabilities of all models, ``(B, M + 1, A)``.
+            late: steps that commands are late, ``(B,)``.
+            pairs: what is remembered.
+            ahead: commands that wait, and the present one, ``(B, D + 1, A)``.
+        """
+        size, now = len(self.scale), ahead[:, :1]
+        sent = pairs[..., :size]
+        acted = torch.cat([sent, now], 1)
+        acting = ago(acted, late).unsqueeze(1)
+        acted = self.rows_acting @ acted[:, -self.rows_acting.shape[-1] :]  # (B, R, A)
+        follows = (self.delays[1 : acted.shape[1] + 1] < 0).unsqueeze(-1)
+        acted = torch.where(follows, acting, acted)
+        every = torch.cat([sent, ahead], 1)
+        newest = every[:, every.shape[1] - self.most_late - ahead.shape[1] + 1 :]
+        shape = (-1, acted.shape[1], -1, -1)
+        asked = torch.cat([acted.unsqueeze(2), newest.unsqueeze(1).expand(shape)], 2)
+        found = self.network.effect(encoded, asked.flatten(0, 1)).view_as(asked)
+        linear = lines.effect(torch.cat([acting, newest], 1))
+        follow = aligned(pairs, late, size)[..., : 3 * size + 1]
+        before, came, _, valid = follow.split([size, size, size, 1], -1)
+        noisy = acting + sensor_noise(before, came, (valid == 1.0).to(now))
+        forecasts = [now, found[:, :, 0], linear[:, :, 0], acted[:, self.late], noisy]
+        nominal = newest.unsqueeze(1)
+        same = nominal.expand(-1, len(self.late) + 1, -1, -1)
+        effects = torch.cat([nominal, found[:, :, 1:], linear[:, :, 1:], same], 1)
+        delays = torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
+        return torch.cat(forecasts, 1), effects_of(effects, weights, late, delays)
 
 
 def points_of(count: int, size: int) -> Tensor:

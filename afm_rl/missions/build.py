@@ -161,7 +161,8 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
         transform = None
         if corrector.module is not None:
             around["reported_key"] = robot.reported
-            transform = ActionFlowTransform(model, corrector.module, **around)
+            # Scores and updaters read what was measured; planners the state in which they will act.
+            transform = ActionFlowTransform(model, corrector.module, late="leave", **around)
     shape = {name: value for name, value in settings["robot"].items() if name in SHAPE_TRAINING}
     trainings = [
         part.training._replace(settings=[shape, *part.training.settings])
@@ -174,7 +175,8 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     # Without a transform the planner does not know which effects are achievable.
     no_box = transform is None and "box_key" in settings["planner"]
     changed = {"box_key": None} if no_box else {}
-    world = PlanningEnv(model, cost, *robot.action_box, observe=robot.observe)
+    seen = "observation" if transform is None else transform.key("arrival")
+    world = PlanningEnv(model, cost, *robot.action_box, observation_key=seen, observe=robot.observe)
     planner = make("planner", world, **changed)
     if hasattr(planner, "signature"):  # a file: its name does not tell what it holds
         trainings = [t._replace(settings=[*t.settings, planner.signature]) for t in trainings]

@@ -5,17 +5,20 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform
 
 from afm_rl.correction import Corrector
+from afm_rl.correction.arrival import arrival
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_flag, check_instance
+from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance
 from afm_rl.spaces.keys import as_key, as_keys
 from afm_rl.transforms.carried import CarriedTransform
 from afm_rl.transforms.memory import (
+    LATE,
     begin,
     correct,
     corrector_for,
@@ -43,6 +46,8 @@ class ActionFlowTransform(CarriedTransform):
       predicted to have; where nothing is corrected, itself,
     * ``(prefix, "misaligned")`` ``(*B)``: does the model misjudge actions, so that they are
       corrected (with ``enabled=False``: so that they would be)?
+    * ``(prefix, "observation")`` and ``(prefix, "arrival")`` ``(*B, S)``: the measured state, and
+      the one in which the next action will act; while no action is late, the same,
     * ``(prefix, "innovation")`` ``(*B)``: the misalignment, in the unit of the gate,
     * ``(prefix, "spread")`` ``(*B, A)``: standard deviation of the flow's samples,
     * ``(prefix, "effect_bounds")`` ``(*B, 2, A)``: lowest and highest effect that an action can
@@ -66,6 +71,9 @@ class ActionFlowTransform(CarriedTransform):
             predict them.
         reported_key: where the environment reports the action ``(*B, A)`` that its actuators gave
             in a step, if that is known and not what they were sent: motors that lag.
+        late: what policies find under ``in_keys`` while actions act late: ``"predict"``, the state
+            in which the next action will act; ``"leave"``, the measured one.
+        delay: steps from an action to its effect that are known, one number or one per axis.
 
     Raises:
         ConfigurationError: for parts that do not fit each other, also when it is put around an
@@ -94,13 +102,17 @@ class ActionFlowTransform(CarriedTransform):
         enabled: bool = True,
         extend_action_box: bool = True,
         reported_key: NestedKey | None = None,
+        late: str = "predict",
+        delay: int | Sequence[int] | None = None,
     ) -> None:
+        self.delay = delay
+        self.late = check_choice("transform.late", late, LATE)
         state = _one_key("in_keys", ["observation"] if in_keys is None else in_keys)
         action = _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv)
         super().__init__(state, action, prefix)
         self.__dict__["model"] = check_instance("transform.model", model, DynamicsModel)
         if corrector is not None:
-            corrector = corrector_for("transform", model, corrector, None)
+            corrector = corrector_for("transform", model, corrector, None, delay)
         self._corrector = corrector
         self.enabled = check_flag("transform.enabled", enabled)
         self.extend_action_box = check_flag("transform.extend_action_box", extend_action_box)
@@ -115,7 +127,9 @@ class ActionFlowTransform(CarriedTransform):
                     "ActionFlowTransform.corrector: the action box is not known yet; put the "
                     "transform around an environment first, or give a corrector"
                 )
-            self._corrector = corrector_for("transform", self.model, None, self._action_spec)
+            self._corrector = corrector_for(
+                "transform", self.model, None, self._action_spec, self.delay
+            )
         return self._corrector
 
     @property
@@ -148,7 +162,10 @@ class ActionFlowTransform(CarriedTransform):
             self.action_key,
         )
         tensordict.set(self.action_key, entries.get("executed_action").to(planned.dtype))
-        return tensordict.set(self.prefix, entries)
+        kept = tensordict.get(self.prefix).select("observation", "arrival")
+        # Environments without a state of their own go on from what is under this key.
+        tensordict.set(self.observation_key, kept.get("observation"))
+        return tensordict.set(self.prefix, entries.update(kept))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         entries = dict(tensordict.get(self.prefix).items())
@@ -157,9 +174,11 @@ class ActionFlowTransform(CarriedTransform):
             given = next_tensordict.get(self.reported_key).to(memory.dtype)
             memory = self.corrector.reported(memory, given)
         state = next_tensordict.get(self.observation_key, None)
-        entries["memory"] = observe(memory, state, self.model, self.corrector, self.observation_key)
+        memory = observe(memory, state, self.model, self.corrector, self.observation_key)
+        entries |= {"memory": memory, **self._seen(memory, state)}
         # Of the device that the next tensordict names: else every entry is moved to where it is.
         device, batch = next_tensordict.device, next_tensordict.batch_size
+        self._show(next_tensordict, entries["arrival"])
         return next_tensordict.set(self.prefix, TensorDict(entries, batch, device=device))
 
     def _reset(
@@ -169,7 +188,22 @@ class ActionFlowTransform(CarriedTransform):
         state = tensordict_reset.get(self.observation_key, None)
         if state is None:
             self._entry("in_keys", self.parent.full_observation_spec)
-        return tensordict_reset.set(self.prefix, begin(self.corrector, state, self._action_spec))
+        entries = begin(self.corrector, state, self._action_spec)
+        entries.update(self._seen(entries.get("memory"), state))
+        self._show(tensordict_reset, entries.get("arrival"))
+        return tensordict_reset.set(self.prefix, entries)
+
+    def _seen(self, memory: Tensor, measured: Tensor) -> dict[str, Tensor]:
+        """Return the entries of the present state and of that in which the next action acts."""
+        there, steps = arrival(self.corrector, memory, self.model)
+        there = there.to(measured.dtype)
+        late = (steps > 0).unsqueeze(-1) & self.enabled
+        return {"observation": measured.clone(), "arrival": torch.where(late, there, measured)}
+
+    def _show(self, tensordict: TensorDictBase, there: Tensor) -> None:
+        """Let policies find the state in which their action will act."""
+        if self.late == "predict":
+            tensordict.set(self.observation_key, there)
 
     def _check_process(self) -> None:
         """Refuse a copy of a model that learns in another process: it would stay behind."""
@@ -204,7 +238,11 @@ class ActionFlowTransform(CarriedTransform):
                 f"{tuple(found.shape)}, but the dynamics model's state has "
                 f"{self.model.state_size} numbers"
             )
-        return entries_spec(self.corrector, self.model.state_size, spec.shape, found.dtype)
+        entries = entries_spec(self.corrector, self.model.state_size, spec.shape, found.dtype)
+        size = (*spec.shape, self.model.state_size)
+        entries["observation"] = Unbounded(size, dtype=found.dtype)
+        entries["arrival"] = Unbounded(size, dtype=found.dtype)
+        return entries
 
 
 def _one_key(name: str, keys: Sequence[NestedKey]) -> NestedKey:

@@ -85,7 +85,8 @@ class Controller(nn.Module):
                 f"that writes {self.policy.action_key!r}"
             )
         entries = env.observation_spec.items(True, True)
-        return {key: s.shape[-1] for key, s in entries if key != self.policy.observation_key}
+        states = (self.policy.observation_key, unravel_key((self.policy.prefix, "arrival")))
+        return {key: s.shape[-1] for key, s in entries if key not in states}
 
     def _record(self) -> None:
         """Find out which noise is asked for."""
@@ -143,7 +144,7 @@ class Controller(nn.Module):
         if self.planner is not None:
             if isinstance(self.planner, SamplingPlanner):
                 self.planner.streams = noise
-            self.planner(td)
+            self.planner(self.policy.arrival()(td))
         self.policy(td)
         later = td.get("next")
         return torch.cat([later.get(key).flatten() for key in self.shapes]), td.get(

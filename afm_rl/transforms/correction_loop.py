@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from typing import Any
@@ -16,17 +17,20 @@ from torch import Tensor
 from torchrl.data import Bounded
 
 from afm_rl.correction import Corrector
+from afm_rl.correction.arrival import arrival
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.diagnosis import explain
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
-from afm_rl.errors import ConfigurationError, check_flag
+from afm_rl.errors import ConfigurationError, check_choice, check_flag
 from afm_rl.faults import fault_of, safe_action
 from afm_rl.learning.watching import Watching
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.transforms.memory import begin, computable, correct, corrector_for, observe
+from afm_rl.transforms.arrival import UNSEEN, simulated_observations
+from afm_rl.transforms.memory import LATE, begin, computable, correct, corrector_for, observe
 
 Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str
 State = Callable[[Any, Any], Any]
+Observe = Callable[[np.ndarray], Any]
 AS_EXPECTED = "as the model expects"
 SHOWN = {
     "planned": "planned_action",
@@ -49,6 +53,9 @@ class CorrectionLoop:
         corrector: the correction.
         enabled: False to watch only.
         source: environment, or vector of environments, that may have a simulation.
+        late: see :class:`ActionFlowWrapper`, as the next one.
+        observe: what is observed in states.
+        delay: steps that are known.
     """
 
     def __init__(
@@ -60,7 +67,12 @@ class CorrectionLoop:
         corrector: Corrector | None = None,
         enabled: bool = True,
         source: Any = None,
+        late: str = "predict",
+        observe: Observe | None = None,
+        delay: int | Sequence[int] | None = None,
     ) -> None:
+        self.delay = delay
+        self.late = check_choice("wrapper.late", late, LATE)
         if not isinstance(actions, Box) or len(actions.shape) != 1 or actions.dtype.kind != "f":
             raise ConfigurationError(
                 f"ActionFlowWrapper: action_space={actions}: expected a Box of one vector of real "
@@ -79,6 +91,13 @@ class CorrectionLoop:
                 "or a DynamicsModel"
             )
         self.corrector: Any = corrector
+        if observe is None and state is None and isinstance(self.model, MuJoCoDynamics):
+            observe = simulated_observations(source, observations)
+        elif observe is None and state is None:
+            observe = _states
+        self.seen_in: Observe | None = observe
+        if delay is not None and late == "predict" and observe is None:
+            raise ConfigurationError(f"ActionFlowWrapper: delay={delay!r}: {UNSEEN}")
         if state is None and isinstance(self.model, MuJoCoDynamics):
             state = _vector_state if isinstance(source, VectorEnv) else _env_state
         if state is None and not (isinstance(observations, Box) and len(observations.shape) == 1):
@@ -138,7 +157,9 @@ class CorrectionLoop:
             )
         low, high = (torch.as_tensor(x).to(states) for x in (self.space.low, self.space.high))
         self.spec = Bounded(low, high, low.shape, dtype=low.dtype)
-        self.corrector = corrector_for("ActionFlowWrapper", self.model, self.corrector, self.spec)
+        self.corrector = corrector_for(
+            "ActionFlowWrapper", self.model, self.corrector, self.spec, self.delay
+        )
         self.corrector.to(states.dtype)
 
     @torch.no_grad()
@@ -183,6 +204,29 @@ class CorrectionLoop:
             self.begin(states, fresh)
             self.told = told
 
+    @torch.no_grad()
+    def at_arrival(self, observations: Any, over: np.ndarray | None = None) -> Any:
+        """Return the observations ``(N, ...)`` in the states in which the next commands act.
+
+        Args:
+            observations: what was measured.
+            over: where episodes have ended, and nothing is predicted, ``(N,)``.
+        """
+        if self.late == "leave" or not self.enabled or self.watching and self.learning:
+            return observations
+        memory = self.entries.get("memory")
+        states, steps = arrival(self.corrector, memory, self.model)
+        rows = (steps > 0).numpy() & (states != self.states).any(-1).numpy()
+        rows &= np.ones_like(rows) if over is None else ~over
+        if not rows.any():
+            return observations
+        if self.seen_in is None:
+            warnings.warn(f"ActionFlowWrapper: commands act late: {UNSEEN}", stacklevel=3)
+            return observations
+        found = np.array(observations)
+        found[rows] = self.seen_in(states.numpy()[rows])
+        return found
+
     def diagnosis(self, row: int) -> str:
         """Say in words what the pairs that an environment remembers show of its actuators."""
         corrects = self.entries is not None and bool(self.entries.get("misaligned")[row])
@@ -192,7 +236,11 @@ class CorrectionLoop:
         pairs = self.corrector.unpack(memory, self.states.shape[-1])["pairs"][:, : 3 * size + 1]
         executed, effective, std, valid = (x.numpy() for x in pairs.split([size, size, size, 1], 1))
         use, step = valid[:, 0] > 0, getattr(self.model, "dt", 1.0)
-        return str(explain(executed[use], effective[use], self.names, std[use], step))
+        found = str(explain(executed[use], effective[use], self.names, std[use], step))
+        late = int(self.corrector.under_way(memory)[2])
+        if late and self.late == "predict" and self.enabled:
+            found += f"\nlateness: {late} step{'s' * (late > 1)}, made up for"
+        return found
 
     def _tell(self) -> dict[str, np.ndarray]:
         """Return what is known of the newest step, ``(N, ...)`` each."""
@@ -225,6 +273,10 @@ def as_numbers(name: str, given: Any, shape: Sequence[int] | None) -> Tensor:
 
 def _observed(env: Any, observation: Any) -> Any:
     return observation
+
+
+def _states(states: np.ndarray) -> np.ndarray:
+    return states
 
 
 def _env_state(env: Any, observation: Any) -> np.ndarray:

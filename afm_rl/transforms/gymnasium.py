@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -14,7 +15,7 @@ from afm_rl.correction import Corrector
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning.watching import Watching
-from afm_rl.transforms.correction_loop import CorrectionLoop, Model, State, as_numbers
+from afm_rl.transforms.correction_loop import CorrectionLoop, Model, Observe, State, as_numbers
 
 
 class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
@@ -46,6 +47,13 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         corrector: the correction, owned; None: the universal
             :class:`~afm_rl.correction.ActionFlow` for the action space.
         enabled: False to watch only.
+        late: what the policy is shown while commands act late: ``"predict"``, the observation in
+            the state in which its next command will act; ``"leave"``, what was measured. That is in
+            ``info["afm"]["observation"]`` in any case. Rewards and ends stay the environment's own.
+        observe: ``observe(states)`` returns what is observed in states ``(N, S)``, arrays both;
+            None: the states, or what a gymnasium task with MuJoCo observes in them.
+        delay: steps from a command to its effect that are known, one number or one per actuator:
+            used from the first step on. What comes on top of it is found out.
 
     Raises:
         ConfigurationError: for spaces or a model that cannot be used, or do not fit each other;
@@ -66,13 +74,19 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         state: State | None = None,
         corrector: Corrector | None = None,
         enabled: bool = True,
+        late: str = "predict",
+        observe: Observe | None = None,
+        delay: int | Sequence[int] | None = None,
     ) -> None:
         given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
+        given |= {"late": late, "observe": observe, "delay": delay}
         RecordConstructorArgs.__init__(self, **given)
         gymnasium.Wrapper.__init__(self, env)
         inner: Any = env.unwrapped
         spaces = env.observation_space, env.action_space
-        self._loop = CorrectionLoop(*spaces, model, state, corrector, enabled, env)
+        self._loop = CorrectionLoop(
+            *spaces, model, state, corrector, enabled, env, late, observe, delay
+        )
         simulated = isinstance(self._loop.model, MuJoCoDynamics)
         if simulated and hasattr(inner, "data") and env.action_space != inner.action_space:
             raise ConfigurationError(
@@ -84,7 +98,8 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         """Begin an episode with an empty memory."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._loop.begin(self._state(observation), seed=seed)
-        return observation, {**info, "afm": self._told()}
+        info = {**info, "afm": self._told(observation)}
+        return self._loop.at_arrival(np.asarray(observation)[None])[0], info
 
     def step(self, action: Any):
         """Execute the corrected action."""
@@ -92,7 +107,10 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         executed = self._loop.act(planned[None])[0]
         observation, reward, terminated, truncated, info = self.env.step(executed)
         self._loop.observe(self._state(observation))
-        return observation, reward, terminated, truncated, {**info, "afm": self._told()}
+        info = {**info, "afm": self._told(observation)}
+        if not (terminated or truncated):
+            observation = self._loop.at_arrival(np.asarray(observation)[None])[0]
+        return observation, reward, terminated, truncated, info
 
     @property
     def watching(self) -> Watching | None:
@@ -108,9 +126,10 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         state = self._loop.state(self.env, observation)
         return as_numbers("observation", state, self._loop.state_shape)[None]
 
-    def _told(self) -> dict[str, Any]:
+    def _told(self, observation: Any) -> dict[str, Any]:
         told = {name: value[0] for name, value in self._loop.told.items()}
-        return {k: v.item() if isinstance(v, np.generic) else v for k, v in told.items()}
+        told = {k: v.item() if isinstance(v, np.generic) else v for k, v in told.items()}
+        return {**told, "observation": observation}
 
 
 class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
@@ -137,12 +156,18 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         state: State | None = None,
         corrector: Corrector | None = None,
         enabled: bool = True,
+        late: str = "predict",
+        observe: Observe | None = None,
+        delay: int | Sequence[int] | None = None,
     ) -> None:
         given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
+        given |= {"late": late, "observe": observe, "delay": delay}
         RecordConstructorArgs.__init__(self, **given)
         VectorWrapper.__init__(self, env)
         spaces = env.single_observation_space, env.single_action_space
-        self._loop = CorrectionLoop(*spaces, model, state, corrector, enabled, env)
+        self._loop = CorrectionLoop(
+            *spaces, model, state, corrector, enabled, env, late, observe, delay
+        )
         self._mode = autoreset_mode_of(env)
         self._over = np.zeros(env.num_envs, dtype=bool)
 
@@ -154,7 +179,8 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         first = seed[0] if isinstance(seed, list | tuple) else seed
         self._loop.begin(self._states(observations), rows, first)
         self._over &= ~rows
-        return observations, {**infos, "afm": self._loop.told, "_afm": rows}
+        told = {**self._loop.told, "observation": observations}
+        return self._loop.at_arrival(observations), {**infos, "afm": told, "_afm": rows}
 
     def step(self, actions: Any):
         """Execute the corrected actions."""
@@ -164,7 +190,8 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         same = self._mode is AutoresetMode.SAME_STEP
         self._loop.observe(self._states(observations), over if same else self._over)
         self._over = over & (self._mode is AutoresetMode.NEXT_STEP)
-        infos = {**infos, "afm": self._loop.told, "_afm": made}
+        infos = {**infos, "afm": {**self._loop.told, "observation": observations}, "_afm": made}
+        observations = self._loop.at_arrival(observations, over)
         return observations, rewards, terminated, truncated, infos
 
     @property

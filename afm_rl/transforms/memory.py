@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -16,14 +17,20 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.faults import check_numbers, safe_action
 
+LATE = ("predict", "leave")
+"""What a policy is shown while its actions act late: the state at arrival, or the measured one."""
+
 
 def corrector_for(
     owner: str,
     model: DynamicsModel,
     corrector: Corrector | None,
     action_spec: TensorSpec,
+    delay: int | Sequence[int] | None = None,
 ) -> Corrector:
     """Return the corrector of an ``owner`` such as ``transform``: the universal one if None.
+
+    That one is told a ``delay`` that is known.
 
     Raises:
         ConfigurationError: if a part is not what it should be, or they are of different actions.
@@ -38,7 +45,13 @@ def corrector_for(
                 f"{size} finite bounds of the dynamics model's actions; limit the action spec, or "
                 "give a corrector with bounds of its own"
             )
-        corrector = ActionFlow(low.reshape(-1, size)[0], high.reshape(-1, size)[0])
+        low, high = low.reshape(-1, size)[0], high.reshape(-1, size)[0]
+        corrector = ActionFlow(low, high, delay=delay or 0)
+    elif delay is not None:
+        raise ConfigurationError(
+            f"{owner}.delay={delay!r}: a corrector was given too; say it there, as in "
+            f"ActionFlow(low, high, delay={delay!r})"
+        )
     check_instance(f"{owner}.corrector", corrector, Corrector)
     if corrector.action_size != model.action_size:
         raise ConfigurationError(
@@ -161,6 +174,8 @@ def correct(
         predicted = torch.where(touched & ~misaligned.unsqueeze(-1), executed, predicted)
     if not enabled:
         predicted = executed
+    else:
+        executed = corrector.sending(memory, executed)
     bounds = found.bounds if enabled else box
     if not (extend_action_box and model.extrapolates):
         low, high = box.unbind(-2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -12,6 +12,7 @@ from torchrl.data import Bounded, Composite, TensorSpec
 
 from afm_rl.compiling.devices import moved
 from afm_rl.correction import Corrector
+from afm_rl.correction.arrival import arrival
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.planning.primer import ZeroPrimer
@@ -48,6 +49,7 @@ class ActionFlowPolicy(TensorDictModuleBase):
         enabled: False to watch only.
         extend_action_box: let planners know of effects beyond the action box, if the model can
             predict them.
+        delay: steps from an action to its effect that are known, one number or one per axis.
 
     Raises:
         ConfigurationError: for parts that do not fit each other.
@@ -77,10 +79,11 @@ class ActionFlowPolicy(TensorDictModuleBase):
         prefix: NestedKey = "afm",
         enabled: bool = True,
         extend_action_box: bool = True,
+        delay: int | Sequence[int] | None = None,
     ) -> None:
         super().__init__()
         self.action_spec = check_instance("policy.action_spec", action_spec, Bounded)
-        self.corrector = corrector_for("policy", model, corrector, action_spec)
+        self.corrector = corrector_for("policy", model, corrector, action_spec, delay)
         if action_spec.shape != (self.corrector.action_size,):
             raise ConfigurationError(
                 f"policy.action_spec: of the shape {tuple(action_spec.shape)}, expected "
@@ -104,6 +107,10 @@ class ActionFlowPolicy(TensorDictModuleBase):
     def _spec(self) -> Composite:
         states = self.model.state_size
         return entries_spec(self.corrector, states, torch.Size(), self.action_spec.dtype)
+
+    def arrival(self) -> Arrival:
+        """Return the module that tells a planner in which state its action will act."""
+        return Arrival(self)
 
     def make_tensordict_primer(self) -> MemoryPrimer:
         """Return the transform that puts an empty memory into a tensordict, or every reset."""
@@ -138,6 +145,31 @@ class ActionFlowPolicy(TensorDictModuleBase):
         )
         tensordict.set(unravel_key(("next", self.prefix)), entries)
         return tensordict.set(self.action_key, entries.get("executed_action").to(planned.dtype))
+
+
+class Arrival(TensorDictModuleBase):
+    """Writes the state in which the next action will act to ``(prefix, "arrival")``.
+
+    Put it before the planner, which reads that: ``PlanningEnv(..., observation_key=("afm",
+    "arrival"))``.
+
+    Args:
+        policy: the correction after the planner, whose memory it reads.
+    """
+
+    def __init__(self, policy: ActionFlowPolicy) -> None:
+        super().__init__()
+        self.__dict__["policy"] = policy  # shared, so not registered
+        self.in_keys = [policy.observation_key, unravel_key((policy.prefix, "memory"))]
+        self.out_keys = [unravel_key((policy.prefix, "arrival"))]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Look at the state, and roll the model to where the next action will act."""
+        policy, (key, kept) = self.policy, self.in_keys
+        state, model = tensordict.get(key, None), policy.model
+        memory = observe(tensordict.get(kept), state, model, policy.corrector, key)
+        there, _ = arrival(policy.corrector, memory, model)
+        return tensordict.set(self.out_keys[0], there.to(state.dtype))
 
 
 class MemoryPrimer(ZeroPrimer):

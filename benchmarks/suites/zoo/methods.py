@@ -34,6 +34,11 @@ def afm(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
     return ActionFlowVectorWrapper(envs, **task.model), task.act
 
 
+def afm_measured(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+    """The same, but the policy is shown what was measured while commands act late."""
+    return ActionFlowVectorWrapper(envs, late="leave", **task.model), task.act
+
+
 def afm_learned(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
     """The same over an ensemble that is fitted to healthy episodes of this policy."""
     healthy = ActionFlowVectorWrapper(task.vector(WATCHED), Watching())
@@ -95,6 +100,7 @@ METHODS = {
     "alone": alone,
     "least squares": least_squares,
     "AFM": afm,
+    "AFM, measured": afm_measured,
     "AFM, learned": afm_learned,
     "truth": truth,
 }

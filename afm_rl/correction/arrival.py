@@ -1,0 +1,122 @@
+r"""Where a robot will be when its next command acts.
+
+Commands that act late cannot be undone by others. But policy or planner can be asked about the
+state in which their command will act (Smith 1957, Chem. Eng. Progress 53): the model is rolled
+through the effects of the commands that are still under way.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from afm_rl.compiling.tracing import all_hold, may_look
+from afm_rl.dynamics import DynamicsModel
+
+if TYPE_CHECKING:
+    from afm_rl.correction.base import Corrector
+
+LEAST = 1e-3  # share of the best that every delay keeps on every axis: none decides alone
+
+
+def steps_late(weights: Tensor, prior: Tensor, delays: Tensor, before: Tensor, most: int) -> Tensor:
+    r"""Return the most probable delay of commands in steps, ``(*B)``.
+
+    .. math:: k = \operatorname{argmax}_k \log p_k + \sum_a \log\frac{p_{ka}}{p_k}
+
+    One for all axes, from the evidence of all: an axis whose commands hardly change shows none.
+    None while *nothing has changed* is believed everywhere; else that is as probable, a priori, as
+    all else that is not late. A delay that was found stays, as actuators' delays do, until the
+    evidence for another one exceeds the odds of *nothing has changed*.
+
+    Args:
+        weights: probabilities of the models on every axis, ``(*B, M, A)``.
+        prior: log-odds of the models, ``(*B, M, A)``, or ``(M, 1)``.
+        delays: of the models now, ``(*B, M)``.
+        before: the delay until now, ``(*B)``.
+        most: the longest delay, K.
+
+    >>> weights = torch.tensor([[0.8, 0.1], [0.1, 0.8], [0.1, 0.1]])
+    >>> delays = torch.tensor([0, 1, 1])
+    >>> steps_late(weights, torch.zeros(3, 1), delays, torch.tensor(0), 1)
+    tensor(1)
+    """
+    every = torch.arange(most + 1, device=weights.device)
+    among = (delays.unsqueeze(-2) == every.unsqueeze(-1)).to(weights)  # (*B, K + 1, M)
+    share = prior.to(weights).softmax(-2)
+    even = (among[..., :1, 1:] @ share[..., 1:, :] / share[..., :1, :]).clamp_max(1.0)
+    ones = torch.ones_like(share[..., 1:, :])
+    even = torch.cat([even, ones.expand(*even.shape[:-2], *ones.shape[-2:])], -2)
+    first = among @ (even * share)
+    evidence = among @ (even * weights) / first.clamp_min(1e-30)
+    evidence = (evidence / evidence.amax(-2, keepdim=True)).clamp_min(LEAST)
+    first = (first / first.sum(-2, keepdim=True)).mean(-1)
+    stays = (before.unsqueeze(-1) == every).to(first)
+    sticky = torch.lerp(first, stays, share[..., 0, :1])
+    kept = torch.where((before > 0).unsqueeze(-1), sticky, first)
+    found = (kept.log() + evidence.log().sum(-1)).argmax(-1)
+    return torch.where((weights[..., 0, :] < 0.5).any(-1) | (before > 0), found, 0)
+
+
+def effects_of(models: Tensor, weights: Tensor, late: Tensor, delays: Tensor) -> Tensor:
+    """Return the effects ``(*B, K, A)`` of commands by those models that are so late.
+
+    Args:
+        models: their effects by every model, ``(*B, M, K, A)``.
+        weights: probabilities of the models, ``(*B, M, A)``.
+        late: steps, ``(*B)``.
+        delays: of the models, ``(*B, M)``.
+    """
+    so_late = delays.unsqueeze(-1) == late[..., None, None]
+    among = torch.where(so_late, weights.clamp_min(1e-9), 0.0)
+    among = among / among.sum(-2, keepdim=True)
+    return (among.unsqueeze(-2) * models).sum(-3)
+
+
+def ago(commands: Tensor, late: Tensor) -> Tensor:
+    """Return the command ``(*B, A)`` that acts now, of all ``(*B, N, A)``, the newest last."""
+    row = (commands.shape[-2] - 1 - late)[..., None, None]
+    return commands.gather(-2, row.expand(*row.shape[:-1], commands.shape[-1])).squeeze(-2)
+
+
+def aligned(pairs: Tensor, late: Tensor, size: int) -> Tensor:
+    """Return pairs ``(*B, M, D)`` with the commands of so many steps before each effect.
+
+    >>> pairs = torch.tensor([[0.1, 7.0, 0.0, 1.0], [0.2, 8.0, 0.0, 1.0]])
+    >>> aligned(pairs, torch.tensor(1), 1)[..., [0, 3]]
+    tensor([[0.1000, 0.0000],
+            [0.1000, 1.0000]])
+    """
+    row = torch.arange(pairs.shape[-2], device=pairs.device) - late.unsqueeze(-1)
+    sent = pairs[..., :size]
+    sent = sent.gather(-2, row.clamp_min(0).unsqueeze(-1).expand_as(sent))
+    valid = pairs[..., 3 * size :][..., :1] * (row >= 0).unsqueeze(-1)
+    return torch.cat([sent, pairs[..., size : 3 * size], valid, pairs[..., 3 * size + 1 :]], -1)
+
+
+def arrival(corrector: Corrector, memory: Tensor, model: DynamicsModel) -> tuple[Tensor, Tensor]:
+    """Return the state ``(*B, S)`` in which the next command will act, and in how many steps.
+
+    The present state where no command is late, or where the model leads to no number.
+
+    Args:
+        corrector: whose memory it is.
+        memory: up to the present state, ``(*B, P)``.
+        model: the dynamics model as it is now.
+    """
+    with torch.no_grad():
+        state, effects, steps = corrector.under_way(memory)
+        if not effects.shape[-2] or all_hold(steps == 0):
+            return state, steps
+        most = int(steps.max()) if may_look(steps) else effects.shape[-2]
+        # Every mission's commands under way, the oldest first; what follows them is not looked at.
+        ages = effects.shape[-2] - steps.unsqueeze(-1) + torch.arange(most, device=steps.device)
+        ages = ages.clamp_max(effects.shape[-2] - 1).unsqueeze(-1)
+        plan = effects.gather(-2, ages.expand(*ages.shape[:-1], effects.shape[-1]))
+        states = model.rollout(state, plan.unsqueeze(-3)).squeeze(-3)
+        last = (steps - 1).clamp_min(0)[..., None, None].expand(*steps.shape, 1, state.shape[-1])
+        found = states.gather(-2, last).squeeze(-2).to(state)
+        late = (steps > 0).unsqueeze(-1) & found.isfinite().all(-1, keepdim=True)
+        return torch.where(late, found, state), steps

@@ -1,0 +1,150 @@
+"""Commands that act late: whoever acts is asked about the state in which they will."""
+
+from collections import deque
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+from tensordict import TensorDict
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
+from afm_rl.correction import ActionFlow
+from afm_rl.dynamics import KnownDynamics
+from afm_rl.errors import ConfigurationError
+from afm_rl.planning import KnownReward, PlanningEnv
+from afm_rl.regimes import Delay
+from afm_rl.spaces.manifold import Manifold
+from afm_rl.transforms import ActionFlowTransform, RegimeTransform
+
+STEPS = 60
+
+
+def glide(state, action):
+    """Two carts on rails: positions and speeds."""
+    place, speed = state[..., :2], state[..., 2:]
+    speed = 0.98 * speed + 0.1 * action
+    return torch.cat([place + 0.1 * speed, speed], -1)
+
+
+class Carts(gymnasium.Env):
+    """Carts whose commands act ``late`` by so many steps each, from step ``at`` on."""
+
+    observation_space = Box(-np.inf, np.inf, (4,), np.float64)
+    action_space = Box(-1.0, 1.0, (2,), np.float64)
+
+    def __init__(self, late=(0, 0), at=0, sign=1.0):
+        self.late, self.at, self.sign = late, at, sign
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state, self.count = torch.tensor([1.0, -0.5, 0.0, 0.3], dtype=torch.float64), 0
+        self.past = deque([np.zeros(2)] * 12, maxlen=12)
+        return self.state.numpy().copy(), {}
+
+    def step(self, action):
+        self.past.append(np.array(action))
+        acts = self.past[-1]
+        if self.count >= self.at:
+            acts = self.sign * np.array([self.past[-1 - k][a] for a, k in enumerate(self.late)])
+        self.count += 1
+        self.state = glide(self.state, torch.as_tensor(acts))
+        return self.state.numpy().copy(), -float(self.state.square().sum()), False, False, {}
+
+
+def law(seen):
+    """A controller that is fast enough to be upset by a few steps of delay."""
+    return np.clip(-3.0 * seen[..., :2] - 3.5 * seen[..., 2:], -1.0, 1.0)
+
+
+def drive(env, steps=STEPS):
+    """Return the states ``(T, S)`` that were measured, and what was told at the end."""
+    seen, info = env.reset(seed=0)
+    found = []
+    for _ in range(steps):
+        seen, _, _, _, info = env.step(law(seen))
+        found.append(info["afm"]["observation"] if "afm" in info else seen)
+    return np.stack(found), info
+
+
+def test_a_known_delay_shifts_the_loop_and_changes_nothing_else():
+    """The first three steps are those of a robot that rests."""
+    late, _ = drive(ActionFlowWrapper(Carts((3, 3)), glide, delay=3))
+    plain = Carts()
+    plain.reset()
+    for _ in range(3):
+        seen = plain.step(np.zeros(2))[0]
+    for measured in late[3:]:
+        seen = plain.step(law(seen))[0]
+        np.testing.assert_allclose(measured, seen, atol=1e-9)
+
+
+def test_actuators_with_delays_of_their_own_act_together():
+    mixed, _ = drive(ActionFlowWrapper(Carts((3, 1)), glide, delay=[3, 1]))
+    same, _ = drive(ActionFlowWrapper(Carts((3, 3)), glide, delay=3))
+    np.testing.assert_allclose(mixed, same, atol=1e-9)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["", "reversed"])
+def test_a_delay_is_found_and_made_up_for(sign):
+    cost = {}
+    for late in ("predict", "leave"):
+        env = ActionFlowWrapper(Carts((4, 4), at=5, sign=sign), glide, late=late)
+        states, info = drive(env, 100)
+        cost[late] = np.square(states[50:]).mean()
+    assert 10 * cost["predict"] < cost["leave"], cost
+
+
+def test_nothing_is_predicted_while_nothing_is_late(monkeypatch):
+    def refuse(*_):
+        raise AssertionError("asked for a prediction")
+
+    monkeypatch.setattr(KnownDynamics, "rollout", refuse)
+    for at in (STEPS, 0):
+        sign = -1.0 if at == 0 else 1.0  # a fault that is not a delay
+        states, _ = drive(ActionFlowWrapper(Carts((0, 0), at, sign), glide))
+        plain, _ = drive(Carts())
+        assert at == 0 or np.array_equal(states, plain)
+
+
+def test_policies_in_a_vector_are_shown_the_same():
+    alone, _ = drive(ActionFlowWrapper(Carts((3, 3)), glide, delay=3))
+    envs = gymnasium.vector.SyncVectorEnv([lambda: Carts((3, 3))] * 2)
+    both, _ = drive(ActionFlowVectorWrapper(envs, glide, delay=3))
+    for row in range(2):
+        np.testing.assert_array_equal(both[:, row], alone)
+
+
+def test_the_transform_shows_the_same_and_keeps_what_was_measured():
+    alone, _ = drive(ActionFlowWrapper(Carts((2, 2)), glide, delay=2), 20)
+    model, ends = KnownDynamics(glide, Manifold(4), 2), torch.ones(2, dtype=torch.float64)
+    world = PlanningEnv(model, KnownReward(lambda s, a, n: s.sum(-1)), -ends, ends)
+    late = RegimeTransform(Delay(), [{"delay": 2.0}])
+    env = TransformedEnv(world, Compose(late, ActionFlowTransform(model, delay=2)))
+    start = torch.tensor([1.0, -0.5, 0.0, 0.3], dtype=torch.float64)
+    td = env.reset(TensorDict({"observation": start}))
+    for measured in alone:
+        td["action"] = torch.from_numpy(law(td["observation"].numpy()))
+        td = env.step_mdp(env.step(td))
+        np.testing.assert_allclose(td["afm", "observation"], measured, atol=1e-9)
+        assert torch.equal(td["observation"], td["afm", "arrival"])
+    check_env_specs(env)
+
+
+@pytest.mark.parametrize(
+    ("settings", "match"),
+    [
+        ({"delay": [1, 2, 3]}, "delay=.*one number of steps, or 2"),
+        ({"delay": -1}, "delay"),
+        ({"delay": 10**6}, "delay"),
+        ({"late": "ignore"}, "predict, leave|'predict'"),
+        ({"delay": 2, "state": lambda env, seen: seen}, "observe="),
+        ({"delay": 2, "corrector": ActionFlow(-torch.ones(2), torch.ones(2))}, "corrector"),
+    ],
+)
+def test_what_cannot_be_used_is_said_at_once(settings, match):
+    with pytest.raises(ConfigurationError, match=match):
+        ActionFlowWrapper(Carts(), glide, **settings).reset()
