@@ -38,6 +38,7 @@ SHOWN = {
     "predicted": "predicted_effect",
     "corrects": "misaligned",
     "innovation": "innovation",
+    "noise": "noise",
 }
 """What ``info["afm"]`` has of the entries."""
 
