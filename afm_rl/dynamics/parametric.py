@@ -10,7 +10,9 @@ from torch import Tensor, nn
 
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.per_mission import PerMissionModel
-from afm_rl.spaces.manifold import Manifold
+from afm_rl.spaces.manifold import Manifold, wrap_angle
+
+STEP = 1e-5  # of central differences: in double precision far above rounding, in any usual unit
 
 
 class PhysicsModel(PerMissionModel):
@@ -59,6 +61,9 @@ class PhysicsModel(PerMissionModel):
 class ParametricDynamics(KnownDynamics, PhysicsModel):
     """A step function with physical parameters as a dynamics model.
 
+    Derivatives are central differences in double precision: torch's forward differentiation takes a
+    millisecond for each product with a tensor that is not differentiated, such as these parameters.
+
     Args:
         step: ``step(state, action, physics) -> next state``, batched and differentiable; physics
             ``(*B, P)`` are in the order of their names.
@@ -92,3 +97,29 @@ class ParametricDynamics(KnownDynamics, PhysicsModel):
 
         super().__init__(now, manifold, action_size, noise_std, affine)
         self._name_physics(physics)
+
+    def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
+        """Return central differences ``(*B, D, A)``."""
+        after = self._beside(state, action, torch.eye(self.action_size), state.shape[-1])
+        change = self.manifold.difference(*after[..., 1:, :].chunk(2, -2))
+        return (change.mT / (2 * STEP)).to(action.dtype)
+
+    def linearise(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the next state and central differences by state and action."""
+        after = self._beside(state, action, torch.eye(self.state_size + self.action_size))
+        more, less = after[..., 1:, :].chunk(2, -2)
+        change = torch.where(self.manifold.is_angle, wrap_angle(more - less), more - less)
+        slopes = (change.mT / (2 * STEP)).to(action.dtype)
+        by_state, by_action = slopes.split([self.state_size, self.action_size], -1)
+        return after[..., 0, :].to(state.dtype), by_state, by_action
+
+    def _beside(self, state: Tensor, action: Tensor, axes: Tensor, still: int = 0) -> Tensor:
+        """Return what follows a state, and states and actions beside it; ``(*B, 1 + 2 K, S)``.
+
+        The axes ``(K, ...)`` are of states and actions; of actions only if ``still`` is S.
+        """
+        axes = torch.nn.functional.pad(axes.to(action), (still, 0)).double()
+        steps = STEP * torch.cat([axes.new_zeros(1, axes.shape[-1]), axes, -axes])
+        whole = torch.cat([state.expand(*action.shape[:-1], -1), action], -1).double()
+        moved = whole.unsqueeze(-2) + steps
+        return self(moved[..., : self.state_size], moved[..., self.state_size :])

@@ -23,7 +23,7 @@ class Model(ParametricDynamics):
     """The equations with a length and a tip mass of each pendulum; plans are coarser in time."""
 
     def __init__(self) -> None:
-        super().__init__(partial(step, substeps=4), SPACE, 1, MIDDLE, NOISE)
+        super().__init__(partial(step, substeps=2), SPACE, 1, MIDDLE, NOISE)
 
     def rollout(self, state: Tensor, actions: Tensor) -> Tensor:
         now, states = state.unsqueeze(-2).expand(*actions.shape[:-2], -1), []
@@ -50,14 +50,14 @@ class Agent:
         self,
         count: int,
         far: Callable,
-        level: float = 2.0,
+        level: float = 4.0,
         cap: float = 20.0,
         correct: bool = True,
         learn: bool = True,
         told: bool = False,
     ) -> None:
         self.model, self.told = Model(), told
-        cost = TrackingCost([0.1, 1.0, 0.005, 0.01], [0.001], [], angles=[0, 1], in_keys=[])
+        cost = TrackingCost([0.01, 1.0, 0.002, 0.01], [0.002], [], angles=[0, 1], in_keys=[])
         env = PlanningEnv(self.model, cost, [-VOLTAGE], [VOLTAGE])
         self.planner = Handover(env, far, level, cap)
         self.model.expand_(count)
