@@ -1,95 +1,19 @@
-"""What the pages for users show works: files, snippets and commands, from top to bottom."""
+"""Pages lead to what is there, and the site is made of them."""
 
 import json
 import re
-import shlex
-import sys
 from pathlib import Path
 
 import pytest
 import yaml
-from hydra import compose, initialize_config_module
+from pages import DOCS, PAGES, ROOT, name_of
 
-from afm_rl.cli.trusted import checked
-from afm_rl.missions import build
+import afm_rl.conf
 
-ROOT = Path(__file__).resolve().parents[1]
-DOCS = ROOT / "docs"
-PAGES = [
-    *(DOCS / "quickstart.md", DOCS / "torchrl.md", DOCS / "reliability.md"),
-    *(DOCS / "command_line.md", DOCS / "concepts.md", DOCS / "design.md", DOCS / "benchmarks.md"),
-    *sorted((DOCS / "howto").glob("*.md")),
-    *sorted((DOCS / "methods").glob("*.md")),
-]
-FENCE = re.compile(r"^```(python|yaml|sh|xml)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-NAME = re.compile(r"(?:# @.*\n)?(?:# |<!-- )(\S+\.(?:py|yaml|xml))(?:: .*| -->)?\n")
 PATHS = re.compile(r"`((?:afm_rl|envs|conf|examples|notebooks|tests|benchmarks)/[\w./]+)`")
-
-
-def name_of(page):
-    return str(page.relative_to(DOCS))
-
-
-def blocks(page, kind):
-    return [text for found, text in FENCE.findall(page.read_text()) if found == kind]
-
-
-def commands():
-    """Find the command lines of all pages that start one run."""
-    found = []
-    for page in PAGES:
-        inline = re.findall(r"`(afm-rl [^`]+)`", re.sub(FENCE, "", page.read_text()))
-        for line in [*"".join(blocks(page, "sh")).splitlines(), *inline]:
-            words = shlex.split(line, comments=True)
-            while words and re.fullmatch(r"[A-Z]+=\S*", words[0]):  # of the environment
-                words.pop(0)
-            asked = words[1:]
-            if words[:1] == ["afm-rl"] and "=" in line and not {"-m", "--cfg"} & set(asked):
-                found.append(pytest.param(page, asked, id=f"{name_of(page)}: {' '.join(asked)}"))
-    return found
-
-
-@pytest.fixture
-def desk(monkeypatch, tmp_path):
-    """Work in a folder with the examples alone, from which modules are imported."""
-    monkeypatch.chdir(tmp_path)
-    for name in ("examples", "benchmarks"):
-        (tmp_path / name).symlink_to(ROOT / name)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    yield tmp_path
-    sys.modules.pop("mine", None)
-
-
-def write_files(page, folder):
-    """Write the blocks that are files; return the other Python blocks."""
-    rest = []
-    for kind in ("python", "yaml", "xml"):
-        for text in blocks(page, kind):
-            named = NAME.match(text)
-            if named:
-                path = folder / named[1]
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(text)  # as a reader pastes it
-            elif kind == "python":
-                rest.append(text)
-    return rest
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(
-    "page", [p for p in sorted(DOCS.rglob("*.md")) if blocks(p, "python")], ids=name_of
-)
-def test_snippets_run(page, desk):
-    rest = write_files(page, desk)
-    exec(compile("\n".join(rest), str(page), "exec"), {"__name__": "page"})
-
-
-@pytest.mark.parametrize(("page", "asked"), commands())
-def test_commands_can_be_run(page, asked, desk):
-    write_files(page, desk)
-    with checked(asked) as names, initialize_config_module("afm_rl.conf", version_base="1.3"):
-        agent = build(compose("config", asked), names)
-    assert len(agent.missions)
+CONF = Path(afm_rl.conf.__file__).parent
+GROUPS = {path.name: {p.stem for p in path.glob("*.yaml")} for path in CONF.iterdir()}
+GROUPS = {group: choices for group, choices in GROUPS.items() if choices}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -122,9 +46,28 @@ def test_every_page_is_in_the_navigation():
             return {entry}
         return set().union(*map(leaves, entry.values() if isinstance(entry, dict) else entry))
 
-    pages = {name_of(page) for page in DOCS.rglob("*.md")}
+    pages = {name_of(page) for page in PAGES} - {"README.md"}
     notebooks = {f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")}
     assert leaves(nav) >= pages | notebooks | {"index.md", "api.md"}
+
+
+def explained():
+    """Read the tables of choices: the names in the first column of each group's table."""
+    found, group = {}, None
+    for line in (DOCS / "command_line.md").read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
+        if not line.startswith("|"):
+            group = None
+        elif group is None:
+            group = cells[0] if cells[0] != "model" else "dynamics"
+        elif group in GROUPS:
+            found.setdefault(group, []).extend(re.findall(r"`(\w+)`", cells[0]))
+    return found
+
+
+def test_every_choice_is_explained_once():
+    found = {group: sorted(names) for group, names in explained().items()}
+    assert found == {group: sorted(choices) for group, choices in GROUPS.items()}
 
 
 def test_docstrings_become_markdown(monkeypatch):

@@ -105,9 +105,9 @@ class ActionFlow(Believer):
         rows = max(12, size + 4) if rows is None else check_count("corrector.rows", rows)
         names = check_readings(list(READINGS) if readings is None else readings, bool(place))
         chosen = [READINGS[name] for name in names]
-        models = [*names, *LINEAR, *(f"only {name}" for name in late_ones(names))]
         late = late_ones(names)
-        worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * len(late)
+        models = [*names, *LINEAR, *(f"only {name}" for name in late), "noisy readings"]
+        worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * (len(late) + 1)
         super().__init__(action_low, action_high, rows, memory, models, len(place), worth, **rules)
         self.readings, self.place = names, place
         self.place_scale = check_number(
@@ -126,7 +126,9 @@ class ActionFlow(Believer):
             self.scale,
             names,
             rows,
-            self.prior,
+            self.worth,
+            self.odds,
+            self.least_noise,
             likely,
             samples,
             source_std,

@@ -37,28 +37,30 @@ class Belief(NamedTuple):
 
         .. math::
 
-            l_h &\leftarrow \alpha\,l_h + \log\Big(1 + \frac{(v - T_h)^2}{s^2 + \sigma^2}\Big) \\
+            l_h &\leftarrow \big(1 - (1 - \alpha)\,q\big)\,l_h
+            + \log\Big(1 + \frac{(v - T_h)^2}{s^2 + \sigma^2}\Big) \\
             s^2 &\leftarrow s^2 + \beta\,k\,\big(\min\{(v - T)^2 - \sigma^2, 3 s^2\} - s^2\big),
             \qquad k = \frac{s^2}{s^2 + \sigma^2}
 
         with the forecasts :math:`T_h`, that of the model that is believed most, T, and no noise
-        below ``floor``. An effect of which the transition showed nothing has a large
-        :math:`\sigma` and changes little.
+        below ``floor``. In noise one has to look back longer, by the :func:`haste` q. An effect of
+        which the transition showed nothing has a large :math:`\sigma` and changes little.
 
         Args:
             effect: v, ``(*B, A)``.
             std: :math:`\sigma` of v, ``(*B, A)``.
             valid: does the transition count? ``(*B, 1)``, 0 or 1.
-            prior: log-odds of the models, ``(M, 1)``.
+            prior: log-odds of the models, ``(*B, M, A)``.
             discount: :math:`\alpha`.
             rate: :math:`\beta`.
             floor: least noise.
             tails: degrees of freedom of the Student-t distribution.
         """
+        kept = 1 - (1 - discount) * haste(self.noise, floor).unsqueeze(-2)
         variance, stated = self.noise.square(), std.square()
         miss = (self.forecasts - effect.unsqueeze(-2)).square()
         scaled = miss / (variance + stated).unsqueeze(-2)
-        losses = discount * self.losses + 0.5 * (tails + 1) * (scaled / tails).log1p()
+        losses = kept * self.losses + 0.5 * (tails + 1) * (scaled / tails).log1p()
         losses = torch.where(valid.unsqueeze(-2) > 0, losses, self.losses)
         best = (losses - prior).argmin(-2, keepdim=True)
         excess = miss.gather(-2, best).squeeze(-2) - stated
@@ -76,6 +78,30 @@ class Belief(NamedTuple):
         tensor([0.5000, 0.5000])
         """
         return (prior - self.losses).softmax(-2)
+
+
+def haste(noise: Tensor, floor: float) -> Tensor:
+    r"""Return :math:`q = \min\{1, (s_0 / s)^2\}`: how little a row tells in noise, ``(*B, A)``.
+
+    >>> haste(torch.tensor([0.02, 0.04]), floor=0.02)
+    tensor([1.0000, 0.2500])
+    """
+    return (floor / noise).square().clamp_max(1.0)
+
+
+def prior_of(worth: Tensor, odds: float, noise: Tensor, floor: float) -> Tensor:
+    """Return the prior log-odds of the models, that of *nothing has changed* first, ``(*B, M, A)``.
+
+    What one model is worth more than another counts where it is quiet: in noise none is exact.
+
+    Args:
+        worth: of the others, ``(M - 1,)``.
+        odds: of *nothing has changed* against all others together.
+        noise: that no model explains, ``(*B, A)``.
+        floor: least noise, in which ``worth`` counts in full.
+    """
+    among = worth.unsqueeze(-1) * haste(noise, floor).unsqueeze(-2)
+    return torch.cat([torch.full_like(among[..., :1, :], odds), among.log_softmax(-2)], -2)
 
 
 def mean_and_std(effects: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.base import Correction, Fields, put, rows_of
-from afm_rl.correction.belief import Belief, mean_and_std
+from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_number
@@ -56,11 +56,12 @@ class Believer(PairCorrector):
         discount: of the losses; .95 looks back on twenty steps.
         noise: standard deviation that no model explains, at first, a share of the largest action.
         noise_rate: share of its square that is renewed at every step.
-        least_noise: its floor: effects nearer than that are all the same.
+        least_noise: its floor: effects nearer than that are all the same. In more noise a belief
+            looks back longer.
         quiet: normalised innovation up to which a transition needs no explanation.
     """
 
-    prior: Tensor
+    worth: Tensor
 
     def __init__(
         self,
@@ -71,11 +72,11 @@ class Believer(PairCorrector):
         models: Sequence[str],
         place: int = 0,
         worth: Sequence[float] | None = None,
-        odds: float = 3.0,
+        odds: float = 2.5,
         discount: float = 0.95,
         noise: float = 0.1,
         noise_rate: float = 0.1,
-        least_noise: float = 0.05,
+        least_noise: float = 0.02,
         quiet: float = 1.0,
         tails: float = 1.0,
     ) -> None:
@@ -90,8 +91,7 @@ class Believer(PairCorrector):
         self.noise = check_number("corrector.noise", noise, low=self.least_noise)
         self.tails = check_number("corrector.tails", tails, low=0.0, open_low=True)
         among = torch.zeros(len(models)) if worth is None else torch.tensor(worth)
-        prior = torch.cat([torch.tensor([self.odds]), among.log_softmax(0)]).unsqueeze(-1)
-        self.register_buffer("prior", prior, persistent=False)
+        self.register_buffer("worth", among, persistent=False)
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the belief; its noise is the last part."""
@@ -108,13 +108,17 @@ class Believer(PairCorrector):
         """Return the belief in the parts of a memory."""
         return Belief(parts["losses"], parts["forecasts"], parts["noise"])
 
+    def prior(self, parts: Fields) -> Tensor:
+        """Return the prior log-odds of the models ``(*B, M, A)``."""
+        return prior_of(self.worth.to(parts["noise"]), self.odds, parts["noise"], self.least_noise)
+
     def look(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts of the memory with the newest pairs and the belief after them."""
         parts = super().look(memory, model)
         newest, size = parts["pairs"][..., -1, :], self.action_size
         _, effect, std, valid, _ = newest.split([size, size, size, 1, self.tail], -1)
-        rules = (self.prior.to(newest), self.discount, self.noise_rate, self.least_noise)
-        belief = self.belief(parts).update(effect, std, valid, *rules, self.tails)
+        rules = (self.discount, self.noise_rate, self.least_noise, self.tails)
+        belief = self.belief(parts).update(effect, std, valid, self.prior(parts), *rules)
         awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
         begins = (parts["misaligned"] != 1.0) & awake
         count = 1 if model.taught_in is None else self.recent
@@ -155,7 +159,7 @@ class Believer(PairCorrector):
         """
         parts = self.unpack(memory, self.states_in(memory))
         answer = self.answer(parts, planned, box)
-        weights = self.belief(parts).weights(self.prior.to(memory))
+        weights = self.belief(parts).weights(self.prior(parts))
         acting = self.denormalise((weights * answer.forecasts.to(memory)).sum(-2))
         parts |= {"planned": planned, "executed": answer.executed.to(memory), "acting": acting}
         parts["forecasts"] = answer.forecasts.to(memory)
@@ -186,7 +190,7 @@ class Believer(PairCorrector):
     def believed(self, memory: Tensor) -> Tensor:
         """Return how probable the :attr:`models` are, by axis, ``(*B, M, A)``."""
         parts = self.unpack(memory, self.states_in(memory))
-        return self.belief(parts).weights(self.prior.to(memory))
+        return self.belief(parts).weights(self.prior(parts))
 
     def predict(
         self, memory: Tensor, action: Tensor, model: DynamicsModel
@@ -204,7 +208,7 @@ class Believer(PairCorrector):
         with torch.no_grad():
             seen = self._foresee(self.pack(self.look(memory, model)), action)
             parts = self.unpack(seen, model.state_size)
-            weights = self.belief(parts).weights(self.prior.to(memory))
+            weights = self.belief(parts).weights(self.prior(parts))
             mean, std = mean_and_std(parts["forecasts"], weights)
             return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))
 

@@ -13,10 +13,22 @@ from torch import Tensor
 from afm_rl.correction.fits import LEAST_GAIN, PRIOR, not_zero
 from afm_rl.spaces.small_matrices import solve_positive
 
-LINEAR = ("offset_1", "offset_3", "gain_3", "gain_12", "gain", "line_12", "line", "drift", "affine")
+LINEAR = (
+    "offset_1",
+    "offset_3",
+    "gain_3",
+    "gain_12",
+    "gain",
+    "line_12",
+    "line",
+    "drift",
+    "arx",
+    "affine",
+)
 """Offset at a gain of one; gain; gain and offset (*line*); gain and the newest offset (*drift*);
-affine map. Of the newest rows, or of all pairs."""
+what goes on from row to row (*arx*); affine map. Of the newest rows, or of all pairs."""
 WINDOWS = (1, 3, 12, 0)  # rows; 0: all
+RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for a few noisy rows
 
 
 class Lines(NamedTuple):
@@ -73,7 +85,8 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
     drift = (shift - gain[..., 2:3] * mean)[..., 0] / mass[..., 0]
     gains = [one, one, gain[..., 1], gain[..., 2], gain[..., 3], slope[..., 2], slope[..., 3]]
     biases = [offset[..., 0], offset[..., 1], zero, zero, zero, rest[..., 2], rest[..., 3]]
-    gains, biases = [*gains, gain[..., 2]], [*biases, drift]
+    slope, rest = _autoregressive(u, v, weight)
+    gains, biases = [*gains, gain[..., 2], slope], [*biases, drift, rest]
     matrix = torch.diag_embed(torch.stack(gains, 1))  # (B, L - 1, A, A)
     outer = torch.nn.functional.pad(u.mT, (0, 1), value=1.0)  # (B, M, A + 1)
     nominal = PRIOR * torch.eye(size + 1, device=sent.device, dtype=u.dtype)
@@ -84,3 +97,46 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
     matrix = torch.cat([matrix, solution[:, None, :, :-1]], 1)
     bias = torch.cat([torch.stack(biases, 1), solution[:, None, :, -1]], 1)
     return Lines(matrix.to(sent), bias.to(sent))
+
+
+def sensor_noise(sent: Tensor, came: Tensor, valid: Tensor, keep: float = 0.7) -> Tensor:
+    r"""Return what errors of the readings add to the next effect, ``(B, 1, A)``.
+
+    An error n of a reading is in two effects, :math:`v_k = u_k + n_{k+1} - n_k`. A policy answers
+    it, too, so it looks like another gain. Exponential smoothing of the misses foresees it
+    (Muth 1960): :math:`-\sum_j \theta^j (v_{k-j} - u_{k-j})`.
+
+    Args:
+        sent: executed actions, the oldest first, ``(B, M, A)``.
+        came: their effects.
+        valid: which rows count, ``(B, M, 1)``, 0 or 1.
+        keep: :math:`\theta`, 1 if nothing but the readings is noisy, 0 if nothing of them is.
+
+    >>> sensor_noise(torch.zeros(1, 2, 1), torch.tensor([[[-0.4], [0.4]]]), torch.ones(1, 2, 1))
+    tensor([[[-0.0840]]])
+    """
+    age = torch.arange(sent.shape[-2], 0, -1, device=sent.device)
+    weight = valid * (keep**age).unsqueeze(-1).to(sent)
+    return (weight * (sent - came)).sum(-2, keepdim=True)
+
+
+def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Return gain and offset ``(B, A)`` of :math:`v_k = b u_k + c u_{k-1} + a v_{k-1} + d`.
+
+    The row before is known, so this is a line in u. Rows after one that does not count do not.
+
+    Args:
+        u: executed, the oldest first, ``(B, A, M)``.
+        v: effects.
+        weight: of the rows.
+    """
+    sound = (weight > 0).to(u)
+    before = torch.stack([u, v], -1) * sound.unsqueeze(-1)
+    x = torch.cat([u.unsqueeze(-1), before.roll(1, -2), torch.ones_like(u).unsqueeze(-1)], -1)
+    follows = sound.roll(1, -1) * (torch.arange(u.shape[-1], device=u.device) > 0)
+    pull = (weight * follows).unsqueeze(-1) * x
+    left = pull.mT @ x + RIDGE * torch.eye(4, device=u.device, dtype=u.dtype)
+    right = pull.mT @ (v - u).unsqueeze(-1)
+    b, c, a, d = solve_positive(left, right).squeeze(-1).unbind(-1)
+    last_u, last_v = before[..., -1, :].unbind(-1)
+    return not_zero(1 + b), c * last_u + a * last_v + d

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.correction.achievable import MODES, attainable, extend
-from afm_rl.correction.belief import Belief, mean_and_std
+from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
-from afm_rl.correction.linear import LINEAR, Lines, fit_lines
+from afm_rl.correction.linear import LINEAR, Lines, fit_lines, sensor_noise
 from afm_rl.correction.network import AxisNetwork, Encoded
 from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows
 from afm_rl.correction.solver import midpoint
@@ -43,7 +43,7 @@ class Tick(nn.Module):
     scale: Tensor
     points: Tensor
     probes: Tensor
-    prior: Tensor
+    worth: Tensor
     late: Tensor
     rows_acting: Tensor
 
@@ -53,7 +53,9 @@ class Tick(nn.Module):
         scale: Tensor,
         readings: Sequence[str],
         rows: int,
-        prior: Tensor,
+        worth: Tensor,
+        odds: float,
+        least_noise: float,
         likely: int,
         samples: int,
         source_std: float,
@@ -62,20 +64,21 @@ class Tick(nn.Module):
     ) -> None:
         super().__init__()
         self.network, size = network, len(scale)
+        self.odds, self.least_noise = odds, least_noise
         self.source_std = check_number("corrector.source_std", source_std, low=0.0)
         self.steps = check_count("corrector.steps", steps)
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
         chosen = [READINGS[name] for name in readings]
         self.by_place = any(r.near for r in chosen)
         self.varied = sum(r.varied for r in chosen)
-        self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings))]
+        self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings)), 1]
         self.likely = min(check_count("corrector.likely", likely), len(chosen))
         late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
-            "prior": prior,
+            "worth": worth,
             "late": torch.tensor(late, dtype=torch.long),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
@@ -103,7 +106,8 @@ class Tick(nn.Module):
         """
         unit, ends = planned / self.scale, box / self.scale
         encoded, lines = self.read(pairs, noise, place)
-        weights = Belief(losses, losses, noise).weights(self.prior)
+        prior = prior_of(self.worth, self.odds, noise, self.least_noise)
+        weights = Belief(losses, losses, noise).weights(prior)
         models = self.most_likely(encoded, lines, weights)
         proposals, spread = self.propose(models, unit, ends)
         expected = self.expect(models, proposals)
@@ -114,7 +118,7 @@ class Tick(nn.Module):
         tried = sent.amax(1) - sent.amin(1)
         bounds = extend(reach, ends, tried, self.saturation)
         action = self.decide(models, proposals, expected, wanted, noise)
-        changed = weights[:, 0] < 0.5  # else the plan, to the bit
+        changed = weights[:, 0] + weights[:, -1] < 0.5  # else the plan, to the bit
         action = torch.where(changed & action.isfinite().all(-1, True), action, unit)
         predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
         forecasts = self.forecast(encoded, lines, pairs, action)
@@ -145,14 +149,14 @@ class Tick(nn.Module):
 
     def most_likely(self, encoded: Encoded, lines: Lines, weights: Tensor) -> Models:
         """Return the most likely models of every axis."""
-        still, read, linear, late = weights.split(self.counts, 1)
+        still, read, linear, late, noisy = weights.split(self.counts, 1)
         # Of models that are alike the first, on any machine and in any batch.
         order = torch.arange(read.shape[1], device=read.device).view(-1, 1)
         best = (read * (1 - 1e-4 * order)).topk(self.likely, 1)
         which = encoded.choose(best.indices)
         share = best.values / best.values.sum(1, keepdim=True).clamp_min(1e-30)
         share = read.sum(1, keepdim=True) * share
-        still = still + late.sum(1, keepdim=True)
+        still = still + late.sum(1, keepdim=True) + noisy
         return Models(which, lines, torch.cat([still, share, linear], 1))
 
     def propose(self, models: Models, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
@@ -227,7 +231,9 @@ class Tick(nn.Module):
         acted = self.rows_acting @ sent[:, -self.rows_acting.shape[-1] :]  # (B, R, A)
         read = self.network.effect(encoded, acted.reshape(-1, 1, size)).view_as(acted)
         linear = lines.effect(now).squeeze(2)
-        return torch.cat([now, read, linear, acted[:, self.late]], 1)
+        before, came, _, valid = pairs[..., : 3 * size + 1].split([size, size, size, 1], -1)
+        noisy = now + sensor_noise(before, came, (valid == 1.0).to(now))
+        return torch.cat([now, read, linear, acted[:, self.late], noisy], 1)
 
 
 def points_of(count: int, size: int) -> Tensor:

@@ -40,6 +40,7 @@ COPIES = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "afm_rl/correction/README.md": "mathematics.md",
 }
 
 
@@ -88,6 +89,13 @@ def on_files(files, config):
             files.append(File.generated(config, f"notebooks/{name}", content=image))
     files.append(File.generated(config, "images/layers.svg", content=layers.draw()))
     return files
+
+
+def on_page_markdown(markdown, page, **kwargs):
+    """Point links that leave docs/ to the copies."""
+    for path, uri in COPIES.items():
+        markdown = markdown.replace(f"](../{path}", f"]({uri}")
+    return markdown
 
 
 def on_page_content(content, page, **kwargs):

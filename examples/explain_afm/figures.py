@@ -62,22 +62,37 @@ def draw_progress(axes: Axes, budget: int) -> None:
 
 
 @torch.no_grad()
-def draw_belief(axes: Axes, regimes: str, budget: int) -> None:
-    """Draw how probable the models are, for the driving."""
+def draw_belief(above: Axes, below: Axes, regimes: str, budget: int) -> None:
+    """Draw driving as planned, executed and effective; below, how probable the models are."""
     agent = agent_of("method=afm_physics", regimes, f"budget={budget}")
     start = agent.env.reset(agent.missions, set_state=False)
     rollout = agent.env.rollout(budget, agent.planner, auto_reset=False, tensordict=start)
-    flow, entries = agent.transform.corrector, rollout["next", "afm"][0]
-    believed = flow.believed(entries["memory"])[..., 0]
+    entries, pose = rollout["next", "afm"][0], rollout["observation"][0]
     first = int(entries["misaligned"].int().argmax()) - 5
-    styles = method_styles(NAMES)
-    for k, name in enumerate(flow.models):
-        if name not in NAMES:
-            continue
-        shown = believed[first : first + 80, k]
-        times = first + torch.arange(len(shown))
-        styles[name].line(axes, times, shown, gid=name, label=NAMES[name], linewidth=1.2)
-    axes.set(xlabel="step", ylabel="probability", ylim=(0, 1))
+    shown = slice(first, first + 80)
+    times = range(first, first + len(pose[shown]))
+    moved = rollout["next", "observation"][0] - pose
+    ahead = moved[:, 0] * pose[:, 2].cos() + moved[:, 1] * pose[:, 2].sin()
+    driving = {
+        "planned": entries["planned_action"][:, 0],
+        "executed": entries["executed_action"][:, 0],
+        "effective": ahead / agent.robot.model.dt,
+    }
+    draw_lines(above, times, {name: values[shown] for name, values in driving.items()})
+    flow = agent.transform.corrector
+    believed = flow.believed(entries["memory"])[shown, :, 0]
+    models = {NAMES[name]: believed[:, flow.models.index(name)] for name in NAMES}
+    draw_lines(below, times, models)
+    above.set(ylabel="v (m/s)", ylim=(-1.1, 1.1))
+    below.set(xlabel="step", ylabel="probability", ylim=(0, 1))
+
+
+def draw_lines(axes: Axes, times: range, curves: dict[str, torch.Tensor]) -> None:
+    """Draw curves over time, with their names."""
+    styles = method_styles(curves)
+    for name, values in curves.items():
+        styles[name].line(axes, times, values, gid=name, label=name, linewidth=1.2)
+    dress(axes)
 
 
 def main() -> None:
@@ -94,15 +109,13 @@ def main() -> None:
     draw_progress(axes, asked.budget)
     write_whole(asked.out / "afm_forms.png", png_bytes(figure))
 
-    figure = new_figure(9.0, 3.6)
-    pair = figure.subplots(1, 2)
-    for axes, (title, regimes) in zip(pair, TRAPS.items(), strict=True):
-        dress(axes)
-        draw_belief(axes, regimes, asked.budget)
-        axes.set_title(title, fontsize=9)
-    figure.legend(
-        *pair[1].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=7
-    )
+    figure = new_figure(9.0, 5.2)
+    panels = figure.subplots(2, 2, sharex="col")
+    for column, (title, regimes) in zip(panels.T, TRAPS.items(), strict=True):
+        draw_belief(*column, regimes, asked.budget)
+        column[0].set_title(title, fontsize=9)
+    for row in panels:
+        row[0].legend(frameon=False, fontsize=7)
     write_whole(asked.out / "afm_views.png", png_bytes(figure))
 
 

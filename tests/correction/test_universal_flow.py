@@ -156,9 +156,12 @@ def test_an_outlier_does_little_harm(line, drive, plans):
 def test_bounds_say_what_can_be_had(line, drive, plans, gain):
     found, _ = drive(flow_of(2), line(2), lambda sent: gain * sent[-1], plans(12, 4, 2, size=0.4))
     low, high = found[3][-1].unbind(-2)
-    expected = max(gain, 1.0)  # little was tried: never less than the box
-    torch.testing.assert_close(high, torch.full((4, 2), expected), rtol=0.25, atol=0)
-    torch.testing.assert_close(low, torch.full((4, 2), -expected), rtol=0.25, atol=0)
+    if gain > 1:
+        torch.testing.assert_close(high, torch.full((4, 2), gain), rtol=0.25, atol=0)
+        torch.testing.assert_close(low, torch.full((4, 2), -gain), rtol=0.25, atol=0)
+    else:  # never less than what can be had, and little more than the box
+        assert (torch.stack([high, -low]) > 0.9 * gain).all()
+        assert (torch.stack([high, -low]) < 1.5).all()
 
 
 @pytest.mark.parametrize(("mode", "weak"), [("clip", 0.2), ("clip", 0.0), ("mixed", 0.5)])

@@ -279,11 +279,12 @@ def draw_examples(
     # A transition that shows nothing leaves the action where it was.
     effective = torch.where(mute, torch.lerp(effective, executed, 0.5), effective) + noise
     told = std * draw.log_uniform(0.5, 2.0, count, 1, 1)
-    # What a model states of its noise is often an upper bound, and as often far too little.
-    modest, bold = draw.chance(0.35, count, 1, 1), draw.chance(0.5, count, 1, 1)
+    # What a model states of its noise is often an upper bound, and at times too little; what is
+    # learnt of it is added, and has a floor.
+    modest, bold = draw.chance(0.35, count, 1, 1), draw.chance(0.25, count, 1, 1)
     told = told * torch.where(modest, draw.log_uniform(1.0, 100.0, count, 1, 1), 1.0)
-    told = told * torch.where(bold & ~modest, draw.log_uniform(0.02, 1.0, count, 1, 1), 1.0)
-    told = told.clamp_max(LIMIT)
+    told = told * torch.where(bold & ~modest, draw.log_uniform(0.1, 1.0, count, 1, 1), 1.0)
+    told = torch.hypot(told, draw.log_uniform(0.02, 0.1, count, 1, 1)).clamp_max(LIMIT)
     seen = Rows(executed, effective.clamp(-LIMIT, LIMIT), told, valid)
     planned = _draw_plans(now, executed[:, -1:], plans, draw)
     probe = draw.uniform(-1.0, 1.0, count, plans, axes)

@@ -1,0 +1,102 @@
+"""Film policies that others trained, alone and corrected, while their actuators fail.
+
+    python benchmarks/suites/zoo/film.py --out docs/images/policies.gif
+
+It draws MuJoCo's capsules from the side, so no graphics card is needed. A robot that fell stays as
+it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from faults import FaultyVector
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from methods import METHODS
+from run import POLICIES
+from task import Task
+
+from afm_rl.report import style
+from afm_rl.report.film import ENCODERS
+from afm_rl.storage.files import write_whole
+
+SCENES = {"hopper_trpo": "all reversed", "half_cheetah_tqc": "one reversed"}
+SAID = {"all reversed": "all motors reversed", "one reversed": "one motor reversed"}
+VIEW = np.array([2.6, 1.7])  # width and height of a panel, m
+
+
+def record(task: Task, fault: str, method: str, at: int, steps: int) -> list[np.ndarray]:
+    """Return the ends of all capsules, x and z, ``(G, 2, 2)``, at every step until it falls."""
+    row = task.regime.encode(task.faults[fault]).unsqueeze(0)
+    inner = FaultyVector(task.vector(1), task.regime, row, at)
+    envs, act = METHODS[method](task, inner)
+    world = inner.env.envs[0].unwrapped
+    observations, _ = envs.reset(seed=[0])
+    frames = []
+    for _ in range(steps):
+        axes = world.data.geom_xmat.reshape(-1, 3, 3)[..., 2] * world.model.geom_size[:, 1:2]
+        ends = np.stack([world.data.geom_xpos - axes, world.data.geom_xpos + axes], 1)
+        frames.append(ends[1:, :, ::2])  # all but the ground
+        observations, _, terminated, _, _ = envs.step(act(observations))
+        if terminated.any():
+            break
+    envs.close()
+    return frames
+
+
+def draw(axes: Axes, ends: np.ndarray, sizes: np.ndarray, colour: str) -> None:
+    """Draw a robot, and the ground in strips of half a metre."""
+    axes.clear()
+    axes.set_axis_off()
+    left, width = ends[0, :, 0].mean() - VIEW[0] / 2, VIEW[0]
+    axes.set(xlim=(left, left + width), ylim=(-0.15, VIEW[1] - 0.15))
+    points = 72 * axes.get_window_extent().width / axes.figure.dpi / width
+    for x in np.arange(np.floor(left), left + width, 1.0):
+        axes.fill_between([x, x + 0.5], -0.15, 0.0, color=style.ROAD, lw=0)
+    axes.axhline(0.0, color=style.FAINT, lw=0.8)
+    for (x, z), radius in zip(ends.swapaxes(1, 2), sizes, strict=True):
+        axes.plot(x, z, color=colour, lw=2 * radius * points, solid_capstyle="round")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("outputs/policies.gif"))
+    parser.add_argument("--seconds", type=float, default=6.0)
+    parser.add_argument("--rate", type=int, default=15, help="frames a second")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    figure = style.new_figure(6.4, 3.9)
+    panels = figure.subplots(2, 2)
+    canvas = FigureCanvasAgg(figure)
+    rows = []
+    for name, fault in SCENES.items():
+        task = Task(POLICIES / f"{name}.safetensors")
+        rate = task.twin.metadata["render_fps"]
+        steps, at = round(args.seconds * rate), round(args.seconds * rate / 4)
+        sizes = task.twin.unwrapped.model.geom_size[1:, 0]
+        both = [record(task, fault, method, at, steps) for method in ("alone", "AFM")]
+        rows.append((name.split("_t")[0].replace("_", " "), SAID[fault], rate, at, sizes, both))
+
+    def pictures():
+        for frame in range(round(args.seconds * args.rate)):
+            for row, (name, said, rate, at, sizes, both) in zip(panels, rows, strict=True):
+                step = round(frame * rate / args.rate)
+                broken = step >= at
+                for axes, who, film in zip(row, ("alone", "with AFM"), both, strict=True):
+                    colour = style.REGIME if broken and who == "alone" else style.COLOURS[0]
+                    draw(axes, film[min(step, len(film) - 1)], sizes, colour)
+                    state = f", {said}" if broken else ", healthy"
+                    axes.set_title(f"{name}, {who}{state}", fontsize=style.SMALL)
+            canvas.draw()
+            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+    write_whole(args.out, ENCODERS["gif"](pictures()))
+    print(f"wrote {args.out}")
+
+
+if __name__ == "__main__":
+    main()

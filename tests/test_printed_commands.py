@@ -1,0 +1,243 @@
+"""Every command that README and docs print runs, at a small size."""
+
+import argparse
+import contextlib
+import re
+import runpy
+import sys
+import tomllib
+
+import pandas as pd
+import pytest
+from hydra import compose, initialize_config_module
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import ConfigCompositionException
+from omegaconf import OmegaConf
+from pages import PAGES, ROOT, blocks, commands, name_of, write_files
+
+from afm_rl.cli import diagnose, play, report
+from afm_rl.cli.trusted import checked
+from afm_rl.jobs.run import begin, finish
+from afm_rl.missions import build, prepare, run
+
+STEPS, ROWS = 2, 40
+SMALL = {  # settings that are there are made small
+    "budget": STEPS,
+    "seeds": 1,
+    "planner.population": 4,
+    "planner.elites": 2,
+    "planner.iterations": 1,
+    "dynamics.members": 2,
+    "dynamics.hidden": [8, 8],
+    "dynamics.pretrain.samples": 256,
+    "dynamics.pretrain.epochs": 1,
+    "dynamics.pretrain.flights": 2,
+    "dynamics.base.members": 2,
+    "dynamics.base.hidden": [8, 8],
+    "dynamics.base.pretrain.samples": 256,
+    "dynamics.base.pretrain.epochs": 1,
+    "corrector.width": 8,
+    "corrector.train.iterations": 5,
+    "robot.contexts": 2,
+    "robot.data.rounds": [64, 64],
+    "robot.data.fit.epochs": 1,
+}
+LESS = {  # programs that run to their end, with less to do
+    "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none --methods alone AFM "
+    "--episodes 1 --steps 12",
+}
+BUILT = {"method=afm_sysid"}  # takes seconds a step: built, and not run
+NEED = {"robot=gymnasium": "mujoco", "robot=dm_control": "dm_control"}
+FOLDER = re.compile(r"outputs/\S+")
+
+
+class Parsed(Exception):
+    """The arguments were understood; the program need not run."""
+
+
+@pytest.fixture
+def desk(monkeypatch, tmp_path):
+    """Work in a folder with the examples alone, from which modules are imported."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("examples", "benchmarks", "tests"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    for name in ("mine", "run", "show", "task", "methods", "faults"):
+        sys.modules.pop(name, None)
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    """Folder of trained parts that all these tests share."""
+    return tmp_path_factory.getbasetemp() / "trained_parts"
+
+
+@pytest.fixture(scope="session")
+def results(tmp_path_factory):
+    """Write the results of a small run."""
+    folder = tmp_path_factory.mktemp("results")
+    few = ["method=physics", "label=physics", "budget=5", "seeds=2", "planner.population=4"]
+    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+        cfg = compose("config", few)
+    begin(folder, cfg)
+    finish(folder)
+    return str(folder)
+
+
+def settings_of_methods(first):
+    """Return the settings as they are, or those of each method that is compared, AFM first."""
+    single = {"method", "dynamics", "corrector", "updater"}
+    if single & {choice.partition("=")[0] for choice in first}:
+        return [first]
+    whole = compose("config", [choice for choice in first if "." not in choice.partition("=")[0]])
+    methods = sorted(whole.compare, key=lambda name: not name.startswith("afm"))
+    return [[*first, f"method={method}"] for method in methods]
+
+
+def composed(overrides):
+    """Compose settings; None if this method lacks one of them, which others have."""
+    try:
+        return compose("config", overrides)
+    except ConfigCompositionException as error:
+        if "Could not override" not in str(error):
+            raise
+    return None
+
+
+def shrunk(overrides):
+    """Compose the settings of a command line, with its first choices and little to do."""
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    first = [
+        f"{each.get_key_element()}={next(iter(each.sweep_string_iterator()))}"
+        if each.is_sweep_override()
+        else each.input_line
+        for each in parsed
+        if not each.get_key_element().startswith("hydra.")
+    ]
+    first = [choice for choice in first if not choice.startswith(("out=", "launcher="))]
+    cfg = next(filter(None, map(composed, settings_of_methods(first))))
+    for key, value in SMALL.items():
+        if OmegaConf.select(cfg, key) is not None:
+            OmegaConf.update(cfg, key, value)
+    return cfg
+
+
+def run_afm_rl(page, words, desk, cache):
+    write_files(page, desk)
+    asked = [word for word in words if word != "-m"]
+    with checked(asked) as names, initialize_config_module("afm_rl.conf", version_base="1.3"):
+        cfg = shrunk(asked)
+        agent = build(cfg, names)
+    if not BUILT & set(asked):
+        prepare(agent, cache)
+        assert len(run(agent).missions)
+
+
+def run_tool(main, words, monkeypatch, desk, results):
+    """Run a command that reads files: logs are cut, results are small ones."""
+    arguments = []
+    for word in words[1:]:
+        if FOLDER.match(word) and "--out" not in arguments[-1:]:
+            word = results
+        elif word.endswith((".csv", ".parquet")) and (ROOT / word).exists():
+            word = cut(ROOT / word, desk)
+        arguments.append(word)
+    if main is diagnose.main:
+        arguments += ["--out", "diagnosis"]
+    monkeypatch.setattr("sys.argv", [words[0], *arguments])
+    main()
+
+
+def cut(path, desk):
+    """Copy the first rows of a log."""
+    read = pd.read_csv if path.suffix == ".csv" else pd.read_parquet
+    rows = read(path)[:ROWS]
+    target = desk / path.name
+    rows.to_csv(target, index=False) if path.suffix == ".csv" else rows.to_parquet(target)
+    return str(target)
+
+
+def run_python(words, monkeypatch, results):
+    """Run a program; one that takes long only as far as its arguments."""
+    as_module = words[1] == "-m"
+    name, *arguments = words[2:] if as_module else words[1:]
+    arguments = [results if FOLDER.match(a) else a for a in arguments]
+    if not as_module and "parse_args" not in (ROOT / name).read_text():
+        assert not arguments
+        compile((ROOT / name).read_text(), name, "exec")  # takes minutes
+        return
+    if name in LESS:
+        arguments += LESS[name].split()
+    else:
+        parse = argparse.ArgumentParser.parse_args
+
+        def parsed(parser, *given):
+            raise Parsed(parse(parser, *given))
+
+        monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parsed)
+    monkeypatch.setattr("sys.argv", [name, *arguments])
+    monkeypatch.syspath_prepend(str((ROOT / name).parent))
+    start = runpy.run_module if as_module else runpy.run_path
+    try:
+        start(name, run_name="__main__")
+    except Parsed:
+        pass
+    except SystemExit as end:
+        assert not end.code
+
+
+def check_install(words):
+    """Check that extras exist."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for name in re.findall(r"\[(\w+)\]", " ".join(words)):
+        assert name in extras["optional-dependencies"]
+
+
+def check_make(words):
+    assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+
+
+def check_file(words):
+    assert words[0] != "sh" or (ROOT / words[1]).exists()
+
+
+ELSEWHERE = {"pip": check_install, "make": check_make, "sh": check_file}
+ELSEWHERE |= dict.fromkeys(("ray", "kill", "pytest"), check_file)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "command", commands(), ids=lambda c: f"{name_of(c.page)}: {' '.join(c.words)}"
+)
+def test_commands_run(command, desk, cache, results, monkeypatch, capsys):
+    page, words = command
+    program = words[0]
+    for choice, module in NEED.items():
+        if choice in words:
+            pytest.importorskip(module)
+    if program == "afm-rl" and {"--help", "--cfg"} & set(words):
+        with initialize_config_module("afm_rl.conf", version_base="1.3"):
+            compose("config", [word for word in words[1:] if "=" in word])
+    elif program in ("afm-rl", "afm-rl-export"):
+        run_afm_rl(page, words[1:], desk, cache)
+    elif program == "afm-rl-report":
+        run_tool(report.main, [*words, "--no-figures"], monkeypatch, desk, results)
+    elif program == "afm-rl-diagnose":
+        listing = words[1].endswith(".ulg") and len(words) == 2  # says what there is to choose
+        with pytest.raises(SystemExit, match="2") if listing else contextlib.nullcontext():
+            run_tool(diagnose.main, words, monkeypatch, desk, results)
+    elif program == "afm-rl-play":
+        monkeypatch.setattr(play, "_run", lambda options: None)
+        run_tool(play.main, words, monkeypatch, desk, results)
+    elif program == "python":
+        run_python(words, monkeypatch, results)
+    else:
+        ELSEWHERE[program](words)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=name_of)
+def test_snippets_run(page, desk, short_trainings):
+    rest = write_files(page, desk)
+    exec(compile("\n".join(rest), str(page), "exec"), {"__name__": "page"})
