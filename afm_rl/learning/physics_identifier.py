@@ -105,8 +105,9 @@ class PhysicsIdentifier(Learner):
         model = loss.model
         if not isinstance(model, PhysicsModel):
             raise ConfigurationError(
-                f"updater: PhysicsIdentifier needs a model with physics, got {type(model).__name__}; "
-                "choose dynamics=physics with a robot in MuJoCo, or updater=rls"
+                "updater: PhysicsIdentifier needs a model with physics, got "
+                f"{type(model).__name__}; choose dynamics=physics with a robot in MuJoCo, or "
+                "updater=rls"
             )
         self.register_buffer(
             "candidates", _candidates(model, ranges, count, most), persistent=False

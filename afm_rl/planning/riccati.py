@@ -144,7 +144,7 @@ def stationary_value(
         onward, pull = both.split(A.shape[-1], -1)
         change = move.mT @ value @ onward
         value, reach, move = value + change, reach + move @ pull @ move.mT, move @ onward
-        if bool((change.abs().amax() <= 1e-12 * value.abs().amax())):
+        if bool(change.abs().amax() <= 1e-12 * value.abs().amax()):
             break
     gain = torch.linalg.solve_ex(R + B.mT @ value @ B, B.mT @ value @ A).result
     return value.to(dtype), gain.to(dtype)

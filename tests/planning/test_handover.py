@@ -39,7 +39,9 @@ def test_the_value_is_that_of_the_algebraic_riccati_equation():
     weights = torch.eye(4).double(), 0.1 * torch.eye(2).double()
     values, gains = stationary_value(move, push, *weights)
     for a, b, value, gain in zip(move, push, values, gains, strict=True):
-        wanted = scipy.linalg.solve_discrete_are(a.numpy(), b.numpy(), *map(torch.Tensor.numpy, weights))
+        wanted = scipy.linalg.solve_discrete_are(
+            a.numpy(), b.numpy(), *map(torch.Tensor.numpy, weights)
+        )
         torch.testing.assert_close(value, torch.from_numpy(wanted), rtol=1e-8, atol=1e-8)
         assert torch.linalg.eigvals(a - b @ gain).abs().max() < 1
 
@@ -72,6 +74,8 @@ def swing_with(state, torque, physics):
 
 
 def test_what_is_not_quadratic_is_refused():
-    env = PlanningEnv(KnownDynamics(swing, Manifold(2), 1), GoalDistance([0], goal_size=1), [-1.0], [1.0])
+    env = PlanningEnv(
+        KnownDynamics(swing, Manifold(2), 1), GoalDistance([0], goal_size=1), [-1.0], [1.0]
+    )
     with pytest.raises(ConfigurationError, match="Handover needs a quadratic cost"):
         Handover(env, search)

@@ -101,8 +101,8 @@ PATHS = partial(MPPI, horizon=14, population=128, iterations=2, temperature=0.5,
 METHODS = {
     "iCEM": partial(Agent, far=CEM, level=0.0, cap=0.0),
     "MPPI": partial(Agent, far=PATHS, level=0.0, cap=0.0),
-    "MPPI, then LQR": partial(Agent, far=PATHS),
-    "iCEM, then LQR": partial(Agent, far=CEM),
-    "not corrected": partial(Agent, far=CEM, correct=False),
+    "MPPI+LQR": partial(Agent, far=PATHS),
+    "iCEM+LQR": partial(Agent, far=CEM),
+    "uncorrected": partial(Agent, far=CEM, correct=False),
     "truth": partial(Agent, far=CEM, told=True),
 }

@@ -92,7 +92,7 @@ def main() -> None:
     tables = []
     for part in args.parts:
         for method in args.methods:
-            file = args.out / f"{part}.{method.replace(', ', '_').replace(' ', '_')}.csv"
+            file = args.out / f"{part}.{method}.csv"
             if not file.is_file():
                 runs = [run._replace(steps=args.steps or run.steps) for run in PARTS[part]()]
                 rows = pd.DataFrame(play(runs[: args.runs], METHODS[method]))
