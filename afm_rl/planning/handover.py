@@ -57,8 +57,8 @@ class Handover(RecedingHorizonPlanner):
         self,
         env: PlanningEnv,
         far: Callable[[PlanningEnv], RecedingHorizonPlanner],
-        level: float = 1.0,
-        cap: float = 0.0,
+        level: float = 4.0,
+        cap: float = 20.0,
         action_key: NestedKey = "action",
     ) -> None:
         cost = check_instance("planner.env", env, PlanningEnv).cost
