@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -29,11 +29,12 @@ class Handover(RecedingHorizonPlanner):
 
     Args:
         env: a :class:`PlanningEnv` whose cost is a :class:`QuadraticCost` without a task.
-        far: makes the other planner of the environment: a partial planner, such as
-            :class:`ICEM` or :class:`MPPI`, whose memory travels in the tensordict.
+        far: makes the other planner of the environment, such as :class:`ICEM` or :class:`MPPI`,
+            whose memory travels in the tensordict.
         level: cost to go up to which the feedback acts.
         cap: of the cost to go at the end of the other planner's plans; 0 for none.
         action_key: where the action goes.
+        settings: of the other planner.
 
     Raises:
         ConfigurationError: for parts that do not fit.
@@ -56,10 +57,11 @@ class Handover(RecedingHorizonPlanner):
     def __init__(
         self,
         env: PlanningEnv,
-        far: Callable[[PlanningEnv], RecedingHorizonPlanner],
+        far: Callable[..., RecedingHorizonPlanner],
         level: float = 4.0,
         cap: float = 20.0,
         action_key: NestedKey = "action",
+        **settings: Any,
     ) -> None:
         cost = check_instance("planner.env", env, PlanningEnv).cost
         if not isinstance(cost, QuadraticCost) or cost.in_keys:
@@ -67,7 +69,7 @@ class Handover(RecedingHorizonPlanner):
                 f"planner: Handover needs a quadratic cost without a task, such as TrackingCost "
                 f"with in_keys=[] and coordinates=[]; got {type(cost).__name__} with {cost.in_keys}"
             )
-        planner = far(env)
+        planner = far(env, action_key=action_key, **settings)
         check_instance("planner.far", planner, RecedingHorizonPlanner)
         super().__init__(env, planner.memory, action_key)
         self.far = planner

@@ -50,7 +50,7 @@ def test_another_pendulum_keeps_angles_and_speeds(furuta):
 
 
 def test_a_reversed_motor_and_the_body_are_found_from_a_cold_start(furuta, monkeypatch, tmp_path):
-    arguments = ["--methods", "iCEM+LQR", "--parts", "A", "--runs", "8", "--steps", "80"]
+    arguments = ["--methods", "iCEM+LQR", "--parts", "A", "--runs", "8", "--steps", "120"]
     monkeypatch.setattr("sys.argv", ["run.py", *arguments, "--out", str(tmp_path)])
     run = furuta("run")
     run.main()
