@@ -1,6 +1,7 @@
 """A planner that searches, and LQR near the goal."""
 
 import math
+from functools import partial
 
 import pytest
 import scipy.linalg
@@ -13,6 +14,7 @@ from afm_rl.planning import ICEM, GoalDistance, Handover, PlanningEnv, TrackingC
 from afm_rl.planning.riccati import stationary_value
 from afm_rl.spaces.manifold import Manifold
 
+SEARCH = partial(ICEM, horizon=20, population=64, elites=8, sigma=1.0)
 COST = TrackingCost([1.0, 0.1], [0.01], [], angles=[0], in_keys=[])
 
 
@@ -25,12 +27,8 @@ def swing(state, torque, mass=1.0):
     return torch.stack([angle, speed], -1)
 
 
-def search(env):
-    return ICEM(env, horizon=20, population=64, elites=8, sigma=1.0)
-
-
 def planner_of(model, **settings):
-    return Handover(PlanningEnv(model, COST, [-2.0], [2.0]), search, **settings)
+    return Handover(PlanningEnv(model, COST, [-2.0], [2.0]), SEARCH, **settings)
 
 
 def test_the_value_is_that_of_the_algebraic_riccati_equation():
@@ -88,4 +86,4 @@ def test_what_is_not_quadratic_is_refused():
         KnownDynamics(swing, Manifold(2), 1), GoalDistance([0], goal_size=1), [-1.0], [1.0]
     )
     with pytest.raises(ConfigurationError, match="Handover needs a quadratic cost"):
-        Handover(env, search)
+        Handover(env, SEARCH)
