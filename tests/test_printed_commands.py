@@ -46,6 +46,7 @@ LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none --methods alone AFM "
     "--episodes 1 --steps 12",
     "benchmarks/suites/zoo/film.py": "--seconds 0.2",
+    "benchmarks/suites/furuta/run.py": "--methods iCEM+LQR --parts A --runs 2 --steps 12",
 }
 BUILT = {"method=afm_sysid"}  # takes seconds a step: built, and not run
 NEED = {"robot=gymnasium": "mujoco", "robot=dm_control": "dm_control"}
@@ -64,7 +65,7 @@ def desk(monkeypatch, tmp_path):
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.syspath_prepend(str(tmp_path))
     yield tmp_path
-    for name in ("mine", "run", "show", "task", "methods", "faults"):
+    for name in ("mine", "run", "show", "task", "methods", "faults", "plant"):
         sys.modules.pop(name, None)
 
 

@@ -9,6 +9,7 @@ from afm_rl.dynamics.knode import KNODE
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.mujoco import MuJoCoDynamics
 from afm_rl.dynamics.oracle import Oracle
+from afm_rl.dynamics.parametric import ParametricDynamics, PhysicsModel
 from afm_rl.dynamics.quadrotor import Quadrotor
 from afm_rl.dynamics.unknown import UnknownDynamics
 
@@ -22,6 +23,8 @@ __all__ = [
     "KnownDynamics",
     "MuJoCoDynamics",
     "Oracle",
+    "ParametricDynamics",
+    "PhysicsModel",
     "Quadrotor",
     "UnknownDynamics",
     "dubins_step",

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.mujoco_model import HUGE, actuator_names, read_model, space_of, state_names
 from afm_rl.dynamics.mujoco_physics import changed_model
-from afm_rl.dynamics.per_mission import PerMissionModel
+from afm_rl.dynamics.parametric import PhysicsModel
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.regimes import Physics
 
@@ -100,7 +99,7 @@ class Simulator:
         return after
 
 
-class MuJoCoDynamics(KnownDynamics, PerMissionModel):
+class MuJoCoDynamics(KnownDynamics, PhysicsModel):
     r"""Any MuJoCo model: its own simulation, as robot or as the nominal model of one.
 
     States are :math:`(q, \dot q, w)`: positions, velocities and the actuators' activations;
@@ -138,8 +137,6 @@ class MuJoCoDynamics(KnownDynamics, PerMissionModel):
 
     extrapolates = True
     stiff = True
-    nominal: Tensor
-    physics_now: Tensor
     mix: Tensor | None
 
     def __init__(
@@ -172,9 +169,7 @@ class MuJoCoDynamics(KnownDynamics, PerMissionModel):
         super().__init__(simulator, space_of(found), size, noise_std)
         controls = None if mix is None else torch.tensor(mix, dtype=torch.float64)
         self.register_buffer("mix", controls, persistent=False)
-        self.physics_names = tuple(physics)
-        self.register_buffer("nominal", torch.tensor(nominal), persistent=False)
-        self.register_buffer("physics_now", self.nominal, persistent=False)
+        self._name_physics(physics)
         self.mjcf = found
         self.dt = skip * float(found.opt.timestep)
         low, high = torch.as_tensor(found.actuator_ctrlrange).unbind(-1)
@@ -191,26 +186,6 @@ class MuJoCoDynamics(KnownDynamics, PerMissionModel):
     def names(self) -> tuple[list[str], list[str]]:
         """Names of the state coordinates, ``q_JOINT``, ``v_JOINT``, ``w_...``, and of actions."""
         return state_names(self.mjcf), actuator_names(self.mjcf)
-
-    def set_physics(self, physics: Tensor | None) -> None:
-        """Change the physics from now on: rows ``(P,)``, or ``(*L, P)`` for leading dimensions.
-
-        See :class:`~afm_rl.regimes.Physics`; None for the nominal ones.
-        """
-        self.physics_now = self.nominal if physics is None else physics.detach()
-
-    @contextmanager
-    def assuming(self, physics: Tensor) -> Iterator[None]:
-        """Predict with other physics ``(*L, P)`` within a ``with`` block."""
-        now = self.physics_now
-        self.set_physics(physics)
-        try:
-            yield
-        finally:
-            self.physics_now = now
-
-    def _owned(self) -> list[tuple[nn.Module, str]]:
-        return [(self, "physics_now")]
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the next state ``(*B, S)``."""
@@ -249,7 +224,7 @@ class MuJoCoDynamics(KnownDynamics, PerMissionModel):
         numbers = [rows, plans]
         told = self.physics_now
         if not torch.equal(told, self.nominal.to(told).expand_as(told)):
-            told = told.reshape(*told.shape[:-1], *[1] * (len(batch) + 1 - told.dim()), -1)
+            told = self._physics_for(len(batch))
             numbers.append(told.expand(*batch, -1).reshape(len(rows), told.shape[-1]))
         after = step(*(x.detach().cpu().double().numpy() for x in numbers))
         return torch.from_numpy(after).to(state).reshape(*batch, *after.shape[1:])

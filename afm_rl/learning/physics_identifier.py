@@ -10,7 +10,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.dynamics import PhysicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.learning.error_decomposition import check_half_range, decompose_error
 from afm_rl.learning.learner import Learner
@@ -28,7 +28,7 @@ class Belief(NamedTuple):
 
 
 class PhysicsIdentifier(Learner):
-    r"""Finds mass, lengths, ... of a body in MuJoCo, among candidates, per mission, at every step.
+    r"""Finds mass, lengths, ... of a body, among candidates, per mission, at every step.
 
     A body of another length is not what an action could undo; a reversed motor is. So each
     candidate :math:`\theta` is judged by what *no action explains* under it
@@ -47,9 +47,11 @@ class PhysicsIdentifier(Learner):
     nothing but the actuated axes looks like weak actuators, and is left to these.
 
     Args:
-        loss: a loss over a :class:`~afm_rl.dynamics.MuJoCoDynamics`, whose keys are read.
+        loss: a loss over a model whose physics can be set, such as
+            :class:`~afm_rl.dynamics.MuJoCoDynamics` or
+            :class:`~afm_rl.dynamics.ParametricDynamics`; its keys are read.
         ranges: lowest and highest value of each parameter that may differ, by its name in
-            :attr:`MuJoCoDynamics.physics_names <afm_rl.dynamics.MuJoCoDynamics>`.
+            ``model.physics_names``.
         count: candidates per parameter, at equal distances; the nominal physics come on top. All
             combinations are tried, at most ``most``. What too coarse a grid leaves over looks like
             actuators.
@@ -62,12 +64,13 @@ class PhysicsIdentifier(Learner):
         mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
 
     Raises:
-        ConfigurationError: for a setting out of range, or a model that is not MuJoCo's.
+        ConfigurationError: for a setting out of range, or a model without physics.
 
     >>> from tensordict import TensorDict
     >>> pole = '''<mujoco><worldbody><body><joint type="slide" axis="1 0 0" name="x"/>
     ... <geom size=".1"/><body><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 1"
     ... size=".05"/></body></body></worldbody><actuator><motor joint="x"/></actuator></mujoco>'''
+    >>> from afm_rl.dynamics import MuJoCoDynamics
     >>> model = MuJoCoDynamics(pole, frame_skip=10, noise_std=1e-3)
     >>> updater = PhysicsIdentifier(GaussianNLLLoss(model), {"length": [0.5, 1.5]}, [1.0], 11)
     >>> state, long = torch.tensor([0.0, 0.3, 0.0, 0.0]), model.nominal.clone()
@@ -100,10 +103,11 @@ class PhysicsIdentifier(Learner):
     ) -> None:
         super().__init__(loss, mask_key)
         model = loss.model
-        if not isinstance(model, MuJoCoDynamics):
+        if not isinstance(model, PhysicsModel):
             raise ConfigurationError(
-                f"updater: PhysicsIdentifier needs MuJoCoDynamics, got {type(model).__name__}; "
-                "choose dynamics=physics with a robot in MuJoCo, or updater=rls"
+                "updater: PhysicsIdentifier needs a model with physics, got "
+                f"{type(model).__name__}; choose dynamics=physics with a robot in MuJoCo, or "
+                "updater=rls"
             )
         self.register_buffer(
             "candidates", _candidates(model, ranges, count, most), persistent=False
@@ -120,9 +124,9 @@ class PhysicsIdentifier(Learner):
         self.belief = MissionState(self._nothing(1))
 
     @property
-    def model(self) -> MuJoCoDynamics:
+    def model(self) -> PhysicsModel:
         """The model whose physics are set."""
-        return cast(MuJoCoDynamics, self.loss.model)
+        return cast(PhysicsModel, self.loss.model)
 
     @property
     def physics(self) -> dict[str, Tensor]:
@@ -176,7 +180,7 @@ class PhysicsIdentifier(Learner):
 
 
 def _candidates(
-    model: MuJoCoDynamics, ranges: Mapping[str, Sequence[float]], count: int, most: int
+    model: PhysicsModel, ranges: Mapping[str, Sequence[float]], count: int, most: int
 ) -> Tensor:
     """Return rows of physics ``(K, P)``; the first is the nominal one."""
     names, count = model.physics_names, check_count("updater.count", count, low=2)

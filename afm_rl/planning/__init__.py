@@ -1,6 +1,7 @@
 """Planners, and the world in which they imagine."""
 
 from afm_rl.planning.costs import Cost, GoalDistance, KnownReward
+from afm_rl.planning.handover import Handover
 from afm_rl.planning.icem import ICEM
 from afm_rl.planning.imported_policy import policy_from_cleanrl, policy_from_sb3
 from afm_rl.planning.law import LawPlanner
@@ -18,6 +19,7 @@ __all__ = [
     "MPPI",
     "Cost",
     "GoalDistance",
+    "Handover",
     "KnownReward",
     "LawPlanner",
     "PlanningEnv",

@@ -59,6 +59,9 @@ class PlanningEnv(ModelBasedEnvBase):
     torch.Size([7])
     """
 
+    value: Callable[[Tensor], Tensor] | None = None
+    """Cost to go ``(*B, N)`` of last states ``(*B, N, S)``, which :meth:`returns` adds; or None."""
+
     def __init__(
         self,
         dynamics: DynamicsModel,
@@ -184,4 +187,5 @@ class PlanningEnv(ModelBasedEnvBase):
         by_coordinate = [part.movedim(-1, 0) for part in (first, states[..., :-1, :])]
         before = torch.cat(by_coordinate, -1).movedim(0, -1)
         wide = [entry[..., None, None, :] for entry in task]
-        return -self.cost(before, actions, states, *wide).sum(-1)
+        total = self.cost(before, actions, states, *wide).sum(-1)
+        return -total if self.value is None else -total - self.value(states[..., -1, :])

@@ -113,6 +113,43 @@ def solve_lq(problem: LQProblem, sweeps: int = 300, patience: float = 3.0) -> LQ
     )
 
 
+def stationary_value(
+    A: Tensor, B: Tensor, Q: Tensor, R: Tensor, doublings: int = 20
+) -> tuple[Tensor, Tensor]:
+    r"""Return P and K of linear-quadratic control without an end, all of a batch at once.
+
+    .. math:: \sum_{k=0}^\infty x_k^\top Q x_k + u_k^\top R u_k = x_0^\top P x_0
+        \quad\text{for}\quad u_k = -K x_k,\ x_{k+1} = A x_k + B u_k
+
+    Each round of the structure-preserving doubling algorithm (Chu et al. 2004) doubles the number
+    of stages that P looks ahead. In double precision, returned in that of A.
+
+    Args:
+        A: ``(*B, S, S)``.
+        B: ``(*B, S, A)``.
+        Q: positive semi-definite, ``(*B, S, S)``.
+        R: positive definite, ``(*B, A, A)``.
+        doublings: rounds at most; fewer if P no longer changes.
+
+    >>> one = torch.ones(1, 1)
+    >>> stationary_value(one, one, one, one)  # the golden ratio, and its inverse
+    (tensor([[1.6180]]), tensor([[0.6180]]))
+    """
+    dtype, eye = A.dtype, torch.eye(A.shape[-1], device=A.device).double()
+    A, B, Q, R = (x.double() for x in (A, B, Q, R))
+    move, value = A, Q.expand_as(A)
+    reach = B @ torch.linalg.solve(R, B.mT)
+    for _ in range(doublings):
+        both = torch.linalg.solve_ex(eye + reach @ value, torch.cat([move, reach], -1)).result
+        onward, pull = both.split(A.shape[-1], -1)
+        change = move.mT @ value @ onward
+        value, reach, move = value + change, reach + move @ pull @ move.mT, move @ onward
+        if bool(change.abs().amax() <= 1e-12 * value.abs().amax()):
+            break
+    gain = torch.linalg.solve_ex(R + B.mT @ value @ B, B.mT @ value @ A).result
+    return value.to(dtype), gain.to(dtype)
+
+
 def _last(wrong: Tensor) -> Tensor:
     """Keep the last true entry of ``(N, b, A)`` for each b."""
     stages, flights, inputs = wrong.shape

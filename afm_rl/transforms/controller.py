@@ -46,9 +46,9 @@ class Controller(nn.Module):
     >>> from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
     >>> planner = MPPI(PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5]))
     >>> controller = Controller(planner, ActionFlowPolicy(Dubins(), planner.action_spec))
-    >>> controller.sizes
-    {'memory': 944, 'observation': 3, 'goal': 2, 'noise': 3000}
-    >>> memory, noise = torch.zeros(944), controller.draw()
+    >>> list(controller.sizes)
+    ['memory', 'observation', 'goal', 'noise']
+    >>> memory, noise = torch.zeros(controller.sizes["memory"]), controller.draw()
     >>> memory, action = controller(memory, torch.zeros(3), torch.ones(2), noise)
     >>> action.shape
     torch.Size([2])

@@ -102,5 +102,5 @@ def test_bad_settings_are_named(settings, word):
 
 
 def test_other_models_are_refused():
-    with pytest.raises(ConfigurationError, match="needs MuJoCoDynamics, got Dubins"):
+    with pytest.raises(ConfigurationError, match="needs a model with physics, got Dubins"):
         PhysicsIdentifier(GaussianNLLLoss(Dubins()), LENGTHS, [1.0, 1.0])

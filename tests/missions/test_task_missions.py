@@ -101,7 +101,7 @@ def test_the_change_comes_when_the_schedule_says(tmp_path):
         ([*PENDULUM, "tracks=ethz_2"], "tracks=.*: expected all, or Pendulum-v1"),
         ([*PENDULUM, "cost=goal_position"], "cost: reads 2 numbers from 'goal'"),
         (["cost=reward"], "cost=reward: robot=ugv has no reward"),
-        (["updater=sysid"], "updater: PhysicsIdentifier needs MuJoCoDynamics, got Dubins"),
+        (["updater=sysid"], "updater: PhysicsIdentifier needs a model with physics, got Dubins"),
         (["robot=inverted_pendulum", "updater=sysid"], "updater.ranges=None: expected what may"),
         (["robot=reacher", "robot.physics={size: [1, 2]}"], "robot.physics=.*: expected"),
     ],
