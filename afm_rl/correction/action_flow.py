@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -106,7 +107,7 @@ class ActionFlow(Believer):
         compile: bool = False,
         cache: str | Path = "~/.cache/afm_rl",
         network: AxisNetwork | None = None,
-        **rules: float,
+        **rules: Any,
     ) -> None:
         size, place = len(torch.as_tensor(action_low)), list(place)
         rows = max(12, size + 4) if rows is None else check_count("corrector.rows", rows)
@@ -122,8 +123,15 @@ class ActionFlow(Believer):
         follows[1 + len(names) : len(follows) - len(late) - 1] = [True] * len(LINEAR)
         follows[-1] = True
         super().__init__(
-            *(action_low, action_high, rows, memory, models, len(place)),
-            *(worth, acting, follows),
+            action_low,
+            action_high,
+            recent=rows,
+            memory=memory,
+            models=models,
+            place=len(place),
+            worth=worth,
+            acting=acting,
+            follows=follows,
             **rules,
         )
         self.readings, self.place = names, place

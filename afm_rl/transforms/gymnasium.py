@@ -28,7 +28,8 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
     ``info["afm"]`` has, after each step, ``planned``, ``executed`` and ``predicted`` ``(A,)``, the
     last being the effect that the executed action is expected to have; ``corrects``, whether the
     planned action was replaced by the corrector's; the ``innovation``, in standard deviations of
-    the model; and the ``noise`` ``(A,)`` of the effects that was learnt. :attr:`diagnosis` says in words what the actuators seem to do.
+    the model; and the ``noise`` ``(A,)`` of the effects that was learnt. :attr:`diagnosis` says in
+    words what the actuators seem to do.
 
     What the model takes for the state is, with ``"mujoco"`` or a
     :class:`~afm_rl.dynamics.MuJoCoDynamics`, the whole state of the environment's simulation, else
