@@ -44,7 +44,13 @@ POLICY = Path(__file__).parents[1] / "examples" / "policies" / "pendulum_sac.saf
 OWN = [f"robot.xml={ASSETS / 'inverted_pendulum.xml'}"]
 OWN += ["robot.reward=afm_rl.envs.task.rewards.upright"]
 STILL = ["robot=inverted_pendulum", "cost=tracking", "cost.weights=[1,1,1,1]"]
-STILL += ["cost.action_weights=[1]", "cost.coordinates=[]", "cost.rest=null", "cost.in_keys=[]"]
+STILL += [
+    "~planner.temperature",
+    "cost.action_weights=[1]",
+    "cost.coordinates=[]",
+    "cost.rest=null",
+    "cost.in_keys=[]",
+]
 PARTNERS = {  # what else must be chosen for a choice to make sense
     "dynamics=oracle": ["updater=oracle"],
     "dynamics=oracle_pe": ["updater=oracle"],
