@@ -85,7 +85,7 @@ class Believer(PairCorrector):
         follows: Sequence[bool] | None = None,
         odds: float = 2.5,
         discount: float = 0.95,
-        noise: float = 0.1,
+        noise: float = 0.05,
         noise_rate: float = 0.1,
         least_noise: float = 0.02,
         quiet: float = 1.0,
