@@ -29,7 +29,7 @@ demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and f
 
 test: $(VENV)/.with-test ## Run all tests with coverage (at least 95 %)
 	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 \
-		--cov --cov-report=term-missing:skip-covered --cov-fail-under=95
+		--cov --cov-report=term-missing:skip-covered --cov-fail-under=95 --durations=10
 
 lint: $(VENV)/.with-test ## Check style, format and spelling
 	@$(BIN)/ruff check --quiet . && $(BIN)/ruff format --quiet --check . && $(BIN)/codespell

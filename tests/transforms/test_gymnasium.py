@@ -58,6 +58,7 @@ def test_healthy_steps_are_those_of_the_environment(dtype):
         np.testing.assert_array_equal(seen, other)
         assert rest == others and told["mine"] == info["mine"]
         assert not told["afm"]["corrects"] and told["afm"]["innovation"] < 1
+        assert (0 < told["afm"]["noise"]).all() and (told["afm"]["noise"] <= 0.05).all()
 
 
 def test_reversed_actuators_do_what_was_planned():
