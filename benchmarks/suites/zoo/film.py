@@ -24,8 +24,8 @@ from afm_rl.report import style
 from afm_rl.report.film import ENCODERS
 from afm_rl.storage.files import write_whole
 
-SCENES = {"hopper_trpo": "all reversed", "half_cheetah_tqc": "one reversed"}
-SAID = {"all reversed": "reversed", "one reversed": "thigh reversed"}
+SCENES = {"hopper_trpo": "all reversed", "half_cheetah_tqc": "late 4"}
+SAID = {"all reversed": "reversed", "late 4": "4 steps late"}
 VIEW = 4.0, 2.2  # width and height of a panel, m
 GOES_ON = {"hopper_trpo": {"terminate_when_unhealthy": False}}
 
