@@ -173,7 +173,9 @@ class Page:
         afm = sides[1].info["afm"]
         state = "**corrects**" if afm["corrects"] else "does nothing"
         lines = [f"AFM {state}; innovation {afm['innovation']:.2f}"]
-        lines += [f"{name}: {afm[name]}" for name in ("belief", "noise", "delay") if name in afm]
+        if "noise" in afm:
+            noise = ", ".join(f"{value:.2g}" for value in np.ravel(afm["noise"]))
+            lines.append(f"noise that was learnt: {noise}")
         words = str(sides[1].env.diagnosis)
         for k, name in enumerate(self.world.robot.names):
             words = words.replace(f"actuator {k}:", f"{name}:").replace(f"a_{k}:", f"{name}:")
