@@ -1,5 +1,6 @@
 """Suites are used as a command uses them: packages that it trusts, with their settings."""
 
+import importlib
 import sys
 from pathlib import Path
 
@@ -29,3 +30,20 @@ def agent_of():
             return build(cfg, names)
 
     return make
+
+
+@pytest.fixture
+def modules_of(monkeypatch):
+    """Import a suite's modules by name; they are forgotten afterwards."""
+    names = []
+
+    def begin(suite):
+        names.extend(path.stem for path in suite.glob("*.py"))
+        monkeypatch.syspath_prepend(str(suite))
+        for name in names:
+            sys.modules.pop(name, None)
+        return importlib.import_module
+
+    yield begin
+    for name in names:
+        sys.modules.pop(name, None)

@@ -1,7 +1,5 @@
 """The Furuta pendulum whose motor sign, length and tip mass are hidden, at a small size."""
 
-import importlib
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +11,9 @@ SUITE = Path(__file__).parents[2] / "benchmarks" / "suites" / "furuta"
 
 
 @pytest.fixture
-def furuta(monkeypatch):
+def furuta(modules_of):
     """The suite's modules, by name."""
-    names = [path.stem for path in SUITE.glob("*.py")]
-    monkeypatch.syspath_prepend(str(SUITE))
-    for name in names:
-        sys.modules.pop(name, None)
-    yield importlib.import_module
-    for name in names:
-        sys.modules.pop(name, None)
+    return modules_of(SUITE)
 
 
 def test_the_equations_are_those_of_the_simulator(furuta):

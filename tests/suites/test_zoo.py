@@ -1,7 +1,5 @@
 """Policies of others in tasks whose actuators fail, at a small size."""
 
-import importlib
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +12,9 @@ POLICIES = sorted((SUITE.parents[2] / "examples" / "policies" / "zoo").glob("*.s
 
 
 @pytest.fixture
-def zoo(monkeypatch):
+def zoo(modules_of):
     """The suite's modules, by name."""
-    names = [path.stem for path in SUITE.glob("*.py")]
-    monkeypatch.syspath_prepend(str(SUITE))
-    for name in names:
-        sys.modules.pop(name, None)
-    yield importlib.import_module
-    for name in names:
-        sys.modules.pop(name, None)
+    return modules_of(SUITE)
 
 
 @pytest.fixture

@@ -173,7 +173,7 @@ def _of(rows: pd.DataFrame, method: str, part: str) -> pd.DataFrame:
 
 
 def _middle(values: pd.Series) -> str:
-    return f"{np.quantile(values, 0.5, method='lower'):.2f}" if len(values) else "–"
+    return f"{np.quantile(values, 0.5, method='higher'):.2f}" if len(values) else "–"
 
 
 if __name__ == "__main__":
