@@ -53,13 +53,16 @@ def test_who_knows_the_truth_acts_as_the_healthy_policy(command):
     assert np.allclose(after, after["none"], rtol=0.1) and results["survived"].any()
 
 
-def test_recovered(zoo):
-    rewards = np.ones(500)
-    assert zoo("run").recovered(rewards, 100) == 0
-    rewards[100:140] = 0.45
-    assert zoo("run").recovered(rewards, 100) == 22  # the hundred steps from then on miss 9.9
-    rewards[300:] = 0.0
-    assert zoo("run").recovered(rewards, 100) == np.inf
+def test_recovered_is_to_be_no_worse_than_the_worst_healthy_second_but_for_a_tenth(zoo):
+    episodes, healthy = zoo("episodes"), np.tile([0.8, 1.2], 200)[:, None]
+    level = episodes.usual(healthy, window=10)
+    assert level == pytest.approx(0.9)
+    rewards = np.ones(300)
+    assert episodes.recovered(rewards, level, 10) == 0
+    rewards[:40] = 0.45
+    assert episodes.recovered(rewards, level, 10) == 39  # one of the ten steps from then on
+    rewards[200:] = 0.0
+    assert episodes.recovered(rewards, level, 10) == np.inf
 
 
 def test_shares_are_those_of_what_is_healthy(zoo):

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 import torch
-from methods import METHODS, Agent
+from agents import METHODS, Agent
 from plant import PERIOD, Plant, Simulated, drawn
 
 from afm_rl.storage.files import write_whole

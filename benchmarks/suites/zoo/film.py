@@ -17,8 +17,7 @@ from faults import FaultyVector
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from methods import METHODS
-from run import POLICIES
-from task import Task
+from task import POLICIES, Task
 
 from afm_rl.report import style
 from afm_rl.report.film import ENCODERS

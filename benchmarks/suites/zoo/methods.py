@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from task import Task
 from torch import Tensor
 
 from afm_rl import ActionFlowVectorWrapper
-from afm_rl.correction import LeastSquares
+from afm_rl.correction import L1Augmentation, LeastSquares
 from afm_rl.learning.watching import Watching
 
 Acting = Callable[[np.ndarray], np.ndarray]
@@ -29,26 +30,34 @@ def least_squares(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
     return ActionFlowVectorWrapper(envs, corrector=corrector, **task.model), task.act
 
 
+def l1(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+    """L1 adaptive augmentation: filtered disturbances are taken off."""
+    corrector = L1Augmentation(task.low, task.high, task.twin.unwrapped.dt)
+    return ActionFlowVectorWrapper(envs, corrector=corrector, **task.model), task.act
+
+
 def afm(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
     """The wrapper as it comes, over the exact model."""
     return ActionFlowVectorWrapper(envs, **task.model), task.act
 
 
-def afm_measured(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
-    """The same, but the policy is shown what was measured while commands act late."""
-    return ActionFlowVectorWrapper(envs, late="leave", **task.model), task.act
-
-
-def afm_learned(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
-    """The same over an ensemble that is fitted to healthy episodes of this policy."""
+@cache
+def learned(task: Task) -> tuple[Any, Any]:
+    """Return an ensemble that is fitted to healthy episodes of a policy, and its corrector."""
     healthy = ActionFlowVectorWrapper(task.vector(WATCHED), Watching())
     observations, infos = healthy.reset(seed=list(range(10_000, 10_000 + WATCHED)))
     while not infos["afm"]["learned"].all():
         for _ in range(task.steps):
             observations = healthy.step(task.act(observations))[0]
         observations, infos = healthy.reset()
-    found = healthy.watching.fitted
-    return ActionFlowVectorWrapper(envs, found, corrector=healthy._loop.corrector), task.act
+    healthy.close()
+    return healthy.watching.fitted, healthy._loop.corrector
+
+
+def afm_learned(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+    """The same over a model that was learned from watching."""
+    model, corrector = learned(task)
+    return ActionFlowVectorWrapper(envs, model, corrector=corrector), task.act
 
 
 class Truth:
@@ -99,8 +108,8 @@ def truth(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
 METHODS = {
     "alone": alone,
     "least squares": least_squares,
+    "L1": l1,
     "AFM": afm,
-    "AFM, measured": afm_measured,
     "AFM, learned": afm_learned,
     "truth": truth,
 }

@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+HARM = 0.05  # share of the healthy return
 NUMBERED = 8  # policies up to which each cell has its number
 
 
@@ -43,8 +44,20 @@ def print_tables(results: pd.DataFrame) -> None:
     for policy, rows in results.groupby("policy"):
         print(f"\n{policy}: return after the fault (survivors, where some fell)\n")
         print_table(rows, _sum)
-    print("\nAll policies: share of the healthy return; survivors; median steps until recovered\n")
-    print_table(results, _summary)
+    for title, cell in ALL.items():
+        print(f"\nAll policies: {title}\n")
+        print_table(results, cell)
+    harmed(results)
+
+
+def harmed(results: pd.DataFrame) -> None:
+    """Say where a correction has less of the healthy return than the policy alone."""
+    keys = ["policy", "fault"]
+    table = results.pivot_table(index=keys, columns="method", values="share", observed=True)
+    for method in table.columns.drop("alone"):
+        lost = (table["alone"] - table[method]).loc[lambda gap: gap > HARM].sort_values()[::-1]
+        cases = ", ".join(f"{policy} {fault} -{gap:.2f}" for (policy, fault), gap in lost.items())
+        print(f"\nless than alone by more than {HARM}, {method}: {cases or 'nowhere'}")
 
 
 def print_table(rows: pd.DataFrame, cell) -> None:
@@ -60,10 +73,15 @@ def _sum(rows: pd.DataFrame) -> str:
     return f"{rows['after'].mean():.0f}" + ("" if alive == 1 else f" ({alive:.0%})")
 
 
-def _summary(rows: pd.DataFrame) -> str:
-    share, alive = rows["share"].mean(), rows["survived"].mean()
-    steps = f"{np.quantile(rows['recovered'], 0.5, method='lower'):.0f}".replace("inf", "∞")
-    return f"{share:.2f}; {alive:.0%}; {steps}"
+def _steps(rows: pd.DataFrame) -> str:
+    return f"{np.quantile(rows['recovered'], 0.5, method='lower'):.0f}".replace("inf", "∞")
+
+
+ALL = {
+    "share of the healthy return": lambda rows: f"{rows['share'].mean():.2f}",
+    "survivors": lambda rows: f"{rows['survived'].mean():.0%}",
+    "median steps until recovered": _steps,
+}
 
 
 def draw(results: pd.DataFrame, file: Path) -> None:

@@ -14,6 +14,7 @@ from gymnasium.vector import SyncVectorEnv
 from afm_rl.envs.task.pendulum import pendulum_step
 from afm_rl.planning import load_policy
 
+POLICIES = Path(__file__).parents[3] / "examples" / "policies" / "zoo"
 HEALTHY = 0.2  # share of an episode before the actuators fail
 
 

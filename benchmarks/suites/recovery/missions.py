@@ -1,0 +1,117 @@
+"""Robots that a planner drives, by the command line of the library."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+METHODS = {"alone": "physics", "AFM": "afm_physics", "truth": "oracle"}
+
+
+class Mission(NamedTuple):
+    """A robot on the command line, and what its faults are called."""
+
+    options: list[str]
+    dt: float  # s
+    steps: str  # the setting that says how many
+    count: int
+    faults: dict[str, str]
+
+
+def _actuators(count: int) -> dict[str, str]:
+    every = range(count)
+    faults = {
+        "one reversed": "{gain_0: -1}",
+        "all reversed": "{" + ", ".join(f"gain_{k}: -1" for k in every) + "}",
+        "half": "{" + ", ".join(f"gain_{k}: .5" for k in every) + "}",
+        "bias .3": "{" + ", ".join(f"bias_{k}: .3" for k in every) + "}",
+        "late 2": "{delay: 2}",
+        "swapped pair": "{from_0: 1, from_1: 0}",
+    }
+    return faults if count > 1 else {k: v for k, v in faults.items() if k != "swapped pair"}
+
+
+GROUND = {
+    "one reversed": "{v_gain: -1}",
+    "all reversed": "{v_gain: -1, omega_gain: -1}",
+    "half": "{v_gain: .5, omega_gain: .5}",
+    "bias .3": "{v_bias: .3, omega_bias: .3}",
+    "late 2": "{delay: 2}",
+    "swapped pair": "{v_from: 1, omega_from: 0}",
+}
+FLIGHT = {  # a thrust cannot be reversed, and half of it does not carry the robot
+    "one reversed": "{roll_gain: -1}",
+    "all reversed": "{roll_gain: -1, pitch_gain: -1, yaw_gain: -1}",
+    "half": "{roll_gain: .5, pitch_gain: .5, yaw_gain: .5}",
+    "late 2": "{delay: 2}",
+    "swapped pair": "{roll_from: 2, pitch_from: 1}",
+}
+CONTROL = ["robot=dm_control", "robot.schedule.at=[0.4]"]
+MISSIONS = {
+    "cart-pole": Mission(
+        [*CONTROL, "robot.domain=cartpole", "robot.task=balance"],
+        *(0.01, "robot.steps", 500, _actuators(1)),
+    ),
+    "hard reacher": Mission(
+        [*CONTROL, "robot.domain=reacher", "robot.task=hard", "planner.hold=2"],
+        *(0.02, "robot.steps", 400, _actuators(2)),
+    ),
+    "ground robot": Mission(
+        ["robot=ugv", "tracks=ethz_1", "planner.population=200", "robot.schedule.at=[0.3]"],
+        *(0.2, "budget", 400, GROUND),
+    ),
+    "quadrotor": Mission(
+        ["robot=quadrotor", "robot.schedule.times=[2.0]", "robot.env.start_noise=0.02"],
+        *(0.05, "robot.env.duration", 8, FLIGHT),
+    ),
+}
+
+
+def rewards(
+    task: str, method: str, pairs: list[tuple[str, int]], out: Path, steps: int | None
+) -> tuple[dict[tuple[str, int], np.ndarray], float]:
+    """Return the rewards after the fault by fault and seed, and seconds a step."""
+    mission, name = MISSIONS[task], METHODS[method]
+    faults = {"none": "{}", **mission.faults}
+    asked = [fault for fault in dict.fromkeys(fault for fault, _ in pairs) if fault in faults]
+    seeds = max(seed for _, seed in pairs) + 1
+    folder = out / f"{task.replace(' ', '_')}.{name}.{len(asked)}"
+    if not (folder / "missions.csv").is_file():
+        regimes = ", ".join(faults[fault] for fault in asked)
+        command = [sys.executable, "-m", "afm_rl", *mission.options, f"regimes=[{regimes}]"]
+        command += [f"compare=[{name}]", f"seeds={seeds}", f"hydra.run.dir={folder}"]
+        command += [f"{mission.steps}={steps or mission.count}"]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    table = pd.read_parquet(folder / "jobs" / name / "steps.parquet")
+    groups = [group for _, group in table.groupby("mission", sort=True)]
+    length = max(len(group) for group in groups)
+    found = {}
+    for number, group in enumerate(groups):
+        pair = asked[number // seeds], number % seeds
+        values = _rewards(group)
+        # A flight or episode that ended early has no reward any more.
+        worst = values.min() if task == "quadrotor" else 0.0
+        values = np.append(values, np.full(length - len(group), worst))
+        active = group["regime_active"].to_numpy()
+        found[pair] = values[_change(active) if active.any() else 0 :]
+    return found, mission.dt
+
+
+def _change(active: np.ndarray) -> int:
+    return int(np.flatnonzero(active)[0])
+
+
+def _rewards(steps: pd.DataFrame) -> np.ndarray:
+    """Return what counts at each step: reward, less error, or speed towards the goal."""
+    if "reward" in steps:
+        return steps["reward"].to_numpy(float)
+    if "square_error_x" in steps:
+        return -np.sqrt(steps[[f"square_error_{axis}" for axis in "xyz"]].sum(1).to_numpy(float))
+    place, goal = steps[["x", "y"]].to_numpy(float), steps[["goal_x", "goal_y"]].to_numpy(float)
+    left = np.linalg.norm(goal - place, axis=1)[:-1]
+    return left - np.linalg.norm(goal[:-1] - place[1:], axis=1)

@@ -1,0 +1,56 @@
+"""What a step of each correction costs, as a multiple of AFM's.
+
+    python benchmarks/suites/zoo/cost.py --policy half_cheetah_tqc
+
+One environment for each method, stepped in turns in one process, from a fault on. The time of the
+policy alone is taken off.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from faults import FaultyVector
+from methods import METHODS
+from task import POLICIES, Task
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--policy", default="half_cheetah_tqc")
+    parser.add_argument("--folder", type=Path, default=POLICIES, help="where the policy is")
+    parser.add_argument("--fault", default="one reversed")
+    parser.add_argument("--steps", type=int, default=300)
+    parser.add_argument("--methods", nargs="*", default=["alone", "least squares", "L1", "AFM"])
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    task = Task(args.folder / f"{args.policy}.safetensors")
+    spent = {name: np.quantile(times, 0.5) for name, times in measure(task, args).items()}
+    print("| method | µs a step | of AFM's |\n|---|---|---|")
+    for name, seconds in spent.items():
+        more = seconds - spent["alone"]
+        print(f"| {name} | {1e6 * more:.0f} | {more / (spent['AFM'] - spent['alone']):.2f} |")
+
+
+def measure(task: Task, args: argparse.Namespace) -> dict[str, list[float]]:
+    """Return the seconds of processor time of every step, of each method."""
+    row = task.regime.encode(task.faults[args.fault]).unsqueeze(0)
+    players, spent = {}, {name: [] for name in args.methods}
+    for name in args.methods:
+        envs, act = METHODS[name](task, FaultyVector(task.vector(1), task.regime, row, 0))
+        players[name] = [envs, act, envs.reset(seed=[0])[0]]
+    for _ in range(args.steps):
+        for name, player in players.items():
+            envs, act, seen = player
+            start = time.process_time()
+            player[2] = envs.step(act(seen))[0]
+            spent[name].append(time.process_time() - start)
+    return spent
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""Episodes whose actuators fail, side by side, and how soon their rewards are as before."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from functools import cache
+
+import numpy as np
+import pandas as pd
+import torch
+from faults import FaultyVector
+from methods import METHODS
+from task import Task
+
+from afm_rl.storage.files import write_whole
+
+HEALTHY = [("none", episode) for episode in range(5)]  # what "as before" means is read from these
+SECOND, MISSING = 1.0, 0.1  # s; share of the healthy reward
+
+
+def complete(task: Task, method: str, faults: list[str], args: argparse.Namespace) -> pd.DataFrame:
+    """Play those episodes of a policy and a method that have no results yet; return all."""
+    file = args.out / f"{task.name}.{method.replace(', ', '_').replace(' ', '_')}.csv"
+    rows = pd.read_csv(file).to_dict("records") if file.is_file() else []
+    done = {(row["fault"], row["episode"]) for row in rows}
+    wanted = [(fault, episode) for fault in faults for episode in range(args.episodes)]
+    missing = [pair for pair in wanted if pair not in done]
+    for first in range(0, len(missing), args.side_by_side):
+        start, pairs = time.perf_counter(), missing[first : first + args.side_by_side]
+        rows += play(task, method, pairs, args.steps or task.steps)
+        args.out.mkdir(parents=True, exist_ok=True)
+        write_whole(file, pd.DataFrame(rows).to_csv(index=False).encode())
+        spent = time.perf_counter() - start
+        print(f"{task.name}, {method}: {len(pairs)} episodes in {spent:.0f} s", flush=True)
+    return pd.DataFrame(rows)
+
+
+def play(task: Task, method: str, pairs: list[tuple[str, int]], steps: int) -> list[dict]:
+    """Play faults and episodes side by side; return a row of results for each."""
+    rewards, lasted = rewards_of(task, method, pairs, steps)
+    window = round(SECOND / task.twin.unwrapped.dt)
+    level = usual(healthy(task, steps)[task.at :], window)
+    return [
+        {
+            "policy": task.name,
+            "fault": fault,
+            "method": method,
+            "episode": episode,
+            "before": mine[: task.at].sum(),
+            "after": mine[task.at :].sum(),
+            "survived": bool(last == steps),
+            "recovered": recovered(mine[task.at :], level, window),
+        }
+        for (fault, episode), mine, last in zip(pairs, rewards.T, lasted, strict=True)
+    ]
+
+
+def rewards_of(
+    task: Task, method: str, pairs: list[tuple[str, int]], steps: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return rewards ``(T, N)``, 0 after the end of an episode, and how long each one lasted."""
+    torch.manual_seed(0)
+    rows = torch.stack([task.regime.encode(task.faults[fault]) for fault, _ in pairs])
+    inner = FaultyVector(task.vector(len(pairs)), task.regime, rows, task.at)
+    envs, act = METHODS[method](task, inner)
+    observations, _ = envs.reset(seed=[episode for _, episode in pairs])
+    rewards, alive = np.zeros((steps, len(pairs))), np.ones(len(pairs), dtype=bool)
+    lasted = np.zeros(len(pairs), dtype=int)
+    for step in range(steps):
+        observations, reward, terminated, truncated, _ = envs.step(act(observations))
+        rewards[step] = np.where(alive, reward, 0.0)
+        lasted += alive
+        alive &= ~(terminated | truncated)
+        if not alive.any():
+            break
+    envs.close()
+    return rewards, lasted
+
+
+@cache
+def healthy(task: Task, steps: int) -> np.ndarray:
+    """Return the rewards ``(T, 5)`` of a policy that nothing happens to."""
+    return rewards_of(task, "alone", HEALTHY, steps)[0]
+
+
+def usual(rewards: np.ndarray, window: int) -> float:
+    """Return the reward a step that healthy runs ``(T, N)`` never miss by more than a tenth.
+
+    It is that of their worst window, less a tenth of their mean.
+
+    >>> round(usual(np.ones((50, 2)), window=10), 6)
+    0.9
+    """
+    worst = min(means(mine, window).min() for mine in rewards.T)
+    return float(worst - MISSING * abs(rewards.mean()))
+
+
+def recovered(rewards: np.ndarray, level: float, window: int) -> float:
+    """Return after how many steps no window of the rewards ``(T,)`` has a mean below ``level``.
+
+    >>> recovered(np.r_[np.zeros(5), np.ones(20)], level=0.9, window=4)
+    5.0
+    """
+    over = means(rewards, window)
+    low = np.flatnonzero(over < level)
+    start = 0 if not len(low) else int(low[-1]) + 1
+    return float(start) if start < len(over) else np.inf
+
+
+def means(values: np.ndarray, window: int) -> np.ndarray:
+    """Return the means of all windows of values ``(T,)``."""
+    return np.convolve(values, np.full(window, 1 / window), "valid")
