@@ -26,6 +26,7 @@ VALIDATION = [(23, 18, 1), (23, 42, -1), (37, 18, -1), (37, 42, 1)]  # cm, g, si
 VALIDATION += [(30, 30, 1), (26, 36, -1), (34, 22, 1), (31, 44, -1)]
 NEAR, LASTS = 0.15, 20  # rad; steps: up is to stay near for a second
 PUSH = 0.3  # N m
+TOGETHER = 8  # runs that are played side by side, and then kept
 
 
 class Run(NamedTuple):
@@ -92,15 +93,22 @@ def main() -> None:
     tables = []
     for part in args.parts:
         for method in args.methods:
+            runs = [run._replace(steps=args.steps or run.steps) for run in PARTS[part]()]
             file = args.out / f"{part}.{method}.csv"
-            if not file.is_file():
-                runs = [run._replace(steps=args.steps or run.steps) for run in PARTS[part]()]
-                rows = pd.DataFrame(play(runs[: args.runs], METHODS[method]))
-                args.out.mkdir(parents=True, exist_ok=True)
-                write_whole(file, rows.assign(part=part, method=method).to_csv().encode())
-                print(f"{part}, {method}: done", flush=True)
-            tables.append(pd.read_csv(file))
+            tables.append(complete(file, runs[: args.runs], part, method))
     print_tables(pd.concat(tables, ignore_index=True), args.methods)
+
+
+def complete(file: Path, runs: Sequence[Run], part: str, method: str) -> pd.DataFrame:
+    """Play the runs of a part that a file does not have yet, a few at a time; return all."""
+    table = pd.read_csv(file) if file.is_file() else pd.DataFrame()
+    for first in range(len(table), len(runs), TOGETHER):
+        rows = pd.DataFrame(play(runs[first : first + TOGETHER], METHODS[method]))
+        table = pd.concat([table, rows.assign(part=part, method=method)], ignore_index=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(file, table.to_csv(index=False).encode())
+        print(f"{part}, {method}: {len(table)} of {len(runs)}", flush=True)
+    return table
 
 
 def play(runs: Sequence[Run], method: Callable[..., Agent]) -> list[dict]:

@@ -18,8 +18,8 @@ class Mission(NamedTuple):
 
     options: list[str]
     dt: float  # s
-    steps: str  # the setting that says how many
-    count: int
+    setting: str  # of how long a mission is
+    steps: int  # its value
     faults: dict[str, str]
 
 
@@ -73,37 +73,29 @@ MISSIONS = {
 
 
 def rewards(
-    task: str, method: str, pairs: list[tuple[str, int]], out: Path, steps: int | None
+    task: str, method: str, names: list[str], seeds: int, out: Path, steps: int | None
 ) -> tuple[dict[tuple[str, int], np.ndarray], float]:
     """Return the rewards after the fault by fault and seed, and seconds a step."""
     mission, name = MISSIONS[task], METHODS[method]
-    faults = {"none": "{}", **mission.faults}
-    asked = [fault for fault in dict.fromkeys(fault for fault, _ in pairs) if fault in faults]
-    seeds = max(seed for _, seed in pairs) + 1
-    folder = out / f"{task.replace(' ', '_')}.{name}.{len(asked)}"
-    if not (folder / "missions.csv").is_file():
-        regimes = ", ".join(faults[fault] for fault in asked)
-        command = [sys.executable, "-m", "afm_rl", *mission.options, f"regimes=[{regimes}]"]
-        command += [f"compare=[{name}]", f"seeds={seeds}", f"hydra.run.dir={folder}"]
-        command += [f"{mission.steps}={steps or mission.count}"]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    table = pd.read_parquet(folder / "jobs" / name / "steps.parquet")
-    groups = [group for _, group in table.groupby("mission", sort=True)]
-    length = max(len(group) for group in groups)
-    found = {}
-    for number, group in enumerate(groups):
-        pair = asked[number // seeds], number % seeds
-        values = _rewards(group)
-        # A flight or episode that ended early has no reward any more.
-        worst = values.min() if task == "quadrotor" else 0.0
-        values = np.append(values, np.full(length - len(group), worst))
-        active = group["regime_active"].to_numpy()
-        found[pair] = values[_change(active) if active.any() else 0 :]
+    faults = {"none": "{}", **{fault: mission.faults.get(fault) for fault in names}}
+    asked = [fault for fault, regime in faults.items() if regime]
+    folder = out / "missions" / f"{task.replace(' ', '_')}.{name}"
+    command = [sys.executable, "-m", "afm_rl", *mission.options, f"compare=[{name}]"]
+    command += [f"regimes=[{', '.join(faults[fault] for fault in asked)}]", f"seeds={seeds}"]
+    command += [f"{mission.setting}={steps or mission.steps}", f"hydra.run.dir={folder}"]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    table = pd.read_parquet(folder / "steps.parquet")
+    groups = [group for _, group in table.groupby("mission")]
+    at = [int(group["regime_active"].to_numpy().argmax()) for group in groups]
+    at[:seeds] = [int(np.median(at[seeds:]))] * seeds  # healthy ones show no change
+    found, length = {}, max(len(group) for group in groups)
+    for number, (group, begin) in enumerate(zip(groups, at, strict=True)):
+        mine = _rewards(group)
+        # What ended early has no reward any more, or its worst error.
+        rest = min(0.0, mine.min()) if "reward" not in group else 0.0
+        mine = np.append(mine, np.full(max(0, length - len(group)), rest))
+        found[asked[number // seeds], number % seeds] = mine[begin:]
     return found, mission.dt
-
-
-def _change(active: np.ndarray) -> int:
-    return int(np.flatnonzero(active)[0])
 
 
 def _rewards(steps: pd.DataFrame) -> np.ndarray:

@@ -49,33 +49,34 @@ def main() -> None:
     torch.set_num_threads(1)
     tables = []
     for task in args.tasks:
-        for method in args.methods:
+        level = None  # of what the robot has alone and healthy
+        for method in dict.fromkeys(["alone", *args.methods]):
             file = args.out / f"{task.replace(' ', '_')}.{method}.csv"
             if not file.is_file():
-                rows = pd.DataFrame(times(task, method, args))
+                rows = pd.DataFrame(times(task, method, level, args))
                 args.out.mkdir(parents=True, exist_ok=True)
                 write_whole(file, rows.to_csv(index=False).encode())
                 print(f"{task}, {method}: done", flush=True)
             tables.append(pd.read_csv(file))
+            level = level or tables[-1]["level"][0]
     print_table(pd.concat(tables, ignore_index=True), args)
 
 
-def times(task: str, method: str, args: argparse.Namespace) -> list[dict]:
-    """Return the seconds until recovered of each fault and seed."""
+def times(task: str, method: str, level: float | None, args: argparse.Namespace) -> list[dict]:
+    """Return the seconds until recovered of each fault and seed; by a level, if it is known."""
     pairs = [(fault, seed) for fault in ["none", *args.faults] for seed in range(args.seeds)]
     rewards, dt = rewards_after(task, method, pairs, args)
-    healthy = rewards
-    if method != "alone":
-        unharmed = [("none", seed) for seed in range(args.seeds)]
-        healthy, _ = rewards_after(task, "alone", unharmed, args)
     window = max(1, round(SECOND / dt))
-    level = usual(np.stack(list(healthy.values())[: args.seeds], 1), window)
+    if level is None:
+        healthy = [rewards["none", seed] for seed in range(args.seeds)]
+        level = usual(np.stack([mine[: min(map(len, healthy))] for mine in healthy], 1), window)
     return [
         {
             "task": task,
             "method": method,
             "fault": fault,
             "seed": seed,
+            "level": level,
             "seconds": dt * recovered(mine, level, window),
         }
         for (fault, seed), mine in rewards.items()
@@ -87,7 +88,7 @@ def rewards_after(
 ) -> tuple[dict[tuple[str, int], np.ndarray], float]:
     """Return the rewards ``(T,)`` after the fault by fault and seed, and seconds a step."""
     if task in MISSIONS:
-        return of_missions(task, method, pairs, args.out / "missions", args.steps)
+        return of_missions(task, method, args.faults, args.seeds, args.out, args.steps)
     if task == "Furuta":
         return of_pendulums(method, pairs, args.steps)
     zoo = Task(POLICIES / f"{task}.safetensors")
