@@ -191,7 +191,7 @@ class ActionFlow(Believer):
         pairs, losses, noise, place, unit = (x.reshape(rows, *x.shape[len(lead) :]) for x in given)
         weights = self.tick.weights(losses, noise)
         read = self.tick.read(pairs, noise, place, steps)
-        found = self.tick.forecast(*read, weights, steps, pairs, unit.to(pairs))
+        found = self.tick.forecast(read, weights, steps, pairs, unit.to(pairs))
         forecasts, late = (x.view(*lead, *x.shape[1:]).to(executed) for x in found)
         return forecasts, late
 
