@@ -16,7 +16,7 @@ from torch import Tensor
 from afm_rl.correction.experts import Rows
 from afm_rl.errors import ConfigurationError, check_choice
 
-FILTER = 6  # commands that a lag looks back on
+FILTER = 12  # commands that a lag looks back on
 AGE = 20.0  # steps that separate two pairs as much as one unit of place does
 FAR = 1e3  # squared distance beyond all
 OLDER = 1e-6  # squared distance that a pair is worth less, times its squared age

@@ -15,7 +15,7 @@ from afm_rl.correction.arrival import ago, aligned, effects_of
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
-from afm_rl.correction.linear import LINEAR, Lines, fit_lines, sensor_noise
+from afm_rl.correction.linear import CALM, LINEAR, Lines, fit_lines, sensor_noise, within_rate
 from afm_rl.correction.network import AxisNetwork, Encoded
 from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows
 from afm_rl.correction.solver import midpoint
@@ -31,6 +31,8 @@ class Read(NamedTuple):
     """The linear models."""
     noisy: Tensor
     """What errors of the readings add to the next effect, ``(B, 1, A)``."""
+    slow: Tensor
+    """Lowest and highest effect of actuators no faster than of late, ``(B, 2, A)``."""
 
 
 class Models(NamedTuple):
@@ -59,6 +61,8 @@ class Tick(nn.Module):
     worth: Tensor
     late: Tensor
     delays: Tensor
+    filters: Tensor
+    filtered: Tensor
     rows_acting: Tensor
 
     def __init__(
@@ -71,6 +75,7 @@ class Tick(nn.Module):
         odds: float,
         least_noise: float,
         delays: Tensor,
+        acting: Tensor,
         likely: int,
         samples: int,
         source_std: float,
@@ -86,16 +91,19 @@ class Tick(nn.Module):
         chosen = [READINGS[name] for name in readings]
         self.by_place = any(r.near for r in chosen)
         self.varied = sum(r.varied for r in chosen)
-        self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings)), 1]
+        self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings)), len(CALM)]
         self.likely = min(check_count("corrector.likely", likely), len(chosen))
         self.most_late = max(delays.tolist())
         late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
+        filters, which = filters_of(acting)
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "worth": worth,
             "delays": delays,
+            "filters": filters,
+            "filtered": torch.nn.functional.one_hot(which).T.to(scale),
             "late": torch.tensor(late, dtype=torch.long),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
@@ -138,7 +146,12 @@ class Tick(nn.Module):
         tried = sent.amax(1) - sent.amin(1)
         bounds = extend(reach, ends, tried, self.saturation)
         action, effects = self.decide(models, proposals, expected, wanted, noise)
-        changed = weights[:, 0] + weights[:, -1] < 0.5  # else the plan, to the bit
+        lag = (self.filtered.to(weights) @ weights).argmax(1)  # the most probable one
+        if not all_hold(lag == 0):
+            action, acts = self.lead(action, lag, torch.cat([sent, waiting], 1), ends)
+            effects = self.expect(models, acts.unsqueeze(1)).squeeze(2)
+        calm = weights[:, 0] + weights[:, -len(CALM) :].sum(1)
+        changed = calm < 0.5  # else the plan, to the bit
         corrects = changed & action.isfinite().all(-1, True)
         action = torch.where(corrects, action, unit)
         effects = torch.where(corrects.unsqueeze(1), effects, expected[:, :, 0])
@@ -176,18 +189,18 @@ class Tick(nn.Module):
         sound = (valid == 1.0).to(pairs)
         lines = fit_lines(sent, came, torch.hypot(std, noise.unsqueeze(1)), sound)
         encoded = self.network.encode(rows, fit_experts(rows))
-        return Read(encoded, lines, sensor_noise(sent, came, sound))
+        return Read(encoded, lines, sensor_noise(sent, came, sound), within_rate(came, sound))
 
     def most_likely(self, found: Read, weights: Tensor) -> Models:
         """Return the most likely models of every axis."""
-        still, read, linear, late, noisy = weights.split(self.counts, 1)
+        still, read, linear, late, calm = weights.split(self.counts, 1)
         # Of models that are alike the first, on any machine and in any batch.
         order = torch.arange(read.shape[1], device=read.device).view(-1, 1)
         best = (read * (1 - 1e-4 * order)).topk(self.likely, 1)
         which = found.encoded.choose(best.indices)
         share = best.values / best.values.sum(1, keepdim=True).clamp_min(1e-30)
         share = read.sum(1, keepdim=True) * share
-        still = still + late.sum(1, keepdim=True) + noisy
+        still = still + torch.cat([late, calm], 1).sum(1, keepdim=True)
         return Models(which, found.lines, torch.cat([still, share, linear], 1))
 
     def propose(self, models: Models, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
@@ -251,6 +264,28 @@ class Tick(nn.Module):
             effect = torch.where(better.unsqueeze(1), foreseen, effect)
         return action.squeeze(1), effect.squeeze(2)
 
+    def lead(
+        self, acts: Tensor, lag: Tensor, sent: Tensor, box: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        r"""Return the commands ``(B, A)`` after which ``acts`` acts, and what acts after them.
+
+        .. math:: u = (v - (1 - c) \bar u) / c
+
+        as far as the box allows, where the actuator makes :math:`c u + (1 - c) \bar u` of this
+        command and those before it.
+
+        Args:
+            acts: v, what should act, ``(B, A)``.
+            lag: by which filter commands act, ``(B, A)``.
+            sent: commands until now, the newest last, ``(B, N, A)``.
+            box: lowest and highest action, ``(B, 2, A)``.
+        """
+        shares = self.filters[lag]  # (B, A, L)
+        before = sent[:, sent.shape[1] - shares.shape[-1] + 1 :].mT
+        rest, share = (shares[..., :-1] * before).sum(-1), shares[..., -1]
+        action = ((acts - rest) / share).clamp(box[:, 0], box[:, 1])
+        return action, share * action + rest
+
     def loss(self, models: Models, expected: Tensor, wanted: Tensor, noise: Tensor) -> Tensor:
         """Return the expected loss ``(B, C, A)`` of effects ``(B, 1 + K + L, C, A)``."""
         miss = (expected - wanted[:, None, None]).square() / noise[:, None, None].square()
@@ -285,15 +320,30 @@ class Tick(nn.Module):
             asked, line = torch.cat([asked, more], 2), torch.cat([line, newest], 1)
         found = self.network.effect(read.encoded, asked.flatten(0, 1)).view_as(asked)
         linear = read.lines.effect(line)
-        noisy = acting + read.noisy
-        forecasts = [now, found[:, :, 0], linear[:, :, 0], acts[:, self.late], noisy]
+        calmly = [acting.clamp(*read.slow.split(1, 1)), acting + read.noisy]
+        forecasts = [now, found[:, :, 0], linear[:, :, 0], acts[:, self.late], *calmly]
         if not calm:
             nominal = newest.unsqueeze(1)
-            same = nominal.expand(-1, len(self.late) + 1, -1, -1)
+            same = nominal.expand(-1, len(self.late) + len(CALM), -1, -1)
             effects = torch.cat([nominal, found[:, :, 1:], linear[:, :, 1:], same], 1)
             delays = torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
             newest = effects_of(effects, weights, late, delays)
         return torch.cat(forecasts, 1), newest
+
+
+def filters_of(acting: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the ways ``(F, L)`` in which actuators are slow, and that of each model ``(M,)``.
+
+    The first is that they are not, as where commands are late and no more.
+
+    >>> filters_of(torch.tensor([[0.0, 1.0], [1.0, 0.0], [0.4, 0.6]]))
+    (tensor([[0.0000, 1.0000],
+            [0.4000, 0.6000]]), tensor([0, 0, 1]))
+    """
+    newest = torch.zeros_like(acting)
+    newest[:, -1] = 1.0
+    slow = ((acting > 0).sum(-1, keepdim=True) > 1) & (acting[:, -1:] > 0)
+    return torch.where(slow, acting, newest).unique(dim=0, return_inverse=True)
 
 
 def points_of(count: int, size: int) -> Tensor:
