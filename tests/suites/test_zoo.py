@@ -53,7 +53,7 @@ def test_who_knows_the_truth_acts_as_the_healthy_policy(command):
     assert np.allclose(after, after["none"], rtol=0.1) and results["survived"].any()
 
 
-def test_recovered_is_to_be_no_worse_than_the_worst_healthy_second_but_for_a_tenth(zoo):
+def test_recovered_is_to_be_no_worse_than_the_worst_healthy_window_but_for_a_tenth(zoo):
     episodes, healthy = zoo("episodes"), np.tile([0.8, 1.2], 200)[:, None]
     level = episodes.usual(healthy, window=10)
     assert level == pytest.approx(0.9)

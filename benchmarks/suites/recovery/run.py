@@ -5,8 +5,9 @@
 plays what is not yet in `outputs/recovery` and prints the table of docs/recovery.md. It can be
 ended at any time; the same command goes on. `--tasks` and `--methods` choose.
 
-Recovered: from then on no second is worse than the worst one of healthy runs by more than a tenth
-of their mean. What counts is the reward, or the speed along the track, or less the error.
+Recovered: from then on, and for a quarter of the time at least, no two seconds are worse than the
+worst two of healthy runs by more than a tenth of their mean. What counts is the reward, the speed
+along the track, or less the error.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import torch
 SUITES = Path(__file__).parents[1]
 sys.path[:0] = [str(SUITES / name) for name in ("zoo", "furuta", "recovery")]
 
-from episodes import SECOND, recovered, rewards_of, usual  # noqa: E402
+from episodes import WINDOW, recovered, rewards_of, usual  # noqa: E402
 from missions import MISSIONS  # noqa: E402
 from missions import rewards as of_missions  # noqa: E402
 from pendulums import rewards as of_pendulums  # noqa: E402
@@ -66,7 +67,7 @@ def times(task: str, method: str, level: float | None, args: argparse.Namespace)
     """Return the seconds until recovered of each fault and seed; by a level, if it is known."""
     pairs = [(fault, seed) for fault in ["none", *args.faults] for seed in range(args.seeds)]
     rewards, dt = rewards_after(task, method, pairs, args)
-    window = max(1, round(SECOND / dt))
+    window = max(1, round(WINDOW / dt))
     if level is None:
         healthy = [rewards["none", seed] for seed in range(args.seeds)]
         level = usual(np.stack([mine[: min(map(len, healthy))] for mine in healthy], 1), window)

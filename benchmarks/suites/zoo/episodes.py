@@ -16,7 +16,8 @@ from task import Task
 from afm_rl.storage.files import write_whole
 
 HEALTHY = [("none", episode) for episode in range(5)]  # what "as before" means is read from these
-SECOND, MISSING = 1.0, 0.1  # s; share of the healthy reward
+WINDOW, MISSING = 2.0, 0.1  # s; share of the healthy reward
+LASTS = 0.25  # share of the rest of an episode for which a recovery lasts at least
 
 
 def complete(task: Task, method: str, faults: list[str], args: argparse.Namespace) -> pd.DataFrame:
@@ -39,7 +40,7 @@ def complete(task: Task, method: str, faults: list[str], args: argparse.Namespac
 def play(task: Task, method: str, pairs: list[tuple[str, int]], steps: int) -> list[dict]:
     """Play faults and episodes side by side; return a row of results for each."""
     rewards, lasted = rewards_of(task, method, pairs, steps)
-    window = round(SECOND / task.twin.unwrapped.dt)
+    window = round(WINDOW / task.twin.unwrapped.dt)
     level = usual(healthy(task, steps)[task.at :], window)
     return [
         {
@@ -99,13 +100,15 @@ def usual(rewards: np.ndarray, window: int) -> float:
 def recovered(rewards: np.ndarray, level: float, window: int) -> float:
     """Return after how many steps no window of the rewards ``(T,)`` has a mean below ``level``.
 
+    Infinity where that lasts for less than a quarter of all windows.
+
     >>> recovered(np.r_[np.zeros(5), np.ones(20)], level=0.9, window=4)
     5.0
     """
     over = means(rewards, window)
     low = np.flatnonzero(over < level)
     start = 0 if not len(low) else int(low[-1]) + 1
-    return float(start) if start < len(over) else np.inf
+    return float(start) if len(over) - start >= LASTS * len(over) else np.inf
 
 
 def means(values: np.ndarray, window: int) -> np.ndarray:
