@@ -45,6 +45,8 @@ SMALL = {  # settings that are there are made small
 LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none --methods alone AFM "
     "--episodes 1 --steps 12",
+    "benchmarks/suites/recovery/run.py": "--tasks Furuta --methods alone --faults half --seeds 1 "
+    "--steps 142",
     "benchmarks/suites/zoo/film.py": "--seconds 0.2",
     "benchmarks/suites/furuta/run.py": "--methods iCEM+LQR --parts A --runs 2 --steps 12",
 }
@@ -65,7 +67,8 @@ def desk(monkeypatch, tmp_path):
         (tmp_path / name).symlink_to(ROOT / name)
     monkeypatch.syspath_prepend(str(tmp_path))
     yield tmp_path
-    for name in ("mine", "run", "show", "task", "methods", "faults", "plant"):
+    suites = (ROOT / "benchmarks" / "suites").glob("*/*.py")
+    for name in ("mine", *(file.stem for file in suites)):
         sys.modules.pop(name, None)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-SUITES = Path(__file__).parents[1]
+SUITES = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(SUITES / name) for name in ("zoo", "furuta", "recovery")]
 
 from episodes import WINDOW, recovered, rewards_of, usual  # noqa: E402
