@@ -23,7 +23,7 @@ import torch
 SUITES = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(SUITES / name) for name in ("zoo", "furuta", "recovery")]
 
-from episodes import WINDOW, recovered, rewards_of, usual  # noqa: E402
+from episodes import WINDOW, complete, recovered, usual  # noqa: E402
 from missions import MISSIONS  # noqa: E402
 from missions import rewards as of_missions  # noqa: E402
 from pendulums import rewards as of_pendulums  # noqa: E402
@@ -33,8 +33,7 @@ from afm_rl.storage.files import write_whole  # noqa: E402
 
 FAULTS = ["one reversed", "all reversed", "half", "bias .3", "late 2", "swapped pair"]
 METHODS = ["alone", "AFM", "truth"]
-ZOO = {"hopper_trpo": 1000, "half_cheetah_tqc": 600, "walker2d_tqc": 1000, "ant_trpo": 600}
-ZOO |= {"swimmer_trpo": 600}  # steps of an episode, 200 of them healthy
+ZOO = ["hopper_trpo", "half_cheetah_tqc", "walker2d_tqc", "ant_trpo", "swimmer_trpo"]
 TASKS = [*ZOO, *MISSIONS, "Furuta"]
 
 
@@ -46,6 +45,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--steps", type=int, help="cut episodes (use another --out)")
     parser.add_argument("--out", type=Path, default=Path("outputs/recovery"))
+    parser.add_argument("--zoo", type=Path, default=Path("outputs/zoo"), help="results of policies")
     args = parser.parse_args()
     torch.set_num_threads(1)
     tables = []
@@ -59,14 +59,19 @@ def main() -> None:
                 write_whole(file, rows.to_csv(index=False).encode())
                 print(f"{task}, {method}: done", flush=True)
             tables.append(pd.read_csv(file))
-            level = level or tables[-1]["level"][0]
+            level = tables[-1]["level"][0] if level is None else level
     print_table(pd.concat(tables, ignore_index=True), args)
 
 
 def times(task: str, method: str, level: float | None, args: argparse.Namespace) -> list[dict]:
     """Return the seconds until recovered of each fault and seed; by a level, if it is known."""
     pairs = [(fault, seed) for fault in ["none", *args.faults] for seed in range(args.seeds)]
-    rewards, dt = rewards_after(task, method, pairs, args)
+    if task in ZOO:
+        return times_of_policy(task, method, pairs, args)
+    if task == "Furuta":
+        rewards, dt = of_pendulums(method, pairs, args.steps)
+    else:
+        rewards, dt = of_missions(task, method, args.faults, args.seeds, args.out, args.steps)
     window = max(1, round(WINDOW / dt))
     if level is None:
         healthy = [rewards["none", seed] for seed in range(args.seeds)]
@@ -84,18 +89,17 @@ def times(task: str, method: str, level: float | None, args: argparse.Namespace)
     ]
 
 
-def rewards_after(
-    task: str, method: str, pairs: list[tuple[str, int]], args: argparse.Namespace
-) -> tuple[dict[tuple[str, int], np.ndarray], float]:
-    """Return the rewards ``(T,)`` after the fault by fault and seed, and seconds a step."""
-    if task in MISSIONS:
-        return of_missions(task, method, args.faults, args.seeds, args.out, args.steps)
-    if task == "Furuta":
-        return of_pendulums(method, pairs, args.steps)
-    zoo = Task(POLICIES / f"{task}.safetensors")
-    pairs = [pair for pair in pairs if pair[0] in zoo.faults]
-    found = rewards_of(zoo, method, pairs, args.steps or ZOO[task])[0][zoo.at :]
-    return dict(zip(pairs, found.T, strict=True)), zoo.twin.unwrapped.dt
+def times_of_policy(
+    name: str, method: str, pairs: list[tuple[str, int]], args: argparse.Namespace
+) -> list[dict]:
+    """Return the same for a policy, from the results of the zoo, which are completed."""
+    task = Task(POLICIES / f"{name}.safetensors")
+    faults = [fault for fault in dict.fromkeys(fault for fault, _ in pairs) if fault in task.faults]
+    rows = complete(task, method, faults, args.seeds, args.zoo, args.steps)
+    rows = rows[[pair in set(pairs) for pair in zip(rows["fault"], rows["episode"], strict=True)]]
+    rows = rows.assign(seconds=rows["recovered"] * task.twin.unwrapped.dt, level=None, task=name)
+    rows = rows.rename(columns={"episode": "seed"})
+    return rows[["task", "method", "fault", "seed", "level", "seconds"]].to_dict("records")
 
 
 def print_table(rows: pd.DataFrame, args: argparse.Namespace) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -20,17 +20,35 @@ WINDOW, MISSING = 2.0, 0.1  # s; share of the healthy reward
 LASTS = 0.25  # share of the rest of an episode for which a recovery lasts at least
 
 
-def complete(task: Task, method: str, faults: list[str], args: argparse.Namespace) -> pd.DataFrame:
-    """Play those episodes of a policy and a method that have no results yet; return all."""
-    file = args.out / f"{task.name}.{method.replace(', ', '_').replace(' ', '_')}.csv"
+def complete(
+    task: Task,
+    method: str,
+    faults: list[str],
+    episodes: int,
+    out: Path,
+    steps: int | None = None,
+    together: int = 100,
+) -> pd.DataFrame:
+    """Play those episodes of a policy and a method that have no results yet; return all.
+
+    Args:
+        task: the policy and its task.
+        method: who acts.
+        faults: what happens.
+        episodes: of each fault.
+        out: folder of results.
+        steps: of an episode; None for as many as the task has.
+        together: episodes that are played side by side, and then kept.
+    """
+    file = out / f"{task.name}.{method.replace(', ', '_').replace(' ', '_')}.csv"
     rows = pd.read_csv(file).to_dict("records") if file.is_file() else []
     done = {(row["fault"], row["episode"]) for row in rows}
-    wanted = [(fault, episode) for fault in faults for episode in range(args.episodes)]
+    wanted = [(fault, episode) for fault in faults for episode in range(episodes)]
     missing = [pair for pair in wanted if pair not in done]
-    for first in range(0, len(missing), args.side_by_side):
-        start, pairs = time.perf_counter(), missing[first : first + args.side_by_side]
-        rows += play(task, method, pairs, args.steps or task.steps)
-        args.out.mkdir(parents=True, exist_ok=True)
+    for first in range(0, len(missing), together):
+        start, pairs = time.perf_counter(), missing[first : first + together]
+        rows += play(task, method, pairs, steps or task.steps)
+        out.mkdir(parents=True, exist_ok=True)
         write_whole(file, pd.DataFrame(rows).to_csv(index=False).encode())
         spent = time.perf_counter() - start
         print(f"{task.name}, {method}: {len(pairs)} episodes in {spent:.0f} s", flush=True)

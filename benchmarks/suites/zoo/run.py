@@ -28,7 +28,6 @@ def main() -> None:
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--steps", type=int, help="cut episodes (use another --out)")
-    parser.add_argument("--side-by-side", type=int, default=64, help="episodes in one batch")
     parser.add_argument("--folder", type=Path, default=POLICIES, help="where the policies are")
     parser.add_argument("--out", type=Path, default=Path("outputs/zoo"))
     args = parser.parse_args()
@@ -38,7 +37,7 @@ def main() -> None:
         task = Task(args.folder / f"{name}.safetensors")
         faults = [fault for fault in args.faults or task.faults if fault in task.faults]
         for method in args.methods:
-            complete(task, method, faults, args)
+            complete(task, method, faults, args.episodes, args.out, args.steps)
     results = read(args.out)
     asked = results["policy"].isin(names) & (results["episode"] < args.episodes)
     for column, chosen in (("method", args.methods), ("fault", args.faults)):
