@@ -200,7 +200,7 @@ def test_pairs_without_effect_tell_nothing_of_friction():
     effective = MAPS["dead zone"][0](EXECUTED)
     assert 0 < (effective == 0).sum() < effective.numel() / 2  # some are held
     found = fit_experts(rows_of(EXECUTED, effective))
-    fitted = [part[0, :, 0, FRICTION] for part in (found.gain, found.offset)]
+    fitted = [part[0, :, 0, FRICTION].float() for part in (found.gain, found.offset)]
     torch.testing.assert_close(fitted[0], gain, rtol=0, atol=0.1)
     torch.testing.assert_close(fitted[1], offset, rtol=0, atol=0.1)
     torch.testing.assert_close(apply_friction(gain, offset, EXECUTED), effective)
@@ -211,7 +211,7 @@ def test_friction_is_overcome(sign):
     gain, offset = torch.tensor([-0.8, 1.2]), sign * torch.tensor([0.2, -0.3])
     effective = gain * EXECUTED + offset * EXECUTED.sign()
     found = fit_experts(rows_of(EXECUTED, effective))
-    fitted = [part[0, :, 0, FRICTION] for part in (found.gain, found.offset)]
+    fitted = [part[0, :, 0, FRICTION].float() for part in (found.gain, found.offset)]
     torch.testing.assert_close(fitted[0], gain, rtol=0, atol=0.05)
     torch.testing.assert_close(fitted[1], offset, rtol=0, atol=0.05)
     wanted = torch.tensor([0.5, -0.7])
