@@ -44,7 +44,7 @@ SMALL = {  # settings that are there are made small
 }
 LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none --methods alone AFM "
-    "--episodes 1 --steps 12",
+    "--episodes 1 --steps 60",
     "benchmarks/suites/recovery/run.py": "--tasks Furuta --methods alone --faults half --seeds 1 "
     "--steps 142",
     "benchmarks/suites/zoo/film.py": "--seconds 0.2",

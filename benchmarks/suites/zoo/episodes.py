@@ -13,6 +13,7 @@ from faults import FaultyVector
 from methods import METHODS
 from task import Task
 
+from afm_rl.errors import ConfigurationError
 from afm_rl.storage.files import write_whole
 
 HEALTHY = [("none", episode) for episode in range(5)]  # what "as before" means is read from these
@@ -57,8 +58,12 @@ def complete(
 
 def play(task: Task, method: str, pairs: list[tuple[str, int]], steps: int) -> list[dict]:
     """Play faults and episodes side by side; return a row of results for each."""
+    if steps <= task.at:
+        raise ConfigurationError(
+            f"--steps {steps}: expected more than {task.at}, at which the actuators fail"
+        )
     rewards, lasted = rewards_of(task, method, pairs, steps)
-    window = round(WINDOW / task.twin.unwrapped.dt)
+    window = min(round(WINDOW / task.twin.unwrapped.dt), steps - task.at)
     level = usual(healthy(task, steps)[task.at :], window)
     return [
         {
