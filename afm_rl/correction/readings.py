@@ -107,6 +107,27 @@ def late_ones(names: Sequence[str]) -> list[str]:
     return [name for name in names if READINGS[name].delay or READINGS[name].lag]
 
 
+def cause_of(model: str, known: int = 0) -> str:
+    """Return what a model of the belief says of the actuators, in plain words.
+
+    Args:
+        model: name of one.
+        known: steps that actions are known to be late by.
+
+    >>> [cause_of(model) for model in ("delay_2", "only lag_1", "gain_12")]
+    ['2 steps late', 'slow', 'a recent change']
+    """
+    reading = READINGS.get(model.removeprefix("only "), Reading())
+    if reading.delay:
+        steps = reading.delay + known
+        return f"{steps} step{'s' * (steps > 1)} late"
+    if reading.lag:
+        return "slow"
+    if reading.near:
+        return "another ground"
+    return model if model in ("nothing has changed", "noisy readings") else "a recent change"
+
+
 def check_readings(names: Sequence[str], by_place: bool) -> list[str]:
     """Return the names in the order of :func:`read_rows`: by time, by variety, by place.
 

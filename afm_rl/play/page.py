@@ -35,7 +35,7 @@ class Page:
         with redirect_stdout(io.StringIO()):  # the command says where the page is
             self.server = viser.ViserServer("127.0.0.1", port, label=title, verbose=False)
         self.url = f"http://127.0.0.1:{self.server.get_port()}"
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self.server.scene.set_up_direction("+z")
         self.server.initial_camera.position = (1.0, -6.0, 3.0)
         self.server.initial_camera.look_at = (1.0, 0.0, 0.0)  # left of the controls
@@ -61,7 +61,7 @@ class Page:
             self._button("Push", self.world.push)
             self._button("Reset", self.world.reset)
         with gui.add_folder("All actuators"):
-            self._slider("delay", "Late by (steps)", 0.0, 8.0, 1.0, 0.0)
+            self._slider("delay", "Late by (steps)", 0.0, 10.0, 1.0, 0.0)
             self._slider("lag", "Slow (steps)", 0.0, 6.0, 0.5, 0.0)
             self._slider("noise", "Noise", 0.0, 0.5, 0.05, 0.0)
         for k, name in enumerate(names):
@@ -108,6 +108,7 @@ class Page:
             lines = [uplot.Series(label=name, stroke=STROKES[name], width=2) for name in SIDES]
             series = (uplot.Series(label="step"), *lines)
             self.rewards = gui.add_uplot((empty,) * 3, series, title="Reward", **PLOT)
+            self.faults = gui.add_markdown("")
         with gui.add_folder("Commands of AFM", order=100.0):
             self.shown = gui.add_dropdown("Actuator", self.world.robot.names)
             looks = {"planned": "gray", "executed": STROKES["AFM"], "effect": STROKES["alone"]}
@@ -130,10 +131,11 @@ class Page:
             now = time.monotonic()
             step = self.world.robot.dt / self.speed.value
             done = now if self.pause.value else max(done, now - FRAME - step)
+            last = now
             while not self.pause.value and done + step <= now:
                 self.world.step()
-                done += step
-                if time.monotonic() > now + FRAME:  # slower than life
+                done, before, last = done + step, last, time.monotonic()
+                if 2 * last - before > now + FRAME:  # no time for another one: slower than life
                     break
             self.draw()
             if now - worded > WORDS:
@@ -151,7 +153,7 @@ class Page:
     def say(self) -> None:
         """Renew words and curves."""
         with self.world.lock:
-            self.words.content = self.text()
+            self.words.content, self.faults.content = self.text(), self.diagnosis()
             rewards = [np.array(side.rewards) for side in self.world.sides.values()]
             commands = np.array(self.world.sides["AFM"].commands)
         size = min(map(len, rewards))
@@ -170,17 +172,37 @@ class Page:
         if score != "reward":
             table[score] = [side.info.get(score, "") for side in sides]
         rows = ["| " + " | ".join(map(str, (name, *row))) + " |" for name, row in table.items()]
-        afm = sides[1].info["afm"]
+        afm, late = sides[1].info["afm"], self.world.faults.values.get("delay", 0)
         state = "**corrects**" if afm["corrects"] else "does nothing"
-        lines = [f"AFM {state}; innovation {afm['innovation']:.2f}"]
-        if "noise" in afm:
-            noise = ", ".join(f"{value:.2g}" for value in np.ravel(afm["noise"]))
-            lines.append(f"noise that was learnt: {noise}")
-        words = str(sides[1].env.diagnosis)
+        lines = [f"AFM {state}; innovation {afm['innovation']:.3g}"]
+        if f"{late:.0f} steps late" not in afm["belief"] and late > 1:
+            lines.append(f"{late:.0f} steps are more than AFM looks back: it cannot find that")
+        belief = believed(self.world.robot.names, afm["belief"], afm["noise"])
+        return "\n".join([*rows, "", "  \n".join(lines), "", *belief])
+
+    def diagnosis(self) -> str:
+        """Say what the actuators seem to do that they should not."""
+        words = str(self.world.sides["AFM"].env.diagnosis)
         for k, name in enumerate(self.world.robot.names):
             words = words.replace(f"actuator {k}:", f"{name}:").replace(f"a_{k}:", f"{name}:")
-        words = words.replace("\n", "  \n")
-        return "\n".join([*rows, "", "  \n".join(lines), "", words])
+        return "  \n".join(x for x in words.splitlines() if not x.endswith(": healthy"))
+
+
+def believed(names: list[str], belief: dict[str, np.ndarray], noise: np.ndarray) -> list[str]:
+    """Return a table of what is believed most of each actuator, and of all on average.
+
+    >>> believed(["joint"], {"1 step late": np.array([0.97])}, np.array([0.05]))[-1]
+    '| joint | 1 step late | 97 | 0.050 |'
+    """
+    chances = np.stack(list(belief.values()))  # of causes and actuators
+    if len(names) > 1:
+        names, chances = [*names, "*mean*"], np.c_[chances, chances.mean(1)]
+        noise = np.append(noise, noise.mean())
+    rows = ["| actuator | believed | % | noise |", "|---|---|---|---|"]
+    for name, chance, spread in zip(names, chances.T, noise, strict=True):
+        cause = list(belief)[chance.argmax()]
+        rows.append(f"| {name} | {cause} | {100 * chance.max():.0f} | {spread:.3f} |")
+    return rows
 
 
 def mean(values: Any) -> float:

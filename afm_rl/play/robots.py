@@ -91,6 +91,7 @@ def _gymnasium(task: str, policy: Callable[[], Acting], settings: dict[str, Any]
         joints = [found.joint(joint).name for joint in found.actuator_trnid[:, 0]]
         return Robot(make, policy, {"model": "mujoco"}, _push_root, inner.dt, joints)
     model = {"model": pendulum_step, "state": lambda env, seen: env.unwrapped.state}
+    model["observe"] = lambda s: np.c_[np.cos(s[:, 0]), np.sin(s[:, 0]), s[:, 1]]
     return Robot(make, policy, model, _push_pendulum, inner.dt, ["joint"])
 
 
@@ -147,6 +148,21 @@ def _planned(planner: Any, parts: dict[str, tuple[int, ...]]) -> Acting:
     return act
 
 
+def _first(size: int) -> dict[str, Any]:
+    """Return how to find the state where it is the first numbers of an observation, and back."""
+    rest = np.zeros(0)
+
+    def state(env: Any, seen: np.ndarray) -> np.ndarray:
+        nonlocal rest
+        rest = seen[size:]
+        return seen[:size]
+
+    def observe(states: np.ndarray) -> np.ndarray:
+        return np.concatenate([states, np.tile(rest, (len(states), 1))], 1)
+
+    return {"state": state, "observe": observe}
+
+
 def _ugv(file: Path | None) -> Robot:
     """The ground robot on its track, by MPPI."""
     low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
@@ -162,7 +178,7 @@ def _ugv(file: Path | None) -> Robot:
     def push(inner: Any, direction: float) -> None:
         inner._data["pose"] += torch.tensor([0.0, 0.0, 0.5 * direction])
 
-    model = {"model": dynamics, "state": lambda env, seen: seen[:3]}
+    model = {"model": dynamics, **_first(3)}
     return Robot(make, policy, model, push, 0.2, ["speed", "turn"], score="reached")
 
 
@@ -193,7 +209,7 @@ def _quadrotor(file: Path | None) -> Robot:
     def push(inner: Any, direction: float) -> None:
         inner._data["pose"][3] += 0.5 * direction
 
-    model = {"model": dynamics, "state": lambda env, seen: seen[:13]}
+    model = {"model": dynamics, **_first(13)}
     names = ["thrust", "roll", "pitch", "yaw"]
     return Robot(make, policy, model, push, 0.05, names, corrector=lambda: ActionFlow(-unit, unit))
 

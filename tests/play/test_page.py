@@ -3,6 +3,7 @@
 import shutil
 import threading
 import time
+import warnings
 
 import pytest
 
@@ -88,9 +89,17 @@ def test_robots_are_drawn_and_described(name, page_of):
     assert page.world.faults.values["gain_0"] == -1.0
     executed = page.world.sides["AFM"].info["afm"]["executed"]
     assert effect[0] == pytest.approx(-executed[0], rel=1e-5)
-    assert "| alone | AFM |" in page.words.content and "AFM " in page.words.content
+    assert "| alone | AFM |" in page.words.content and "| a recent change |" in page.words.content
     for figure in page.figures.values():
         assert all(abs(number) < 1e3 for number in figure.root.position)
+    page.choose("late by 4")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # what is observed at arrival is known of every robot
+        for _ in range(20):
+            page.world.step()
+    assert "cannot find" not in page.text()
+    page.world.faults.values["delay"] = 10.0
+    assert "cannot find" in page.text()
     page.choose("healthy")
     assert page.world.faults.values["gain_0"] == 1.0
 

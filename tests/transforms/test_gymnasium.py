@@ -58,17 +58,21 @@ def test_healthy_steps_are_those_of_the_environment(dtype):
         np.testing.assert_array_equal(seen, other)
         assert rest == others and told["mine"] == info["mine"]
         assert not told["afm"]["corrects"] and told["afm"]["innovation"] < 1
+        assert "belief" not in told["afm"]
         assert (0 < told["afm"]["noise"]).all() and (told["afm"]["noise"] <= 0.05).all()
 
 
 def test_reversed_actuators_do_what_was_planned():
-    env = ActionFlowWrapper(Puck(gain=-1.0), push)
+    env = ActionFlowWrapper(Puck(gain=-1.0), push, belief=True)
     assert env.diagnosis == "as the model expects"
+    unaware = env.reset(seed=0)[1]["afm"]["belief"]["nothing has changed"]
+    assert (unaware > 0.9).all()
     told = [info["afm"] for *_, info in play(env, 30)]
     assert all(each["corrects"] for each in told[3:])
     for each in told[8:]:
         np.testing.assert_allclose(each["executed"], -each["planned"], atol=0.1)
         np.testing.assert_allclose(each["predicted"], each["planned"], atol=0.1)
+        assert (each["belief"]["a recent change"] > 0.9).all()
     assert "actuator 0: reversed" in env.diagnosis
 
 
