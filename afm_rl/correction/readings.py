@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.correction.experts import Rows
+from afm_rl.correction.linear import CALM
 from afm_rl.errors import ConfigurationError, check_choice
 
 FILTER = 12  # commands that a lag looks back on
@@ -125,7 +126,7 @@ def cause_of(model: str, known: int = 0) -> str:
         return "slow"
     if reading.near:
         return "another ground"
-    return model if model in ("nothing has changed", "noisy readings") else "a recent change"
+    return model if model in ("nothing has changed", *CALM) else "a recent change"
 
 
 def check_readings(names: Sequence[str], by_place: bool) -> list[str]:

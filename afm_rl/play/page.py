@@ -35,10 +35,11 @@ class Page:
         with redirect_stdout(io.StringIO()):  # the command says where the page is
             self.server = viser.ViserServer("127.0.0.1", port, label=title, verbose=False)
         self.url = f"http://127.0.0.1:{self.server.get_port()}"
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        look: Any = {"control_width": "large", "show_logo": False, "show_share_button": False}
+        self.server.gui.configure_theme(**look)
         self.server.scene.set_up_direction("+z")
-        self.server.initial_camera.position = (1.0, -6.0, 3.0)
-        self.server.initial_camera.look_at = (1.0, 0.0, 0.0)  # left of the controls
+        self.server.initial_camera.position = (1.6, -6.5, 3.0)
+        self.server.initial_camera.look_at = (1.6, 0.0, 0.0)  # left of the controls
         sides = world.sides.items()
         self.figures = {name: figure_of(self.server, name, side.inner) for name, side in sides}
         self.labels = {
@@ -192,7 +193,7 @@ def believed(names: list[str], belief: dict[str, np.ndarray], noise: np.ndarray)
     """Return a table of what is believed most of each actuator, and of all on average.
 
     >>> believed(["joint"], {"1 step late": np.array([0.97])}, np.array([0.05]))[-1]
-    '| joint | 1 step late | 97 | 0.050 |'
+    '| joint | 1 step late | 97 | 0.05 |'
     """
     chances = np.stack(list(belief.values()))  # of causes and actuators
     if len(names) > 1:
@@ -201,7 +202,7 @@ def believed(names: list[str], belief: dict[str, np.ndarray], noise: np.ndarray)
     rows = ["| actuator | believed | % | noise |", "|---|---|---|---|"]
     for name, chance, spread in zip(names, chances.T, noise, strict=True):
         cause = list(belief)[chance.argmax()]
-        rows.append(f"| {name} | {cause} | {100 * chance.max():.0f} | {spread:.3f} |")
+        rows.append(f"| {name} | {cause} | {100 * chance.max():.0f} | {spread:.2g} |")
     return rows
 
 

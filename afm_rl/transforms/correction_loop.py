@@ -249,7 +249,8 @@ class CorrectionLoop:
 
     def _tell(self) -> dict[str, Any]:
         """Return what is known of the newest step, ``(N, ...)`` each."""
-        told: dict[str, Any] = {name: self.entries.get(key).numpy().copy() for name, key in SHOWN.items()}
+        found = {name: self.entries.get(key) for name, key in SHOWN.items()}
+        told: dict[str, Any] = {name: value.numpy().copy() for name, value in found.items()}
         told["corrects"] &= self.enabled
         if self.watching:
             told["learned"] = np.full(len(told["corrects"]), not self.learning)
