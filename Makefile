@@ -20,12 +20,16 @@ help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
 
 demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and film them (3 minutes)
-	@echo "A robot drives along a track. After the second target its motors drive it backwards."
+	@echo "A robot drives along a track. After the second target its motors drive it backwards, until"
+	@echo "three targets are left."
 	@echo "Four methods meet that: the old physics alone (physics), an ensemble that learns from every"
 	@echo "step (online_pe), the old physics behind AFM (afm_physics), and an oracle that knows it."
 	@$(BIN)/afm-rl hydra.run.dir=outputs/demo overwrite=true budget=600 video=gif
-	@echo "Look at outputs/demo/figures/trajectory.png: paths are black before the change, orange after it."
-	@echo "The film is outputs/demo/video/all_methods.gif"
+	@awk -F, 'NR == 1 { for (k = 1; k <= NF; k++) at[$$k] = k } NR > 1 { who[$$at["finished"]] = \
+		who[$$at["finished"]] " " $$at["method"] } END { print "All targets were reached by:" \
+		who["True"] "; not by:" who["False"] "." }' outputs/demo/missions.csv
+	@echo "Look at outputs/demo/figures/trajectory.png: paths are black while the robot is healthy, orange"
+	@echo "while its motors are reversed; and at the film outputs/demo/video/all_methods.gif"
 
 test: $(VENV)/.with-test ## Run all tests with coverage (at least 95 %)
 	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 \

@@ -215,6 +215,11 @@ def test_progress_is_a_line_off_a_terminal_and_live_in_one(monkeypatch, tmp_path
             board.look()
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("jobs: 25 %") and line.endswith("1/3 jobs, 1 at work")
+        tell(jobs[0], 0.2)  # it began anew; what is shown does not run backwards
+        clock.now = 1020.0
+        board.look()
+        assert capsys.readouterr().err.startswith("jobs: 25 %")
+        tell(jobs[0], 0.5)
         (jobs[0].folder / "log.txt").write_text("ensemble: held-out error 0.1\n")
         board.end(jobs[0], None)
         board.end(jobs[1], "why")
