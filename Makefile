@@ -24,7 +24,7 @@ demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and f
 	@echo "three targets are left."
 	@echo "Four methods meet that: the old physics alone (physics), an ensemble that learns from every"
 	@echo "step (online_pe), the old physics behind AFM (afm_physics), and an oracle that knows it."
-	@$(BIN)/afm-rl hydra.run.dir=outputs/demo overwrite=true budget=600 video=gif
+	@$(BIN)/afm-rl hydra.run.dir=outputs/demo overwrite=true budget=400 video=gif
 	@awk -F, 'NR == 1 { for (k = 1; k <= NF; k++) at[$$k] = k } NR > 1 { who[$$at["finished"]] = \
 		who[$$at["finished"]] " " $$at["method"] } END { print "All targets were reached by:" \
 		who["True"] "; not by:" who["False"] "." }' outputs/demo/missions.csv

@@ -12,7 +12,6 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.wrappers import TransformObservation
-from scipy.linalg import solve_discrete_are
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
@@ -21,6 +20,7 @@ from afm_rl.dynamics import Dubins, MuJoCoDynamics, Quadrotor
 from afm_rl.envs.task.pendulum import pendulum_step
 from afm_rl.errors import ConfigurationError, check_choice
 from afm_rl.planning import MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost, load_policy
+from afm_rl.planning.riccati import stationary_value
 
 Acting = Callable[[np.ndarray], np.ndarray]
 LONG, NEAR = 3600.0, 3.0  # s, of a flight; m, from its reference, beyond which it is lost
@@ -107,22 +107,10 @@ def _push_pendulum(inner: Any, direction: float) -> None:
 def _cart_pole(file: Path | None) -> Robot:
     """A cart with a pole, by the linear quadratic regulator."""
     env: Any = gymnasium.make("InvertedPendulum-v5")
-    model, zero = MuJoCoDynamics(env), torch.zeros(1, 4, dtype=torch.float64)
-    a, b = (
-        torch.stack(
-            [
-                (model(zero + p, u) - model(zero - p, -u))[0] / 2e-4
-                for p, u in zip(1e-4 * states, 1e-4 * actions, strict=True)
-            ],
-            -1,
-        ).numpy()
-        for states, actions in (
-            (torch.eye(4, dtype=torch.float64), torch.zeros(4, 1, dtype=torch.float64)),
-            (torch.zeros(1, 4, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64)),
-        )
-    )
-    cost = solve_discrete_are(a, b, np.diag([1.0, 10.0, 0.1, 0.1]), np.eye(1))
-    gain = np.linalg.solve(np.eye(1) + b.T @ cost @ b, b.T @ cost @ a)
+    upright = torch.zeros(4, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    _, a, b = MuJoCoDynamics(env).linearise(*upright)
+    cost = torch.tensor([1.0, 10.0, 0.1, 0.1]).diag(), torch.eye(1)
+    gain = stationary_value(a, b, *cost)[1].numpy()
     space = env.action_space
 
     def act(seen: np.ndarray) -> np.ndarray:
