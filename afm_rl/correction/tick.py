@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.achievable import MODES, attainable, extend
-from afm_rl.correction.arrival import ago, aligned, effects_of
+from afm_rl.correction.arrival import ago, aligned
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
@@ -287,7 +287,7 @@ class Tick(nn.Module):
         """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now.
 
         And those ``(B, K + D, A)`` that the newest commands have or will have, by the models that
-        are so late; the commands themselves where none is late.
+        are so late; the commands themselves where none is to come.
 
         Args:
             read: what the memory says.
@@ -303,22 +303,19 @@ class Tick(nn.Module):
         follows = (self.delays[1 : acts.shape[1] + 1] < 0).unsqueeze(-1)
         acts = torch.where(follows, acting, acts)
         newest = every[:, every.shape[1] - self.most_late - ahead.shape[1] + 1 :]
-        calm = all_hold(late == 0)
-        asked, line = acts.unsqueeze(2), acting
-        if not calm:
-            more = newest.unsqueeze(1).expand(-1, acts.shape[1], -1, -1)
-            asked, line = torch.cat([asked, more], 2), torch.cat([line, newest], 1)
-        found = self.network.effect(read.encoded, asked.flatten(0, 1)).view_as(asked)
-        linear = read.lines.effect(line)
+        found = self.network.effect(read.encoded, acts.flatten(0, 1).unsqueeze(1)).view_as(acts)
+        linear = read.lines.effect(acting).squeeze(2)
         calmly = [acting.clamp(*read.slow.split(1, 1)), acting + read.noisy]
-        forecasts = [now, found[:, :, 0], linear[:, :, 0], acts[:, self.late], *calmly]
-        if not calm:
-            nominal = newest.unsqueeze(1)
-            same = nominal.expand(-1, len(self.late) + len(CALM), -1, -1)
-            effects = torch.cat([nominal, found[:, :, 1:], linear[:, :, 1:], same], 1)
+        forecasts = torch.cat([now, found, linear, acts[:, self.late], *calmly], 1)
+        waits = late + ahead.shape[1] > 1
+        if not all_hold(~waits):
             delays = torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
-            newest = effects_of(effects, weights, late, delays)
-        return torch.cat(forecasts, 1), newest
+            so_late = (delays == late.unsqueeze(-1)).unsqueeze(-1)
+            models = self.most_likely(read, torch.where(so_late, weights.clamp_min(1e-9), 0.0))
+            shares = models.weights / models.weights.sum(1, keepdim=True)
+            effects = (shares.unsqueeze(2) * self.expect(models, newest)).sum(1)
+            newest = torch.where(waits[:, None, None], effects, newest)
+        return forecasts, newest
 
 
 def filters_of(acting: Tensor) -> tuple[Tensor, Tensor]:
