@@ -90,7 +90,8 @@ def _gymnasium(task: str, policy: Callable[[], Acting], settings: dict[str, Any]
         found = inner.model
         joints = [found.joint(joint).name for joint in found.actuator_trnid[:, 0]]
         return Robot(make, policy, {"model": "mujoco"}, _push_root, inner.dt, joints)
-    model = {"model": pendulum_step, "state": lambda env, seen: env.unwrapped.state}
+    model: dict[str, Any] = {"model": pendulum_step}
+    model["state"] = lambda env, seen: env.unwrapped.state
     model["observe"] = lambda s: np.c_[np.cos(s[:, 0]), np.sin(s[:, 0]), s[:, 1]]
     return Robot(make, policy, model, _push_pendulum, inner.dt, ["joint"])
 
