@@ -14,6 +14,7 @@ from viser import uplot
 
 from afm_rl.play.actuators import presets
 from afm_rl.play.scene import COLOURS, figure_of
+from afm_rl.play.words import faults_of, text_of
 from afm_rl.play.world import SIDES, World
 
 FRAME, WORDS = 0.04, 0.25  # seconds between two pictures, and between two texts
@@ -154,7 +155,7 @@ class Page:
     def say(self) -> None:
         """Renew words and curves."""
         with self.world.lock:
-            self.words.content, self.faults.content = self.text(), self.diagnosis()
+            self.words.content, self.faults.content = text_of(self.world), faults_of(self.world)
             rewards = [np.array(side.rewards) for side in self.world.sides.values()]
             commands = np.array(self.world.sides["AFM"].commands)
         size = min(map(len, rewards))
@@ -164,49 +165,3 @@ class Page:
         if len(commands) > 1:
             one = commands[..., self.world.robot.names.index(self.shown.value)].T
             self.commands.data = (np.arange(len(commands), dtype=float), *one.astype(float))
-
-    def text(self) -> str:
-        """Say how both are, and what AFM knows."""
-        sides, score = [self.world.sides[name] for name in SIDES], self.world.robot.score
-        table = {"": SIDES, "---": ["---"] * 2, "falls": [side.falls for side in sides]}
-        table["reward a step"] = [f"{mean(side.rewards):.2f}" for side in sides]
-        if score != "reward":
-            table[score] = [side.info.get(score, "") for side in sides]
-        rows = ["| " + " | ".join(map(str, (name, *row))) + " |" for name, row in table.items()]
-        afm, late = sides[1].info["afm"], self.world.faults.values.get("delay", 0)
-        state = "**corrects**" if afm["corrects"] else "does nothing"
-        lines = [f"AFM {state}; innovation {afm['innovation']:.3g}"]
-        if f"{late:.0f} steps late" not in afm["belief"] and late > 1:
-            lines.append(f"{late:.0f} steps are more than AFM looks back: it cannot find that")
-        belief = believed(self.world.robot.names, afm["belief"], afm["noise"])
-        return "\n".join([*rows, "", "  \n".join(lines), "", *belief])
-
-    def diagnosis(self) -> str:
-        """Say what the actuators seem to do that they should not."""
-        words = str(self.world.sides["AFM"].env.diagnosis)
-        for k, name in enumerate(self.world.robot.names):
-            words = words.replace(f"actuator {k}:", f"{name}:").replace(f"a_{k}:", f"{name}:")
-        return "  \n".join(x for x in words.splitlines() if not x.endswith(": healthy"))
-
-
-def believed(names: list[str], belief: dict[str, np.ndarray], noise: np.ndarray) -> list[str]:
-    """Return a table of what is believed most of each actuator, and of all on average.
-
-    >>> believed(["joint"], {"1 step late": np.array([0.97])}, np.array([0.05]))[-1]
-    '| joint | 1 step late | 97 | 0.05 |'
-    """
-    chances = np.stack(list(belief.values()))  # of causes and actuators
-    if len(names) > 1:
-        names, chances = [*names, "*mean*"], np.c_[chances, chances.mean(1)]
-        noise = np.append(noise, noise.mean())
-    rows = ["| actuator | believed | % | noise |", "|---|---|---|---|"]
-    for name, chance, spread in zip(names, chances.T, noise, strict=True):
-        cause = list(belief)[chance.argmax()]
-        rows.append(f"| {name} | {cause} | {100 * chance.max():.0f} | {spread:.2g} |")
-    return rows
-
-
-def mean(values: Any) -> float:
-    """Return the mean of the newest 50 values."""
-    newest = list(values)[-50:]
-    return sum(newest) / max(len(newest), 1)

@@ -8,6 +8,7 @@ import warnings
 import pytest
 
 from afm_rl.play import World, make_robot
+from afm_rl.play.words import text_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
@@ -97,9 +98,9 @@ def test_robots_are_drawn_and_described(name, page_of):
         warnings.simplefilter("error")  # what is observed at arrival is known of every robot
         for _ in range(20):
             page.world.step()
-    assert "cannot find" not in page.text()
+    assert "cannot find" not in text_of(page.world)
     page.world.faults.values["delay"] = 10.0
-    assert "cannot find" in page.text()
+    assert "cannot find" in text_of(page.world)
     page.choose("healthy")
     assert page.world.faults.values["gain_0"] == 1.0
 
