@@ -81,31 +81,18 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
 }
 
 
-def choices(*groups):
-    """Name every combination of choices, with the partners that they need."""
-    for names in itertools.product(*(GROUPS[group] for group in groups)):
-        chosen = [f"{group}={name}" for group, name in zip(groups, names, strict=True)]
-        partners = [partner for choice in chosen for partner in PARTNERS.get(choice, [])]
-        yield [*dict.fromkeys(chosen + partners)]
+def choices(group):
+    """Name every choice of a group, with the partners that it needs."""
+    for name in GROUPS[group]:
+        yield [f"{group}={name}", *PARTNERS.get(f"{group}={name}", [])]
 
 
-def fits(dynamics, planner, *_):
-    """Tell whether a model that only flies has a planner for flights."""
-    flies = "robot=quadrotor"
-    return flies not in PARTNERS.get(dynamics, []) or flies in PARTNERS.get(planner, [])
-
-
-PAIRS = [
-    *(pair for pair in choices("dynamics", "planner") if fits(*pair)),
-    *(["method=online_pe", "seeds=2", *planner] for planner in choices("planner")),
-]
-SINGLES = [
-    *choices("method"),
-    *choices("updater"),
-    *choices("corrector"),
-    *([*cost, "method=afm_physics"] for cost in choices("cost")),
-    *choices("robot"),
-]
+# Each choice once against the defaults; a planner also over a model of two missions that learns.
+EACH = [choice for group in ("dynamics", "method", "updater", "corrector") for choice in choices(group)]
+EACH += choices("planner")
+EACH += [["method=online_pe", "seeds=2", *planner] for planner in choices("planner")]
+EACH += [[*cost, "method=afm_physics"] for cost in choices("cost")]
+EACH += choices("robot")
 
 
 @pytest.fixture(scope="session")
@@ -120,7 +107,7 @@ def composed(*overrides):
         return compose("config", list(overrides))
 
 
-@pytest.mark.parametrize("overrides", [*PAIRS, *SINGLES], ids=" ".join)
+@pytest.mark.parametrize("overrides", EACH, ids=" ".join)
 def test_every_choice_runs(overrides, cache, tmp_path):
     cfg = copy.deepcopy(composed(*overrides))
     for key, value in SMALL.items():
