@@ -88,8 +88,10 @@ def choices(group):
 
 
 # Each choice once against the defaults; a planner also over a model of two missions that learns.
-EACH = [choice for group in ("dynamics", "method", "updater", "corrector") for choice in choices(group)]
-EACH += choices("planner")
+EACH = [
+    *(each for group in ("dynamics", "method", "updater", "corrector") for each in choices(group)),
+    *choices("planner"),
+]
 EACH += [["method=online_pe", "seeds=2", *planner] for planner in choices("planner")]
 EACH += [[*cost, "method=afm_physics"] for cost in choices("cost")]
 EACH += choices("robot")

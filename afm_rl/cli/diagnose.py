@@ -10,7 +10,6 @@ from typing import NoReturn
 from afm_rl.cli.error_messages import told_by
 
 NAME = "afm-rl-diagnose"
-PATIENCE = 3.0  # s: shorter work shows no progress
 KINDS = ".csv, .parquet, .ulg, .mcap, .db3, .bag, or a folder of LeRobot or ROS"
 ABOUT = """\
 Say what the actuators of a robot do, from what it logged.
@@ -95,7 +94,7 @@ def _run(options: argparse.Namespace) -> None:
         from afm_rl.replay import replay
         from afm_rl.report.replay import print_replay, write_replay
 
-        with Bar(total=1.0, desc="replaying", delay=PATIENCE) as bar:
+        with Bar(total=1.0, desc="replaying", delay=3.0) as bar:  # s
             replayed = replay(log, lambda share: bar.update(share - bar.n))
     file = options.file.resolve()
     out = options.out or file.with_name(f"{file.stem}_diagnosis")

@@ -1,4 +1,4 @@
-"""Two processes give the same bytes, whatever the method, over hundreds of steps."""
+"""Two processes give the same bytes, whatever the method, over many steps."""
 
 import pytest
 from omegaconf import OmegaConf
@@ -8,7 +8,7 @@ from afm_rl.jobs.executor import LocalExecutor
 from afm_rl.jobs.layout import job_folders
 from afm_rl.storage.manifest import check_manifest
 
-METHODS = ["physics", "online_pe", "afm_physics", "stream_x_pe", "adaptive_gain", "rls", "oracle"]
+METHODS = ["online_pe", "afm_physics", "rls"]
 SMALL = {
     "dynamics.members": 2,
     "dynamics.hidden": [16, 16],
@@ -26,7 +26,7 @@ def test_two_processes_give_the_same_bytes(configure, tmp_path, here):
     """New processes train the parts, this old one finds them in the cache."""
     jobs = {}
     for method in METHODS:
-        cfg = configure(method, budget=60, cache=str(tmp_path / "cache"))
+        cfg = configure(method, budget=30, cache=str(tmp_path / "cache"))
         for key in SMALL.keys() - {k for k in SMALL if OmegaConf.select(cfg, k) is None}:
             OmegaConf.update(cfg, key, SMALL[key])
         jobs[method] = cfg

@@ -5,8 +5,6 @@ import math
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
-from hydra.utils import instantiate
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins
@@ -187,18 +185,3 @@ def test_impossible_settings_are_refused(make):
             updater_of(make(), **settings)
     with pytest.raises(ConfigurationError, match="teaches an Ensemble, got Dubins"):
         updater_of(Dubins())
-
-
-@pytest.mark.parametrize("method", ["stream_x_pe", "afm_stream_x_pe", "afm_online_pe"])
-def test_presets_choose_what_their_name_says(method):
-    with initialize_config_module("afm_rl.conf", version_base=None):
-        cfg = compose("config", overrides=[f"method={method}"])
-        literal = compose("config", overrides=["updater=stream_x_literal"]).updater
-    assert (cfg.corrector.get("samples") is not None) == method.startswith("afm")
-    loss = GaussianNLLLoss(instantiate(cfg.dynamics)(instantiate(cfg.robot)).module)
-    updater = instantiate(cfg.updater)(loss)
-    learner = getattr(updater, "updater", updater)  # beside AFM it learns what no action can undo
-    assert isinstance(learner, StreamXUpdater) == ("stream_x" in method)
-    assert loss.model.layer_norm == ("stream_x" in method)
-    if method == "stream_x_pe":
-        assert (updater.form, instantiate(literal)(loss).form) == ("error", "loss")

@@ -51,11 +51,6 @@ def test_means_are_those_found_by_hand(four, laps, table):
     assert means.loc["a", ["steps_low", "steps_high"]].isna().all()
 
 
-def test_the_index_of_the_frame_plays_no_part(four, laps, table):
-    joined = four.set_index(pd.Index([0, 1, 0, 1]))
-    pd.testing.assert_frame_equal(summarise(joined, laps), summarise(four, laps))
-
-
 def test_cells_are_summarised_one_by_one(four, laps, table):
     two = four.assign(v_gain=[-1.0, -1.0, 2.0, 2.0])
     cells = summarise(two, laps, ["cell", "method"])
@@ -93,22 +88,11 @@ def test_a_terminal_gets_the_best_in_bold(four, laps, table, monkeypatch):
     assert better.count("\x1b[1m") == 3  # success, finished, steps; not seconds
 
 
-def test_what_is_equal_is_not_the_best(four, laps, table, monkeypatch):
-    monkeypatch.setenv("TERM", "xterm")
-    lines = table(four[four["method"] == "a"], Terminal()).splitlines()
-    assert "\x1b[1m" not in next(line for line in lines if " a " in line)
-
-
 def test_cells_have_a_table_of_their_own_if_there_are_several(four, laps, table):
     assert "v_gain" not in table(four, io.StringIO())
     text = table(four.assign(v_gain=[-1.0, -1.0, 2.0, 2.0]), io.StringIO())
     (row,) = (line for line in text.splitlines() if "v_gain = 2" in line)
     assert row.split()[-6:] == ["75", "/", "300", "50", "/", "300"]
-
-
-def test_one_mission_has_no_interval(four, laps, table):
-    text = table(four[:2], io.StringIO())
-    assert "[" not in text
 
 
 def test_names_are_no_markup(four, laps, table):

@@ -6,7 +6,6 @@ import pickle
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, Unbounded
 from torchrl.envs import (
     Compose,
@@ -96,11 +95,6 @@ def test_without_an_environment():
     assert (Compose(transform(), transform(prefix="b"))(td.clone()) == td).all()
 
 
-def test_in_a_model():
-    td = TensorDict({"observation": torch.randn(5, 3)}, [5])
-    assert (nn.Sequential(transform(), nn.Identity())(td.clone()) == td).all()
-
-
 def test_in_a_replay_buffer():
     data = env(batch_size=(2,)).rollout(6, break_when_any_done=False).reshape(-1)
     for chain in (None, transform()):
@@ -180,11 +174,6 @@ def test_a_copied_environment_keeps_its_own_model():
     twin = copy.deepcopy(whole)
     torch.testing.assert_close(twin.rollout(2).shape, whole.rollout(2).shape)
     assert twin.transform[0].model is not whole.transform[0].model
-
-
-def test_an_appended_environment_copy_shares_the_specs():
-    whole = env(batch_size=(2,)).append_transform(StepCounter())
-    check_env_specs(whole)
 
 
 def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble, small_flow):

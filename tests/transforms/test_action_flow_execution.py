@@ -298,13 +298,6 @@ def test_losses_can_read_the_executed_action():
     torch.testing.assert_close(loss(data)["loss_nll"], torch.zeros(16), rtol=0, atol=1e-4)
 
 
-def test_an_aligned_robot_is_left_alone():
-    base = UGVTrack(batch_size=(4,), missions={"track": 0, "regime": {}})  # with its noise
-    data = TransformedEnv(base, ActionFlowTransform(Dubins())).rollout(20)
-    assert not data["next", "afm", "misaligned"].any()
-    assert torch.equal(data["next", "afm", "executed_action"], data["action"])
-
-
 def test_a_robot_with_reversed_drive_arrives_with_it_and_not_without():
     reached = []
     for enabled in (True, False):
@@ -319,17 +312,3 @@ def test_a_robot_with_reversed_drive_arrives_with_it_and_not_without():
         assert (data["next", "afm", "innovation"][:, 2:] > 5).float().mean() > 0.9
         reached.append(int(data["next", "reached"][:, -1].sum()))
     assert reached[0] > 2 * reached[1]
-
-
-def test_missions_may_leave_a_free_batch():
-    base = UGVTrack(process_noise=0.0)
-    whole = TransformedEnv(base, ActionFlowTransform(Dubins(), Stub()))
-    td = whole.reset(TensorDict(batch_size=[4]), set_state=False)
-    for count in (4, 4, 2, 1):
-        td = td[:count]
-        td["action"] = torch.full((count, 2), 0.3)
-        td = whole.step(td)
-        executed = td["next", "afm", "executed_action"]
-        assert executed.shape == (count, 2)
-        td = step_mdp(td)
-    torch.testing.assert_close(executed, torch.full((1, 2), -0.3))
