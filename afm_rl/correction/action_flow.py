@@ -13,7 +13,7 @@ from torch import Tensor
 from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.correction.base import Fields
 from afm_rl.correction.believing import Answer, Believer
-from afm_rl.correction.linear import LINEAR
+from afm_rl.correction.linear import CALM, LINEAR
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.readings import (
@@ -114,14 +114,15 @@ class ActionFlow(Believer):
         names = check_readings(list(READINGS) if readings is None else readings, bool(place))
         chosen = [READINGS[name] for name in names]
         late = late_ones(names)
-        models = [*names, *LINEAR, *(f"only {name}" for name in late), "noisy readings"]
-        worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * (len(late) + 1)
+        models = [*names, *LINEAR, *(f"only {name}" for name in late), *CALM]
+        worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * (len(late) + len(CALM))
         only, simple = (READINGS[name] for name in late), [Reading()] * len(LINEAR)
-        read = [Reading(), *chosen, *simple, *only, Reading()]
+        read = [Reading(), *chosen, *simple, *only, *[Reading()] * len(CALM)]
         acting = lay_out(read, rows).acting
         follows = [r.varied or r.near for r in read]
-        follows[1 + len(names) : len(follows) - len(late) - 1] = [True] * len(LINEAR)
-        follows[-1] = True
+        first = 1 + len(names)
+        follows[first : first + len(LINEAR)] = [True] * len(LINEAR)
+        follows[-len(CALM) :] = [True] * len(CALM)
         super().__init__(
             action_low,
             action_high,
@@ -155,6 +156,7 @@ class ActionFlow(Believer):
             self.odds,
             self.least_noise,
             self.delays,
+            self.acting,
             likely,
             samples,
             source_std,
@@ -191,7 +193,7 @@ class ActionFlow(Believer):
         pairs, losses, noise, place, unit = (x.reshape(rows, *x.shape[len(lead) :]) for x in given)
         weights = self.tick.weights(losses, noise)
         read = self.tick.read(pairs, noise, place, steps)
-        found = self.tick.forecast(*read, weights, steps, pairs, unit.to(pairs))
+        found = self.tick.forecast(read, weights, steps, pairs, unit.to(pairs))
         forecasts, late = (x.view(*lead, *x.shape[1:]).to(executed) for x in found)
         return forecasts, late
 

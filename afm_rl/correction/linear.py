@@ -27,6 +27,8 @@ LINEAR = (
 )
 """Offset at a gain of one; gain; gain and offset (*line*); gain and the newest offset (*drift*);
 what goes on from row to row (*arx*); affine map. Of the newest rows, or of all pairs."""
+CALM = ("only so fast", "noisy readings")
+"""Models by which there is nothing to correct: :func:`within_rate`, and :func:`sensor_noise`."""
 WINDOWS = (1, 3, 12, 0)  # rows; 0: all
 RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for a few noisy rows
 
@@ -118,6 +120,27 @@ def sensor_noise(sent: Tensor, came: Tensor, valid: Tensor, keep: float = 0.7) -
     age = torch.arange(sent.shape[-2], 0, -1, device=sent.device)
     weight = valid * (keep**age).unsqueeze(-1).to(sent)
     return (weight * (sent - came)).sum(-2, keepdim=True)
+
+
+def within_rate(came: Tensor, valid: Tensor, rows: int = 12, least: float = 0.05) -> Tensor:
+    """Return the lowest and highest next effect ``(B, 2, A)`` of actuators with a limited rate.
+
+    That is the fastest of the newest ``rows``, and no less than ``least``: what does not move is
+    not slow. Without two effects nothing is limited.
+
+    Args:
+        came: effects, the oldest first, ``(B, M, A)``.
+        valid: which rows count, ``(B, M, 1)``, 0 or 1.
+
+    >>> within_rate(torch.tensor([[[0.0], [0.2], [0.3]]]), torch.ones(1, 3, 1)).flatten()
+    tensor([0.1000, 0.5000])
+    """
+    came, valid = came[:, -rows:], valid[:, -rows:]
+    both = valid[:, 1:] * valid[:, :-1]
+    rate = (both * came.diff(dim=1).abs()).amax(1, keepdim=True).clamp_min(least)
+    known = both[:, -1:] > 0
+    now = came[:, -1:]
+    return torch.cat([torch.where(known, now + k * rate, k * torch.inf) for k in (-1, 1)], 1)
 
 
 def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from afm_rl.correction.experts import Rows
 from afm_rl.errors import ConfigurationError, check_choice
 
-FILTER = 6  # commands that a lag looks back on
+FILTER = 12  # commands that a lag looks back on
 AGE = 20.0  # steps that separate two pairs as much as one unit of place does
 FAR = 1e3  # squared distance beyond all
 OLDER = 1e-6  # squared distance that a pair is worth less, times its squared age
@@ -195,22 +195,18 @@ def _nearest(pairs: Tensor, away: Tensor, rows: int) -> Tensor:
 
 
 def _varied(pairs: Tensor, size: int, rows: int) -> Tensor:
-    """Return the newest pair, and each time the one whose command is farthest from all of them.
+    """Return the pairs whose commands are farthest from all that came after them.
 
-    Farthest-point sampling (Gonzalez 1985) of the pairs since the last change, ``(*B, K, D)``,
-    oldest first. Where there are fewer, rows are not valid.
+    Of the pairs since the last change, ``(*B, K, D)``, oldest first; the newest is always among
+    them. Where there are fewer, rows are not valid.
     """
     sent, sound = pairs[..., :size], pairs[..., 3 * size] == 1.0
     apart = (sent.unsqueeze(-2) - sent.unsqueeze(-3)).square().sum(-1)
     age = torch.arange(pairs.shape[-2] - 1, -1, -1, device=pairs.device)
-    old = OLDER * age.square()
-    nearest, picks = torch.where(sound, FAR - age, -torch.inf), []  # the newest first
-    for _ in range(rows):
-        worth, pick = nearest.max(-1, keepdim=True)
-        picks.append(torch.where(worth > -torch.inf, pick, -1))
-        row = pick.unsqueeze(-1).expand(*pick.shape, apart.shape[-1])
-        nearest = torch.minimum(nearest, apart.gather(-2, row).squeeze(-2) - old)
-        nearest = nearest.scatter(-1, pick, -torch.inf)
-    chosen = torch.cat(picks, -1).sort(-1).values
-    row = chosen.clamp_min(0).unsqueeze(-1).expand(*chosen.shape, pairs.shape[-1])
-    return pairs.gather(-2, row) * (chosen >= 0).unsqueeze(-1)
+    later = (age < age.unsqueeze(-1)) & sound.unsqueeze(-2)
+    new = torch.where(later, apart, FAR).amin(-1) - OLDER * age.square()
+    worth, chosen = torch.where(sound, new, -torch.inf).topk(rows, -1)
+    chosen, order = chosen.sort(-1)
+    row = chosen.unsqueeze(-1).expand(*chosen.shape, pairs.shape[-1])
+    found = worth.gather(-1, order) > -torch.inf
+    return pairs.gather(-2, row) * found.unsqueeze(-1)

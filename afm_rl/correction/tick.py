@@ -9,16 +9,30 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.achievable import MODES, attainable, extend
 from afm_rl.correction.arrival import ago, aligned, effects_of
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
-from afm_rl.correction.linear import LINEAR, Lines, fit_lines, sensor_noise
+from afm_rl.correction.linear import CALM, LINEAR, Lines, fit_lines, sensor_noise, within_rate
 from afm_rl.correction.network import AxisNetwork, Encoded
 from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows
 from afm_rl.correction.solver import midpoint
 from afm_rl.errors import check_choice, check_count, check_number
+
+
+class Read(NamedTuple):
+    """What the memory says of actions, by all models."""
+
+    encoded: Encoded
+    """What the R readings have read, B R sets."""
+    lines: Lines
+    """The linear models."""
+    noisy: Tensor
+    """What errors of the readings add to the next effect, ``(B, 1, A)``."""
+    slow: Tensor
+    """Lowest and highest effect of actuators no faster than of late, ``(B, 2, A)``."""
 
 
 class Models(NamedTuple):
@@ -47,6 +61,8 @@ class Tick(nn.Module):
     worth: Tensor
     late: Tensor
     delays: Tensor
+    filters: Tensor
+    filtered: Tensor
     rows_acting: Tensor
 
     def __init__(
@@ -59,6 +75,7 @@ class Tick(nn.Module):
         odds: float,
         least_noise: float,
         delays: Tensor,
+        acting: Tensor,
         likely: int,
         samples: int,
         source_std: float,
@@ -74,16 +91,19 @@ class Tick(nn.Module):
         chosen = [READINGS[name] for name in readings]
         self.by_place = any(r.near for r in chosen)
         self.varied = sum(r.varied for r in chosen)
-        self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings)), 1]
+        self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings)), len(CALM)]
         self.likely = min(check_count("corrector.likely", likely), len(chosen))
         self.most_late = max(delays.tolist())
         late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
+        filters, which = filters_of(acting)
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "worth": worth,
             "delays": delays,
+            "filters": filters,
+            "filtered": torch.nn.functional.one_hot(which).T.to(scale),
             "late": torch.tensor(late, dtype=torch.long),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
@@ -114,9 +134,9 @@ class Tick(nn.Module):
             box: lowest and highest action, ``(B, 2, A)``.
         """
         unit, ends = planned / self.scale, box / self.scale
-        encoded, lines = self.read(pairs, noise, place, late)
+        read = self.read(pairs, noise, place, late)
         weights = self.weights(losses, noise)
-        models = self.most_likely(encoded, lines, weights)
+        models = self.most_likely(read, weights)
         proposals, spread = self.propose(models, unit, ends)
         expected = self.expect(models, proposals)
         reach = self.reach(models, expected)
@@ -125,12 +145,19 @@ class Tick(nn.Module):
         sent = pairs[..., : len(self.scale)]
         tried = sent.amax(1) - sent.amin(1)
         bounds = extend(reach, ends, tried, self.saturation)
-        action = self.decide(models, proposals, expected, wanted, noise)
-        changed = weights[:, 0] + weights[:, -1] < 0.5  # else the plan, to the bit
-        action = torch.where(changed & action.isfinite().all(-1, True), action, unit)
-        predicted = self.mean(models, self.expect(models, action.unsqueeze(1)))[0].squeeze(1)
+        action, effects = self.decide(models, proposals, expected, wanted, noise)
+        lag = (self.filtered.to(weights) @ weights).argmax(1)  # the most probable one
+        if not all_hold(lag == 0):
+            action, acts = self.lead(action, lag, torch.cat([sent, waiting], 1), ends)
+            effects = self.expect(models, acts.unsqueeze(1)).squeeze(2)
+        calm = weights[:, 0] + weights[:, -len(CALM) :].sum(1)
+        changed = calm < 0.5  # else the plan, to the bit
+        corrects = changed & action.isfinite().all(-1, True)
+        action = torch.where(corrects, action, unit)
+        effects = torch.where(corrects.unsqueeze(1), effects, expected[:, :, 0])
+        predicted = (models.weights * effects).sum(1)
         ahead = torch.cat([waiting, action.unsqueeze(1)], 1)
-        forecasts, under_way = self.forecast(encoded, lines, weights, late, pairs, ahead)
+        forecasts, under_way = self.forecast(read, weights, late, pairs, ahead)
         return Answer(
             action * self.scale,
             predicted * self.scale,
@@ -146,10 +173,8 @@ class Tick(nn.Module):
         prior = prior_of(self.worth, self.odds, noise, self.least_noise)
         return Belief(losses, losses, noise).weights(prior)
 
-    def read(
-        self, pairs: Tensor, noise: Tensor, place: Tensor, late: Tensor
-    ) -> tuple[Encoded, Lines]:
-        """Return what is read in every reading, B R sets of rows, and the linear models."""
+    def read(self, pairs: Tensor, noise: Tensor, place: Tensor, late: Tensor) -> Read:
+        """Return what the memory says of actions, by all models."""
         away, size = None, len(self.scale)
         if self.by_place:
             first = 3 * size + 2
@@ -163,19 +188,20 @@ class Tick(nn.Module):
         sent, came, std, valid = follow[..., : 3 * size + 1].split([size, size, size, 1], -1)
         sound = (valid == 1.0).to(pairs)
         lines = fit_lines(sent, came, torch.hypot(std, noise.unsqueeze(1)), sound)
-        return self.network.encode(rows, fit_experts(rows)), lines
+        encoded = self.network.encode(rows, fit_experts(rows))
+        return Read(encoded, lines, sensor_noise(sent, came, sound), within_rate(came, sound))
 
-    def most_likely(self, encoded: Encoded, lines: Lines, weights: Tensor) -> Models:
+    def most_likely(self, found: Read, weights: Tensor) -> Models:
         """Return the most likely models of every axis."""
-        still, read, linear, late, noisy = weights.split(self.counts, 1)
+        still, read, linear, late, calm = weights.split(self.counts, 1)
         # Of models that are alike the first, on any machine and in any batch.
         order = torch.arange(read.shape[1], device=read.device).view(-1, 1)
         best = (read * (1 - 1e-4 * order)).topk(self.likely, 1)
-        which = encoded.choose(best.indices)
+        which = found.encoded.choose(best.indices)
         share = best.values / best.values.sum(1, keepdim=True).clamp_min(1e-30)
         share = read.sum(1, keepdim=True) * share
-        still = still + late.sum(1, keepdim=True) + noisy
-        return Models(which, lines, torch.cat([still, share, linear], 1))
+        still = still + torch.cat([late, calm], 1).sum(1, keepdim=True)
+        return Models(which, found.lines, torch.cat([still, share, linear], 1))
 
     def propose(self, models: Models, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions ``(B, C, A)``, the first the planned one, and the samples' deviation.
@@ -203,23 +229,19 @@ class Tick(nn.Module):
         read = self.network.effect(models.encoded, each).unflatten(0, (-1, self.likely))
         return torch.cat([actions.unsqueeze(1), read, models.lines.effect(actions)], 1)
 
-    def mean(self, models: Models, expected: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation of effects over the models, ``(B, C, A)`` each."""
-        weights = models.weights.unsqueeze(2)
-        return mean_and_std(expected.transpose(1, 2), weights.transpose(1, 2))
-
     def reach(self, models: Models, foreseen: Tensor) -> Tensor:
         """Return the lowest and highest effects that actions may have, ``(B, 2, A)``.
 
         As far as the models differ, the best is hoped for: a planner that may try learns more.
         """
-        mean, std = self.mean(models, foreseen)
+        weights = models.weights.unsqueeze(2)
+        mean, std = mean_and_std(foreseen.transpose(1, 2), weights.transpose(1, 2))
         return torch.stack([(mean - std).amin(1), (mean + std).amax(1)], 1)
 
     def decide(
         self, models: Models, proposals: Tensor, expected: Tensor, wanted: Tensor, noise: Tensor
-    ) -> Tensor:
-        r"""Return the actions ``(B, A)`` with the least expected loss.
+    ) -> tuple[Tensor, Tensor]:
+        r"""Return the actions ``(B, A)`` with the least expected loss, and what models expect.
 
         .. math:: u_a = \operatorname{argmin}_u \sum_h w_{ha}
                   \log\Big(1 + \frac{(T_{ha}(u) - u^*_a)^2}{s_a^2}\Big)
@@ -230,12 +252,39 @@ class Tick(nn.Module):
         more: half of two opposite answers would do nothing, and tell nothing.
         """
         cost = self.loss(models, expected, wanted, noise)  # (B, C, A)
-        mixed = proposals.gather(1, cost.argmin(1, keepdim=True))
-        joint = cost.sum(-1).argmin(1)[:, None, None].expand_as(mixed)
-        again = self.loss(models, self.expect(models, mixed), wanted, noise)
-        whole = cost.gather(1, joint).sum(-1, keepdim=True)
-        better = again.sum(-1, keepdim=True) <= whole + 1e-6
-        return torch.where(better, mixed, proposals.gather(1, joint)).squeeze(1)
+        joint = cost.sum(-1).argmin(1)[:, None, None].expand_as(proposals[:, :1])
+        action, least = proposals.gather(1, joint), cost.gather(1, joint)
+        effect = expected.gather(2, joint.unsqueeze(1).expand_as(expected[:, :, :1]))
+        if len(self.scale) > 1:
+            mixed = proposals.gather(1, cost.argmin(1, keepdim=True))
+            foreseen = self.expect(models, mixed)
+            loss = self.loss(models, foreseen, wanted, noise).sum(-1, keepdim=True)
+            better = loss <= least.sum(-1, keepdim=True) + 1e-6
+            action = torch.where(better, mixed, action)
+            effect = torch.where(better.unsqueeze(1), foreseen, effect)
+        return action.squeeze(1), effect.squeeze(2)
+
+    def lead(
+        self, acts: Tensor, lag: Tensor, sent: Tensor, box: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        r"""Return the commands ``(B, A)`` after which ``acts`` acts, and what acts after them.
+
+        .. math:: u = (v - (1 - c) \bar u) / c
+
+        as far as the box allows, where the actuator makes :math:`c u + (1 - c) \bar u` of this
+        command and those before it.
+
+        Args:
+            acts: v, what should act, ``(B, A)``.
+            lag: by which filter commands act, ``(B, A)``.
+            sent: commands until now, the newest last, ``(B, N, A)``.
+            box: lowest and highest action, ``(B, 2, A)``.
+        """
+        shares = self.filters[lag]  # (B, A, L)
+        before = sent[:, sent.shape[1] - shares.shape[-1] + 1 :].mT
+        rest, share = (shares[..., :-1] * before).sum(-1), shares[..., -1]
+        action = ((acts - rest) / share).clamp(box[:, 0], box[:, 1])
+        return action, share * action + rest
 
     def loss(self, models: Models, expected: Tensor, wanted: Tensor, noise: Tensor) -> Tensor:
         """Return the expected loss ``(B, C, A)`` of effects ``(B, 1 + K + L, C, A)``."""
@@ -243,49 +292,58 @@ class Tick(nn.Module):
         return (models.weights.unsqueeze(2) * miss.log1p()).sum(1)
 
     def forecast(
-        self,
-        encoded: Encoded,
-        lines: Lines,
-        weights: Tensor,
-        late: Tensor,
-        pairs: Tensor,
-        ahead: Tensor,
+        self, read: Read, weights: Tensor, late: Tensor, pairs: Tensor, ahead: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now.
 
         And those ``(B, K + D, A)`` that the newest commands have or will have, by the models that
-        are so late.
+        are so late; the commands themselves where none is late.
 
         Args:
-            encoded: what the readings have read.
-            lines: the linear models.
+            read: what the memory says.
             weights: probabilities of all models, ``(B, M + 1, A)``.
             late: steps that commands are late, ``(B,)``.
             pairs: what is remembered.
             ahead: commands that wait, and the present one, ``(B, D + 1, A)``.
         """
-        size, now = len(self.scale), ahead[:, :1]
-        sent = pairs[..., :size]
-        acted = torch.cat([sent, now], 1)
+        every, now = torch.cat([pairs[..., : len(self.scale)], ahead], 1), ahead[:, :1]
+        acted = every[:, : pairs.shape[1] + 1]
         acting = ago(acted, late).unsqueeze(1)
-        acted = self.rows_acting @ acted[:, -self.rows_acting.shape[-1] :]  # (B, R, A)
-        follows = (self.delays[1 : acted.shape[1] + 1] < 0).unsqueeze(-1)
-        acted = torch.where(follows, acting, acted)
-        every = torch.cat([sent, ahead], 1)
+        acts = self.rows_acting @ acted[:, -self.rows_acting.shape[-1] :]  # (B, R, A)
+        follows = (self.delays[1 : acts.shape[1] + 1] < 0).unsqueeze(-1)
+        acts = torch.where(follows, acting, acts)
         newest = every[:, every.shape[1] - self.most_late - ahead.shape[1] + 1 :]
-        shape = (-1, acted.shape[1], -1, -1)
-        asked = torch.cat([acted.unsqueeze(2), newest.unsqueeze(1).expand(shape)], 2)
-        found = self.network.effect(encoded, asked.flatten(0, 1)).view_as(asked)
-        linear = lines.effect(torch.cat([acting, newest], 1))
-        follow = aligned(pairs, late, size)[..., : 3 * size + 1]
-        before, came, _, valid = follow.split([size, size, size, 1], -1)
-        noisy = acting + sensor_noise(before, came, (valid == 1.0).to(now))
-        forecasts = [now, found[:, :, 0], linear[:, :, 0], acted[:, self.late], noisy]
-        nominal = newest.unsqueeze(1)
-        same = nominal.expand(-1, len(self.late) + 1, -1, -1)
-        effects = torch.cat([nominal, found[:, :, 1:], linear[:, :, 1:], same], 1)
-        delays = torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
-        return torch.cat(forecasts, 1), effects_of(effects, weights, late, delays)
+        calm = all_hold(late == 0)
+        asked, line = acts.unsqueeze(2), acting
+        if not calm:
+            more = newest.unsqueeze(1).expand(-1, acts.shape[1], -1, -1)
+            asked, line = torch.cat([asked, more], 2), torch.cat([line, newest], 1)
+        found = self.network.effect(read.encoded, asked.flatten(0, 1)).view_as(asked)
+        linear = read.lines.effect(line)
+        calmly = [acting.clamp(*read.slow.split(1, 1)), acting + read.noisy]
+        forecasts = [now, found[:, :, 0], linear[:, :, 0], acts[:, self.late], *calmly]
+        if not calm:
+            nominal = newest.unsqueeze(1)
+            same = nominal.expand(-1, len(self.late) + len(CALM), -1, -1)
+            effects = torch.cat([nominal, found[:, :, 1:], linear[:, :, 1:], same], 1)
+            delays = torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
+            newest = effects_of(effects, weights, late, delays)
+        return torch.cat(forecasts, 1), newest
+
+
+def filters_of(acting: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the ways ``(F, L)`` in which actuators are slow, and that of each model ``(M,)``.
+
+    The first is that they are not, as where commands are late and no more.
+
+    >>> filters_of(torch.tensor([[0.0, 1.0], [1.0, 0.0], [0.4, 0.6]]))
+    (tensor([[0.0000, 1.0000],
+            [0.4000, 0.6000]]), tensor([0, 0, 1]))
+    """
+    newest = torch.zeros_like(acting)
+    newest[:, -1] = 1.0
+    slow = ((acting > 0).sum(-1, keepdim=True) > 1) & (acting[:, -1:] > 0)
+    return torch.where(slow, acting, newest).unique(dim=0, return_inverse=True)
 
 
 def points_of(count: int, size: int) -> Tensor:
