@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
-from typing import NoReturn
 
-from afm_rl.cli.error_messages import told_by
+from afm_rl.cli.error_messages import OneLineParser, told_by
 
 NAME = "afm-rl-diagnose"
 KINDS = ".csv, .parquet, .ulg, .mcap, .db3, .bag, or a folder of LeRobot or ROS"
@@ -30,18 +28,9 @@ healthy, changed, dead, or the log cannot tell.
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong in one line."""
-        print(f"{NAME}: {message} (see {NAME} --help)", file=sys.stderr)
-        sys.exit(2)
-
-
 def main() -> None:
     """Run ``afm-rl-diagnose``; a mistake ends in one line and exit status 2."""
-    parser = _Parser(
-        prog=NAME, description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = OneLineParser(NAME, ABOUT)
     add = parser.add_argument
     add("file", metavar="FILE", type=Path, help=f"a log: {KINDS}")
     add("--out", metavar="DIR", type=Path, help="where to (FILE_diagnosis, beside FILE)")

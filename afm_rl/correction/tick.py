@@ -264,9 +264,7 @@ class Tick(nn.Module):
             effect = torch.where(better.unsqueeze(1), foreseen, effect)
         return action.squeeze(1), effect.squeeze(2)
 
-    def lead(
-        self, acts: Tensor, lag: Tensor, sent: Tensor, box: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def lead(self, acts: Tensor, lag: Tensor, sent: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
         r"""Return the commands ``(B, A)`` after which ``acts`` acts, and what acts after them.
 
         .. math:: u = (v - (1 - c) \bar u) / c
