@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
+from small import shrink
 
 import afm_rl.conf
 from afm_rl.missions import build, prepare, run
@@ -20,24 +21,6 @@ FILES = sorted(CONF.glob("*/*.yaml"))
 GROUPS = {
     folder: [path.stem for path in paths]
     for folder, paths in itertools.groupby(FILES, lambda path: path.parent.name)
-}
-SMALL = {  # settings that are there are made small
-    "planner.population": 8,
-    "planner.elites": 2,
-    "dynamics.members": 2,
-    "dynamics.hidden": [8, 8],
-    "dynamics.pretrain.samples": 256,
-    "dynamics.pretrain.epochs": 1,
-    "dynamics.pretrain.flights": 4,
-    "dynamics.base.members": 2,
-    "dynamics.base.hidden": [8, 8],
-    "dynamics.base.pretrain.samples": 256,
-    "dynamics.base.pretrain.epochs": 1,
-    "corrector.width": 8,
-    "corrector.train.iterations": 5,
-    "robot.data.rounds": [64, 64],
-    "robot.data.fit.epochs": 1,
-    "budget": 5,
 }
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 POLICY = Path(__file__).parents[1] / "examples" / "policies" / "pendulum_sac.safetensors"
@@ -111,10 +94,7 @@ def composed(*overrides):
 
 @pytest.mark.parametrize("overrides", EACH, ids=" ".join)
 def test_every_choice_runs(overrides, cache, tmp_path):
-    cfg = copy.deepcopy(composed(*overrides))
-    for key, value in SMALL.items():
-        if OmegaConf.select(cfg, key) is not None:
-            OmegaConf.update(cfg, key, value)
+    cfg = shrink(copy.deepcopy(composed(*overrides)), {"budget": 5})
     agent = build(cfg)
     prepare(agent, cache, echo=lambda line: None)
     results = run(agent)

@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.errors import ConfigurationError
 from afm_rl.jobs import process, progress
 from afm_rl.jobs.batch import file_name, run_batch
 from afm_rl.jobs.executor import LocalExecutor
@@ -91,14 +91,6 @@ def test_nothing_is_changed_if_one_job_has_other_settings(jobs, tmp_path, here):
     with pytest.raises(ConfigurationError, match=r"budget: 12 -> 13"):
         run_batch(tmp_path, jobs("oracle", "physics", budget=13), here, **QUIET)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
-
-
-def test_damaged_results_stop_a_batch_and_are_named(jobs, tmp_path, here):
-    run_batch(tmp_path, jobs("physics", seeds=[0]), here, **QUIET)
-    path = tmp_path / "jobs" / "physics+seed=0" / "missions.csv"
-    path.write_bytes(path.read_bytes().replace(b"0", b"1", 1))
-    with pytest.raises(ArtefactError, match=f"{path.name}: damaged"):
-        run_batch(tmp_path, jobs("physics"), here, **QUIET)
 
 
 def test_folders_that_are_taken(jobs, tmp_path, here):

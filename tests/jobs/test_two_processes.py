@@ -1,7 +1,7 @@
 """Two processes give the same bytes, whatever the method, over many steps."""
 
 import pytest
-from omegaconf import OmegaConf
+from small import shrink
 
 from afm_rl.jobs.batch import run_batch
 from afm_rl.jobs.executor import LocalExecutor
@@ -9,16 +9,6 @@ from afm_rl.jobs.layout import job_folders
 from afm_rl.storage.manifest import check_manifest
 
 METHODS = ["online_pe", "afm_physics", "rls"]
-SMALL = {
-    "dynamics.members": 2,
-    "dynamics.hidden": [16, 16],
-    "dynamics.pretrain.samples": 512,
-    "dynamics.pretrain.epochs": 1,
-    "corrector.hidden": [16, 16],
-    "corrector.latent": 8,
-    "corrector.width": 8,
-    "corrector.train.iterations": 20,
-}
 
 
 @pytest.mark.slow
@@ -27,9 +17,7 @@ def test_two_processes_give_the_same_bytes(configure, tmp_path, here):
     jobs = {}
     for method in METHODS:
         cfg = configure(method, budget=30, cache=str(tmp_path / "cache"))
-        for key in SMALL.keys() - {k for k in SMALL if OmegaConf.select(cfg, k) is None}:
-            OmegaConf.update(cfg, key, SMALL[key])
-        jobs[method] = cfg
+        jobs[method] = shrink(cfg)
     assert run_batch(tmp_path / "new", jobs, LocalExecutor(2), echo=lambda line: None) == {}
     assert run_batch(tmp_path / "old", jobs, here, echo=lambda line: None) == {}
     for one, other in zip(*(job_folders(tmp_path / name) for name in ("new", "old")), strict=True):

@@ -242,12 +242,6 @@ def test_what_was_learnt_keeps_its_digits():
     torch.testing.assert_close(other.model.matrix, world.model.matrix, atol=1e-6, rtol=0)
 
 
-def test_a_mask_says_what_to_learn_from():
-    world = World(missions=2, mask_key="mask")
-    world.drive(10, matrix=GAINS, mask=torch.tensor([True, False]).unsqueeze(-1))
-    torch.testing.assert_close(world.model.matrix, torch.stack([GAINS, EYE]))
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -65,14 +65,6 @@ def test_missions_stand_in_order_tracks_then_regimes_then_seeds(drive, ring):
     assert run.steps["mission"].tolist() == [mission for mission in range(12) for _ in range(2)]
 
 
-def test_the_regime_of_a_mission_in_words(drive, ring):
-    regimes = ["mixed", BACKWARDS, [{"v_gain": 2.0}, {}, {"delay": 1}]]
-    run = drive(tracks=["ethz_1", ring], regimes=regimes, seeds=2, budget=2)
-    words = ["mixed", "v_gain = -1", "v_gain = 2; nominal; delay = 1"]
-    assert run.missions["regime"].tolist() == [name for name in words for _ in range(2)] * 2
-    assert run.agent.regime_names == run.missions["regime"].tolist()
-
-
 def test_the_oracle_is_told_what_acts_during_a_ramp(drive, ring):
     regime = {"phases": [{}, {"v_gain": 0.5, "rotation": 0.3}], "at": [0.0], "ramp": 30}
     steps = drive("method=oracle", tracks=ring, regimes=[regime], budget=60).steps
@@ -119,10 +111,6 @@ def test_seconds_are_shared_out_among_the_missions(drive, ring):
 OTHERS = {"sysid", "afm_sysid"}  # need MuJoCo, and all with a KNODE a quadrotor
 METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
 METHODS = [name for name in METHODS if name not in OTHERS and "knode" not in name]
-NAIVE = {
-    "corrector.readings": ["recent"],
-    "corrector.odds": 0.0,
-}  # whatever is believed, it is corrected
 
 
 @pytest.mark.parametrize(
@@ -201,26 +189,6 @@ def test_a_run_changes_no_other_agent_and_no_stored_part(make_agent, drive, ring
     drive("method=online_pe", tracks=ring, budget=5)
     assert not any(changed(other.model, before))
     assert {path: path.read_bytes() for path in cache.iterdir()} == stored
-
-
-def test_actions_are_planned_and_executed_inside_the_box(drive, ring):
-    settings = {"tracks": ring, "regimes": [BACKWARDS], "budget": 60, **NAIVE}
-    steps = drive("method=afm_physics", "corrector.extend_action_box=false", **settings).steps
-    for kind in ("planned", "executed"):
-        assert steps[f"{kind}_v"].abs().max() <= 1
-        assert steps[f"{kind}_omega"].abs().max() <= np.float32(np.pi / 2)
-    corrected = steps["planned_v"].ne(steps["executed_v"])
-    assert corrected.any() and steps.loc[corrected, "misaligned"].eq(1).all()
-
-
-def test_a_transform_that_only_watches_executes_what_was_planned(drive, ring):
-    settings = {"tracks": ring, "regimes": [BACKWARDS], "budget": 60}
-    watch = {"corrector.enabled": False, **NAIVE}
-    watching = drive("method=afm_physics", **settings, **watch).steps
-    physics = drive("method=physics", **settings).steps
-    assert watching["misaligned"].sum() > 0
-    columns = ["x", "y", "theta", "planned_v", "executed_v", "reached"]
-    same(watching[columns], physics[columns])
 
 
 def test_progress_is_shown_if_asked_for(make_agent, spot, capsys, monkeypatch):

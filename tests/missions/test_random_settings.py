@@ -8,6 +8,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from small import shrink
 
 from afm_rl.errors import AFMError
 from afm_rl.missions import build
@@ -23,7 +24,6 @@ false null none all abc "" "../../x" ".." "/" [] [0] [1,2] [[]] [null] [nan,inf]
 [1e30,-1e30] {v_gain:1e30} [{}] [{v_gain:-1}] [{saturation:0}] [[{},{}]] {_target_:os.system}
 [-1,0,1] [a,b,c] cuda:7
 """.split()
-SMALL = {"planner.population": 8, "dynamics.hidden": [8]}
 
 
 def leaves(node, place=""):
@@ -39,11 +39,8 @@ def leaves(node, place=""):
 @pytest.mark.parametrize("method", METHODS)
 def test_random_settings_end_in_a_run_or_in_one_line(composed, no_training, method):
     dice, parse = random.Random(method), OverridesParser.create().parse_override
-    base = composed(*method.split())
+    base = shrink(copy.deepcopy(composed(*method.split())))
     keys = sorted(leaves(OmegaConf.to_container(base, resolve=False)))
-    for key, value in SMALL.items():
-        if OmegaConf.select(base, key) is not None:
-            OmegaConf.update(base, key, value)
     refused = built = 0
     for _ in range(CHANGES):
         cfg = copy.deepcopy(base)

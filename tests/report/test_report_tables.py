@@ -5,7 +5,7 @@ import io
 import pandas as pd
 import pytest
 
-from afm_rl.report import print_summary, summarise
+from afm_rl.report import print_summary
 
 
 class Terminal(io.StringIO):
@@ -35,31 +35,6 @@ def four():
     frame.insert(1, "track", "ring")
     frame.insert(2, "v_gain", -1.0)
     return frame.assign(seconds=1.5)
-
-
-def test_means_are_those_found_by_hand(four, laps, table):
-    means = summarise(four, laps).set_index("method")
-    assert means.index.tolist() == ["a", "b"]
-    assert means["missions"].tolist() == [2, 2]
-    assert means["success_rate"].tolist() == [0.5, 0.75]
-    assert means["finished"].tolist() == [0.0, 0.5]
-    assert means["steps"].tolist() == [300.0, 250.0]  # given up: the budget of the cell
-    assert means["seconds"].tolist() == [3.0, 3.0]
-    # Of two values, a quarter of the resamples consist of the lower one alone.
-    assert means.loc["a", ["success_rate_low", "success_rate_high"]].tolist() == [0.25, 0.75]
-    assert means.loc["b", ["steps_low", "steps_high"]].tolist() == [200.0, 300.0]
-    assert means.loc["a", ["steps_low", "steps_high"]].isna().all()
-
-
-def test_cells_are_summarised_one_by_one(four, laps, table):
-    two = four.assign(v_gain=[-1.0, -1.0, 2.0, 2.0])
-    cells = summarise(two, laps, ["cell", "method"])
-    assert cells[["cell", "method", "success_rate"]].to_numpy().tolist() == [
-        ["ring, v_gain = -1", "a", 0.25],
-        ["ring, v_gain = -1", "b", 1.0],
-        ["ring, v_gain = 2", "a", 0.75],
-        ["ring, v_gain = 2", "b", 0.5],
-    ]
 
 
 def test_a_pipe_gets_plain_text_that_is_never_cut_off(four, laps, table, monkeypatch):

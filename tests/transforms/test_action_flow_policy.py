@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.envs.utils import step_mdp
 
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins
@@ -85,13 +85,6 @@ def test_the_first_state_is_no_transition(track, agent):
     data = TransformedEnv(track(), primers(agent)).rollout(3)
     memory = data["afm", "memory"][:, 0]
     assert memory[:, :3].isnan().all() and not memory[:, 3:-2].any()  # the last is the noise
-
-
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-def test_any_batch(track, agent, batch):
-    env = TransformedEnv(track(batch), primers(agent))
-    check_env_specs(env, break_when_any_done="both")
-    assert env.rollout(2, agent)["action"].shape == (*batch, 2, 2)
 
 
 def test_keys_are_declared_and_may_be_nested(planner, flow):
