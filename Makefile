@@ -28,7 +28,7 @@ demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and f
 	@echo "The film is outputs/demo/video/all_methods.gif"
 
 test: $(VENV)/.with-test ## Run the tests with coverage (at least 95 %); ALL=1 adds those marked slow
-	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 $(if $(ALL),,-m "not slow") \
+	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --dist worksteal $(if $(ALL),,-m "not slow") \
 		--cov --cov-report=term-missing:skip-covered --cov-fail-under=95 --durations=10
 
 lint: $(VENV)/.with-test ## Check style, format and spelling
