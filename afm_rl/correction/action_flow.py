@@ -59,7 +59,6 @@ class ActionFlow(Believer):
         place_scale: distance at which ground counts as other ground, in their unit.
         plain: prior log-odds of a linear model against a reading: a line that predicts what is done
             now knows nothing of other actions.
-        likely: models of an axis that are asked, of which the first proposes.
         samples: starting points of the flow.
         source_std: :math:`\sigma`, a share of the largest action.
         steps: midpoint steps.
@@ -99,7 +98,6 @@ class ActionFlow(Believer):
         place: Sequence[int] = (),
         place_scale: float = 0.5,
         plain: float = -6.0,
-        likely: int = 3,
         samples: int = 16,
         source_std: float = 0.3,
         steps: int = 1,
@@ -157,7 +155,6 @@ class ActionFlow(Believer):
             self.least_noise,
             self.delays,
             self.acting,
-            likely,
             samples,
             source_std,
             steps,

@@ -60,21 +60,6 @@ def steps_late(weights: Tensor, prior: Tensor, delays: Tensor, before: Tensor, m
     return torch.where((weights[..., 0, :] < 0.5).any(-1) | (before > 0), found, 0)
 
 
-def effects_of(models: Tensor, weights: Tensor, late: Tensor, delays: Tensor) -> Tensor:
-    """Return the effects ``(*B, K, A)`` of commands by those models that are so late.
-
-    Args:
-        models: their effects by every model, ``(*B, M, K, A)``.
-        weights: probabilities of the models, ``(*B, M, A)``.
-        late: steps, ``(*B)``.
-        delays: of the models, ``(*B, M)``.
-    """
-    so_late = delays.unsqueeze(-1) == late[..., None, None]
-    among = torch.where(so_late, weights.clamp_min(1e-9), 0.0)
-    among = among / among.sum(-2, keepdim=True)
-    return (among.unsqueeze(-2) * models).sum(-3)
-
-
 def ago(commands: Tensor, late: Tensor) -> Tensor:
     """Return the command ``(*B, A)`` that acts now, of all ``(*B, N, A)``, the newest last."""
     row = (commands.shape[-2] - 1 - late)[..., None, None]

@@ -90,27 +90,12 @@ def fit_gain_offset(
     return not_zero(gain), offset
 
 
-def fit_friction(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Fit :math:`u_\mathrm{eff} = g \odot u + h \odot \mathrm{sign}(u)`, each axis for itself.
-
-    Dry friction, or a dead zone: pairs without any effect are left out, see
-    :func:`apply_friction`. Weak prior g = 1, h = 0. Args as for :func:`fit_gain`.
-
-    Returns:
-        Gains, none smaller than 0.02 in size, and offsets, ``(*B, A)`` each.
-    """
-    size, sign = executed.abs(), executed.sign()
-    terms = torch.stack([size * size, size, sign.abs(), executed * effective, sign * effective], -3)
-    moved = weight * (effective.abs() > STUCK)
-    square, mixed, signs, cross, signed = (moved.unsqueeze(-3) * terms).sum(-2).unbind(-2)
-    square, cross, signs = square + PRIOR, cross + PRIOR, signs + 10 * PRIOR
-    determinant = (square * signs - mixed.square()).clamp_min(PRIOR**2)
-    gain = (signs * cross - mixed * signed) / determinant
-    return not_zero(gain), (square * signed - mixed * cross) / determinant
-
-
 def apply_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
-    """Return the effect of ``unit`` ``(*B, A)`` under :func:`fit_friction`: zero if it is held.
+    r"""Return the effect of ``unit`` ``(*B, A)`` under dry friction or a dead zone.
+
+    .. math:: v = g u + h\,\mathrm{sign}(u)
+
+    and 0 where that is held, against the motion.
 
     >>> apply_friction(torch.tensor(1.0), torch.tensor(-0.5), torch.tensor([-0.75, 0.25])).tolist()
     [-0.25, 0.0]
@@ -121,7 +106,7 @@ def apply_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
 
 
 def invert_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
-    """Return the action ``(*B, A)`` that has the effect ``unit`` under :func:`fit_friction`."""
+    """Return the action ``(*B, A)`` that has the effect ``unit`` under :func:`apply_friction`."""
     ratio = unit / gain
     return ratio - offset / gain * ratio.sign()
 

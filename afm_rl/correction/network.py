@@ -54,17 +54,14 @@ class Encoded(NamedTuple):
     """A code per axis, ``(N, A, 1, L)``."""
 
     def choose(self, which: Tensor) -> Encoded:
-        """Compose models axis by axis from the R sets of rows that each of B missions has.
+        """Return one model of B missions, axis by axis from the R sets of rows that each has.
 
         Args:
-            which: the set that an axis of each of K models reads, ``(B, K, A)``; N is B R.
-
-        Returns:
-            B K sets.
+            which: the set that an axis reads, ``(B, A)``; N is B R.
         """
-        count, models, axes = which.shape
-        row = torch.arange(count, device=which.device).view(-1, 1, 1)
-        at = (row * (self.code.shape[0] // count) + which).flatten(0, 1)
+        count, axes = which.shape
+        row = torch.arange(count, device=which.device).unsqueeze(-1)
+        at = row * (self.code.shape[0] // count) + which
         axis = torch.arange(axes, device=which.device)
         parts = {name: part[at, axis] for name, part in self.experts._asdict().items()}
         parts["inverse"] = invert_matrix(parts["matrix"])
@@ -78,10 +75,6 @@ class Asked(NamedTuple):
     """Their part in the first layer, ``(N, A, C, W)``."""
     answers: Tensor
     """The experts' answers, ``(N, A, C, 6)``."""
-
-    def pick(self, which: Tensor) -> Asked:
-        """Return those of some sets of rows."""
-        return Asked(self.hidden.index_select(0, which), self.answers.index_select(0, which))
 
 
 class AxisNetwork(nn.Module):

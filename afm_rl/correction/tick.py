@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.achievable import MODES, attainable, extend
-from afm_rl.correction.arrival import ago, aligned, effects_of
+from afm_rl.correction.arrival import ago, aligned
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
@@ -36,15 +36,15 @@ class Read(NamedTuple):
 
 
 class Models(NamedTuple):
-    """What is believed of the next action: the models, or the most likely of them."""
+    """What is believed of the next action."""
 
     encoded: Encoded
-    """What the K most likely readings of every axis have read, B K sets."""
+    """What the most likely reading of every axis has read."""
     lines: Lines
     """The linear models."""
     weights: Tensor
-    """Probabilities ``(B, 1 + K + L, A)``: that actions have their nominal effect, now or late;
-    of the readings; of the linear models."""
+    """Probabilities ``(B, 2 + L, A)``: that actions have their nominal effect, now or late;
+    of a reading; of the linear models."""
 
 
 class Tick(nn.Module):
@@ -76,7 +76,6 @@ class Tick(nn.Module):
         least_noise: float,
         delays: Tensor,
         acting: Tensor,
-        likely: int,
         samples: int,
         source_std: float,
         steps: int,
@@ -92,7 +91,6 @@ class Tick(nn.Module):
         self.by_place = any(r.near for r in chosen)
         self.varied = sum(r.varied for r in chosen)
         self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings)), len(CALM)]
-        self.likely = min(check_count("corrector.likely", likely), len(chosen))
         self.most_late = max(delays.tolist())
         late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
         filters, which = filters_of(acting)
@@ -192,41 +190,34 @@ class Tick(nn.Module):
         return Read(encoded, lines, sensor_noise(sent, came, sound), within_rate(came, sound))
 
     def most_likely(self, found: Read, weights: Tensor) -> Models:
-        """Return the most likely models of every axis."""
+        """Return the models of which an action is chosen."""
         still, read, linear, late, calm = weights.split(self.counts, 1)
-        # Of models that are alike the first, on any machine and in any batch.
+        # Of readings that are alike the first, on any machine and in any batch.
         order = torch.arange(read.shape[1], device=read.device).view(-1, 1)
-        best = (read * (1 - 1e-4 * order)).topk(self.likely, 1)
-        which = found.encoded.choose(best.indices)
-        share = best.values / best.values.sum(1, keepdim=True).clamp_min(1e-30)
-        share = read.sum(1, keepdim=True) * share
-        still = still + torch.cat([late, calm], 1).sum(1, keepdim=True)
-        return Models(which, found.lines, torch.cat([still, share, linear], 1))
+        best = found.encoded.choose((read * (1 - 1e-4 * order)).argmax(1))
+        still = torch.cat([still, late, calm], 1).sum(1, keepdim=True)
+        shares = torch.cat([still, read.sum(1, keepdim=True), linear], 1)
+        return Models(best, found.lines, shares)
 
     def propose(self, models: Models, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions ``(B, C, A)``, the first the planned one, and the samples' deviation.
 
-        The flow's samples of the most likely reading, the exact answers of all fits, and a few
-        actions from all over the box.
+        The flow's samples, the exact answers of all fits, and a few actions from all over the box.
         """
-        count, size = planned.shape
-        plans = planned.repeat_interleave(self.likely, 0).unsqueeze(1)
-        asked = self.network.ask(models.encoded, plans, self.saturation)
-        first = asked.pick(torch.arange(count, device=planned.device) * self.likely)
         plan = planned.unsqueeze(1)
+        asked = self.network.ask(models.encoded, plan, self.saturation)
         start = plan + self.source_std * self.points
-        ends = midpoint(partial(self.network.velocity, first), start, self.steps)
+        ends = midpoint(partial(self.network.velocity, asked), start, self.steps)
         mean, spread = ends.mean(1, keepdim=True), ends.std(1, correction=0)
-        exact = asked.answers[..., 0, :MISSES].mT.reshape(count, -1, size)
+        exact = asked.answers[..., 0, :MISSES].mT
         least, most = box.split(1, 1)
         probes = torch.lerp(least, most, 0.5 * (self.probes + 1))
         found = [plan, mean, ends, exact, models.lines.invert(planned), probes]
         return torch.cat(found, 1).clamp(least, most), spread
 
     def expect(self, models: Models, actions: Tensor) -> Tensor:
-        """Return the effects ``(B, 1 + K + L, C, A)`` of actions ``(B, C, A)`` by every model."""
-        each = actions.repeat_interleave(self.likely, 0)
-        read = self.network.effect(models.encoded, each).unflatten(0, (-1, self.likely))
+        """Return the effects ``(B, 2 + L, C, A)`` of actions ``(B, C, A)`` by every model."""
+        read = self.network.effect(models.encoded, actions).unsqueeze(1)
         return torch.cat([actions.unsqueeze(1), read, models.lines.effect(actions)], 1)
 
     def reach(self, models: Models, foreseen: Tensor) -> Tensor:
@@ -252,11 +243,12 @@ class Tick(nn.Module):
         more: half of two opposite answers would do nothing, and tell nothing.
         """
         cost = self.loss(models, expected, wanted, noise)  # (B, C, A)
-        joint = cost.sum(-1).argmin(1)[:, None, None].expand_as(proposals[:, :1])
+        each = cost.argmin(1, keepdim=True)
+        joint = cost.sum(-1).argmin(1)[:, None, None].expand_as(each)
         action, least = proposals.gather(1, joint), cost.gather(1, joint)
         effect = expected.gather(2, joint.unsqueeze(1).expand_as(expected[:, :, :1]))
-        if len(self.scale) > 1:
-            mixed = proposals.gather(1, cost.argmin(1, keepdim=True))
+        if not all_hold(each == joint):
+            mixed = proposals.gather(1, each)
             foreseen = self.expect(models, mixed)
             loss = self.loss(models, foreseen, wanted, noise).sum(-1, keepdim=True)
             better = loss <= least.sum(-1, keepdim=True) + 1e-6
@@ -285,7 +277,7 @@ class Tick(nn.Module):
         return action, share * action + rest
 
     def loss(self, models: Models, expected: Tensor, wanted: Tensor, noise: Tensor) -> Tensor:
-        """Return the expected loss ``(B, C, A)`` of effects ``(B, 1 + K + L, C, A)``."""
+        """Return the expected loss ``(B, C, A)`` of effects ``(B, 2 + L, C, A)``."""
         miss = (expected - wanted[:, None, None]).square() / noise[:, None, None].square()
         return (models.weights.unsqueeze(2) * miss.log1p()).sum(1)
 
@@ -311,22 +303,17 @@ class Tick(nn.Module):
         follows = (self.delays[1 : acts.shape[1] + 1] < 0).unsqueeze(-1)
         acts = torch.where(follows, acting, acts)
         newest = every[:, every.shape[1] - self.most_late - ahead.shape[1] + 1 :]
-        calm = all_hold(late == 0)
-        asked, line = acts.unsqueeze(2), acting
-        if not calm:
-            more = newest.unsqueeze(1).expand(-1, acts.shape[1], -1, -1)
-            asked, line = torch.cat([asked, more], 2), torch.cat([line, newest], 1)
-        found = self.network.effect(read.encoded, asked.flatten(0, 1)).view_as(asked)
-        linear = read.lines.effect(line)
+        found = self.network.effect(read.encoded, acts.flatten(0, 1).unsqueeze(1)).view_as(acts)
+        linear = read.lines.effect(acting).squeeze(2)
         calmly = [acting.clamp(*read.slow.split(1, 1)), acting + read.noisy]
-        forecasts = [now, found[:, :, 0], linear[:, :, 0], acts[:, self.late], *calmly]
-        if not calm:
-            nominal = newest.unsqueeze(1)
-            same = nominal.expand(-1, len(self.late) + len(CALM), -1, -1)
-            effects = torch.cat([nominal, found[:, :, 1:], linear[:, :, 1:], same], 1)
+        forecasts = torch.cat([now, found, linear, acts[:, self.late], *calmly], 1)
+        if not all_hold(late == 0):
             delays = torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
-            newest = effects_of(effects, weights, late, delays)
-        return torch.cat(forecasts, 1), newest
+            so_late = (delays == late.unsqueeze(-1)).unsqueeze(-1)
+            models = self.most_likely(read, torch.where(so_late, weights.clamp_min(1e-9), 0.0))
+            shares = models.weights / models.weights.sum(1, keepdim=True)
+            newest = (shares.unsqueeze(2) * self.expect(models, newest)).sum(1)
+        return forecasts, newest
 
 
 def filters_of(acting: Tensor) -> tuple[Tensor, Tensor]:

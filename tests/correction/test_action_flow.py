@@ -124,7 +124,6 @@ def test_it_can_be_refined_on_a_robot(small_flow, gains, states):
         {"least_noise": 0.0},
         {"quiet": -1.0},
         {"tails": 0.0},
-        {"likely": 0},
         {"samples": 0},
         {"source_std": -0.1},
         {"steps": 0},

@@ -91,11 +91,11 @@ def test_a_batch_equals_its_parts(network, axes):
 def test_axes_may_read_different_sets_of_rows(network):
     rows, _, points = example(6, 2)  # three sets for each of two missions
     encoded = network.encode(rows, fit_experts(rows))
-    which = torch.tensor([[[2, 0]], [[1, 1]]])  # one model each, by axis
+    which = torch.tensor([[2, 0], [1, 1]])  # by axis
     points = points[:2]
     found = network.effect(encoded.choose(which), points)
     for mission, axis in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        whole = encoded.choose(which[..., axis : axis + 1].expand(2, 1, 2))
+        whole = encoded.choose(which[:, axis : axis + 1].expand(2, 2))
         expected = network.effect(whole, points)
         torch.testing.assert_close(
             found[mission, :, axis], expected[mission, :, axis], rtol=1e-3, atol=1e-3

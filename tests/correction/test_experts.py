@@ -18,7 +18,6 @@ from afm_rl.correction.fits import (
     apply_friction,
     confidence,
     fit_affine,
-    fit_friction,
     fit_gain,
     fit_gain_offset,
     invert_affine,
@@ -106,7 +105,6 @@ def test_the_fits_are_those_of_the_single_functions():
         (gain[..., 0], fit_gain(*pairs, short)),
         (gain[..., 1], fit_gain(*pairs, long)),
         *zip((gain[..., 2], offset[..., 2]), fit_gain_offset(*pairs, long, rounds=1), strict=True),
-        *zip((gain[..., 3], offset[..., 3]), fit_friction(*pairs, long), strict=True),
         *zip((experts.matrix, experts.bias[..., 0]), fit_affine(*pairs, long), strict=True),
     ]
     for found, expected in one_by_one:
@@ -131,7 +129,7 @@ def test_sets_of_rows_do_not_mix():
             torch.testing.assert_close(found, together.execute(asked, mode)[k])
 
 
-@pytest.mark.parametrize("form", [fit_gain, fit_gain_offset, fit_friction, fit_affine])
+@pytest.mark.parametrize("form", [fit_gain, fit_gain_offset, fit_affine])
 def test_each_axis_has_weights_of_its_own(form):
     executed = drawn(9, 2)
     effective = torch.where(torch.arange(9).unsqueeze(-1) < 4, -executed, 0.5 * executed)
@@ -143,7 +141,7 @@ def test_each_axis_has_weights_of_its_own(form):
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=str)
-@pytest.mark.parametrize("form", [fit_gain, fit_gain_offset, fit_friction, fit_affine])
+@pytest.mark.parametrize("form", [fit_gain, fit_gain_offset, fit_affine])
 def test_fits_take_any_batch(form, batch):
     executed, effective = drawn(*batch, 7, 2), drawn(*batch, 7, 2, seed=1)
     found = form(executed, effective, torch.ones(*batch, 7, 2))
@@ -201,7 +199,8 @@ def test_pairs_without_effect_tell_nothing_of_friction():
     gain, offset = torch.tensor([1.0, 1.0]), torch.tensor([-0.55, -0.5])
     effective = MAPS["dead zone"][0](EXECUTED)
     assert 0 < (effective == 0).sum() < effective.numel() / 2  # some are held
-    fitted = fit_friction(EXECUTED, effective, torch.ones(6, 1))
+    found = fit_experts(rows_of(EXECUTED, effective))
+    fitted = [part[0, :, 0, FRICTION].float() for part in (found.gain, found.offset)]
     torch.testing.assert_close(fitted[0], gain, rtol=0, atol=0.1)
     torch.testing.assert_close(fitted[1], offset, rtol=0, atol=0.1)
     torch.testing.assert_close(apply_friction(gain, offset, EXECUTED), effective)
@@ -211,7 +210,8 @@ def test_pairs_without_effect_tell_nothing_of_friction():
 def test_friction_is_overcome(sign):
     gain, offset = torch.tensor([-0.8, 1.2]), sign * torch.tensor([0.2, -0.3])
     effective = gain * EXECUTED + offset * EXECUTED.sign()
-    fitted = fit_friction(EXECUTED, effective, torch.ones(6, 1))
+    found = fit_experts(rows_of(EXECUTED, effective))
+    fitted = [part[0, :, 0, FRICTION].float() for part in (found.gain, found.offset)]
     torch.testing.assert_close(fitted[0], gain, rtol=0, atol=0.05)
     torch.testing.assert_close(fitted[1], offset, rtol=0, atol=0.05)
     wanted = torch.tensor([0.5, -0.7])

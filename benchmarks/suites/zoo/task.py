@@ -71,4 +71,9 @@ def _angle_and_speed(envs: Any, observations: np.ndarray) -> np.ndarray:
     return np.stack([np.arctan2(sine, cosine), speed], -1)
 
 
-PENDULUM = {"model": pendulum_step, "state": _angle_and_speed}
+def _observed(states: np.ndarray) -> np.ndarray:
+    angle, speed = states.T
+    return np.stack([np.cos(angle), np.sin(angle), speed], -1)
+
+
+PENDULUM = {"model": pendulum_step, "state": _angle_and_speed, "observe": _observed}
