@@ -287,7 +287,7 @@ class Tick(nn.Module):
         """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now.
 
         And those ``(B, K + D, A)`` that the newest commands have or will have, by the models that
-        are so late; the commands themselves where none is late.
+        are so late; the commands themselves where none is to come.
 
         Args:
             read: what the memory says.
@@ -307,12 +307,14 @@ class Tick(nn.Module):
         linear = read.lines.effect(acting).squeeze(2)
         calmly = [acting.clamp(*read.slow.split(1, 1)), acting + read.noisy]
         forecasts = torch.cat([now, found, linear, acts[:, self.late], *calmly], 1)
-        if not all_hold(late == 0):
+        waits = late + ahead.shape[1] > 1
+        if not all_hold(~waits):
             delays = torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
             so_late = (delays == late.unsqueeze(-1)).unsqueeze(-1)
             models = self.most_likely(read, torch.where(so_late, weights.clamp_min(1e-9), 0.0))
             shares = models.weights / models.weights.sum(1, keepdim=True)
-            newest = (shares.unsqueeze(2) * self.expect(models, newest)).sum(1)
+            effects = (shares.unsqueeze(2) * self.expect(models, newest)).sum(1)
+            newest = torch.where(waits[:, None, None], effects, newest)
         return forecasts, newest
 
 

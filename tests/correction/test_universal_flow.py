@@ -125,6 +125,23 @@ def test_late_commands_of_a_reversed_motor_are_found(line, drive, plans, delay):
     assert (effects - planned)[settled].abs().median() < 0.08
 
 
+def test_what_waits_by_a_known_delay_has_the_effects_that_are_believed(line, plans):
+    """Two steps late, as is known, and reversed, as is found out."""
+    flow, model, planned = flow_of(2, delay=2), line(2), plans(30, 8, 2)
+    box = torch.tensor([[-1.0, -1.0], [1.0, 1.0]]).expand(8, 2, 2)
+    state, waiting = torch.zeros(8, 2), [torch.zeros(8, 2)] * 2
+    memory = flow.begin(state)
+    for plan in planned:
+        memory, found = flow.correct(memory, plan, model, box)
+        _, effects, steps = flow.under_way(memory)
+        waiting.append(found.executed)
+        state = model(state, -waiting.pop(0))
+        memory = flow.observe(memory, state)
+    assert (steps == 2).all()
+    to_come = torch.stack(waiting, 1)
+    assert (effects[:, -2:] + to_come).abs().median() < 0.02
+
+
 @pytest.mark.parametrize("lag", [1.0, 1.5, 3.0])
 @pytest.mark.parametrize("gain", [1.0, -1.0])
 def test_slow_actuators_are_led(line, drive, plans, lag, gain):

@@ -29,13 +29,19 @@ def main() -> None:
     parser.add_argument("--robots", nargs="*", default=[*WORLDS, *ROBOTS])
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--out", type=Path, default=Path("outputs/safety"))
+    parser.add_argument(
+        "--set", nargs="*", default=[], help="of the correction, such as odds=0; with another --out"
+    )
     args = parser.parse_args()
     torch.set_num_threads(1)
-    tables = [costs(name, args.seeds, args.out) for name in args.robots]
+    settings = {name: float(value) for name, value in (pair.split("=") for pair in args.set)}
+    if settings and not set(args.robots) <= set(WORLDS):
+        parser.error(f"--set: only with --robots of {', '.join(WORLDS)}")
+    tables = [costs(name, args.seeds, args.out, settings) for name in args.robots]
     print_table(pd.concat(tables, ignore_index=True), args.seeds)
 
 
-def costs(name: str, seeds: int, out: Path) -> pd.DataFrame:
+def costs(name: str, seeds: int, out: Path, settings: dict[str, float]) -> pd.DataFrame:
     """Return the costs of a robot, a row for each situation and seed; from the file if it is."""
     file = out / f"{name.replace(' ', '_')}.{seeds}.csv"
     if file.is_file():
@@ -44,7 +50,7 @@ def costs(name: str, seeds: int, out: Path) -> pd.DataFrame:
         world, names = WORLDS[name](), list(SITUATIONS)
         rules = list(SITUATIONS.values())
         alone = play_world(world, rules, seeds, None).numpy()
-        corrected = play_world(world, rules, seeds, flow_for(world)).numpy()
+        corrected = play_world(world, rules, seeds, flow_for(world, **settings)).numpy()
     else:
         names = list(CHANGES)
         alone, corrected = (play_task(name, afm, seeds) for afm in (False, True))
