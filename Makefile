@@ -31,8 +31,8 @@ demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and f
 	@echo "Look at outputs/demo/figures/trajectory.png: paths are black while the robot is healthy, orange"
 	@echo "while its motors are reversed; and at the film outputs/demo/video/all_methods.gif"
 
-test: $(VENV)/.with-test ## Run all tests with coverage (at least 95 %)
-	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 \
+test: $(VENV)/.with-test ## Run the tests with coverage (at least 95 %); ALL=1 adds those marked slow
+	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --dist worksteal $(if $(ALL),,-m "not slow") \
 		--cov --cov-report=term-missing:skip-covered --cov-fail-under=95 --durations=10
 
 lint: $(VENV)/.with-test ## Check style, format and spelling
@@ -52,7 +52,8 @@ typecheck: $(VENV)/.with-test build/package ## Check types
 		--config-file $(CURDIR)/pyproject.toml --cache-dir $(CURDIR)/.mypy_cache \
 		$(patsubst benchmarks/suites/%/__init__.py,--package %,$(wildcard benchmarks/suites/*/__init__.py))
 
-check: lint typecheck test ## All of lint, typecheck and test
+check: ALL := 1
+check: lint typecheck test ## All of lint, typecheck and test, the slow ones, too
 
 format: $(VENV)/.with-test ## Put the code in shape
 	@$(BIN)/ruff check --quiet --fix-only . && $(BIN)/ruff format .

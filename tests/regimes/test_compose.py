@@ -62,24 +62,12 @@ def test_names_and_nominal_values_are_joined(both):
     assert torch.equal(both.apply(action, both.encode({}), torch.zeros(3)), action)
 
 
-def test_every_family_is_drawn(both):
-    drawn = both.sample((7, 2), torch.Generator().manual_seed(0))
-    assert drawn.shape == (7, 2, 3)
-    assert (drawn[..., 2] >= 0).all() and (drawn[..., :2].abs() >= 0.05).all()
-
-
 def test_the_inverse_is_found_by_search(both):
     row = both.encode({"v_gain": -2.0, "omega_gain": 1.5, "bias": 0.2})
     wanted = torch.tensor([[0.5, -0.4], [-1.0, 0.9], [0.0, 0.0]])
     found = both.inverse(wanted, row.expand(3, 3), torch.zeros(3, 3), LOW, HIGH)
     exact = (wanted - 0.2) / row[:2]
     torch.testing.assert_close(found, exact, rtol=0, atol=2e-3)
-
-
-def test_the_search_serves_a_single_action_and_stays_in_the_box(both):
-    row = both.encode({"v_gain": 0.1})
-    found = both.inverse(torch.tensor([0.9, 0.3]), row, torch.zeros(3), LOW, HIGH)
-    torch.testing.assert_close(found, torch.tensor([1.0, 0.3]), rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize("families", [[], [ActionGain(["a"]), ActionGain(["a"])]], ids=["0", "2"])
@@ -151,11 +139,6 @@ def test_the_inverse_chains_closed_forms(robot):
     torch.testing.assert_close(effect, wanted, rtol=0, atol=1e-5)
     far = robot.inverse(10 * wanted, rows, torch.zeros(300, 3), LOW, HIGH)
     assert (far.abs() <= 1).all()
-
-
-def test_a_family_without_a_closed_form_makes_the_inverse_a_search(both, robot):
-    assert not both.closed_form
-    assert not Compose({"robot": robot, "shift": Shift()}).closed_form
 
 
 def test_only_rows_with_a_family_without_a_closed_form_are_searched(gains, monkeypatch):
@@ -241,8 +224,3 @@ def test_families_check_their_own_values(robot):
 def test_families_that_do_not_go_together_are_refused(settings, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
         Compose(**{"regimes": {"delay": Delay(), "shift": Shift()}, **settings})
-
-
-def test_unknown_families_are_not_drawn(robot):
-    with pytest.raises(ConfigurationError, match="family='nope'"):
-        robot.draw(["nope"], ())

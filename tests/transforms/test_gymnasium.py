@@ -76,12 +76,6 @@ def test_reversed_actuators_do_what_was_planned():
     assert "actuator 0: reversed" in env.diagnosis
 
 
-def test_watching_only_corrects_nothing():
-    for *_, info in play(ActionFlowWrapper(Puck(gain=-1.0), push, enabled=False), 20):
-        np.testing.assert_array_equal(info["afm"]["planned"], info["afm"]["executed"])
-        assert not info["afm"]["corrects"]
-
-
 def test_actions_are_those_of_the_transform():
     def healthy(state, action):
         return state + 0.1 * action
@@ -164,12 +158,6 @@ def test_an_observation_of_another_shape_is_refused_by_name():
 def test_steps_need_a_reset():
     with pytest.raises(ResetNeeded):
         ActionFlowWrapper(Puck(), push).step(np.zeros(2))
-
-
-def test_truncation_passes():
-    env = gymnasium.wrappers.TimeLimit(Puck(), 5)
-    ends = [step[2:4] for step in play(ActionFlowWrapper(env, push), 5)]
-    assert ends[-1] == (False, True) and ends[-2] == (False, False)
 
 
 @pytest.mark.filterwarnings("ignore")
