@@ -17,9 +17,11 @@ LESS = {
 }
 OF_FILES = {  # where the examples of a folder differ
     "stable_baselines.py": "--steps 64 --episodes 1",
+    "belief.py": "--steps 5 --out belief.png",
     "train_sac.py": "--id Pendulum-v1 --steps 60 --first 40 --out policy.safetensors",
 }
 FILES = [path for verb in LESS for path in sorted((ROOT / "examples" / verb).glob("*.py"))]
+FILES.append(ROOT / "examples" / "explain_afm" / "belief.py")
 
 
 def lines_on_top(path):
@@ -38,13 +40,14 @@ def test_every_example_says_how_to_run_it():
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_examples_run(path, short_trainings, monkeypatch, tmp_path, capsys):
-    if path.parent.name == "policies":
+    if path.parent.name == "policies" or path.stem == "belief":
         pytest.importorskip("mujoco")
     if path.stem == "stable_baselines":
         pytest.importorskip("stable_baselines3")
     monkeypatch.chdir(tmp_path)
     (line,) = lines_on_top(path)
-    arguments = shlex.split(line)[2:] + shlex.split(OF_FILES.get(path.name, LESS[path.parent.name]))
+    less = OF_FILES.get(path.name) or LESS[path.parent.name]
+    arguments = shlex.split(line)[2:] + shlex.split(less)
     monkeypatch.setattr("sys.argv", [str(path), *arguments])
     runpy.run_path(str(path), run_name="__main__")
     assert capsys.readouterr().out

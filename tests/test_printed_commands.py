@@ -12,35 +12,21 @@ import pytest
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException
-from omegaconf import OmegaConf
 from pages import PAGES, ROOT, blocks, commands, name_of, write_files
+from small import shrink
 
 from afm_rl.cli import diagnose, play, report
 from afm_rl.cli.trusted import checked
 from afm_rl.jobs.run import begin, finish
 from afm_rl.missions import build, prepare, run
 
-STEPS, ROWS = 2, 40
-SMALL = {  # settings that are there are made small
-    "budget": STEPS,
+ROWS = 40  # of a log
+LITTLE = {
+    "budget": 2,
     "seeds": 1,
     "planner.population": 4,
-    "planner.elites": 2,
     "planner.iterations": 1,
-    "dynamics.members": 2,
-    "dynamics.hidden": [8, 8],
-    "dynamics.pretrain.samples": 256,
-    "dynamics.pretrain.epochs": 1,
     "dynamics.pretrain.flights": 2,
-    "dynamics.base.members": 2,
-    "dynamics.base.hidden": [8, 8],
-    "dynamics.base.pretrain.samples": 256,
-    "dynamics.base.pretrain.epochs": 1,
-    "corrector.width": 8,
-    "corrector.train.iterations": 5,
-    "robot.contexts": 2,
-    "robot.data.rounds": [64, 64],
-    "robot.data.fit.epochs": 1,
 }
 LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/zoo/run.py": "--policies pendulum_sac --faults none --methods alone AFM "
@@ -122,10 +108,7 @@ def shrunk(overrides):
     ]
     first = [choice for choice in first if not choice.startswith(("out=", "launcher="))]
     cfg = next(filter(None, map(composed, settings_of_methods(first))))
-    for key, value in SMALL.items():
-        if OmegaConf.select(cfg, key) is not None:
-            OmegaConf.update(cfg, key, value)
-    return cfg
+    return shrink(cfg, LITTLE)
 
 
 def run_afm_rl(page, words, desk, cache):

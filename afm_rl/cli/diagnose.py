@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
-from typing import NoReturn
 
-from afm_rl.cli.error_messages import told_by
+from afm_rl.cli.error_messages import OneLineParser, told_by
 
 NAME = "afm-rl-diagnose"
-PATIENCE = 3.0  # s: shorter work shows no progress
 KINDS = ".csv, .parquet, .ulg, .mcap, .db3, .bag, or a folder of LeRobot or ROS"
 ABOUT = """\
 Say what the actuators of a robot do, from what it logged.
@@ -31,18 +28,9 @@ healthy, changed, dead, or the log cannot tell.
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong in one line."""
-        print(f"{NAME}: {message} (see {NAME} --help)", file=sys.stderr)
-        sys.exit(2)
-
-
 def main() -> None:
     """Run ``afm-rl-diagnose``; a mistake ends in one line and exit status 2."""
-    parser = _Parser(
-        prog=NAME, description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = OneLineParser(NAME, ABOUT)
     add = parser.add_argument
     add("file", metavar="FILE", type=Path, help=f"a log: {KINDS}")
     add("--out", metavar="DIR", type=Path, help="where to (FILE_diagnosis, beside FILE)")
@@ -95,7 +83,7 @@ def _run(options: argparse.Namespace) -> None:
         from afm_rl.replay import replay
         from afm_rl.report.replay import print_replay, write_replay
 
-        with Bar(total=1.0, desc="replaying", delay=PATIENCE) as bar:
+        with Bar(total=1.0, desc="replaying", delay=3.0) as bar:  # s
             replayed = replay(log, lambda share: bar.update(share - bar.n))
     file = options.file.resolve()
     out = options.out or file.with_name(f"{file.stem}_diagnosis")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import difflib
 import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn
 
 from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
@@ -37,6 +38,19 @@ def told_by(name: str) -> Iterator[None]:
         if message is None:
             raise
         print(f"{name}: {printable(one_line(message), 4000)}", file=sys.stderr)
+        sys.exit(2)
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Reads the arguments of a command; a mistake ends in one line and exit status 2."""
+
+    def __init__(self, name: str, about: str) -> None:
+        raw = argparse.RawDescriptionHelpFormatter
+        super().__init__(prog=name, description=about, formatter_class=raw)
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong."""
+        print(f"{self.prog}: {message} (see {self.prog} --help)", file=sys.stderr)
         sys.exit(2)
 
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 import socket
-import sys
 import webbrowser
 from pathlib import Path
-from typing import NoReturn
 
-from afm_rl.cli.error_messages import told_by
+from afm_rl.cli.error_messages import OneLineParser, told_by
 
 NAME = "afm-rl-play"
 ABOUT = """\
@@ -21,18 +19,9 @@ A page in the browser to play with: the same policy on two robots, alone and wit
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong in one line."""
-        print(f"{NAME}: {message} (see {NAME} --help)", file=sys.stderr)
-        sys.exit(2)
-
-
 def main() -> None:
     """Run ``afm-rl-play``; a mistake ends in one line and exit status 2."""
-    parser = _Parser(
-        prog=NAME, description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = OneLineParser(NAME, ABOUT)
     add = parser.add_argument
     add("--robot", default="half_cheetah", help="half_cheetah, hopper, ant, ugv, ...")
     add("--policy", metavar="FILE", type=Path, help="a stored policy of a task of gymnasium")

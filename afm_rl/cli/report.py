@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from pathlib import Path
-from typing import NoReturn
 
-from afm_rl.cli.error_messages import told_by
+from afm_rl.cli.error_messages import OneLineParser, told_by
 from afm_rl.errors import ArtefactError
 
 NAME = "afm-rl-report"
@@ -28,18 +25,9 @@ so and ends with status 2. Of a mission that stands in several folders, the last
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        """Say what is wrong in one line."""
-        print(f"{NAME}: {message} (see {NAME} --help)", file=sys.stderr)
-        sys.exit(2)
-
-
 def main() -> None:
     """Run ``afm-rl-report``; a mistake ends in one line and exit status 2."""
-    parser = _Parser(
-        prog=NAME, description=ABOUT, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = OneLineParser(NAME, ABOUT)
     add = parser.add_argument
     add("folders", metavar="FOLDER", nargs="+", type=Path, help="results of a run or a study")
     add("--out", metavar="DIR", type=Path, help="where to (FOLDER/report, of the first one)")

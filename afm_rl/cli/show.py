@@ -13,8 +13,7 @@ from afm_rl.envs import load_track
 from afm_rl.errors import AFMError, ConfigurationError
 from afm_rl.jobs.run import SHOWN
 from afm_rl.missions import Agent
-from afm_rl.missions.explained import explain_mission
-from afm_rl.missions.robot import Robot
+from afm_rl.missions.explained import explain_mission, planned_for
 from afm_rl.report import (
     load_tracks,
     print_summary,
@@ -53,7 +52,7 @@ def show(folder: Path, cfg: DictConfig, agents: Sequence[Agent], film: str | Non
                 write_films(folder / "video", runs, tracks, film, draw=draw)
             except ConfigurationError as error:  # such as a robot that cannot be drawn
                 print(f"afm-rl: no film: {error}", file=sys.stderr)
-        explained = _explain(folder, cfg.figures, missions, steps, agents[0].robot)
+        explained = _explain(folder, cfg.figures, missions, steps, agents[0])
         extend_manifest(folder, [name for name in SHOWN if (folder / name).is_dir()])
     print_summary(missions, measures)
     print(explained, end="")
@@ -61,12 +60,13 @@ def show(folder: Path, cfg: DictConfig, agents: Sequence[Agent], film: str | Non
 
 
 def _explain(
-    folder: Path, page: bool, missions: pd.DataFrame, steps: pd.DataFrame, robot: Robot
+    folder: Path, page: bool, missions: pd.DataFrame, steps: pd.DataFrame, agent: Agent
 ) -> str:
     """Return what the first mission shows of the actuators, one line each; write the page."""
     first = missions.iloc[0]
     try:
-        found, log = explain_mission(robot, steps[steps["mission"] == first["mission"]])
+        steps = steps[steps["mission"] == first["mission"]]
+        found, log = explain_mission(agent.robot, steps, late=planned_for(agent))
     except AFMError:  # such as a mission of a few steps
         return ""
     which = f"{first['method']}, {first['track']}, seed {first['seed']}"

@@ -19,6 +19,7 @@ from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.readings import (
     READINGS,
     Reading,
+    cause_of,
     check_readings,
     late_ones,
     lay_out,
@@ -87,6 +88,7 @@ class ActionFlow(Believer):
     """
 
     _machine_code: MachineCode
+    cause: Tensor
 
     def __init__(
         self,
@@ -142,6 +144,11 @@ class ActionFlow(Believer):
                 f"corrector.memory={memory!r}: expected at least {memory_of(chosen, rows)} for "
                 f"{rows} rows and the readings {', '.join(names)}"
             )
+        by_model = [cause_of(name, self.delay) for name in self.models]
+        late_by = [cause_of(f"delay_{k}", self.delay) for k in range(1, self.most_late + 1)]
+        self.causes = tuple(dict.fromkeys([by_model[0], *late_by, *by_model]))
+        cause = torch.tensor([self.causes.index(name) for name in by_model])
+        self.register_buffer("cause", cause, persistent=False)
         self.compiles = check_flag("corrector.compile", compile)
         self.__dict__["_machine_code"] = MachineCode(self, cache)
         network = load_universal() if network is None else network
@@ -170,6 +177,22 @@ class ActionFlow(Believer):
     def signature(self) -> dict[str, object]:
         """What stored weights must agree in to be loaded."""
         return {"kind": "ActionFlow"}
+
+    def belief_in(self, memory: Tensor) -> Tensor:
+        """Return how probable the :attr:`causes` are, by axis, ``(*B, C, A)``.
+
+        Of a memory ``(*B, P)``. What takes any delay that is believed counts as late.
+
+        >>> flow = ActionFlow(-torch.ones(1), torch.ones(1))
+        >>> belief = flow.belief_in(flow.begin(torch.zeros(2)))
+        >>> flow.causes[0], belief[0].item() > 0.9, belief.sum(-2).round(decimals=4)
+        ('nothing has changed', True, tensor([1.]))
+        """
+        late = self.unpack(memory, self.states_in(memory))["late"].long()
+        cause = torch.where((self.delays < 0) & (late > 0), late, self.cause)
+        found = self.believed(memory)
+        none = found.new_zeros(*found.shape[:-2], len(self.causes), self.action_size)
+        return none.scatter_add(-2, cause.unsqueeze(-1).expand_as(found), found)
 
     def place_of(self, state: Tensor) -> Tensor:
         """Return where a state is, in the unit in which ground differs."""

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.correction.experts import Rows
+from afm_rl.correction.linear import CALM
 from afm_rl.errors import ConfigurationError, check_choice
 
 FILTER = 12  # commands that a lag looks back on
@@ -105,6 +106,27 @@ def late_ones(names: Sequence[str]) -> list[str]:
     ['delay_2', 'lag_1']
     """
     return [name for name in names if READINGS[name].delay or READINGS[name].lag]
+
+
+def cause_of(model: str, known: int = 0) -> str:
+    """Return what a model of the belief says of the actuators, in plain words.
+
+    Args:
+        model: name of one.
+        known: steps that actions are known to be late by.
+
+    >>> [cause_of(model) for model in ("delay_2", "only lag_1", "gain_12")]
+    ['2 steps late', 'slow', 'a recent change']
+    """
+    reading = READINGS.get(model.removeprefix("only "), Reading())
+    if reading.delay:
+        steps = reading.delay + known
+        return f"{steps} step{'s' * (steps > 1)} late"
+    if reading.lag:
+        return "slow"
+    if reading.near:
+        return "another ground"
+    return model if model in ("nothing has changed", *CALM) else "a recent change"
 
 
 def check_readings(names: Sequence[str], by_place: bool) -> list[str]:

@@ -53,7 +53,7 @@ class Actuator:
     time_interval: Interval = (0.0, math.inf)
     """95 % interval of delay and lag together (s)."""
     made_up: bool = False
-    """Does a correction act so that delay and lag do no harm?"""
+    """Did a correction act so that the response is the planned one? Nothing remains to mend."""
     lag_s: float = 0.0
     """Time constant of the lag (s)."""
     driven_by: str | None = None

@@ -5,9 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import stdtrit
 
-LEAST = 0.03
-"""Of one minus the sum of an autoregression's coefficients: no memory above 33 rows is believed."""
-
 
 def half_widths(influence: np.ndarray, chosen: float = 1.25) -> np.ndarray:
     r"""Return half widths ``(P,)`` of 95 % intervals.
@@ -64,14 +61,17 @@ def _density_at_zero(series: np.ndarray, power: float) -> float:
     return max(densities, default=power)
 
 
-def _autoregression(series: np.ndarray, power: float, most: int = 12) -> float:
-    """Return the long-run variance by the autoregression with the least AIC (Levinson)."""
+def _autoregression(series: np.ndarray, power: float, most: int = 12, fresh: float = 0.03) -> float:
+    """Return the long-run variance by the autoregression with the least AIC (Levinson).
+
+    Its coefficients sum to ``1 - fresh`` at most: no memory above 33 rows is believed.
+    """
     rows = len(series)
     order = max(min(most, rows // 10), 1)
     lags = np.array([(series[k:] * series[: rows - k]).sum() for k in range(order + 1)]) / rows
     # The first order counts in any case, without its bias in few rows (Kendall 1954).
     first = lags[1] / power
-    first = min(first + (1 + 4 * first) / rows, 1 - LEAST)
+    first = min(first + (1 + 4 * first) / rows, 1 - fresh)
     least = power * (1 - first**2) / (1 - first) ** 2 if first > 0 else 0.3 * power
     best, density = 0.0, power
     coefficients, error = np.zeros(0), power
@@ -84,5 +84,5 @@ def _autoregression(series: np.ndarray, power: float, most: int = 12) -> float:
         criterion = rows * np.log(error / power) + 2 * p
         if criterion < best:
             best = criterion
-            density = error / max(1 - coefficients.sum(), LEAST) ** 2
+            density = error / max(1 - coefficients.sum(), fresh) ** 2
     return max(density, least)

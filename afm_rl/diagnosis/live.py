@@ -13,13 +13,6 @@ from afm_rl.diagnosis.settings import Settings
 from afm_rl.diagnosis.words import judge
 from afm_rl.errors import ConfigurationError
 
-DELAYS = 5  # 0 to 4 steps
-FEWEST = 8  # pairs
-CLEAR = 5.0  # standard errors by which another command has to show
-BETTER = 0.5  # share of the squared residual that another delay or command may leave
-STALE = 9.0  # times the newest pairs' squared residual: the older ones were another regime
-ROUNDING = 1e-4  # share of the range of commands: smaller residuals are rounding
-
 
 def explain(
     executed: Any,
@@ -27,6 +20,8 @@ def explain(
     names: Sequence[str] | None = None,
     std: Any = None,
     step: float = 1.0,
+    delays: int = 5,
+    fewest: int = 8,
 ) -> Diagnosis:
     r"""Say what pairs of executed and effective actions show of each actuator.
 
@@ -41,6 +36,8 @@ def explain(
         names: of the actuators.
         std: standard deviations of the effective actions, ``(K, A)``; None if all are alike.
         step: time of a step (s).
+        delays: how many are tried: 0 to 4 steps.
+        fewest: pairs of which something is said.
 
     Raises:
         ConfigurationError: for shapes that do not fit.
@@ -65,28 +62,42 @@ def explain(
         weight = 1 / (weight**2 + (0.1 * np.ptp(u, 0).clip(1e-9)) ** 2)
     sound = np.isfinite(u).all(1) & np.isfinite(y).all(1) & np.isfinite(weight).all(1)
     u, y, weight = u[sound], y[sound], weight[sound]
-    if len(u) < FEWEST:
+    if len(u) < fewest:
         found = [judge(Actuator(name=name, rows=len(u))) for name in names]
         return Diagnosis(actuators=tuple(found), step_s=step, rows=len(u))
-    late = np.zeros((DELAYS, *u.shape))
-    for delay in range(DELAYS):
+    late = np.zeros((delays, *u.shape))
+    for delay in range(delays):
         late[delay, delay:] = u[: len(u) - delay]
-    shown = [_fit(late, y[:, j], weight[:, j], j, names, step) for j in range(size)]
+    shown = [_fit(late, y[:, j], weight[:, j], j, names, step, fewest) for j in range(size)]
     return Diagnosis(actuators=tuple(shown), step_s=step, rows=len(u))
 
 
 def _fit(
-    late: np.ndarray, y: np.ndarray, weight: np.ndarray, own: int, names: Sequence[str], step: float
+    late: np.ndarray,
+    y: np.ndarray,
+    weight: np.ndarray,
+    own: int,
+    names: Sequence[str],
+    step: float,
+    fewest: int,
+    stale: float = 9.0,
+    visible: float = 5.0,
+    rounding: float = 1e-4,
 ) -> Actuator:
-    """Fit one actuator's effects ``(K,)`` by the commands, ``(D, K, A)`` with each delay."""
-    rows = len(y)
-    shortest, rounding = DELAYS + FEWEST, float((10 * ROUNDING) ** 2 * late[0].var(0).max())
+    """Fit one actuator's effects ``(K,)`` by the commands, ``(D, K, A)`` with each delay.
+
+    Older pairs were another regime if their squared residual is ``stale`` times the newest's.
+    Another command has to show by ``visible`` standard errors; a residual below ``rounding``, a
+    share of the range of commands, is rounding.
+    """
+    rows, delays = len(y), len(late)
+    shortest, rounded = delays + fewest, float((10 * rounding) ** 2 * late[0].var(0).max())
     for share in (4, 2, 1):  # the newest quarter, half, all
-        first = max(rows - max(rows // share, shortest), min(DELAYS - 1, rows - FEWEST))
-        found = _line(late[:, first:], y[first:], weight[first:], own)
+        first = max(rows - max(rows // share, shortest), min(delays - 1, rows - fewest))
+        found = _line(late[:, first:], y[first:], weight[first:], own, rounding)
         if share == 4:
             newest, start = found, first
-        elif first < start and found[-1] > STALE * max(newest[-1], rounding):
+        elif first < start and found[-1] > stale * max(newest[-1], rounded):
             break
         best, start = found, first
     delay, driver, gain, offset, _ = best
@@ -101,10 +112,10 @@ def _fit(
         power = (weight[:, None] * rest**2).sum(0)
         slope = (weight * residual) @ rest / np.maximum(power, 1e-300)
         error = np.sqrt((residual**2).mean() / np.maximum((rest**2).sum(0), 1e-300))
-        clear = (np.abs(slope) > CLEAR * error) & (power > 0.01 * whole)
-        clear &= np.abs(slope) * spread > Settings().matters * max(spread[own], ROUNDING)
+        clear = (np.abs(slope) > visible * error) & (power > 0.01 * whole)
+        clear &= np.abs(slope) * spread > Settings().matters * max(spread[own], rounding)
         clear[used] = False
-        if not clear.any() or len(x) < len(used) + FEWEST:
+        if not clear.any() or len(x) < len(used) + fewest:
             break
         used.append(int(np.argmax(np.where(clear, slope**2 * power, -1.0))))
         design = np.column_stack([x[:, used], np.ones(len(x))])
@@ -149,7 +160,7 @@ def _fit(
 
 
 def _line(
-    x: np.ndarray, y: np.ndarray, weight: np.ndarray, own: int
+    x: np.ndarray, y: np.ndarray, weight: np.ndarray, own: int, rounding: float, better: float = 0.5
 ) -> tuple[int, int, float, float, float]:
     """Return delay, driver, gain, offset and squared residual of the best line.
 
@@ -158,6 +169,8 @@ def _line(
         y: effects, ``(K,)``.
         weight: of the pairs, ``(K,)``.
         own: index of the actuator's own command.
+        rounding: residuals below this share of the range of commands are rounding.
+        better: share of the squared residual that another delay or command may leave.
     """
     share = weight / weight.sum()
     mean, level = share @ x, share @ y  # (D, A)
@@ -165,12 +178,12 @@ def _line(
     power = share @ centred**2
     slope = (share * moved) @ centred / np.maximum(power, 1e-12)
     left = np.maximum((share * moved) @ moved - slope**2 * power, 0.0)
-    left += ROUNDING**2 * np.maximum(power.max(), 1e-300)
+    left += rounding**2 * np.maximum(power.max(), 1e-300)
     # the own command without delay, unless another is clearly better
-    clear = left[:, own].min() < BETTER * left[0, own]
+    clear = left[:, own].min() < better * left[0, own]
     best = (int(left[:, own].argmin()) if clear else 0, own)
     other = np.unravel_index(left.argmin(), left.shape)
-    if left[other] < BETTER**2 * left[best]:
+    if left[other] < better**2 * left[best]:
         best = (int(other[0]), int(other[1]))
     gain = float(slope[best])
     return best[0], best[1], gain, float(level - gain * mean[best]), float(left[best])

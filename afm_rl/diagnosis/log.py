@@ -11,7 +11,6 @@ from afm_rl.errors import ConfigurationError
 
 FEWEST = 20  # rows
 GAP = 1.5  # steps: where the time between two rows is longer, commands between them are not known
-EVEN = 0.02  # steps: time stamps that scatter less are even
 
 
 @dataclass(frozen=True)
@@ -158,11 +157,12 @@ class Clock:
         return bool(self.time[-1] - self.time[0] == len(self.time) - 1)
 
 
-def clocks_of(log: Log) -> list[Clock]:
+def clocks_of(log: Log, even_steps: float = 0.02) -> list[Clock]:
     """Return the clocks that a log may have been written by: one if its rows are evenly spaced.
 
     Otherwise commands may move between rows or hold, or a delay may be one of rows: time stamps
-    can scatter where the robot's own cycle does not.
+    can scatter where the robot's own cycle does not. Time stamps that scatter by less than
+    ``even_steps`` are even.
     """
     begins = log.begins
     rows = np.arange(len(begins))
@@ -171,7 +171,7 @@ def clocks_of(log: Log) -> list[Clock]:
     steps[begins] = 1.0
     row = rows if log.row is None else log.row
     even = Clock(rows.astype(float), start, row)
-    if np.abs(steps - 1.0).max() < EVEN:
+    if np.abs(steps - 1.0).max() < even_steps:
         return [even]
     time = np.cumsum(steps)
     return [Clock(time, start, row), Clock(time, start, row, hold=True), even]

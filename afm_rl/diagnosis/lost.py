@@ -13,11 +13,9 @@ from afm_rl.diagnosis.pattern import hats, predictable
 from afm_rl.diagnosis.response import respond
 from afm_rl.diagnosis.search import Lead, beginning
 
-FAR = 5.0  # standard deviations of the others: rows that are as far from the line are lost
-
 
 def without_lost(
-    log: Log, j: int, lead: Lead, parts: Sequence[Part], repeats: bool
+    log: Log, j: int, lead: Lead, parts: Sequence[Part], repeats: bool, apart: float = 5.0
 ) -> tuple[Log, float]:
     """Return the log with one response as it would be if it always followed, and the share lost.
 
@@ -32,6 +30,7 @@ def without_lost(
         lead: where its explanation begins.
         parts: the explanations of all rows.
         repeats: are rows lost that repeat the last response, too?
+        apart: standard deviations of the others: rows that are as far from the line are lost.
     """
     y, clock = log.response[:, j], lead.clock_of(log)
     best = y - y.mean()
@@ -50,11 +49,11 @@ def without_lost(
         place = clock.places(shape.delay).astype(int)
         near = clock.time[np.minimum(place + 1, len(y) - 1)] - clock.time[place] < GAP
         x = respond(clock, u, shape, begin)
-        options.append(_trimmed(np.column_stack([x, np.ones(len(y))]), y, known & near))
+        options.append(_trimmed(np.column_stack([x, np.ones(len(y))]), y, known & near, apart))
     line, chosen = min(options, key=lambda option: np.abs(y - option[0])[option[1]].mean())
     far = np.abs(y - line)
     residual = (y - line)[chosen]
-    lost = far > max(FAR * _scale(residual), 1e-9)
+    lost = far > max(apart * _scale(residual), 1e-9)
     share = float(lost.mean())
     blocks = np.array([block.mean() for block in np.array_split(lost, 8)])
     if not 0.006 < share < 0.45 or (blocks > 0.2 * share).sum() < 5:
@@ -74,7 +73,7 @@ def without_lost(
 
 
 def _trimmed(
-    design: np.ndarray, y: np.ndarray, known: np.ndarray, kept: float = 0.55
+    design: np.ndarray, y: np.ndarray, known: np.ndarray, apart: float, kept: float = 0.55
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the line through the share of rows that it fits best, and which rows are near it."""
     chosen = known
@@ -83,7 +82,7 @@ def _trimmed(
         far = np.abs(y - line)
         chosen = known & (far <= np.quantile(far[known], kept))
     for _ in range(2):
-        chosen = known & (far <= FAR * _scale(far[chosen]))
+        chosen = known & (far <= apart * _scale(far[chosen]))
         line = design @ np.linalg.lstsq(design[chosen], y[chosen], rcond=None)[0]
         far = np.abs(y - line)
     return line, chosen

@@ -71,8 +71,9 @@ class Settings:
     """Ranges of its command that an actuator has to move: up and down twice. Take-off and landing
     alone do not tell a delay from chance; half of it is enough on either side of a change. 0 for
     responses that were computed: nothing else moves those."""
-    shared: float = 0.25
-    """Share of a delay by which those of several actuators may differ, to be the loop's."""
+    shared: float | None = 0.25
+    """Share of a delay by which those of several actuators may differ, to be the loop's. None where
+    the healthy loop is known to have none."""
 
     def price(self, rows: float) -> float:
         """Return twice the log-likelihood that a number has to win in independent rows.

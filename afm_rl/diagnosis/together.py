@@ -88,7 +88,9 @@ def shared_delay(
     times = np.array([max(a.delay_s, 0.0) + a.lag_s for a in known])
     usual = [log.usual_delay] * len(actuators)
     late = log.usual_delay + settings.late * log.step
-    if len(times) < 2 or (times > late).mean() < (1.0 if len(times) < 5 else 0.8):
+    if settings.shared is None or len(times) < 2:
+        return usual, ()
+    if (times > late).mean() < (1.0 if len(times) < 5 else 0.8):
         return usual, ()
     alike = np.abs(times - times[:, None]) <= np.maximum(settings.shared * times, log.step)
     shared = alike.sum(1) > max(1.0, 0.2 * len(times))

@@ -229,13 +229,12 @@ def _timing(
     delay, lag, late = actuator.delay_s, actuator.lag_s, s.late * step
     if widened(actuator.time_interval, s)[0] < usual_delay < delay + lag:
         usual_delay = delay + lag  # it may as well be the usual one
-    made_up = ", made up for" if actuator.made_up else ""
     if delay < -late:
         yield f"answers {_steps(-delay, step, timed)} before its command in the log"
     if delay > usual_delay + late:
-        yield f"{_steps(delay, step, timed)} late{made_up}"
+        yield f"{_steps(delay, step, timed)} late"
     if delay + lag > usual_delay + late and lag > late:
-        yield f"a lag of {_steps(lag, step, timed)}{made_up}"
+        yield f"a lag of {_steps(lag, step, timed)}"
 
 
 def _beyond(ends: Interval, actuator: Actuator, unit: str) -> str:

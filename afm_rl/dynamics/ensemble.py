@@ -28,7 +28,6 @@ Parameters = tuple[Iterable[Tensor], Iterable[Tensor]]  # weights and biases, la
 PROPAGATIONS = ("mean", "sample", "member")
 INITS = {"uniform": uniform_layer, "sparse": sparse_layer}
 CHUNK = 2**18  # activations per layer and chunk: 1 MiB in float32, so that they stay in cache
-STILL = 1e-6  # variation below which a coordinate never changes, as a share of its size
 
 
 class Ensemble(PerMissionModel):
@@ -140,15 +139,16 @@ class Ensemble(PerMissionModel):
             for name, _ in self.running.named_buffers():
                 yield self.running, name
 
-    def normalise_(self, inputs: Tensor, targets: Tensor) -> None:
+    def normalise_(self, inputs: Tensor, targets: Tensor, rounding: float = 1e-6) -> None:
         """Set the statistics of inputs ``(N, in)`` and state changes ``(N, D)``.
 
         A coordinate that never changes counts in its own unit, and its change begins as the mean:
-        divided by a rounding error, the smallest difference later on would be a huge one.
+        divided by a rounding error, the smallest difference later on would be a huge one. It never
+        changes if it varies by less than ``rounding``, a share of its size.
         """
         for name, data in (("input", inputs), ("target", targets)):
             std = data.std(0)
-            still = std <= STILL * data.abs().amax(0).clamp_min(1e-2)
+            still = std <= rounding * data.abs().amax(0).clamp_min(1e-2)
             getattr(self, f"{name}_mean").copy_(data.mean(0))
             getattr(self, f"{name}_std").copy_(std.masked_fill(still, 1.0))
         with torch.no_grad():

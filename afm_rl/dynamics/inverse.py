@@ -11,10 +11,6 @@ from afm_rl.compiling.tracing import all_hold
 from afm_rl.dynamics.base import DynamicsModel
 from afm_rl.spaces.small_matrices import invert_positive
 
-UNSEEN = 4.0  # half ranges: standard deviation of an axis of which a transition shows nothing
-ASSUMED = 0.1  # half ranges: standard deviation where nothing needs an explanation
-ENOUGH = 0.1  # squared standard deviations: what less a round promises is not worth the next one
-
 
 class EffectiveAction(NamedTuple):
     """An executed action, as a transition shows it through a model."""
@@ -36,6 +32,9 @@ def effective_action(
     rounds: int = 3,
     quiet: float | Tensor = 0.0,
     guess: Tensor | None = None,
+    unseen: float = 4.0,
+    assumed: float = 0.1,
+    enough: float = 0.1,
 ) -> EffectiveAction:
     r"""Express a prediction error in action space, for any model and robot.
 
@@ -70,6 +69,9 @@ def effective_action(
         quiet: innovations up to this size need no explanation: the executed action is returned,
             with a standard deviation of a tenth; one number, or one per row ``(*B)``.
         guess: where else to begin, such as the effect that was predicted, ``(*B, A)``.
+        unseen: standard deviation of an axis of which a transition shows nothing (half ranges).
+        assumed: that where nothing needs an explanation (half ranges).
+        enough: what a round has to promise, to be worth its time (squared standard deviations).
 
     >>> from afm_rl.dynamics import Dubins
     >>> s, a = torch.zeros(3), torch.tensor([0.5, 0.2])
@@ -87,7 +89,7 @@ def effective_action(
     innovation = error.abs().amax(-1)
     silent = innovation <= quiet  # false for NaN
     if all_hold(silent):  # nothing more to compute
-        std = (ASSUMED * half_range).expand_as(action)
+        std = (assumed * half_range).expand_as(action)
         return EffectiveAction(action.to(dtype), std.to(dtype), innovation.to(dtype))
     effective = action
     if guess is not None and not model.affine:
@@ -95,7 +97,7 @@ def effective_action(
         there = model.manifold.difference(next_state, model(state, guess)) / noise
         better = there.square().sum(-1, True) < error.square().sum(-1, True)
         effective, error = torch.where(better, guess, action), torch.where(better, there, error)
-    prior = UNSEEN**-2 * torch.eye(len(half_range), dtype=torch.float64, device=action.device)
+    prior = unseen**-2 * torch.eye(len(half_range), dtype=torch.float64, device=action.device)
     limit = torch.ones_like(innovation).unsqueeze(-1)
     going, covariance = limit > 0, limit.double().unsqueeze(-1)
     for last in (False,) * (rounds - 1) + (True,):
@@ -113,15 +115,15 @@ def effective_action(
         effective = torch.where(better, trial, effective)
         error = torch.where(better, remaining, error)
         limit = limit * torch.where(better, 1.0, 0.25)
-        going = going & ((step * slope.squeeze(-1)).sum(-1, True) > ENOUGH)
+        going = going & ((step * slope.squeeze(-1)).sum(-1, True) > enough)
         if last or all_hold(~going):
             break
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     if not model.affine:  # what the rounds could not explain, per coordinate
-        std = (std * error.square().mean(-1, True).sqrt().clamp_min(1.0)).clamp_max(UNSEEN)
+        std = (std * error.square().mean(-1, True).sqrt().clamp_min(1.0)).clamp_max(unseen)
     known = innovation + std.sum(-1) < torch.inf
     row = (known & ~silent).unsqueeze(-1)
-    else_std = torch.where(silent, ASSUMED, UNSEEN).unsqueeze(-1)
+    else_std = torch.where(silent, assumed, unseen).unsqueeze(-1)
     return EffectiveAction(
         torch.where(row, effective, action.nan_to_num()).to(dtype),
         (torch.where(row, std, else_std) * half_range).to(dtype),

@@ -26,7 +26,6 @@ STEP = 1e-4  # of finite differences, in half ranges and units of the state: far
 # tolerance of the contact solver, far below what bends a trajectory
 Change = Callable[[Any, tuple[float, ...]], Any]
 NOMINAL = dict(zip(Physics.names, Physics.identity, strict=True))
-MOST_MODELS = 1024  # with changed physics that are kept
 
 
 class Simulator:
@@ -38,6 +37,7 @@ class Simulator:
         threads: 0 for the calling thread.
         change: see :class:`MuJoCoDynamics`.
         nominal: the row of physics that changes nothing.
+        most: models with changed physics that are kept.
     """
 
     def __init__(
@@ -47,8 +47,9 @@ class Simulator:
         threads: int,
         change: Change = changed_model,
         nominal: tuple[float, ...] = Physics.identity,
+        most: int = 1024,
     ) -> None:
-        self.settings = model, frame_skip, threads, change, nominal
+        self.settings = model, frame_skip, threads, change, nominal, most
         self.data = [mujoco.MjData(model) for _ in range(max(1, threads))]
         self.pool = mujoco_rollout.Rollout(nthread=threads)
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -65,9 +66,9 @@ class Simulator:
 
     def models(self, physics: np.ndarray) -> list[Any]:
         """Return the model of each row of physics ``(N, P)``, made when it is first met."""
-        if len(self.changed) > MOST_MODELS:
+        model, _, _, change, nominal, most = self.settings
+        if len(self.changed) > most:
             self.changed.clear()
-        model, _, _, change, nominal = self.settings
         rows = [tuple(row) for row in physics.tolist()]
         for row in set(rows) - self.changed.keys():
             self.changed[row] = model if row == nominal else change(model, row)

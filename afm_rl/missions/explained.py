@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import torch
 
-from afm_rl.diagnosis import Diagnosis, Log, diagnose
+from afm_rl.diagnosis import Actuator, Diagnosis, Log, Settings, diagnose
 from afm_rl.diagnosis.log import FEWEST
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import ConfigurationError
+from afm_rl.missions.build import Agent
 from afm_rl.missions.robot import Robot
 
 
@@ -65,7 +68,7 @@ def effective_log(
 
 
 def explain_mission(
-    robot: Robot, steps: pd.DataFrame, newest: int | None = None
+    robot: Robot, steps: pd.DataFrame, newest: int | None = None, late: int | None = None
 ) -> tuple[Diagnosis, Log]:
     """Return what the steps of one mission show of the robot's actuators, and the log of these.
 
@@ -73,6 +76,8 @@ def explain_mission(
         robot: its nominal physics says what a healthy one does.
         steps: of one mission, in order.
         newest: how many steps are looked at; None: 3000, or 400 where a simulator takes its time.
+        late: delays up to this one (steps) were planned for by the correction; None if there was
+            none. What it corrected is said to be made up for.
 
     Raises:
         ConfigurationError: if there are too few steps, or none shows what an action did.
@@ -85,4 +90,55 @@ def explain_mission(
         raise ConfigurationError("steps that are not finite show nothing of the actuators")
     t = steps["t"].to_numpy(dtype=float) * (robot.dt or 1.0)
     log = effective_log(robot.model, tuple(robot.action_names), states, actions, t)
-    return diagnose(log), log
+    found = diagnose(log, Settings(shared=None))  # a delay is no part of the robot's model
+    if late is None:
+        return found, log
+    rows = np.searchsorted(t, log.seconds)
+    planned = steps[[f"planned_{name}" for name in robot.action_names]].to_numpy(dtype=float)
+    actuators = tuple(
+        replace(actuator, made_up=True, sentence=f"{actuator.sentence}; made up for")
+        if _made_up(actuator, planned[:, j], log.response[:, j], rows, log, late)
+        else actuator
+        for j, actuator in enumerate(found.actuators)
+    )
+    return replace(found, actuators=actuators), log
+
+
+def planned_for(agent: Agent) -> int | None:
+    """Return the longest delay that an agent plans for (steps); None if nothing is corrected."""
+    if agent.transform is None or not agent.transform.enabled:
+        return None
+    corrector = agent.transform.corrector
+    return corrector.delay + getattr(corrector, "most_late", 0)
+
+
+def _made_up(
+    actuator: Actuator,
+    planned: np.ndarray,
+    response: np.ndarray,
+    rows: np.ndarray,
+    log: Log,
+    late: int,
+    near: float = 0.05,
+    most: float = 0.9,
+) -> bool:
+    """Did an actuator with a fault do what was planned, so many steps before, in the end?
+
+    Args:
+        actuator: as it was found.
+        planned: for it, ``(N,)``.
+        response: in ``rows``.
+        rows: numbers of the steps that are looked at.
+        log: of these.
+        late: delays that were planned for (steps).
+        near: distance that counts as the same, in half ranges of the plan.
+        most: share of the steps in which it has to be.
+    """
+    steps = round(actuator.delay_s / log.step)
+    if actuator.status != "changed" or not 0 <= steps <= late:
+        return False
+    since = max((change.t for change in actuator.changes), default=-np.inf) + log.seconds[0]
+    use = (log.seconds >= since) & (rows >= steps)
+    use &= np.cumsum(use) > use.sum() / 2  # the correction needs some steps
+    far = np.abs(response[use] - planned[rows[use] - steps])
+    return bool(use.any()) and float(np.quantile(far, most)) < near * np.ptp(planned) / 2

@@ -17,43 +17,23 @@ KEYS = ("draw", "set", "ramp", "changes")
 
 
 @dataclass(frozen=True)
-class Fixed:
-    """A regime that every mission meets.
+class Listed:
+    """Regimes that are listed: a mission's seed says which one it meets; of one, every mission.
 
     Args:
-        name: what it is called in tables.
+        name: what they are called in configurations and tables.
         given: arguments of ``env.mission``: ``regime``, and ``at`` and ``ramp`` if there are any.
 
-    >>> Fixed("heavy", {"regime": {"mass": 1.5}}).mission(seed=3)
-    {'regime': {'mass': 1.5}}
-    """
-
-    name: str
-    given: Mapping[str, Any]
-
-    def mission(self, seed: int) -> dict[str, Any]:
-        """Return the arguments of ``env.mission``."""
-        return dict(self.given)
-
-
-@dataclass(frozen=True)
-class Listed:
-    """A family of regimes that are listed: a mission's seed says which one it meets.
-
-    Args:
-        name: what it is called in configurations and tables.
-        regimes: parameters, or those of each phase.
-
-    >>> Listed("heavy", [{"mass": 1.5}, {"mass": 2.0}]).mission(seed=3)
+    >>> Listed("heavy", [{"regime": {"mass": 1.5}}, {"regime": {"mass": 2.0}}]).mission(seed=3)
     {'regime': {'mass': 2.0}}
     """
 
     name: str
-    regimes: Sequence[Any]
+    given: Sequence[Mapping[str, Any]]
 
     def mission(self, seed: int) -> dict[str, Any]:
         """Return the arguments of ``env.mission``."""
-        return {"regime": self.regimes[seed % len(self.regimes)]}
+        return dict(self.given[seed % len(self.given)])
 
 
 @dataclass(frozen=True)
@@ -141,7 +121,7 @@ def find_family(name: str, robot: Robot) -> Family | Listed:
     given: Any = robot.families[check_choice("regimes", name, robot.families)]
     where = f"robot.families.{name}"
     if isinstance(given, Mapping) and "list" in given:
-        return Listed(name, given["list"])
+        return Listed(name, [{"regime": regime} for regime in given["list"]])
     if not isinstance(given, Mapping):
         raise ConfigurationError(f"{where}={given!r}: expected a mapping of {', '.join(KEYS)}")
     for key in given:

@@ -10,11 +10,11 @@ import torch
 from tensordict import TensorDictBase
 
 from afm_rl.errors import ConfigurationError, check_choice, check_count
-from afm_rl.missions.families import Family, Fixed, Listed, find_family
+from afm_rl.missions.families import Family, Listed, find_family
 from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Schedule
 
-Entry = Family | Listed | Fixed
+Entry = Family | Listed
 PLAN = ("phases", "at", "ramp")
 
 
@@ -83,7 +83,7 @@ def _entry(entry: Any, robot: Robot) -> Entry:
         words.append("at " + ", ".join(f"{value:g}" for value in given["at"]))
     if given.get("ramp"):
         words.append(f"ramp {given['ramp']}")
-    return Fixed("; ".join(words), {"regime": regime, **given})
+    return Listed("; ".join(words), [{"regime": regime, **given}])
 
 
 def select_seeds(seeds: Any) -> list[int]:

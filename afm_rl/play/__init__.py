@@ -2,6 +2,6 @@
 
 from afm_rl.play.actuators import Actuators
 from afm_rl.play.robots import ROBOTS, Robot, make_robot
-from afm_rl.play.world import World
+from afm_rl.play.world import Side, World
 
-__all__ = ["ROBOTS", "Actuators", "Robot", "World", "make_robot"]
+__all__ = ["ROBOTS", "Actuators", "Robot", "Side", "World", "make_robot"]

@@ -14,6 +14,7 @@ from viser import uplot
 
 from afm_rl.play.actuators import presets
 from afm_rl.play.scene import COLOURS, figure_of
+from afm_rl.play.words import faults_of, text_of
 from afm_rl.play.world import SIDES, World
 
 FRAME, WORDS = 0.04, 0.25  # seconds between two pictures, and between two texts
@@ -35,10 +36,11 @@ class Page:
         with redirect_stdout(io.StringIO()):  # the command says where the page is
             self.server = viser.ViserServer("127.0.0.1", port, label=title, verbose=False)
         self.url = f"http://127.0.0.1:{self.server.get_port()}"
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
+        look: Any = {"control_width": "large", "show_logo": False, "show_share_button": False}
+        self.server.gui.configure_theme(**look)
         self.server.scene.set_up_direction("+z")
-        self.server.initial_camera.position = (1.0, -6.0, 3.0)
-        self.server.initial_camera.look_at = (1.0, 0.0, 0.0)  # left of the controls
+        self.server.initial_camera.position = (1.6, -6.5, 3.0)
+        self.server.initial_camera.look_at = (1.6, 0.0, 0.0)  # left of the controls
         sides = world.sides.items()
         self.figures = {name: figure_of(self.server, name, side.inner) for name, side in sides}
         self.labels = {
@@ -61,7 +63,7 @@ class Page:
             self._button("Push", self.world.push)
             self._button("Reset", self.world.reset)
         with gui.add_folder("All actuators"):
-            self._slider("delay", "Late by (steps)", 0.0, 8.0, 1.0, 0.0)
+            self._slider("delay", "Late by (steps)", 0.0, 10.0, 1.0, 0.0)
             self._slider("lag", "Slow (steps)", 0.0, 6.0, 0.5, 0.0)
             self._slider("noise", "Noise", 0.0, 0.5, 0.05, 0.0)
         for k, name in enumerate(names):
@@ -108,6 +110,7 @@ class Page:
             lines = [uplot.Series(label=name, stroke=STROKES[name], width=2) for name in SIDES]
             series = (uplot.Series(label="step"), *lines)
             self.rewards = gui.add_uplot((empty,) * 3, series, title="Reward", **PLOT)
+            self.faults = gui.add_markdown("")
         with gui.add_folder("Commands of AFM", order=100.0):
             self.shown = gui.add_dropdown("Actuator", self.world.robot.names)
             looks = {"planned": "gray", "executed": STROKES["AFM"], "effect": STROKES["alone"]}
@@ -130,10 +133,11 @@ class Page:
             now = time.monotonic()
             step = self.world.robot.dt / self.speed.value
             done = now if self.pause.value else max(done, now - FRAME - step)
+            last = now
             while not self.pause.value and done + step <= now:
                 self.world.step()
-                done += step
-                if time.monotonic() > now + FRAME:  # slower than life
+                done, before, last = done + step, last, time.monotonic()
+                if 2 * last - before > now + FRAME:  # no time for another one: slower than life
                     break
             self.draw()
             if now - worded > WORDS:
@@ -151,7 +155,7 @@ class Page:
     def say(self) -> None:
         """Renew words and curves."""
         with self.world.lock:
-            self.words.content = self.text()
+            self.words.content, self.faults.content = text_of(self.world), faults_of(self.world)
             rewards = [np.array(side.rewards) for side in self.world.sides.values()]
             commands = np.array(self.world.sides["AFM"].commands)
         size = min(map(len, rewards))
@@ -161,29 +165,3 @@ class Page:
         if len(commands) > 1:
             one = commands[..., self.world.robot.names.index(self.shown.value)].T
             self.commands.data = (np.arange(len(commands), dtype=float), *one.astype(float))
-
-    def text(self) -> str:
-        """Say how both are, and what AFM knows."""
-        sides, score = [self.world.sides[name] for name in SIDES], self.world.robot.score
-        table = {"": SIDES, "---": ["---"] * 2, "falls": [side.falls for side in sides]}
-        table["reward a step"] = [f"{mean(side.rewards):.2f}" for side in sides]
-        if score != "reward":
-            table[score] = [side.info.get(score, "") for side in sides]
-        rows = ["| " + " | ".join(map(str, (name, *row))) + " |" for name, row in table.items()]
-        afm = sides[1].info["afm"]
-        state = "**corrects**" if afm["corrects"] else "does nothing"
-        lines = [f"AFM {state}; innovation {afm['innovation']:.2f}"]
-        if "noise" in afm:
-            noise = ", ".join(f"{value:.2g}" for value in np.ravel(afm["noise"]))
-            lines.append(f"noise that was learnt: {noise}")
-        words = str(sides[1].env.diagnosis)
-        for k, name in enumerate(self.world.robot.names):
-            words = words.replace(f"actuator {k}:", f"{name}:").replace(f"a_{k}:", f"{name}:")
-        words = words.replace("\n", "  \n")
-        return "\n".join([*rows, "", "  \n".join(lines), "", words])
-
-
-def mean(values: Any) -> float:
-    """Return the mean of the newest 50 values."""
-    newest = list(values)[-50:]
-    return sum(newest) / max(len(newest), 1)

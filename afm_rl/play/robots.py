@@ -12,7 +12,6 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.wrappers import TransformObservation
-from scipy.linalg import solve_discrete_are
 from tensordict import TensorDict
 from torchrl.envs.utils import step_mdp
 
@@ -21,6 +20,7 @@ from afm_rl.dynamics import Dubins, MuJoCoDynamics, Quadrotor
 from afm_rl.envs.task.pendulum import pendulum_step
 from afm_rl.errors import ConfigurationError, check_choice
 from afm_rl.planning import MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost, load_policy
+from afm_rl.planning.riccati import stationary_value
 
 Acting = Callable[[np.ndarray], np.ndarray]
 LONG, NEAR = 3600.0, 3.0  # s, of a flight; m, from its reference, beyond which it is lost
@@ -90,7 +90,9 @@ def _gymnasium(task: str, policy: Callable[[], Acting], settings: dict[str, Any]
         found = inner.model
         joints = [found.joint(joint).name for joint in found.actuator_trnid[:, 0]]
         return Robot(make, policy, {"model": "mujoco"}, _push_root, inner.dt, joints)
-    model = {"model": pendulum_step, "state": lambda env, seen: env.unwrapped.state}
+    model: dict[str, Any] = {"model": pendulum_step}
+    model["state"] = lambda env, seen: env.unwrapped.state
+    model["observe"] = lambda s: np.c_[np.cos(s[:, 0]), np.sin(s[:, 0]), s[:, 1]]
     return Robot(make, policy, model, _push_pendulum, inner.dt, ["joint"])
 
 
@@ -106,22 +108,10 @@ def _push_pendulum(inner: Any, direction: float) -> None:
 def _cart_pole(file: Path | None) -> Robot:
     """A cart with a pole, by the linear quadratic regulator."""
     env: Any = gymnasium.make("InvertedPendulum-v5")
-    model, zero = MuJoCoDynamics(env), torch.zeros(1, 4, dtype=torch.float64)
-    a, b = (
-        torch.stack(
-            [
-                (model(zero + p, u) - model(zero - p, -u))[0] / 2e-4
-                for p, u in zip(1e-4 * states, 1e-4 * actions, strict=True)
-            ],
-            -1,
-        ).numpy()
-        for states, actions in (
-            (torch.eye(4, dtype=torch.float64), torch.zeros(4, 1, dtype=torch.float64)),
-            (torch.zeros(1, 4, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64)),
-        )
-    )
-    cost = solve_discrete_are(a, b, np.diag([1.0, 10.0, 0.1, 0.1]), np.eye(1))
-    gain = np.linalg.solve(np.eye(1) + b.T @ cost @ b, b.T @ cost @ a)
+    upright = torch.zeros(4, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    _, a, b = MuJoCoDynamics(env).linearise(*upright)
+    cost = torch.tensor([1.0, 10.0, 0.1, 0.1]).diag(), torch.eye(1)
+    gain = stationary_value(a, b, *cost)[1].numpy()
     space = env.action_space
 
     def act(seen: np.ndarray) -> np.ndarray:
@@ -147,6 +137,21 @@ def _planned(planner: Any, parts: dict[str, tuple[int, ...]]) -> Acting:
     return act
 
 
+def _first(size: int) -> dict[str, Any]:
+    """Return how to find the state where it is the first numbers of an observation, and back."""
+    rest = np.zeros(0)
+
+    def state(env: Any, seen: np.ndarray) -> np.ndarray:
+        nonlocal rest
+        rest = seen[size:]
+        return seen[:size]
+
+    def observe(states: np.ndarray) -> np.ndarray:
+        return np.concatenate([states, np.tile(rest, (len(states), 1))], 1)
+
+    return {"state": state, "observe": observe}
+
+
 def _ugv(file: Path | None) -> Robot:
     """The ground robot on its track, by MPPI."""
     low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
@@ -162,7 +167,7 @@ def _ugv(file: Path | None) -> Robot:
     def push(inner: Any, direction: float) -> None:
         inner._data["pose"] += torch.tensor([0.0, 0.0, 0.5 * direction])
 
-    model = {"model": dynamics, "state": lambda env, seen: seen[:3]}
+    model = {"model": dynamics, **_first(3)}
     return Robot(make, policy, model, push, 0.2, ["speed", "turn"], score="reached")
 
 
@@ -193,7 +198,7 @@ def _quadrotor(file: Path | None) -> Robot:
     def push(inner: Any, direction: float) -> None:
         inner._data["pose"][3] += 0.5 * direction
 
-    model = {"model": dynamics, "state": lambda env, seen: seen[:13]}
+    model = {"model": dynamics, **_first(13)}
     names = ["thrust", "roll", "pitch", "yaw"]
     return Robot(make, policy, model, push, 0.05, names, corrector=lambda: ActionFlow(-unit, unit))
 

@@ -25,7 +25,7 @@ class Side:
         self.env: Any = Actuators(robot.make(), faults)
         if corrected:
             model, corrector = robot.model, robot.corrector()
-            self.env = ActionFlowWrapper(self.env, **model, corrector=corrector)
+            self.env = ActionFlowWrapper(self.env, **model, corrector=corrector, belief=True)
         self.rewards: deque[float] = deque(maxlen=KEPT)
         self.commands: deque[np.ndarray] = deque(maxlen=KEPT)
         self.falls = 0

@@ -10,11 +10,11 @@ from torch import Tensor
 from afm_rl.errors import ConfigurationError, check_counts
 from afm_rl.regimes.base import DelayedRegime
 
-MOST_STEPS = 8
+MOST_STEPS = 10
 
 
 class Delay(DelayedRegime):
-    r"""The command of d steps ago: :math:`a_\mathrm{eff} = a_{t - d}`, with d up to 8.
+    r"""The command of d steps ago: :math:`a_\mathrm{eff} = a_{t - d}`, with d up to 10.
 
     Between whole steps, as in a ramp, the neighbouring commands are mixed linearly. Without
     the previous commands there is no delay, and so the inverse is the action itself. The

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform
 
-from afm_rl.correction import Corrector
+from afm_rl.correction import ActionFlow, Corrector
 from afm_rl.correction.arrival import arrival
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance
@@ -50,6 +50,7 @@ class ActionFlowTransform(CarriedTransform):
       the one in which the next action will act; while no action is late, the same,
     * ``(prefix, "innovation")`` ``(*B)``: the misalignment, in the unit of the gate,
     * ``(prefix, "spread")`` ``(*B, A)``: standard deviation of the flow's samples,
+    * ``(prefix, "noise")`` ``(*B, A)``: standard deviation of effects that nothing explains,
     * ``(prefix, "effect_bounds")`` ``(*B, 2, A)``: lowest and highest effect that an action can
       have, at least the action box: for planners that can plan beyond it.
 
@@ -74,6 +75,8 @@ class ActionFlowTransform(CarriedTransform):
         late: what policies find under ``in_keys`` while actions act late: ``"predict"``, the state
             in which the next action will act; ``"leave"``, the measured one.
         delay: steps from an action to its effect that are known, one number or one per axis.
+        belief: keep ``(prefix, "belief")`` ``(*B, C, A)``, too: how probable the ``causes`` of the
+            :class:`~afm_rl.correction.ActionFlow` are, by axis.
 
     Raises:
         ConfigurationError: for parts that do not fit each other, also when it is put around an
@@ -104,8 +107,9 @@ class ActionFlowTransform(CarriedTransform):
         reported_key: NestedKey | None = None,
         late: str = "predict",
         delay: int | Sequence[int] | None = None,
+        belief: bool = False,
     ) -> None:
-        self.delay = delay
+        self.delay, self.belief = delay, check_flag("transform.belief", belief)
         self.late = check_choice("transform.late", late, LATE)
         state = _one_key("in_keys", ["observation"] if in_keys is None else in_keys)
         action = _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv)
@@ -165,7 +169,18 @@ class ActionFlowTransform(CarriedTransform):
         kept = tensordict.get(self.prefix).select("observation", "arrival")
         # Environments without a state of their own go on from what is under this key.
         tensordict.set(self.observation_key, kept.get("observation"))
-        return tensordict.set(self.prefix, entries.update(kept))
+        return tensordict.set(self.prefix, self._believed(entries.update(kept)))
+
+    def _believed(self, entries: TensorDictBase) -> TensorDictBase:
+        """Return the entries with the belief, if it is asked for."""
+        if self.belief:
+            entries.set("belief", self._believer.belief_in(entries.get("memory")))
+        return entries
+
+    @property
+    def _believer(self) -> ActionFlow:
+        name = "transform.belief=True: transform.corrector"
+        return check_instance(name, self.corrector, ActionFlow)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         entries = dict(tensordict.get(self.prefix).items())
@@ -191,7 +206,7 @@ class ActionFlowTransform(CarriedTransform):
         entries = begin(self.corrector, state, self._action_spec)
         entries.update(self._seen(entries.get("memory"), state))
         self._show(tensordict_reset, entries.get("arrival"))
-        return tensordict_reset.set(self.prefix, entries)
+        return tensordict_reset.set(self.prefix, self._believed(entries))
 
     def _seen(self, memory: Tensor, measured: Tensor) -> dict[str, Tensor]:
         """Return the entries of the present state and of that in which the next action acts."""
@@ -242,6 +257,9 @@ class ActionFlowTransform(CarriedTransform):
         size = (*spec.shape, self.model.state_size)
         entries["observation"] = Unbounded(size, dtype=found.dtype)
         entries["arrival"] = Unbounded(size, dtype=found.dtype)
+        if self.belief:
+            size = (*spec.shape, len(self._believer.causes), self.corrector.action_size)
+            entries["belief"] = Unbounded(size, dtype=found.dtype)
         return entries
 
 

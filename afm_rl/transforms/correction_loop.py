@@ -16,12 +16,12 @@ from gymnasium.vector import VectorEnv
 from torch import Tensor
 from torchrl.data import Bounded
 
-from afm_rl.correction import Corrector
+from afm_rl.correction import ActionFlow, Corrector
 from afm_rl.correction.arrival import arrival
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.diagnosis import explain
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
-from afm_rl.errors import ConfigurationError, check_choice, check_flag
+from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance
 from afm_rl.faults import fault_of, safe_action
 from afm_rl.learning.watching import Watching
 from afm_rl.spaces.manifold import Manifold
@@ -57,6 +57,7 @@ class CorrectionLoop:
         late: see :class:`ActionFlowWrapper`, as the next one.
         observe: what is observed in states.
         delay: steps that are known.
+        belief: tell it, too.
     """
 
     def __init__(
@@ -71,8 +72,9 @@ class CorrectionLoop:
         late: str = "predict",
         observe: Observe | None = None,
         delay: int | Sequence[int] | None = None,
+        belief: bool = False,
     ) -> None:
-        self.delay = delay
+        self.delay, self.belief = delay, check_flag("wrapper.belief", belief)
         self.late = check_choice("wrapper.late", late, LATE)
         if not isinstance(actions, Box) or len(actions.shape) != 1 or actions.dtype.kind != "f":
             raise ConfigurationError(
@@ -161,6 +163,8 @@ class CorrectionLoop:
         self.corrector = corrector_for(
             "ActionFlowWrapper", self.model, self.corrector, self.spec, self.delay
         )
+        if self.belief:
+            check_instance("wrapper.belief=True: wrapper.corrector", self.corrector, ActionFlow)
         self.corrector.to(states.dtype)
 
     @torch.no_grad()
@@ -243,12 +247,16 @@ class CorrectionLoop:
             found += f"\nlateness: {late} step{'s' * (late > 1)}, made up for"
         return found
 
-    def _tell(self) -> dict[str, np.ndarray]:
+    def _tell(self) -> dict[str, Any]:
         """Return what is known of the newest step, ``(N, ...)`` each."""
-        told = {name: self.entries.get(key).numpy().copy() for name, key in SHOWN.items()}
+        found = {name: self.entries.get(key) for name, key in SHOWN.items()}
+        told: dict[str, Any] = {name: value.numpy().copy() for name, value in found.items()}
         told["corrects"] &= self.enabled
         if self.watching:
             told["learned"] = np.full(len(told["corrects"]), not self.learning)
+        if self.belief:
+            belief = self.corrector.belief_in(self.entries.get("memory")).numpy()
+            told["belief"] = dict(zip(self.corrector.causes, belief.swapaxes(0, 1), strict=True))
         return told
 
 

@@ -55,6 +55,8 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
             None: the states, or what a gymnasium task with MuJoCo observes in them.
         delay: steps from a command to its effect that are known, one number or one per actuator:
             used from the first step on. What comes on top of it is found out.
+        belief: have ``info["afm"]["belief"]``, too: how probable ``(A,)`` each cause is, by name,
+            such as ``"nothing has changed"`` or ``"2 steps late"``.
 
     Raises:
         ConfigurationError: for spaces or a model that cannot be used, or do not fit each other;
@@ -78,15 +80,16 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         late: str = "predict",
         observe: Observe | None = None,
         delay: int | Sequence[int] | None = None,
+        belief: bool = False,
     ) -> None:
         given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
-        given |= {"late": late, "observe": observe, "delay": delay}
+        given |= {"late": late, "observe": observe, "delay": delay, "belief": belief}
         RecordConstructorArgs.__init__(self, **given)
         gymnasium.Wrapper.__init__(self, env)
         inner: Any = env.unwrapped
         spaces = env.observation_space, env.action_space
         self._loop = CorrectionLoop(
-            *spaces, model, state, corrector, enabled, env, late, observe, delay
+            *spaces, model, state, corrector, enabled, env, late, observe, delay, belief
         )
         simulated = isinstance(self._loop.model, MuJoCoDynamics)
         if simulated and hasattr(inner, "data") and env.action_space != inner.action_space:
@@ -128,9 +131,7 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         return as_numbers("observation", state, self._loop.state_shape)[None]
 
     def _told(self, observation: Any) -> dict[str, Any]:
-        told = {name: value[0] for name, value in self._loop.told.items()}
-        told = {k: v.item() if isinstance(v, np.generic) else v for k, v in told.items()}
-        return {**told, "observation": observation}
+        return {**_first(self._loop.told), "observation": observation}
 
 
 class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
@@ -160,14 +161,15 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         late: str = "predict",
         observe: Observe | None = None,
         delay: int | Sequence[int] | None = None,
+        belief: bool = False,
     ) -> None:
         given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
-        given |= {"late": late, "observe": observe, "delay": delay}
+        given |= {"late": late, "observe": observe, "delay": delay, "belief": belief}
         RecordConstructorArgs.__init__(self, **given)
         VectorWrapper.__init__(self, env)
         spaces = env.single_observation_space, env.single_action_space
         self._loop = CorrectionLoop(
-            *spaces, model, state, corrector, enabled, env, late, observe, delay
+            *spaces, model, state, corrector, enabled, env, late, observe, delay, belief
         )
         self._mode = autoreset_mode_of(env)
         self._over = np.zeros(env.num_envs, dtype=bool)
@@ -208,6 +210,13 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
     def _states(self, observations: Any) -> Tensor:
         states, shape = self._loop.state(self.env, observations), self._loop.state_shape
         return as_numbers("observations", states, shape and (self.num_envs, *shape))
+
+
+def _first(told: Any) -> Any:
+    """Return what is told of the first environment."""
+    if isinstance(told, dict):
+        return {name: _first(value) for name, value in told.items()}
+    return told[0].item() if isinstance(told[0], np.generic) else told[0]
 
 
 def autoreset_mode_of(env: VectorEnv) -> AutoresetMode:

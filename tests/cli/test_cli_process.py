@@ -16,7 +16,7 @@ COLUMNS = (  # the last ones, after the parameters
 
 
 def test_the_paper_s_study_is_one_line(process, program, tmp_path, quick):
-    small = [*quick, "budget=8"]
+    small = [*quick, "budget=3"]
     done = process(program, *STUDY.split(), f"hydra.run.dir={tmp_path}/study", *small)
     assert (done.returncode, done.stderr) == (0, "")
     missions = pd.read_csv(tmp_path / "study" / "missions.csv")

@@ -61,13 +61,10 @@ def test_bare_compares_four_methods(afm_rl, tmp_path, small_training):
     [
         (["method=physics"], ["physics"]),
         (["method=physics", "label=mine"], ["mine"]),
-        (["method=physics", "planner=mppi_paper"], ["physics"]),
         (["method=oracle", "dynamics=oracle"], ["oracle+dynamics=oracle"]),
         (["compare=[]"], ["physics"]),
         (["dynamics=oracle", "updater=oracle"], ["dynamics=oracle+updater=oracle"]),
         (["compare=[physics]", "corrector=none"], ["physics+corrector=none"]),
-        (["compare=[]", "label=mine"], ["mine"]),
-        (["compare=null"], ["physics"]),
         (["compare=[oracle, physics]", "label=mine"], ["oracle", "physics"]),
     ],
 )

@@ -27,7 +27,6 @@ def methods(jobs):
     ("study", "more", "budget", "count", "last"),
     [
         ("ugv", [], 5000, 13, "oracle"),
-        ("ugv_paper", [], 5000, 5, "afm_paper"),
         ("ugv_families", ["compare=[physics,oracle]"], 3000, 2, "oracle"),
     ],
 )

@@ -4,24 +4,16 @@ import os
 import re
 
 import pytest
-import torch
 
 from afm_rl.cli.error_messages import explain, one_line
-from afm_rl.correction import PaperFlow
 from afm_rl.errors import ConfigurationError
-from afm_rl.storage.artefacts import save_artefact
 
 # method, overrides, what the line must name
 CASES = """
 -               method=nope                              method/nope afm_physics
--               planner=nope                             planner/nope mppi_paper
 physics         +planner.horizn=3                        planner: horizn
-physics         +robot.env.horizn=3                      robot.env: horizn
 physics         seeds                                    seeds
 physics         seeds=[1                                 [1
-physics         seeds=0                                  seeds=0
-physics         seeds=many                               seeds='many'
-physics         seeds=[99999999999999999999]             seeds=
 physics         budget=0                                 budget=0
 physics         budget=${nope}                           nope
 physics         threads=0                                threads=0
@@ -33,23 +25,12 @@ physics         cache=null                               cache=None
 -               compare=[nope]                           method/nope afm_physics
 -               compare=physics                          compare=physics
 -               compare=[physics,physics]                compare=
-physics         regimes=[]                               regimes=[] paper none v_gain
-physics         regimes=papper                           regimes='papper' paper
-physics         regimes=[{v_gain:nan}]                   regimes v_gain=nan
-physics         regimes={v_gain:-1.0}                    regimes
-physics         tracks=nope                              tracks='nope' ethz_1 ethz_2
 physics         tracks=missing.csv                       tracks missing.csv
-physics         planner.horizon=abc                      planner.horizon='abc'
-physics         planner=cem,planner.elites=500           planner.elites=500
-physics         planner=torchrl_mppi,planner.elites=0    planner.elites=0
 physics         robot.action_high=[inf,inf]              half_range=[inf, action_high
 physics         robot.paper_regimes=[],regimes=paper     regimes=[]
 online_pe       dynamics.pretrain.samples=10             dynamics.pretrain.samples=10 256
-online_pe       updater.optimizer.lr=0                   updater lr=0
-afm_physics     corrector.memory=10                           corrector.memory=10
-afm_physics     corrector.readings=[late]                     corrector.readings='late' recent
-afm_physics     corrector.train={step:1}                      corrector.train 'step' iterations
-afm_physics     corrector.checkpoint=missing                  corrector.checkpoint missing
+afm_physics     corrector.train={step:1}                 corrector.train 'step' iterations
+afm_physics     corrector.checkpoint=missing             corrector.checkpoint missing
 """
 
 
@@ -94,22 +75,10 @@ def test_a_setting_that_cannot_be_used(refuse, overrides, named):
     assert all(word in line for word in named), line
 
 
-@pytest.mark.parametrize(
-    ("content", "complaint"),
-    [
-        ("x,y\n0,0\n", "waypoint count 1: expected at least 2"),
-        ("x,y\n0,0\n1,one\n", "line 3: 'one' is not a finite number"),
-        ("x,y\n0,0\n1,nan\n", "line 3: 'nan' is not a finite number"),
-        ("x,y\n0,0\n1\n", "line 3: 1 values, expected 2"),
-        ("a,b\n0,0\n1,1\n", "the first line is a,b, expected x,y or x,y,radius"),
-        ("", "the first line is nothing"),
-        ("x,y\n0,0\n0,0\n", "waypoint 1 and waypoint 2 coincide"),
-    ],
-)
-def test_a_track_that_cannot_be_used(refuse, tmp_path, content, complaint):
-    (tmp_path / "my_track.csv").write_text(content)
+def test_a_track_that_cannot_be_used(refuse, tmp_path):
+    (tmp_path / "my_track.csv").write_text("x,y\n0,0\n1,one\n")
     line = refuse("method=physics", f"tracks={tmp_path}/my_track.csv")
-    assert "tracks" in line and "my_track" in line and complaint in line
+    assert "tracks" in line and "my_track" in line and "line 3: 'one' is not a finite" in line
 
 
 def test_a_folder_that_cannot_be_written(refuse, tmp_path):
@@ -126,19 +95,6 @@ def test_a_cache_that_cannot_be_written(afm_rl, tmp_path, quick, monkeypatch):
     done = afm_rl("method=afm_paper", f"cache={tmp_path}/file/parts", folder, *quick)
     assert done.status == 2
     assert done.err.startswith(f"afm-rl: cannot write {tmp_path}/file/parts: Not a ")
-
-
-def test_a_checkpoint_for_another_robot(refuse, tmp_path):
-    flow = PaperFlow(torch.tensor([-1.0]), torch.tensor([1.0]), [2], 3)
-    save_artefact(tmp_path / "flow", flow, flow.signature)
-    line = refuse("method=afm_physics", f"corrector.checkpoint={tmp_path}/flow")
-    assert "corrector.checkpoint: " in line and "kind=PaperFlow, expected kind=ActionFlow" in line
-
-
-def test_a_checkpoint_that_is_no_checkpoint(refuse, tmp_path):
-    (tmp_path / "flow").write_bytes(b"\x80\x04cposix\nsystem\n.")
-    line = refuse("method=afm_physics", f"corrector.checkpoint={tmp_path}/flow")
-    assert "corrector.checkpoint: " in line and "damaged" in line
 
 
 def test_a_configuration_from_a_file_runs_no_command(refuse, tmp_path):

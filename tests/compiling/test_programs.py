@@ -119,11 +119,13 @@ def real(compiled, tmp_path, monkeypatch):
     return tmp_path / "compiled" / path.name, path.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_real_program_runs_at_once_the_second_time(real, tmp_path, capfd):
     keep(*real)
     assert run(tmp_path) == [2.0] * 3 and "compiling" not in capfd.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["planted", "one bit", "open folder"])
 def test_a_real_program_that_may_be_anothers_does_not_run(
     real, fault, tmp_path, capfd, monkeypatch

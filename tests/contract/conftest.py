@@ -194,7 +194,8 @@ THEIRS = ("CEM", "TorchRLMPPI")  # they draw from the generator of the device
 BUILT_IN_PRECISION = ("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI")
 
 
-SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "OnlineUpdater", "StreamXUpdater", "UnmatchedUpdater")
+SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "ActionFlowPolicy", "CFMLoss")
+SLOW_TO_COMPILE += ("OnlineUpdater", "RLSUpdater", "StreamXUpdater", "UnmatchedUpdater")
 COMPILED_SMALLER = {  # what is compiled is the updater: a model in closed form has fewer operations
     "RLSUpdater": Case(
         lambda seed: RLSUpdater(GaussianNLLLoss(Calibrated(Dubins(), torch.ones(2)))), learn

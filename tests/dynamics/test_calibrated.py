@@ -130,14 +130,6 @@ def test_missions_expand_and_leave(transitions):
         model(state, action)
 
 
-def test_the_state_dict_holds_the_calibration(transitions):
-    model, other = calibrated(missions=4), Calibrated(Dubins(), HALF).double().expand_(4)
-    other.load_state_dict(model.state_dict())
-    other.half_range = model.half_range
-    state, action = transitions(4, dtype=torch.float64)
-    assert torch.equal(other(state, action), model(state, action))
-
-
 def test_what_cannot_be_calibrated(make_ensemble):
     with pytest.raises(ConfigurationError, match=r"holds \(3,\) missions"):
         Calibrated(make_ensemble().expand_(3), HALF)

@@ -30,16 +30,6 @@ def test_the_heading_stays_in_one_turn():
     torch.testing.assert_close(moved[:, 2], torch.tensor([3.3 - math.tau, math.tau - 3.3]))
 
 
-def test_a_batch_is_a_loop_in_either_precision(transitions):
-    for dtype in (torch.float32, torch.float64):
-        state, action = transitions(4, 3, dtype=dtype)
-        moved = Dubins()(state, action)
-        assert moved.dtype is dtype and moved.shape == (4, 3, 3)
-        for i in range(4):
-            for j in range(3):
-                torch.testing.assert_close(moved[i, j], Dubins()(state[i, j], action[i, j]))
-
-
 def test_its_noise_is_what_was_asked_for(transitions):
     model = Dubins(noise_std=0.01)
     state, action = transitions(5)

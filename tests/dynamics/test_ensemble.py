@@ -121,16 +121,6 @@ def test_statistics_are_those_of_the_data(make_ensemble):
     torch.testing.assert_close(standard[:, [0, 2]].std(0), torch.ones(2))
 
 
-def test_the_precision_is_that_of_the_model(make_ensemble, transitions):
-    model = make_ensemble()
-    state, action = transitions(5)
-    single = model(state, action)
-    assert single.dtype is torch.float32
-    double = model.double()(state.double(), action.double())
-    assert double.dtype is torch.float64
-    torch.testing.assert_close(double.float(), single, rtol=1e-5, atol=1e-5)
-
-
 def test_initial_weights_follow_the_seed_and_the_bounds_of_linear_layers(make_ensemble):
     one, same, other = (make_ensemble(seed=seed) for seed in (1, 1, 2))
     for left, right in zip(one.parameters(), same.parameters(), strict=True):
@@ -139,23 +129,6 @@ def test_initial_weights_follow_the_seed_and_the_bounds_of_linear_layers(make_en
     assert one.weights[1].abs().max() <= 0.25  # 1 / sqrt(16)
     assert one.weights[1].abs().max() > 0.24
     assert not torch.equal(one.weights[0][0], one.weights[0][1])  # members differ
-
-
-def test_its_state_makes_a_twin(make_ensemble, transitions):
-    model, twin = make_ensemble(seed=1), make_ensemble(seed=2)
-    twin.normalise_(torch.randn(9, 4), torch.randn(9, 3))
-    state, action = transitions(5)
-    twin.load_state_dict(model.state_dict())
-    assert torch.equal(twin(state, action), model(state, action))
-
-
-def test_a_copy_is_independent(make_ensemble, transitions):
-    model = make_ensemble(propagation="sample")
-    twin = copy.deepcopy(model)
-    state, action = transitions(5)
-    assert torch.equal(twin(state, action), model(state, action))
-    twin.weights[0].data.zero_()
-    assert model.weights[0].abs().sum() > 0
 
 
 @pytest.mark.parametrize(

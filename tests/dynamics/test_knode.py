@@ -196,21 +196,6 @@ def test_a_shared_pool_stays_as_it_is():
     assert torch.equal(model(state, action), before)
 
 
-def test_its_state_makes_a_twin():
-    model, (state, action) = full(), flights(3)
-    twin = KNODE(Quadrotor())
-    twin.load_state_dict(model.state_dict())
-    assert torch.equal(twin(state, action), model(state, action))
-    assert set(model.state_dict()) == set(Network._fields)
-
-
-def test_single_precision_stays():
-    model, (state, action) = full(), flights(3)
-    single = model(state.float(), action.float())
-    assert single.dtype is torch.float32
-    torch.testing.assert_close(single.double(), model(state, action), rtol=1e-4, atol=1e-3)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

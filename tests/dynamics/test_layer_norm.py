@@ -8,7 +8,7 @@ from torch import nn
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.sparse import sparse_layer
-from afm_rl.dynamics.stacked import SLOPE, stacked_mlp, stacked_mlp_tangent
+from afm_rl.dynamics.stacked import SLOPE
 from afm_rl.errors import ConfigurationError
 
 HIDDEN = [[16], [8, 8, 8]]
@@ -49,27 +49,6 @@ def test_outputs_equal_those_of_ordinary_layers(make, transitions, hidden):
             layers += [linear, norm, nn.LeakyReLU(SLOPE)]
         expected = nn.Sequential(*layers[:-2])(rows)[:, :3]
         torch.testing.assert_close(out[:, e], expected)
-
-
-@pytest.mark.parametrize("hidden", HIDDEN)
-def test_tangents_equal_automatic_ones(hidden):
-    sizes = [3, *hidden, 2]
-    generator = torch.Generator().manual_seed(0)
-
-    def draw(*shape):
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    pairs = list(zip(sizes[:-1], sizes[1:], strict=True))
-    inputs, axes = draw(4, 7, 3), draw(2, 3)
-    weights, biases = [draw(4, a, b) for a, b in pairs], [draw(4, 1, b) for _, b in pairs]
-    moved = stacked_mlp_tangent(inputs, axes, weights, biases, layer_norm=True)
-    for k, axis in enumerate(axes):
-        _, expected = torch.func.jvp(
-            lambda x: stacked_mlp(x, weights, biases, layer_norm=True),
-            (inputs,),
-            (axis.expand_as(inputs),),
-        )
-        torch.testing.assert_close(moved[:, :, k], expected)
 
 
 @pytest.mark.parametrize("missions", [0, 3])
@@ -116,14 +95,6 @@ def test_statistics_stay_without_the_switch(make_ensemble, transitions):
     before = {name: value.clone() for name, value in model.state_dict().items()}
     model.observe_(*transitions(5))
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
-
-
-def test_its_state_makes_a_twin(make, transitions):
-    model, twin = make(seed=1), make(seed=2)
-    state, action = transitions(5, dtype=torch.float64)
-    model.observe_(state, action)
-    twin.load_state_dict(model.state_dict())
-    assert torch.equal(twin(state, action), model(state, action))
 
 
 @pytest.mark.parametrize(("fan_in", "kept"), [(3, 1), (10, 1), (50, 5), (200, 20)])

@@ -49,13 +49,6 @@ def test_a_batch_of_missions_equals_single_ones(missions, make_ensemble, transit
         torch.testing.assert_close(missions(state, action)[index], expected[0])
 
 
-def test_further_dimensions_are_free(missions, transitions):
-    for further in [(), (3,), (2, 3)]:
-        state, action = transitions(4, *further, dtype=torch.float64)
-        assert missions(state, action).shape == (4, *further, 3)
-        assert missions.moments(state, action)[0].shape == (4, *further, 3, 3)
-
-
 @pytest.mark.parametrize("index", [[2, 0], [True, False, True, False], [3]], ids=str)
 def test_selection_keeps_the_right_missions(missions, transitions, index):
     index = torch.tensor(index)
@@ -90,10 +83,3 @@ def test_gradients_stay_with_their_mission(missions, transitions):
     for parameter in missions.parameters():
         if parameter.grad is not None:
             assert parameter.grad[[0, 2, 3]].abs().sum() == 0
-
-
-def test_missions_survive_a_round_trip(missions, make_ensemble, transitions):
-    twin = make_ensemble(seed=3).double().expand_(4)
-    twin.load_state_dict(missions.state_dict())
-    state, action = transitions(4, dtype=torch.float64)
-    assert torch.equal(twin(state, action), missions(state, action))

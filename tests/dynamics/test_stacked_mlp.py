@@ -7,15 +7,16 @@ from torch import nn
 from afm_rl.dynamics.stacked import SLOPE, stacked_mlp, stacked_mlp_tangent
 
 
-def loop(weights, biases):
+def loop(weights, biases, layer_norm=False):
     networks = []
     for member in range(len(weights[0])):
         layers = []
         for weight, bias in zip(weights, biases, strict=True):
             linear = nn.Linear(*weight.shape[1:], dtype=torch.float64)
             linear.weight.data, linear.bias.data = weight[member].T, bias[member, 0]
-            layers += [linear, nn.LeakyReLU(SLOPE)]
-        networks.append(nn.Sequential(*layers[:-1]))
+            norm = nn.LayerNorm(weight.shape[-1], elementwise_affine=False)
+            layers += [linear, *[norm] * layer_norm, nn.LeakyReLU(SLOPE)]
+        networks.append(nn.Sequential(*layers[: -1 - layer_norm]))
     return networks
 
 
@@ -37,12 +38,13 @@ def test_outputs_equal_those_of_a_loop(stack):
         torch.testing.assert_close(out[member], network(inputs[member]))
 
 
-def test_tangents_equal_automatic_ones(stack):
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_tangents_equal_automatic_ones(stack, layer_norm):
     inputs, weights, biases = stack
     axes = torch.eye(3, dtype=torch.float64)[1:]
-    moved = stacked_mlp_tangent(inputs, axes, weights, biases)
+    moved = stacked_mlp_tangent(inputs, axes, weights, biases, layer_norm=layer_norm)
     assert moved.shape == (4, 7, 2, 2)
-    for member, network in enumerate(loop(weights, biases)):
+    for member, network in enumerate(loop(weights, biases, layer_norm)):
         for row in range(7):
             full = torch.func.jacrev(network)(inputs[member, row])
             torch.testing.assert_close(moved[member, row], full.T[1:])

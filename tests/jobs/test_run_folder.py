@@ -205,7 +205,7 @@ def test_new_results_replace_old_ones_whole_or_not_at_all(configure, tmp_path, m
     assert 20 < kills < 99
 
 
-@pytest.mark.parametrize("when", range(0, 16, 3))
+@pytest.mark.parametrize("when", [0, 6, 12])
 def test_a_full_disk_leaves_the_old_results(configure, tmp_path, monkeypatch, when):
     """The disk is full at one write after another; what was there stays, whole."""
     old, room = go(tmp_path, configure()), when

@@ -55,11 +55,6 @@ def test_a_planner_over_a_learned_model_can_be_the_policy():
     assert not env.is_closed
 
 
-def test_entries_can_be_chosen():
-    data = collect(pendulum(), frames=3, keys=["action", ["next", "reward"]])[:]
-    assert "observation" not in data.keys() and data["next", "reward"].shape == (3, 1)
-
-
 def test_no_frames_are_refused():
     with pytest.raises(ConfigurationError, match="frames=0"):
         collect(pendulum(), frames=0)

@@ -79,18 +79,6 @@ def test_keys_can_be_chosen(data):
     assert loss.in_keys == ["did", "then"]
 
 
-def test_the_executed_action_can_be_read_instead_of_the_planned(data):
-    model, td = data
-    loss = GaussianNLLLoss(model)
-    expected = loss(td)["loss_nll"]
-    td = td.clone()
-    td["next", "afm", "executed_action"] = td["action"]
-    td["action"] = -td["action"]
-    assert not torch.allclose(loss(td)["loss_nll"], expected)
-    loss.set_keys(action=("next", "afm", "executed_action"))
-    torch.testing.assert_close(loss(td)["loss_nll"], expected)
-
-
 def test_entries_may_come_by_name(data):
     model, td = data
     loss = GaussianNLLLoss(model)

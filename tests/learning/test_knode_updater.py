@@ -175,15 +175,6 @@ def test_faulty_rows_are_left_out():
     assert (missed(model, ticks[4]) < missed(KNODE(Quadrotor()), ticks[4])).all()
 
 
-def test_the_mask_says_who_learns():
-    ticks = stream(4)
-    for td in ticks:
-        td["mask"] = torch.tensor([[True], [False], [True]])
-    model, updater = teach(ticks, mask_key="mask")
-    assert not model.networks.inner[1].any()
-    assert model.networks.inner[0].any() and updater.refused == 0
-
-
 def test_missions_that_end_take_their_rows_along():
     ticks = stream(9)
     whole, _ = teach(ticks)

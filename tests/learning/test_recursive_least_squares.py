@@ -76,9 +76,8 @@ TURN = torch.tensor([[0.5, -0.9], [0.9, 0.5]], dtype=torch.float64)
     ],
     ids=["gains", "coupling", "bias", "affine"],
 )
-@pytest.mark.parametrize("missions", [None, 3])
-def test_regimes_are_learnt_and_left_again(regime, steps, missions):
-    world = World(missions)
+def test_regimes_are_learnt_and_left_again(regime, steps):
+    world = World(missions=3)
     world.drive(20)
     assert world.plain and not torch.stack(world.errors).any()
     world.drive(30, **regime)
@@ -167,8 +166,9 @@ def test_missions_learn_for_themselves_and_leave_one_by_one():
     assert alone.updater.matched.parts.age.tolist() == [0]
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+@pytest.mark.parametrize(
+    ("batch", "dtype"), [((), torch.float32), ((4,), torch.float64), ((2, 3), torch.float32)]
+)
 def test_one_calibration_learns_from_simultaneous_transitions(batch, dtype):
     world = World(dtype=dtype)
     world.drive(8, matrix=TURN, batch=batch)
@@ -240,12 +240,6 @@ def test_what_was_learnt_keeps_its_digits():
     for each in (world, other):
         each.drive(3, matrix=GAINS)
     torch.testing.assert_close(other.model.matrix, world.model.matrix, atol=1e-6, rtol=0)
-
-
-def test_a_mask_says_what_to_learn_from():
-    world = World(missions=2, mask_key="mask")
-    world.drive(10, matrix=GAINS, mask=torch.tensor([True, False]).unsqueeze(-1))
-    torch.testing.assert_close(world.model.matrix, torch.stack([GAINS, EYE]))
 
 
 @pytest.mark.parametrize(

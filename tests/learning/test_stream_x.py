@@ -5,8 +5,6 @@ import math
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
-from hydra.utils import instantiate
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins
@@ -140,34 +138,6 @@ def test_a_stream_of_reversed_actions_is_learnt(make, states, box, transitions, 
     assert updater.refused == 0 and miss() < 0.4 * before
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_masked_missions_do_not_learn_but_are_measured(missions, transitions, form):
-    updater = updater_of(missions, mask_key=["learn", "here"], form=form)
-    td = transition(*transitions(4, dtype=torch.float64))
-    td["learn", "here"] = torch.tensor([True, False, True, False])
-    before = [state_of(missions, index) for index in range(4)]
-    expected = updater.loss(td)["loss_nll"].detach()
-    torch.testing.assert_close(updater(td)["loss"], expected)
-    changed = [not torch.equal(state_of(missions, i), before[i]) for i in range(4)]
-    assert changed == [True, False, True, False] and updater.refused == 0
-    assert missions.running.count.flatten().tolist() == [51, 50, 51, 50]
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_faulty_transitions_are_refused_and_counted(missions, transitions, form):
-    updater, twin = updater_of(missions, form=form), copy.deepcopy(missions)
-    td = transition(*transitions(4, dtype=torch.float64))
-    good = td.clone()
-    td["action"][1] = math.nan
-    before = state_of(missions, 1)
-    loss = updater(td)["loss"]
-    assert loss[1].isnan() and loss[[0, 2, 3]].isfinite().all() and updater.refused == 1
-    assert torch.equal(state_of(missions, 1), before)
-    updater_of(twin, form=form)(good)  # the others learn as ever
-    for index in (0, 2, 3):
-        torch.testing.assert_close(state_of(missions, index), state_of(twin, index))
-
-
 def test_missions_may_leave_and_a_shared_model_learns_from_all(missions, make, transitions):
     updater = updater_of(missions)
     updater(transition(*transitions(4, dtype=torch.float64)))
@@ -187,18 +157,3 @@ def test_impossible_settings_are_refused(make):
             updater_of(make(), **settings)
     with pytest.raises(ConfigurationError, match="teaches an Ensemble, got Dubins"):
         updater_of(Dubins())
-
-
-@pytest.mark.parametrize("method", ["stream_x_pe", "afm_stream_x_pe", "afm_online_pe"])
-def test_presets_choose_what_their_name_says(method):
-    with initialize_config_module("afm_rl.conf", version_base=None):
-        cfg = compose("config", overrides=[f"method={method}"])
-        literal = compose("config", overrides=["updater=stream_x_literal"]).updater
-    assert (cfg.corrector.get("samples") is not None) == method.startswith("afm")
-    loss = GaussianNLLLoss(instantiate(cfg.dynamics)(instantiate(cfg.robot)).module)
-    updater = instantiate(cfg.updater)(loss)
-    learner = getattr(updater, "updater", updater)  # beside AFM it learns what no action can undo
-    assert isinstance(learner, StreamXUpdater) == ("stream_x" in method)
-    assert loss.model.layer_norm == ("stream_x" in method)
-    if method == "stream_x_pe":
-        assert (updater.form, instantiate(literal)(loss).form) == ("error", "loss")

@@ -9,25 +9,11 @@ import pytest
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from small import shrink
 
 from afm_rl.missions import build, prepare, run
 
-SMALL = {  # settings that are there are made small
-    "budget": 12,
-    "planner.population": 16,
-    "planner.elites": 4,
-    "dynamics.members": 2,
-    "dynamics.hidden": [16, 16],
-    "dynamics.pretrain.samples": 512,
-    "dynamics.pretrain.epochs": 1,
-    "dynamics.pretrain.flights": 4,
-    "dynamics.base.members": 2,
-    "dynamics.base.hidden": [16, 16],
-    "dynamics.base.pretrain.samples": 512,
-    "dynamics.base.pretrain.epochs": 1,
-    "corrector.width": 8,
-    "corrector.train.iterations": 20,
-}
+SMALL = {"budget": 12, "planner.population": 16, "planner.elites": 4}
 TARGETS = 20  # of the ring
 
 
@@ -50,9 +36,7 @@ def configure(composed):
     def make(*overrides, **settings):
         cfg = copy.deepcopy(composed(*overrides))
         cfg.label = next((o.removeprefix("method=") for o in overrides if "method=" in o), None)
-        for key, value in SMALL.items():
-            if OmegaConf.select(cfg, key) is not None:
-                OmegaConf.update(cfg, key, value)
+        shrink(cfg, SMALL)
         for key, value in settings.items():
             OmegaConf.update(cfg, key, value)
         return cfg

@@ -3,9 +3,7 @@
 import pandas as pd
 import pytest
 
-from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, run
-from afm_rl.missions.run import Stopped
 
 
 def same(left, right):
@@ -19,37 +17,8 @@ def test_nothing_changes_where_nothing_changed(make_agent, ring):
     same(*(run(make_agent(f"method={name}", **settings)) for name in ("rls", "physics")))
 
 
-@pytest.mark.parametrize("stop", [5, 11, 15])
-def test_interrupted_runs_are_bit_identical(make_agent, ring, spot, tmp_path, stop):
-    settings = {"tracks": [ring, spot], "seeds": 2, "budget": 18, "regimes": [{"v_gain": -1.0}]}
-    settings["robot.schedule"] = {
-        "_target_": "afm_rl.regimes.Schedule", "by": "step", "at": [6, 14],
-    }  # fmt: skip
-    whole, path = run(make_agent("method=rls", **settings)), tmp_path / "run.safetensors"
-    with pytest.raises(Stopped):
-        stopped = {"checkpoint": path, "stopped": lambda loop: loop.step == stop}
-        run(make_agent("method=rls", **settings), **stopped)
-    same(whole, run(make_agent("method=rls", **settings), checkpoint=path))
-    assert whole.steps["regime_active"].any()
-    late = whole.steps[(whole.steps["mission"] == 0) & whole.steps["t"].between(9, 13)]
-    assert (late["error"] < 1e-2).all()  # learnt in two steps, with a little left
-
-
 @pytest.mark.parametrize("method", ["rls_pe", "oracle_pe"])
 def test_an_ensemble_is_trained_once_whatever_is_in_front_of_it(configure, method):
     cfg = [configure(f"method={name}") for name in (method, "frozen_pe")]
     one, other = ([(t.title, t.settings) for t in build(c).trainings] for c in cfg)
     assert one == other and len(one) == 1
-
-
-@pytest.mark.parametrize(
-    ("choices", "message"),
-    [
-        (["dynamics=physics", "updater=rls"], "teaches a Calibrated model, got Dubins"),
-        (["dynamics=calibrated_pe", "updater=online"], "OnlineUpdater does not set that"),
-    ],
-    ids=str,
-)
-def test_what_does_not_go_together(configure, choices, message):
-    with pytest.raises(ConfigurationError, match=message):
-        build(configure(*choices))

@@ -9,7 +9,8 @@ import torch
 
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
-from afm_rl.missions.explained import explain_mission
+from afm_rl.missions.explained import explain_mission, planned_for
+from afm_rl.missions.run import run
 
 ROBOT = SimpleNamespace(
     model=Dubins(dt=0.2), dt=0.2, state_names=["x", "y", "theta"], action_names=["v", "omega"]
@@ -35,6 +36,23 @@ def test_a_mission_is_explained():
         "omega: healthy",
     ]
     assert len(log.command) == 299 and log.step == pytest.approx(0.2)
+
+
+AT_LEAST = {"budget": 150, "planner.population": 200}
+
+
+@pytest.mark.parametrize(
+    ("method", "end"),
+    [("afm_physics", "; made up for"), ("adaptive_gain", "")],
+)
+def test_what_a_method_made_up_for_is_said(method, end, make_agent):
+    """Only AFM plans for the state in which its commands act."""
+    agent = make_agent(f"method={method}", "tracks=[ethz_2]", "regimes=[{delay: 3}]", **AT_LEAST)
+    steps = run(agent).steps
+    found, _ = explain_mission(agent.robot, steps, late=planned_for(agent))
+    omega = found.actuators[1]
+    assert omega.sentence == f"omega: 3 steps late, since step 40{end}"
+    assert omega.made_up == bool(end)
 
 
 @pytest.mark.parametrize("steps", [5, 0])

@@ -102,94 +102,37 @@ def test_parts_that_do_not_fit_are_refused(configure, no_training, overrides, co
 NAN = float("nan")
 
 
+# Each constructor's own test has its ranges; here, that the setting is named as it was written.
 @pytest.mark.parametrize(
     ("method", "key", "value", "complaint"),
     [
-        ("physics", "label", 3, "label=3: expected a text"),
-        ("physics", "label", ["a"], r"label=\['a'\]: expected a text"),
         ("physics", "label", "../../x", "label='../../x': expected a text"),
-        ("physics", "label", ".x", "label='.x': expected a text"),
+        ("physics", "label", 3, "label=3: expected a text"),
         ("physics", "budget", 10**20, "budget=1000.*: expected a whole number of at most 10000000"),
-        ("physics", "seeds", 10**9, "seeds=1000000000: expected a count in 1..100000"),
-        ("physics", "planner.population", 10**11, "planner.population=.*at most 1000000"),
-        ("physics", "planner.horizon", 10**9, "planner.horizon=1000000000: .*at most 10000"),
-        ("physics", "planner.sigma", 1e300, r"planner.sigma=1e\+300: expected .* 100"),
-        ("physics", "regimes", [{"saturation": 0}], "regimes: saturation=0: expected"),
-        ("physics", "regimes", [{"v_gain": 1e30}], r"regimes: v_gain=1e\+30: expected"),
-        ("online_pe", "dynamics.hidden", [], r"dynamics.hidden=\[\]: expected at least 1"),
-        (
-            "online_pe",
-            "dynamics.pretrain.lr",
-            1e30,
-            r"dynamics.pretrain.lr=1e\+30: expected .* 1\]",
-        ),
-        ("physics", "budget", 0, "budget=0: expected a whole number of at least 1"),
         ("physics", "budget", 1.5, "budget=1.5: expected a whole number"),
-        ("physics", "tracks", "nope", "tracks='nope': expected one of ethz_1, ethz_2"),
+        ("physics", "seeds", 10**9, "seeds=1000000000: expected a count in 1..100000"),
         ("physics", "tracks", ["ethz_1", "ethz_1"], "tracks=.*distinct names"),
         ("physics", "regimes", [[{}, {}]], "regimes: .*or one for each of 3 phases"),
-        ("physics", "planner.horizon", 0, "planner.horizon=0: expected a whole number"),
-        ("physics", "planner.population", 0, "planner.population=0: expected a whole number"),
-        ("physics", "planner.iterations", 0, "planner.iterations=0: expected a whole number"),
-        ("physics", "planner.beta", 0, r"planner.beta=0: expected .* \(0, 1\]"),
-        ("physics", "planner.beta", 2, r"planner.beta=2: expected .* \(0, 1\]"),
-        ("physics", "planner.temperature", 0.0, "planner.temperature=0.0: expected a finite"),
+        ("physics", "planner.population", 10**11, "planner.population=.*at most 1000000"),
         ("physics", "planner.temperature", NAN, "planner.temperature=nan: expected a finite"),
-        ("physics", "planner.sigma", -1, "planner.sigma=-1: expected a finite"),
-        ("physics", "planner.noise", "loud", "planner.noise='loud': expected one of scaled, unit"),
-        ("physics", "planner.past", "long", "planner.past='long': expected one of"),
         ("physics", "cost.coordinates", 3, "cost: 'int' object is not iterable"),
         ("physics", "robot.schedule.at", [0.15, 1.8], r"schedule.at=1.8: .* \[0, 1\]"),
-        ("physics", "robot.schedule.by", "foo", "schedule.by='foo': expected one of progress"),
         ("physics", "robot.action_low", [1.0, 0.5], "action_low=.*expected less than action_high"),
-        ("physics", "robot.action_low", 3, "robot: 'int' object is not iterable"),
         ("physics", "robot.env.dt", 0, "dynamics.dt=0: expected a finite number"),
-        ("physics", "robot.env.process_noise", -1, "process_noise=-1: expected a finite number"),
-        ("physics", "robot.env.reach", NAN, "reach=nan: expected a finite number"),
-        ("physics", "robot.model.noise_std", 0, "dynamics.noise_std=0: expected"),
-        ("physics", "robot.regime.regimes.gain.low", 0, "low=0: expected a finite number"),
-        ("physics", "robot.regime.regimes.gain.names", ["a", "a"], "names=.*expected distinct"),
-        ("online_pe", "dynamics.members", 1.5, "dynamics.members=1.5: expected a whole number"),
-        ("online_pe", "dynamics.hidden", [0], "dynamics.hidden=0: expected a whole number"),
-        ("online_pe", "dynamics.log_variance", [1], "dynamics.log_variance="),
+        ("physics", "tracks", "nope", "tracks='nope': expected one of ethz_1, ethz_2"),
         ("online_pe", "dynamics.log_variance", [NAN, 1], "dynamics.log_variance=.*low < high"),
-        ("online_pe", "dynamics.propagation", "foo", "dynamics.propagation='foo': expected one"),
-        ("online_pe", "dynamics.seed", "abc", "dynamics.seed="),
         ("online_pe", "dynamics.pretrain", 3, "dynamics: 'int' object"),
         ("online_pe", "dynamics.pretrain.epochs", 0, "dynamics.pretrain.epochs=0: expected"),
-        ("online_pe", "dynamics.pretrain.batch_size", 0, "dynamics.pretrain.batch_size=0: exp"),
-        ("online_pe", "dynamics.pretrain.lr", NAN, "dynamics.pretrain.lr=nan: expected"),
-        ("online_pe", "dynamics.pretrain.action_noise", -1, "dynamics.pretrain.action_noise=-1"),
         ("online_pe", "updater.optimizer.lr", "abc", "updater.lr='abc': expected a finite"),
-        (
-            "online_pe",
-            "updater.optimizer._target_",
-            "torch.Nope",
-            "updater.optimizer._target_=.torch.Nope",
-        ),
-        ("afm_physics", "corrector.odds", NAN, "corrector.odds=nan: expected a finite number"),
-        ("afm_physics", "corrector.samples", 0, "corrector.samples=0: expected a whole number"),
-        ("afm_physics", "corrector.steps", 0, "corrector.steps=0: expected a whole number"),
-        ("afm_physics", "corrector.source_std", -1, "corrector.source_std=-1: expected a finite"),
-        ("afm_physics", "corrector.memory", 10, "corrector.memory=10: expected at least"),
-        ("afm_physics", "corrector.readings", ["late"], "corrector.readings='late': expected"),
+        ("online_pe", "updater.optimizer._target_", "torch.Nope", "updater.optimizer._target_="),
         ("afm_physics", "corrector.readings", ["near"], "corrector.readings=.* by time"),
-        ("afm_physics", "corrector.train", 3, "corrector: 'int' object"),
         ("afm_physics", "corrector.train", {"batch_size": 1}, "corrector.train.batch_size=1: exp"),
-        ("afm_physics", "corrector.train", {"seed": "abc"}, "corrector.train.seed='abc': expected"),
-        ("afm_paper", "corrector.train.batch_size", 1, "corrector.train.batch_size=1: expected"),
-        ("afm_paper", "corrector.width", 0, "corrector.width=0: "),
         ("afm_paper", "corrector.error_action", "foo", "corrector.error_action='foo': expected"),
     ],
 )
 def test_settings_out_of_range_are_refused(configure, no_training, method, key, value, complaint):
     with pytest.raises(ConfigurationError, match=f"^{complaint}"):
         build(configure(f"method={method}", **{key: value}))
-
-
-def test_a_robot_without_tracks_is_refused(configure):
-    with pytest.raises(ConfigurationError, match="robot: 'int' object is not iterable"):
-        build(configure(tracks="all", **{"robot.tracks": 3}))
 
 
 @pytest.mark.parametrize("key", ["next", "plain"])
@@ -262,13 +205,6 @@ def test_a_checkpoint_of_another_flow_is_refused(configure, no_training, tmp_pat
     cfg = configure("method=afm_physics", **{"corrector.checkpoint": str(tmp_path / "flow")})
     with pytest.raises(ConfigurationError, match=f"^corrector.checkpoint: {tmp_path}.*{complaint}"):
         build(cfg)
-
-
-def test_a_checkpoint_that_is_not_there_is_refused(configure, tmp_path):
-    for given in (str(tmp_path / "nowhere"), str(tmp_path), 3):
-        cfg = configure("method=afm_physics", **{"corrector.checkpoint": given})
-        with pytest.raises(ConfigurationError, match="^corrector.checkpoint.*(no such|the path)"):
-            build(cfg)
 
 
 def _train(*, samples: int = 100, lr: float = 1e-3, seed: int = 0, progress: bool = False):

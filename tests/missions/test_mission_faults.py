@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Transform
 
 from afm_rl.errors import ConfigurationError, NonFiniteError
-from afm_rl.missions import build, run
+from afm_rl.missions import run
 
 FLIGHT = ("robot=quadrotor", "dynamics=physics")
 PLANNERS = {
@@ -173,17 +173,3 @@ def test_a_track_in_map_coordinates_is_driven_to_the_bit_as_near_zero(make_agent
         steps.append(run(make_agent("method=oracle", tracks=str(path), budget=60)).steps)
     same(*steps)
     assert steps[0]["reached"].max() >= 3
-
-
-@pytest.mark.parametrize(
-    ("setting", "complaint"),
-    [
-        ("robot.state_names=[x,x,x]", r"robot.state_names=\['x', 'x', 'x'\]: .* each once"),
-        ("robot.goal_names=[x,z]", r"robot.goal_names=\['x', 'z'\]: expected some of x, y, theta"),
-        ("regimes=[{saturation: 0}]", r"saturation=0: expected a finite number in \[0.01, 1\]"),
-        ("regimes=[{v_gain: 1e30}]", r"v_gain=1e\+30: .* in \[-100, 100\]"),
-    ],
-)
-def test_settings_that_nobody_can_mean_are_refused(configure, setting, complaint):
-    with pytest.raises(ConfigurationError, match=complaint):
-        build(configure(setting))

@@ -65,14 +65,6 @@ def test_missions_stand_in_order_tracks_then_regimes_then_seeds(drive, ring):
     assert run.steps["mission"].tolist() == [mission for mission in range(12) for _ in range(2)]
 
 
-def test_the_regime_of_a_mission_in_words(drive, ring):
-    regimes = ["mixed", BACKWARDS, [{"v_gain": 2.0}, {}, {"delay": 1}]]
-    run = drive(tracks=["ethz_1", ring], regimes=regimes, seeds=2, budget=2)
-    words = ["mixed", "v_gain = -1", "v_gain = 2; nominal; delay = 1"]
-    assert run.missions["regime"].tolist() == [name for name in words for _ in range(2)] * 2
-    assert run.agent.regime_names == run.missions["regime"].tolist()
-
-
 def test_the_oracle_is_told_what_acts_during_a_ramp(drive, ring):
     regime = {"phases": [{}, {"v_gain": 0.5, "rotation": 0.3}], "at": [0.0], "ramp": 30}
     steps = drive("method=oracle", tracks=ring, regimes=[regime], budget=60).steps
@@ -111,13 +103,6 @@ def test_a_robot_that_stalls_at_the_change(drive):
     assert not missions["finished"].any()
 
 
-def test_no_change_is_no_regime(drive, ring):
-    run = drive(tracks=ring, regimes="none", budget=60)
-    assert run.missions[["v_gain", "omega_gain"]].eq(1).all(axis=None)
-    assert run.steps["regime_active"].eq(0).all()
-    assert run.steps["misaligned"].eq(0).all()
-
-
 def test_seconds_are_shared_out_among_the_missions(drive, ring):
     seconds = drive(tracks=ring, seeds=3, budget=5).missions["seconds"]
     assert seconds.nunique() == 1 and 0 < seconds.sum() < 60
@@ -126,37 +111,22 @@ def test_seconds_are_shared_out_among_the_missions(drive, ring):
 OTHERS = {"sysid", "afm_sysid"}  # need MuJoCo, and all with a KNODE a quadrotor
 METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
 METHODS = [name for name in METHODS if name not in OTHERS and "knode" not in name]
-NAIVE = {
-    "corrector.readings": ["recent"],
-    "corrector.odds": 0.0,
-}  # whatever is believed, it is corrected
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_two_runs_are_bit_identical(drive, ring, method):
-    settings = {"tracks": ring, "regimes": [BACKWARDS], "seeds": [3, 8], "budget": 30}
+@pytest.mark.parametrize(
+    "method", [*METHODS, "physics planner=cem", "physics planner=torchrl_mppi"]
+)
+def test_two_runs_are_bit_identical_and_leave_the_global_generator_alone(drive, ring, method):
+    changed = {"regimes": [BACKWARDS], "robot.schedule.at": []}
+    settings = {"tracks": ring, "seeds": [3, 8], "budget": 8, **changed}
     torch.manual_seed(1)
-    first = drive(f"method={method}", **settings)
-    torch.manual_seed(2)
-    again = drive(f"method={method}", **settings)
+    first = drive(*f"method={method}".split(), **settings)
+    before = torch.manual_seed(2).get_state()
+    again = drive(*f"method={method}".split(), **settings)
+    assert torch.equal(before, torch.random.get_rng_state())
     same(first.steps, again.steps)
     same(first.missions, again.missions)
     assert alone(first, 0)["x"].ne(alone(first, 1)["x"]).any()  # seeds matter
-
-
-@pytest.mark.parametrize("planner", ["cem", "torchrl_mppi"])
-def test_planners_that_draw_from_the_global_generator_repeat_as_well(drive, ring, planner):
-    torch.manual_seed(1)
-    first = drive(f"planner={planner}", tracks=ring, budget=5)
-    torch.manual_seed(2)
-    same(first.steps, drive(f"planner={planner}", tracks=ring, budget=5).steps)
-
-
-@pytest.mark.parametrize("method", [*METHODS, "physics planner=cem"])
-def test_the_global_generator_is_left_alone(drive, ring, method):
-    before = torch.random.get_rng_state()
-    drive(*f"method={method}".split(), tracks=ring, budget=2)
-    assert torch.equal(before, torch.random.get_rng_state())
 
 
 @pytest.mark.parametrize("method", ["physics", "oracle"])
@@ -219,33 +189,6 @@ def test_a_run_changes_no_other_agent_and_no_stored_part(make_agent, drive, ring
     drive("method=online_pe", tracks=ring, budget=5)
     assert not any(changed(other.model, before))
     assert {path: path.read_bytes() for path in cache.iterdir()} == stored
-
-
-def test_the_oracle_is_never_surprised(drive, ring):
-    steps = drive("method=oracle", tracks=ring, regimes=[BACKWARDS], budget=120).steps
-    assert steps["regime_active"].nunique() == 2
-    assert steps["error"].max() < 1e-4  # process noise is 1e-5
-    assert steps["misaligned"].eq(0).all()
-
-
-def test_actions_are_planned_and_executed_inside_the_box(drive, ring):
-    settings = {"tracks": ring, "regimes": [BACKWARDS], "budget": 60, **NAIVE}
-    steps = drive("method=afm_physics", "corrector.extend_action_box=false", **settings).steps
-    for kind in ("planned", "executed"):
-        assert steps[f"{kind}_v"].abs().max() <= 1
-        assert steps[f"{kind}_omega"].abs().max() <= np.float32(np.pi / 2)
-    corrected = steps["planned_v"].ne(steps["executed_v"])
-    assert corrected.any() and steps.loc[corrected, "misaligned"].eq(1).all()
-
-
-def test_a_transform_that_only_watches_executes_what_was_planned(drive, ring):
-    settings = {"tracks": ring, "regimes": [BACKWARDS], "budget": 60}
-    watch = {"corrector.enabled": False, **NAIVE}
-    watching = drive("method=afm_physics", **settings, **watch).steps
-    physics = drive("method=physics", **settings).steps
-    assert watching["misaligned"].sum() > 0
-    columns = ["x", "y", "theta", "planned_v", "executed_v", "reached"]
-    same(watching[columns], physics[columns])
 
 
 def test_progress_is_shown_if_asked_for(make_agent, spot, capsys, monkeypatch):

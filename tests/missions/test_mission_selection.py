@@ -72,7 +72,7 @@ def test_families_are_chosen_by_name(robot):
     assert isinstance(slip, Family) and slip.name == "slip"
     mixed = select_regimes(["drift", {"v_gain": -1.0}, "slip"], robot)
     assert [mixed[0].name, mixed[1].given, mixed[2]] == [
-        *("drift", {"regime": {"v_gain": -1.0}}, slip)
+        *("drift", [{"regime": {"v_gain": -1.0}}], slip)
     ]
 
 

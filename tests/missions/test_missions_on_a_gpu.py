@@ -18,14 +18,9 @@ ALWAYS = {  # what a step waits for, whatever the method
 }
 LEARNING = {"learner.forward"}
 METHODS = {
-    "physics": set(),
     "oracle": set(),
     "afm_physics": set(),
-    "afm_paper": LEARNING,
-    "l1": set(),
-    "adaptive_gain": set(),
     "online_pe": LEARNING,
-    "afm_stream_x_pe": LEARNING,
     "rls": LEARNING,
 }
 

@@ -64,6 +64,7 @@ def test_name_and_seed_decide_the_draw(robot):
     assert find_family("drift", robot).mission(3)["regime"] != first["regime"]
 
 
+@pytest.mark.slow
 def test_another_process_draws_the_same():
     regime = Compose({"gain": ActionGain(["v_gain", "omega_gain"])})
     family = Family("gains", regime, [["gain"]], {})

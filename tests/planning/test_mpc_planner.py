@@ -158,17 +158,6 @@ def test_headings_may_be_written_in_any_way(box, angle):
     torch.testing.assert_close(planner(td)["action"], expected, rtol=0, atol=1e-5)
 
 
-def test_a_held_reference_equals_one_repeated_for_each_stage(box):
-    planner = car(box)
-    td = situation(planner, 3)
-    held = plan(planner, td)
-    td["reference"] = td["reference"].unsqueeze(-2).repeat(1, 7, 1)
-    for one, other in zip(held, plan(planner, td), strict=True):
-        torch.testing.assert_close(one, other)
-    td["reference"][:, 5:] += 1.0
-    assert not torch.allclose(plan(planner, td)[1], held[1], atol=1e-3)
-
-
 @pytest.mark.parametrize("bounded", [None, [0], []], ids=str)
 def test_bounds_hold_for_the_components_chosen(box, bounded):
     planner = car(box, bounded=bounded, iterations=3)
@@ -247,19 +236,6 @@ def test_a_missing_memory_is_told_once_and_taken_as_zero(box):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         planner(td.clone())
-
-
-def test_it_writes_what_it_says_where_it_is_told(box):
-    planner = car(box, memory_key=["agent", "plan"])
-    memory = [("agent", "plan", "states"), ("agent", "plan", "actions")]
-    assert planner.in_keys == ["observation", "reference", *memory]
-    assert planner.out_keys == ["action", *(("next", *key) for key in memory)]
-    td = situation(car(box), 2)
-    td["agent"] = TensorDict({"plan": td.pop("mpc")}, [2])
-    out = planner(td, tensordict_out=TensorDict({}, [2]))
-    assert set(out.keys(True, True)) == set(planner.out_keys)
-    assert "action" not in td.keys()
-    torch.testing.assert_close(planner.planning(td), out["action"])
 
 
 def test_plans_that_are_not_minima_are_counted(box, monkeypatch):

@@ -45,8 +45,3 @@ def test_they_drive_towards_the_goal(world, kind):
 def test_impossible_settings_are_refused(world, kind, settings):
     with pytest.raises(ConfigurationError, match=f"planner.{next(iter(settings))}"):
         kind(world, **settings)
-
-
-def test_the_temperature_must_be_positive(world):
-    with pytest.raises(ConfigurationError, match="planner.temperature"):
-        TorchRLMPPI(world, temperature=0.0)

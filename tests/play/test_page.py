@@ -3,10 +3,12 @@
 import shutil
 import threading
 import time
+import warnings
 
 import pytest
 
 from afm_rl.play import World, make_robot
+from afm_rl.play.words import text_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
@@ -88,9 +90,17 @@ def test_robots_are_drawn_and_described(name, page_of):
     assert page.world.faults.values["gain_0"] == -1.0
     executed = page.world.sides["AFM"].info["afm"]["executed"]
     assert effect[0] == pytest.approx(-executed[0], rel=1e-5)
-    assert "| alone | AFM |" in page.words.content and "AFM " in page.words.content
+    assert "| alone | AFM |" in page.words.content and "| a recent change |" in page.words.content
     for figure in page.figures.values():
         assert all(abs(number) < 1e3 for number in figure.root.position)
+    page.choose("late by 4")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # what is observed at arrival is known of every robot
+        for _ in range(20):
+            page.world.step()
+    assert "cannot find" not in text_of(page.world)
+    page.world.faults.values["delay"] = 10.0
+    assert "cannot find" in text_of(page.world)
     page.choose("healthy")
     assert page.world.faults.values["gain_0"] == 1.0
 

@@ -81,17 +81,6 @@ def test_writing_again_replaces(tmp_path, make_results, laps):
     )
 
 
-def test_the_index_of_the_frames_plays_no_part(tmp_path, make_results, laps):
-    missions, steps = make_results(["adaptive", "oracle"], seeds=2)
-    write_events(tmp_path / "a", missions, steps, laps)
-    joined = missions.set_index(pd.Index([0, 1, 0, 1])), steps.set_index(steps["t"].rename(None))
-    write_events(tmp_path / "b", *joined, laps)
-    for name in ("oracle", "oracle/ring_v_gain=-1_seed_1"):
-        first, second = read(tmp_path / "a" / name), read(tmp_path / "b" / name)
-        for tag, curve in first.items():
-            pd.testing.assert_series_equal(curve, second[tag])
-
-
 @pytest.mark.parametrize("name", ["../up", "a/b", "..", "", ".hidden", "C:\\x", "a b"])
 def test_folder_names_stay_inside_the_folder(tmp_path, name):
     (folder,) = folder_names([name])

@@ -1,14 +1,11 @@
 """What the figures of joined results show."""
 
-import warnings
-
 import numpy as np
 import pandas as pd
 import pytest
 
 from afm_rl.report import read_runs
 from afm_rl.report.figures import (
-    draw_report,
     read_excerpts,
     share_reached,
     telling_cells,
@@ -28,15 +25,6 @@ def joined(run_folder, laps):
         return count_budgets(runs.missions, laps), runs, *read_excerpts(runs)
 
     return make
-
-
-def test_pictures_are_whole(joined, ring):
-    missions, runs, _, progress = joined(seeds=2)
-    with warnings.catch_warnings(action="error"):
-        drawn = [*draw_report(runs, missions, progress, [ring])]
-    names = ["summary", "learning_ring", "profile", "progress", "trajectory_ring"]
-    assert [picture.name for picture in drawn] == names
-    assert all(picture.png.startswith(b"\x89PNG") and picture.caption for picture in drawn)
 
 
 def test_the_profile_counts_missions_within_a_factor(joined, artists, laps):

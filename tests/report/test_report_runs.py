@@ -11,7 +11,7 @@ import yaml
 from afm_rl.cli import report
 from afm_rl.errors import AFMError, ArtefactError, ConfigurationError
 from afm_rl.report import read_runs
-from afm_rl.report.stranger import read_settings, read_table
+from afm_rl.report.stranger import read_settings
 from afm_rl.storage.manifest import write_manifest
 
 
@@ -240,13 +240,6 @@ def test_a_job_that_was_deleted_is_missed(study_folder, monkeypatch, capsys):
     assert str(job) in (folder / "report" / "index.html").read_text()
 
 
-def test_jobs_that_were_all_deleted_are_missed(study_folder):
-    folder = study_folder()
-    shutil.rmtree(folder / "jobs")
-    with pytest.raises(ConfigurationError, match="no mission is finished .*seed=1: missing, alth"):
-        read_runs([folder])
-
-
 def test_a_record_without_a_checksum_is_said(study_folder):
     folder = study_folder()
     (folder / "manifest.json").unlink()
@@ -298,11 +291,6 @@ def test_measures_of_a_stranger_are_checked(run_folder):
     rewrite(folder, "measures.json", json.dumps(declared))
     with pytest.raises(ArtefactError, match=r"measures\.json: no decl.* measure 'success_rate'"):
         read_runs([folder])
-
-
-def test_a_table_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(ConfigurationError, match="none.csv: no such file"):
-        read_table(tmp_path / "none.csv", ["a"])
 
 
 def test_folders_without_results_are_refused(tmp_path):

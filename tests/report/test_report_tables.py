@@ -5,7 +5,7 @@ import io
 import pandas as pd
 import pytest
 
-from afm_rl.report import print_summary, summarise
+from afm_rl.report import print_summary
 
 
 class Terminal(io.StringIO):
@@ -37,36 +37,6 @@ def four():
     return frame.assign(seconds=1.5)
 
 
-def test_means_are_those_found_by_hand(four, laps, table):
-    means = summarise(four, laps).set_index("method")
-    assert means.index.tolist() == ["a", "b"]
-    assert means["missions"].tolist() == [2, 2]
-    assert means["success_rate"].tolist() == [0.5, 0.75]
-    assert means["finished"].tolist() == [0.0, 0.5]
-    assert means["steps"].tolist() == [300.0, 250.0]  # given up: the budget of the cell
-    assert means["seconds"].tolist() == [3.0, 3.0]
-    # Of two values, a quarter of the resamples consist of the lower one alone.
-    assert means.loc["a", ["success_rate_low", "success_rate_high"]].tolist() == [0.25, 0.75]
-    assert means.loc["b", ["steps_low", "steps_high"]].tolist() == [200.0, 300.0]
-    assert means.loc["a", ["steps_low", "steps_high"]].isna().all()
-
-
-def test_the_index_of_the_frame_plays_no_part(four, laps, table):
-    joined = four.set_index(pd.Index([0, 1, 0, 1]))
-    pd.testing.assert_frame_equal(summarise(joined, laps), summarise(four, laps))
-
-
-def test_cells_are_summarised_one_by_one(four, laps, table):
-    two = four.assign(v_gain=[-1.0, -1.0, 2.0, 2.0])
-    cells = summarise(two, laps, ["cell", "method"])
-    assert cells[["cell", "method", "success_rate"]].to_numpy().tolist() == [
-        ["ring, v_gain = -1", "a", 0.25],
-        ["ring, v_gain = -1", "b", 1.0],
-        ["ring, v_gain = 2", "a", 0.75],
-        ["ring, v_gain = 2", "b", 0.5],
-    ]
-
-
 def test_a_pipe_gets_plain_text_that_is_never_cut_off(four, laps, table, monkeypatch):
     monkeypatch.setenv("COLUMNS", "20")
     text = table(four.replace("a", "a_method_with_a_long_name"), io.StringIO())
@@ -93,22 +63,11 @@ def test_a_terminal_gets_the_best_in_bold(four, laps, table, monkeypatch):
     assert better.count("\x1b[1m") == 3  # success, finished, steps; not seconds
 
 
-def test_what_is_equal_is_not_the_best(four, laps, table, monkeypatch):
-    monkeypatch.setenv("TERM", "xterm")
-    lines = table(four[four["method"] == "a"], Terminal()).splitlines()
-    assert "\x1b[1m" not in next(line for line in lines if " a " in line)
-
-
 def test_cells_have_a_table_of_their_own_if_there_are_several(four, laps, table):
     assert "v_gain" not in table(four, io.StringIO())
     text = table(four.assign(v_gain=[-1.0, -1.0, 2.0, 2.0]), io.StringIO())
     (row,) = (line for line in text.splitlines() if "v_gain = 2" in line)
     assert row.split()[-6:] == ["75", "/", "300", "50", "/", "300"]
-
-
-def test_one_mission_has_no_interval(four, laps, table):
-    text = table(four[:2], io.StringIO())
-    assert "[" not in text
 
 
 def test_names_are_no_markup(four, laps, table):

@@ -237,11 +237,6 @@ def test_names_that_are_formulas_stay_texts(run_folder, report):
     assert strange in Page((folder / "index.html").read_text()).texts
 
 
-def test_tracks_that_are_not_known_have_no_road(run_folder, report):
-    folder, _ = report(run_folder(tracks=["elsewhere"]))
-    assert "figures/trajectory_elsewhere.png" in files(folder)
-
-
 def test_the_figures_and_curves_of_a_run(tmp_path, make_results, laps, ring):
     said = []
     written = write_run(str(tmp_path), *make_results(seeds=2), laps, [ring], echo=said.append)

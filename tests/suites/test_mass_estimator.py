@@ -5,11 +5,11 @@ import torch
 from flight import MassEstimator
 from tensordict import TensorDict
 
-from afm_rl.dynamics import Dubins, Oracle, Quadrotor
+from afm_rl.dynamics import Oracle, Quadrotor
 from afm_rl.dynamics.quadrotor_equations import quadrotor_step
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss
-from afm_rl.regimes import ActionGain, MassFactor, flight_regimes
+from afm_rl.regimes import MassFactor, flight_regimes
 from afm_rl.spaces.airframe import QuadrotorBody
 
 BODY = QuadrotorBody()
@@ -60,13 +60,6 @@ def test_missions_that_end_take_their_estimate_along():
     )
 
 
-def test_the_nominal_mass_is_where_it_begins():
-    updater = estimator(share=0.5)
-    updater(tick(level(2), torch.tensor([1.0, 0.5])))
-    told = updater.model.parameters_now
-    torch.testing.assert_close(told, torch.tensor([[1.0], [2 / 3]]), rtol=1e-3, atol=0)
-
-
 def test_what_cannot_be_measured_is_left_alone():
     updater, factor = estimator(share=1.0), torch.tensor([0.5, 0.5])
     updater.start(TensorDict({}, [2]))
@@ -78,13 +71,6 @@ def test_what_cannot_be_measured_is_left_alone():
     assert updater.refused == 1
     told = updater.model.parameters_now
     torch.testing.assert_close(told, torch.tensor([[1.0], [0.5]]), rtol=1e-3, atol=0)
-
-
-def test_beliefs_have_bounds():
-    updater = estimator(share=1.0, least=0.8, most=1.2)
-    updater.start(TensorDict({}, [2]))
-    updater(tick(level(2), torch.tensor([0.5, 2.0])))
-    torch.testing.assert_close(updater.model.parameters_now, torch.tensor([[0.8], [1.2]]))
 
 
 @pytest.mark.parametrize(
@@ -101,13 +87,3 @@ def test_beliefs_have_bounds():
 def test_impossible_settings_are_refused(settings, message):
     with pytest.raises(ConfigurationError, match=message):
         estimator(**settings)
-
-
-def test_other_models_are_refused():
-    gains = ActionGain(["v_gain", "omega_gain"])
-    for model in (Quadrotor(), Oracle(Dubins(), gains)):
-        with pytest.raises(ConfigurationError, match="needs an Oracle of a Quadrotor"):
-            MassEstimator(GaussianNLLLoss(model))
-    thrust = ActionGain(["thrust_gain", "roll_gain", "pitch_gain", "yaw_gain"])
-    with pytest.raises(ConfigurationError, match="the regime has thrust_gain.*: expected a mass"):
-        estimator(thrust)

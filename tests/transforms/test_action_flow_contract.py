@@ -6,15 +6,11 @@ import pickle
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, Unbounded
 from torchrl.envs import (
     Compose,
-    ObservationNorm,
     ParallelEnv,
-    RewardSum,
     SerialEnv,
-    StepCounter,
     TransformedEnv,
 )
 from torchrl.envs.utils import check_env_specs
@@ -96,11 +92,6 @@ def test_without_an_environment():
     assert (Compose(transform(), transform(prefix="b"))(td.clone()) == td).all()
 
 
-def test_in_a_model():
-    td = TensorDict({"observation": torch.randn(5, 3)}, [5])
-    assert (nn.Sequential(transform(), nn.Identity())(td.clone()) == td).all()
-
-
 def test_in_a_replay_buffer():
     data = env(batch_size=(2,)).rollout(6, break_when_any_done=False).reshape(-1)
     for chain in (None, transform()):
@@ -111,44 +102,6 @@ def test_in_a_replay_buffer():
         assert sample["next", "afm", "executed_action"].shape == (7, 2)
         found = (sample["action"].unsqueeze(1) == data["action"]).all(-1)
         assert found.any(-1).all()  # the planned actions, as they were
-
-
-@pytest.mark.parametrize("first", [True, False])
-def test_in_company(first):
-    others = [StepCounter(), RewardSum()]
-    chain = Compose(transform(), *others) if first else Compose(*others, transform())
-    together = TransformedEnv(track(batch_size=(2,)), chain)
-    check_env_specs(together, break_when_any_done="both")
-    data = together.rollout(3, break_when_any_done=False)
-    assert data["next", "step_count"][:, -1].flatten().tolist() == [3, 3]
-
-
-def test_a_later_normaliser_does_not_disturb_it():
-    norm = ObservationNorm(loc=3.0, scale=0.1, in_keys=["observation"])
-    data = env(norm, batch_size=(4,), process_noise=0.0).rollout(3)
-    assert not torch.allclose(data["next", "observation"], data["next", "pose"])
-    torch.testing.assert_close(data["next", "afm", "memory"][..., :3], data["next", "pose"])
-    assert float(data["next", "afm", "innovation"].max()) < 0.1
-
-
-def test_random_rollouts_stay_within_the_specs():
-    whole = env(batch_size=(4,))
-    data = whole.rollout(7, break_when_any_done=False)
-    spec = whole.observation_spec
-    for step in range(7):
-        found = data["next"][:, step].select(*spec.keys(True, True))
-        assert spec.is_in(found)
-    assert all(value.isfinite().all() for value in data.values(True, True))
-
-
-def test_two_prefixes_live_together():
-    chain = Compose(transform(prefix="first"), transform(prefix=["agent", "second"]))
-    both = TransformedEnv(track(batch_size=(2,)), chain)
-    check_env_specs(both, break_when_any_done="both")
-    data = both.rollout(3)
-    assert data["next", "agent", "second", "executed_action"].shape == (2, 3, 2)
-    size = chain[0].corrector.memory_size(3)
-    assert data["next", "first", "memory"].shape == (2, 3, size)
 
 
 def test_keys_may_be_nested_and_come_from_yaml(box):
@@ -182,11 +135,6 @@ def test_a_copied_environment_keeps_its_own_model():
     assert twin.transform[0].model is not whole.transform[0].model
 
 
-def test_an_appended_environment_copy_shares_the_specs():
-    whole = env(batch_size=(2,)).append_transform(StepCounter())
-    check_env_specs(whole)
-
-
 def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble, small_flow):
     model, flow = make_ensemble().train(), small_flow()
     chain = ActionFlowTransform(model, flow)
@@ -196,15 +144,6 @@ def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble, small_flo
     assert len(stored) == len(flow.state_dict()) > 0
     assert all("corrector." in name for name in stored)
     assert {id(p) for p in chain.parameters()} == {id(p) for p in flow.parameters()}
-
-
-def test_the_state_of_one_environment_loads_into_another():
-    one, other = env(), env()
-    for parameter in one.transform[0].corrector.parameters():
-        parameter.data += 1.0
-    other.load_state_dict(one.state_dict())
-    pairs = zip(one.parameters(), other.parameters(), strict=True)
-    assert all(torch.equal(left, right) for left, right in pairs)
 
 
 def test_nothing_but_a_model_is_needed(box):

@@ -15,8 +15,8 @@ from afm_rl.dynamics import Calibrated, Dubins, KnownDynamics, Oracle, dubins_st
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss
-from afm_rl.planning import MPPI, GoalDistance, KnownReward, PlanningEnv
-from afm_rl.regimes import ActionGain, Schedule
+from afm_rl.planning import GoalDistance, KnownReward, PlanningEnv
+from afm_rl.regimes import ActionGain
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
 from afm_rl.transforms.memory import correct
@@ -147,16 +147,6 @@ def test_an_asymmetric_box_is_kept_by_transform_and_policy_alike():
         td = step_mdp(td)
 
 
-def test_a_plan_outside_the_box_is_brought_into_it():
-    whole = env(Stub())
-    td = whole.reset()
-    td["action"] = torch.full((4, 2), 9.0)
-    entries = whole.step(td)["next", "afm"]
-    assert torch.equal(entries["planned_action"], torch.full((4, 2), 9.0))
-    torch.testing.assert_close(entries["executed_action"], HIGH.expand(4, 2))
-    torch.testing.assert_close(entries["predicted_effect"], HIGH.expand(4, 2))
-
-
 NO_NUMBERS = {
     "shape": (torch.zeros(4, 3), r"'%s': shape \(4, 3\), expected \(4, %d\)"),
     "complex": (
@@ -193,18 +183,6 @@ def test_what_is_no_action_and_no_state_is_refused_by_name(case, key, size):
             whole.transform._inv_call(put(td))
         else:
             whole.transform._step(whole.transform._inv_call(td), put(td.clone()))
-
-
-def test_an_answer_that_is_not_finite_holds_the_last_action():
-    def answer(planned):
-        answered = -planned
-        answered[0], answered[1, 1] = math.nan, math.inf
-        return answered
-
-    data = env(Stub(answer)).rollout(4)
-    executed, planned = data["next", "afm", "executed_action"], data["action"]
-    assert torch.equal(executed[:2], planned[:2, :1].expand(2, 4, 2))
-    torch.testing.assert_close(executed[2:, 1:], -planned[2:, 1:])
 
 
 def test_switched_off_it_only_watches():
@@ -296,40 +274,3 @@ def test_losses_can_read_the_executed_action():
     assert (loss(data)["loss_nll"] > 1).any()
     loss.set_keys(action=("next", "afm", "executed_action"))
     torch.testing.assert_close(loss(data)["loss_nll"], torch.zeros(16), rtol=0, atol=1e-4)
-
-
-def test_an_aligned_robot_is_left_alone():
-    base = UGVTrack(batch_size=(4,), missions={"track": 0, "regime": {}})  # with its noise
-    data = TransformedEnv(base, ActionFlowTransform(Dubins())).rollout(20)
-    assert not data["next", "afm", "misaligned"].any()
-    assert torch.equal(data["next", "afm", "executed_action"], data["action"])
-
-
-def test_a_robot_with_reversed_drive_arrives_with_it_and_not_without():
-    reached = []
-    for enabled in (True, False):
-        world = PlanningEnv(Dubins(), GoalDistance(), LOW, HIGH)
-        planner = MPPI(world, horizon=5, population=64)
-        reversed_drive = {"schedule": Schedule([]), "missions": {"regime": {"v_gain": -1.0}}}
-        box = {"action_low": LOW.tolist(), "action_high": HIGH.tolist()}
-        base = UGVTrack(batch_size=(2,), **reversed_drive, **box)
-        chain = ActionFlowTransform(Dubins(), enabled=enabled)
-        whole = TransformedEnv(base, Compose(chain, planner.make_tensordict_primer()))
-        data = whole.rollout(60, planner, break_when_any_done=False)
-        assert (data["next", "afm", "innovation"][:, 2:] > 5).float().mean() > 0.9
-        reached.append(int(data["next", "reached"][:, -1].sum()))
-    assert reached[0] > 2 * reached[1]
-
-
-def test_missions_may_leave_a_free_batch():
-    base = UGVTrack(process_noise=0.0)
-    whole = TransformedEnv(base, ActionFlowTransform(Dubins(), Stub()))
-    td = whole.reset(TensorDict(batch_size=[4]), set_state=False)
-    for count in (4, 4, 2, 1):
-        td = td[:count]
-        td["action"] = torch.full((count, 2), 0.3)
-        td = whole.step(td)
-        executed = td["next", "afm", "executed_action"]
-        assert executed.shape == (count, 2)
-        td = step_mdp(td)
-    torch.testing.assert_close(executed, torch.full((1, 2), -0.3))

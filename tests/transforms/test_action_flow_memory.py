@@ -121,15 +121,6 @@ def test_one_surprise_is_not_answered(make):
     assert not td["afm", "misaligned"].any() and torch.equal(executed[1], action)
 
 
-def test_an_automatic_reset_clears_it(make, remembered):
-    env = make(max_steps=4)
-    data = env.rollout(9, break_when_any_done=False)
-    valid = remembered(env.transform.corrector, data["afm"])["valid"].sum(-1)
-    assert valid.tolist() == [[0, 1, 2, 3, 0, 1, 2, 3, 0]] * 4
-    torch.testing.assert_close(data["afm", "memory"][..., :3], data["observation"])
-    assert not data["next", "afm", "misaligned"][:, [0, 4, 8]].any()
-
-
 def test_a_partial_reset_clears_its_own_rows_only(make):
     env = make()
     td, _ = follow(env, env.reset(), torch.full((4, 4, 2), 0.5))
@@ -142,19 +133,6 @@ def test_a_partial_reset_clears_its_own_rows_only(make):
     torch.testing.assert_close(fresh["memory"][:, :3], after["observation"][rows])
     begun = env.transform.corrector.begin(after["observation"][rows])
     assert torch.equal(fresh["memory"], begun) and not fresh["innovation"].any()
-
-
-def test_missions_end_at_times_of_their_own(make, remembered):
-    env = make()
-    td = env.reset()
-    td["step"] = torch.tensor([99, 98, 97, 0])  # of 100
-    counts = []
-    for _ in range(4):
-        td["action"] = torch.full((4, 2), 0.1)
-        _, td = env.step_and_maybe_reset(td)
-        found = remembered(env.transform.corrector, td["afm"])
-        counts.append(found["valid"].sum(-1).tolist())
-    assert counts == [[0, 1, 1, 1], [1, 0, 2, 2], [2, 1, 0, 3], [3, 2, 1, 4]]
 
 
 @pytest.mark.parametrize("cut", [1, 2, 5])
@@ -186,16 +164,6 @@ def test_environments_in_series_obey_the_tensordict_given(make):
     first, expected = follow(series, fork.clone(), actions[2:])
     again, executed = follow(series, fork.clone(), actions[2:])
     assert torch.equal(executed, expected)
-
-
-def test_a_batch_equals_single_missions(make):
-    env, actions = make(), torch.rand(6, 4, 2)
-    start = env.reset()
-    _, together = follow(env, start.clone(), actions)
-    for mission in range(4):
-        single = make(batch=())
-        _, alone = follow(single, start[mission].clone(), actions[:, mission])
-        torch.testing.assert_close(alone, together[:, mission])
 
 
 @pytest.mark.parametrize("more", [[], [StepCounter()]], ids=["alone", "in company"])

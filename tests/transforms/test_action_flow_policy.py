@@ -7,12 +7,11 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.envs.utils import step_mdp
 
-from afm_rl.correction import ActionFlow, LeastSquares
+from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
-from afm_rl.errors import ConfigurationError
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 from afm_rl.regimes import Schedule
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
@@ -88,13 +87,6 @@ def test_the_first_state_is_no_transition(track, agent):
     assert memory[:, :3].isnan().all() and not memory[:, 3:-2].any()  # the last is the noise
 
 
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-def test_any_batch(track, agent, batch):
-    env = TransformedEnv(track(batch), primers(agent))
-    check_env_specs(env, break_when_any_done="both")
-    assert env.rollout(2, agent)["action"].shape == (*batch, 2, 2)
-
-
 def test_keys_are_declared_and_may_be_nested(planner, flow):
     policy = ActionFlowPolicy(
         Dubins(),
@@ -130,25 +122,9 @@ def test_without_its_memory_it_says_what_is_missing(agent):
         agent[1](td)
 
 
-def test_sizes_that_contradict_each_other_are_refused(planner, flow):
-    with pytest.raises(ConfigurationError, match="made for 1 actions, but .* has 2"):
-        ActionFlowPolicy(Dubins(), planner.action_spec, LeastSquares([-1.0], [1.0]))
-    with pytest.raises(ConfigurationError, match=r"policy.action_spec: of the shape \(3, 2\)"):
-        ActionFlowPolicy(Dubins(), planner.action_spec.expand(3, 2), flow)
-
-
 def test_nothing_but_a_model_and_a_spec_is_needed(planner):
     policy = ActionFlowPolicy(Dubins(), planner.action_spec)
     assert isinstance(policy.corrector, ActionFlow)
     td = policy.make_tensordict_primer()(TensorDict())
     td.update({"observation": torch.zeros(3), "action": torch.tensor([0.3, 0.4])})
     assert torch.equal(policy(td)["action"], torch.tensor([0.3, 0.4]))
-
-
-@pytest.mark.parametrize(
-    "part", ["model", "corrector", "action_spec", "enabled", "extend_action_box"]
-)
-def test_parts_of_the_wrong_kind_are_refused(planner, flow, part):
-    parts = {"model": Dubins(), "corrector": flow, "action_spec": planner.action_spec, part: 3}
-    with pytest.raises(ConfigurationError, match=f"policy.{part}"):
-        ActionFlowPolicy(**parts)

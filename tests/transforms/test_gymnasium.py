@@ -58,24 +58,22 @@ def test_healthy_steps_are_those_of_the_environment(dtype):
         np.testing.assert_array_equal(seen, other)
         assert rest == others and told["mine"] == info["mine"]
         assert not told["afm"]["corrects"] and told["afm"]["innovation"] < 1
+        assert "belief" not in told["afm"]
         assert (0 < told["afm"]["noise"]).all() and (told["afm"]["noise"] <= 0.05).all()
 
 
 def test_reversed_actuators_do_what_was_planned():
-    env = ActionFlowWrapper(Puck(gain=-1.0), push)
+    env = ActionFlowWrapper(Puck(gain=-1.0), push, belief=True)
     assert env.diagnosis == "as the model expects"
+    unaware = env.reset(seed=0)[1]["afm"]["belief"]["nothing has changed"]
+    assert (unaware > 0.9).all()
     told = [info["afm"] for *_, info in play(env, 30)]
     assert all(each["corrects"] for each in told[3:])
     for each in told[8:]:
         np.testing.assert_allclose(each["executed"], -each["planned"], atol=0.1)
         np.testing.assert_allclose(each["predicted"], each["planned"], atol=0.1)
+        assert (each["belief"]["a recent change"] > 0.9).all()
     assert "actuator 0: reversed" in env.diagnosis
-
-
-def test_watching_only_corrects_nothing():
-    for *_, info in play(ActionFlowWrapper(Puck(gain=-1.0), push, enabled=False), 20):
-        np.testing.assert_array_equal(info["afm"]["planned"], info["afm"]["executed"])
-        assert not info["afm"]["corrects"]
 
 
 def test_actions_are_those_of_the_transform():
@@ -160,12 +158,6 @@ def test_an_observation_of_another_shape_is_refused_by_name():
 def test_steps_need_a_reset():
     with pytest.raises(ResetNeeded):
         ActionFlowWrapper(Puck(), push).step(np.zeros(2))
-
-
-def test_truncation_passes():
-    env = gymnasium.wrappers.TimeLimit(Puck(), 5)
-    ends = [step[2:4] for step in play(ActionFlowWrapper(env, push), 5)]
-    assert ends[-1] == (False, True) and ends[-2] == (False, False)
 
 
 @pytest.mark.filterwarnings("ignore")

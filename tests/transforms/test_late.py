@@ -12,7 +12,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
-from afm_rl.correction import ActionFlow
+from afm_rl.correction import ActionFlow, LeastSquares
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning import KnownReward, PlanningEnv
@@ -92,9 +92,9 @@ def test_actuators_with_delays_of_their_own_act_together():
 def test_a_delay_is_found_and_made_up_for(sign):
     cost = {}
     for late in ("predict", "leave"):
-        env = ActionFlowWrapper(Carts((4, 4), at=5, sign=sign), glide, late=late)
-        states, info = drive(env, 100)
-        cost[late] = np.square(states[50:]).mean()
+        env = ActionFlowWrapper(Carts((4, 4), at=5, sign=sign), glide, late=late, belief=True)
+        cost[late] = np.square(drive(env, 100)[0][50:]).mean()
+        assert (drive(env, 25)[1]["afm"]["belief"]["4 steps late"] > 0.9).all()
     assert 10 * cost["predict"] < cost["leave"], cost
 
 
@@ -111,11 +111,14 @@ def test_nothing_is_predicted_while_nothing_is_late(monkeypatch):
 
 
 def test_policies_in_a_vector_are_shown_the_same():
-    alone, _ = drive(ActionFlowWrapper(Carts((3, 3)), glide, delay=3))
+    how = {"delay": 3, "belief": True}
+    alone, one = drive(ActionFlowWrapper(Carts((3, 3)), glide, **how))
     envs = gymnasium.vector.SyncVectorEnv([lambda: Carts((3, 3))] * 2)
-    both, _ = drive(ActionFlowVectorWrapper(envs, glide, delay=3))
+    both, two = drive(ActionFlowVectorWrapper(envs, glide, **how))
     for row in range(2):
         np.testing.assert_array_equal(both[:, row], alone)
+        for name, chance in one["afm"]["belief"].items():
+            np.testing.assert_array_equal(two["afm"]["belief"][name][row], chance)
 
 
 def test_the_transform_shows_the_same_and_keeps_what_was_measured():
@@ -123,7 +126,7 @@ def test_the_transform_shows_the_same_and_keeps_what_was_measured():
     model, ends = KnownDynamics(glide, Manifold(4), 2), torch.ones(2, dtype=torch.float64)
     world = PlanningEnv(model, KnownReward(lambda s, a, n: s.sum(-1)), -ends, ends)
     late = RegimeTransform(Delay(), [{"delay": 2.0}])
-    env = TransformedEnv(world, Compose(late, ActionFlowTransform(model, delay=2)))
+    env = TransformedEnv(world, Compose(late, ActionFlowTransform(model, delay=2, belief=True)))
     start = torch.tensor([1.0, -0.5, 0.0, 0.3], dtype=torch.float64)
     td = env.reset(TensorDict({"observation": start}))
     for measured in alone:
@@ -131,6 +134,8 @@ def test_the_transform_shows_the_same_and_keeps_what_was_measured():
         td = env.step_mdp(env.step(td))
         np.testing.assert_allclose(td["afm", "observation"], measured, atol=1e-9)
         assert torch.equal(td["observation"], td["afm", "arrival"])
+        torch.testing.assert_close(td["afm", "belief"].sum(-2), torch.ones_like(ends))
+    assert env.transform[1].corrector.causes[:2] == ("nothing has changed", "3 steps late")
     check_env_specs(env)
 
 
@@ -140,6 +145,8 @@ def test_the_transform_shows_the_same_and_keeps_what_was_measured():
         ({"delay": [1, 2, 3]}, "delay=.*one number of steps, or 2"),
         ({"delay": -1}, "delay"),
         ({"delay": 10**6}, "delay"),
+        ({"belief": True, "corrector": LeastSquares([-1.0] * 2, [1.0] * 2)}, "a ActionFlow"),
+        ({"belief": "yes"}, "belief='yes'"),
         ({"late": "ignore"}, "predict, leave|'predict'"),
         ({"delay": 2, "state": lambda env, seen: seen}, "observe="),
         ({"delay": 2, "corrector": ActionFlow(-torch.ones(2), torch.ones(2))}, "corrector"),

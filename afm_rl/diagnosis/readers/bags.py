@@ -12,7 +12,6 @@ from afm_rl.diagnosis.readers.messages import Field, fields_of, series_of
 from afm_rl.diagnosis.readers.source import Series, Source, check_regular
 from afm_rl.errors import ConfigurationError, printable
 
-LOOKED_AT = 20  # messages of a topic that show its fields: joints may come in turns
 MISSING = "needs {}: pip install 'afm-rl[logs]'"
 Messages = Iterator[tuple[str, float, Any]]
 """Topic, time (s) and content."""
@@ -69,13 +68,16 @@ def open_bag(path: Path) -> Source:
     return _source(path, messages)
 
 
-def _source(path: Path, messages: Any) -> Source:
-    """Return a source of messages: a first pass finds the fields."""
+def _source(path: Path, messages: Any, looked_at: int = 20) -> Source:
+    """Return a source of messages: a first pass finds the fields, in some of each topic.
+
+    Of one alone it would not: joints may come in turns.
+    """
     fields: dict[str, tuple[str, Field]] = {}
     counts: dict[str, int] = {}
     for topic, _, content in messages(None):
         counts[topic] = counts.get(topic, 0) + 1
-        if counts[topic] <= LOOKED_AT:
+        if counts[topic] <= looked_at:
             fields |= {f"{topic}{name}": (topic, way) for name, way in fields_of(content)}
 
     def read(wanted: Sequence[str]) -> dict[str, Series]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 
-from afm_rl.diagnosis.readers.source import SHOWN, Source, Unchosen
+from afm_rl.diagnosis.readers.source import Source, Unchosen
 from afm_rl.errors import ConfigurationError, printable
 
 Pairs = tuple[list[str], list[str]]
@@ -118,5 +118,5 @@ def _expanded(source: Source, option: str, given: Sequence[str]) -> Pairs:
     return fields, names
 
 
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(printable(name, 40) for name in names[:SHOWN])
+def _some(names: Sequence[str], most: int = 8) -> str:
+    return ", ".join(printable(name, 40) for name in names[:most])

@@ -12,14 +12,12 @@ from afm_rl.diagnosis.readers.source import Series
 Field = tuple[str | int, ...]
 """The way to a number: attributes, keys, places in arrays."""
 
-MOST = 64  # numbers of an array that are named: of an image, none is wanted
 
-
-def fields_of(message: Any, depth: int = 8) -> Iterator[tuple[str, Field]]:
+def fields_of(message: Any, depth: int = 8, most: int = 64) -> Iterator[tuple[str, Field]]:
     """Yield name and way of each number in a message.
 
     Where a list ``name`` has as many entries as an array beside it, these are its names, as in
-    ROS's ``JointState``.
+    ROS's ``JointState``. Of an array of more than ``most`` numbers, as of an image, none is named.
 
     >>> message = {"name": ["pan"], "position": [0.5], "header": {"stamp": 3}}
     >>> [name for name, _ in fields_of(message)]
@@ -31,7 +29,7 @@ def fields_of(message: Any, depth: int = 8) -> Iterator[tuple[str, Field]]:
     for key, value in parts.items():
         if isinstance(value, bool | int | float | np.number | np.bool_):
             yield f".{key}", (key,)
-        elif isinstance(value, list | tuple | np.ndarray) and 0 < len(value) <= MOST:
+        elif isinstance(value, list | tuple | np.ndarray) and 0 < len(value) <= most:
             named = labels if len(labels) == len(value) and value is not labels else []
             for place, entry in enumerate(value):
                 shown = named[place] if named else place

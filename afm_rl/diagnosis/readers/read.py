@@ -18,7 +18,6 @@ from afm_rl.errors import ConfigurationError, printable
 
 PAIRS = ("command", "response")
 TRANSITIONS = ("action", "state")
-LOST = 0.5  # share of the rows that may be dropped because a number is missing
 EFFORT = re.compile(r"(pwm|thrust|throttle|motor|esc)[._]?\d*")
 """Columns that say how hard the motors are driven, if at all."""
 LARGEST = 1e30  # squares of larger numbers leave single precision
@@ -205,7 +204,7 @@ def _complete(
         if column is not None:
             sound &= np.isfinite(column)
     lost = int((~sound).sum())
-    if lost > LOST * len(sound) or len(sound) - lost < FEWEST:
+    if lost > 0.5 * len(sound) or len(sound) - lost < FEWEST:
         missing = f", {lost} of them with missing numbers" if lost else ""
         raise ConfigurationError(
             f"{len(sound)} rows{missing}: expected at least {FEWEST} complete ones, and half of "

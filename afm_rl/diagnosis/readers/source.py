@@ -13,8 +13,6 @@ import numpy as np
 
 from afm_rl.errors import ConfigurationError, printable
 
-SHOWN = 8  # names in a message
-
 
 @dataclass(frozen=True)
 class Source:

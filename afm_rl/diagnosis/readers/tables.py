@@ -16,7 +16,6 @@ from afm_rl.diagnosis.readers.thin import blocks_of, thinned_note
 from afm_rl.errors import ConfigurationError, printable
 
 TIME, EPISODE = "t", "episode_index"
-LARGE = 1 << 25  # bytes: of smaller files all rows are read
 
 
 def open_csv(path: Path) -> Source:
@@ -46,13 +45,13 @@ def open_csv(path: Path) -> Source:
     )
 
 
-def _large(path: Path) -> tuple[list[tuple[int, int, int]], tuple[str, ...]]:
+def _large(path: Path, large: int = 1 << 25) -> tuple[list[tuple[int, int, int]], tuple[str, ...]]:
     """Return the blocks of a large file: byte, row, and number of rows; and a note.
 
-    A file that is read as a whole has none.
+    A file of less than ``large`` bytes is read as a whole, and has none.
     """
     size, count = path.stat().st_size, len(blocks_of(1 << 60))
-    if size < LARGE:
+    if size < large:
         return [], ()
     starts, lines, before = [size * k // count for k in range(count)], [], 0
     with path.open("rb") as file:

@@ -50,12 +50,6 @@ def test_waypoints_are_met_in_time_and_the_last_is_held():
     assert found[-1, 3:].tolist() == [0, 0, 0]
 
 
-def test_closed_waypoints_go_round():
-    square = Waypoints([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], speed=1.0, closed=True)
-    torch.testing.assert_close(square.at(torch.tensor(3.5)), square.at(torch.tensor(7.5)))
-    assert square.at(torch.tensor(3.5)).tolist() == [0, 0.5, 0, 0, -1, 0]
-
-
 def write(path, header, rows):
     path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]))
     return path

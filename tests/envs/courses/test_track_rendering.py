@@ -2,7 +2,6 @@
 
 import math
 
-import matplotlib
 import numpy as np
 import pytest
 import torch
@@ -48,18 +47,6 @@ def test_the_robot_is_drawn_where_it_is():
     half = canvas.draw(torch.zeros(3), torch.zeros(2)).shape[1] / 2
     assert left < half < right
     assert left + right == pytest.approx(2 * half, abs=3)
-
-
-def test_no_window_and_no_global_figure():
-    backend = matplotlib.get_backend()
-    TrackCanvas(load_track("ethz_1"))
-    assert matplotlib._pylab_helpers.Gcf.get_all_fig_managers() == []
-    assert matplotlib.get_backend() == backend
-
-
-def test_a_picture_needs_pixels():
-    with pytest.raises(ConfigurationError, match="pixels=0"):
-        TrackCanvas(load_track("ethz_1"), pixels=0)
 
 
 def test_the_environment_draws_the_first_mission():

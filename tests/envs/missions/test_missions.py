@@ -38,12 +38,6 @@ def test_given_entries_are_kept_and_copied(form):
     assert mission["track"].dtype is torch.int64
 
 
-def test_what_is_completed_fits_the_spec(form):
-    batch = torch.Size([2, 3])
-    mission = form.complete(None, batch, 0, "cpu")
-    assert form.spec(batch, torch.device("cpu")).is_in(mission)
-
-
 @pytest.mark.parametrize(
     ("entries", "complaint"),
     [
@@ -89,11 +83,6 @@ def test_room_for_more_phases_changes_no_mission():
         mission = form.build(regime=regime)["mission"]
         assert mission["parameters"][:, 0].tolist() == [1, 2, 1, 1, 1]
         assert mission["at"].tolist() == pytest.approx([0.15, 0.8, torch.inf, torch.inf])
-
-
-def test_a_schedule_without_breakpoints_has_one_phase():
-    form = MissionFormat(("a",), GAINS, Schedule([]))
-    assert form.build(regime={"v_gain": 2.0})["mission", "parameters"].tolist() == [[2, 1]]
 
 
 @pytest.mark.parametrize(

@@ -52,17 +52,3 @@ def test_the_budget_and_the_duration_both_end_a_flight():
 )
 def test_flights_start_as_the_protocol_has_it(settings, start):
     assert flights(max_steps=5, **settings).simulation.start == start
-
-
-@pytest.mark.parametrize(
-    ("settings", "complaint"),
-    [
-        ({"max_steps": 0}, "max_steps=0: expected a whole number of at least 1"),
-        ({"max_steps": 5, "duration": 0.0}, "duration=0.0: expected a finite number"),
-        ({"max_steps": 5, "dt": -1}, "dt=-1: expected a finite number"),
-        ({"max_steps": 5, "start": "flying"}, "start='flying': expected one of rest, moving"),
-    ],
-)
-def test_impossible_settings_are_refused(settings, complaint):
-    with pytest.raises(ConfigurationError, match=complaint):
-        flights(**settings)

@@ -46,20 +46,6 @@ def test_it_is_the_native_environment():
     assert (terminated, truncated) == (False, True)
 
 
-def test_a_seed_repeats_a_flight_and_no_seed_does_not():
-    env = CrazyflieTrackGym(start_noise=0.1)
-    first, again, other = env.reset(seed=1)[0], env.reset(seed=1)[0], env.reset()[0]
-    assert (first == again).all()
-    assert (first != other).any()
-
-
-def test_the_spaces_have_units():
-    env = CrazyflieTrackGym()
-    np.testing.assert_allclose(env.action_space.high, [0.575, 6.6125e-3, 6.6125e-3, 9.75e-4])
-    np.testing.assert_allclose(env.action_space.low[:2], [0, -6.6125e-3])
-    assert env.observation_space.shape == (19,)
-
-
 def test_mistakes_are_explained():
     with pytest.raises(ConfigurationError, match="render_mode='human': expected none"):
         CrazyflieTrackGym(render_mode="human")

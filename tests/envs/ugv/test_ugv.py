@@ -24,8 +24,9 @@ def act(env, data, action):
     return env.step(data)["next"]
 
 
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-@pytest.mark.parametrize("schedule", [None, Schedule([]), Schedule([2, 5], by="step")])
+@pytest.mark.parametrize(
+    ("batch", "schedule"), [((), None), ((4,), Schedule([])), ((2, 3), Schedule([2, 5], by="step"))]
+)
 def test_specs_hold(batch, schedule):
     env = UGVTrack(batch_size=batch, max_steps=3, schedule=schedule)
     check_env_specs(env, break_when_any_done="both")
@@ -108,15 +109,6 @@ def test_a_progress_equal_to_the_threshold_is_not_beyond_it():
     assert act(env, data, [0.0, 0.0])["regime_active"].tolist() == [False, True]
 
 
-def test_missions_have_breakpoints_of_their_own():
-    env = quiet(schedule=Schedule([1], by="step"))
-    missions = env.mission(regime={"v_gain": 2.0}).expand(2).clone()
-    missions["mission", "at"] = torch.tensor([[0.0], [math.inf]])
-    data = env.reset(missions, set_state=False)
-    after = act(env, data, [0.0, 0.0])
-    assert after["regime_active"].tolist() == [True, False]
-
-
 def test_the_next_target_becomes_the_goal_one_per_step():
     env = quiet(reach=10.0)
     data = env.reset()
@@ -171,20 +163,6 @@ def test_seeds_decide_and_the_global_generator_is_left_alone():
     assert (runs[0] == runs[1]).all()
     assert (runs[0] != runs[2]).any(-1).all()
     assert (torch.get_rng_state() == before).all()
-
-
-def test_a_reset_continues_the_noise_and_no_seed_restarts_it():
-    env = UGVTrack(seed=3)
-    first, second = env.reset()["pose"], env.reset()["pose"]
-    assert (first != second).any()
-    env.set_seed(None)
-    assert (env.reset()["pose"] == first).all()
-
-
-def test_default_missions_differ_in_their_noise():
-    data = UGVTrack(batch_size=(4,), seed=7).reset()
-    assert data["mission", "seed"].tolist() == [7, 8, 9, 10]
-    assert len(set(data["pose"][:, 0].tolist())) == 4
 
 
 def test_default_missions_broadcast_and_keep_what_reset_adds():

@@ -69,16 +69,6 @@ def test_the_shape_of_the_batch_does_not_matter(together):
         assert (batch == other.reshape(-1)).all()
 
 
-def test_equal_seeds_meet_equal_noise():
-    env = UGVTrack(process_noise=0.01)
-    missions = torch.stack([env.mission(seed=seed) for seed in (4, 5, 4)])
-    data = env.reset(missions, set_state=False)
-    data["action"] = torch.ones(3, 2)
-    pose = env.step(data)["next", "pose"]
-    assert (pose[0] == pose[2]).all()
-    assert (pose[0] != pose[1]).all()
-
-
 def test_a_locked_batch_gives_the_same_as_an_open_one():
     missions = fleet()
     settings = {"tracks": ["ethz_1", "ethz_2"], "process_noise": 0.01}

@@ -1,0 +1,111 @@
+"""Planners as policies: a plan travels with the tensordict."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.modules.utils import get_primers_from_module
+
+from afm_rl.dynamics import Dubins
+from afm_rl.envs import UGVTrack
+from afm_rl.planning import MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost
+
+PLANS = {"mppi": ("mppi", "mean"), "mpc": ("mpc", "actions")}
+
+
+def make(kind, box):
+    if kind == "mppi":
+        world = PlanningEnv(Dubins(), GoalDistance(), *box)
+        return MPPI(world, horizon=4, population=16, seed_key=["mission", "seed"])
+    cost = TrackingCost([1.0, 1.0, 0.0], [0.02, 0.02], [0, 1], in_keys=["goal"])
+    return MPC(PlanningEnv(Dubins(), cost, *box), horizon=4)
+
+
+@pytest.fixture(params=PLANS)
+def kind(request):
+    return request.param
+
+
+@pytest.fixture
+def planner(kind, box):
+    return make(kind, box)
+
+
+@pytest.fixture
+def plan(kind):
+    """The key of the plan, of four actions."""
+    return PLANS[kind]
+
+
+def track(planner, **settings):
+    return TransformedEnv(UGVTrack(**settings), planner.make_tensordict_primer())
+
+
+@pytest.mark.parametrize("batch", [(), (2, 2)])
+def test_specs_hold_with_the_primer(planner, batch):
+    check_env_specs(track(planner, batch_size=batch, max_steps=3))
+
+
+def test_torchrl_finds_the_primer(planner, plan):
+    primer = get_primers_from_module(planner)
+    env = TransformedEnv(UGVTrack(batch_size=(2,)), primer)
+    assert env.reset()[plan].shape == (2, 4, 2)
+
+
+def test_the_plan_is_zero_at_resets_and_carried_between(planner, plan):
+    env = track(planner, batch_size=(3,), max_steps=4)
+    data = env.rollout(10, planner, break_when_any_done=False)
+    now, later = data[plan], data["next", *plan]
+    fresh = torch.arange(10) % 4 == 0
+    assert (now[:, fresh] == 0).all() and (later != 0).any(-1).all()
+    carried = torch.arange(1, 10)[~fresh[1:]]
+    assert torch.equal(now[:, carried], later[:, carried - 1])
+
+
+def test_a_partial_reset_clears_its_own_rows_only(planner, plan):
+    env = track(planner, batch_size=(3,))
+    td = step_mdp(env.step(planner(env.reset())))
+    before = td[plan].clone()
+    td["_reset"] = torch.tensor([[False], [True], [False]])
+    after = env.reset(td)[plan]
+    assert (after[1] == 0).all() and torch.equal(after[[0, 2]], before[[0, 2]])
+
+
+def test_a_batch_unlocked_environment_takes_the_batch_of_the_reset(planner, plan):
+    env = track(planner)
+    td = env.reset(TensorDict(batch_size=[5]), set_state=False)
+    assert td[plan].shape == (5, 4, 2)
+    td = step_mdp(env.step(planner(td)))
+    td = td[torch.tensor([0, 3])]  # missions that are done leave
+    assert env.step(planner(td))["next", *plan].shape == (2, 4, 2)
+
+
+def test_a_collector_collects_what_a_rollout_does(kind, plan, box):
+    settings = {"batch_size": (2,), "max_steps": 3}
+    planner = make(kind, box)
+    rollout = track(planner, **settings).rollout(8, planner, break_when_any_done=False)
+    planner = make(kind, box)
+    frames = {"frames_per_batch": 8, "total_frames": 16, "use_buffers": False}
+    collector = Collector(track(planner, **settings), planner, **frames)
+    collected = torch.cat(list(collector), -1)
+    collector.shutdown()
+    for key in ("action", plan, "pose"):
+        torch.testing.assert_close(collected[key], rollout[key])
+
+
+def test_environments_in_series_have_plans_of_their_own(planner, plan):
+    env = SerialEnv(2, lambda: track(planner, max_steps=3))
+    data = env.rollout(5, planner, break_when_any_done=False)
+    assert data[plan].shape == (2, 5, 4, 2) and (data[plan][:, 3] == 0).all()
+    assert (data[plan][:, [1, 2, 4]] != 0).any(-1).all()
+
+
+def test_mpc_rolls_out_in_its_own_world(box):
+    planner = make("mpc", box)
+    env = TransformedEnv(planner.env, planner.make_tensordict_primer())
+    start = TensorDict({"observation": torch.zeros(3, 3), "goal": torch.ones(3, 2)}, [3])
+    data = env.rollout(20, planner, tensordict=env.reset(start), auto_reset=False)
+    gap = data["next", "observation"][:, -1, :2] - data["goal"][:, -1]
+    assert (gap.norm(dim=-1) < 0.2).all()
