@@ -28,7 +28,7 @@ def steps_late(weights: Tensor, prior: Tensor, delays: Tensor, before: Tensor, m
 
     One for all axes, from the evidence of all: an axis whose commands hardly change shows none.
     None while *nothing has changed* is believed everywhere; else that is as probable, a priori, as
-    all else that is not late. A delay that was found stays, as actuators' delays do, until the
+    all else that is not late. The delay until now stays, as actuators' delays do, until the
     evidence for another one exceeds the odds of *nothing has changed*.
 
     Args:
@@ -54,9 +54,8 @@ def steps_late(weights: Tensor, prior: Tensor, delays: Tensor, before: Tensor, m
     evidence = (evidence / evidence.amax(-2, keepdim=True)).clamp_min(LEAST)
     first = (first / first.sum(-2, keepdim=True)).mean(-1)
     stays = (before.unsqueeze(-1) == every).to(first)
-    sticky = torch.lerp(first, stays, share[..., 0, :1])
-    kept = torch.where((before > 0).unsqueeze(-1), sticky, first)
-    found = (kept.log() + evidence.log().sum(-1)).argmax(-1)
+    stays = torch.lerp(first, stays, share[..., 0, :1])
+    found = (stays.log() + evidence.log().sum(-1)).argmax(-1)
     return torch.where((weights[..., 0, :] < 0.5).any(-1) | (before > 0), found, 0)
 
 

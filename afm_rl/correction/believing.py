@@ -57,8 +57,8 @@ class Believer(PairCorrector):
         acting: what commands weigh in what acts now by all M + 1 models, by age, the oldest first,
             ``(M + 1, L)``: the newest one by all of them, if None.
         follows: which of the M + 1 models take any delay that is believed; none if None.
-        odds: prior log-odds of *nothing has changed* against all other models together: one
-            surprise that its Student-t distribution gives e^-odds is no reason to act.
+        odds: prior log-odds of *nothing has changed* against all other models together; a larger
+            one acts later, and a legged robot that is reversed falls.
         discount: of the losses; .95 looks back on twenty steps.
         noise: standard deviation that no model explains, at first, a share of the largest action.
         noise_rate: share of its square that is renewed at every step.
@@ -83,7 +83,7 @@ class Believer(PairCorrector):
         worth: Sequence[float] | None = None,
         acting: Tensor | None = None,
         follows: Sequence[bool] | None = None,
-        odds: float = 2.5,
+        odds: float = 1.0,
         discount: float = 0.95,
         noise: float = 0.05,
         noise_rate: float = 0.1,
@@ -140,6 +140,7 @@ class Believer(PairCorrector):
         rules = (self.discount, self.noise_rate, self.least_noise, self.tails)
         prior = self.prior(parts)
         belief = self.belief(parts).update(effect, std, valid, prior, *rules)
+        belief = belief._replace(losses=self.surprised(parts["losses"], belief.losses))
         awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
         before = parts["late"].squeeze(-1).long()
         if not all_hold(~awake.squeeze(-1) & (before == 0)):
@@ -149,6 +150,16 @@ class Believer(PairCorrector):
         count = 1 if model.taught_in is None else self.recent
         parts["pairs"] = self.aged(parts["pairs"], begins, count)
         return parts | belief._asdict() | {"misaligned": awake.to(newest)}
+
+    def surprised(self, before: Tensor, losses: Tensor) -> Tensor:
+        """Return the losses ``(*B, M, A)`` with those of a first surprise made alike.
+
+        What surprises *nothing has changed* surprises all models that have yet to learn of it. One
+        that foresaw it better, as some delay may by chance, leads by no more than the odds.
+        """
+        nothing = losses[..., :1, :]
+        first = (before[..., :1, :] <= self.odds) & (nothing > self.odds)
+        return torch.where(first, torch.maximum(losses, nothing - self.odds), losses)
 
     def delays_now(self, late: Tensor) -> Tensor:
         """Return the delays of all models ``(*B, M)`` while ``late`` ``(*B)`` is believed."""

@@ -142,10 +142,13 @@ def test_what_waits_by_a_known_delay_has_the_effects_that_are_believed(line, pla
     assert (effects[:, -2:] + to_come).abs().median() < 0.02
 
 
-@pytest.mark.parametrize("lag", [1.0, 1.5, 3.0])
+@pytest.mark.parametrize(("lag", "share"), [(1.0, 0.3), (3.0, 0.5), (1.5, 0.7)])
 @pytest.mark.parametrize("gain", [1.0, -1.0])
-def test_slow_actuators_are_led(line, drive, plans, lag, gain):
-    """What acts follows commands with a time constant; slow plans are within its reach."""
+def test_slow_actuators_are_led(line, drive, plans, lag, share, gain):
+    """What acts follows commands with a time constant; slow plans are within its reach.
+
+    Lags of 1 and 3 steps are readings, one of 1.5 is between them.
+    """
     keep, phase = math.exp(-1 / lag), 6 * plans(1, 24, 2)
     planned = 0.5 * (0.2 * torch.arange(60)[:, None, None] + phase).sin()
 
@@ -158,7 +161,7 @@ def test_slow_actuators_are_led(line, drive, plans, lag, gain):
     _, effects = drive(flow_of(2), line(2), slow, planned)
     alone = torch.stack([slow(planned[: k + 1]) for k in range(len(planned))])
     miss, usual = ((e - planned)[30:].abs().mean() for e in (effects, gain * alone))
-    assert miss < 0.5 * usual
+    assert miss < share * usual
 
 
 def test_a_limited_rate_is_no_reason_to_correct(line, drive, plans):
