@@ -200,10 +200,14 @@ def slurm_cluster(monkeypatch, tmp_path):
     """Stand-ins for SLURM's commands, which run an array of two jobs on this machine."""
     commands = {
         "sbatch": """
-            for task in 0 1; do
-              SLURM_JOB_ID=7$task SLURM_ARRAY_JOB_ID=7 SLURM_ARRAY_TASK_ID=$task sh "$1" &
-            done > /dev/null 2>&1
+            cp "$1" "$0.script"  # as SLURM does: the caller's file is about to move
+            for task in 0 1; do node $task & done > /dev/null 2>&1
             echo Submitted batch job 7
+        """,
+        "node": """
+            export SLURM_JOB_ID=7$1 SLURM_ARRAY_JOB_ID=7 SLURM_ARRAY_TASK_ID=$1
+            sh "${0%node}sbatch.script" && state=COMPLETED || state=OUT_OF_MEMORY
+            echo "7_$1|$state" >> "${0%node}states"
         """,
         "srun": """
             export SLURM_PROCID=0 SLURM_LOCALID=0 SLURM_NODEID=0 SLURM_NTASKS=1
@@ -211,7 +215,7 @@ def slurm_cluster(monkeypatch, tmp_path):
             while [ "${1#/}" = "$1" ] || [ "${1%log.*}" != "$1" ]; do shift; done
             exec "$@"
         """,
-        "sacct": "printf 'JobID|State\\n7_1|OUT_OF_MEMORY\\n'",
+        "sacct": "echo 'JobID|State'; cat \"${0%sacct}states\" 2> /dev/null; true",
     }
     (tmp_path / "bin").mkdir()
     for name, script in commands.items():
