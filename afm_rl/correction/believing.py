@@ -59,6 +59,8 @@ class Believer(PairCorrector):
         follows: which of the M + 1 models take any delay that is believed; none if None.
         odds: prior log-odds of *nothing has changed* against all other models together; a larger
             one acts later, and a legged robot that is reversed falls.
+        most_odds: what evidence for *nothing has changed* can make of them: what was learnt in a
+            thousand healthy steps must not hide a change for longer than a few.
         discount: of the losses; .95 looks back on twenty steps.
         noise: standard deviation that no model explains, at first, a share of the largest action.
         noise_rate: share of its square that is renewed at every step.
@@ -84,6 +86,7 @@ class Believer(PairCorrector):
         acting: Tensor | None = None,
         follows: Sequence[bool] | None = None,
         odds: float = 1.0,
+        most_odds: float = 8.0,
         discount: float = 0.95,
         noise: float = 0.05,
         noise_rate: float = 0.1,
@@ -95,6 +98,7 @@ class Believer(PairCorrector):
         super().__init__(action_low, action_high, recent, memory, place, quiet, delay)
         self.models = ("nothing has changed", *models)
         self.odds = check_number("corrector.odds", odds, low=0.0)
+        self.most_odds = check_number("corrector.most_odds", most_odds, low=0.0)
         self.discount = check_number("corrector.discount", discount, low=0.0, high=1.0)
         self.noise_rate = check_number("corrector.noise_rate", noise_rate, low=0.0, high=1.0)
         self.least_noise = check_number(
@@ -152,14 +156,18 @@ class Believer(PairCorrector):
         return parts | belief._asdict() | {"misaligned": awake.to(newest)}
 
     def surprised(self, before: Tensor, losses: Tensor) -> Tensor:
-        """Return the losses ``(*B, M, A)`` with those of a first surprise made alike.
+        """Return the losses ``(*B, M, A)`` as models may have them until a change is known.
 
         What surprises *nothing has changed* surprises all models that have yet to learn of it. One
-        that foresaw it better, as some delay may by chance, leads by no more than the odds.
+        that foresaw it better, as some delay may by chance, leads by no more than the odds. And
+        while nothing has changed, no model falls farther behind than a change may need: it may
+        come at any step (fixed share: Herbster and Warmuth 1998, Machine Learning 32).
         """
         nothing = losses[..., :1, :]
         first = (before[..., :1, :] <= self.odds) & (nothing > self.odds)
-        return torch.where(first, torch.maximum(losses, nothing - self.odds), losses)
+        losses = torch.where(first, torch.maximum(losses, nothing - self.odds), losses)
+        healthy = (nothing <= losses.amin(-2, keepdim=True) + self.odds).all(-1, keepdim=True)
+        return torch.where(healthy, torch.minimum(losses, nothing + self.most_odds), losses)
 
     def delays_now(self, late: Tensor) -> Tensor:
         """Return the delays of all models ``(*B, M)`` while ``late`` ``(*B)`` is believed."""
