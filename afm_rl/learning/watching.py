@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -25,13 +26,16 @@ class Watching:
     if not, twice as many transitions are waited for.
 
     A policy's action is a function of the state, so that its own data do not tell what another
-    action would have done. While it watches, normal noise of ``noise`` half ranges on the executed
-    action does; 0 leaves actions as they are.
+    action would have done. While it watches, normal noise on the executed action does. Every robot
+    has a standard deviation of its own, drawn anew between 0 and ``noise`` every ``hold`` steps: so
+    the model knows the policy's own motion well, and also what is around it.
 
     Args:
         transitions: watched before the first fit.
         error: largest held-out error of a model that is used.
-        noise: standard deviation, in half ranges of the action box.
+        noise: largest standard deviation, in half ranges of the action box; 0 leaves actions as
+            they are.
+        hold: steps for which a robot keeps its own.
         fit: settings of :func:`~afm_rl.learning.fit_ensemble`.
         model: settings of the ensemble.
         manifold: of the states; plain numbers if None.
@@ -50,8 +54,9 @@ class Watching:
 
     transitions: int = 20_000
     error: float = 0.5
-    noise: float = 0.1
-    fit: Mapping[str, Any] = field(default_factory=dict)
+    noise: float = 0.5
+    hold: int = 20
+    fit: Mapping[str, Any] = field(default_factory=lambda: {"epochs": 100})
     model: Mapping[str, Any] = field(default_factory=lambda: {"hidden": [200, 200]})
     manifold: Manifold | None = None
     seed: int = 0
@@ -66,6 +71,8 @@ class Watching:
         self.needed = check_count("learn.transitions", self.transitions)
         check_number("learn.error", self.error, low=0.0, open_low=True)
         check_number("learn.noise", self.noise, low=0.0)
+        check_count("learn.hold", self.hold)
+        self.restart(self.seed)
 
     @property
     def count(self) -> int:
@@ -86,6 +93,17 @@ class Watching:
         for mine, row, whole in zip(self._seen, rows, valid & rows.isfinite().all(-1), strict=True):
             if bool(whole):
                 mine.append(row)
+
+    def restart(self, seed: int) -> None:
+        """Draw the noise of actions from ``seed`` on."""
+        self._random, self._steps = np.random.default_rng(seed), 0
+
+    def excitation(self, shape: Sequence[int]) -> Tensor:
+        """Return the noise ``(N, A)`` of this step, in half ranges."""
+        if self._steps % self.hold == 0:
+            self._level = self.noise * self._random.random((shape[0], 1))
+        self._steps += 1
+        return torch.from_numpy(self._level * self._random.standard_normal(shape))
 
     def learn(self) -> FitReport:
         """Fit a model to all that was watched; :attr:`fitted` is set if it is good enough."""

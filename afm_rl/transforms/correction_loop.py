@@ -112,7 +112,6 @@ class CorrectionLoop:
         names = self.model.names[1] if isinstance(self.model, MuJoCoDynamics) else None
         self.names = names or [f"actuator {k}" for k in range(actions.shape[0])]
         self.entries: Any = None  # a tensordict, from the first reset on
-        self.random = np.random.default_rng(0)
 
     @property
     def learning(self) -> bool:
@@ -129,8 +128,8 @@ class CorrectionLoop:
         self, states: Tensor, rows: np.ndarray | None = None, seed: int | None = None
     ) -> None:
         """Begin episodes in ``states`` ``(N, S)``; only in ``rows`` ``(N,)``, if given."""
-        if seed is not None:
-            self.random = np.random.default_rng(seed)
+        if self.watching and seed is not None:
+            self.watching.restart(seed)
         if self.entries is None:
             self._complete(states)
         if self.watching and self.learning and self.watching.due:
@@ -188,8 +187,8 @@ class CorrectionLoop:
         """Execute plans ``(N, A)`` with noise, which shows what actions do."""
         low, high = self.spec.space.low, self.spec.space.high
         wanted = computable(planned, low, high, self.states.dtype)
-        noise = self.random.standard_normal(wanted.shape) * self.watching.noise  # type: ignore[union-attr]
-        noisy = wanted + torch.from_numpy(noise).to(wanted) * (high - low) / 2
+        noise = self.watching.excitation(wanted.shape)  # type: ignore[union-attr]
+        noisy = wanted + noise.to(wanted) * (high - low) / 2
         executed, _ = safe_action(noisy, low, high, self.entries.get("executed_action"))
         found = {"planned": wanted, "executed": executed, "predicted": executed}
         self.entries.update({SHOWN[name]: value for name, value in found.items()})
