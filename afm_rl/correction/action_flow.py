@@ -24,7 +24,6 @@ from afm_rl.correction.readings import (
     late_ones,
     lay_out,
     memory_of,
-    whole_steps,
 )
 from afm_rl.correction.tick import Tick
 from afm_rl.correction.weights import load_universal
@@ -115,14 +114,11 @@ class ActionFlow(Believer):
         names = check_readings(list(READINGS) if readings is None else readings, bool(place))
         chosen = [READINGS[name] for name in names]
         late = late_ones(names)
-        turned = whole_steps(names)
-        sure = [*(f"only {name}" for name in late), *(f"reversed {name}" for name in turned)]
-        models = [*names, *LINEAR, *sure, *CALM]
-        worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * (len(sure) + len(CALM))
-        only, simple = (READINGS[name] for name in late + turned), [Reading()] * len(LINEAR)
+        models = [*names, *LINEAR, *(f"only {name}" for name in late), *CALM]
+        worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * (len(late) + len(CALM))
+        only, simple = (READINGS[name] for name in late), [Reading()] * len(LINEAR)
         read = [Reading(), *chosen, *simple, *only, *[Reading()] * len(CALM)]
         acting = lay_out(read, rows).acting
-        acting[len(read) - len(turned) - len(CALM) : -len(CALM)] *= -1.0
         follows = [r.varied or r.near for r in read]
         first = 1 + len(names)
         follows[first : first + len(LINEAR)] = [True] * len(LINEAR)
@@ -161,6 +157,9 @@ class ActionFlow(Believer):
             self.scale,
             names,
             rows,
+            self.worth,
+            self.odds,
+            self.least_noise,
             self.delays,
             self.acting,
             samples,
@@ -211,15 +210,16 @@ class ActionFlow(Believer):
         ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
         lead, given = executed.shape[:-1], [*self._read(parts), self.normalise(ahead)]
         rows, steps = math.prod(lead), parts["late"].reshape(-1).long()
-        pairs, weights, noise, place, unit = (x.reshape(rows, *x.shape[len(lead) :]) for x in given)
+        pairs, losses, noise, place, unit = (x.reshape(rows, *x.shape[len(lead) :]) for x in given)
+        weights = self.tick.weights(losses, noise)
         read = self.tick.read(pairs, noise, place, steps)
         found = self.tick.forecast(read, weights, steps, pairs, unit.to(pairs))
         forecasts, late = (x.view(*lead, *x.shape[1:]).to(executed) for x in found)
         return forecasts, late
 
     def _read(self, parts: Fields) -> list[Tensor]:
-        given = parts["pairs"], self.weights(parts), parts["noise"], self.place_of(parts["state"])
-        return [part.to(self.tick.scale) for part in given]
+        given = [parts[name] for name in ("pairs", "losses", "noise")]
+        return [part.to(self.tick.scale) for part in (*given, self.place_of(parts["state"]))]
 
     @property
     def _as_machine_code(self) -> bool:

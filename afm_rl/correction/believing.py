@@ -111,7 +111,7 @@ class Believer(PairCorrector):
         acting = torch.ones(len(self.models), 1) if acting is None else acting
         self.register_buffer("acting", acting, persistent=False)
         # Of a model: the age of the command that weighs most; -1: the delay that is believed.
-        late = acting.shape[-1] - 1 - acting.abs().argmax(-1)
+        late = acting.shape[-1] - 1 - acting.argmax(-1)
         late = late if follows is None else late.masked_fill(torch.tensor(follows), -1)
         self.register_buffer("delays", late, persistent=False)
         self.most_late = max(late.tolist())
@@ -135,18 +135,6 @@ class Believer(PairCorrector):
     def prior(self, parts: Fields) -> Tensor:
         """Return the prior log-odds of the models ``(*B, M, A)``."""
         return prior_of(self.worth.to(parts["noise"]), self.odds, parts["noise"], self.least_noise)
-
-    def weights(self, parts: Fields) -> Tensor:
-        """Return the probabilities of the models ``(*B, M, A)``, given the delay of all axes.
-
-        Once a delay is believed, models of other delays must have predicted much better: an axis
-        of which the others know more waits for no evidence of its own.
-        """
-        late = parts["late"].squeeze(-1).long()
-        other = (self.delays_now(late) != late.unsqueeze(-1)) & (late > 0).unsqueeze(-1)
-        other = other & ((self.acting != 0).sum(-1) == 1)  # slowness looks like a delay, at first
-        prior = self.prior(parts) - self.most_odds * other.unsqueeze(-1)
-        return self.belief(parts).weights(prior)
 
     def look(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts of the memory with the newest pairs and the belief after them."""
@@ -251,7 +239,7 @@ class Believer(PairCorrector):
         """
         parts = self.unpack(memory, self.states_in(memory))
         answer = self.answer(parts, planned, box)
-        weights = self.weights(parts)
+        weights = self.belief(parts).weights(self.prior(parts))
         acting = self.denormalise((weights * answer.forecasts.to(memory)).sum(-2))
         parts |= {"planned": planned, "executed": answer.executed.to(memory), "acting": acting}
         parts["forecasts"] = answer.forecasts.to(memory)
@@ -289,7 +277,7 @@ class Believer(PairCorrector):
     def believed(self, memory: Tensor) -> Tensor:
         """Return how probable the :attr:`models` are, by axis, ``(*B, M, A)``."""
         parts = self.unpack(memory, self.states_in(memory))
-        return self.weights(parts)
+        return self.belief(parts).weights(self.prior(parts))
 
     def predict(
         self, memory: Tensor, action: Tensor, model: DynamicsModel
@@ -307,7 +295,7 @@ class Believer(PairCorrector):
         with torch.no_grad():
             seen = self._foresee(self.pack(self.look(memory, model)), action)
             parts = self.unpack(seen, model.state_size)
-            weights = self.weights(parts)
+            weights = self.belief(parts).weights(self.prior(parts))
             mean, std = mean_and_std(parts["forecasts"], weights)
             return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))
 

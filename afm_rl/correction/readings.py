@@ -108,15 +108,6 @@ def late_ones(names: Sequence[str]) -> list[str]:
     return [name for name in names if READINGS[name].delay or READINGS[name].lag]
 
 
-def whole_steps(names: Sequence[str]) -> list[str]:
-    """Return the readings by which actions act late, and no more.
-
-    >>> whole_steps(["recent", "delay_2", "lag_1"])
-    ['delay_2']
-    """
-    return [name for name in names if READINGS[name].delay]
-
-
 def cause_of(model: str, known: int = 0) -> str:
     """Return what a model of the belief says of the actuators, in plain words.
 
@@ -127,7 +118,7 @@ def cause_of(model: str, known: int = 0) -> str:
     >>> [cause_of(model) for model in ("delay_2", "only lag_1", "gain_12")]
     ['2 steps late', 'slow', 'a recent change']
     """
-    reading = READINGS.get(model.split()[-1], Reading())
+    reading = READINGS.get(model.removeprefix("only "), Reading())
     if reading.delay:
         steps = reading.delay + known
         return f"{steps} step{'s' * (steps > 1)} late"

@@ -12,12 +12,12 @@ from torch import Tensor, nn
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.achievable import MODES, attainable, extend
 from afm_rl.correction.arrival import ago, aligned
-from afm_rl.correction.belief import mean_and_std
+from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.linear import CALM, LINEAR, Lines, fit_lines, sensor_noise, within_rate
 from afm_rl.correction.network import AxisNetwork, Encoded
-from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows, whole_steps
+from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows
 from afm_rl.correction.solver import midpoint
 from afm_rl.errors import check_choice, check_count, check_number
 
@@ -43,8 +43,8 @@ class Models(NamedTuple):
     lines: Lines
     """The linear models."""
     weights: Tensor
-    """Probabilities ``(B, 3 + L, A)``: that actions have their nominal effect, now or late; that
-    they have the opposite one; of a reading; of the linear models."""
+    """Probabilities ``(B, 2 + L, A)``: that actions have their nominal effect, now or late;
+    of a reading; of the linear models."""
 
 
 class Tick(nn.Module):
@@ -58,7 +58,8 @@ class Tick(nn.Module):
     scale: Tensor
     points: Tensor
     probes: Tensor
-    sure: Tensor
+    worth: Tensor
+    late: Tensor
     delays: Tensor
     filters: Tensor
     filtered: Tensor
@@ -70,6 +71,9 @@ class Tick(nn.Module):
         scale: Tensor,
         readings: Sequence[str],
         rows: int,
+        worth: Tensor,
+        odds: float,
+        least_noise: float,
         delays: Tensor,
         acting: Tensor,
         samples: int,
@@ -79,24 +83,26 @@ class Tick(nn.Module):
     ) -> None:
         super().__init__()
         self.network, size = network, len(scale)
+        self.odds, self.least_noise = odds, least_noise
         self.source_std = check_number("corrector.source_std", source_std, low=0.0)
         self.steps = check_count("corrector.steps", steps)
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
         chosen = [READINGS[name] for name in readings]
         self.by_place = any(r.near for r in chosen)
         self.varied = sum(r.varied for r in chosen)
-        sure = len(late_ones(readings)), len(whole_steps(readings))
-        self.counts = [1, len(chosen), len(LINEAR), *sure, len(CALM)]
+        self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings)), len(CALM)]
         self.most_late = max(delays.tolist())
+        late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
         filters, which = filters_of(acting)
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
+            "worth": worth,
             "delays": delays,
             "filters": filters,
             "filtered": torch.nn.functional.one_hot(which).T.to(scale),
-            "sure": acting[-sum(sure) - len(CALM) : -len(CALM)].to(scale),
+            "late": torch.tensor(late, dtype=torch.long),
         }
         fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
         for name, value in fixed.items():
@@ -105,7 +111,7 @@ class Tick(nn.Module):
     def forward(
         self,
         pairs: Tensor,
-        weights: Tensor,
+        losses: Tensor,
         noise: Tensor,
         place: Tensor,
         late: Tensor,
@@ -117,7 +123,7 @@ class Tick(nn.Module):
 
         Args:
             pairs: what is remembered, the newest last, ``(B, M, D)``.
-            weights: probabilities of the models, ``(B, M + 1, A)``.
+            losses: of the models, ``(B, M + 1, A)``.
             noise: that no model explains, ``(B, A)``.
             place: where the missions are, ``(B, P)``.
             late: steps that commands are late, ``(B,)``.
@@ -127,6 +133,7 @@ class Tick(nn.Module):
         """
         unit, ends = planned / self.scale, box / self.scale
         read = self.read(pairs, noise, place, late)
+        weights = self.weights(losses, noise)
         models = self.most_likely(read, weights)
         proposals, spread = self.propose(models, unit, ends)
         expected = self.expect(models, proposals)
@@ -159,6 +166,11 @@ class Tick(nn.Module):
             under_way,
         )
 
+    def weights(self, losses: Tensor, noise: Tensor) -> Tensor:
+        """Return the probabilities of the models, ``(B, M + 1, A)``."""
+        prior = prior_of(self.worth, self.odds, noise, self.least_noise)
+        return Belief(losses, losses, noise).weights(prior)
+
     def read(self, pairs: Tensor, noise: Tensor, place: Tensor, late: Tensor) -> Read:
         """Return what the memory says of actions, by all models."""
         away, size = None, len(self.scale)
@@ -179,13 +191,12 @@ class Tick(nn.Module):
 
     def most_likely(self, found: Read, weights: Tensor) -> Models:
         """Return the models of which an action is chosen."""
-        still, read, linear, late, turned, calm = weights.split(self.counts, 1)
+        still, read, linear, late, calm = weights.split(self.counts, 1)
         # Of readings that are alike the first, on any machine and in any batch.
         order = torch.arange(read.shape[1], device=read.device).view(-1, 1)
         best = found.encoded.choose((read * (1 - 1e-4 * order)).argmax(1))
         still = torch.cat([still, late, calm], 1).sum(1, keepdim=True)
-        turned = turned.sum(1, keepdim=True)
-        shares = torch.cat([still, turned, read.sum(1, keepdim=True), linear], 1)
+        shares = torch.cat([still, read.sum(1, keepdim=True), linear], 1)
         return Models(best, found.lines, shares)
 
     def propose(self, models: Models, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
@@ -201,14 +212,13 @@ class Tick(nn.Module):
         exact = asked.answers[..., 0, :MISSES].mT
         least, most = box.split(1, 1)
         probes = torch.lerp(least, most, 0.5 * (self.probes + 1))
-        found = [plan, -plan, mean, ends, exact, models.lines.invert(planned), probes]
+        found = [plan, mean, ends, exact, models.lines.invert(planned), probes]
         return torch.cat(found, 1).clamp(least, most), spread
 
     def expect(self, models: Models, actions: Tensor) -> Tensor:
-        """Return the effects ``(B, 3 + L, C, A)`` of actions ``(B, C, A)`` by every model."""
+        """Return the effects ``(B, 2 + L, C, A)`` of actions ``(B, C, A)`` by every model."""
         read = self.network.effect(models.encoded, actions).unsqueeze(1)
-        here = actions.unsqueeze(1)
-        return torch.cat([here, -here, read, models.lines.effect(actions)], 1)
+        return torch.cat([actions.unsqueeze(1), read, models.lines.effect(actions)], 1)
 
     def reach(self, models: Models, foreseen: Tensor) -> Tensor:
         """Return the lowest and highest effects that actions may have, ``(B, 2, A)``.
@@ -267,7 +277,7 @@ class Tick(nn.Module):
         return action, share * action + rest
 
     def loss(self, models: Models, expected: Tensor, wanted: Tensor, noise: Tensor) -> Tensor:
-        """Return the expected loss ``(B, C, A)`` of effects ``(B, 3 + L, C, A)``."""
+        """Return the expected loss ``(B, C, A)`` of effects ``(B, 2 + L, C, A)``."""
         miss = (expected - wanted[:, None, None]).square() / noise[:, None, None].square()
         return (models.weights.unsqueeze(2) * miss.log1p()).sum(1)
 
@@ -296,8 +306,7 @@ class Tick(nn.Module):
         found = self.network.effect(read.encoded, acts.flatten(0, 1).unsqueeze(1)).view_as(acts)
         linear = read.lines.effect(acting).squeeze(2)
         calmly = [acting.clamp(*read.slow.split(1, 1)), acting + read.noisy]
-        sure = self.sure.to(acted) @ acted[:, -self.sure.shape[-1] :]
-        forecasts = torch.cat([now, found, linear, sure, *calmly], 1)
+        forecasts = torch.cat([now, found, linear, acts[:, self.late], *calmly], 1)
         waits = late + ahead.shape[1] > 1
         if not all_hold(~waits):
             delays = torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)

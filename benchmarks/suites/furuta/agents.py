@@ -99,10 +99,10 @@ class Agent:
 CEM = partial(ICEM, horizon=14, population=128, iterations=2, elites=12, sigma=0.8, beta=1.0)
 PATHS = partial(MPPI, horizon=14, population=128, iterations=2, temperature=0.5, sigma=0.6)
 METHODS = {
+    "iCEM+LQR": partial(Agent, far=CEM),
+    "MPPI+LQR": partial(Agent, far=PATHS),
     "iCEM": partial(Agent, far=CEM, level=0.0, cap=0.0),
     "MPPI": partial(Agent, far=PATHS, level=0.0, cap=0.0),
-    "MPPI+LQR": partial(Agent, far=PATHS),
-    "iCEM+LQR": partial(Agent, far=CEM),
     "uncorrected": partial(Agent, far=CEM, correct=False),
     "truth": partial(Agent, far=CEM, told=True),
 }

@@ -163,9 +163,9 @@ def print_tables(rows: pd.DataFrame, methods: Sequence[str]) -> None:
     for method in methods:
         a, b = (_of(rows, method, part) for part in "AB")
         good = np.isfinite(a["up"]) & (a["held"] > 0.95)
-        cells = [f"{good.sum()}/{len(a)}", f"{_middle(a['up'])}", f"{a['up'].max():.2f}"]
+        cells = [f"{good.sum()}/{len(a)}", _middle(a["up"]), f"{a['up'].max():.2f}"]
         cells += [f"{a['rms'].max():.3f}", f"{np.isfinite(b['up']).sum()}/{len(b)}"]
-        print(f"| {method} | {' | '.join(cells)} | {_middle(b['up'])} |")
+        print(f"| {method} | {' | '.join(cells)} | {_middle(b['up'])} |".replace("inf", "∞"))
     print(f"\n| film | {' | '.join(EVENTS)} | lost | ms a step: median, 95 %, mean |")
     print(f"|---|{'---|' * (len(EVENTS) + 2)}")
     for method in methods:
@@ -173,7 +173,8 @@ def print_tables(rows: pd.DataFrame, methods: Sequence[str]) -> None:
         cells = [f"{_middle(found[name])}, {found[name].max():.2f}" for name in EVENTS]
         lost = np.isinf(found[[*EVENTS]]).any(axis=1).sum()
         ms = ", ".join(f"{alone[f'ms {q}'].mean():.1f}" for q in ("50", "95", "mean"))
-        print(f"| {method} | {' | '.join(cells)} | {lost}/{len(found)} | {ms} |")
+        row = f"| {method} | {' | '.join(cells)} | {lost}/{len(found)} | {ms} |"
+        print(row.replace("inf", "∞"))
 
 
 def _of(rows: pd.DataFrame, method: str, part: str) -> pd.DataFrame:
