@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from actuator_inversion import actuator_inversion_task
+from actuator_inversion.score import scores
 from actuator_inversion.toys import COEFFICIENT, MASS, Coefficients, Sled
 
 from afm_rl.envs import TaskEnv
@@ -193,3 +195,15 @@ def test_the_ode_starts_in_the_unit_interval_and_pays_by_distance():
     place = torch.tensor([[0.04], [-0.06], [0.15], [-0.3], [1.0], [2.1]])
     paid = task.reward(place, place, place)
     torch.testing.assert_close(paid, torch.tensor([1, 1 / 2, 1 / 3, 1 / 4, 0.05, 0]))
+
+
+def test_scores_are_shares_of_what_all_methods_span_in_a_task():
+    rows = pd.DataFrame({"method": ["nothing", "oracle"] * 4, "regime": ["in"] * 4 + ["out"] * 4})
+    rows["return"] = [0, 10, 5, 10, -1, 99, 5, 10]
+    rows["track"] = ["ode"] * 6 + ["cartpole"] * 2
+    rows = rows.assign(cell=rows["track"] + rows["regime"])
+    found = scores(rows).set_index(["split", "method"])["score"]
+    assert found["in", "nothing"] == pytest.approx((0.01 + 0.06) / 2)
+    assert found["out", "oracle"] == 1
+    unused = pd.DataFrame([dict(rows.iloc[0], regime="reversed") | {"return": 1e9}])
+    assert scores(pd.concat([rows, unused])).equals(scores(rows))
