@@ -54,7 +54,7 @@ class Watching:
 
     transitions: int = 20_000
     error: float = 0.5
-    noise: float = 0.5
+    noise: float = 0.2
     hold: int = 20
     fit: Mapping[str, Any] = field(default_factory=lambda: {"epochs": 100})
     model: Mapping[str, Any] = field(default_factory=lambda: {"hidden": [200, 200]})
