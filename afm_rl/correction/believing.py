@@ -86,7 +86,7 @@ class Believer(PairCorrector):
         acting: Tensor | None = None,
         follows: Sequence[bool] | None = None,
         odds: float = 1.0,
-        most_odds: float = 8.0,
+        most_odds: float = 16.0,
         discount: float = 0.95,
         noise: float = 0.05,
         noise_rate: float = 0.1,
