@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from afm_rl.diagnosis.findings import Actuator, Interval, Status
-from afm_rl.diagnosis.pattern import OWN
+from afm_rl.diagnosis.residuals import OWN
 from afm_rl.diagnosis.settings import Settings
 
 UNITS = {

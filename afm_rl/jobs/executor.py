@@ -1,17 +1,19 @@
-"""Where jobs run: one interface, and this machine as the first of its kind."""
+"""Where jobs run: one interface, for this machine and two kinds of cluster."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import sys
+import tempfile
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from afm_rl.errors import AFMError, ConfigurationError
-from afm_rl.jobs.process import Job, is_done, last_words, said, start
+from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_number
+from afm_rl.jobs.process import Job, is_done, last_words, needs, run, said, start
 from afm_rl.jobs.progress import Board
 
 
@@ -114,3 +116,91 @@ class LocalExecutor(Executor):
             process.join(max(0.0, latest - time.monotonic()))
             process.kill()
             process.join()
+
+
+class SubmititExecutor(Executor):
+    """Submits jobs to SLURM as one array, or runs them as if, with submitit.
+
+    submitit hands a job to its node as a pickle. It is in a new folder that only the user can
+    enter, and holds the name of :func:`~afm_rl.jobs.process.run` and a :class:`Job`. What comes
+    back is not read, but what the job leaves in its own folder. The new folder goes when all jobs
+    are over; if the command is ended before, it stays, since the queue needs it.
+
+    Args:
+        cluster: ``slurm``, or ``local`` for this machine.
+        parameters: of ``submitit.AutoExecutor.update_parameters``; those that are None are left to
+            the cluster.
+
+    Raises:
+        ConfigurationError: for another cluster, or if submitit is not installed.
+    """
+
+    def __init__(self, cluster: str = "slurm", parameters: Mapping[str, Any] | None = None) -> None:
+        self.cluster = check_choice("hydra.launcher.cluster", cluster, ("local", "slurm"))
+        given = {key: value for key, value in (parameters or {}).items() if value is not None}
+        self.parameters = {"name": "afm-rl"} | given
+        self.submitit = needs("submitit", "sweeps")
+        self.private = ""
+
+    def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
+        self.private = tempfile.mkdtemp(prefix=".submitit-", dir=jobs[0].folder.parent.parent)
+        try:
+            executor = self.submitit.AutoExecutor(self.private, cluster=self.cluster)
+            executor.update_parameters(**self.parameters)
+            return executor.map_array(run, jobs)
+        except (RuntimeError, NameError, TypeError) as error:  # no cluster, no such parameter
+            raise ConfigurationError(f"hydra.launcher: {' '.join(str(error).split())}") from error
+
+    def is_over(self, handle: Any) -> bool:
+        return handle.done()
+
+    def last_words(self, handle: Any) -> str:
+        said = (handle.stderr() or "").splitlines() or ["no word on standard error"]
+        return f"it ended in state {handle.state} before its results were whole: {said[-1]}"
+
+    def close(self, handles: Collection[Any]) -> None:
+        if not handles:  # else they stay in the queue, with their pickles
+            shutil.rmtree(self.private, ignore_errors=True)
+
+
+class RayExecutor(Executor):
+    """Runs each job on a node of a Ray cluster that has room for it.
+
+    Args:
+        address: of the cluster, as ``ray.init`` takes it; None for the one that ``RAY_ADDRESS``
+            names, or else one of this machine that lasts as long as the command.
+        num_cpus: cores that a job takes up.
+        num_gpus: GPUs that a job takes up.
+
+    Raises:
+        ConfigurationError: for a negative number, or if Ray is not installed.
+    """
+
+    def __init__(
+        self, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0
+    ) -> None:
+        self.address = address
+        self.resources = {
+            "num_cpus": check_number("hydra.launcher.num_cpus", num_cpus, low=0),
+            "num_gpus": check_number("hydra.launcher.num_gpus", num_gpus, low=0),
+        }
+        self.ray = needs("ray", "ray")
+
+    def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
+        self.ray.init(self.address, log_to_driver=False, ignore_reinit_error=True)
+        # Not tried again elsewhere: a job that outgrows a node would bring down the next one.
+        remote = self.ray.remote(max_retries=0, **self.resources)(run)
+        return [remote.remote(job) for job in jobs]
+
+    def is_over(self, handle: Any) -> bool:
+        return bool(self.ray.wait([handle], timeout=0)[0])
+
+    def last_words(self, handle: Any) -> str:
+        try:
+            self.ray.get(handle)
+        except self.ray.exceptions.RayError as error:
+            return str(error).splitlines()[0]
+        return super().last_words(handle)
+
+    def close(self, handles: Collection[Any]) -> None:
+        self.ray.shutdown()

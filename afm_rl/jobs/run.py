@@ -18,10 +18,15 @@ from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.jobs.layout import COMPUTE, CONFIG, MISSIONS, STEPS, UNFINISHED, is_batch, is_finished
 from afm_rl.missions import Agent, Results, build, prepare, run
 from afm_rl.storage import measures
-from afm_rl.storage.csv_text import csv_text
-from afm_rl.storage.files import sync_folder, write_whole
-from afm_rl.storage.manifest import MANIFEST, check_manifest, read_manifest, write_manifest
-from afm_rl.storage.settings import differences, influential
+from afm_rl.storage.files import csv_text, sync_folder, write_whole
+from afm_rl.storage.manifest import (
+    MANIFEST,
+    check_manifest,
+    differences,
+    influential,
+    read_manifest,
+    write_manifest,
+)
 
 READY = "ready"  # the folder of new results, inside that of unfinished ones
 SHOWN = ("diagnosis", "figures", "video", "tensorboard")  # folders drawn from the results

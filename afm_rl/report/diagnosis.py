@@ -19,10 +19,9 @@ from rich.text import Text
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
 from afm_rl.replay import Table as Replayed
 from afm_rl.report import style
-from afm_rl.report.console import WIDE
 from afm_rl.report.figures import Picture
 from afm_rl.report.replay import errors_table, pictures_of
-from afm_rl.report.table import Table
+from afm_rl.report.tables import WIDE, Table
 from afm_rl.report.write import render_page
 from afm_rl.storage.files import write_whole
 

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
-from afm_rl.report.table import Table, number
+from afm_rl.report.tables import Table, number
 
 STAY = 20  # steps that the error must stay low
 MEASURES = {  # columns, by what they measure

@@ -18,9 +18,8 @@ from afm_rl.replay import Table as Replayed
 from afm_rl.replay.table import AFM, ALONE, SHARES
 from afm_rl.report import style
 from afm_rl.report.figures import Picture
-from afm_rl.report.table import Table
-from afm_rl.storage.csv_text import csv_text
-from afm_rl.storage.files import write_whole
+from afm_rl.report.tables import Table
+from afm_rl.storage.files import csv_text, write_whole
 
 TITLE = "Error of predictions"
 NOTE = (

@@ -18,8 +18,7 @@ from afm_rl.report import style
 from afm_rl.report.cells import action_names
 from afm_rl.report.space_plot import GOAL, POSITION, dress_space, mark_regimes
 from afm_rl.report.style import BEFORE, CHANGED, EXECUTED, PLANNED, REFERENCE, START, TARGET
-from afm_rl.report.track_plot import DrawableTrack, draw_road, view
-from afm_rl.report.trajectory import changed_stretch, positions
+from afm_rl.report.trajectory import DrawableTrack, changed_stretch, draw_road, positions, view
 
 COLUMNS = ("x", "y", "goal_x", "goal_y", "error", "misaligned", "regime_active")  # at least
 BODY = np.array([[1.0, 0.0], [-0.8, 0.65], [-0.4, 0.0], [-0.8, -0.65]])  # seen from above

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from afm_rl.compiling.cast_cache import CastCache
+from afm_rl.compiling.devices import CastCache
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import roma
 import torch
 from scipy.spatial.transform import Rotation
 
-from afm_rl.spaces.rigid_body import RigidBodySpace
+from afm_rl.spaces.manifold import RigidBodySpace
 
 ANGLES = [0.0, 1e-12, 1e-8, 1e-3, 0.1, 1.0, 3.0, math.pi - 1e-6]
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from afm_rl.spaces.sampling import draw_states, uniform
+from afm_rl.spaces.manifold import draw_states, uniform
 
 
 def test_points_fill_their_box_evenly():

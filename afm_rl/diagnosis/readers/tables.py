@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from afm_rl.diagnosis.readers.source import Series, Source
-from afm_rl.diagnosis.readers.thin import blocks_of, thinned_note
+from afm_rl.diagnosis.readers.source import Series, Source, blocks_of, thinned_note
 from afm_rl.errors import ConfigurationError, printable
 
 TIME, EPISODE = "t", "episode_index"
