@@ -13,21 +13,12 @@ from yaml import safe_dump
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.jobs.executor import Executor
-from afm_rl.jobs.layout import (
-    COMPUTE,
-    JOBS,
-    MISSIONS,
-    RECORD,
-    is_batch,
-    is_finished,
-    job_folders,
-    recorded,
-)
+from afm_rl.jobs.layout import is_batch, is_finished, job_folders, recorded
 from afm_rl.jobs.process import Job
 from afm_rl.jobs.progress import Board
 from afm_rl.jobs.run import begin, csv_of, needs_run
 from afm_rl.storage.files import locked, remove_parts, write_whole
-from afm_rl.storage.manifest import MANIFEST, write_manifest
+from afm_rl.storage.manifest import COMPUTE, JOBS, MANIFEST, MISSIONS, RECORD, write_manifest
 from afm_rl.trust import trusted
 
 
@@ -94,10 +85,6 @@ def _record(folder: Path, jobs: Sequence[Job], command: str) -> None:
 
 def file_name(name: str, longest: int = 120) -> str:
     """Return a name for the folder of a job: readable, and another one for every job.
-
-    Args:
-        name: of the job.
-        longest: characters that are kept of it.
 
     >>> file_name("physics+planner.horizon=5")
     'physics+planner.horizon=5'

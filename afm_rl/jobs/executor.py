@@ -51,12 +51,7 @@ class Executor(ABC):
         """Deal with the jobs that still run when the command ends, if any."""
 
     def run(self, jobs: Sequence[Job], board: Board) -> dict[str, str]:
-        """Run jobs, in any order; return why some have no results, by name.
-
-        Args:
-            jobs: what to run.
-            board: is told of each job that is over, and looks at the others now and then.
-        """
+        """Run jobs, in any order; return why some have no results, by name."""
         waiting, running, failures = deque(jobs), dict[Job, Any](), dict[str, str]()
         try:
             while waiting or running:

@@ -7,20 +7,14 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from afm_rl.jobs.layout import LOG, UNFINISHED
+from afm_rl.jobs.layout import LOG
 from afm_rl.jobs.process import PROGRESS, Job
 from afm_rl.progress import Bar
+from afm_rl.storage.manifest import UNFINISHED
 
 
 class Board:
-    """Shows how far jobs are, and how much time is left.
-
-    Args:
-        jobs: those that are still to be run.
-        count: of all jobs, also the finished ones.
-        shown: show progress; the ends of jobs are said in any case.
-        echo: receives lines of text, off a terminal.
-    """
+    """Shows how far jobs are, and how much time is left."""
 
     def __init__(
         self, jobs: Sequence[Job], count: int, shown: bool, echo: Callable[[str], object]

@@ -15,12 +15,17 @@ from yaml import YAMLError, safe_load
 
 from afm_rl._version import __version__
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.jobs.layout import COMPUTE, CONFIG, MISSIONS, STEPS, UNFINISHED, is_batch, is_finished
+from afm_rl.jobs.layout import is_batch, is_finished
 from afm_rl.missions import Agent, Results, build, prepare, run
 from afm_rl.storage import measures
 from afm_rl.storage.files import csv_text, sync_folder, write_whole
 from afm_rl.storage.manifest import (
+    COMPUTE,
+    CONFIG,
     MANIFEST,
+    MISSIONS,
+    STEPS,
+    UNFINISHED,
     check_manifest,
     differences,
     influential,
@@ -37,11 +42,6 @@ def needs_run(folder: Path, cfg: DictConfig, overwrite: bool = False) -> bool:
     """Return whether the missions of a configuration are still to be run in a folder.
 
     Nothing is written.
-
-    Args:
-        folder: of the run.
-        cfg: settings of one method, with its label.
-        overwrite: the folder may hold anything, which will be replaced.
 
     Raises:
         ConfigurationError: if the folder holds something else.
@@ -82,12 +82,7 @@ def _check_same(path: Path, cfg: DictConfig, version: str) -> None:
 
 
 def begin(folder: Path, cfg: DictConfig) -> None:
-    """Write down what a run is asked. Checkpoints of other settings are removed.
-
-    Args:
-        folder: of the run.
-        cfg: settings of one method, with its label.
-    """
+    """Write down what a run is asked. Checkpoints of other settings are removed."""
     path = folder / UNFINISHED / CONFIG
     if path.exists():
         try:

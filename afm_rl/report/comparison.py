@@ -104,15 +104,7 @@ def draw_profile(
     styles: Mapping[str, style.Style],
     widest: float = 20.0,
 ) -> Figure:
-    """Return a figure of the share of missions within a factor of the least.
-
-    Args:
-        missions: one row per mission, with ``cell``.
-        ratio: from :func:`ratios`, of all methods.
-        spent: what missions spend.
-        styles: the methods to draw, and how.
-        widest: largest factor that is shown.
-    """
+    """Return a figure of the share of missions within a factor of the least."""
     finite = ratio[np.isfinite(ratio)]
     limit = float(np.clip(finite.max() if len(finite) else 2.0, 2.0, widest))
     taus, shares, counts = np.geomspace(1.0, limit, 200), {}, {}
@@ -135,15 +127,7 @@ def draw_profile(
 def draw_progress(
     progress: pd.DataFrame, styles: Mapping[str, style.Style], name: str, resamples: int = 500
 ) -> Figure:
-    """Return a figure of the mean share of what was reached against the number of steps.
-
-    Args:
-        progress: shares, one row per ``method`` and ``cell`` of a mission (the index), one column
-            per number of steps.
-        styles: the methods to draw, and how.
-        name: what is reached.
-        resamples: draws of the bootstrap; the band is as wide as a line, no need for more.
-    """
+    """Return a figure of the mean share of what was reached against the number of steps."""
 
     def mean(samples: list[np.ndarray]) -> np.ndarray:
         return np.concatenate(samples, -1).mean(-1)

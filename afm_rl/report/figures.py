@@ -36,14 +36,7 @@ def draw_run(
     measures: Measures,
     tracks: Sequence[DrawableTrack] = (),
 ) -> Iterator[Picture]:
-    """Yield the figures of a run: paths, whether plans came true, and all missions.
-
-    Args:
-        missions: one row per mission.
-        steps: one row per mission and step.
-        measures: what methods are compared by.
-        tracks: tracks to draw, found by name.
-    """
+    """Yield the figures of a run: paths, whether plans came true, and all missions."""
     yield from _paths("{}", "Paths", missions, steps, measures, tracks)
     figure = learning.draw_learning(missions, steps, measures.error_unit)
     title = "How far plans came true"
@@ -61,12 +54,6 @@ def draw_report(
     """Yield the figures of a report, in the order of the page.
 
     Where there are more than six methods, figures of lines and maps come in several pages.
-
-    Args:
-        runs: the results.
-        missions: one row per mission, from :func:`~.statistics.count_budgets`.
-        progress: from :func:`read_excerpts`.
-        tracks: tracks to draw; a map whose track is not here has no road.
     """
     measures = runs.measures
     yield _summary(missions, measures)
@@ -149,10 +136,6 @@ def traced_missions(missions: pd.DataFrame) -> pd.DataFrame:
 
 def read_excerpts(runs: Runs, points: int = 240) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Read the steps of each method in turn and keep what a report needs of them.
-
-    Args:
-        runs: the results.
-        points: of each curve of progress.
 
     Returns:
         Recovery times, with ``method``; and the share of what there is to reach, one row per

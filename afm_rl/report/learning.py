@@ -80,10 +80,6 @@ def draw_learning(
 def last_step(missions: pd.DataFrame, beyond: float = 1.15) -> float:
     """Return where the axis of steps ends: soon after the last mission that finishes.
 
-    Args:
-        missions: with ``steps``, and ``finished`` if there is a goal.
-        beyond: of the longest mission that finished.
-
     >>> last_step(pd.DataFrame({"steps": [400, 5000], "finished": [True, False]}))
     460.0
     >>> last_step(pd.DataFrame({"steps": [400, 430], "finished": [True, False]}))
@@ -128,10 +124,7 @@ def _mark_regime(axes: Axes, steps: pd.DataFrame, look: style.Style, alone: bool
 
 
 def _scale(axes: Axes, name: str, values: pd.Series, linear: float = 10.0) -> None:
-    """Give axes a scale that shows these distances (positive), or losses (of either sign).
-
-    Losses up to ``linear`` are drawn to a linear scale.
-    """
+    """Give axes a scale that shows these distances (positive), or losses (of either sign)."""
     if name != "loss":
         if (values > 0).any():
             axes.set_yscale("log", nonpositive="mask")

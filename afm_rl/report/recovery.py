@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
-from afm_rl.report.tables import Table, number
+from afm_rl.report.tables import Table
+from afm_rl.storage.measures import number
 
 STAY = 20  # steps that the error must stay low
 MEASURES = {  # columns, by what they measure
@@ -57,14 +58,7 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
 def _times(
     error: np.ndarray, changes: np.ndarray, factor: float = 1.5, floor: float = 1e-4
 ) -> list[tuple[int, float, float]]:
-    """Return changes, from 1, and their two times.
-
-    Args:
-        error: of each step.
-        changes: places in ``error``.
-        factor: nominal level over the 95th percentile before the first change.
-        floor: least level (m, rad): below it every robot counts as well predicted.
-    """
+    """Return changes, from 1, and their two times."""
     level = max(floor, factor * float(np.quantile(error[: changes[0]], 0.95)))
     times = []
     for count, (start, end) in enumerate(zip(changes, [*changes[1:], len(error)], strict=True)):
@@ -77,11 +71,7 @@ def _times(
 
 
 def recovery_table(times: pd.DataFrame) -> Table:
-    """Return medians per method, measure and change.
-
-    Args:
-        times: rows of :func:`recovery_times` with a column ``method``; at least one.
-    """
+    """Return medians per method, measure and change."""
 
     def share(of: float) -> object:
         return lambda steps: steps.quantile(of, interpolation="lower")

@@ -11,23 +11,27 @@ import pandas as pd
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.report.cells import cell_names, outcome
 from afm_rl.report.stranger import read_numbers, read_settings, read_table, read_text
-from afm_rl.storage.manifest import MANIFEST, check_manifest
+from afm_rl.storage.manifest import (
+    COMPUTE,
+    CONFIG,
+    JOBS,
+    MANIFEST,
+    MISSIONS,
+    RECORD,
+    STEPS,
+    UNFINISHED,
+    check_manifest,
+)
 from afm_rl.storage.measures import FILE, Measures
 
-MISSIONS, STEPS, COMPUTE, RECORD = "missions.csv", "steps.parquet", "compute.csv", "jobs.yaml"
 Plan = list[tuple[str, list[int]]]
 KEY = ["method", "cell", "seed"]
 
 
 def run_folders(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the folders of the runs in a folder, in the order of its record, and lost ones.
-
-    Raises:
-        ConfigurationError: if there are none.
-        ArtefactError: if a file that the manifest names is damaged.
-    """
+    """Return the folders of the runs in a folder, in the order of its record, and lost ones."""
     record = folder / RECORD
-    jobs = {path.name: path for path in sorted((folder / "jobs").glob("*")) if path.is_dir()}
+    jobs = {path.name: path for path in sorted((folder / JOBS).glob("*")) if path.is_dir()}
     if not jobs and not record.is_file():
         if not has_results(folder):
             what = f"holds no {MISSIONS}" if folder.is_dir() else "no such folder"
@@ -42,7 +46,7 @@ def run_folders(folder: Path) -> tuple[list[Path], list[Path]]:
         raise ConfigurationError(f"{record}: damaged; expected a list of jobs")
     names = [*map(str, named)]
     there = [jobs[name] for name in dict.fromkeys([*names, *jobs]) if name in jobs]
-    return there, [folder / "jobs" / name for name in names if name not in jobs]
+    return there, [folder / JOBS / name for name in names if name not in jobs]
 
 
 def has_results(folder: Path) -> bool:
@@ -51,12 +55,8 @@ def has_results(folder: Path) -> bool:
 
 
 def read_plan(run: Path, most: int = 100_000) -> Plan:
-    """Return the method and the seeds, ``most`` at most, that a run was to have by its settings.
-
-    Raises:
-        ConfigurationError: if the settings cannot be read.
-    """
-    paths = [run / "config.yaml", run / "unfinished" / "config.yaml"]
+    """Return the method and the seeds, ``most`` at most, that a run was to have by its settings."""
+    paths = [run / CONFIG, run / UNFINISHED / CONFIG]
     for path in (path for path in paths if path.is_file()):
         settings = read_settings(path)
         seeds = settings.get("seeds", [])
@@ -71,11 +71,7 @@ def read_plan(run: Path, most: int = 100_000) -> Plan:
 
 
 def read_joined_plan(folder: Path) -> Plan:
-    """Return the methods and seeds of the table that a batch has of all its jobs, if it is there.
-
-    Raises:
-        ConfigurationError: if it cannot be read.
-    """
+    """Return the methods and seeds of the table of all jobs of a batch, if there is one."""
     if not (folder / MISSIONS).is_file():
         return []
     asked = read_table(folder / MISSIONS, ["seed"], ["method"])
@@ -83,12 +79,7 @@ def read_joined_plan(folder: Path) -> Plan:
 
 
 def read_measures(run: Path) -> Measures:
-    """Return what the missions of a run are compared by.
-
-    Raises:
-        ConfigurationError: if there is no such file.
-        ArtefactError: if it is damaged.
-    """
+    """Return what the missions of a run are compared by."""
     try:
         return Measures.from_json(read_text(run / FILE))
     except ArtefactError as error:
@@ -96,11 +87,7 @@ def read_measures(run: Path) -> Measures:
 
 
 def read_missions(run: Path, measures: Measures) -> pd.DataFrame:
-    """Return the missions of a run, checked, with ``cell``, and ``seconds`` if they were counted.
-
-    Raises:
-        ConfigurationError: if a file cannot be read, a column is missing, or a value cannot be.
-    """
+    """Return the missions of a run, checked, with ``cell``, and ``seconds`` if they are known."""
     path, whole = run / MISSIONS, ["seed", "steps", "mission"]
     numbers = list(dict.fromkeys([*whole, *measures.columns]))
     missions = read_table(path, numbers, ["method", "track"])

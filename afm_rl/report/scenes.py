@@ -86,11 +86,7 @@ def map_scene(
 def _robot(
     axes: Axes, steps: pd.DataFrame, color: str, span: float, alone: bool
 ) -> tuple[Moves, dict[str, Artist]]:
-    """Draw a robot on a map; return what moves, and what stands in the legend.
-
-    Its line so far, its body, and alone its target and actions. One that has ended stays where it
-    is.
-    """
+    """Draw a robot on a map; return what moves, and what stands in the legend."""
     path = positions(steps)
     moved = np.diff(path, axis=0, prepend=path[:1])
     heading = (
@@ -137,10 +133,7 @@ def _point(arrow: FancyArrowPatch, starts: np.ndarray, ends: np.ndarray, row: in
 
 
 def _courses(steps: pd.DataFrame, heading: np.ndarray, ahead: float = 0.5) -> np.ndarray:
-    """Return arrows ``(2, T, 2)`` of planned and executed actions, the longest of size 1.
-
-    They turn for ``ahead`` seconds.
-    """
+    """Return arrows ``(2, T, 2)`` of planned and executed actions, the longest of size 1."""
     kinds = ("planned", "executed")
     fast, turning = (
         np.stack([steps[f"{kind}_{name}"].to_numpy(dtype=float) for kind in kinds])
@@ -152,12 +145,7 @@ def _courses(steps: pd.DataFrame, heading: np.ndarray, ahead: float = 0.5) -> np
 
 
 def space_scene(title: str, steps: pd.DataFrame) -> Scene:
-    """Return the scene of a path in space, with the height and the first action over time.
-
-    Args:
-        title: what is shown.
-        steps: one mission's steps, with :data:`COLUMNS`, ``z``, ``goal_z`` and actions.
-    """
+    """Return the scene of a path in space, with the height and the first action over time."""
     figure, action = style.new_figure(9.6, 28 * GRID), action_names(steps)[0]
     grid = figure.add_gridspec(2, 2, width_ratios=[1.2, 1])
     space: Any = figure.add_subplot(grid[:, 0], projection="3d")
@@ -193,10 +181,7 @@ def space_scene(title: str, steps: pd.DataFrame) -> Scene:
 
 
 def _cursors(panels: Mapping[str, Axes], steps: pd.DataFrame, alone: bool) -> Moves:
-    """Dress axes over time, by their labels; return the lines that mark now.
-
-    Methods change at different steps: changes are marked of a method ``alone``.
-    """
+    """Dress axes over time, by their labels; return the lines that mark now."""
     if alone:
         mark_regimes([*panels.values()], steps)
     moving: Moves = {}

@@ -254,11 +254,6 @@ def aggregate(missions: pd.DataFrame, measures: Measures, oracle: str) -> pd.Dat
     of what was spent over what the oracle spent, where it finished (``ratio``) and over all pairs
     (``ratio_all``), each with ``_low``, ``_high`` and ``_pairs``; ``per_hour``, missions per hour
     of computing, of those whose time was counted.
-
-    Args:
-        missions: one row per mission, with ``cell``, from :func:`count_budgets`.
-        measures: what methods are compared by.
-        oracle: name of the method that others are compared with.
     """
     rows = summarise(missions, measures).to_dict("records")
     for row in rows:
@@ -303,11 +298,6 @@ def compare(missions: pd.DataFrame, measures: Measures, baselines: Sequence[str]
     Columns: ``baseline``, ``method``, ``pairs``; means of paired differences of each measure under
     its column's name (NaN without pairs), and ``better``, the probability of improvement, each
     with ``_low`` and ``_high``.
-
-    Args:
-        missions: from :func:`count_budgets`.
-        measures: what methods are compared by.
-        baselines: names of methods; those that have no missions are passed over.
     """
     rows = []
     groups = dict(iter(rank_missions(missions, measures).groupby("method", sort=False)))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 from matplotlib.axes import Axes
@@ -113,10 +113,6 @@ def groups_of_methods(methods: Iterable[str]) -> list[list[str]]:
 def excerpt(missions: pd.DataFrame, cells: int) -> tuple[pd.DataFrame, dict[str, Style], str]:
     """Return what a figure shows of some missions.
 
-    Args:
-        missions: one row per mission.
-        cells: how many are shown.
-
     Returns:
         The first mission of each method and cell, of the first six methods; how these methods are
         drawn; and a sentence on what is left out.
@@ -133,12 +129,6 @@ def new_figure(width: float, height: float) -> Figure:
     figure = Figure((width, height), dpi=DPI, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     return figure
-
-
-def grid(axes: Axes, axis: Literal["both", "x", "y"] = "both") -> None:
-    """Draw faint lines behind everything."""
-    axes.grid(axis=axis, color="#eeeeee", linewidth=0.6)
-    axes.set_axisbelow(True)
 
 
 def dress(axes: Any, x: str = "", y: str = "", lines: Any = None, size: float = SMALL) -> None:
@@ -159,7 +149,8 @@ def dress(axes: Any, x: str = "", y: str = "", lines: Any = None, size: float = 
         if label:
             write(literal(label), fontsize=size)
     if lines:
-        grid(axes, lines)
+        axes.grid(axis=lines, color="#eeeeee", linewidth=0.6)
+        axes.set_axisbelow(True)
 
 
 def legend_above(

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import shorten
 from typing import IO
 
 import pandas as pd
 from rich import box
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.table import Table as Grid
 from rich.text import Text
 
 from afm_rl.report.cells import outcome
 from afm_rl.report.statistics import summarise
 from afm_rl.storage.files import csv_text
-from afm_rl.storage.measures import Measures
+from afm_rl.storage.measures import Measures, number
 
 # What LaTeX writes another way; the escapes of pandas leave these alone.
 LATEX = {"±": r"$\pm$", "∞": r"$\infty$"}
@@ -106,27 +105,32 @@ class Table:
 
     def to_grid(self, columns: Sequence[int] | None = None, caption: str | None = None) -> Grid:
         """Return some columns of the table, or all, for the terminal."""
-        grid = Grid(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False, caption=caption)
-        chosen = range(self.shown.shape[1]) if columns is None else columns
-        for column in chosen:
-            grid.add_column(Text(self.shown.columns[column]), justify="right" if column else "left")
-        for row, texts in enumerate(self.shown.to_numpy()):
-            looks = ("bold" if (row, column) in self.bold else "" for column in chosen)
-            grid.add_row(*(Text(texts[c], look) for c, look in zip(chosen, looks, strict=True)))
-        return grid
+        chosen = list(range(self.shown.shape[1]) if columns is None else columns)
+
+        def look(row: int, column: int) -> str:
+            return "bold" if (row, chosen[column]) in self.bold else ""
+
+        return grid_of(self.shown.iloc[:, chosen], look, "right", caption)
 
 
-def number(value: float, digits: int = 0) -> str:
-    """Return a number as text; a dash if there is none.
+def grid_of(
+    shown: pd.DataFrame,
+    look: Callable[[int, int], str] = lambda row, column: "",
+    justify: JustifyMethod = "left",
+    caption: str | None = None,
+) -> Grid:
+    """Return texts as a table for the terminal, by the look of each place ``(row, column)``."""
+    grid = Grid(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False, caption=caption)
+    for column, head in enumerate(shown):
+        grid.add_column(Text(str(head)), justify=justify if column else "left")
+    for row, texts in enumerate(shown.to_numpy()):
+        grid.add_row(*(Text(text, look(row, column)) for column, text in enumerate(texts)))
+    return grid
 
-    >>> number(0.1234, 2), number(math.nan), number(math.inf)
-    ('0.12', '-', '∞')
-    """
-    if math.isnan(value):
-        return "-"
-    if math.isinf(value):
-        return "∞" if value > 0 else "-∞"
-    return f"{value:.{digits}f}"
+
+def terminal(file: IO[str] | None) -> Console:
+    """Return what prints tables to a file, or to standard output: plain text off a terminal."""
+    return Console(file=file, width=WIDE, highlight=False)
 
 
 def interval_text(
@@ -176,7 +180,7 @@ def print_summary(
      physics         1           100    300
     <BLANKLINE>
     """
-    console = Console(file=file, width=WIDE, highlight=False)
+    console = terminal(file)
     table = summary_table(summarise(missions, measures), measures)
     some = table.shown.apply(lambda texts: texts.str.contains("[", regex=False)).any(axis=None)
     caption = "mean [95 % interval, seeds drawn anew within cells]" if some else None
@@ -275,12 +279,7 @@ def cell_table(missions: pd.DataFrame, measures: Measures) -> Table:
 
 
 def missing_table(missing: pd.DataFrame, cells: int) -> Table:
-    """Return the table of what is missing, one row per method and set of seeds.
-
-    Args:
-        missing: one row per ``method``, ``cell`` and ``seed``.
-        cells: how many there are in all.
-    """
+    """Return the table of what is missing, one row per method and set of seeds."""
     rows = []
     seeds = missing.groupby(["method", "cell"], sort=False)["seed"].agg(tuple).reset_index()
     for (method, numbers), group in seeds.groupby(["method", "seed"], sort=False):

@@ -201,14 +201,7 @@ def changed_stretch(active: np.ndarray) -> np.ndarray:
 def draw_path(
     axes: Axes, steps: pd.DataFrame, finished: bool, track: DrawableTrack | None = None
 ) -> None:
-    """Draw one mission: its line, the changed stretch, the start and how it ended.
-
-    Args:
-        axes: where to; their limits must be set.
-        steps: the mission's steps, in order.
-        finished: did it finish?
-        track: to say how far from the road a mission that left the picture ended.
-    """
+    """Draw one mission: its line, the changed stretch, the start and how it ended."""
     path = positions(steps)
     changed = changed_stretch(steps["regime_active"].to_numpy())
     x, y = np.where(changed[:, None], path, np.nan).T
@@ -228,10 +221,7 @@ def draw_path(
 
 
 def _last_inside(axes: Axes, path: np.ndarray, inset: float = 0.02) -> np.ndarray:
-    """Return the last point of a path ``(T, 2)`` that is well inside the view.
-
-    ``inset`` is half of what a view shows around all: no end that it was made for is farther out.
-    """
+    """Return the last point of a path ``(T, 2)`` that is well inside the view."""
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     edge = inset * (high - low).max()
     inside = ((path > low + edge) & (path < high - edge)).all(-1)
@@ -259,10 +249,7 @@ def _write_distance(axes: Axes, end: np.ndarray, distance: float) -> None:
 def _maps(
     methods: Sequence[str], views: Mapping[str, Box]
 ) -> tuple[Figure, dict[tuple[str, str], Axes]]:
-    """Return a figure with axes by cell and method; those of a row show the same area.
-
-    All maps side by side are 9.9 inches wide; one is 1.9 wide at least and 3.4 tall at most.
-    """
+    """Return a figure with axes by cell and method; those of a row show the same area."""
     most = 3.4
     width = max(1.9, min(9.9 / len(methods), 1.5 * most))
     tall = [min(width * box.ratio, most) for box in views.values()]

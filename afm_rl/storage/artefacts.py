@@ -58,11 +58,6 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def load_artefact(path: Path, module: nn.Module, description: Mapping[str, Any]) -> dict[str, Any]:
     """Load a module's state, if it is whole and fits; return the file's description.
 
-    Args:
-        path: file written by :func:`save_artefact`.
-        module: receives the state.
-        description: entries that the file's description must have.
-
     Raises:
         ConfigurationError: if there is no such file.
         ArtefactError: if it is damaged, or belongs to something else.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -12,7 +12,9 @@ from afm_rl._version import __version__
 from afm_rl.errors import ArtefactError
 from afm_rl.storage.files import write_whole
 
-MANIFEST = "manifest.json"
+MANIFEST, CONFIG, UNFINISHED = "manifest.json", "config.yaml", "unfinished"
+MISSIONS, STEPS, COMPUTE = "missions.csv", "steps.parquet", "compute.csv"
+JOBS, RECORD = "jobs", "jobs.yaml"
 _REMEDY = "restore it, or delete the folder and run the same command again"
 WITHOUT_INFLUENCE = (
     *(
@@ -82,10 +84,6 @@ def check_manifest(folder: str | Path) -> dict[str, str]:
 
 def read_verified(folder: str | Path, name: str) -> bytes:
     r"""Return the content of one file, if the manifest of its folder has its SHA-256.
-
-    Args:
-        folder: the one with the manifest.
-        name: of the file, relative to ``folder``.
 
     Raises:
         ArtefactError: if there is no manifest, the manifest or the file is damaged, or the
@@ -181,26 +179,19 @@ def _without(value: Any, names: tuple[str, ...]) -> Any:
     return {key: _without(part, names) for key, part in value.items() if key not in names}
 
 
-def differences(old: Any, new: Any) -> list[str]:
+def differences(old: Any, new: Any, key: str = "") -> list[str]:
     """Name what differs between two nested mappings, one line for each value.
 
     >>> differences({"a": {"b": 1, "c": 2}}, {"a": {"b": 3}, "d": None})
     ['a.b: 1 -> 3', 'a.c: 2 -> nothing', 'd: nothing -> None']
     """
-    return list(_differences(old, new, ""))
-
-
-def _differences(old: Any, new: Any, key: str) -> Iterator[str]:
     if isinstance(old, Mapping) and isinstance(new, Mapping):
+        found = []
         for name in dict.fromkeys([*old, *new]):
-            was, will = (side.get(name, _Nothing()) for side in (old, new))
-            yield from _differences(was, will, f"{key}.{name}" if key else str(name))
-    elif old != new:
-        yield f"{key}: {old} -> {new}"
-
-
-class _Nothing:
-    """Stands for a value that is not there."""
-
-    def __str__(self) -> str:
-        return "nothing"
+            inner = f"{key}.{name}" if key else str(name)
+            if name in old and name in new:
+                found += differences(old[name], new[name], inner)
+            else:
+                found.append(f"{inner}: {old.get(name, 'nothing')} -> {new.get(name, 'nothing')}")
+        return found
+    return [f"{key}: {old} -> {new}"] if old != new else []
