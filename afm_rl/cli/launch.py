@@ -24,7 +24,7 @@ from afm_rl.envs import load_track
 from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag, check_number
 from afm_rl.jobs.batch import run_batch
 from afm_rl.jobs.executor import Executor, JobsFailed, LocalExecutor
-from afm_rl.jobs.layout import JOBS, LOG
+from afm_rl.jobs.layout import LOG
 from afm_rl.jobs.process import handled
 from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
 from afm_rl.missions import Agent, build
@@ -41,7 +41,7 @@ from afm_rl.report import (
 )
 from afm_rl.report.diagnosis import write_diagnosis
 from afm_rl.storage.files import locked
-from afm_rl.storage.manifest import extend_manifest, read_manifest, write_manifest
+from afm_rl.storage.manifest import JOBS, extend_manifest, read_manifest, write_manifest
 
 SWITCHES = ("overwrite", "progress", "figures", "tensorboard")
 ENDS = (signal.SIGINT, signal.SIGTERM)
@@ -80,17 +80,7 @@ def sweep(
     overrides: Sequence[Sequence[str]],
     executor: Executor,
 ) -> None:
-    """Run the jobs of a sweep, and report on them.
-
-    Args:
-        cfg: the settings that all have.
-        configs: those of each combination.
-        overrides: what each was composed from.
-        executor: where they run.
-
-    Raises:
-        JobsFailed: if some have no results, once the others are done.
-    """
+    """Run the jobs of a sweep, and report on them."""
     film = check_settings(cfg)
     common = set.intersection(*map(set, overrides))
     jobs, failures = dict[str, DictConfig](), dict[str, str]()
@@ -117,9 +107,6 @@ def check_settings(cfg: DictConfig) -> str | None:
 
     Returns:
         The format of films; None for no films.
-
-    Raises:
-        ConfigurationError: for one that cannot be used.
     """
     torch.set_num_threads(check_count("threads", cfg.threads, high=256))
     for name in SWITCHES:
@@ -151,14 +138,6 @@ def run_together(
     failures: Mapping[str, str] | None = None,
 ) -> JobsFailed | None:
     """Run jobs, and say which of them failed.
-
-    Args:
-        folder: of the batch.
-        jobs: settings of each, by name.
-        executor: where they run.
-        cfg: settings of the command.
-        overrides: of the command, for people.
-        failures: jobs that could not even be composed, with reasons.
 
     Returns:
         What to raise once the results of the others are shown.
@@ -193,14 +172,7 @@ def _interruptible(folder: Path) -> Iterator[None]:
 
 
 def show(folder: Path, cfg: DictConfig, agents: Sequence[Agent], film: str | None) -> None:
-    """Draw the results of a run or a comparison, print their table, and explain a mission.
-
-    Args:
-        folder: of the results.
-        cfg: settings of the command.
-        agents: one of each method; their environments know tracks, and how a robot is drawn.
-        film: the format of films; None for no films.
-    """
+    """Draw the results of a run or a comparison, print their table, and explain a mission."""
     runs = read_runs([folder])
     missions, steps, measures = runs.missions, runs.steps(), runs.measures
     roads = [getattr(agent.base_env, "tracks", ()) for agent in agents]  # flights have none

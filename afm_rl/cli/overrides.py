@@ -67,14 +67,10 @@ def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
         return list(arguments)
     own = [parts for parts in given if not parts[0].startswith(("hydra.", "hydra/"))]
     asked = sorted("".join(parts) for parts in own if parts[0] not in BESIDE)
-    swept = [key.strip("+~") for key, _, value in own if re.search(r"[,(]", _bare(value))]
+    bare = [(key, re.sub(r"\[.*]|\{.*}", "", value)) for key, _, value in own]  # lists do not sweep
+    swept = [key.strip("+~") for key, value in bare if re.search(r"[,(]", value)]
     name = "-".join([*swept, hashlib.sha256("\0".join(asked).encode()).hexdigest()[:6]])
     return [*arguments, f"hydra.sweep.dir=multirun/{re.sub(r'[^-.0-9A-Z_a-z]', '_', name[-60:])}"]
-
-
-def _bare(value: str) -> str:
-    """Leave out lists and mappings, whose commas do not sweep."""
-    return re.sub(r"\[.*]|\{.*}", "", value)
 
 
 def optional(overrides: Sequence[str]) -> dict[str, str]:
@@ -114,9 +110,6 @@ class TrustedFolders(SearchPathPlugin):
 def trusted_packages(arguments: Sequence[str]) -> list[str]:
     """Return the packages that the command line itself trusts; files cannot.
 
-    Raises:
-        ConfigurationError: if these are no names.
-
     >>> trusted_packages(["method=physics", "trust=[mine, my.models]"])
     ['mine', 'my.models']
     """
@@ -131,9 +124,6 @@ def checked(arguments: Sequence[str]) -> Iterator[list[str]]:
 
     Yields:
         The packages that the command trusts.
-
-    Raises:
-        ConfigurationError: for a package that cannot be found, and for code that is not trusted.
     """
     load = ConfigLoaderImpl.load_configuration
 

@@ -15,10 +15,6 @@ from afm_rl.errors import ConfigurationError
 def check_device(name: str, value: object) -> torch.device:
     """Return the device that a setting names.
 
-    Args:
-        name: of the setting.
-        value: ``"cpu"``, ``"cuda"``, ``"cuda:1"`` or ``"mps"``.
-
     Raises:
         ConfigurationError: if it is no device, or is not there.
 

@@ -51,9 +51,6 @@ def recall(path: Path) -> tuple[bytes | None, str]:
     The bytes that were checked are those that are returned, so that nobody can change them
     in between.
 
-    Args:
-        path: the file.
-
     Returns:
         The program; or None, and why what is there must not run, if anything is there.
     """
@@ -115,13 +112,7 @@ class Trace(NamedTuple):
 
 
 def trace(module: nn.Module, inputs: Sequence[Tensor], shapes: Any = None) -> Trace:
-    """Return what a module computes of such inputs.
-
-    Args:
-        module: takes and returns tensors.
-        inputs: an example.
-        shapes: which dimensions may be of any size, as in ``torch.export``.
-    """
+    """Return what a module computes of such inputs."""
     begun = time.monotonic()
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -167,12 +158,7 @@ def _working_in(folder: Path) -> Iterator[None]:
 
 
 class MachineCode:
-    """Methods of a module as machine code, each compiled when it is first called.
-
-    Args:
-        owner: whose methods.
-        cache: folder of compiled functions.
-    """
+    """Methods of a module as machine code, each compiled when it is first called."""
 
     def __init__(self, owner: nn.Module, cache: str | Path) -> None:
         self.owner, self.cache = owner, cache

@@ -37,13 +37,6 @@ def likely_intervals(
     They span those of every mixture of delay and lag that explains the response about as well, and
     of a model with one number more that explains it a little better: what was left out because it
     is not sure may still be there.
-
-    Args:
-        problem: response and commands.
-        model: the explanation that was chosen.
-        part: where it was found.
-        centre: the command, in its half ranges.
-        settings: which models are tried.
     """
     rows = problem.use.sum() * weight_of(problem, model)
     ends = []
@@ -84,15 +77,7 @@ def _others(problem: Problem, model: Model, settings: Settings) -> list[Model]:
 
 
 def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Settings) -> Actuator:
-    """Return the numbers of a part in the units of the log.
-
-    Args:
-        scaled: the log.
-        clean: without lost rows.
-        part: what was found.
-        j: number of the actuator.
-        settings: what matters.
-    """
+    """Return the numbers of a part in the units of the log."""
     log, reach, spread = scaled.raw, scaled.reach, scaled.spread
     model, shape = part.model, part.model.shape
     problem = problem_of(clean.part(part.rows).thinned(settings.refined), j, part.lead, settings)
@@ -170,12 +155,7 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
 
 
 def quantum_of(response: np.ndarray, few: float = 0.1) -> float:
-    """Return the size of the steps of a response, 0 if it moves freely.
-
-    Args:
-        response: ``(N,)``.
-        few: share of the rows: a response with more values moves freely.
-    """
+    """Return the size of the steps of a response, 0 if it moves freely."""
     values = np.unique(response)
     steps = np.diff(values)
     if not 3 <= len(values) < few * len(response) or not steps.min() > 1e-6 * np.ptp(values):

@@ -86,13 +86,7 @@ def hats(x: np.ndarray, count: int = 8) -> np.ndarray:
 
 
 def predictable(columns: np.ndarray, y: np.ndarray, folds: int = 20) -> float:
-    """Return the share of the variance that lines in one half of the rows predict in the other.
-
-    Args:
-        columns: functions, ``(N, F)``.
-        y: what is predicted, of mean 0, ``(N,)``.
-        folds: blocks of rows, of which every second one is predicted from the others.
-    """
+    """Return the share of the variance that lines in one half of the rows predict in the other."""
     rows = len(y)
     design = np.column_stack([np.ones(rows), columns])
     held_out = np.arange(rows) * folds // rows % 2 == 0
@@ -114,14 +108,6 @@ def without_lost(
     and rate limit that leave least. The other rows are lost if they are all over the log, if
     neither the command nor its last moves predict which they are, and if no explanation of all
     rows comes near.
-
-    Args:
-        log: scaled.
-        j: number of the actuator.
-        lead: where its explanation begins.
-        parts: the explanations of all rows.
-        repeats: are rows lost that repeat the last response, too?
-        apart: standard deviations of the others: rows that are as far from the line are lost.
     """
     y, clock = log.response[:, j], lead.clock_of(log)
     best = y - y.mean()

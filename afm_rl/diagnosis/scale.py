@@ -70,10 +70,6 @@ def unwrapped(log: Log, settings: Settings) -> tuple[Log, dict[int, float]]:
 
     A response is unwrapped if the commands explain it far better then; so is a command that wraps
     together with its response, which is no fault and not told.
-
-    Args:
-        log: as it was written.
-        settings: of the search for an explanation.
     """
     turns: dict[int, float] = {}
     for j in range(len(log.names)):

@@ -63,12 +63,6 @@ def agree(
 
     Of the sets of numbers that the members were found to need, the one that is best for all of them
     together (BIC) is fitted to each. Members that changed, or follow another command, stay.
-
-    Args:
-        log: scaled.
-        found: parts of each actuator.
-        reach: half range of each command, ``(A,)``.
-        settings: how many rows are looked at, and what a number costs.
     """
     kinds = defaultdict(list)
     for j, parts in found.items():

@@ -107,17 +107,7 @@ def _judged(
     step: float,
     settings: Settings,
 ) -> tuple[Actuator, ...]:
-    """Return the last part of each actuator with its status, its sentence, and its changes.
-
-    Args:
-        found: the parts of each actuator.
-        times: when they begin (s).
-        doubts: why nothing can be said of some.
-        usual: delay and lag that are no fault (s).
-        scaled: the log.
-        step: time between two of its rows (s).
-        settings: what matters.
-    """
+    """Return the last part of each actuator with its status, its sentence, and its changes."""
     actuators, small = [], small_twins(scaled.raw.names, scaled.reach)
     for j, numbers in enumerate(found):
         how: dict[str, Any] = {

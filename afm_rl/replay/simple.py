@@ -96,17 +96,7 @@ def _least_squares(
     skipped: np.ndarray | None = None,
     ridge: float = 0.1,
 ) -> np.ndarray:
-    """Return each actuator's prediction by its columns ``(N, F)``, fitted to earlier rows.
-
-    Args:
-        columns: of each actuator.
-        command: ``(N, A)``.
-        response: ``(N, A)``.
-        prior: coefficients before the first row, ``(A, F)``.
-        forgetting: what a row counts after one more.
-        skipped: rows that tell nothing, ``(N,)``.
-        ridge: weight of the prior, in rows.
-    """
+    """Return each actuator's prediction by its columns ``(N, F)``, fitted to earlier rows."""
     earlier = partial(lfilter, [0.0, 1.0], [1.0, -forgetting], axis=0)
     found = np.empty_like(command)
     for j, x in enumerate(columns):

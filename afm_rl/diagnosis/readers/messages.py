@@ -75,12 +75,7 @@ def value_at(message: Any, way: Field) -> float:
 def series_of(
     messages: Iterable[tuple[str, float, Any]], wanted: Mapping[str, tuple[str, Field]]
 ) -> dict[str, Series]:
-    """Return the series of fields.
-
-    Args:
-        messages: topic, time (s) and content of each.
-        wanted: topic and way of each name.
-    """
+    """Return the series of fields."""
     by_topic: dict[str, list[str]] = {}
     for name, (topic, _) in wanted.items():
         by_topic.setdefault(topic, []).append(name)
@@ -120,11 +115,7 @@ def _get(message: Any, key: Any) -> Any:
 
 
 def open_mcap(path: Path) -> Source:
-    """Return the fields of an MCAP file whose messages are those of ROS 2, or JSON.
-
-    Raises:
-        ConfigurationError: if it cannot be read.
-    """
+    """Return the fields of an MCAP file whose messages are those of ROS 2, or JSON."""
     try:
         from mcap.reader import make_reader
     except ImportError as error:
@@ -145,11 +136,7 @@ def open_mcap(path: Path) -> Source:
 
 
 def open_bag(path: Path) -> Source:
-    """Return the fields of a bag of ROS 2 (a folder, or ``.db3``), or of ROS 1 (``.bag``).
-
-    Raises:
-        ConfigurationError: if it cannot be read.
-    """
+    """Return the fields of a bag of ROS 2 (a folder, or ``.db3``), or of ROS 1 (``.bag``)."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -171,10 +158,7 @@ def open_bag(path: Path) -> Source:
 
 
 def _source(path: Path, messages: Any, looked_at: int = 20) -> Source:
-    """Return a source of messages: a first pass finds the fields, in some of each topic.
-
-    Of one alone it would not: joints may come in turns.
-    """
+    """Return a source of messages: a first pass finds the fields, in some of each topic."""
     fields: dict[str, tuple[str, Field]] = {}
     counts: dict[str, int] = {}
     for topic, _, content in messages(None):
@@ -219,11 +203,7 @@ def _reading(what: str) -> Iterator[None]:
 
 
 def open_ulog(path: Path) -> Source:
-    """Return the fields of a ULog: ``TOPIC.FIELD``, or ``TOPIC[1].FIELD`` of a second instance.
-
-    Raises:
-        ConfigurationError: if it is no ULog, or if the package for it is missing.
-    """
+    """Return the fields of a ULog: ``TOPIC.FIELD``, or ``TOPIC[1].FIELD`` of a second instance."""
     try:
         from pyulog import ULog
     except ImportError as error:

@@ -34,11 +34,7 @@ FASTEST, SLOWEST = 1e6, 1e-3  # rates (1/s) that a robot may have
 
 
 def open_parquet(path: Path) -> Source:
-    """Return the columns of a parquet file; a list's numbers are called ``COLUMN.0`` and so on.
-
-    Raises:
-        ConfigurationError: if it is no parquet file.
-    """
+    """Return the columns of a parquet file; a list's numbers are called ``COLUMN.0`` and so on."""
     names: dict[str, tuple[str, int | None]] = {}
     columns = columns_of(path)
     for column in columns:
@@ -60,17 +56,7 @@ def source_of(
     frame: float = 0.0,
     notes: tuple[str, ...] = (),
 ) -> Source:
-    """Return the rows of parquet files, one after the other, as a source.
-
-    Args:
-        path: what they belong to.
-        files: in order.
-        names: of numbers: a column, and the place in its lists.
-        time: name of the time.
-        episode: name of the number of the episode.
-        frame: time between command and response of a healthy robot (s).
-        notes: what a reader must know.
-    """
+    """Return the rows of parquet files, one after the other, as a source."""
     sizes = [_rows(file) for file in files]
     blocks = blocks_of(sum(sizes))
 
@@ -208,9 +194,6 @@ def open_lerobot(folder: Path) -> Source:
     """Return actions and states of a data set: ``action.NAME``, ``observation.state.NAME``.
 
     A state is read before the action is sent, so that a healthy robot is late by one frame.
-
-    Raises:
-        ConfigurationError: if the folder cannot be used.
     """
     features, fps = _info(check_regular(folder / INFO))
     files, notes = _files(folder)

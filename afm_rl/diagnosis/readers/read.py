@@ -37,11 +37,7 @@ EXPECTED = (
 
 
 def open_source(path: Path) -> Source:
-    """Return what there is in a file or folder.
-
-    Raises:
-        ConfigurationError: if it cannot be read.
-    """
+    """Return what there is in a file or folder."""
     if path.is_dir():
         if (path / parquet.INFO).parent.exists():
             return parquet.open_lerobot(path)
@@ -111,11 +107,7 @@ def read_columns(
     response: Sequence[str] = (),
     episode: str | None = None,
 ) -> Columns:
-    """Read two groups of columns, ``command.*`` and ``response.*`` or ``action.*`` and ``state.*``.
-
-    Raises:
-        ConfigurationError: if the file cannot be used.
-    """
+    """Read groups of columns: ``command.*``, ``response.*`` or ``action.*``, ``state.*``."""
     with _about(path):
         source = open_source(path)
         if episode is not None:

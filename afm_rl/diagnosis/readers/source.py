@@ -103,12 +103,7 @@ class Columns:
 
 
 class Unchosen(ConfigurationError):
-    """It is not known what is a command and what a response.
-
-    Args:
-        message: one line.
-        listing: what there is, a line each.
-    """
+    """It is not known what is a command and what a response."""
 
     def __init__(self, message: str, listing: Sequence[str]) -> None:
         super().__init__(message)
@@ -116,11 +111,7 @@ class Unchosen(ConfigurationError):
 
 
 def check_regular(path: Path) -> Path:
-    """Return a path if it leads to a file that ends.
-
-    Raises:
-        ConfigurationError: for what cannot be read, a device, a pipe.
-    """
+    """Return a path if it leads to a file that ends."""
     try:
         kind = path.stat().st_mode
     except (OSError, ValueError) as error:
@@ -179,10 +170,6 @@ def choose(
             for all its fields.
         response: the same, one for each command.
         paired: each command has a response.
-
-    Raises:
-        Unchosen: if nothing was given, and nothing begins as expected; it has a listing.
-        ConfigurationError: if what was given does not fit.
     """
     if command or response:
         if not (command and response):
