@@ -12,10 +12,9 @@ from omegaconf import DictConfig
 from yaml import safe_dump
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.jobs.executor import Executor
+from afm_rl.jobs.executor import Board, Executor
 from afm_rl.jobs.layout import is_batch, is_finished, job_folders, recorded
 from afm_rl.jobs.process import Job
-from afm_rl.jobs.progress import Board
 from afm_rl.jobs.run import begin, csv_of, needs_run
 from afm_rl.storage.files import locked, remove_parts, write_whole
 from afm_rl.storage.manifest import COMPUTE, JOBS, MANIFEST, MISSIONS, RECORD, write_manifest

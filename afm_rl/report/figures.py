@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from afm_rl.report import comparison, learning, space_plot, style, trajectory
-from afm_rl.report.recovery import MEASURES, recovery_times
+from afm_rl.report.learning import MEASURES, recovery_times
 from afm_rl.report.runs import Runs
 from afm_rl.report.trajectory import DrawableTrack
 from afm_rl.storage.measures import Measures

@@ -14,9 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.report.cells import steps_of
 from afm_rl.report.learning import last_step
-from afm_rl.report.runs import Runs
+from afm_rl.report.runs import Runs, steps_of
 from afm_rl.report.scenes import COLUMNS, Scene, map_scene, space_scene
 from afm_rl.report.style import FEW
 from afm_rl.report.trajectory import DrawableTrack

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch, Polygon
 
 from afm_rl.report import style
-from afm_rl.report.cells import action_names
+from afm_rl.report.runs import action_names
 from afm_rl.report.space_plot import GOAL, POSITION, dress_space, mark_regimes
 from afm_rl.report.style import BEFORE, CHANGED, EXECUTED, PLANNED, REFERENCE, START, TARGET
 from afm_rl.report.trajectory import DrawableTrack, changed_stretch, draw_road, positions, view

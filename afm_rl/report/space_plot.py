@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from afm_rl.report import style
-from afm_rl.report.cells import action_names, steps_of
 from afm_rl.report.learning import regime_changes
+from afm_rl.report.runs import action_names, steps_of
 
 POSITION, GOAL = ["x", "y", "z"], ["goal_x", "goal_y", "goal_z"]
 COLUMNS = [*POSITION, *GOAL, "regime_active"]  # of the steps

@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.stats import bootstrap, trim_mean
 
-from afm_rl.report.cells import outcome, with_cells
+from afm_rl.report.runs import outcome, with_cells
 from afm_rl.storage.measures import Measures
 
 Bounds = tuple[float, float]

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
-from afm_rl.report.cells import first_missions
+from afm_rl.report.runs import first_missions
 
 Look = dict[str, Any]
 DPI = 150

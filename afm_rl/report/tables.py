@@ -13,7 +13,7 @@ from rich.console import Console, JustifyMethod
 from rich.table import Table as Grid
 from rich.text import Text
 
-from afm_rl.report.cells import outcome
+from afm_rl.report.runs import outcome
 from afm_rl.report.statistics import summarise
 from afm_rl.storage.files import csv_text
 from afm_rl.storage.measures import Measures, number

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.report import style
-from afm_rl.report.cells import outcome, steps_of
+from afm_rl.report.runs import outcome, steps_of
 from afm_rl.report.style import ROAD
 from afm_rl.storage.measures import Measures
 

@@ -15,10 +15,9 @@ from jinja2 import Environment, StrictUndefined
 from torch.utils.tensorboard import SummaryWriter
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.report.cells import steps_of, with_cells
 from afm_rl.report.figures import draw_report, draw_run, read_excerpts
-from afm_rl.report.recovery import recovery_table
-from afm_rl.report.runs import Runs
+from afm_rl.report.learning import recovery_table
+from afm_rl.report.runs import Runs, steps_of, with_cells
 from afm_rl.report.statistics import aggregate, budget_notes, compare, count_budgets
 from afm_rl.report.stranger import LONGEST, read_text
 from afm_rl.report.tables import (

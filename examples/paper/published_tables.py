@@ -12,7 +12,7 @@ from pathlib import Path
 import pandas as pd
 
 from afm_rl.report import read_runs
-from afm_rl.report.cells import cell_names
+from afm_rl.report.runs import cell_names
 from afm_rl.report.tables import Table
 from afm_rl.storage.files import write_whole
 
