@@ -43,7 +43,6 @@ from afm_rl.report.diagnosis import write_diagnosis
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import JOBS, extend_manifest, read_manifest, write_manifest
 
-SWITCHES = ("overwrite", "progress", "figures", "tensorboard")
 ENDS = (signal.SIGINT, signal.SIGTERM)
 """Batch systems send the latter before they kill; a shell ignores the former for what it runs
 behind itself."""
@@ -109,7 +108,7 @@ def check_settings(cfg: DictConfig) -> str | None:
         The format of films; None for no films.
     """
     torch.set_num_threads(check_count("threads", cfg.threads, high=256))
-    for name in SWITCHES:
+    for name in ("overwrite", "progress", "figures", "tensorboard"):
         check_flag(name, cfg[name])
     if not isinstance(cfg.cache, str):
         raise ConfigurationError(f"cache={cfg.cache!r}: expected a folder")

@@ -22,12 +22,6 @@ def jobs_of(cfg: DictConfig, hydra: DictConfig, swept: Sequence[str] = ()) -> di
     """Return the configuration of each job that a command asks for, by name.
 
     A job is one method; in a study, one method with one seed.
-
-    Args:
-        cfg: the composed configuration.
-        hydra: Hydra's part of it.
-        swept: overrides that not all jobs of a sweep have; they are part of the names of jobs,
-            and, unless the tables show their effect anyway, of the labels of methods.
     """
     methods = _methods(cfg, hydra)
     keys = {text: text.lstrip("+~").split("=")[0] for text in swept}

@@ -23,8 +23,6 @@ from afm_rl._version import __version__
 from afm_rl.progress import waiting
 from afm_rl.storage.files import write_whole
 
-OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
-
 
 def checksum_of(code: bytes) -> str:
     """Return the SHA-256 of a program, as ``sha256sum`` prints it.
@@ -101,7 +99,8 @@ def _why_not_ours(folder: Path) -> str:
         return ""
     if _belongs_to_another(folder):
         return f"{folder} belongs to another user"
-    return f"others may write into {folder}" if folder.stat().st_mode & OTHERS_WRITE else ""
+    others = stat.S_IWGRP | stat.S_IWOTH
+    return f"others may write into {folder}" if folder.stat().st_mode & others else ""
 
 
 class Trace(NamedTuple):
@@ -123,14 +122,7 @@ def trace(module: nn.Module, inputs: Sequence[Tensor], shapes: Any = None) -> Tr
 def package(
     traced: Trace, settings: Mapping[str, Any], cache: str | Path, times: float = 6.0
 ) -> bytes:
-    """Return a traced function as a program; show how far it is.
-
-    Args:
-        traced: the function.
-        settings: of the compiler.
-        cache: where the compiler keeps what it needs again; torch's own is where others may write.
-        times: how much longer than tracing it takes, on a machine that is as busy as then.
-    """
+    """Return a traced function as a program; show how far it is."""
     with tempfile.TemporaryDirectory() as made, torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         path, scratch = Path(made) / "program.pt2", folder_in(cache) / "torch"
@@ -170,13 +162,7 @@ class MachineCode:
     def __call__(
         self, function: Callable, *given: Tensor, model: nn.Module | None = None
     ) -> list[Tensor]:
-        """Return what a method makes of tensors ``(*B, ...)``, or its plain form if it must be.
-
-        Args:
-            function: the method, as the class has it; returns a tensor or several.
-            given: its tensors.
-            model: what it takes after them.
-        """
+        """Return what a method makes of tensors ``(*B, ...)``, or its plain form if it must be."""
         like = given[0]
         key = (function.__name__, model, like.dtype, like.device, like.shape[-1])
         code = self.codes.get(key)

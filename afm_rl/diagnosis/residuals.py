@@ -28,13 +28,6 @@ def find_pattern(
     half of the rows, and tried on the other one. If none predicts the residual, but one its
     absolute value, the name is that of the scatter, and the share 0.
 
-    Args:
-        problem: the log of one actuator.
-        model: what was fitted to it.
-        most: rows that are looked at, at most.
-        least: share of the residual that has to be predicted; otherwise it is noise.
-        scatter: the same for its absolute value.
-
     Returns:
         ``("", 0.0)`` if the residual looks like noise.
     """

@@ -12,8 +12,6 @@ from afm_rl.diagnosis.response import Shape, respond
 from afm_rl.diagnosis.search import find_leads
 from afm_rl.diagnosis.settings import Settings
 
-TURNS = (2 * math.pi, 360.0)
-
 
 @dataclass(frozen=True)
 class Scaled:
@@ -96,7 +94,8 @@ def unwrapped(log: Log, settings: Settings) -> tuple[Log, dict[int, float]]:
 def _turn(values: np.ndarray) -> float | None:
     """Return by which turn some values jump, if by any."""
     jump, reach = np.abs(np.diff(values)).max(), np.ptp(values)
-    return next((turn for turn in TURNS if 0.5 * turn < jump and reach < 1.05 * turn), None)
+    turns = (2 * math.pi, 360.0)
+    return next((turn for turn in turns if 0.5 * turn < jump and reach < 1.05 * turn), None)
 
 
 def _with(log: Log, kind: str, j: int, values: np.ndarray) -> Log:

@@ -15,8 +15,8 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.jobs.executor import Board, Executor
 from afm_rl.jobs.layout import is_batch, is_finished, job_folders, recorded
 from afm_rl.jobs.process import Job
-from afm_rl.jobs.run import begin, csv_of, needs_run
-from afm_rl.storage.files import locked, remove_parts, write_whole
+from afm_rl.jobs.run import begin, needs_run
+from afm_rl.storage.files import csv_text, locked, remove_parts, write_whole
 from afm_rl.storage.manifest import COMPUTE, JOBS, MANIFEST, MISSIONS, RECORD, write_manifest
 from afm_rl.trust import trusted
 
@@ -109,8 +109,8 @@ def write_tables(folder: Path) -> None:
         texts = [pd.read_csv(run / MISSIONS, dtype=str, keep_default_na=False) for run in runs]
         taken = pd.concat([pd.read_csv(run / COMPUTE) for run in runs])
         whole = taken.groupby("method", sort=False).sum().reset_index()
-        write_whole(folder / MISSIONS, csv_of(join(texts)))
-        write_whole(folder / COMPUTE, csv_of(whole))
+        write_whole(folder / MISSIONS, csv_text(join(texts)).encode())
+        write_whole(folder / COMPUTE, csv_text(whole).encode())
     write_manifest(folder, [n for n in (RECORD, MISSIONS, COMPUTE) if (folder / n).exists()])
 
 

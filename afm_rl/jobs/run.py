@@ -139,9 +139,9 @@ def _publish(folder: Path, results: Results) -> None:
     files = {
         CONFIG: (new / CONFIG).read_bytes(),
         # Times differ from run to run: without them the same missions make the same file.
-        MISSIONS: csv_of(missions.drop(columns="seconds")),
+        MISSIONS: csv_text(missions.drop(columns="seconds")).encode(),
         STEPS: steps.getvalue(),
-        COMPUTE: csv_of(compute(missions)),
+        COMPUTE: csv_text(compute(missions)).encode(),
         measures.FILE: results.measures.to_json().encode(),
     }
     shutil.rmtree(new / READY, ignore_errors=True)
@@ -160,11 +160,6 @@ def _publish(folder: Path, results: Results) -> None:
             path.unlink()
     (new / CONFIG).unlink()  # the last one: as long as it is there, there is something to do
     new.rmdir()
-
-
-def csv_of(table: pd.DataFrame) -> bytes:
-    """Return a table as the text of a CSV file."""
-    return csv_text(table).encode()
 
 
 def compute(missions: pd.DataFrame) -> pd.DataFrame:

@@ -69,13 +69,7 @@ def mean(values: Any) -> float:
 
 
 class Page:
-    """A page in the browser for a world, on 127.0.0.1 only.
-
-    Args:
-        world: the robots.
-        title: of the page.
-        port: a free one.
-    """
+    """A page in the browser for a world, on 127.0.0.1 only."""
 
     def __init__(self, world: World, title: str, port: int) -> None:
         self.world, self.ended = world, False

@@ -15,7 +15,6 @@ from afm_rl.play.robots import Robot
 from afm_rl.regimes import Compose, actuator_regimes
 from afm_rl.transforms.gymnasium import ActionFlowWrapper
 
-FAMILIES = ("delay", "lag", "permutation", "gain", "dead", "bias")
 SIDES = ("alone", "AFM")
 KEPT = 400  # steps that are drawn as curves
 LYING = 1.0  # seconds that a robot lies where it fell
@@ -73,7 +72,8 @@ class Actuators(gymnasium.Wrapper):
         super().__init__(env)
         space: Any = env.action_space
         families = actuator_regimes(space.low.tolist(), space.high.tolist())
-        self.regime = Compose({name: families[name] for name in FAMILIES})
+        chosen = ("delay", "lag", "permutation", "gain", "dead", "bias")
+        self.regime = Compose({name: families[name] for name in chosen})
         self.faults, self.random = faults, np.random.default_rng(0)
         self.half = (space.high - space.low) / 2
 

@@ -34,11 +34,7 @@ CAPTION = (
     "was."
 )
 STAY = 20  # steps that the error must stay low
-MEASURES = {  # columns, by what they measure
-    "miss": "motion",
-    "unforeseen": "agent",
-    "error": "model",
-}
+MEASURES = {"miss": "motion", "unforeseen": "agent", "error": "model"}  # columns: of what
 NOTE = (
     "Steps from a change of the regime until the one-step error is back under the nominal level "
     f"for the first time, and until it stays there for {STAY} steps. The nominal level of a "

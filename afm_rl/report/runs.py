@@ -67,11 +67,6 @@ def with_cells(missions: pd.DataFrame) -> pd.DataFrame:
     return missions if "cell" in missions else missions.assign(cell=cell_names(missions))
 
 
-def first_missions(missions: pd.DataFrame) -> pd.DataFrame:
-    """Return one mission per method and cell, the first, with a column ``cell``."""
-    return with_cells(missions).drop_duplicates(["method", "cell"])
-
-
 def steps_of(steps: pd.DataFrame, missions: Iterable[int]) -> dict[int, pd.DataFrame]:
     """Return the steps of some missions, by mission.
 

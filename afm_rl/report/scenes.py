@@ -48,12 +48,6 @@ def map_scene(
     A robot alone has its target, and arrows for the planned action (wide) and the executed one
     (slim), if its actions are called ``v`` and ``omega``: as long as the robot is to be fast, and
     turned by how far it is to turn in half a second. Several robots move at the same time.
-
-    Args:
-        title: what is shown.
-        runs: each method's steps, with :data:`COLUMNS`; ``miss`` is drawn if all have it, and
-            ``error`` otherwise.
-        track: the road.
     """
     box = view(track, [positions(steps) for steps in runs.values()])
     tall = 5.6 * np.clip(box.ratio, 0.4, 1.2)

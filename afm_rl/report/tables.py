@@ -50,7 +50,6 @@ PAIRS_NOTE = (
     + "Bold "
     "where 0, or a probability of 1/2, lies outside the interval."
 )
-CELL_NOTE = "Means: {names}. Bold: the best of a cell."
 MISSING_NOTE = (
     "Every method is expected to have every cell and seed that any method has, and all that was to "
     "be run."
@@ -274,7 +273,8 @@ def cell_table(missions: pd.DataFrame, measures: Measures) -> Table:
         if len(set(rank.values())) > 1:
             best = max(rank.values())
             bold |= {(place, heads.index(name)) for name in rank if rank[name] == best}
-    note = CELL_NOTE.format(names=" / ".join(measure.head for measure in short))
+    heads_of = " / ".join(measure.head for measure in short)
+    note = f"Means: {heads_of}. Bold: the best of a cell."
     return Table("cells", "Cell by cell", note, numbers, pd.DataFrame(rows), frozenset(bold))
 
 

@@ -105,12 +105,6 @@ def view(
 
     Paths that leave the road are followed a little way only: a robot that has gone astray
     must not shrink the road to a dot.
-
-    Args:
-        track: the road.
-        paths: where robots went (m).
-        margin: shown around all, as a part of the longer side.
-        stray: shown of those who leave the road, as a part of the road's sides.
     """
     points = np.concatenate([path[np.isfinite(path).all(-1)] for path in paths])
     if track is None:

@@ -34,7 +34,6 @@ from afm_rl.storage.measures import Measures
 # TensorBoard orders groups by name: whether plans came true stands first.
 GROUPS = {"miss": "came_true", "unforeseen": "came_true", "error": "model", "loss": "model"}
 FILE = "events.out.tfevents.0.afm_rl"  # TensorBoard looks for "tfevents" in the name
-TEMPLATE = Path(__file__).with_name("page.html")
 REFERENCES = (
     "R. Agarwal, M. Schwarzer, P. S. Castro, A. Courville, M. G. Bellemare: Deep Reinforcement "
     "Learning at the Edge of the Statistical Precipice. NeurIPS 2021 (interquartile mean, "
@@ -284,4 +283,5 @@ def render_page(**content: Any) -> str:
     file in base 64.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined)
-    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(**content)
+    template = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
+    return environment.from_string(template).render(**content)

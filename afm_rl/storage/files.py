@@ -17,7 +17,6 @@ from afm_rl.errors import ConfigurationError
 if TYPE_CHECKING:
     import pandas as pd
 
-LOCK = ".lock"
 _FORMULA = re.compile(r"[=+\-@\t\r]")  # how a formula begins
 _QUOTED = re.compile(r"'(?=[=+\-@\t\r])")
 
@@ -68,7 +67,7 @@ def sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def locked(folder: Path, name: str = LOCK, wait: bool = False) -> Iterator[None]:
+def locked(folder: Path, name: str = ".lock", wait: bool = False) -> Iterator[None]:
     """Hold the lock of a folder, which is made if it is not there.
 
     The lock ends with the process that holds it, however that ends.

@@ -17,18 +17,8 @@ MISSIONS, STEPS, COMPUTE = "missions.csv", "steps.parquet", "compute.csv"
 JOBS, RECORD = "jobs", "jobs.yaml"
 _REMEDY = "restore it, or delete the folder and run the same command again"
 WITHOUT_INFLUENCE = (
-    *(
-        "progress",
-        "figures",
-        "video",
-        "tensorboard",
-        "overwrite",
-        "cache",
-        "threads",
-        "device",
-        "compile",
-    ),
-    *("compare", "study", "label", "trust", "checkpoints"),
+    *("progress", "figures", "video", "tensorboard", "overwrite", "cache", "threads", "device"),
+    *("compile", "compare", "study", "label", "trust", "checkpoints"),
 )
 """Settings that change how a run is done, shown or called, but not its results."""
 

@@ -11,7 +11,6 @@ from typing import Any
 from afm_rl.errors import ArtefactError
 
 FILE = "measures.json"
-BETTER = ("higher", "lower")
 
 
 def number(value: float, digits: int = 0) -> str:
@@ -74,7 +73,7 @@ class Measure:
             and isinstance(self.headline, bool)
             and isinstance(self.budget, bool)
         )
-        if not fits or self.better not in BETTER:
+        if not fits or self.better not in ("higher", "lower"):
             raise ArtefactError(
                 f"measure {self.column!r}: expected short texts, finite numbers, better=higher or "
                 "lower, 0 to 12 digits"

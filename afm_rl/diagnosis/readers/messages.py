@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -208,12 +207,11 @@ def open_ulog(path: Path) -> Source:
         from pyulog import ULog
     except ImportError as error:
         raise ConfigurationError("ULog needs pyulog: pip install 'afm-rl[logs]'") from error
-    try:
-        with path.open("rb") as file, contextlib.redirect_stdout(io.StringIO()):
-            topics = {_name(data): data.data for data in ULog(file).data_list}
-    except Exception as error:  # of a damaged file it raises whatever the bytes lead it to
-        reason = printable(f"{type(error).__name__}: {error}", 120)
-        raise ConfigurationError(f"no ULog, or a damaged one: {reason}") from error
+    with _reading("ULog"), path.open("rb") as file, redirect_stdout(io.StringIO()):
+        topics = {
+            f"{data.name}[{data.multi_id}]" if data.multi_id else data.name: data.data
+            for data in ULog(file).data_list
+        }
     fields = {
         f"{topic}.{field}": (topic, field)
         for topic, data in topics.items()
@@ -231,7 +229,3 @@ def open_ulog(path: Path) -> Source:
 
     counts = {topic: len(data[TIME]) for topic, data in topics.items() if TIME in data}
     return Source(path, list(fields), read, topics=counts)
-
-
-def _name(data: Any) -> str:
-    return f"{data.name}[{data.multi_id}]" if data.multi_id else data.name

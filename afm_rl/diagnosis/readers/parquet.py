@@ -27,7 +27,7 @@ from afm_rl.diagnosis.readers.source import (
 from afm_rl.diagnosis.readers.tables import EPISODE, TIME
 from afm_rl.errors import ConfigurationError, printable
 
-STAMP, FLOATS = "timestamp", ("float", "double")
+STAMP = "timestamp"
 LISTS = (arrow.types.is_list, arrow.types.is_large_list, arrow.types.is_fixed_size_list)
 INFO = "meta/info.json"
 FASTEST, SLOWEST = 1e6, 1e-3  # rates (1/s) that a robot may have
@@ -43,7 +43,7 @@ def open_parquet(path: Path) -> Source:
             names[column] = (column, None)
         names |= {f"{column}.{k}": (column, k) for k in range(width or 0)}
     # An episode of LeRobot's has the time (s) under another name.
-    time = STAMP if TIME not in columns and str(columns.get(STAMP)) in FLOATS else TIME
+    time = STAMP if TIME not in columns and str(columns.get(STAMP)) in ("float", "double") else TIME
     return source_of(path, [path], names, time)
 
 
@@ -123,17 +123,14 @@ def _read(
                     parts[column].append(_values(column, batch.column(column)))
         begin += size
     for column, found in parts.items():
-        if len({part.shape[1:] for part in found}) > 1:
+        kinds = {str(part.shape[1]) if part.ndim > 1 else "single" for part in found}
+        if len(kinds) > 1:
             raise ConfigurationError(
-                f"{printable(column)}: lists of {' and '.join(_widths(found))} numbers: expected "
+                f"{printable(column)}: lists of {' and '.join(sorted(kinds))} numbers: expected "
                 "one length"
             )
     joined = {name: np.concatenate(found or [np.empty(0)]) for name, found in parts.items()}
     return np.concatenate(numbers), joined
-
-
-def _widths(found: Sequence[np.ndarray]) -> list[str]:
-    return sorted({str(part.shape[1]) if part.ndim > 1 else "single" for part in found})
 
 
 def _batches(
