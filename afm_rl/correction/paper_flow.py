@@ -20,7 +20,7 @@ from afm_rl.errors import (
     check_number,
 )
 from afm_rl.regimes import Regime
-from afm_rl.spaces.sampling import draw_states, uniform
+from afm_rl.spaces.manifold import draw_states, uniform
 
 
 class PaperFlow(Corrector):

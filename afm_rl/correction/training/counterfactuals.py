@@ -17,7 +17,7 @@ from afm_rl.correction.training.prior import Draw, Drawn, draw_actions, draw_mas
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.regimes import Regime
-from afm_rl.spaces.sampling import draw_states
+from afm_rl.spaces.manifold import draw_states
 
 if TYPE_CHECKING:
     from afm_rl.correction.action_flow import ActionFlow
