@@ -12,13 +12,12 @@ from torch import Tensor, nn
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.achievable import MODES, attainable, extend
 from afm_rl.correction.arrival import ago, aligned
-from afm_rl.correction.belief import Belief, mean_and_std, prior_of
+from afm_rl.correction.belief import mean_and_std
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.linear import CALM, LINEAR, Lines, fit_lines, sensor_noise, within_rate
-from afm_rl.correction.network import AxisNetwork, Encoded
+from afm_rl.correction.network import AxisNetwork, Encoded, midpoint
 from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows
-from afm_rl.correction.solver import midpoint
 from afm_rl.errors import check_choice, check_count, check_number
 
 
@@ -58,7 +57,6 @@ class Tick(nn.Module):
     scale: Tensor
     points: Tensor
     probes: Tensor
-    worth: Tensor
     late: Tensor
     delays: Tensor
     filters: Tensor
@@ -71,9 +69,6 @@ class Tick(nn.Module):
         scale: Tensor,
         readings: Sequence[str],
         rows: int,
-        worth: Tensor,
-        odds: float,
-        least_noise: float,
         delays: Tensor,
         acting: Tensor,
         samples: int,
@@ -83,7 +78,6 @@ class Tick(nn.Module):
     ) -> None:
         super().__init__()
         self.network, size = network, len(scale)
-        self.odds, self.least_noise = odds, least_noise
         self.source_std = check_number("corrector.source_std", source_std, low=0.0)
         self.steps = check_count("corrector.steps", steps)
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
@@ -98,7 +92,6 @@ class Tick(nn.Module):
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
-            "worth": worth,
             "delays": delays,
             "filters": filters,
             "filtered": torch.nn.functional.one_hot(which).T.to(scale),
@@ -111,7 +104,7 @@ class Tick(nn.Module):
     def forward(
         self,
         pairs: Tensor,
-        losses: Tensor,
+        weights: Tensor,
         noise: Tensor,
         place: Tensor,
         late: Tensor,
@@ -123,7 +116,7 @@ class Tick(nn.Module):
 
         Args:
             pairs: what is remembered, the newest last, ``(B, M, D)``.
-            losses: of the models, ``(B, M + 1, A)``.
+            weights: probabilities of the models, ``(B, M + 1, A)``.
             noise: that no model explains, ``(B, A)``.
             place: where the missions are, ``(B, P)``.
             late: steps that commands are late, ``(B,)``.
@@ -133,7 +126,6 @@ class Tick(nn.Module):
         """
         unit, ends = planned / self.scale, box / self.scale
         read = self.read(pairs, noise, place, late)
-        weights = self.weights(losses, noise)
         models = self.most_likely(read, weights)
         proposals, spread = self.propose(models, unit, ends)
         expected = self.expect(models, proposals)
@@ -165,11 +157,6 @@ class Tick(nn.Module):
             forecasts,
             under_way,
         )
-
-    def weights(self, losses: Tensor, noise: Tensor) -> Tensor:
-        """Return the probabilities of the models, ``(B, M + 1, A)``."""
-        prior = prior_of(self.worth, self.odds, noise, self.least_noise)
-        return Belief(losses, losses, noise).weights(prior)
 
     def read(self, pairs: Tensor, noise: Tensor, place: Tensor, late: Tensor) -> Read:
         """Return what the memory says of actions, by all models."""
@@ -309,8 +296,7 @@ class Tick(nn.Module):
         forecasts = torch.cat([now, found, linear, acts[:, self.late], *calmly], 1)
         waits = late + ahead.shape[1] > 1
         if not all_hold(~waits):
-            delays = torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
-            so_late = (delays == late.unsqueeze(-1)).unsqueeze(-1)
+            so_late = ((self.delays < 0) | (self.delays == late.unsqueeze(-1))).unsqueeze(-1)
             models = self.most_likely(read, torch.where(so_late, weights.clamp_min(1e-9), 0.0))
             shares = models.weights / models.weights.sum(1, keepdim=True)
             effects = (shares.unsqueeze(2) * self.expect(models, newest)).sum(1)

@@ -13,7 +13,7 @@ from afm_rl.dynamics.quadrotor_equations import HeldFlight, aligned, quadrotor_s
 from afm_rl.dynamics.runge_kutta import runge_kutta_linearised
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.spaces.airframe import QuadrotorBody
-from afm_rl.spaces.rigid_body import RigidBodySpace
+from afm_rl.spaces.manifold import RigidBodySpace
 
 
 class Quadrotor(KnownDynamics):

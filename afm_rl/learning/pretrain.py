@@ -11,7 +11,7 @@ from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import DynamicsModel, Ensemble
 from afm_rl.errors import check_count, check_number
 from afm_rl.learning.fitting import FitReport, fit_changes
-from afm_rl.spaces.sampling import uniform
+from afm_rl.spaces.manifold import uniform
 
 
 def pretrain_ensemble(

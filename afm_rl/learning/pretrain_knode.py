@@ -11,7 +11,7 @@ from afm_rl.dynamics.knode import KNODE
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.progress import Bar
 from afm_rl.regimes import Regime
-from afm_rl.spaces.sampling import uniform
+from afm_rl.spaces.manifold import uniform
 
 
 def pretrain_knode(

@@ -20,7 +20,7 @@ from afm_rl.missions.log import StepLog
 from afm_rl.missions.state import Loop, leave, owner, restore, snapshot
 from afm_rl.missions.unsaved import unsaved
 from afm_rl.progress import Bar
-from afm_rl.storage.checkpoints import Checkpoints
+from afm_rl.storage.artefacts import Checkpoints
 from afm_rl.storage.measures import Measures
 
 

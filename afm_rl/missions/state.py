@@ -17,7 +17,7 @@ from afm_rl.missions.build import Agent
 from afm_rl.missions.log import StepLog
 from afm_rl.missions.unsaved import PLAIN, TORCH, check_saved, has_extra_state, whole
 from afm_rl.storage.artefacts import digest_of
-from afm_rl.storage.settings import influential
+from afm_rl.storage.manifest import influential
 from afm_rl.streams import Streams
 
 

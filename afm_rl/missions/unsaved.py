@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torchrl.envs import EnvBase
 
-from afm_rl.compiling.cast_cache import CastCache
+from afm_rl.compiling.devices import CastCache
 from afm_rl.errors import ConfigurationError
 from afm_rl.mission_state import MissionState
 from afm_rl.missions.build import Agent
