@@ -9,10 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from afm_rl.dynamics.known import KnownDynamics
-from afm_rl.dynamics.mujoco_model import HUGE, actuator_names, read_model, space_of, state_names
-from afm_rl.dynamics.mujoco_physics import changed_model
-from afm_rl.dynamics.parametric import PhysicsModel
+from afm_rl.dynamics.known import KnownDynamics, PhysicsModel
+from afm_rl.dynamics.mujoco_model import (
+    HUGE,
+    actuator_names,
+    changed_model,
+    read_model,
+    space_of,
+    state_names,
+)
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.regimes import Physics
 

@@ -19,8 +19,7 @@ from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import Ensemble
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import collect, fit_ensemble
-from afm_rl.missions.collection import Collection
-from afm_rl.missions.robot import Robot
+from afm_rl.missions.robot import Collection, Robot
 from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.planning.costs import KnownReward
 from afm_rl.regimes import Schedule

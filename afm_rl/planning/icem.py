@@ -10,8 +10,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.errors import ConfigurationError, check_count, check_number
-from afm_rl.planning.receding import action_spec_of
-from afm_rl.planning.sampling_planner import SamplingPlanner
+from afm_rl.planning.receding import SamplingPlanner, action_spec_of
 from afm_rl.spaces.keys import as_key
 
 WITHOUT_NOISE = (

@@ -17,7 +17,7 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.planning.stored_policy import StoredPolicy
+from afm_rl.planning.policies import StoredPolicy
 
 # How the weights of an actor are called, hidden layers and last one; its usual activation; and
 # whether a tanh ends it.

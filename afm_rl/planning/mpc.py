@@ -11,10 +11,10 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.planning.costs import QuadraticCost
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.planning.riccati import LQProblem, solve_lq
-from afm_rl.planning.tracking import QuadraticCost
 from afm_rl.spaces.keys import as_key
 from afm_rl.spaces.manifold import Manifold, wrap_angle
 

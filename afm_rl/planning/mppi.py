@@ -13,8 +13,7 @@ from torchrl.envs import EnvBase
 from afm_rl.compiling.machine_code import MachineCode
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.errors import check_choice, check_flag, check_number
-from afm_rl.planning.receding import action_spec_of
-from afm_rl.planning.sampling_planner import SamplingPlanner
+from afm_rl.planning.receding import SamplingPlanner, action_spec_of
 from afm_rl.spaces.keys import as_key
 
 

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime, StaticRegime
+from afm_rl.regimes.base import Regime, StaticRegime, check_span, draw_between
 from afm_rl.regimes.compose import Compose
-from afm_rl.regimes.gain import ActionGain, divide
-from afm_rl.regimes.settings import check_span, draw_between
+from afm_rl.regimes.gains import ActionGain, divide
 from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix
 
 LEAST, MOST = 0.01, 100.0  # factors beyond these are typing errors

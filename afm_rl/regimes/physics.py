@@ -29,7 +29,7 @@ class Physics(StaticRegime):
     """Other physics; actions stay what they are.
 
     A world that knows these parameters moves differently, see
-    :func:`afm_rl.dynamics.mujoco_physics.changed_model` for what they do there: factors ``mass``,
+    :func:`afm_rl.dynamics.mujoco_model.changed_model` for what they do there: factors ``mass``,
     ``friction``, ``damping``, ``gravity`` and ``length`` (of links, whose masses stay what they
     are); ``payload``, a share of the whole mass; ``wind_x`` and ``wind_y``, steady accelerations
     (m/s^2).

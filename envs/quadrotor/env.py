@@ -6,15 +6,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from afm_rl.dynamics.quadrotor import check_body
-from afm_rl.envs.courses.flights import find_reference
-from afm_rl.envs.courses.reference import Reference, check_reference
+from afm_rl.envs.courses.flights import Reference, check_reference, find_reference
 from afm_rl.envs.missions.env import MissionEnv
-from afm_rl.envs.missions.noise import flight_noise
+from afm_rl.envs.missions.format import flight_noise
+from afm_rl.envs.missions.gym import MissionGym
 from afm_rl.envs.missions.settings import (
     check_bounds,
     check_names,
@@ -34,7 +35,7 @@ UNIT = 1e-3  # how far a quaternion's length may be from 1
 class CrazyflieTrack(MissionEnv):
     r"""Quadrotors that follow position references, tick by tick, batched.
 
-    The plant is the rigid body of :func:`~afm_rl.dynamics.quadrotor_equations.quadrotor_rate`,
+    The plant is the rigid body of :func:`~afm_rl.dynamics.quadrotor.quadrotor_rate`,
     integrated at 500 Hz while the action :math:`u = (T, M_x, M_y, M_z)` in N and N m is held for a
     control tick of 50 ms. What the motors can give of it (:func:`~afm_rl.spaces.airframe.saturate`)
     goes through a regime whose parameters follow the mission's phases. There is no ground, no drag
@@ -256,3 +257,59 @@ def _sensor_noise(std: float | Sequence[float]) -> Tensor:
         raise ConfigurationError(f"sensor_noise={std!r}: expected one number, or four")
     checked = [check_number("sensor_noise", value, low=0.0) for value in given]
     return torch.tensor(checked, dtype=torch.float64).repeat_interleave(3)
+
+
+class CrazyflieTrackGym(MissionGym):
+    """One mission of :class:`~afm_rl.envs.CrazyflieTrack`.
+
+    The observation holds the state (position in m, velocity in m/s, quaternion, body rate in rad/s)
+    and the present reference (position, velocity), the action thrust (N) and moments (N m). The
+    info holds the time (s), the squared error per axis of the last tick (m^2) and, as a truth
+    hidden from the observation, ``regime_active``.
+
+    Args:
+        reference: a reference or the path of a CSV file; a circle if None.
+        regime: regime parameters of the changed phase, or one mapping per phase.
+        times: when phases begin (s); at 2 s and 5 s if None.
+        ramp: ticks over which the regime changes; 0 for sudden changes.
+        render_mode: None; there is nothing to see.
+        settings: further arguments of :class:`~afm_rl.envs.CrazyflieTrack`.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+        NonFiniteError: at a step whose action is NaN or infinite.
+
+    >>> import gymnasium, afm_rl  # registers the name
+    >>> env = gymnasium.make("afm_rl/CrazyflieTrack-v0", regime={"mass": 0.5}, times=[2.0])
+    >>> observation, info = env.reset(seed=0)
+    >>> observation.shape, info["time"]
+    ((19,), 0.0)
+    """
+
+    native: CrazyflieTrack
+    metadata: dict[str, Any] = {"render_modes": [], "render_fps": 20}
+
+    def __init__(
+        self,
+        reference: Reference | str | Path | None = None,
+        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+        times: Sequence[float] | None = None,
+        ramp: int = 0,
+        render_mode: None = None,
+        **settings: Any,
+    ) -> None:
+        if render_mode is not None:
+            raise ConfigurationError(f"render_mode={render_mode!r}: expected none")
+        missions = {"regime": regime, "ramp": ramp}
+        tracks = "circle_2m_0.8mps" if reference is None else reference
+        settings.setdefault("start", "moving")
+        native = CrazyflieTrack(tracks, schedule=times, missions=missions, **settings)
+        super().__init__(native, [np.inf] * 19)
+
+    def _seen(self, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        info = {
+            "time": data["step"].double() * self.native.simulation.dt,
+            "square_error": data["square_error"],
+            "regime_active": data["regime_active"],
+        }
+        return torch.cat([data["observation"], data["reference"][..., 0, :]], -1), info

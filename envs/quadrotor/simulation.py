@@ -10,9 +10,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from afm_rl.dynamics.quadrotor_equations import quadrotor_path
-from afm_rl.envs.courses.reference import Reference, references_at
-from afm_rl.envs.missions.phases import PhasedSimulation
+from afm_rl.dynamics.quadrotor import quadrotor_path
+from afm_rl.envs.courses.flights import Reference, references_at
+from afm_rl.envs.missions.env import PhasedSimulation
 from afm_rl.regimes import Regime, Schedule, wind_of
 from afm_rl.spaces.airframe import QuadrotorBody, saturate
 from afm_rl.spaces.rigid_body import RigidBodySpace

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.envs.task.simulated import EXACT, Limits
+from afm_rl.envs.task.own import EXACT, Limits
 from afm_rl.envs.task.task import Reward, Task, trust
 from afm_rl.errors import check_count
 

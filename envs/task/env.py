@@ -12,9 +12,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.envs.missions.env import MissionEnv
-from afm_rl.envs.missions.noise import MissionNoise
-from afm_rl.envs.missions.phases import PhasedSimulation
+from afm_rl.envs.missions.env import MissionEnv, PhasedSimulation
+from afm_rl.envs.missions.format import MissionNoise
 from afm_rl.envs.missions.settings import check_bounds, check_regime
 from afm_rl.envs.task.film import curves, film
 from afm_rl.envs.task.task import Task

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.dynamics.mujoco_physics import changed_model
+from afm_rl.dynamics.mujoco_model import changed_model
 from afm_rl.errors import check_count, check_number
 from afm_rl.regimes import Physics
 

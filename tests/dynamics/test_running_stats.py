@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from afm_rl.dynamics.running_stats import RunningStats
+from afm_rl.dynamics.stacked import RunningStats
 from afm_rl.errors import ConfigurationError
 
 

@@ -8,13 +8,12 @@ from tensordict import TensorDict
 from torch import nn
 
 from afm_rl.dynamics import KNODE, Dubins, Quadrotor
-from afm_rl.dynamics.quadrotor_equations import quadrotor_path
+from afm_rl.dynamics.quadrotor import quadrotor_path
 from afm_rl.dynamics.residual import Network
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, KNODEUpdater
 from afm_rl.learning.knode_fit import first_order, fit_network, through_integration
-from afm_rl.missions.log import StepLog
-from afm_rl.missions.state import Loop, restore, snapshot
+from afm_rl.missions.state import Loop, StepLog, restore, snapshot
 from afm_rl.spaces.airframe import QuadrotorBody
 from afm_rl.storage.checkpoints import Checkpoints
 
