@@ -34,15 +34,10 @@ NOMINAL = dict(zip(Physics.names, Physics.identity, strict=True))
 
 
 class Simulator:
-    """Simulates many copies of a MuJoCo model from given states, on some threads.
+    """Simulates copies of an ``MjModel``, ``frame_skip`` steps per action, on some threads.
 
-    Args:
-        model: an ``MjModel``; not copied.
-        frame_skip: simulation steps per action.
-        threads: 0 for the calling thread.
-        change: see :class:`MuJoCoDynamics`.
-        nominal: the row of physics that changes nothing.
-        most: models with changed physics that are kept.
+    ``change`` makes models with other physics, of which the ``most`` latest are kept; the row
+    ``nominal`` changes nothing.
     """
 
     def __init__(

@@ -90,14 +90,7 @@ HUGE = 1e9  # MuJoCo resets a simulation that holds larger numbers
 
 
 def read_model(source: Any) -> tuple[Any, int]:
-    """Return a copy of the ``MjModel`` in a source, and the simulation steps per action.
-
-    Args:
-        source: see :class:`MuJoCoDynamics`.
-
-    Raises:
-        ConfigurationError: if there is no model in it, none with actuators, or none that moves.
-    """
+    """Return a copy of the ``MjModel`` in a source, and the simulation steps per action."""
     if mujoco is None:
         raise ConfigurationError(
             "dynamics=mujoco: the package mujoco is missing; install afm-rl[mujoco]"
@@ -123,11 +116,7 @@ def read_model(source: Any) -> tuple[Any, int]:
 
 
 def check_numbers(name: str, model: Any) -> None:
-    """Check the time step and the bodies of an ``MjModel``.
-
-    Raises:
-        ConfigurationError: for a step that is not above 0, and masses that nothing can move.
-    """
+    """Refuse a time step that is not above 0, and masses that nothing can move."""
     check_number(f"{name}: timestep", float(model.opt.timestep), low=0.0, open_low=True)
     for kind, values in (("mass", model.body_mass), ("inertia", model.body_inertia)):
         for body, most in enumerate(np.abs(values).reshape(model.nbody, -1).max(-1)):
@@ -203,19 +192,12 @@ LONG = (3, 5)  # and of capsules and cylinders, whose second size is half their 
 
 
 def changed_model(model: Any, row: tuple[float, ...]) -> Any:
-    """Return a copy of an ``MjModel`` with other physics.
+    """Return a copy of an ``MjModel`` with other physics, a row of :attr:`Physics.names`.
 
-    * ``mass``: masses and inertias of all bodies times a factor,
-    * ``friction``: sliding friction of contacts and dry friction of joints,
-    * ``damping``: of joints and tendons,
-    * ``gravity``, and ``wind_x``, ``wind_y``, a steady acceleration (m/s^2),
-    * ``length``: of links (bodies that only turn, and what is fixed to them) and of tendons'
-      limits; masses stay, inertias grow with the square,
-    * ``payload``: a share of the whole mass, at the centre of the heaviest body.
-
-    Args:
-        model: the nominal model.
-        row: values of :attr:`Physics.names <afm_rl.regimes.Physics>`.
+    ``mass`` scales masses and inertias, ``friction`` that of contacts and joints, ``damping`` that
+    of joints and tendons; wind is an acceleration (m/s^2). ``length`` is of links (bodies that only
+    turn, and what is fixed to them) and of tendons' limits: masses stay, inertias grow with the
+    square. The ``payload``, a share of the whole mass, is at the centre of the heaviest body.
     """
     import mujoco
 

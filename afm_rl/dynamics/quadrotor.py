@@ -34,11 +34,6 @@ class _Tables(NamedTuple):
 class HeldFlight(HeldRate):
     """What :func:`quadrotor_rate` gives while an action is held: ``gain * products + offset``.
 
-    Args:
-        action: thrust (N) and moments (N m), ``(*B, 4)``.
-        body: the quadrotor.
-        wind: a further acceleration (m/s^2), ``(*B, 3)``.
-
     >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
     >>> HeldFlight(torch.zeros(4), QuadrotorBody())(level)[3:6]
     tensor([ 0.0000,  0.0000, -9.8100])
@@ -122,21 +117,10 @@ def quadrotor_path(
     body: QuadrotorBody,
     wind: Tensor | None = None,
 ) -> Tensor:
-    """Fly for ``dt`` seconds by fourth-order Runge-Kutta steps, the action held.
+    """Fly for ``dt`` s by N Runge-Kutta steps, the action held; return the states ``(N, *B, 13)``.
 
     The quaternion is scaled back to length 1 at the end; before that it is off by the error of the
     integration.
-
-    Args:
-        state: where to start, ``(*B, 13)``.
-        action: thrust (N) and moments (N m), ``(*B, 4)``.
-        dt: time (s).
-        substeps: number of Runge-Kutta steps, N.
-        body: the quadrotor.
-        wind: a further acceleration (m/s^2), ``(*B, 3)``.
-
-    Returns:
-        The state after every step, ``(N, *B, 13)``.
 
     >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
     >>> fallen = quadrotor_path(level, torch.zeros(4), 1.0, 2, QuadrotorBody())
@@ -247,10 +231,7 @@ class Quadrotor(KnownDynamics):
 
 
 def check_body(body: QuadrotorBody | None) -> QuadrotorBody:
-    """Return the quadrotor, by default a Crazyflie.
-
-    Raises:
-        ConfigurationError: if it is none.
+    """Return the quadrotor, by default a Crazyflie; refuse what is none.
 
     >>> check_body(None).mass
     0.03

@@ -39,15 +39,9 @@ def derivative(
 def pushed_forward(
     function: Callable[[Tensor], Tensor], point: Tensor, slope: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return a function's value at a point, and its derivative by what the point depends on.
+    """Return a function's value ``(*B, R)`` at a ``point`` ``(*B, S)``, and its derivative.
 
-    Args:
-        function: takes ``(*B, K, S)``, returns ``(*B, K, R)``.
-        point: ``(*B, S)``.
-        slope: derivative of the point by K parameters, ``(*B, S, K)``.
-
-    Returns:
-        ``(*B, R)`` and ``(*B, R, K)``.
+    That is by K parameters, ``(*B, R, K)``, given the point's by them, ``slope`` ``(*B, S, K)``.
 
     >>> pushed_forward(torch.square, torch.tensor([3.0]), torch.tensor([[1.0, 2.0]]))
     (tensor([9.]), tensor([[ 6., 12.]]))
@@ -60,17 +54,10 @@ def pushed_forward(
 def linearised(
     function: Callable[[Tensor, Tensor], Tensor], state: Tensor, action: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a function of state and action, and its derivatives by both.
+    """Return a function of state ``(*B, S)`` and action ``(*B, A)``, and its derivatives by both.
 
-    Forward differentiation of all S + A columns in one batch.
-
-    Args:
-        function: takes states ``(*B, S)`` and actions ``(*B, A)``, returns ``(*B, R)``.
-        state: ``(*B, S)``.
-        action: ``(*B, A)``.
-
-    Returns:
-        The value ``(*B, R)`` and derivatives ``(*B, R, S)`` and ``(*B, R, A)``.
+    Forward differentiation of all S + A columns in one batch; ``(*B, R)``, ``(*B, R, S)``,
+    ``(*B, R, A)``.
 
     >>> value, by_state, by_action = linearised(torch.mul, torch.ones(2), torch.tensor([3.0, 4.0]))
     >>> by_state.tolist(), by_action.tolist()
@@ -97,14 +84,9 @@ class HeldRate(ABC):
 
     @abstractmethod
     def tangent(self, state: Tensor, through: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the rate of change and its derivative by K parameters, the action the last.
+        """Return the rate ``(*B, S)`` and its derivative ``(*B, S, K)``, by actions last.
 
-        Args:
-            state: ``(*B, S)``.
-            through: derivative of ``state`` by them, ``(*B, S, K)``.
-
-        Returns:
-            ``(*B, S)`` and ``(*B, S, K)``.
+        ``through`` ``(*B, S, K)`` is that of the state.
         """
 
     @abstractmethod
@@ -113,12 +95,7 @@ class HeldRate(ABC):
 
 
 class HeldFunction(HeldRate):
-    """Any function as a rate; derivatives by forward differentiation.
-
-    Args:
-        action: ``(*B, A)``.
-        function: ``function(state, action) -> rate``, batched and differentiable.
-        manifold: the state space, whose angles wrap.
+    """Any function ``(state, action) -> rate`` as a rate; derivatives by forward differentiation.
 
     >>> held = HeldFunction(torch.ones(1), lambda x, u: torch.cat([x[..., 1:], u], -1), Manifold(2))
     >>> held.tangent(torch.zeros(2), torch.eye(2, 3))[1]
@@ -162,17 +139,7 @@ def runge_kutta(
 def runge_kutta_path(
     rate: Callable[[Tensor], Tensor], state: Tensor, dt: float, substeps: int
 ) -> list[Tensor]:
-    r"""Integrate :math:`x' = f(x)` for ``dt`` seconds.
-
-    Args:
-        rate: f, ``(*B, S) -> (*B, S)``.
-        state: where to start, ``(*B, S)``.
-        dt: time (s).
-        substeps: number of steps, N.
-
-    Returns:
-        The N states after each step, ``(*B, S)``.
-    """
+    """Integrate :math:`x' = f(x)` for ``dt`` s; return the states ``(*B, S)`` after each step."""
     step, path = dt / substeps, []
     for _ in range(substeps):
         first = rate(state)
@@ -192,17 +159,8 @@ def runge_kutta_linearised(
 
     The chain rule through the stages:
     :math:`dk_i = \tfrac{\partial f}{\partial x}(x_i)\,dx_i + \tfrac{\partial f}{\partial u}(x_i)`.
-
-    Args:
-        rate: f under an action that is held.
-        state: where to start, ``(*B, S)``.
-        actions: number of action components, A.
-        dt: time (s).
-        substeps: number of steps.
-
-    Returns:
-        The state ``(*B, S)``, put back into the state space, and its derivatives ``(*B, S, S)``
-        and ``(*B, S, A)``.
+    Returns the state ``(*B, S)``, put back into the state space, and its derivatives ``(*B, S, S)``
+    and ``(*B, S, A)``.
 
     >>> from afm_rl.dynamics.rates import HeldFunction
     >>> from afm_rl.spaces.manifold import Manifold

@@ -35,16 +35,10 @@ def network_shapes(inputs: int, hidden: int, outputs: int) -> list[tuple[int, in
 
 
 def draw_network(numbers: Tensor, inputs: int, hidden: int, outputs: int) -> Network:
-    r"""Make a network of standard normal numbers: Xavier-uniform weights, no biases.
+    r"""Make a network of standard normal numbers z: Xavier-uniform weights, no biases.
 
     :math:`w = \sqrt{6 / (n_\mathrm{in} + n_\mathrm{out})}\;\mathrm{erf}(z / \sqrt 2)`, which is
     uniform (Glorot & Bengio 2010), so that streams of normal numbers serve.
-
-    Args:
-        numbers: z, ``(*L, hidden * (inputs + outputs))``.
-        inputs: size of the input.
-        hidden: number of hidden units.
-        outputs: size of the output.
 
     >>> draw_network(torch.zeros(5, 6), inputs=2, hidden=2, outputs=1).inner.shape
     torch.Size([5, 2, 2])
@@ -93,13 +87,9 @@ VELOCITY, ATTITUDE = slice(3, 6), slice(6, 10)  # of a state, see RigidBodySpace
 
 
 def to_world(state: Tensor) -> Tensor:
-    r"""Return what turns a rate of change whose acceleration is along the body's axes.
+    """Return what turns a rate whose acceleration is along the body's axes: R(q) for the velocity.
 
-    Args:
-        state: position, velocity, quaternion (scalar-last) and body rate, ``(*B, 13)``.
-
-    Returns:
-        The matrix ``(*B, 13, 13)``: :math:`R(q)` for the velocity, 1 for all else.
+    States are ``(*B, 13)``, the matrix ``(*B, 13, 13)``.
 
     >>> quarter = torch.zeros(13).index_fill(0, torch.tensor([8, 9]), 0.5**0.5)  # about z
     >>> (to_world(quarter) @ torch.arange(13.0))[3:6].round()
@@ -127,15 +117,10 @@ def to_world_slope(state: Tensor, rate: Tensor) -> Tensor:
 
 
 class HeldHybrid(HeldRate):
-    r"""Return :math:`f(x, u) + N([x; u])` and its derivatives, the action held.
+    """:math:`f(x, u) + N([x; u])` and its derivatives, the action ``(l, n, A)`` held.
 
-    Args:
-        nominal: f under ``action``.
-        network: N, one per leading index.
-        action: u, ``(l, n, A)``; states are ``(l, n, S)``.
-        features: indices of the state coordinates that the network sees, None for all.
-        turned: whether the network speaks in the frame of a rigid body, see
-            :func:`~afm_rl.dynamics.residual.to_world`.
+    The network sees the state coordinates ``features`` (None: all), and speaks in the frame of a
+    rigid body if ``turned``, see :func:`to_world`.
 
     >>> from afm_rl.dynamics.rates import HeldFunction
     >>> from afm_rl.dynamics.residual import draw_network

@@ -23,13 +23,8 @@ def stacked_mlp(
 ) -> Tensor:
     """Run M perceptrons with LeakyReLU on M batches: ``(M, N, in) -> (M, N, out)``.
 
-    Each layer runs in the precision of its parameters.
-
-    Args:
-        inputs: ``(M, N, in)``.
-        weights: one ``(M, in, out)`` per layer.
-        biases: one ``(M, 1, out)`` per layer.
-        layer_norm: standardise the units of a layer before each LeakyReLU.
+    Each layer runs in the precision of its parameters, weights ``(M, in, out)`` and biases
+    ``(M, 1, out)``; with ``layer_norm`` units are standardised before each LeakyReLU.
 
     >>> stacked_mlp(torch.ones(2, 7, 3), [torch.ones(2, 3, 1)], [torch.zeros(2, 1, 1)])[0, 0]
     tensor([3.])
@@ -57,18 +52,7 @@ def stacked_mlp_tangent(
     biases: Sequence[Tensor],
     layer_norm: bool = False,
 ) -> Tensor:
-    """Push A tangent vectors through the networks of :func:`stacked_mlp`.
-
-    Args:
-        inputs: ``(M, N, in)``.
-        tangents: ``(A, in)``, the same for every row.
-        weights: one ``(M, in, out)`` per layer.
-        biases: one ``(M, 1, out)`` per layer.
-        layer_norm: standardise the units of a layer before each LeakyReLU.
-
-    Returns:
-        Directional derivatives ``(M, N, A, out)``.
-    """
+    """Push tangents ``(A, in)``, the same for all rows, through them: ``(M, N, A, out)``."""
     axes = tangents.unsqueeze(1).expand(len(inputs), -1, *inputs.shape[1:])
     moved = torch.cat([inputs.unsqueeze(1), axes], 1)  # (M, 1 + A, N, in): values, then tangents
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
@@ -111,16 +95,6 @@ def sparse_layer(
     Each unit keeps a random tenth of its incoming weights, at least one, drawn from
     :math:`U(\pm 1/\sqrt{\text{fan-in}})` (Elsayed et al. 2024, section 3): units that look
     at different inputs disturb each other less when they learn from one sample at a time.
-
-    Args:
-        members: number of networks, M.
-        fan_in: inputs of the layer.
-        fan_out: units of the layer.
-        generator: source of randomness.
-        density: share of the weights kept, in (0, 1].
-
-    Raises:
-        ConfigurationError: for a density out of range.
 
     >>> weight, bias = sparse_layer(2, 50, 7, torch.Generator().manual_seed(0))
     >>> (weight != 0).sum(1).unique(), bias.abs().sum()
@@ -195,26 +169,14 @@ class RunningStats(nn.Module):
         return (values - mean) / std
 
     def start_(self, mean: Tensor, std: Tensor, count: int) -> None:
-        """Begin as if ``count`` samples of this mean and deviation ``(D,)`` had been seen.
-
-        Raises:
-            ConfigurationError: for a count below 1.
-        """
+        """Begin as if ``count`` samples of this mean and deviation ``(D,)`` had been seen."""
         self.count.fill_(check_count("count", count))
         self.mean.copy_(mean)
         self.scatter.copy_(std.square() * (count - 1))
 
     @torch.no_grad()
     def update_(self, values: Tensor, where: Tensor | None = None) -> None:
-        """Take in samples.
-
-        Args:
-            values: ``(*L, *N, D)``; must be finite where they count.
-            where: ``(*L, *N)`` boolean, which samples count; None for all.
-
-        Raises:
-            ConfigurationError: if the shapes do not fit.
-        """
+        """Take in finite samples ``(*L, *N, D)``, those of ``where`` ``(*L, *N)``; all if None."""
         batch = values.shape[:-1]
         if batch[: len(self.lead)] != self.lead or values.shape[-1:] != (self.size,):
             raise ConfigurationError(

@@ -47,10 +47,7 @@ def fit_network(
         rows: states ``(*L, n, S)``, actions and next states, with l = prod(L).
         counts: which rows count, ``(*L, n)`` boolean; the others must be finite.
         dt: length of a row, h (s).
-        epochs: steps of Adam.
-        lr: their size.
-        l2: :math:`\lambda`.
-        exact: whether to differentiate through the integration.
+        epochs, lr, l2, exact: see :class:`~afm_rl.learning.KNODEUpdater`.
 
     >>> from afm_rl.dynamics import Quadrotor
     >>> model = KNODE(Quadrotor())

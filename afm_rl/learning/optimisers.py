@@ -15,11 +15,8 @@ from afm_rl.errors import ConfigurationError, check_count, check_number
 def bounded_step_size(size: Tensor, delta: Tensor, lr: float, kappa: float) -> Tensor:
     r"""Return :math:`\eta / \max(1, M)`, :math:`M = \eta \kappa \max(|\delta|, 1) \|z\|_1`.
 
-    Args:
-        size: :math:`\|z\|_1`, the sum of the traces' absolute values, ``(*L,)``.
-        delta: error, broadcasts with ``size``.
-        lr: step size :math:`\eta`.
-        kappa: :math:`\kappa`; beyond 1 it leaves room for the function not being linear.
+    ``size`` is :math:`\|z\|_1`, the sum of the traces' absolute values, ``(*L,)``; beyond 1
+    :math:`\kappa` leaves room for the function not being linear.
 
     >>> bounded_step_size(torch.tensor([0.1, 4.0]), torch.tensor(0.5), lr=1.0, kappa=2.0)
     tensor([1.0000, 0.1250])

@@ -92,14 +92,7 @@ def advance(
       judged yet.
     * Innovations are measured by the noise that the fit has had so far, if that is more than the
       model's: a robot of which no transition is as predicted is noisy, it does not change.
-    * A fit is also dropped once the nominal model has been as good for long.
-
-    Args:
-        fit: what is known.
-        rows: the transitions.
-        forgetting: weight of a transition relative to the next one, in (0, 1].
-        gate: standard deviations of the prediction beyond which an innovation is a change.
-        patience: transitions for which the nominal model is as good before a fit is dropped.
+    * A fit is also dropped once the nominal model has been as good for ``patience`` transitions.
     """
     theta, covariance = fit.solution()
     features, y, weight, valid, exciting, prior = rows

@@ -67,9 +67,8 @@ def transitions(
 def fit_collected(model: Ensemble, robot: Robot, how: Collection, progress: bool) -> dict[str, Any]:
     """Collect transitions round by round and fit the model to all.
 
-    Returns:
-        The last :class:`~afm_rl.learning.FitReport`, by name, and ``rewards``, the mean reward per
-        step of each round.
+    Returns the last :class:`~afm_rl.learning.FitReport`, by name, and ``rewards``, the mean reward
+    per step of each round.
     """
     cost = _cost(robot, how)
     first, parts, planner = copy.deepcopy(model.state_dict()), [], None

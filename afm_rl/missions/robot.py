@@ -41,11 +41,7 @@ class Collection:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check counts.
-
-        Raises:
-            ConfigurationError: for numbers that cannot be used.
-        """
+        """Check counts."""
         check_counts("robot.data.rounds", self.rounds, least=1)
         check_count("robot.data.seed", self.seed, low=0)
 
@@ -131,12 +127,7 @@ class Robot:
     data: Collection | None = None
 
     def __post_init__(self) -> None:
-        """Check that boxes, names and features fit the model.
-
-        Raises:
-            ConfigurationError: if a box has the wrong size or is turned inside out, a
-                coordinate lacks its name, or a feature is no coordinate.
-        """
+        """Check that boxes, names and features fit the model."""
         for kind, size in (("action", self.model.action_size), ("state", self.model.state_size)):
             self._check_box(kind, size)
             names = list(getattr(self, f"{kind}_names"))

@@ -115,11 +115,7 @@ class Family:
 
 
 def find_family(name: str, robot: Robot) -> Family | Listed:
-    """Return a family of the robot's configuration.
-
-    Raises:
-        ConfigurationError: if there is none of this name, or its settings cannot be used.
-    """
+    """Return a family of the robot's configuration."""
     given: Any = robot.families[check_choice("regimes", name, robot.families)]
     where = f"robot.families.{name}"
     if isinstance(given, Mapping) and "list" in given:

@@ -91,14 +91,9 @@ TORCH = frozenset(vars(nn.Module()))  # attributes that every module has
 
 
 def check_saved(agent: Agent, before: Mapping[str, Any]) -> None:
-    """Check that nothing changes which is neither saved in checkpoints nor cut with the missions.
+    """Refuse what changes and is neither saved in checkpoints nor cut with the missions.
 
-    Args:
-        agent: during its missions.
-        before: what :func:`unsaved` found at their start.
-
-    Raises:
-        ConfigurationError: naming the attribute.
+    ``before`` is what :func:`unsaved` found at their start.
     """
     now = unsaved(agent)
     changed = sorted(name for name in now if now[name] != before.get(name, now[name]))
@@ -188,10 +183,6 @@ def snapshot(agent: Agent, loop: Loop) -> dict[str, Any]:
     That is the loop itself, the global generator, and of each module of the agent: all tensors
     (also those that are not persistent), plain numbers and texts, and whatever has a state of its
     own (generators, :class:`Streams`, optimisers, an extra state as defined by ``nn.Module``).
-
-    Raises:
-        ConfigurationError: if something else has changed since the start, see
-            :func:`check_saved`.
     """
     check_saved(agent, loop.unsaved)
     return {
@@ -206,13 +197,7 @@ def snapshot(agent: Agent, loop: Loop) -> dict[str, Any]:
 
 
 def restore(agent: Agent, loop: Loop, state: dict[str, Any]) -> None:
-    """Put ``agent`` and ``loop`` where a :func:`snapshot` was taken.
-
-    Args:
-        agent: like the one of the snapshot, at the start of its missions.
-        loop: at their start.
-        state: the snapshot; what it holds is taken over, not copied.
-    """
+    """Put an agent and its loop, both at their start, where a :func:`snapshot` was taken."""
     for name, _, write in _holders(agent):
         write(state["agent"][name])
     torch.random.set_rng_state(state["global"])
@@ -253,11 +238,7 @@ def _set(device: torch.device, owner: Any, name: str, value: Any) -> None:
 
 
 def leave(agent: Agent, loop: Loop, keep: Tensor) -> None:
-    """Go on with the missions in ``keep`` only: the others are finished.
-
-    Raises:
-        ConfigurationError: if something per mission cannot be cut, see :func:`check_saved`.
-    """
+    """Go on with the missions in ``keep`` only: the others are finished."""
     loop.ids, loop.td = loop.ids[keep], loop.td[keep]
     agent.model.select_(keep)
     agent.updater.follow()

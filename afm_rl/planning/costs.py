@@ -96,9 +96,6 @@ class GoalDistance(Cost):
 def check_arguments(name: str, function: Callable[..., Any], count: int) -> None:
     """Check that a function takes ``count`` arguments, as far as it says so.
 
-    Raises:
-        ConfigurationError: otherwise.
-
     >>> check_arguments("cost.reward", lambda state, action, next_state: 0.0, 3)
     """
     try:

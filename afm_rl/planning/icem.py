@@ -22,13 +22,10 @@ WITHOUT_NOISE = (
 
 
 def coloured(noise: Tensor, beta: float) -> Tensor:
-    r"""Colour white noise in time: power spectrum :math:`\propto f^{-\beta}`, variance 1.
+    r"""Colour white noise ``(*B, H, A)`` in time: spectrum :math:`\propto f^{-\beta}`, variance 1.
 
-    The lowest frequency, 1/H, stands in for frequency 0.
-
-    Args:
-        noise: standard normal numbers, ``(*B, H, A)``.
-        beta: 0 leaves the noise white, 1 is pink, 2 red; large ones are all but constant.
+    0 leaves it white, 1 is pink, 2 red; large ones are all but constant. The lowest frequency, 1/H,
+    stands in for frequency 0.
 
     >>> white = torch.randn(1000, 5, 2)
     >>> torch.allclose(coloured(white, 0.0), white, atol=1e-5)

@@ -98,10 +98,6 @@ def read_normaliser(file: str | Path) -> tuple[Tensor, float]:
 
     The file is a pickle. It is not unpickled: its stream of operations is read for the numbers that
     follow these names, which can do no harm.
-
-    Raises:
-        ConfigurationError: if there is no such file.
-        ArtefactError: if there are no such numbers in it.
     """
     content, wanted, word, began = _existing(file).read_bytes(), "", None, False
     found: dict[str, Any] = {}

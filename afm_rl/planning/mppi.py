@@ -18,16 +18,9 @@ from afm_rl.spaces.keys import as_key
 
 
 def smooth(plan: Tensor, past: Tensor, beta: float, low: Tensor, high: Tensor) -> Tensor:
-    r"""Filter plans in time, within the action box.
+    r"""Filter plans x ``(*B, H, A)`` in time, within the action box; ``beta`` 1 does not smooth.
 
     .. math:: u_h = \mathrm{clamp}(\beta\,x_h + (1 - \beta)\,u_{h-1}),\qquad u_{-1} = u_\text{past}
-
-    Args:
-        plan: raw actions x, ``(*B, H, A)``.
-        past: the action before the plan, broadcastable to ``(*B, A)``.
-        beta: weight of the new action in (0, 1]; 1 does not smooth.
-        low: lowest action, ``(A,)``.
-        high: highest action, ``(A,)``.
 
     >>> box = -torch.ones(1), torch.ones(1)
     >>> smooth(torch.tensor([[1.0], [1.0], [9.0]]), torch.zeros(1), 0.5, *box).squeeze(-1)

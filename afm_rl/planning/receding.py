@@ -25,13 +25,7 @@ from afm_rl.streams import Streams
 
 
 class ZeroPrimer(TensorDictPrimer):
-    """A :class:`TensorDictPrimer` of zeros that also serves batch-unlocked environments.
-
-    The base class fills the batch of the environment; this one fills the batch of the reset.
-
-    Args:
-        spec: the entries, without batch dimensions.
-    """
+    """A primer of zeros that fills the batch of the reset, not that of the environment."""
 
     def __init__(self, spec: Composite) -> None:
         super().__init__(spec, default_value=0.0, expand_specs=True)
@@ -51,11 +45,7 @@ class ZeroPrimer(TensorDictPrimer):
 
 
 def action_spec_of(env: EnvBase) -> TensorSpec:
-    """Return the spec of an environment's action, whatever its key.
-
-    Raises:
-        ConfigurationError: if there are several actions.
-    """
+    """Return the spec of an environment's one action, whatever its key."""
     if len(check_instance("planner.env", env, EnvBase).action_keys) != 1:
         raise ConfigurationError(
             f"planner: {type(env).__name__} takes the actions {env.action_keys}; expected one"

@@ -35,13 +35,7 @@ class Constant:
 
 
 class HalfRange(Constant):
-    """Half ranges of the A action axes, the unit of many parameters, where they are needed.
-
-    Args:
-        values: half of highest minus lowest action, per axis.
-
-    Raises:
-        ConfigurationError: unless all are finite and above zero.
+    """Half ranges of the A action axes, finite and above zero: the unit of many parameters.
 
     >>> HalfRange([1.0, 1.5]).values
     (1.0, 1.5)
@@ -61,10 +55,7 @@ class HalfRange(Constant):
 def check_span(
     name: str, span: Sequence[float], low: float = -math.inf, high: float = math.inf
 ) -> tuple[float, float]:
-    """Return the two ends of a range to draw from.
-
-    Raises:
-        ConfigurationError: unless they are two finite numbers in [low, high], in order.
+    """Return the two ends of a range to draw from: finite numbers in [low, high], in order.
 
     >>> check_span("span", [0.2, 0.6], low=0.0)
     (0.2, 0.6)
@@ -94,7 +85,8 @@ class Regime(ABC):
 
     The same object serves the simulator, the oracle and the counterfactual generator. Its
     parameters are one row of named numbers, so a batch of missions, each under a regime of
-    its own, is one tensor ``(*B, F)``.
+    its own, is one tensor ``(*B, F)``. A family that is made with settings that cannot be used
+    raises a :class:`~afm_rl.errors.ConfigurationError`.
 
     Attributes:
         names: names of the F parameters, in order.
@@ -198,11 +190,7 @@ class Regime(ABC):
 
     @staticmethod
     def distinct(names: Sequence[str], axes: int | None = None) -> tuple[str, ...]:
-        """Return ``names`` as a tuple, one per action axis.
-
-        Raises:
-            ConfigurationError: unless they are distinct, and as many as there are ``axes``.
-        """
+        """Return ``names`` as a tuple; they must be distinct, one for each of the ``axes``."""
         found = tuple(names)
         if not found or len(set(found)) < len(found) or len(found) != (axes or len(found)):
             count = "" if axes is None else f"{axes} "
@@ -210,11 +198,7 @@ class Regime(ABC):
         return found
 
     def check_names(self, names: Iterable[str]) -> None:
-        """Check that all ``names`` are parameters.
-
-        Raises:
-            ConfigurationError: naming the first that is not.
-        """
+        """Check that all ``names`` are parameters; the error names the first that is not."""
         for name in names:
             if name not in self.names:
                 raise ConfigurationError(
@@ -222,11 +206,7 @@ class Regime(ABC):
                 )
 
     def check_limits(self, parameters: Tensor) -> None:
-        """Check that parameters ``(*B, F)`` are within their limits.
-
-        Raises:
-            ConfigurationError: naming the first that is not.
-        """
+        """Check that parameters ``(*B, F)`` are within their limits; the error names the first."""
         for name, (low, high) in self.limits.items():
             values = parameters[..., self.names.index(name)]
             wrong = values[~((values >= low) & (values <= high))]

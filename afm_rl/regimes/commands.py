@@ -21,9 +21,6 @@ class Saturation(StaticRegime):
         half_range: half ranges of the action axes, the unit of u.
         span: lowest and highest fraction s in the prior, uniform.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> weak = Saturation(half_range=[1.0, 2.0])
     >>> weak.apply(torch.tensor([-0.9, 0.6]), weak.encode({"saturation": 0.5}), torch.zeros(3))
     tensor([-0.5000,  0.6000])
@@ -55,9 +52,6 @@ class DeadZone(StaticRegime):
         half_range: half ranges of the action axes, the unit of u.
         span: lowest and highest d in the prior, uniform.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> import torch
     >>> stiff = DeadZone(half_range=[1.0, 2.0])
     >>> stiff.apply(torch.tensor([-0.25, 1.0]), stiff.encode({"dead_zone": 0.25}), torch.zeros(3))
@@ -73,7 +67,6 @@ class DeadZone(StaticRegime):
         self.span = check_span("span", span, 0.0, 1.0)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        """Take the loss off the size."""
         loss = parameters * self.half_range.like(action)
         return action.sign() * (action.abs() - loss).clamp(min=0.0)
 
@@ -91,9 +84,6 @@ class Quantisation(StaticRegime):
     Args:
         half_range: half ranges of the action axes, the unit of u and q.
         span: lowest and highest step q in the prior, uniform.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
 
     >>> coarse = Quantisation(half_range=[1.0, 2.0])
     >>> coarse.apply(torch.tensor([0.3, 0.3]), coarse.encode({"quantum": 0.5}), torch.zeros(3))
@@ -129,9 +119,6 @@ class Permutation(StaticRegime):
         names: one parameter name per action axis.
         half_range: half ranges of the action axes.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> swapped = Permutation(["left_from", "right_from"], half_range=[1.0, 2.0])
     >>> row = swapped.encode({"left_from": 1, "right_from": 0})
     >>> swapped.apply(torch.tensor([0.5, 0.2]), row, torch.zeros(3))
@@ -146,22 +133,16 @@ class Permutation(StaticRegime):
         self.limits = dict.fromkeys(self.names, (0.0, axes - 1.0))
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        """Pick each axis from its source."""
         source, ratio = self._sources(action, parameters)
         return action.expand_as(source).gather(-1, source) * ratio
 
     def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Send each axis to its source."""
         source, ratio = self._sources(effect, parameters)
         command = torch.zeros(source.shape, dtype=effect.dtype, device=effect.device)
         return command.scatter(-1, source, effect / ratio)
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
-        """Return the parameter row ``(A,)``.
-
-        Raises:
-            ConfigurationError: also unless the indices are a permutation.
-        """
+        """Return the parameter row ``(A,)``, if its indices are a permutation."""
         row = super().encode(values)
         if sorted(row.tolist()) != list(self.identity):
             given = dict(zip(self.names, row.tolist(), strict=True))
@@ -171,7 +152,6 @@ class Permutation(StaticRegime):
         return row
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw permutations ``(*shape, A)``, all equally likely."""
         return torch.rand((*shape, len(self.names)), generator=generator).argsort(-1).float()
 
     def _sources(self, action: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
@@ -188,9 +168,6 @@ class Rotation(StaticRegime):
     Args:
         half_range: half ranges of the two action axes.
         span: lowest and highest angle (rad) in the prior, uniform.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
 
     >>> coupling = Rotation(half_range=[1.0, 2.0])
     >>> row = coupling.encode({"rotation": math.pi / 2})

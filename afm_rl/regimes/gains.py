@@ -49,11 +49,6 @@ class ActionGain(StaticRegime):
         self.nominal = check_number("nominal", nominal, low=0.0, high=1.0)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        """Multiply.
-
-        Raises:
-            ConfigurationError: for another number of actions than of names.
-        """
         if action.shape[-1] != len(self.names):
             raise ConfigurationError(
                 f"ActionGain({list(self.names)}): the robot has {action.shape[-1]} actions; give "
@@ -94,9 +89,6 @@ class AsymmetricGain(StaticRegime):
         names: one name per action axis; its parameters are ``NAME_up`` and ``NAME_down``.
         span: lowest and highest gain in the prior, > 0.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> worn = AsymmetricGain(["v"])
     >>> row = worn.encode({"v_down": 0.5})
     >>> worn.apply(torch.tensor([[1.0], [-1.0]]), row, torch.zeros(3))
@@ -114,15 +106,12 @@ class AsymmetricGain(StaticRegime):
         self.span = math.log(low), math.log(high)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        """Multiply by the gain of the command's direction."""
         return action * self._gains(action, parameters)
 
     def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Divide by the gain of the effect's direction."""
         return divide(effect, self._gains(effect, parameters))
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw gains ``(*shape, 2 A)``: all upward ones, then all downward ones."""
         return draw_between(self.span, (*shape, len(self.names)), generator).exp()
 
     def _gains(self, action: Tensor, parameters: Tensor) -> Tensor:
@@ -137,9 +126,6 @@ class DeadActuator(StaticRegime):
 
     Args:
         names: one parameter name per action axis.
-
-    Raises:
-        ConfigurationError: unless the names are distinct.
 
     >>> dead = DeadActuator(["left_loss", "right_loss"])
     >>> dead.apply(torch.ones(2), dead.encode({"left_loss": 1.0}), torch.zeros(3))
@@ -159,7 +145,6 @@ class DeadActuator(StaticRegime):
         return divide(effect, 1 - parameters)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw one dead axis each, ``(*shape, A)``."""
         axis = torch.randint(len(self.names), shape, generator=generator)
         return torch.nn.functional.one_hot(axis, len(self.names)).float()
 
@@ -173,9 +158,6 @@ class GainNoise(Regime):
 
     Args:
         span: lowest and highest standard deviation in the prior, uniform.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
 
     >>> import torch
     >>> shaky, noise = GainNoise(), torch.tensor([1.0, -2.0])
@@ -215,9 +197,6 @@ class Bias(StaticRegime):
         names: one parameter name per action axis.
         half_range: half ranges h of the action axes, the unit of the offsets b.
         span: lowest and highest offset in the prior, uniform.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
 
     >>> import torch
     >>> bias = Bias(["v_bias", "omega_bias"], half_range=[1.0, 2.0])

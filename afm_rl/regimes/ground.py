@@ -28,9 +28,6 @@ class WheelSlip(StaticRegime):
         at: lowest and highest c in the prior, uniform.
         peak: lowest and highest m in the prior, uniform.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> slip = WheelSlip(half_range=[1.0, 1.0])
     >>> row = slip.encode({"slip_at": 0.5, "slip_peak": 0.8})
     >>> slip.apply(torch.tensor([0.5, 1.0]), row, torch.zeros(3))
@@ -68,7 +65,6 @@ class WheelSlip(StaticRegime):
         return torch.where(at == 0, effect, effect.sign() * (at * half) * load)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw c and m ``(*shape, 2)``, uniform."""
         size = (*shape, 1)
         return torch.cat([draw_between(span, size, generator) for span in (self.at, self.peak)], -1)
 
@@ -103,9 +99,6 @@ class Patches(Regime):
         where: indices of the state coordinates (m) that say where the robot is.
         names: one parameter name per action axis.
         span: smallest and largest size of the first gain in the prior, > 0.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
 
     >>> ground = Patches(size=2.0)
     >>> row = ground.encode({"patch_v_gain": -1.0})

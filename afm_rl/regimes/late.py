@@ -23,9 +23,6 @@ class Delay(DelayedRegime):
     Args:
         span: lowest and highest delay in the prior (steps).
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> late = Delay()
     >>> past = torch.tensor([[0.2, 0.0], [0.1, 0.0]] + 6 * [[0.0, 0.0]])  # newest first
     >>> late.apply(torch.ones(2), late.encode({"delay": 2}), torch.zeros(3), past)
@@ -46,18 +43,13 @@ class Delay(DelayedRegime):
             )
 
     def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
-        """Pick the command out of the past."""
         effect = action * (1 - parameters).clamp(min=0.0)
         for steps, command in enumerate(past.unbind(-2), 1):
             effect = effect + command * (1 - (parameters - steps).abs()).clamp(min=0.0)
         return effect
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
-        """Return the parameter row; only whole steps are taken.
-
-        Raises:
-            ConfigurationError: also for a fraction of a step.
-        """
+        """Return the parameter row; only whole steps are taken."""
         row = super().encode(values)
         if float(row) % 1:
             given = values["delay"]
@@ -84,9 +76,6 @@ class Lag(DelayedRegime):
         span: lowest and highest time constant T (steps) in the prior, uniform.
         history: number of commands that are remembered.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> import torch
     >>> slow, past = Lag(history=3), torch.zeros(3, 1)
     >>> slow.apply(torch.ones(1), slow.encode({"lag": 1.0}), torch.zeros(3), past)
@@ -102,7 +91,6 @@ class Lag(DelayedRegime):
         self.history = check_count("history", history)
 
     def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
-        """Filter the commands from the oldest one on."""
         keep = (-1 / parameters.abs()).exp()  # 0 where there is no lag
         oldest, *later = reversed(past.unbind(-2))
         effect = oldest
@@ -123,9 +111,6 @@ class Backlash(DelayedRegime):
         half_range: half ranges of the action axes.
         span: lowest and highest half width b in the prior, uniform.
         history: number of commands that are remembered.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
 
     >>> loose = Backlash(half_range=[1.0], history=2)
     >>> past = torch.tensor([[0.5], [0.0]])  # newest first: up to 0.5 - 0.2, then back
@@ -148,7 +133,6 @@ class Backlash(DelayedRegime):
         self.history = check_count("history", history)
 
     def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
-        """Follow the commands from the oldest one on."""
         width = parameters * self.half_range.like(action)
         oldest, *later = reversed(past.unbind(-2))
         effect = oldest

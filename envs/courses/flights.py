@@ -33,11 +33,7 @@ class Reference(ABC):
 
 
 def check_reference(reference: Reference) -> Reference:
-    """Return a reference if it gives positions and velocities.
-
-    Raises:
-        ConfigurationError: otherwise.
-    """
+    """Return a reference if it gives positions and velocities."""
     size = tuple(check_instance("tracks", reference, Reference).at(torch.zeros(2)).shape)
     if size != (2, 6):
         raise ConfigurationError(
@@ -48,12 +44,7 @@ def check_reference(reference: Reference) -> Reference:
 
 
 def references_at(references: Sequence[Reference], index: Tensor, time: Tensor) -> Tensor:
-    """Return positions and velocities ``(*B, K, 6)`` of flights that follow several references.
-
-    Args:
-        references: the references.
-        index: which one each flight follows, ``(*B)``.
-        time: times (s), ``(*B, K)``.
+    """Return ``(*B, K, 6)`` of references by index ``(*B)`` at times ``(*B, K)``.
 
     >>> from afm_rl.envs import Hover
     >>> flights = torch.tensor([0, 1])

@@ -17,18 +17,10 @@ from afm_rl.errors import ConfigurationError, check_number
 def read_columns(
     path: str | Path, headers: Sequence[tuple[str, ...]]
 ) -> tuple[tuple[str, ...], Tensor]:
-    """Read a CSV of finite numbers.
-
-    Args:
-        path: the file; its first line names the columns.
-        headers: the sets of columns that are allowed.
-
-    Returns:
-        The header, and the numbers ``(R, C)`` in double precision.
+    """Return the header of a CSV file, one of ``headers``, and its finite numbers ``(R, C)``.
 
     Raises:
-        ConfigurationError: if the file is missing or is no text, has other columns, or holds
-            a cell that is empty, superfluous or not a finite number. It names file and line.
+        ConfigurationError: naming file and line, if it cannot be read as that.
 
     >>> read_columns(Path(__file__).with_name("maps") / "ethz_2.csv", [("x", "y", "radius")])[0]
     ('x', 'y', 'radius')
@@ -84,11 +76,7 @@ def local_origin(points: Tensor) -> Tensor:
 
 
 def check_near(points: Tensor, name: str) -> None:
-    """Refuse ``points`` ``(N, D)`` that are nowhere on Earth.
-
-    Raises:
-        ConfigurationError: naming the first.
-    """
+    """Refuse ``points`` ``(N, D)`` that are nowhere on Earth, naming the first."""
     far = points.abs().amax(-1) > FARTHEST
     if far.any():
         first = int(far.nonzero()[0])
@@ -155,11 +143,7 @@ class Track:
 
 
 def check_closed(points: Tensor, name: str, what: str) -> None:
-    """Refuse ``points`` that are no closed course: at least two, neighbours distinct, not absurd.
-
-    Raises:
-        ConfigurationError: naming the track and the first offending point or pair.
-    """
+    """Refuse ``points`` that are no closed course: two or more, neighbours distinct, not absurd."""
     if points.dim() != 2 or points.shape[-1] != 2 or not points.isfinite().all():
         raise ConfigurationError(
             f"tracks: {name}: {what} table {tuple(points.shape)}: expected finite numbers (W, 2)"

@@ -16,14 +16,7 @@ from afm_rl.spaces.manifold import wrap_angle
 
 
 class Pieces(NamedTuple):
-    """A line as N pieces of constant curvature, in driving order.
-
-    Attributes:
-        origin: where each piece begins (m), ``(N, 2)``.
-        heading: direction there (rad), ``(N,)``.
-        curvature: change of heading per metre (rad/m), 0 on straights, ``(N,)``.
-        length: arc length (m), ``(N,)``.
-    """
+    """N pieces of constant curvature: where each begins (m) and heads (rad), 1/m, and m."""
 
     origin: Tensor
     heading: Tensor
@@ -32,19 +25,11 @@ class Pieces(NamedTuple):
 
 
 def round_corners(vertices: Tensor, radii: Tensor, name: str = "polygon") -> Pieces:
-    r"""Round the corners of a closed polygon.
+    r"""Round the corners ``(V, 2)`` of a closed polygon by fillets of these radii ``(V,)``, in m.
 
     A corner that turns by :math:`\phi` becomes an arc of radius :math:`r` which touches both
     edges :math:`r \tan(|\phi| / 2)` away from the vertex. The line begins where the arc of the
     first vertex ends, and heads for the second vertex.
-
-    Args:
-        vertices: corners (m), ``(V, 2)``, any two neighbours distinct.
-        radii: fillet radii (m), ``(V,)``; 0 keeps a corner sharp.
-        name: what the error message calls the polygon.
-
-    Raises:
-        ConfigurationError: if an edge is too short for the arcs at its two ends.
 
     >>> square = torch.tensor([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
     >>> round(float(round_corners(square, torch.ones(4)).length.sum() - 8), 4)  # 2 pi

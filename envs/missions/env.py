@@ -104,10 +104,12 @@ class MissionEnv(EnvBase):
     environment.
 
     Args:
+        start_noise: standard deviation of the start pose.
         batch_size: number of missions, or ``()`` for any.
         seed: missions without a seed of their own get ``seed, seed + 1, ...``.
-        start_noise: standard deviation of the start pose.
         device: where the tensors live.
+        missions: what missions are unless ``reset`` is given others: a tensordict that
+            broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
         dtype: floating-point type, torch's default if None.
 
     Attributes:
@@ -118,15 +120,17 @@ class MissionEnv(EnvBase):
     mission_format: MissionFormat
     noise: MissionNoise
     simulation: PhasedSimulation
+    more: Sequence[str] = ()  # arguments of `mission` beside those of the format
     _last: TensorDictBase | None = None
 
     def __init__(
         self,
-        batch_size: Sequence[int],
-        seed: int,
         start_noise: float,
-        device: torch.device | str | None,
-        dtype: torch.dtype | None,
+        batch_size: Sequence[int] = (),
+        seed: int = 0,
+        device: torch.device | str | None = None,
+        missions: TensorDictBase | Mapping[str, Any] | None = None,
+        dtype: torch.dtype | None = None,
     ) -> None:
         batch = check_batch(batch_size)
         super().__init__(device=device, batch_size=batch)
@@ -134,25 +138,24 @@ class MissionEnv(EnvBase):
         self.dtype = check_dtype(dtype)
         self.seed = check_count("seed", seed, low=0)
         self.start_noise = check_number("start_noise", start_noise, low=0.0)
+        self._given = missions
 
     @property
     def max_steps(self) -> int:
         """Most steps of an episode."""
         return self.simulation.steps
 
-    def _complete(
-        self,
-        tracks: Sequence[str],
-        missions: TensorDictBase | Mapping[str, Any] | None,
-        bounds: tuple[Tensor, Tensor],
-    ) -> None:
+    def _complete(self, tracks: Sequence[str], bounds: tuple[Tensor, Tensor]) -> None:
         """Set up missions and specs, once the simulation is there."""
         simulation, batch, device = self.simulation, self.batch_size, self.device
+        missions, self._given = self._given, None
         self.regime, self.schedule = simulation.regime, simulation.schedule
         self.mission_format = MissionFormat(tracks, self.regime, self.schedule, self.dtype)
         if isinstance(missions, Mapping) and not isinstance(missions, TensorDictBase):
             for key in missions:
-                check_choice("missions", key, signature(self.mission).parameters)
+                check_choice(
+                    "missions", key, (*signature(self.mission_format.build).parameters, *self.more)
+                )
             missions = self.mission(**missions)
         self._default = check_missions(missions, batch)
         mission = self._missions_of(None, batch)  # a wrong default fails here
@@ -181,16 +184,9 @@ class MissionEnv(EnvBase):
         }
         self.full_done_spec = Composite(flags, shape=batch, device=device)
 
-    def mission(
-        self,
-        track: int | str = 0,
-        seed: int | None = None,
-        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
-        at: Sequence[float] | None = None,
-        ramp: int = 0,
-    ) -> TensorDict:
+    def mission(self, *args: Any, **entries: Any) -> TensorDict:
         """Describe one mission; see :meth:`~afm_rl.envs.missions.format.MissionFormat.build`."""
-        return self.mission_format.build(track, seed, regime, at, ramp).to(self.device)
+        return self.mission_format.build(*args, **entries).to(self.device)
 
     @abstractmethod
     def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:

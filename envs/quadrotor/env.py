@@ -91,14 +91,10 @@ class CrazyflieTrack(MissionEnv):
         dt: control tick (s).
         substeps: plant steps per tick, K.
         trace: whether to publish the states in between.
-        batch_size: number of flights, or ``()`` for any.
-        seed: missions without a seed of their own get ``seed, seed + 1, ...``.
-        device: where the tensors live.
-        missions: what missions are unless ``reset`` is given others: a tensordict that
-            broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
         action_low: lowest action, ``(4,)``; what the motors can do if None.
         action_high: highest action.
-        dtype: floating-point type, torch's default if None.
+        settings: further arguments of :class:`~afm_rl.envs.missions.env.MissionEnv`:
+            ``batch_size``, ``seed``, ``device``, ``missions`` and ``dtype``.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -115,6 +111,7 @@ class CrazyflieTrack(MissionEnv):
 
     simulation: QuadrotorSimulation
     plant: type[QuadrotorSimulation] = QuadrotorSimulation
+    more = ("times",)
 
     def __init__(
         self,
@@ -133,16 +130,11 @@ class CrazyflieTrack(MissionEnv):
         substeps: int = 25,
         trace: bool = False,
         max_steps: int = 5000,
-        batch_size: Sequence[int] = (),
-        seed: int = 0,
-        device: torch.device | str | None = None,
-        missions: TensorDictBase | Mapping[str, Any] | None = None,
-        *,
         action_low: Sequence[float] | None = None,
         action_high: Sequence[float] | None = None,
-        dtype: torch.dtype | None = None,
+        **settings: Any,
     ) -> None:
-        super().__init__(batch_size, seed, start_noise, device, dtype)
+        super().__init__(start_noise, **settings)
         if isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable):
             tracks = (tracks,)
         self.references = tuple(
@@ -177,36 +169,28 @@ class CrazyflieTrack(MissionEnv):
         )
         pairs = zip((action_low, action_high), self.body.bounds, strict=True)
         low, high = (most if given is None else given for given, most in pairs)
-        self._complete(names, missions, check_bounds(low, high, ACTIONS))
+        self._complete(names, check_bounds(low, high, ACTIONS))
 
     def mission(
-        self,
-        track: int | str = 0,
-        seed: int | None = None,
-        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
-        at: Sequence[float] | None = None,
-        ramp: int = 0,
-        times: Sequence[float] | None = None,
+        self, *args: Any, times: Sequence[float] | None = None, **entries: Any
     ) -> TensorDict:
         """Describe one mission; see :meth:`~afm_rl.envs.missions.format.MissionFormat.build`.
 
         Args:
-            track: index or name of the reference.
-            seed: seed of its noise.
-            regime: parameters that are not nominal, for the second phase or for each.
-            at: breakpoints in the unit of the schedule: a phase begins beyond them.
-            ramp: ticks that a change takes.
-            times: breakpoints in s instead: a phase begins with the first tick from then on.
+            args: as there; the track is the reference. times: breakpoints in s instead of ``at``: a
+            phase begins with the first tick from then on. entries: as there.
 
         Raises:
             ConfigurationError: for a value that cannot be used.
         """
         if times is not None:
-            if at is not None:
-                raise ConfigurationError(f"missions: at={at!r}, times={times!r}: expected one")
+            if entries.get("at") is not None:
+                raise ConfigurationError(
+                    f"missions: at={entries['at']!r}, times={times!r}: expected one"
+                )
             whole = self.simulation.steps if self.schedule.by == "progress" else 1
-            at = [tick / whole for tick in steps_at(times, self.simulation.dt)]
-        return self.mission_format.build(track, seed, regime, at, ramp).to(self.device)
+            entries["at"] = [tick / whole for tick in steps_at(times, self.simulation.dt)]
+        return super().mission(*args, **entries)
 
     def _check_pose(self, pose: Tensor) -> None:
         if pose.shape[-1] != 13 or not pose.isfinite().all():

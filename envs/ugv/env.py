@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -181,14 +181,10 @@ class UGVTrack(MissionEnv):
         max_steps: steps after which an episode is truncated.
         action_low: lower bounds of v (m/s) and omega (rad/s).
         action_high: upper bounds. Actions are clamped before the regime acts on them.
-        batch_size: number of missions, or ``()`` for any.
-        seed: missions without a seed of their own get ``seed, seed + 1, ...``.
-        device: where the tensors live.
-        missions: what missions are unless ``reset`` is given others: a tensordict that
-            broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
-        dtype: floating-point type, torch's default if None.
         world: how the robot moves; Dubins if None.
         observed: how many of the state's coordinates are observed; all if None.
+        settings: further arguments of :class:`~afm_rl.envs.missions.env.MissionEnv`:
+            ``batch_size``, ``seed``, ``device``, ``missions`` and ``dtype``.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -216,16 +212,11 @@ class UGVTrack(MissionEnv):
         max_steps: int = 5000,
         action_low: Sequence[float] = (-1.0, -math.pi / 2),
         action_high: Sequence[float] = (1.0, math.pi / 2),
-        batch_size: Sequence[int] = (),
-        seed: int = 0,
-        device: torch.device | str | None = None,
-        missions: TensorDictBase | Mapping[str, Any] | None = None,
-        *,
-        dtype: torch.dtype | None = None,
         world: DynamicsModel | None = None,
         observed: int | None = None,
+        **settings: Any,
     ) -> None:
-        super().__init__(batch_size, seed, start_noise, device, dtype)
+        super().__init__(start_noise, **settings)
         if isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable):
             tracks = (tracks,)
         self.tracks = tuple(one if isinstance(one, Track) else load_track(one) for one in tracks)
@@ -247,7 +238,7 @@ class UGVTrack(MissionEnv):
             reach=check_number("reach", reach, low=0.0, open_low=True),
             steps=check_count("max_steps", max_steps),
         ).to(self.device)
-        self._complete(names, missions, bounds)
+        self._complete(names, bounds)
 
     @property
     def course(self) -> Course:

@@ -104,11 +104,7 @@ def build_ugv(
 
 
 def observe_ugv(env: UGVTrack, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-    """Return the observation ``(*B, 5)`` and the info of each mission.
-
-    The info holds the number of targets ``reached``, the ``progress`` in [0, 1], and, as a
-    truth hidden from the observation, ``regime_active``.
-    """
+    """Return the observation ``(*B, 5)`` and the info of each mission, in part hidden truth."""
     reached = data["reached"]
     progress = env.course.progress(data["mission", "track"], reached)
     info = {"reached": reached, "progress": progress, "regime_active": data["regime_active"]}

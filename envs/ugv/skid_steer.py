@@ -78,12 +78,7 @@ class WheelPhysics(Physics):
 
 
 def changed_wheels(model: Any, row: tuple[float, ...]) -> Any:
-    """Return a copy of the robot's ``MjModel`` with other physics.
-
-    Args:
-        model: the nominal model.
-        row: values of ``WheelPhysics.names``.
-    """
+    """Return a copy of the robot's model with other physics, a row of ``WheelPhysics.names``."""
     import mujoco
 
     value = dict(zip(WheelPhysics.names, row, strict=True))
