@@ -157,9 +157,6 @@ class ActionFlow(Believer):
             self.scale,
             names,
             rows,
-            self.worth,
-            self.odds,
-            self.least_noise,
             self.delays,
             self.acting,
             samples,
@@ -198,28 +195,29 @@ class ActionFlow(Believer):
         """Return where a state is, in the unit in which ground differs."""
         return state[..., self.place] / self.place_scale if self.place else state[..., :0]
 
-    def answer(self, parts: Fields, planned: Tensor, box: Tensor) -> Answer:
+    def answer(self, parts: Fields, weights: Tensor, planned: Tensor, box: Tensor) -> Answer:
         """Ask the :class:`~afm_rl.correction.tick.Tick`."""
-        sent = self.normalise(parts["sent"])
-        late = parts["late"].squeeze(-1).long()
+        late, sent = parts["late"].squeeze(-1).long(), self.normalise(parts["sent"])
         rest = (x.to(self.tick.scale) for x in (sent, planned, box))
-        return self.tick(*self._read(parts), late, *rest)
+        return self.tick(*self._read(parts, weights), late, *rest)
 
     def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
         """Return the forecasts of all models, and what is under way."""
         ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
-        lead, given = executed.shape[:-1], [*self._read(parts), self.normalise(ahead)]
-        rows, steps = math.prod(lead), parts["late"].reshape(-1).long()
-        pairs, losses, noise, place, unit = (x.reshape(rows, *x.shape[len(lead) :]) for x in given)
-        weights = self.tick.weights(losses, noise)
-        read = self.tick.read(pairs, noise, place, steps)
-        found = self.tick.forecast(read, weights, steps, pairs, unit.to(pairs))
-        forecasts, late = (x.view(*lead, *x.shape[1:]).to(executed) for x in found)
-        return forecasts, late
+        given = *self._read(parts, self.weights(parts)), self.normalise(ahead)
+        lead, late = executed.shape[:-1], parts["late"].reshape(-1).long()
+        count = math.prod(lead)
+        pairs, weights, noise, place, unit = (
+            x.reshape(count, *x.shape[len(lead) :]) for x in given
+        )
+        read = self.tick.read(pairs, noise, place, late)
+        found = self.tick.forecast(read, weights, late, pairs, unit.to(pairs))
+        forecasts, under_way = (x.view(*lead, *x.shape[1:]).to(executed) for x in found)
+        return forecasts, under_way
 
-    def _read(self, parts: Fields) -> list[Tensor]:
-        given = [parts[name] for name in ("pairs", "losses", "noise")]
-        return [part.to(self.tick.scale) for part in (*given, self.place_of(parts["state"]))]
+    def _read(self, parts: Fields, weights: Tensor) -> list[Tensor]:
+        given = parts["pairs"], weights, parts["noise"], self.place_of(parts["state"])
+        return [part.to(self.tick.scale) for part in given]
 
     @property
     def _as_machine_code(self) -> bool:

@@ -136,6 +136,10 @@ class Believer(PairCorrector):
         """Return the prior log-odds of the models ``(*B, M, A)``."""
         return prior_of(self.worth.to(parts["noise"]), self.odds, parts["noise"], self.least_noise)
 
+    def weights(self, parts: Fields) -> Tensor:
+        """Return the probabilities of the models ``(*B, M, A)``."""
+        return self.belief(parts).weights(self.prior(parts))
+
     def look(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts of the memory with the newest pairs and the belief after them."""
         parts = super().look(memory, model)
@@ -238,8 +242,8 @@ class Believer(PairCorrector):
             The next memory, and the parts of an :class:`Answer` but the last two.
         """
         parts = self.unpack(memory, self.states_in(memory))
-        answer = self.answer(parts, planned, box)
-        weights = self.belief(parts).weights(self.prior(parts))
+        weights = self.weights(parts)
+        answer = self.answer(parts, weights, planned, box)
         acting = self.denormalise((weights * answer.forecasts.to(memory)).sum(-2))
         parts |= {"planned": planned, "executed": answer.executed.to(memory), "acting": acting}
         parts["forecasts"] = answer.forecasts.to(memory)
@@ -277,7 +281,7 @@ class Believer(PairCorrector):
     def believed(self, memory: Tensor) -> Tensor:
         """Return how probable the :attr:`models` are, by axis, ``(*B, M, A)``."""
         parts = self.unpack(memory, self.states_in(memory))
-        return self.belief(parts).weights(self.prior(parts))
+        return self.weights(parts)
 
     def predict(
         self, memory: Tensor, action: Tensor, model: DynamicsModel
@@ -295,7 +299,7 @@ class Believer(PairCorrector):
         with torch.no_grad():
             seen = self._foresee(self.pack(self.look(memory, model)), action)
             parts = self.unpack(seen, model.state_size)
-            weights = self.belief(parts).weights(self.prior(parts))
+            weights = self.weights(parts)
             mean, std = mean_and_std(parts["forecasts"], weights)
             return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))
 
@@ -335,8 +339,11 @@ class Believer(PairCorrector):
         return self.decide(*given)
 
     @abstractmethod
-    def answer(self, parts: Fields, planned: Tensor, box: Tensor) -> Answer:
-        """Return what to execute for plans ``(*B, A)``, given the parts of memories."""
+    def answer(self, parts: Fields, weights: Tensor, planned: Tensor, box: Tensor) -> Answer:
+        """Return what to execute for plans ``(*B, A)``.
+
+        Given the parts of memories, and the probabilities of the models ``(*B, M, A)``.
+        """
 
     @abstractmethod
     def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:

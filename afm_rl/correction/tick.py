@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.achievable import MODES, attainable, extend
 from afm_rl.correction.arrival import ago, aligned
-from afm_rl.correction.belief import Belief, mean_and_std, prior_of
+from afm_rl.correction.belief import mean_and_std
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.linear import CALM, LINEAR, Lines, fit_lines, sensor_noise, within_rate
@@ -58,7 +58,6 @@ class Tick(nn.Module):
     scale: Tensor
     points: Tensor
     probes: Tensor
-    worth: Tensor
     late: Tensor
     delays: Tensor
     filters: Tensor
@@ -71,9 +70,6 @@ class Tick(nn.Module):
         scale: Tensor,
         readings: Sequence[str],
         rows: int,
-        worth: Tensor,
-        odds: float,
-        least_noise: float,
         delays: Tensor,
         acting: Tensor,
         samples: int,
@@ -83,7 +79,6 @@ class Tick(nn.Module):
     ) -> None:
         super().__init__()
         self.network, size = network, len(scale)
-        self.odds, self.least_noise = odds, least_noise
         self.source_std = check_number("corrector.source_std", source_std, low=0.0)
         self.steps = check_count("corrector.steps", steps)
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
@@ -98,7 +93,6 @@ class Tick(nn.Module):
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
-            "worth": worth,
             "delays": delays,
             "filters": filters,
             "filtered": torch.nn.functional.one_hot(which).T.to(scale),
@@ -111,7 +105,7 @@ class Tick(nn.Module):
     def forward(
         self,
         pairs: Tensor,
-        losses: Tensor,
+        weights: Tensor,
         noise: Tensor,
         place: Tensor,
         late: Tensor,
@@ -123,7 +117,7 @@ class Tick(nn.Module):
 
         Args:
             pairs: what is remembered, the newest last, ``(B, M, D)``.
-            losses: of the models, ``(B, M + 1, A)``.
+            weights: probabilities of the models, ``(B, M + 1, A)``.
             noise: that no model explains, ``(B, A)``.
             place: where the missions are, ``(B, P)``.
             late: steps that commands are late, ``(B,)``.
@@ -133,7 +127,6 @@ class Tick(nn.Module):
         """
         unit, ends = planned / self.scale, box / self.scale
         read = self.read(pairs, noise, place, late)
-        weights = self.weights(losses, noise)
         models = self.most_likely(read, weights)
         proposals, spread = self.propose(models, unit, ends)
         expected = self.expect(models, proposals)
@@ -165,11 +158,6 @@ class Tick(nn.Module):
             forecasts,
             under_way,
         )
-
-    def weights(self, losses: Tensor, noise: Tensor) -> Tensor:
-        """Return the probabilities of the models, ``(B, M + 1, A)``."""
-        prior = prior_of(self.worth, self.odds, noise, self.least_noise)
-        return Belief(losses, losses, noise).weights(prior)
 
     def read(self, pairs: Tensor, noise: Tensor, place: Tensor, late: Tensor) -> Read:
         """Return what the memory says of actions, by all models."""
