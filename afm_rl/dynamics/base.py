@@ -62,13 +62,14 @@ class DynamicsModel(nn.Module, ABC):
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the expected next state ``(*L, *N, S)``."""
 
-    @abstractmethod
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance ``(*L, *N, M, D)`` of the standardised state change.
 
-        ``M`` counts ensemble members, 1 for a single model. Only mean, log-variance and
-        :meth:`standardise` together mean something: the scale is the model's own.
+        ``M`` counts ensemble members, 1 for a single model, whose variance is one. Only mean,
+        log-variance and :meth:`standardise` together mean something: the scale is the model's own.
         """
+        mean = self.standardise(self.manifold.difference(self(state, action), state))
+        return mean.unsqueeze(-2), torch.zeros_like(mean).unsqueeze(-2)
 
     def standardise(self, change: Tensor) -> Tensor:
         """Express a state change ``(*B, D)`` in the units of :meth:`moments`."""
@@ -221,9 +222,6 @@ class UnknownDynamics(DynamicsModel):
             "learns from the robot's own transitions (method=frozen_pe, afm_frozen_pe, ...), or "
             "give a model"
         )
-
-    def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        return self(state, action), state
 
     def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
         return self(state, action)

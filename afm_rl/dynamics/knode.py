@@ -183,11 +183,6 @@ class KNODE(PerMissionModel):
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         return jacobian_of_linearised(self, state, action)
 
-    def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a single member's mean and unit variance, in the nominal model's units."""
-        mean = self.standardise(self.manifold.difference(self(state, action), state))
-        return mean.unsqueeze(-2), torch.zeros_like(mean).unsqueeze(-2)
-
     def standardise(self, change: Tensor) -> Tensor:
         return self.nominal.standardise(change)
 

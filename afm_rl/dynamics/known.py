@@ -81,11 +81,6 @@ class KnownDynamics(DynamicsModel):
             "function in torch that works on the last dimension, as in state[..., 0]"
         )
 
-    def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a single member's mean and unit variance, in units of ``noise_std``."""
-        mean = self.standardise(self.manifold.difference(self(state, action), state))
-        return mean.unsqueeze(-2), torch.zeros_like(mean).unsqueeze(-2)
-
     def standardise(self, change: Tensor) -> Tensor:
         return change / self.noise
 

@@ -200,15 +200,3 @@ class RunningStats(nn.Module):
         self.scatter += spread + gap.square() * self.count * new / total
         self.mean += gap * new / total
         self.count += new
-
-    def expand_(self, streams: int) -> RunningStats:
-        """Give each of ``streams`` statistics of its own to go on with, in place."""
-        for name, value in self.named_buffers():
-            setattr(self, name, value.expand(streams, *value.shape).clone())
-        return self
-
-    def select_(self, index: Tensor) -> RunningStats:
-        """Keep the streams in ``index`` of the first leading dimension, in place."""
-        for name, value in self.named_buffers():
-            setattr(self, name, value[index])
-        return self

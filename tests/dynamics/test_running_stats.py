@@ -58,18 +58,6 @@ def test_they_go_on_from_where_they_are_told():
     torch.testing.assert_close((stats.mean, stats.std), (both.mean(0), both.std(0)))
 
 
-def test_streams_part_and_leave():
-    data = stream(10, 2)
-    stats = RunningStats(2).double()
-    stats.update_(data)
-    assert stats.expand_(3) is stats and stats.lead == (3,)
-    stats.update_(stream(3, 2, seed=1), torch.tensor([False, True, True]))
-    kept = stats.std[[2, 0]].clone()
-    assert stats.select_(torch.tensor([2, 0])) is stats
-    assert torch.equal(stats.std, kept) and stats.count.flatten().tolist() == [11, 10]
-    torch.testing.assert_close(stats.mean[1], data.mean(0))
-
-
 def test_nothing_is_divided_by_zero():
     stats = RunningStats(1, min_std=0.5)
     assert torch.equal(stats(torch.tensor([3.0])), torch.tensor([3.0]))  # nothing seen
