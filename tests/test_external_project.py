@@ -6,7 +6,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from torch import nn
 
-from afm_rl.cli.trusted import checked
+from afm_rl.cli.overrides import checked
 from afm_rl.correction import Corrector
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, run

@@ -16,7 +16,7 @@ from pages import PAGES, ROOT, blocks, commands, name_of, write_files
 from small import shrink
 
 from afm_rl.cli import diagnose, play, report
-from afm_rl.cli.trusted import checked
+from afm_rl.cli.overrides import checked
 from afm_rl.jobs.run import begin, finish
 from afm_rl.missions import build, prepare, run
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from afm_rl.report.cells import cell_names
+from afm_rl.report.runs import cell_names
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "paper" / "published_tables.py"
 

@@ -15,8 +15,7 @@ from omegaconf import DictConfig
 from afm_rl._version import __version__
 from afm_rl.cli.error_messages import explain, one_line
 from afm_rl.cli.launcher import register
-from afm_rl.cli.overrides import relaxed, with_sweep_folder
-from afm_rl.cli.trusted import checked
+from afm_rl.cli.overrides import checked, relaxed, with_sweep_folder
 from afm_rl.jobs.executor import JobsFailed
 
 _launched: list[bool] = []

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import os
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from afm_rl.cli.error_messages import OneLineParser, told_by
+
+if TYPE_CHECKING:
+    from afm_rl.diagnosis import Log
 
 NAME = "afm-rl-diagnose"
 KINDS = ".csv, .parquet, .ulg, .mcap, .db3, .bag, or a folder of LeRobot or ROS"
@@ -71,9 +77,7 @@ def _run(options: argparse.Namespace) -> None:
             print("\n".join(error.listing))
             raise
     else:
-        from afm_rl.cli.effective import read_effective  # torch takes seconds
-
-        log = read_effective(options.file, options.model)
+        log = _read_effective(options.file, options.model)
     if options.delay is not None:
         log = replace(log, usual_delay=check_number("--delay", options.delay, low=0.0))
     found = diagnose(log)
@@ -81,7 +85,7 @@ def _run(options: argparse.Namespace) -> None:
     if options.replay is not None:
         from afm_rl.progress import Bar
         from afm_rl.replay import replay
-        from afm_rl.report.replay import print_replay, write_replay
+        from afm_rl.report.diagnosis import print_replay, write_replay
 
         with Bar(total=1.0, desc="replaying", delay=3.0) as bar:  # s
             replayed = replay(log, lambda share: bar.update(share - bar.n))
@@ -94,3 +98,22 @@ def _run(options: argparse.Namespace) -> None:
     source, page = printable(str(options.file)), options.page
     for path in write_diagnosis(found, log, out, source, page, replayed):
         print(f"wrote {path}")
+
+
+def _read_effective(path: Path, name: str) -> Log:
+    """Return a log whose commands are the actions, and whose responses are effective actions."""
+    from afm_rl.diagnosis.readers import TRANSITIONS, read_columns
+    from afm_rl.dynamics import KnownDynamics  # torch takes seconds
+    from afm_rl.missions.explained import effective_log
+    from afm_rl.spaces.manifold import Manifold
+    from afm_rl.targets import find_code
+
+    found = read_columns(path, TRANSITIONS)
+    sys.path.insert(0, os.getcwd())
+    try:
+        step = find_code("--model", name)
+    finally:
+        sys.path.pop(0)
+    model = KnownDynamics(step, Manifold(found.second.shape[1]), found.first.shape[1])
+    names = tuple(found.names[0])
+    return effective_log(model, names, found.second, found.first, found.t, found.episode)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from afm_rl.cli.error_messages import told_by
-from afm_rl.cli.trusted import checked
+from afm_rl.cli.overrides import checked
 
 NAME = "afm-rl-export"
 ABOUT = """\

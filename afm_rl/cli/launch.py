@@ -1,4 +1,4 @@
-"""From a composed configuration to a folder of results."""
+"""From a composed configuration to a folder of results, and what is shown of them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
+import pandas as pd
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
@@ -19,19 +20,29 @@ from omegaconf.errors import OmegaConfBaseException
 
 from afm_rl.cli.error_messages import explain
 from afm_rl.cli.methods import jobs_of
-from afm_rl.cli.show import report, show
+from afm_rl.envs import load_track
 from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag, check_number
 from afm_rl.jobs.batch import run_batch
 from afm_rl.jobs.executor import Executor, JobsFailed, LocalExecutor
-from afm_rl.jobs.layout import JOBS, LOG
+from afm_rl.jobs.layout import LOG
 from afm_rl.jobs.process import handled
-from afm_rl.jobs.run import Stop, begin, finish, needs_run
+from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
 from afm_rl.missions import Agent, build
+from afm_rl.missions.explained import explain_mission, planned_for
 from afm_rl.missions.run import Stopped
-from afm_rl.report import check_video
+from afm_rl.report import (
+    check_video,
+    load_tracks,
+    print_summary,
+    read_runs,
+    write_films,
+    write_report,
+    write_run,
+)
+from afm_rl.report.diagnosis import write_diagnosis
 from afm_rl.storage.files import locked
+from afm_rl.storage.manifest import JOBS, extend_manifest, read_manifest, write_manifest
 
-SWITCHES = ("overwrite", "progress", "figures", "tensorboard")
 ENDS = (signal.SIGINT, signal.SIGTERM)
 """Batch systems send the latter before they kill; a shell ignores the former for what it runs
 behind itself."""
@@ -68,17 +79,7 @@ def sweep(
     overrides: Sequence[Sequence[str]],
     executor: Executor,
 ) -> None:
-    """Run the jobs of a sweep, and report on them.
-
-    Args:
-        cfg: the settings that all have.
-        configs: those of each combination.
-        overrides: what each was composed from.
-        executor: where they run.
-
-    Raises:
-        JobsFailed: if some have no results, once the others are done.
-    """
+    """Run the jobs of a sweep, and report on them."""
     film = check_settings(cfg)
     common = set.intersection(*map(set, overrides))
     jobs, failures = dict[str, DictConfig](), dict[str, str]()
@@ -105,12 +106,9 @@ def check_settings(cfg: DictConfig) -> str | None:
 
     Returns:
         The format of films; None for no films.
-
-    Raises:
-        ConfigurationError: for one that cannot be used.
     """
     torch.set_num_threads(check_count("threads", cfg.threads, high=256))
-    for name in SWITCHES:
+    for name in ("overwrite", "progress", "figures", "tensorboard"):
         check_flag(name, cfg[name])
     if not isinstance(cfg.cache, str):
         raise ConfigurationError(f"cache={cfg.cache!r}: expected a folder")
@@ -139,14 +137,6 @@ def run_together(
     failures: Mapping[str, str] | None = None,
 ) -> JobsFailed | None:
     """Run jobs, and say which of them failed.
-
-    Args:
-        folder: of the batch.
-        jobs: settings of each, by name.
-        executor: where they run.
-        cfg: settings of the command.
-        overrides: of the command, for people.
-        failures: jobs that could not even be composed, with reasons.
 
     Returns:
         What to raise once the results of the others are shown.
@@ -178,3 +168,58 @@ def _interruptible(folder: Path) -> Iterator[None]:
             file=sys.stderr,
         )
         sys.exit(130)
+
+
+def show(folder: Path, cfg: DictConfig, agents: Sequence[Agent], film: str | None) -> None:
+    """Draw the results of a run or a comparison, print their table, and explain a mission."""
+    runs = read_runs([folder])
+    missions, steps, measures = runs.missions, runs.steps(), runs.measures
+    roads = [getattr(agent.base_env, "tracks", ()) for agent in agents]  # flights have none
+    tracks = list({track.name: track for some in roads for track in some}.values())
+    with locked(folder):
+        # What is drawn anew leaves the manifest first, so that this may be interrupted.
+        names = [*read_manifest(folder)["files"]]
+        write_manifest(folder, [name for name in names if Path(name).parts[0] not in SHOWN])
+        what = {"figures": cfg.figures, "tensorboard": cfg.tensorboard}
+        write_run(folder, missions, steps, measures, tracks, **what)
+        if film is not None:
+            draw = getattr(agents[0].base_env, "draw", None)
+            try:
+                write_films(folder / "video", runs, tracks, film, draw=draw)
+            except ConfigurationError as error:  # such as a robot that cannot be drawn
+                print(f"afm-rl: no film: {error}", file=sys.stderr)
+        explained = _explain(folder, cfg.figures, missions, steps, agents[0])
+        extend_manifest(folder, [name for name in SHOWN if (folder / name).is_dir()])
+    print_summary(missions, measures)
+    print(explained, end="")
+    print(f"Results: {folder}")
+
+
+def _explain(
+    folder: Path, page: bool, missions: pd.DataFrame, steps: pd.DataFrame, agent: Agent
+) -> str:
+    """Return what the first mission shows of the actuators, one line each; write the page."""
+    first = missions.iloc[0]
+    try:
+        steps = steps[steps["mission"] == first["mission"]]
+        found, log = explain_mission(agent.robot, steps, late=planned_for(agent))
+    except AFMError:  # such as a mission of a few steps
+        return ""
+    which = f"{first['method']}, {first['track']}, seed {first['seed']}"
+    if page:
+        list(write_diagnosis(found, log, folder / "diagnosis", which))
+    return f"Actuators, by the steps of {which}:\n{found}\n"
+
+
+def report(folder: Path, cfg: DictConfig, film: str | None) -> None:
+    """Write the report on a sweep or a study, as far as there are results."""
+    try:
+        runs = read_runs([folder])
+        print_summary(runs.missions, runs.measures)
+        tracks = load_tracks(runs.missions["track"].unique(), load_track)
+        write_report(runs, folder / "report", tracks, figures=cfg.figures)
+        if film is not None:
+            write_films(folder / "report" / "video", runs, tracks, film)
+    except AFMError as error:  # such as jobs that cannot stand in one table
+        print(f"afm-rl: no report: {error}", file=sys.stderr)
+    print(f"Results: {folder}")

@@ -16,9 +16,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
 from afm_rl.errors import check_choice
-from afm_rl.jobs.executor import LocalExecutor
-from afm_rl.jobs.ray_cluster import RayExecutor
-from afm_rl.jobs.submitit_cluster import SubmititExecutor
+from afm_rl.jobs.executor import LocalExecutor, RayExecutor, SubmititExecutor
 
 NAMESPACE = "hydra_plugins"
 EXECUTORS = {"local": LocalExecutor, "submitit": SubmititExecutor, "ray": RayExecutor}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 from hydra import compose
@@ -22,15 +22,6 @@ def jobs_of(cfg: DictConfig, hydra: DictConfig, swept: Sequence[str] = ()) -> di
     """Return the configuration of each job that a command asks for, by name.
 
     A job is one method; in a study, one method with one seed.
-
-    Args:
-        cfg: the composed configuration.
-        hydra: Hydra's part of it.
-        swept: overrides that not all jobs of a sweep have; they are part of the names of jobs,
-            and, unless the tables show their effect anyway, of the labels of methods.
-
-    Raises:
-        ConfigurationError: for methods, seeds or labels that cannot be used.
     """
     methods = _methods(cfg, hydra)
     keys = {text: text.lstrip("+~").split("=")[0] for text in swept}
@@ -81,11 +72,7 @@ def _methods(cfg: DictConfig, hydra: DictConfig) -> list[DictConfig]:
 def _compared(
     names: Sequence[str], overrides: Sequence[str], root: str
 ) -> list[tuple[str, DictConfig]]:
-    """Compose each method with those settings of its parts that it has.
-
-    Raises:
-        ConfigurationError: for a setting that none of them has.
-    """
+    """Compose each method with those settings of its parts that it has."""
     some = optional(overrides)
     common = [text for text in overrides if text not in some.values()]
     bare = {name: compose(root, [*common, f"method={name}"]) for name in names}
@@ -101,14 +88,19 @@ def _compared(
         for name in without:
             print(f"{name}: has no {key}, so it stays as it is")
     return [
-        (name, compose(root, [*common, *_fitting(some, plain[name]), f"method={name}"]))
+        (
+            name,
+            compose(
+                root,
+                [
+                    *common,
+                    *(text for key, text in some.items() if has(plain[name], key)),
+                    f"method={name}",
+                ],
+            ),
+        )
         for name in names
     ]
-
-
-def _fitting(some: Mapping[str, str], settings: Mapping[str, Any]) -> list[str]:
-    """Return the overrides of settings that there are."""
-    return [text for key, text in some.items() if has(settings, key)]
 
 
 def _label(method: str | None, overrides: Sequence[str]) -> str:

@@ -1,11 +1,23 @@
-"""Overrides that only some of the methods of a comparison have."""
+"""Arguments of a command before Hydra reads them: what only some methods have, what is trusted."""
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
+
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from omegaconf import DictConfig, OmegaConf
+
+from afm_rl.targets import check_composed
+from afm_rl.trust import check_trust, conf_folders, trusted, trusting
 
 PARTS = ("dynamics", "updater", "corrector")
 OPTIONAL = "++"  # how Hydra is told to take a setting whether it is there or not
@@ -55,14 +67,10 @@ def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
         return list(arguments)
     own = [parts for parts in given if not parts[0].startswith(("hydra.", "hydra/"))]
     asked = sorted("".join(parts) for parts in own if parts[0] not in BESIDE)
-    swept = [key.strip("+~") for key, _, value in own if re.search(r"[,(]", _bare(value))]
+    bare = [(key, re.sub(r"\[.*]|\{.*}", "", value)) for key, _, value in own]  # lists do not sweep
+    swept = [key.strip("+~") for key, value in bare if re.search(r"[,(]", value)]
     name = "-".join([*swept, hashlib.sha256("\0".join(asked).encode()).hexdigest()[:6]])
     return [*arguments, f"hydra.sweep.dir=multirun/{re.sub(r'[^-.0-9A-Z_a-z]', '_', name[-60:])}"]
-
-
-def _bare(value: str) -> str:
-    """Leave out lists and mappings, whose commas do not sweep."""
-    return re.sub(r"\[.*]|\{.*}", "", value)
 
 
 def optional(overrides: Sequence[str]) -> dict[str, str]:
@@ -89,3 +97,49 @@ def has(settings: Mapping[str, Any], key: str) -> bool:
             return False
         place = place[name]
     return True
+
+
+class TrustedFolders(SearchPathPlugin):
+    """Lets Hydra find the settings of trusted packages, after those of this library."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder in conf_folders():
+            search_path.append("trust", f"file://{folder}")
+
+
+def trusted_packages(arguments: Sequence[str]) -> list[str]:
+    """Return the packages that the command line itself trusts; files cannot.
+
+    >>> trusted_packages(["method=physics", "trust=[mine, my.models]"])
+    ['mine', 'my.models']
+    """
+    given = [text for text in arguments if re.match(r"\+{0,2}trust=", text)]
+    found = [each.value() for each in OverridesParser.create().parse_overrides(given)]
+    return [name for names in found for name in check_trust(names)]
+
+
+@contextmanager
+def checked(arguments: Sequence[str]) -> Iterator[list[str]]:
+    """Let Hydra compose what a command asks for, and check it before anything in it is called.
+
+    Yields:
+        The packages that the command trusts.
+    """
+    load = ConfigLoaderImpl.load_configuration
+
+    @functools.wraps(load)
+    def checking(*args: Any, **kwargs: Any) -> DictConfig:
+        cfg = load(*args, **kwargs)
+        settings: Any = OmegaConf.to_container(cfg, resolve=False)
+        check_composed(settings, trusted())
+        return cfg
+
+    names = trusted_packages(arguments)
+    with trusting(names):
+        conf_folders()  # an error of a package is told here, not as one of Hydra's
+        Plugins.instance().register(TrustedFolders)
+        ConfigLoaderImpl.load_configuration = checking  # type: ignore[method-assign]
+        try:
+            yield names
+        finally:
+            ConfigLoaderImpl.load_configuration = load  # type: ignore[method-assign]

@@ -14,7 +14,7 @@ from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.correction.base import Fields
 from afm_rl.correction.believing import Answer, Believer
 from afm_rl.correction.linear import CALM, LINEAR
-from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.network import AxisNetwork, load_universal
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.readings import (
     READINGS,
@@ -26,7 +26,6 @@ from afm_rl.correction.readings import (
     memory_of,
 )
 from afm_rl.correction.tick import Tick
-from afm_rl.correction.weights import load_universal
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_flag, check_number
 

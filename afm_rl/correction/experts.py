@@ -18,6 +18,7 @@ from afm_rl.correction.fits import (
     confidence,
     invert_friction,
     not_zero,
+    solve_line,
 )
 from afm_rl.spaces.small_matrices import solve_positive
 
@@ -142,11 +143,13 @@ def fit_experts(rows: Rows) -> Experts:
     flat = torch.cat([weights, moved], -2).flatten(0, 1)  # (N A, 3, K)
     moments = torch.baddbmm(prior, flat, terms)
     gains = moments[:, :2, 3] / moments[:, :2, 0]
-    slopes, offsets = _solve_line(moments[:, lines, places])  # with offset, with friction
+    slopes, offsets = solve_line(
+        *moments[:, lines, places].unbind(-1)
+    )  # with offset, with friction
     miss = e.flatten(0, 1) - torch.addcmul(offsets[:, :1], slopes[:, :1], u.flatten(0, 1))
     robust = flat[:, 1] / (1 + (miss / OUTLIER).square())
     robust = torch.baddbmm(prior[1:2], robust.unsqueeze(1), terms)[:, 0, places[0]]
-    slope, offset = _solve_line(robust.unsqueeze(1))
+    slope, offset = solve_line(*robust.unsqueeze(1).unbind(-1))
     gain = not_zero(torch.cat([gains, slope, slopes[:, 1:]], -1))
     offset = torch.cat([torch.zeros_like(gains), offset, offsets[:, 1:]], -1)
     outer = torch.nn.functional.pad(inputs, (0, 1), value=1.0)  # (N, K, A + 1)
@@ -201,9 +204,7 @@ def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     pull = weight * e
     square, mean, cross = weight @ (u * u).mT + PRIOR, weight @ u.mT, pull @ u.mT + PRIOR * own
     mass, shift = weight.sum(-1, keepdim=True) + 10 * PRIOR, pull.sum(-1, keepdim=True)
-    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
-    slope = (mass * cross - mean * shift) / determinant
-    offset = (square * shift - mean * cross) / determinant
+    slope, offset = solve_line(square, mean, mass, cross, shift)
     left = (pull * e).sum(-1, keepdim=True) - slope * cross - offset * shift
     # An axis that its own command explains is driven by it, whatever else fits by chance.
     left, driver = (left.abs() / mass - EXACT**2 * own).min(-1, keepdim=True)
@@ -211,14 +212,6 @@ def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     explained = (left < limit) & (mass > LEAST_ROWS)
     chosen = torch.zeros_like(slope).scatter(-1, driver, slope.gather(-1, driver))
     return explained, torch.cat([chosen, offset.gather(-1, driver)], -1)
-
-
-def _solve_line(moments: Tensor) -> tuple[Tensor, Tensor]:
-    """Return slope and offset ``(*B)`` of weighted least squares, given its moments ``(*B, 5)``."""
-    square, mean, mass, cross, shift = moments.unbind(-1)
-    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
-    slope = (mass * cross - mean * shift) / determinant
-    return slope, (square * shift - mean * cross) / determinant
 
 
 @cached(maxsize=16)

@@ -80,14 +80,24 @@ def fit_gain_offset(
     robust = weight
     for turn in range(rounds + 1):
         square, mean, mass, cross, shift = (terms * robust.unsqueeze(-3)).sum(-2).unbind(-2)
-        square, mass, cross = square + PRIOR, mass + 10 * PRIOR, cross + PRIOR
-        determinant = (square * mass - mean.square()).clamp_min(PRIOR**2)
-        gain = (mass * cross - mean * shift) / determinant
-        offset = (square * shift - mean * cross) / determinant
+        gain, offset = solve_line(square + PRIOR, mean, mass + 10 * PRIOR, cross + PRIOR, shift)
         if turn < rounds:
             miss = effective - (gain.unsqueeze(-2) * executed + offset.unsqueeze(-2))
             robust = weight / (1 + (miss / OUTLIER).square())
     return not_zero(gain), offset
+
+
+def solve_line(
+    square: Tensor, mean: Tensor, mass: Tensor, cross: Tensor, shift: Tensor
+) -> tuple[Tensor, Tensor]:
+    r"""Return slope and offset ``(*B)`` of weighted least squares, given its moments ``(*B)``.
+
+    These are :math:`\sum w u^2`, :math:`\sum w u`, :math:`\sum w`, :math:`\sum w u v` and
+    :math:`\sum w v`, with a prior, so that none vanishes.
+    """
+    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
+    slope = (mass * cross - mean * shift) / determinant
+    return slope, (square * shift - mean * cross) / determinant
 
 
 def apply_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:

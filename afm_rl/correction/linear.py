@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from afm_rl.correction.fits import LEAST_GAIN, PRIOR, not_zero
+from afm_rl.correction.fits import LEAST_GAIN, PRIOR, not_zero, solve_line
 from afm_rl.spaces.small_matrices import solve_positive
 
 LINEAR = (
@@ -80,9 +80,7 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
     square, mass, cross = square + PRIOR, mass + 10 * PRIOR, cross + PRIOR
     gain = not_zero(cross / square)
     offset = (shift - mean) / mass
-    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
-    slope = (mass * cross - mean * shift) / determinant
-    rest = (square * shift - mean * cross) / determinant
+    slope, rest = solve_line(square, mean, mass, cross, shift)
     zero, one = torch.zeros_like(gain[..., 0]), torch.ones_like(gain[..., 0])
     drift = (shift - gain[..., 2:3] * mean)[..., 0] / mass[..., 0]
     gains = [one, one, gain[..., 1], gain[..., 2], gain[..., 3], slope[..., 2], slope[..., 3]]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from importlib.resources import files
 from typing import NamedTuple
 
 import torch
+from safetensors.torch import load
 from torch import Tensor, nn
 
 from afm_rl.correction.achievable import LIMIT, MODES
@@ -19,10 +22,14 @@ from afm_rl.correction.experts import (
     Rows,
     invert_matrix,
 )
+from afm_rl.errors import ArtefactError, check_count
 
 SHARPNESS = 5.0  # of the logits of a mixture: shares of all or nothing are soon learnt
 LEAST_TIME = 0.1  # of the path that is left, in the velocity towards an expert's answer
 CELL = 5 + MISSES  # features of a cell
+FILE = "universal.safetensors"
+
+Velocity = Callable[[float, Tensor], Tensor]
 
 
 def mlp(
@@ -202,3 +209,46 @@ class AxisNetwork(nn.Module):
         left = experts.residuals.clamp(-LIMIT, LIMIT).to(std)
         features = torch.cat([torch.stack(own, -1), left], -1) * valid.unsqueeze(-1)
         return features.to(self.modes.dtype)
+
+
+def midpoint(velocity: Velocity, start: Tensor, steps: int) -> Tensor:
+    r"""Integrate :math:`\dot x = v(\tau, x)` from 0 to 1 with the explicit midpoint rule.
+
+    .. math:: x_{\tau+h} = x_\tau + h\, v(\tau + h/2,\; x_\tau + \tfrac h2 v(\tau, x_\tau))
+
+    Second order: half the step, a quarter of the error.
+
+    Args:
+        velocity: v, takes the time and the point.
+        start: x_0, ``(*B, A)``.
+        steps: number of equal steps.
+
+    >>> x = midpoint(lambda tau, x: x, torch.ones(1), 100)
+    >>> abs(float(x) - 2.718281828) < 1e-4
+    True
+    """
+    check_count("corrector.steps", steps)
+    step, point = 1.0 / steps, start
+    for k in range(steps):
+        tau = k * step
+        half = point + 0.5 * step * velocity(tau, point)
+        point = point + step * velocity(tau + 0.5 * step, half)
+    return point
+
+
+def load_universal() -> AxisNetwork:
+    """Return the universal network, frozen.
+
+    Raises:
+        ArtefactError: if the file does not have the checksum that is written beside it.
+    """
+    folder = files("afm_rl.correction")
+    data = folder.joinpath(FILE).read_bytes()
+    expected = folder.joinpath(f"{FILE}.sha256").read_text().split()[0]
+    if hashlib.sha256(data).hexdigest() != expected:
+        raise ArtefactError(
+            f"{FILE}: damaged, its checksum is not {expected}: install afm-rl again"
+        )
+    network = AxisNetwork()
+    network.load_state_dict(load(data))
+    return network.requires_grad_(False).eval()

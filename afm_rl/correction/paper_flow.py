@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.base import Correction, Corrector
-from afm_rl.correction.network import mlp
-from afm_rl.correction.solver import midpoint
+from afm_rl.correction.network import midpoint, mlp
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import (
     ConfigurationError,
@@ -21,7 +20,7 @@ from afm_rl.errors import (
     check_number,
 )
 from afm_rl.regimes import Regime
-from afm_rl.spaces.sampling import draw_states, uniform
+from afm_rl.spaces.manifold import draw_states, uniform
 
 
 class PaperFlow(Corrector):

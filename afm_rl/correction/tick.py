@@ -16,9 +16,8 @@ from afm_rl.correction.belief import mean_and_std
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.linear import CALM, LINEAR, Lines, fit_lines, sensor_noise, within_rate
-from afm_rl.correction.network import AxisNetwork, Encoded
+from afm_rl.correction.network import AxisNetwork, Encoded, midpoint
 from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows
-from afm_rl.correction.solver import midpoint
 from afm_rl.errors import check_choice, check_count, check_number
 
 
@@ -297,8 +296,7 @@ class Tick(nn.Module):
         forecasts = torch.cat([now, found, linear, acts[:, self.late], *calmly], 1)
         waits = late + ahead.shape[1] > 1
         if not all_hold(~waits):
-            delays = torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
-            so_late = (delays == late.unsqueeze(-1)).unsqueeze(-1)
+            so_late = ((self.delays < 0) | (self.delays == late.unsqueeze(-1))).unsqueeze(-1)
             models = self.most_likely(read, torch.where(so_late, weights.clamp_min(1e-9), 0.0))
             shares = models.weights / models.weights.sum(1, keepdim=True)
             effects = (shares.unsqueeze(2) * self.expect(models, newest)).sum(1)

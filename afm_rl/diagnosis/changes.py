@@ -19,15 +19,7 @@ from afm_rl.diagnosis.settings import Settings
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a log, and what explains one response in it.
-
-    Args:
-        first: its first row.
-        last: the row after its last one.
-        lead: where the search began.
-        model: what explains it, in the units of a scaled log.
-        weight: how many independent rows a row counts as.
-    """
+    """A part of a log, and what explains one response in it."""
 
     first: int
     last: int

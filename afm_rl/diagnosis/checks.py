@@ -23,15 +23,7 @@ SUMMED: Doubt = (
 def find_doubts(
     log: Log, leads: Sequence[Lead], reach: np.ndarray, exact: Sequence[bool], settings: Settings
 ) -> dict[int, Doubt]:
-    """Return why nothing can be said of some actuators, by number.
-
-    Args:
-        log: scaled.
-        leads: of the actuators.
-        reach: half range of each command, ``(A,)``.
-        exact: is the response of an actuator its command in every row?
-        settings: which actuator is idle?
-    """
+    """Return why nothing can be said of some actuators, by number."""
     doubts: dict[int, Doubt] = {}
     idle = bool(log.effort) and all(np.ptp(values) == 0 for values in log.effort.values())
     summed = _summed(log, leads, settings)
@@ -57,7 +49,11 @@ def find_doubts(
         elif ranges[j] < settings.moves * usual:
             share = 100 * ranges[j] / usual
             doubts[j] = "cannot tell", f"its command moves by {share:.1g} % of the usual; move it"
-        elif lead.left > 0.01 and travel(log, j) < settings.travel and _still(u) > 0.8:
+        elif (
+            lead.left > 0.01
+            and travel(log, j) < settings.travel
+            and (np.abs(np.diff(u)) < 1e-3 * np.ptp(u)).mean() > 0.8
+        ):
             doubts[j] = (
                 "cannot tell",
                 f"its command moves {round(travel(log, j))} times only; move it up and down",
@@ -112,11 +108,6 @@ def _range_of(command: np.ndarray) -> np.ndarray:
     """Return the range of each command ``(N, A)`` but for one in a hundred rows at each end."""
     low, high = np.quantile(command, [0.01, 0.99], axis=0)
     return np.where(high > low, high - low, np.ptp(command, axis=0))
-
-
-def _still(command: np.ndarray) -> float:
-    """Return the share of rows in which a command stands still."""
-    return float((np.abs(np.diff(command)) < 1e-3 * np.ptp(command)).mean())
 
 
 def copies_of(command: np.ndarray, alike_from: float = 0.999) -> list[list[int]]:

@@ -42,13 +42,6 @@ def fit_response(
     Delay, lag and rate limit together first; then forward, whichever of the other numbers and
     commands improves the fit most, as long as it improves it clearly; then backward, what is no
     longer needed.
-
-    Args:
-        problem: response and commands, by which numbers are proposed.
-        large: by which they are found and judged, the same or more rows of it.
-        driver: the command that is followed.
-        starts: delays, lags and rate limits to begin with.
-        settings: how clear it must be.
     """
     options, whole = _dynamics(problem, driver, starts), large
     if weight_of(problem, options[-1]) * problem.use.sum() > settings.enough:
@@ -86,10 +79,7 @@ def _dynamics(problem: Problem, driver: int, starts: Sequence[Shape]) -> list[Mo
 
 
 def _simplest(problem: Problem, models: Sequence[Model], settings: Settings) -> Model:
-    """Return the simplest of some models that is not clearly worse than a larger one.
-
-    Of those that explain as much, every machine has a delay, and few have a rate limit.
-    """
+    """Return the simplest of some models that is not clearly worse than a larger one."""
     first, *others = [refine(problem, model) for model in models]
     for size in sorted({other.size for other in others}):
         best, *some = sorted((other for other in others if other.size == size), key=COST)
@@ -224,14 +214,7 @@ def _best(problem: Problem, model: Model, options: Sequence[dict[str, Any]]) -> 
 def _with_another(
     problem: Problem, model: Model, clear: float = 4.5, coupled: float = 0.05
 ) -> Iterator[Model]:
-    """Yield the model with the other command that shows best in what is left.
-
-    Args:
-        problem: response and commands.
-        model: what is known.
-        clear: standard errors by which the other command has to show: it is the best of several.
-        coupled: share of the driver's influence that matters.
-    """
+    """Yield the model with the other command that shows best in what is left."""
     linear = model.shape.linear
     rest = [i for i in range(problem.u.shape[1]) if i not in (model.driver, *model.others)]
     rest = [i for i in rest if problem.u[:, i].std() > 0]

@@ -62,10 +62,7 @@ def _density_at_zero(series: np.ndarray, power: float) -> float:
 
 
 def _autoregression(series: np.ndarray, power: float, most: int = 12, fresh: float = 0.03) -> float:
-    """Return the long-run variance by the autoregression with the least AIC (Levinson).
-
-    Its coefficients sum to ``1 - fresh`` at most: no memory above 33 rows is believed.
-    """
+    """Return the long-run variance by the autoregression with the least AIC (Levinson)."""
     rows = len(series)
     order = max(min(most, rows // 10), 1)
     lags = np.array([(series[k:] * series[: rows - k]).sum() for k in range(order + 1)]) / rows

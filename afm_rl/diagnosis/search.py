@@ -188,14 +188,7 @@ def _with_starts(log: Log, j: int, lead: Lead, delays: np.ndarray, settings: Set
 
 
 def beginning(clock: Clock, u: np.ndarray, y: np.ndarray, line: tuple[float, float]) -> np.ndarray:
-    """Return where each episode begins, as its first response shows, in units of the command.
-
-    Args:
-        clock: of the rows.
-        u: command, ``(N,)``.
-        y: response, ``(N,)``.
-        line: gain and offset.
-    """
+    """Return where each episode begins, as its first response shows, in units of the command."""
     gain, offset = line
     return np.clip((y[clock.start] - offset) / gain, u.min(), u.max())
 

@@ -11,16 +11,14 @@ import numpy as np
 from afm_rl.diagnosis.changes import Part, find_parts
 from afm_rl.diagnosis.checks import SUMMED, Doubt, copies_of, echoes, effort_notes, find_doubts
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
-from afm_rl.diagnosis.kinds import agree, small_twins
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.lost import without_lost
 from afm_rl.diagnosis.numbers import numbers_of, quantum_of
-from afm_rl.diagnosis.scale import Scaled, scale
+from afm_rl.diagnosis.residuals import without_lost
+from afm_rl.diagnosis.scale import Scaled, scale, unwrapped
 from afm_rl.diagnosis.search import find_leads, only, rows_enough
 from afm_rl.diagnosis.settings import Settings
-from afm_rl.diagnosis.together import shared_delay, unit_of, with_basis
+from afm_rl.diagnosis.together import agree, shared_delay, small_twins, unit_of, with_basis
 from afm_rl.diagnosis.words import judge
-from afm_rl.diagnosis.wrap import unwrapped
 
 Parts = dict[int, Sequence[Part]]
 
@@ -109,17 +107,7 @@ def _judged(
     step: float,
     settings: Settings,
 ) -> tuple[Actuator, ...]:
-    """Return the last part of each actuator with its status, its sentence, and its changes.
-
-    Args:
-        found: the parts of each actuator.
-        times: when they begin (s).
-        doubts: why nothing can be said of some.
-        usual: delay and lag that are no fault (s).
-        scaled: the log.
-        step: time between two of its rows (s).
-        settings: what matters.
-    """
+    """Return the last part of each actuator with its status, its sentence, and its changes."""
     actuators, small = [], small_twins(scaled.raw.names, scaled.reach)
     for j, numbers in enumerate(found):
         how: dict[str, Any] = {

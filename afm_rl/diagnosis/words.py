@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from afm_rl.diagnosis.findings import Actuator, Interval, Status
-from afm_rl.diagnosis.pattern import OWN
+from afm_rl.diagnosis.residuals import OWN
 from afm_rl.diagnosis.settings import Settings
 
 UNITS = {
@@ -34,14 +34,6 @@ def judge(
 
     A fault is a deviation that is significant and large enough to matter: more than 5 % of the
     gain or of half the range of commands, or half a step of delay.
-
-    Args:
-        actuator: with all numbers.
-        step: time between two rows (s).
-        usual_delay: delay and lag of the healthy robot (s).
-        doubt: status and reason, if the log cannot tell.
-        timed: is the step known in seconds?
-        settings: what matters.
 
     >>> elbow = Actuator(name="elbow", gain=-0.62, gain_interval=(-0.63, -0.61), reversed=True,
     ...                  command_range=(-1.0, 1.0), delay_s=0.04)

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from afm_rl.compiling.cast_cache import CastCache
+from afm_rl.compiling.devices import CastCache
 from afm_rl.dynamics.base import PerMissionModel
 from afm_rl.dynamics.stacked import (
     RunningStats,

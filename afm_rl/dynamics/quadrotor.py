@@ -16,7 +16,7 @@ from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.rates import HeldRate, runge_kutta_linearised, runge_kutta_path
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.spaces.airframe import QuadrotorBody
-from afm_rl.spaces.rigid_body import RigidBodySpace
+from afm_rl.spaces.manifold import RigidBodySpace
 
 
 class _Tables(NamedTuple):

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
+import pandas as pd
 from omegaconf import DictConfig
 from yaml import safe_dump
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.jobs.executor import Executor
-from afm_rl.jobs.layout import JOBS, MISSIONS, RECORD, is_batch, recorded
+from afm_rl.jobs.executor import Board, Executor
+from afm_rl.jobs.layout import is_batch, is_finished, job_folders, recorded
 from afm_rl.jobs.process import Job
-from afm_rl.jobs.progress import Board
 from afm_rl.jobs.run import begin, needs_run
-from afm_rl.jobs.tables import write_tables
-from afm_rl.storage.files import locked, remove_parts, write_whole
-from afm_rl.storage.manifest import MANIFEST, write_manifest
+from afm_rl.storage.files import csv_text, locked, remove_parts, write_whole
+from afm_rl.storage.manifest import COMPUTE, JOBS, MANIFEST, MISSIONS, RECORD, write_manifest
 from afm_rl.trust import trusted
 
 
@@ -86,10 +85,6 @@ def _record(folder: Path, jobs: Sequence[Job], command: str) -> None:
 def file_name(name: str, longest: int = 120) -> str:
     """Return a name for the folder of a job: readable, and another one for every job.
 
-    Args:
-        name: of the job.
-        longest: characters that are kept of it.
-
     >>> file_name("physics+planner.horizon=5")
     'physics+planner.horizon=5'
     >>> file_name("physics+tracks=[a/b]")
@@ -99,3 +94,43 @@ def file_name(name: str, longest: int = 120) -> str:
     if plain == name:
         return name
     return f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:6]}"
+
+
+def write_tables(folder: Path) -> None:
+    """Write ``missions.csv`` and ``compute.csv`` of a batch, and its manifest.
+
+    ``missions.csv`` holds nothing that depends on the clock, so it is the same to the byte however
+    often the batch was interrupted.
+    """
+    (folder / MANIFEST).unlink(missing_ok=True)
+    runs = [run for run in job_folders(folder) if is_finished(run) and (run / MISSIONS).exists()]
+    if runs:
+        # As text, so that numbers come out as they went in.
+        texts = [pd.read_csv(run / MISSIONS, dtype=str, keep_default_na=False) for run in runs]
+        taken = pd.concat([pd.read_csv(run / COMPUTE) for run in runs])
+        whole = taken.groupby("method", sort=False).sum().reset_index()
+        write_whole(folder / MISSIONS, csv_text(join(texts)).encode())
+        write_whole(folder / COMPUTE, csv_text(whole).encode())
+    write_manifest(folder, [n for n in (RECORD, MISSIONS, COMPUTE) if (folder / n).exists()])
+
+
+def join(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
+    """Put the tables of jobs into one, missions numbered through.
+
+    Methods keep the order in which they come first.
+
+    >>> one = pd.DataFrame({"mission": [0, 1], "method": "a", "track": ["x", "y"], "seed": 7})
+    >>> join([one, one.assign(seed=3)])[["mission", "track", "seed"]].values.tolist()
+    [[0, 'x', 3], [1, 'x', 7], [2, 'y', 3], [3, 'y', 7]]
+    """
+    whole = pd.concat(tables, ignore_index=True)
+    rank = {method: place for place, method in enumerate(whole["method"].unique())}
+    keys = pd.DataFrame(
+        {
+            "method": whole["method"].map(rank),
+            "cell": whole["mission"].astype(int),
+            "seed": whole["seed"].astype(int),
+        }
+    )
+    order = keys.sort_values(list(keys), kind="stable").index
+    return whole.loc[order].assign(mission=range(len(whole))).reset_index(drop=True)

@@ -1,18 +1,89 @@
-"""Where jobs run: one interface, and this machine as the first of its kind."""
+"""Where jobs run: one interface, here and on two kinds of cluster; and how far they are."""
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import sys
+import tempfile
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
-from afm_rl.errors import AFMError, ConfigurationError
-from afm_rl.jobs.process import Job, is_done, last_words, said, start
-from afm_rl.jobs.progress import Board
+from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_number
+from afm_rl.jobs.layout import LOG
+from afm_rl.jobs.process import PROGRESS, Job, is_done, last_words, needs, run, said, start
+from afm_rl.progress import Bar
+from afm_rl.storage.manifest import UNFINISHED
+
+
+class Board:
+    """Shows how far jobs are, and how much time is left."""
+
+    def __init__(
+        self, jobs: Sequence[Job], count: int, shown: bool, echo: Callable[[str], object]
+    ) -> None:
+        self.jobs, self.done, self.count, self.echo = set(jobs), count - len(jobs), count, echo
+        self.told: set[str] = set()
+        self.bars: dict[Job, Bar] = {}
+        self.shares = {job: self._state(job)[1] for job in jobs}
+        begun, total = sum(self.shares.values()), len(jobs)
+        self.whole = Bar(desc="jobs", shown=shown, leave=False, initial=begun, total=total)
+        self.looked = time.monotonic()
+
+    def __enter__(self) -> Board:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for bar in (*self.bars.values(), self.whole):
+            bar.close()
+
+    def end(self, job: Job, failure: str | None) -> None:
+        """Say that a job is over, and why it failed, or what else it said that is new."""
+        self.jobs.remove(job)
+        self.done += 1
+        self.shares[job] = 1.0
+        if job in self.bars:
+            self.bars.pop(job).close()
+        line = f"[{self.done}/{self.count}] {job}: "
+        line += f"failed: {failure}" if failure else "done"
+        with suppress(OSError):
+            told = [] if failure else (job.folder / LOG).read_text().splitlines()
+            line = "\n".join([line, *(f"  {text}" for text in told if text not in self.told)])
+            self.told.update(told)
+        (Bar.write if self.whole.live and not self.whole.disable else self.echo)(line)
+
+    def look(self) -> None:
+        """Look at the jobs that run, if it is time to."""
+        now = time.monotonic()
+        if self.whole.disable or now - self.looked < self.whole.mininterval:
+            return
+        self.looked = now
+        states = {job: state for job in self.jobs if (state := self._state(job))[0]}
+        for job, (line, share) in states.items():
+            self.shares[job] = max(share, self.shares[job])  # one that goes on from a checkpoint
+            if self.whole.live:
+                bar = self.bars.get(job) or Bar(desc=f"  {job}", total=1.0, leave=False)
+                self.bars[job] = bar
+                bar.set_postfix_str(line, refresh=False)
+                bar.n = share
+                bar.refresh()
+        said = f"{self.done}/{self.count} jobs, {len(states)} at work"
+        self.whole.set_postfix_str(said, refresh=False)
+        self.whole.n = sum(self.shares.values())
+        self.whole.refresh()
+
+    def _state(self, job: Job) -> tuple[str, float]:
+        """Return what a job that runs says of itself; "" if it has not begun."""
+        try:
+            told = json.loads((job.folder / UNFINISHED / PROGRESS).read_text())
+            return str(told["line"]), float(told["share"])
+        except (OSError, ValueError):
+            return "", 0.0
 
 
 class JobsFailed(AFMError):
@@ -49,12 +120,7 @@ class Executor(ABC):
         """Deal with the jobs that still run when the command ends, if any."""
 
     def run(self, jobs: Sequence[Job], board: Board) -> dict[str, str]:
-        """Run jobs, in any order; return why some have no results, by name.
-
-        Args:
-            jobs: what to run.
-            board: is told of each job that is over, and looks at the others now and then.
-        """
+        """Run jobs, in any order; return why some have no results, by name."""
         waiting, running, failures = deque(jobs), dict[Job, Any](), dict[str, str]()
         try:
             while waiting or running:
@@ -114,3 +180,91 @@ class LocalExecutor(Executor):
             process.join(max(0.0, latest - time.monotonic()))
             process.kill()
             process.join()
+
+
+class SubmititExecutor(Executor):
+    """Submits jobs to SLURM as one array, or runs them as if, with submitit.
+
+    submitit hands a job to its node as a pickle. It is in a new folder that only the user can
+    enter, and holds the name of :func:`~afm_rl.jobs.process.run` and a :class:`Job`. What comes
+    back is not read, but what the job leaves in its own folder. The new folder goes when all jobs
+    are over; if the command is ended before, it stays, since the queue needs it.
+
+    Args:
+        cluster: ``slurm``, or ``local`` for this machine.
+        parameters: of ``submitit.AutoExecutor.update_parameters``; those that are None are left to
+            the cluster.
+
+    Raises:
+        ConfigurationError: for another cluster, or if submitit is not installed.
+    """
+
+    def __init__(self, cluster: str = "slurm", parameters: Mapping[str, Any] | None = None) -> None:
+        self.cluster = check_choice("hydra.launcher.cluster", cluster, ("local", "slurm"))
+        given = {key: value for key, value in (parameters or {}).items() if value is not None}
+        self.parameters = {"name": "afm-rl"} | given
+        self.submitit = needs("submitit", "sweeps")
+        self.private = ""
+
+    def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
+        self.private = tempfile.mkdtemp(prefix=".submitit-", dir=jobs[0].folder.parent.parent)
+        try:
+            executor = self.submitit.AutoExecutor(self.private, cluster=self.cluster)
+            executor.update_parameters(**self.parameters)
+            return executor.map_array(run, jobs)
+        except (RuntimeError, NameError, TypeError) as error:  # no cluster, no such parameter
+            raise ConfigurationError(f"hydra.launcher: {' '.join(str(error).split())}") from error
+
+    def is_over(self, handle: Any) -> bool:
+        return handle.done()
+
+    def last_words(self, handle: Any) -> str:
+        said = (handle.stderr() or "").splitlines() or ["no word on standard error"]
+        return f"it ended in state {handle.state} before its results were whole: {said[-1]}"
+
+    def close(self, handles: Collection[Any]) -> None:
+        if not handles:  # else they stay in the queue, with their pickles
+            shutil.rmtree(self.private, ignore_errors=True)
+
+
+class RayExecutor(Executor):
+    """Runs each job on a node of a Ray cluster that has room for it.
+
+    Args:
+        address: of the cluster, as ``ray.init`` takes it; None for the one that ``RAY_ADDRESS``
+            names, or else one of this machine that lasts as long as the command.
+        num_cpus: cores that a job takes up.
+        num_gpus: GPUs that a job takes up.
+
+    Raises:
+        ConfigurationError: for a negative number, or if Ray is not installed.
+    """
+
+    def __init__(
+        self, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0
+    ) -> None:
+        self.address = address
+        self.resources = {
+            "num_cpus": check_number("hydra.launcher.num_cpus", num_cpus, low=0),
+            "num_gpus": check_number("hydra.launcher.num_gpus", num_gpus, low=0),
+        }
+        self.ray = needs("ray", "ray")
+
+    def start(self, jobs: Sequence[Job]) -> Sequence[Any]:
+        self.ray.init(self.address, log_to_driver=False, ignore_reinit_error=True)
+        # Not tried again elsewhere: a job that outgrows a node would bring down the next one.
+        remote = self.ray.remote(max_retries=0, **self.resources)(run)
+        return [remote.remote(job) for job in jobs]
+
+    def is_over(self, handle: Any) -> bool:
+        return bool(self.ray.wait([handle], timeout=0)[0])
+
+    def last_words(self, handle: Any) -> str:
+        try:
+            self.ray.get(handle)
+        except self.ray.exceptions.RayError as error:
+            return str(error).splitlines()[0]
+        return super().last_words(handle)
+
+    def close(self, handles: Collection[Any]) -> None:
+        self.ray.shutdown()

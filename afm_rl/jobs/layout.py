@@ -35,11 +35,9 @@ from pathlib import Path
 from yaml import YAMLError, safe_load
 
 from afm_rl.errors import ArtefactError
-from afm_rl.storage.manifest import MANIFEST, read_verified
+from afm_rl.storage.manifest import JOBS, MANIFEST, RECORD, read_verified
 
-JOBS, RECORD, UNFINISHED = "jobs", "jobs.yaml", "unfinished"
-MISSIONS, STEPS, COMPUTE = "missions.csv", "steps.parquet", "compute.csv"
-CONFIG, LOG = "config.yaml", "log.txt"
+LOG = "log.txt"
 
 
 def is_batch(folder: Path) -> bool:
@@ -53,20 +51,12 @@ def is_finished(folder: Path) -> bool:
 
 
 def job_folders(folder: Path) -> list[Path]:
-    """Return the folders of a batch's jobs, finished or not, in the order of ``jobs.yaml``.
-
-    Raises:
-        ArtefactError: if that is damaged.
-    """
+    """Return the folders of a batch's jobs, finished or not, in the order of ``jobs.yaml``."""
     return [folder / JOBS / name for name in recorded(folder)]
 
 
 def recorded(folder: Path) -> list[str]:
-    """Return the names of a batch's jobs in the order of the tables, from ``jobs.yaml``.
-
-    Raises:
-        ArtefactError: if it is damaged.
-    """
+    """Return the names of a batch's jobs in the order of the tables, from ``jobs.yaml``."""
     path = folder / RECORD
     if not path.exists():
         return []

@@ -23,8 +23,9 @@ from types import ModuleType
 from typing import Any
 
 from afm_rl.errors import AFMError, ConfigurationError, causes
-from afm_rl.jobs.layout import CONFIG, LOG, UNFINISHED, is_finished
+from afm_rl.jobs.layout import LOG, is_finished
 from afm_rl.storage.files import locked
+from afm_rl.storage.manifest import CONFIG, UNFINISHED
 from afm_rl.trust import trust
 
 START = "forkserver"  # torch is imported once, and jobs are forked from there
@@ -171,11 +172,7 @@ def explain(error: BaseException) -> str:
 
 
 def needs(package: str, extra: str) -> ModuleType:
-    """Import a package that comes with one of our extras.
-
-    Raises:
-        ConfigurationError: if it is not installed.
-    """
+    """Import a package that comes with one of our extras."""
     try:
         return importlib.import_module(package)
     except ImportError as error:

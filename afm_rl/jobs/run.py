@@ -15,13 +15,23 @@ from yaml import YAMLError, safe_load
 
 from afm_rl._version import __version__
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.jobs.layout import COMPUTE, CONFIG, MISSIONS, STEPS, UNFINISHED, is_batch, is_finished
+from afm_rl.jobs.layout import is_batch, is_finished
 from afm_rl.missions import Agent, Results, build, prepare, run
 from afm_rl.storage import measures
-from afm_rl.storage.csv_text import csv_text
-from afm_rl.storage.files import sync_folder, write_whole
-from afm_rl.storage.manifest import MANIFEST, check_manifest, read_manifest, write_manifest
-from afm_rl.storage.settings import differences, influential
+from afm_rl.storage.files import csv_text, sync_folder, write_whole
+from afm_rl.storage.manifest import (
+    COMPUTE,
+    CONFIG,
+    MANIFEST,
+    MISSIONS,
+    STEPS,
+    UNFINISHED,
+    check_manifest,
+    differences,
+    influential,
+    read_manifest,
+    write_manifest,
+)
 
 READY = "ready"  # the folder of new results, inside that of unfinished ones
 SHOWN = ("diagnosis", "figures", "video", "tensorboard")  # folders drawn from the results
@@ -32,11 +42,6 @@ def needs_run(folder: Path, cfg: DictConfig, overwrite: bool = False) -> bool:
     """Return whether the missions of a configuration are still to be run in a folder.
 
     Nothing is written.
-
-    Args:
-        folder: of the run.
-        cfg: settings of one method, with its label.
-        overwrite: the folder may hold anything, which will be replaced.
 
     Raises:
         ConfigurationError: if the folder holds something else.
@@ -77,12 +82,7 @@ def _check_same(path: Path, cfg: DictConfig, version: str) -> None:
 
 
 def begin(folder: Path, cfg: DictConfig) -> None:
-    """Write down what a run is asked. Checkpoints of other settings are removed.
-
-    Args:
-        folder: of the run.
-        cfg: settings of one method, with its label.
-    """
+    """Write down what a run is asked. Checkpoints of other settings are removed."""
     path = folder / UNFINISHED / CONFIG
     if path.exists():
         try:
@@ -139,9 +139,9 @@ def _publish(folder: Path, results: Results) -> None:
     files = {
         CONFIG: (new / CONFIG).read_bytes(),
         # Times differ from run to run: without them the same missions make the same file.
-        MISSIONS: csv_of(missions.drop(columns="seconds")),
+        MISSIONS: csv_text(missions.drop(columns="seconds")).encode(),
         STEPS: steps.getvalue(),
-        COMPUTE: csv_of(compute(missions)),
+        COMPUTE: csv_text(compute(missions)).encode(),
         measures.FILE: results.measures.to_json().encode(),
     }
     shutil.rmtree(new / READY, ignore_errors=True)
@@ -160,11 +160,6 @@ def _publish(folder: Path, results: Results) -> None:
             path.unlink()
     (new / CONFIG).unlink()  # the last one: as long as it is there, there is something to do
     new.rmdir()
-
-
-def csv_of(table: pd.DataFrame) -> bytes:
-    """Return a table as the text of a CSV file."""
-    return csv_text(table).encode()
 
 
 def compute(missions: pd.DataFrame) -> pd.DataFrame:

@@ -16,7 +16,7 @@ from afm_rl.errors import NonFiniteError, check_count, check_number
 from afm_rl.learning.loss import gaussian_nll
 from afm_rl.progress import Bar
 from afm_rl.spaces.keys import as_keys
-from afm_rl.spaces.sampling import uniform
+from afm_rl.spaces.manifold import uniform
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from afm_rl.dynamics.residual import Network, residual, to_world
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.progress import Bar
 from afm_rl.regimes import Regime
-from afm_rl.spaces.manifold import wrap_angle
-from afm_rl.spaces.sampling import uniform
+from afm_rl.spaces.manifold import uniform, wrap_angle
 
 Triple = tuple[Tensor, Tensor, Tensor]  # states, actions, next states
 

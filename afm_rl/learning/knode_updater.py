@@ -252,7 +252,7 @@ class KNODEUpdater(Learner):
             self.due = NONE
 
 
-def _nothing(kind: type) -> Any:
+def _nothing(kind: Any) -> Any:
     """Return a record without any rows."""
     return kind(*(torch.zeros(0) for _ in kind._fields))
 

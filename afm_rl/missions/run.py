@@ -18,7 +18,7 @@ from afm_rl.errors import AFMError, NonFiniteError
 from afm_rl.missions.build import Agent
 from afm_rl.missions.state import Loop, StepLog, leave, owner, restore, snapshot, unsaved
 from afm_rl.progress import Bar
-from afm_rl.storage.checkpoints import Checkpoints
+from afm_rl.storage.artefacts import Checkpoints
 from afm_rl.storage.measures import Measures
 
 

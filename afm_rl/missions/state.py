@@ -16,13 +16,13 @@ from torch.optim import Optimizer
 from torchrl.envs import EnvBase
 
 from afm_rl._version import __version__
-from afm_rl.compiling.cast_cache import CastCache
+from afm_rl.compiling.devices import CastCache
 from afm_rl.errors import ConfigurationError
 from afm_rl.mission_state import MissionState
 from afm_rl.missions.build import Agent
 from afm_rl.regimes import Regime
 from afm_rl.storage.artefacts import digest_of
-from afm_rl.storage.settings import influential
+from afm_rl.storage.manifest import influential
 from afm_rl.streams import Streams
 
 

@@ -14,14 +14,7 @@ GROUND, TRACK, LINE = (225, 228, 232), (205, 208, 212), (120, 120, 120)
 
 
 class MuJoCoFigure:
-    """A MuJoCo robot in its lane, which runs below it as on a treadmill.
-
-    Args:
-        server: of viser.
-        name: of the side.
-        inner: the innermost environment.
-        place: where the lane is (m), ``(3,)``.
-    """
+    """A MuJoCo robot in its lane, which runs below it as on a treadmill."""
 
     def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
         self.inner, self.place, model = inner, place, inner.model

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from afm_rl.diagnosis.log import Log
-from afm_rl.replay.simple import SIMPLE
-from afm_rl.replay.table import AFM, Table, errors_of, removed_by, slow_in
+from afm_rl.replay.table import AFM, SIMPLE, Table, errors_of, removed_by, slow_in
 
 __all__ = ["Table", "replay"]
 
@@ -18,7 +17,7 @@ def replay(log: Log, seen: Callable[[float], object] = lambda share: None) -> Ta
 
     The robot's state is its response, and the model says that a response is its command. So the
     correction learns what commands do, as it would have on the robot, without acting; beside it
-    stand the predictions of plain methods (:mod:`~afm_rl.replay.simple`). Where an
+    stand the predictions of plain methods (:mod:`~afm_rl.replay.table`). Where an
     episode begins, or rows are missing, the command before is not known.
 
     Args:

@@ -1,4 +1,4 @@
-"""A diagnosis on the terminal, as JSON, and as a page with a figure per actuator."""
+"""A diagnosis, and a replayed log, in a terminal, as files, and as a page with figures."""
 
 from __future__ import annotations
 
@@ -11,20 +11,16 @@ from typing import IO
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from rich import box
-from rich.console import Console
-from rich.table import Table as Grid
 from rich.text import Text
 
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
 from afm_rl.replay import Table as Replayed
+from afm_rl.replay.table import AFM, ALONE, SHARES
 from afm_rl.report import style
-from afm_rl.report.console import WIDE
 from afm_rl.report.figures import Picture
-from afm_rl.report.replay import errors_table, pictures_of
-from afm_rl.report.table import Table
+from afm_rl.report.tables import Table, grid_of, terminal
 from afm_rl.report.write import render_page
-from afm_rl.storage.files import write_whole
+from afm_rl.storage.files import csv_text, write_whole
 
 LOOKS = {"healthy": "green", "changed": "bold red", "dead": "bold red", "cannot tell": "yellow"}
 LOOKS |= {"not measured": "yellow", "not actuated": "yellow"}
@@ -35,6 +31,14 @@ CAPTION = (
 NOTE = (
     "95 % intervals in brackets. Gain: response per command. Offset, noise: in units of the "
     "response. Dead zone, saturation, backlash, rate: in units of the command."
+)
+ERRORS_NOTE = (
+    "Absolute error of what each row was predicted to do, from its command and earlier rows only: "
+    "median and 90th percentile with 95 % intervals, in units of the response."
+)
+ERRORS_CAPTION = (
+    "Running median of the absolute error over {rows} rows: as commanded, the plain method with "
+    "the least median error, and AFM."
 )
 KEPT = ("actuator", "status", "gain", "offset", "delay (s)", "noise", "unexplained (%)")
 
@@ -52,16 +56,10 @@ def print_diagnosis(diagnosis: Diagnosis, file: IO[str] | None = None) -> None:
     <BLANKLINE>
     wrist: healthy
     """
-    console = Console(file=file, width=WIDE, highlight=False)
-    grid = Grid(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
-    shown = _table(diagnosis)
+    console, shown = terminal(file), _table(diagnosis)
     shown = shown.loc[:, [name for name in shown if name in KEPT or (shown[name] != "-").any()]]
-    for head in shown:
-        grid.add_column(Text(head))
-    for actuator, texts in zip(diagnosis.actuators, shown.to_numpy(), strict=True):
-        look = LOOKS[actuator.status]
-        grid.add_row(*(Text(text, look if k < 2 else "") for k, text in enumerate(texts)))
-    console.print(grid)
+    looks = [LOOKS[actuator.status] for actuator in diagnosis.actuators]
+    console.print(grid_of(shown, lambda row, column: looks[row] if column < 2 else ""))
     for note in diagnosis.notes:
         console.print(Text(f"Note: {note}"))
     for actuator in diagnosis.actuators:
@@ -120,19 +118,7 @@ def write_diagnosis(
     page: bool = True,
     replayed: Replayed | None = None,
 ) -> Iterator[Path]:
-    """Write ``diagnosis.json`` and ``index.html``; yield their paths as they are written.
-
-    Args:
-        diagnosis: what to write.
-        log: what it was made from.
-        out: folder; made if it is not there.
-        source: what the log is called.
-        page: write the page, too.
-        replayed: the same log replayed, for the page.
-
-    Raises:
-        ConfigurationError: if a file cannot be written.
-    """
+    """Write ``diagnosis.json`` and ``index.html``; yield their paths as they are written."""
     text = json.dumps(diagnosis.as_dict(), indent=2, ensure_ascii=False)
     write_whole(out / "diagnosis.json", text.encode())
     yield out / "diagnosis.json"
@@ -160,7 +146,8 @@ def _page(diagnosis: Diagnosis, log: Log, source: str, replayed: Replayed | None
     notes = [*diagnosis.notes, *(actuator.sentence for actuator in diagnosis.actuators)]
     if replayed is not None:
         tables.append(errors_table(replayed))
-        figures += list(pictures_of(replayed))
+        figure, caption = draw_replay(replayed)
+        figures.append(Picture("replay", replayed.sentence, caption, style.png_bytes(figure)))
         notes += [replayed.sentence, *replayed.notes]
     content = {"title": "Diagnosis of the actuators", "summary": summary, "notes": notes}
     return render_page(**content, figures=figures, tables=tables, references=[])
@@ -172,7 +159,8 @@ def draw_actuator(diagnosis: Diagnosis, log: Log, place: int, points: int = 3000
     The latter two have ``points`` dots at most.
     """
     actuator = diagnosis.actuators[place]
-    driver = _driver(actuator, log, place)
+    other = actuator.driven_by  # drawn where this alone is followed
+    driver = place if other is None or other in actuator.coupling else log.names.index(other)
     u, y = log.command[:, driver], log.response[:, place]
     fit = y if diagnosis.fitted is None else diagnosis.fitted[:, place]
     t = log.since
@@ -201,14 +189,96 @@ def draw_actuator(diagnosis: Diagnosis, log: Log, place: int, points: int = 3000
     return figure
 
 
-def _driver(actuator: Actuator, log: Log, place: int) -> int:
-    """Return which command to draw: that of another actuator where this alone is followed."""
-    other = actuator.driven_by
-    return place if other is None or other in actuator.coupling else log.names.index(other)
-
-
 def _excerpt(actuator: Actuator, t: np.ndarray, most: int = 300) -> slice:
     """Return rows around the last change, or the first ones."""
     middle = int(np.searchsorted(t, actuator.changes[-1].t)) if actuator.changes else 0
     first = max(0, min(middle - most // 2, len(t) - most))
     return slice(first, first + most)
+
+
+def print_replay(replayed: Replayed, file: IO[str] | None = None) -> None:
+    """Print the errors over the whole log, and what a correction would have done.
+
+    >>> from afm_rl.diagnosis import Log
+    >>> from afm_rl.replay.table import errors_of
+    >>> u = np.linspace(-1, 1, 40)[:, None]
+    >>> log, found = Log(("pan",), u, 0.5 * u), {ALONE: u, AFM: 0.5 * u}
+    >>> table = Replayed(log, found, 0 * u, errors_of(log, found), {"pan": 1.0})
+    >>> print_replay(table)  # doctest: +NORMALIZE_WHITESPACE
+    <BLANKLINE>
+     actuator  error   as commanded       AFM
+     ──────────────────────────────────────────────────────
+     pan       median  0.26 [0.01, 0.50]  0.00 [0.00, 0.00]
+     pan       p90     0.45 [0.37, 0.50]  0.00 [0.00, 0.00]
+    <BLANKLINE>
+    A correction would have removed 100 % of the error of pan.
+    """
+    console = terminal(file)
+    console.print(grid_of(errors_table(replayed, stretches=False).shown))
+    for line in (replayed.sentence, *replayed.notes):
+        console.print(Text(line), soft_wrap=True)
+
+
+def errors_table(replayed: Replayed, stretches: bool = True) -> Table:
+    """Return the errors, a column for each predictor: of stretches of time, or over all."""
+    errors = replayed.errors
+    if not stretches:
+        errors = errors[errors["stretch"] == "all"]
+    rows = []
+    for (name, _), part in errors.groupby(["actuator", "stretch"], sort=False):
+        first = part.iloc[0]
+        for kind in SHARES:
+            row = {"actuator": name}
+            if stretches:
+                row["t (s)"] = f"{first['from']:.6g} to {first['to']:.6g}"
+            row["error"] = kind
+            row |= {p["predictor"]: _error_text(p, kind) for _, p in part.iterrows()}
+            rows.append(row)
+    return Table("errors", "Error of predictions", ERRORS_NOTE, errors, pd.DataFrame(rows))
+
+
+def _error_text(row: pd.Series, kind: str) -> str:
+    """Return an error with its interval, with two digits that count."""
+    largest = row[f"{kind}_high"]
+    digits = min(max(1 - int(np.floor(np.log10(largest))), 0), 9) if largest > 0 else 2
+    middle, low, high = (f"{row[kind + end]:.{digits}f}" for end in ("", "_low", "_high"))
+    return f"{middle} [{low}, {high}]"
+
+
+def write_replay(replayed: Replayed, out: Path) -> Path:
+    """Write a row for each row of the log as CSV."""
+    write_whole(out, csv_text(replayed.rows()).encode())
+    return out
+
+
+def draw_replay(replayed: Replayed, most: int = 6, points: int = 300) -> tuple[Figure, str]:
+    """Return the error over time of the actuators with the largest share, and a caption."""
+    log, t = replayed.log, replayed.log.since
+    whole = replayed.errors[replayed.errors["stretch"] == "all"]
+    median = whole.pivot(index="actuator", columns="predictor", values="median")
+    size = np.maximum(np.abs(log.command).max(0), 1e-300)
+    worst = np.argsort(-median.loc[list(log.names), ALONE].to_numpy() / size, kind="stable")
+    chosen = sorted(worst[:most])
+    figure = style.new_figure(7.0, 0.6 + 1.4 * len(chosen))
+    window = max(len(t) // 40, 5)
+    rows = np.unique(np.linspace(0, len(t) - 1, points).astype(int))
+    for axes, j in zip(figure.subplots(len(chosen), 1, squeeze=False)[:, 0], chosen, strict=True):
+        name = log.names[j]
+        plain = median.loc[name].drop([AFM, ALONE]).idxmin() if median.shape[1] > 2 else None
+        looks = [(ALONE, style.FAINT), (plain, style.COLOURS[1]), (AFM, style.COLOURS[0])]
+        for kind, colour in looks:
+            if kind is not None:
+                miss = np.abs(replayed.predictions[kind][:, j] - log.response[:, j])
+                label = kind if kind != plain else "best plain method"
+                axes.plot(t[rows], _running(miss, rows, window), color=colour, label=label)
+        axes.set_ylabel(style.literal(name), fontsize=style.SMALL)
+        axes.set_ylim(bottom=0)
+        style.dress(axes, lines="both")
+    axes.set_xlabel("t (s)", fontsize=style.SMALL)
+    style.legend_above(figure, *axes.get_legend_handles_labels())
+    return figure, ERRORS_CAPTION.format(rows=window)
+
+
+def _running(values: np.ndarray, rows: np.ndarray, window: int) -> list[float]:
+    """Return the median of the last rows, at some of them."""
+    return [float(np.median(values[max(0, row + 1 - window) : row + 1])) for row in rows]

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from afm_rl.report import comparison, learning, shares, space_plot, style, trajectory
-from afm_rl.report.recovery import MEASURES, recovery_times
+from afm_rl.report import comparison, learning, space_plot, style, trajectory
+from afm_rl.report.learning import MEASURES, recovery_times
 from afm_rl.report.runs import Runs
-from afm_rl.report.track_plot import DrawableTrack
+from afm_rl.report.trajectory import DrawableTrack
 from afm_rl.storage.measures import Measures
 
 
@@ -36,14 +36,7 @@ def draw_run(
     measures: Measures,
     tracks: Sequence[DrawableTrack] = (),
 ) -> Iterator[Picture]:
-    """Yield the figures of a run: paths, whether plans came true, and all missions.
-
-    Args:
-        missions: one row per mission.
-        steps: one row per mission and step.
-        measures: what methods are compared by.
-        tracks: tracks to draw, found by name.
-    """
+    """Yield the figures of a run: paths, whether plans came true, and all missions."""
     yield from _paths("{}", "Paths", missions, steps, measures, tracks)
     figure = learning.draw_learning(missions, steps, measures.error_unit)
     title = "How far plans came true"
@@ -61,12 +54,6 @@ def draw_report(
     """Yield the figures of a report, in the order of the page.
 
     Where there are more than six methods, figures of lines and maps come in several pages.
-
-    Args:
-        runs: the results.
-        missions: one row per mission, from :func:`~.means.count_budgets`.
-        progress: from :func:`read_excerpts`.
-        tracks: tracks to draw; a map whose track is not here has no road.
     """
     measures = runs.measures
     yield _summary(missions, measures)
@@ -80,14 +67,14 @@ def draw_report(
             figure = learning.draw_learning(rows, traces, measures.error_unit)
             yield Picture(name, title, learning.CAPTION, style.png_bytes(figure))
     if (spent := measures.budget) and missions["finished"].any():
-        ratio, caption = shares.ratios(missions, spent), shares.PROFILE_CAPTION
+        ratio, caption = comparison.ratios(missions, spent), comparison.PROFILE_CAPTION
         for name, title, methods in _pages("profile", "Performance profile", missions["method"]):
-            figure = shares.draw_profile(missions, ratio, spent, style.method_styles(methods))
+            figure = comparison.draw_profile(missions, ratio, spent, style.method_styles(methods))
             yield Picture(name, title, caption.format(name=spent.name), style.png_bytes(figure))
     of, known = measures.headlines[0].title, progress.index.get_level_values("method")
     for name, title, methods in _pages("progress", "Progress", known):
-        figure = shares.draw_progress(progress, style.method_styles(methods), of)
-        caption = shares.PROGRESS_CAPTION.format(name=of)
+        figure = comparison.draw_progress(progress, style.method_styles(methods), of)
+        caption = comparison.PROGRESS_CAPTION.format(name=of)
         yield Picture(name, title, caption, style.png_bytes(figure))
     for track, own in traced.groupby("track", sort=False):
         for name, title, methods in _pages(f"{{}}_{track}", f"Paths on {track}", own["method"]):
@@ -149,10 +136,6 @@ def traced_missions(missions: pd.DataFrame) -> pd.DataFrame:
 
 def read_excerpts(runs: Runs, points: int = 240) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Read the steps of each method in turn and keep what a report needs of them.
-
-    Args:
-        runs: the results.
-        points: of each curve of progress.
 
     Returns:
         Recovery times, with ``method``; and the share of what there is to reach, one row per

@@ -14,13 +14,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.report.cells import steps_of
-from afm_rl.report.events import folder_names
 from afm_rl.report.learning import last_step
-from afm_rl.report.runs import Runs
+from afm_rl.report.runs import Runs, steps_of
 from afm_rl.report.scenes import COLUMNS, Scene, map_scene, space_scene
 from afm_rl.report.style import FEW
-from afm_rl.report.track_plot import DrawableTrack
+from afm_rl.report.trajectory import DrawableTrack
+from afm_rl.report.write import folder_names
 from afm_rl.storage.files import write_whole
 
 FRAMES, RATE = 150, 15  # at most; per second

@@ -1,30 +1,176 @@
-"""Folders of results become one table, :class:`Runs`; all that a report shows is a view of it."""
+"""Folders of results, checked, become one table: all that a report shows is a view of it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 
-from afm_rl.errors import ConfigurationError
-from afm_rl.report.folders import (
+from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.report.stranger import read_numbers, read_settings, read_table, read_text
+from afm_rl.storage.manifest import (
+    COMPUTE,
+    CONFIG,
+    JOBS,
+    MANIFEST,
+    MISSIONS,
     RECORD,
     STEPS,
-    Plan,
-    has_results,
-    read_joined_plan,
-    read_measures,
-    read_missions,
-    read_plan,
-    run_folders,
+    UNFINISHED,
+    check_manifest,
 )
-from afm_rl.report.stranger import read_numbers
-from afm_rl.storage.manifest import MANIFEST, check_manifest
-from afm_rl.storage.measures import Measures
+from afm_rl.storage.measures import FILE, Measures
 
+Plan = list[tuple[str, list[int]]]
 KEY = ["method", "cell", "seed"]
+
+
+def outcome(columns: Container[str]) -> str:
+    """Return the name of the column that says how missions ended.
+
+    ``finished`` where there is a goal to reach; otherwise ``terminated``, whether the episode
+    ended before its time.
+
+    >>> outcome(["steps", "terminated"])
+    'terminated'
+    """
+    return "terminated" if "terminated" in columns else "finished"
+
+
+def cell_names(missions: pd.DataFrame) -> pd.Series:
+    """Return each mission's cell: its track and regime, in words.
+
+    The regime is what the column ``regime`` calls it; without one, its parameters, the columns
+    between track and seed, but for gains of 1.
+
+    >>> row = {"method": "physics", "track": "oval", "v_gain": 1.0, "seed": 0}
+    >>> cell_names(pd.DataFrame([row, row | {"v_gain": -1.0}])).tolist()
+    ['oval, nominal', 'oval, v_gain = -1']
+    >>> cell_names(pd.DataFrame([row | {"regime": "slip"}])).tolist()
+    ['oval, slip']
+    """
+    tracks = missions["track"].astype(str)
+    if "regime" in missions:
+        # A family draws its parameters anew for each seed: only its name is the same.
+        return (tracks + ", " + missions["regime"].astype(str)).rename("cell")
+    regimes, names = pd.Series("", index=missions.index), list(missions)
+    for name in names[names.index("track") + 1 : names.index("seed")]:
+        regimes += missions[name].map(f", {name} = {{:g}}".format)
+    regimes = regimes.str.replace(r", \w*gain = 1(?=,|$)", "", regex=True)
+    return (tracks + regimes.where(regimes != "", ", nominal")).rename("cell")
+
+
+def with_cells(missions: pd.DataFrame) -> pd.DataFrame:
+    """Return the missions with a column ``cell``."""
+    return missions if "cell" in missions else missions.assign(cell=cell_names(missions))
+
+
+def steps_of(steps: pd.DataFrame, missions: Iterable[int]) -> dict[int, pd.DataFrame]:
+    """Return the steps of some missions, by mission.
+
+    >>> steps = pd.DataFrame({"mission": [0, 0, 1, 2], "t": [0, 1, 0, 0]})
+    >>> {number: len(rows) for number, rows in steps_of(steps, [0, 2]).items()}
+    {0: 2, 2: 1}
+    """
+    chosen = steps[steps["mission"].isin(list(missions))]
+    return dict(iter(chosen.groupby("mission", sort=False)))
+
+
+def action_names(steps: pd.DataFrame) -> list[str]:
+    """Return the names of the action's components.
+
+    >>> action_names(pd.DataFrame(columns=["x", "planned_v", "executed_v"]))
+    ['v']
+    """
+    return [name.removeprefix("planned_") for name in steps if name.startswith("planned_")]
+
+
+def run_folders(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the folders of the runs in a folder, in the order of its record, and lost ones."""
+    record = folder / RECORD
+    jobs = {path.name: path for path in sorted((folder / JOBS).glob("*")) if path.is_dir()}
+    if not jobs and not record.is_file():
+        if not has_results(folder):
+            what = f"holds no {MISSIONS}" if folder.is_dir() else "no such folder"
+            raise ConfigurationError(
+                f"{folder}: {what}; expected the folder of a run, or of several"
+            )
+        return [folder], []
+    if (folder / MANIFEST).is_file():
+        check_manifest(folder)
+    named = read_settings(record).get("jobs") if record.is_file() else []
+    if not isinstance(named, list):
+        raise ConfigurationError(f"{record}: damaged; expected a list of jobs")
+    names = [*map(str, named)]
+    there = [jobs[name] for name in dict.fromkeys([*names, *jobs]) if name in jobs]
+    return there, [folder / JOBS / name for name in names if name not in jobs]
+
+
+def has_results(folder: Path) -> bool:
+    """Return whether a folder holds results, or did."""
+    return any((folder / name).is_file() for name in (MISSIONS, MANIFEST))
+
+
+def read_plan(run: Path, most: int = 100_000) -> Plan:
+    """Return the method and the seeds, ``most`` at most, that a run was to have by its settings."""
+    paths = [run / CONFIG, run / UNFINISHED / CONFIG]
+    for path in (path for path in paths if path.is_file()):
+        settings = read_settings(path)
+        seeds = settings.get("seeds", [])
+        numbers = range(seeds) if type(seeds) is int else seeds
+        if not isinstance(numbers, (list, range)) or len(numbers) > most:
+            raise ConfigurationError(
+                f"{path}: seeds={str(seeds)[:80]}: expected a count or a list, {most} at most"
+            )
+        whole = [seed for seed in numbers if type(seed) is int]
+        return [(str(settings["label"]), whole)] if "label" in settings else []
+    return []
+
+
+def read_joined_plan(folder: Path) -> Plan:
+    """Return the methods and seeds of the table of all jobs of a batch, if there is one."""
+    if not (folder / MISSIONS).is_file():
+        return []
+    asked = read_table(folder / MISSIONS, ["seed"], ["method"])
+    return [(str(name), seeds.tolist()) for name, seeds in asked.groupby("method")["seed"]]
+
+
+def read_measures(run: Path) -> Measures:
+    """Return what the missions of a run are compared by."""
+    try:
+        return Measures.from_json(read_text(run / FILE))
+    except ArtefactError as error:
+        raise ArtefactError(f"{run / FILE}: {error}") from error
+
+
+def read_missions(run: Path, measures: Measures) -> pd.DataFrame:
+    """Return the missions of a run, checked, with ``cell``, and ``seconds`` if they are known."""
+    path, whole = run / MISSIONS, ["seed", "steps", "mission"]
+    numbers = list(dict.fromkeys([*whole, *measures.columns]))
+    missions = read_table(path, numbers, ["method", "track"])
+    if not len(missions):
+        return missions
+    for name in whole:
+        if missions[name].isna().any() or (missions[name] % 1 != 0).any():
+            raise ConfigurationError(f"{path}: {name}: expected a whole number in each row")
+    ended = outcome(missions)
+    if ended not in missions or missions[ended].dtype != bool:
+        raise ConfigurationError(f"{path}: {ended}: expected True or False in each row")
+    if missions["mission"].duplicated().any():
+        raise ConfigurationError(f"{path}: mission: expected another number in each row")
+    # Single precision as text has seven digits: 6/34 is the same number in all files again.
+    reals = [m.column for m in measures if pd.api.types.is_float_dtype(missions[m.column])]
+    missions = missions.drop(columns="seconds", errors="ignore").assign(
+        **{name: missions[name].map("{:.6g}".format).astype(float) for name in reals},
+        cell=cell_names(missions),
+    )
+    if (run / COMPUTE).is_file():
+        spent = read_table(run / COMPUTE, ["seconds", "missions"], ["method"])
+        each = spent.groupby("method")[["seconds", "missions"]].sum()
+        missions["seconds"] = missions["method"].map(each["seconds"] / each["missions"])
+    return missions
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch, Polygon
 
 from afm_rl.report import style
-from afm_rl.report.cells import action_names
+from afm_rl.report.runs import action_names
 from afm_rl.report.space_plot import GOAL, POSITION, dress_space, mark_regimes
 from afm_rl.report.style import BEFORE, CHANGED, EXECUTED, PLANNED, REFERENCE, START, TARGET
-from afm_rl.report.track_plot import DrawableTrack, draw_road, view
-from afm_rl.report.trajectory import changed_stretch, positions
+from afm_rl.report.trajectory import DrawableTrack, changed_stretch, draw_road, positions, view
 
 COLUMNS = ("x", "y", "goal_x", "goal_y", "error", "misaligned", "regime_active")  # at least
 BODY = np.array([[1.0, 0.0], [-0.8, 0.65], [-0.4, 0.0], [-0.8, -0.65]])  # seen from above
@@ -49,12 +48,6 @@ def map_scene(
     A robot alone has its target, and arrows for the planned action (wide) and the executed one
     (slim), if its actions are called ``v`` and ``omega``: as long as the robot is to be fast, and
     turned by how far it is to turn in half a second. Several robots move at the same time.
-
-    Args:
-        title: what is shown.
-        runs: each method's steps, with :data:`COLUMNS`; ``miss`` is drawn if all have it, and
-            ``error`` otherwise.
-        track: the road.
     """
     box = view(track, [positions(steps) for steps in runs.values()])
     tall = 5.6 * np.clip(box.ratio, 0.4, 1.2)
@@ -87,11 +80,7 @@ def map_scene(
 def _robot(
     axes: Axes, steps: pd.DataFrame, color: str, span: float, alone: bool
 ) -> tuple[Moves, dict[str, Artist]]:
-    """Draw a robot on a map; return what moves, and what stands in the legend.
-
-    Its line so far, its body, and alone its target and actions. One that has ended stays where it
-    is.
-    """
+    """Draw a robot on a map; return what moves, and what stands in the legend."""
     path = positions(steps)
     moved = np.diff(path, axis=0, prepend=path[:1])
     heading = (
@@ -138,10 +127,7 @@ def _point(arrow: FancyArrowPatch, starts: np.ndarray, ends: np.ndarray, row: in
 
 
 def _courses(steps: pd.DataFrame, heading: np.ndarray, ahead: float = 0.5) -> np.ndarray:
-    """Return arrows ``(2, T, 2)`` of planned and executed actions, the longest of size 1.
-
-    They turn for ``ahead`` seconds.
-    """
+    """Return arrows ``(2, T, 2)`` of planned and executed actions, the longest of size 1."""
     kinds = ("planned", "executed")
     fast, turning = (
         np.stack([steps[f"{kind}_{name}"].to_numpy(dtype=float) for kind in kinds])
@@ -153,12 +139,7 @@ def _courses(steps: pd.DataFrame, heading: np.ndarray, ahead: float = 0.5) -> np
 
 
 def space_scene(title: str, steps: pd.DataFrame) -> Scene:
-    """Return the scene of a path in space, with the height and the first action over time.
-
-    Args:
-        title: what is shown.
-        steps: one mission's steps, with :data:`COLUMNS`, ``z``, ``goal_z`` and actions.
-    """
+    """Return the scene of a path in space, with the height and the first action over time."""
     figure, action = style.new_figure(9.6, 28 * GRID), action_names(steps)[0]
     grid = figure.add_gridspec(2, 2, width_ratios=[1.2, 1])
     space: Any = figure.add_subplot(grid[:, 0], projection="3d")
@@ -194,10 +175,7 @@ def space_scene(title: str, steps: pd.DataFrame) -> Scene:
 
 
 def _cursors(panels: Mapping[str, Axes], steps: pd.DataFrame, alone: bool) -> Moves:
-    """Dress axes over time, by their labels; return the lines that mark now.
-
-    Methods change at different steps: changes are marked of a method ``alone``.
-    """
+    """Dress axes over time, by their labels; return the lines that mark now."""
     if alone:
         mark_regimes([*panels.values()], steps)
     moving: Moves = {}

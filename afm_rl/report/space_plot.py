@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from afm_rl.report import style
-from afm_rl.report.cells import action_names, steps_of
 from afm_rl.report.learning import regime_changes
+from afm_rl.report.runs import action_names, steps_of
 
 POSITION, GOAL = ["x", "y", "z"], ["goal_x", "goal_y", "goal_z"]
 COLUMNS = [*POSITION, *GOAL, "regime_active"]  # of the steps
@@ -115,12 +115,7 @@ def dress_space(space: Any) -> None:
 
 
 def mark_regimes(panels: Sequence[Axes], steps: pd.DataFrame) -> None:
-    """Shade the stretch under a changed regime; draw a line at each change.
-
-    Args:
-        panels: axes over ``t``.
-        steps: one mission's steps, with ``t`` and ``regime_active``.
-    """
+    """Shade the stretch under a changed regime; draw a line at each change."""
     active, t = steps["regime_active"].to_numpy(dtype=bool), steps["t"].to_numpy()
     for axes in panels:
         look: style.Look = {"color": style.BAND, "alpha": 0.15, "linewidth": 0}

@@ -17,7 +17,7 @@ import pyarrow.parquet as parquet
 import yaml
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.storage.csv_text import plain_text
+from afm_rl.storage.files import plain_text
 
 WORDS = ["method", "track", "regime"]  # text, whatever they look like
 LONGEST = 500  # letters of a word

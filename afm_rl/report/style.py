@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 from matplotlib.axes import Axes
@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
-from afm_rl.report.cells import first_missions
+from afm_rl.report.runs import with_cells
 
 Look = dict[str, Any]
 DPI = 150
@@ -37,7 +37,6 @@ LINES: tuple[Any, ...] = (
     "-",
     (0, (3, 1)),
 )
-MARKERS = "osD^vP"
 
 BEFORE: Look = {"color": NOMINAL, "linewidth": 1.1}  # a path, and its stretch under the regime
 CHANGED: Look = {"color": REGIME, "linewidth": 1.6}
@@ -93,7 +92,7 @@ def method_styles(methods: Iterable[str]) -> dict[str, Style]:
     (['physics', 'oracle'], '#0072b2')
     """
     return {
-        method: Style(COLOURS[k % FEW], LINES[k % FEW], MARKERS[k % FEW], k % FEW)
+        method: Style(COLOURS[k % FEW], LINES[k % FEW], "osD^vP"[k % FEW], k % FEW)
         for k, method in enumerate(dict.fromkeys(methods))
     }
 
@@ -113,15 +112,12 @@ def groups_of_methods(methods: Iterable[str]) -> list[list[str]]:
 def excerpt(missions: pd.DataFrame, cells: int) -> tuple[pd.DataFrame, dict[str, Style], str]:
     """Return what a figure shows of some missions.
 
-    Args:
-        missions: one row per mission.
-        cells: how many are shown.
-
     Returns:
         The first mission of each method and cell, of the first six methods; how these methods are
         drawn; and a sentence on what is left out.
     """
-    first, names = first_missions(missions), list(dict.fromkeys(missions["method"]))[:FEW]
+    first = with_cells(missions).drop_duplicates(["method", "cell"])
+    names = list(dict.fromkeys(missions["method"]))[:FEW]
     chosen = first["cell"].isin(first["cell"].unique()[:cells]) & first["method"].isin(names)
     missing = len(missions) - chosen.sum()
     note = f"{missing} of {len(missions)} missions not shown" if missing else ""
@@ -135,22 +131,8 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def grid(axes: Axes, axis: Literal["both", "x", "y"] = "both") -> None:
-    """Draw faint lines behind everything."""
-    axes.grid(axis=axis, color="#eeeeee", linewidth=0.6)
-    axes.set_axisbelow(True)
-
-
 def dress(axes: Any, x: str = "", y: str = "", lines: Any = None, size: float = SMALL) -> None:
-    """Give axes the common look: small ticks, a light frame, labels, faint lines behind all.
-
-    Args:
-        axes: to be dressed.
-        x: label.
-        y: label.
-        lines: ``"x"``, ``"y"``, ``"both"``, or None for no lines.
-        size: of the labels (pt).
-    """
+    """Give axes the common look: small ticks, a light frame, labels, faint lines behind all."""
     axes.tick_params(which="both", labelsize=SMALL, length=2.5, color=FAINT)
     axes.tick_params(which="minor", length=1.5)
     axes.spines[["top", "right"]].set_visible(False)
@@ -159,7 +141,8 @@ def dress(axes: Any, x: str = "", y: str = "", lines: Any = None, size: float = 
         if label:
             write(literal(label), fontsize=size)
     if lines:
-        grid(axes, lines)
+        axes.grid(axis=lines, color="#eeeeee", linewidth=0.6)
+        axes.set_axisbelow(True)
 
 
 def legend_above(

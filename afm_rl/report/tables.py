@@ -1,16 +1,30 @@
-"""The tables of a report: all missions, against a baseline, cell by cell, what is missing."""
+"""The tables of a report: what they hold, and their views as CSV, as LaTeX and in a terminal."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from textwrap import shorten
+from typing import IO
 
 import pandas as pd
+from rich import box
+from rich.console import Console, JustifyMethod
+from rich.table import Table as Grid
+from rich.text import Text
 
-from afm_rl.report.cells import outcome
-from afm_rl.report.means import summarise
-from afm_rl.report.table import Table, interval_text, number
-from afm_rl.storage.measures import Measures
+from afm_rl.report.runs import outcome
+from afm_rl.report.statistics import summarise
+from afm_rl.storage.files import csv_text
+from afm_rl.storage.measures import Measures, number
 
+# What LaTeX writes another way; the escapes of pandas leave these alone.
+LATEX = {"±": r"$\pm$", "∞": r"$\infty$"}
+ESCAPES = str.maketrans(
+    {sign: f"\\{sign}" for sign in "%_#&${}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+)
+WIDE = 1000  # columns: numbers that are cut off are worse than lines that wrap
 BOOTSTRAP = (
     "Brackets are 95 % intervals of the stratified bootstrap (Agarwal et al. 2021): seeds are "
     "drawn anew within each cell; there is none where no cell has two missions or where all are "
@@ -36,15 +50,150 @@ PAIRS_NOTE = (
     + "Bold "
     "where 0, or a probability of 1/2, lies outside the interval."
 )
-CELL_NOTE = "Means: {names}. Bold: the best of a cell."
 MISSING_NOTE = (
     "Every method is expected to have every cell and seed that any method has, and all that was to "
     "be run."
 )
 
 
+@dataclass(frozen=True)
+class Table:
+    """One table: its numbers, and how they are shown.
+
+    Attributes:
+        name: file name, without an ending.
+        title: what it is about.
+        note: how to read it.
+        numbers: for programs; becomes the CSV file.
+        shown: the same for people: text, one column per head; becomes LaTeX and HTML.
+        bold: places ``(row, column)`` of ``shown`` that stand out.
+        align: LaTeX's letters for the columns; empty for text and then numbers.
+    """
+
+    name: str
+    title: str
+    note: str
+    numbers: pd.DataFrame
+    shown: pd.DataFrame
+    bold: frozenset[tuple[int, int]] = field(default_factory=frozenset)
+    align: str = ""
+
+    def to_csv(self) -> str:
+        """Return the numbers as CSV."""
+        return csv_text(self.numbers)
+
+    def to_latex(self) -> str:
+        """Return the table as LaTeX, to be set with the package ``booktabs``."""
+        looks = self.shown.copy()
+        for column in looks:
+            looks[column] = ""
+        for row, column in self.bold:
+            looks.iat[row, column] = "textbf:--rwrap;"
+        style = self.shown.style.apply(lambda _: looks, axis=None).hide(axis="index")
+        style = style.format(escape="latex").format_index(escape="latex", axis=1)
+        text = style.to_latex(
+            hrules=True,
+            column_format=self.align or "l" + "r" * (self.shown.shape[1] - 1),
+            caption=f"{self.title}. {self.note}".translate(ESCAPES),
+            label=f"tab:{self.name}",
+            position_float="centering",
+        )
+        for sign, command in LATEX.items():
+            text = text.replace(sign, command)
+        return text
+
+    def to_grid(self, columns: Sequence[int] | None = None, caption: str | None = None) -> Grid:
+        """Return some columns of the table, or all, for the terminal."""
+        chosen = list(range(self.shown.shape[1]) if columns is None else columns)
+
+        def look(row: int, column: int) -> str:
+            return "bold" if (row, chosen[column]) in self.bold else ""
+
+        return grid_of(self.shown.iloc[:, chosen], look, "right", caption)
+
+
+def grid_of(
+    shown: pd.DataFrame,
+    look: Callable[[int, int], str] = lambda row, column: "",
+    justify: JustifyMethod = "left",
+    caption: str | None = None,
+) -> Grid:
+    """Return texts as a table for the terminal, by the look of each place ``(row, column)``."""
+    grid = Grid(box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False, caption=caption)
+    for column, head in enumerate(shown):
+        grid.add_column(Text(str(head)), justify=justify if column else "left")
+    for row, texts in enumerate(shown.to_numpy()):
+        grid.add_row(*(Text(text, look(row, column)) for column, text in enumerate(texts)))
+    return grid
+
+
+def terminal(file: IO[str] | None) -> Console:
+    """Return what prints tables to a file, or to standard output: plain text off a terminal."""
+    return Console(file=file, width=WIDE, highlight=False)
+
+
+def interval_text(
+    row: Mapping[str, float], name: str, digits: int, scale: float = 1.0, sign: str = ""
+) -> str:
+    """Return an entry of a row as text, with its interval.
+
+    Args:
+        row: has the entries ``name``, ``name_low`` and ``name_high``.
+        name: of the entry.
+        digits: after the point.
+        scale: what the numbers are multiplied by.
+        sign: ``"+"`` writes the sign of positive numbers, too.
+
+    >>> row = {"a": 0.5, "a_low": -0.4, "a_high": 0.6}
+    >>> interval_text(row, "a", 1, 100), interval_text(row, "a", 1, sign="+")
+    ('50.0 [-40.0, 60.0]', '+0.5 [-0.4, +0.6]')
+    """
+    values = (row[key] for key in (name, f"{name}_low", f"{name}_high"))
+    middle, low, high = (
+        (sign if value >= 0 else "") + number(scale * value, digits) for value in values
+    )
+    return middle if low == "-" else f"{middle} [{low}, {high}]"
+
+
+def print_summary(
+    missions: pd.DataFrame, measures: Measures, file: IO[str] | None = None, abreast: int = 6
+) -> None:
+    """Print the table of methods, then one of cells x methods if there are several cells.
+
+    In a terminal the best values are bold; a pipe or a file gets plain text. The tables are those
+    of the report, intervals included.
+
+    Args:
+        missions: one row per mission.
+        measures: what methods are compared by.
+        file: where to; standard output if none is given.
+        abreast: methods side by side in a table of cells; more get a table below.
+
+    >>> from afm_rl.storage.measures import Measure
+    >>> steps = Measures((Measure("steps", "steps", "steps", better="lower"),))
+    >>> row = {"method": "physics", "track": "oval", "seed": 0, "steps": 300, "finished": True}
+    >>> print_summary(pd.DataFrame([row]), steps)  # doctest: +NORMALIZE_WHITESPACE
+    <BLANKLINE>
+     method   missions  finished (%)  steps
+     ──────────────────────────────────────
+     physics         1           100    300
+    <BLANKLINE>
+    """
+    console = terminal(file)
+    table = summary_table(summarise(missions, measures), measures)
+    some = table.shown.apply(lambda texts: texts.str.contains("[", regex=False)).any(axis=None)
+    caption = "mean [95 % interval, seeds drawn anew within cells]" if some else None
+    console.print(table.to_grid(caption=caption))
+    cells = cell_table(missions, measures)
+    if len(cells.shown) > 1:
+        caption = f"{' / '.join(measure.head for measure in measures.headlines)}, means"
+        columns = range(1, cells.shown.shape[1])
+        for first in range(0, len(columns), abreast):
+            console.print(cells.to_grid([0, *columns[first : first + abreast]], caption))
+
+
 def summary_table(means: pd.DataFrame, measures: Measures, oracle: str = "") -> Table:
-    """Return :func:`~.means.aggregate`, or as much of it as there is, as a table.
+    """Return :func:`~.statistics.aggregate`, or as much of it as there is, as a table.
 
     The best of all complete methods is bold, but for the oracle: it knows what no other method
     knows and does not compete, and neither does a method that was spared some cells.
@@ -84,7 +233,7 @@ def summary_table(means: pd.DataFrame, measures: Measures, oracle: str = "") -> 
 
 
 def comparison_tables(numbers: pd.DataFrame, measures: Measures) -> list[Table]:
-    """Return :func:`~.means.compare` as one table per baseline."""
+    """Return :func:`~.statistics.compare` as one table per baseline."""
     tables = []
     nulls = {measure.column: 0.0 for measure in measures} | {"better": 0.5}
     order = ", then among equals ".join(f"{m.better} {m.name} first" for m in measures.headlines)
@@ -124,17 +273,13 @@ def cell_table(missions: pd.DataFrame, measures: Measures) -> Table:
         if len(set(rank.values())) > 1:
             best = max(rank.values())
             bold |= {(place, heads.index(name)) for name in rank if rank[name] == best}
-    note = CELL_NOTE.format(names=" / ".join(measure.head for measure in short))
+    heads_of = " / ".join(measure.head for measure in short)
+    note = f"Means: {heads_of}. Bold: the best of a cell."
     return Table("cells", "Cell by cell", note, numbers, pd.DataFrame(rows), frozenset(bold))
 
 
 def missing_table(missing: pd.DataFrame, cells: int) -> Table:
-    """Return the table of what is missing, one row per method and set of seeds.
-
-    Args:
-        missing: one row per ``method``, ``cell`` and ``seed``.
-        cells: how many there are in all.
-    """
+    """Return the table of what is missing, one row per method and set of seeds."""
     rows = []
     seeds = missing.groupby(["method", "cell"], sort=False)["seed"].agg(tuple).reset_index()
     for (method, numbers), group in seeds.groupby(["method", "seed"], sort=False):

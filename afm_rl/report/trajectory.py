@@ -1,21 +1,24 @@
-"""Where the robot went: one small map per method and cell."""
+"""Where robots went on the ground: one small map per method and cell."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
+from afm_rl.errors import ConfigurationError
 from afm_rl.report import style
-from afm_rl.report.cells import outcome, steps_of
-from afm_rl.report.track_plot import Box, DrawableTrack, distance_to, draw_road, view
+from afm_rl.report.runs import outcome, steps_of
+from afm_rl.report.style import ROAD
 from afm_rl.storage.measures import Measures
 
 CAPTION = (
@@ -23,6 +26,105 @@ CAPTION = (
     "its measures. The stretch under the changed regime is broad. A robot that leaves the road is "
     "followed a little way only."
 )
+
+
+class Box(NamedTuple):
+    """The area that a map shows (m)."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Width and height."""
+        return self.right - self.left, self.top - self.bottom
+
+    @property
+    def ratio(self) -> float:
+        """Height over width."""
+        return self.span[1] / self.span[0]
+
+
+class DrawableTrack(Protocol):
+    """What a figure must know of a track; lengths in metres."""
+
+    @property
+    def name(self) -> str:
+        """Name in the tables."""
+
+    @property
+    def waypoints(self) -> Any:
+        """Points to reach, ``(W, 2)``."""
+
+    @property
+    def centerline(self) -> Any:
+        """Dense closed line, ``(M, 2)``."""
+
+    @property
+    def width(self) -> float:
+        """Width of the road."""
+
+
+def load_tracks(
+    names: Iterable[str], load_track: Callable[[str], DrawableTrack]
+) -> list[DrawableTrack]:
+    """Return the tracks that can be loaded by name; a map without its road is a map."""
+    tracks = []
+    for name in names:
+        with suppress(ConfigurationError):
+            tracks.append(load_track(str(name)))
+    return tracks
+
+
+def draw_road(axes: Axes, track: DrawableTrack) -> None:
+    """Draw the road as a ribbon, with its waypoints.
+
+    The ribbon is a row of discs: it is as wide as the track says whatever the size of the axes, and
+    sharp corners come out right.
+    """
+    middle = np.asarray(track.centerline, dtype=float)
+    size = np.full(len(middle), float(track.width))
+    discs = EllipseCollection(
+        size, size, np.zeros(len(middle)), units="xy", offsets=middle, facecolors=ROAD, linewidths=0
+    )
+    discs.set(offset_transform=axes.transData, gid="road", zorder=0.5)
+    axes.add_collection(discs)
+    x, y = np.asarray(track.waypoints, dtype=float).T
+    axes.plot(x, y, ".", color="#9a9a9a", markersize=3.5, zorder=1, gid="waypoints")
+
+
+def view(
+    track: DrawableTrack | None,
+    paths: Sequence[np.ndarray],
+    margin: float = 0.04,
+    stray: float = 0.15,
+) -> Box:
+    """Return the area to show of a track and paths ``(N, 2)``.
+
+    Paths that leave the road are followed a little way only: a robot that has gone astray
+    must not shrink the road to a dot.
+    """
+    points = np.concatenate([path[np.isfinite(path).all(-1)] for path in paths])
+    if track is None:
+        edge, stray = points, 0.0
+    else:
+        line, half = np.asarray(track.centerline, dtype=float), track.width / 2
+        edge = np.concatenate([line - half, line + half])
+    low, high = (edge.min(0), edge.max(0)) if len(edge) else (np.zeros(2), np.ones(2))
+    span = np.maximum(high - low, 1e-3)
+    if len(points):
+        low = np.minimum(low, np.maximum(points.min(0), low - stray * span))
+        high = np.maximum(high, np.minimum(points.max(0), high + stray * span))
+    around = margin * span.max()
+    (left, bottom), (right, top) = (low - around).tolist(), (high + around).tolist()
+    return Box(left, right, bottom, top)
+
+
+def distance_to(track: DrawableTrack, point: np.ndarray) -> float:
+    """Return how far a point ``(2,)`` is from the road's centre line (m)."""
+    return float(np.hypot(*(np.asarray(track.centerline, dtype=float) - point).T).min())
 
 
 def draw_trajectories(
@@ -93,14 +195,7 @@ def changed_stretch(active: np.ndarray) -> np.ndarray:
 def draw_path(
     axes: Axes, steps: pd.DataFrame, finished: bool, track: DrawableTrack | None = None
 ) -> None:
-    """Draw one mission: its line, the changed stretch, the start and how it ended.
-
-    Args:
-        axes: where to; their limits must be set.
-        steps: the mission's steps, in order.
-        finished: did it finish?
-        track: to say how far from the road a mission that left the picture ended.
-    """
+    """Draw one mission: its line, the changed stretch, the start and how it ended."""
     path = positions(steps)
     changed = changed_stretch(steps["regime_active"].to_numpy())
     x, y = np.where(changed[:, None], path, np.nan).T
@@ -120,10 +215,7 @@ def draw_path(
 
 
 def _last_inside(axes: Axes, path: np.ndarray, inset: float = 0.02) -> np.ndarray:
-    """Return the last point of a path ``(T, 2)`` that is well inside the view.
-
-    ``inset`` is half of what a view shows around all: no end that it was made for is farther out.
-    """
+    """Return the last point of a path ``(T, 2)`` that is well inside the view."""
     low, high = np.array([axes.get_xlim(), axes.get_ylim()]).T
     edge = inset * (high - low).max()
     inside = ((path > low + edge) & (path < high - edge)).all(-1)
@@ -151,10 +243,7 @@ def _write_distance(axes: Axes, end: np.ndarray, distance: float) -> None:
 def _maps(
     methods: Sequence[str], views: Mapping[str, Box]
 ) -> tuple[Figure, dict[tuple[str, str], Axes]]:
-    """Return a figure with axes by cell and method; those of a row show the same area.
-
-    All maps side by side are 9.9 inches wide; one is 1.9 wide at least and 3.4 tall at most.
-    """
+    """Return a figure with axes by cell and method; those of a row show the same area."""
     most = 3.4
     width = max(1.9, min(9.9 / len(methods), 1.5 * most))
     tall = [min(width * box.ratio, most) for box in views.values()]

@@ -1,10 +1,11 @@
-"""State spaces on which differences are taken: R^n with angles."""
+"""State spaces on which differences are taken: R^n with angles, rigid bodies; draws of points."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
+import roma
 import torch
 from torch import Tensor, nn
 
@@ -83,3 +84,76 @@ class Manifold(nn.Module):
         """Return the state ``(*B, S)`` reached from ``origin`` along ``tangent``."""
         raw = origin + tangent
         return torch.where(self.is_angle, wrap_angle(raw), raw)
+
+
+class RigidBodySpace(Manifold):
+    r"""Rigid-body states: position, velocity, quaternion, body rate; S = 13 and D = 12.
+
+    States are :math:`(r, v, q, \omega)` in m, m/s, 1 and rad/s (body frame); tangent vectors
+    :math:`(\Delta r, \Delta v, \phi, \Delta \omega)` hold a rotation vector in rad, in the body
+    frame of the origin: :math:`q = q_0 \otimes \exp \phi`.
+
+    >>> space = RigidBodySpace()
+    >>> level = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)
+    >>> turned = space.add(level, torch.full((12,), 0.1))
+    >>> space.difference(turned, level).shape, bool(space.difference(level, level).any())
+    (torch.Size([12]), False)
+    """
+
+    def __init__(self) -> None:
+        super().__init__(13)
+        self.tangent_size = 12
+
+    def project(self, raw: Tensor) -> Tensor:
+        turned = roma.quat_normalize(raw[..., 6:10])
+        return torch.cat([raw[..., :6], turned, raw[..., 10:]], -1)
+
+    def encode(self, state: Tensor, coordinates: Sequence[int] | None = None) -> Tensor:
+        """Return what a network reads: the rotation matrix's nine entries for the quaternion.
+
+        The other coordinates come first. A quaternion and its negative give the same numbers.
+        """
+        chosen = range(self.size) if coordinates is None else coordinates
+        plain = [i for i in chosen if i not in range(6, 10)]
+        if len(plain) == len(chosen):
+            return state[..., plain]
+        matrix = roma.unitquat_to_rotmat(state[..., 6:10]).mT
+        return torch.cat([state[..., plain], matrix.flatten(-2)], -1)
+
+    def difference(self, state: Tensor, origin: Tensor) -> Tensor:
+        raw = state - origin
+        turn = roma.quat_product(roma.quat_conjugation(origin[..., 6:10]), state[..., 6:10])
+        return torch.cat([raw[..., :6], roma.unitquat_to_rotvec(turn), raw[..., 10:]], -1)
+
+    def add(self, origin: Tensor, tangent: Tensor) -> Tensor:
+        turned = roma.quat_product(origin[..., 6:10], roma.rotvec_to_unitquat(tangent[..., 6:9]))
+        moved = origin[..., :6] + tangent[..., :6]
+        return torch.cat([moved, turned, origin[..., 10:] + tangent[..., 9:]], -1)
+
+
+def uniform(low: Tensor, high: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Draw ``count`` points uniformly in a box: ``(count, D)``.
+
+    >>> uniform(torch.zeros(2), torch.ones(2), 5, torch.Generator()).shape
+    torch.Size([5, 2])
+    """
+    share = torch.rand(count, len(low), generator=generator)  # the same on every device
+    return low + (high - low) * share.to(low.device)
+
+
+def draw_states(
+    states: tuple[Tensor, Tensor] | Tensor, count: int, generator: torch.Generator
+) -> Tensor:
+    """Draw ``count`` states from a box or, with replacement, from a pool: ``(count, S)``.
+
+    Args:
+        states: lowest and highest state, ``(S,)`` each; or observed states, ``(P, S)``.
+        count: how many.
+        generator: of the numbers.
+
+    >>> draw_states(torch.tensor([[7.0, 8.0]]), 2, torch.Generator()).tolist()
+    [[7.0, 8.0], [7.0, 8.0]]
+    """
+    if isinstance(states, Tensor):
+        return states[torch.randint(len(states), (count,), generator=generator).to(states.device)]
+    return uniform(*states, count, generator)

@@ -1,18 +1,24 @@
-"""Files that are written whole or not at all, and folders that one process writes at a time."""
+"""Files that are written whole or not at all, tables as CSV, and locks of folders."""
 
 from __future__ import annotations
 
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from filelock import FileLock, Timeout
 
 from afm_rl.errors import ConfigurationError
 
-LOCK = ".lock"
+if TYPE_CHECKING:
+    import pandas as pd
+
+_FORMULA = re.compile(r"[=+\-@\t\r]")  # how a formula begins
+_QUOTED = re.compile(r"'(?=[=+\-@\t\r])")
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -61,7 +67,7 @@ def sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def locked(folder: Path, name: str = LOCK, wait: bool = False) -> Iterator[None]:
+def locked(folder: Path, name: str = ".lock", wait: bool = False) -> Iterator[None]:
     """Hold the lock of a folder, which is made if it is not there.
 
     The lock ends with the process that holds it, however that ends.
@@ -88,3 +94,36 @@ def locked(folder: Path, name: str = LOCK, wait: bool = False) -> Iterator[None]
         yield
     finally:
         lock.release()
+
+
+def csv_text(table: pd.DataFrame) -> str:
+    """Return a table as CSV; a text that looks like a formula gets an apostrophe in front.
+
+    >>> import pandas as pd
+    >>> print(csv_text(pd.DataFrame({"method": ["=cmd|' /C calc'!A0", "-1.5"]})), end="")
+    method
+    '=cmd|' /C calc'!A0
+    -1.5
+    """
+    texts = table.select_dtypes(["object", "string", "category"])
+    safe = {name: texts[name].map(_quote) for name in texts}
+    return table.assign(**safe).to_csv(index=False, lineterminator="\n")
+
+
+def plain_text(text: object) -> object:
+    """Return a cell as it was before :func:`csv_text` put an apostrophe in front.
+
+    >>> plain_text("'=1+1"), plain_text("'tis")
+    ('=1+1', "'tis")
+    """
+    return text[1:] if isinstance(text, str) and _QUOTED.match(text) else text
+
+
+def _quote(cell: object) -> object:
+    if not isinstance(cell, str) or not _FORMULA.match(cell):
+        return cell
+    try:
+        float(cell)
+        return cell
+    except ValueError:
+        return f"'{cell}"

@@ -1,8 +1,4 @@
-"""Checksums of the files of a folder, in a file that is written last.
-
-A folder of results is whole if it has a manifest: ``manifest.json`` holds the SHA-256 of every file
-that a run wrote, and of itself. It is removed before any of these files is replaced.
-"""
+"""What a folder of results must be: whole, by checksums, and of the settings that are asked for."""
 
 from __future__ import annotations
 
@@ -16,8 +12,15 @@ from afm_rl._version import __version__
 from afm_rl.errors import ArtefactError
 from afm_rl.storage.files import write_whole
 
-MANIFEST = "manifest.json"
+MANIFEST, CONFIG, UNFINISHED = "manifest.json", "config.yaml", "unfinished"
+MISSIONS, STEPS, COMPUTE = "missions.csv", "steps.parquet", "compute.csv"
+JOBS, RECORD = "jobs", "jobs.yaml"
 _REMEDY = "restore it, or delete the folder and run the same command again"
+WITHOUT_INFLUENCE = (
+    *("progress", "figures", "video", "tensorboard", "overwrite", "cache", "threads", "device"),
+    *("compile", "compare", "study", "label", "trust", "checkpoints"),
+)
+"""Settings that change how a run is done, shown or called, but not its results."""
 
 
 def write_manifest(folder: str | Path, names: Iterable[str | Path] | None = None) -> None:
@@ -71,10 +74,6 @@ def check_manifest(folder: str | Path) -> dict[str, str]:
 
 def read_verified(folder: str | Path, name: str) -> bytes:
     r"""Return the content of one file, if the manifest of its folder has its SHA-256.
-
-    Args:
-        folder: the one with the manifest.
-        name: of the file, relative to ``folder``.
 
     Raises:
         ArtefactError: if there is no manifest, the manifest or the file is damaged, or the
@@ -151,3 +150,38 @@ def _text(content: Mapping[str, Any]) -> str:
     """Return a manifest's text, with the checksum of what it says."""
     own = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
     return json.dumps({**content, "sha256": own}, indent=1, sort_keys=True) + "\n"
+
+
+def influential(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that results depend on, as they come back from JSON or YAML.
+
+    >>> influential({"budget": 5, "progress": True})
+    {'budget': 5}
+    """
+    kept = {name: value for name, value in settings.items() if name not in WITHOUT_INFLUENCE}
+    return json.loads(json.dumps(_without(kept, ("cache", "compile"))))
+
+
+def _without(value: Any, names: tuple[str, ...]) -> Any:
+    """Leave out entries of nested mappings."""
+    if not isinstance(value, Mapping):
+        return value
+    return {key: _without(part, names) for key, part in value.items() if key not in names}
+
+
+def differences(old: Any, new: Any, key: str = "") -> list[str]:
+    """Name what differs between two nested mappings, one line for each value.
+
+    >>> differences({"a": {"b": 1, "c": 2}}, {"a": {"b": 3}, "d": None})
+    ['a.b: 1 -> 3', 'a.c: 2 -> nothing', 'd: nothing -> None']
+    """
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        found = []
+        for name in dict.fromkeys([*old, *new]):
+            inner = f"{key}.{name}" if key else str(name)
+            if name in old and name in new:
+                found += differences(old[name], new[name], inner)
+            else:
+                found.append(f"{inner}: {old.get(name, 'nothing')} -> {new.get(name, 'nothing')}")
+        return found
+    return [f"{key}: {old} -> {new}"] if old != new else []

@@ -11,7 +11,19 @@ from typing import Any
 from afm_rl.errors import ArtefactError
 
 FILE = "measures.json"
-BETTER = ("higher", "lower")
+
+
+def number(value: float, digits: int = 0) -> str:
+    """Return a number as text; a dash if there is none.
+
+    >>> number(0.1234, 2), number(math.nan), number(math.inf)
+    ('0.12', '-', '∞')
+    """
+    if math.isnan(value):
+        return "-"
+    if math.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    return f"{value:.{digits}f}"
 
 
 @dataclass(frozen=True)
@@ -61,7 +73,7 @@ class Measure:
             and isinstance(self.headline, bool)
             and isinstance(self.budget, bool)
         )
-        if not fits or self.better not in BETTER:
+        if not fits or self.better not in ("higher", "lower"):
             raise ArtefactError(
                 f"measure {self.column!r}: expected short texts, finite numbers, better=higher or "
                 "lower, 0 to 12 digits"
@@ -90,14 +102,10 @@ class Measure:
         """Return a value of the column as text, in the unit; a dash if there is none.
 
         >>> share = Measure("success_rate", "success", "targets reached", "%", scale=100, digits=1)
-        >>> share.text(0.5), share.text(float("nan")), share.text(float("inf"))
-        ('50.0', '-', '∞')
+        >>> share.text(0.5)
+        '50.0'
         """
-        if math.isnan(value):
-            return "-"
-        if math.isinf(value):
-            return "∞" if value > 0 else "-∞"
-        return f"{self.scale * value:.{self.digits if digits is None else digits}f}"
+        return number(self.scale * value, self.digits if digits is None else digits)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from tensordict import NestedKey, TensorDict, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from afm_rl.compiling.machine_code import has_compiler, settings_for
-from afm_rl.compiling.programs import checksum_of, package, trace
+from afm_rl.compiling.machine_code import checksum_of, has_compiler, package, settings_for, trace
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.planning.receding import SamplingPlanner
 from afm_rl.storage.files import write_whole

@@ -15,7 +15,7 @@ from afm_rl.envs.courses.flights import Reference, references_at
 from afm_rl.envs.missions.env import PhasedSimulation
 from afm_rl.regimes import Regime, Schedule, wind_of
 from afm_rl.spaces.airframe import QuadrotorBody, saturate
-from afm_rl.spaces.rigid_body import RigidBodySpace
+from afm_rl.spaces.manifold import RigidBodySpace
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import torch
 from matplotlib.axes import Axes
 
 from afm_rl.play import Side, make_robot
-from afm_rl.play.actuators import Faults
+from afm_rl.play.world import Faults
 from afm_rl.report import style
 from afm_rl.storage.files import write_whole
 

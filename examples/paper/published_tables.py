@@ -12,8 +12,8 @@ from pathlib import Path
 import pandas as pd
 
 from afm_rl.report import read_runs
-from afm_rl.report.cells import cell_names
-from afm_rl.report.table import Table
+from afm_rl.report.runs import cell_names
+from afm_rl.report.tables import Table
 from afm_rl.storage.files import write_whole
 
 LAST = 4999  # step of a published mission that ran out

@@ -2,8 +2,6 @@
 
 import pytest
 
-from afm_rl.jobs import ray_cluster
-
 ray = pytest.importorskip("ray")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -37,7 +35,7 @@ def test_jobs_run_on_both_nodes_and_one_that_dies_takes_no_other_with_it(
         (job.folder / "unfinished" / "config.yaml").unlink()
         write_manifest(job.folder, [])
 
-    monkeypatch.setattr(ray_cluster, "run", meet)
+    monkeypatch.setattr("afm_rl.jobs.executor.run", meet)
     where = ["launcher=ray", f"hydra.launcher.address={address}", f"hydra.sweep.dir={tmp_path}"]
     done = afm_rl("-m", "method=physics", "seeds=1,2,3", *where)
     assert done.status == 1

@@ -11,7 +11,7 @@ import yaml
 from afm_rl.cli import launch
 from afm_rl.cli.overrides import with_sweep_folder
 from afm_rl.errors import ConfigurationError
-from afm_rl.jobs import submitit_cluster
+from afm_rl.jobs import executor
 from afm_rl.jobs.executor import LocalExecutor
 from afm_rl.jobs.process import needs
 from afm_rl.storage.manifest import write_manifest
@@ -241,9 +241,9 @@ def leave(job):
 def test_a_job_whose_process_the_cluster_ends_takes_no_other_with_it(
     sweep, slurm_cluster, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(submitit_cluster.SubmititExecutor, "tick", 0.1)
+    monkeypatch.setattr(executor.SubmititExecutor, "tick", 0.1)
     leave.__module__ = "__main__"  # so that it is sent whole: nodes have no tests
-    monkeypatch.setattr(submitit_cluster, "run", leave)
+    monkeypatch.setattr(executor, "run", leave)
     done = sweep("-m", "method=physics", "seeds=1,2", "launcher=submitit_slurm")
     assert done.status == 1
     assert "physics+seeds=1: done" in done.out

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from afm_rl.compiling import machine_code
-from afm_rl.compiling.programs import checksum_of, claim, keep, recall
+from afm_rl.compiling.machine_code import checksum_of, claim, keep, recall
 
 CODE = os.urandom(1000)
 

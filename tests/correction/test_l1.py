@@ -7,7 +7,7 @@ import torch
 
 from afm_rl.correction import L1Augmentation
 from afm_rl.correction.achievable import MODES
-from afm_rl.correction.l1 import low_pass
+from afm_rl.correction.classical import low_pass
 from afm_rl.dynamics import Quadrotor
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.airframe import QuadrotorBody

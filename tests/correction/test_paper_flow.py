@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from afm_rl.correction import PaperFlow
-from afm_rl.correction.solver import midpoint
+from afm_rl.correction.network import midpoint
 from afm_rl.correction.training import train_flow
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError

@@ -16,12 +16,11 @@ import pytest
 import yaml
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.jobs import process, progress
+from afm_rl.jobs import executor, process
 from afm_rl.jobs.batch import file_name, run_batch
-from afm_rl.jobs.executor import LocalExecutor
+from afm_rl.jobs.executor import Board, LocalExecutor
 from afm_rl.jobs.layout import job_folders
 from afm_rl.jobs.process import Job
-from afm_rl.jobs.progress import Board
 from afm_rl.report import read_runs
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import check_manifest
@@ -191,7 +190,7 @@ def test_an_interrupted_batch_ends_its_jobs_and_keeps_their_state(jobs, tmp_path
 
 def test_progress_is_a_line_off_a_terminal_and_live_in_one(monkeypatch, tmp_path, capsys):
     clock = SimpleNamespace(now=1000.0)
-    monkeypatch.setattr(progress.time, "monotonic", lambda: clock.now)
+    monkeypatch.setattr(executor.time, "monotonic", lambda: clock.now)
     monkeypatch.setattr("tqdm.std.time", lambda: clock.now)
     jobs = [Job(name, tmp_path / name, tmp_path) for name in ("a", "b")]
 

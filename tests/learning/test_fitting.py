@@ -18,8 +18,7 @@ from afm_rl.learning import (
     fit_ensemble,
 )
 from afm_rl.planning import ICEM, MPPI, KnownReward, PlanningEnv
-from afm_rl.spaces.manifold import Manifold
-from afm_rl.spaces.rigid_body import RigidBodySpace
+from afm_rl.spaces.manifold import Manifold, RigidBodySpace
 
 SHORT = {"epochs": 2, "batch_size": 64}
 

@@ -15,7 +15,7 @@ from afm_rl.learning import GaussianNLLLoss, KNODEUpdater
 from afm_rl.learning.knode_fit import first_order, fit_network, through_integration
 from afm_rl.missions.state import Loop, StepLog, restore, snapshot
 from afm_rl.spaces.airframe import QuadrotorBody
-from afm_rl.storage.checkpoints import Checkpoints
+from afm_rl.storage.artefacts import Checkpoints
 
 BODY = QuadrotorBody()
 FACTORS = torch.tensor([1.5, 0.75, 2.0])  # gains of the thrust

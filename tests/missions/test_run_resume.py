@@ -13,8 +13,7 @@ from afm_rl.mission_state import MissionState
 from afm_rl.missions import run
 from afm_rl.missions.run import Stopped
 from afm_rl.missions.state import fingerprint
-from afm_rl.storage.artefacts import read_tensors
-from afm_rl.storage.checkpoints import Checkpoints
+from afm_rl.storage.artefacts import Checkpoints, read_tensors
 
 METHODS = [
     *("online_pe", "oracle", "afm_physics", "afm_paper", "stream_x_pe", "adaptive_gain", "rls"),

@@ -8,7 +8,7 @@ import warnings
 import pytest
 
 from afm_rl.play import World, make_robot
-from afm_rl.play.words import text_of
+from afm_rl.play.page import text_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]

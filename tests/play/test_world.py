@@ -6,7 +6,7 @@ import pytest
 
 from afm_rl.cli.play import main
 from afm_rl.play import Actuators, World, make_robot
-from afm_rl.play.actuators import Faults, presets
+from afm_rl.play.world import Faults, presets
 
 pytest.importorskip("mujoco")
 

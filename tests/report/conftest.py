@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from afm_rl.storage.csv_text import csv_text
+from afm_rl.storage.files import csv_text
 from afm_rl.storage.manifest import write_manifest
 from afm_rl.storage.measures import Measure, Measures
 

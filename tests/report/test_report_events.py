@@ -6,7 +6,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from afm_rl.report import write_events
-from afm_rl.report.events import FILE, folder_names
+from afm_rl.report.write import FILE, folder_names
 
 
 def read(folder):

@@ -13,7 +13,7 @@ from matplotlib.text import Text
 
 from afm_rl.report import draw_comparison, draw_learning, draw_trajectories
 from afm_rl.report.style import DPI, REGIME, groups_of_methods, method_styles, png_bytes
-from afm_rl.report.track_plot import distance_to
+from afm_rl.report.trajectory import distance_to
 from afm_rl.storage.measures import Measure, Measures
 
 

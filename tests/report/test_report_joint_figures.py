@@ -5,14 +5,14 @@ import pandas as pd
 import pytest
 
 from afm_rl.report import read_runs
+from afm_rl.report.comparison import draw_profile, draw_progress, ratios
 from afm_rl.report.figures import (
     read_excerpts,
     share_reached,
     telling_cells,
     traced_missions,
 )
-from afm_rl.report.means import count_budgets
-from afm_rl.report.shares import draw_profile, draw_progress, ratios
+from afm_rl.report.statistics import count_budgets
 from afm_rl.report.style import method_styles
 
 

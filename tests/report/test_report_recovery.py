@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from afm_rl.report.recovery import STAY, recovery_table, recovery_times
+from afm_rl.report.learning import STAY, recovery_table, recovery_times
 
 LOW, HIGH = 1e-3, 0.5
 

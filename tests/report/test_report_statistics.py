@@ -7,20 +7,18 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from afm_rl.report.means import (
+from afm_rl.report.statistics import (
     aggregate,
     budget_notes,
     compare,
     count_budgets,
-    pair,
-    rank_missions,
-    summarise,
-)
-from afm_rl.report.statistics import (
     interquartile_mean,
+    pair,
     probability_of_improvement,
+    rank_missions,
     resampled_bounds,
     stratified_interval,
+    summarise,
 )
 from afm_rl.report.tables import (
     cell_table,

@@ -10,8 +10,8 @@ import pytest
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.report import read_runs, write_report, write_run
-from afm_rl.report.events import FILE
-from afm_rl.report.table import Table
+from afm_rl.report.tables import Table
+from afm_rl.report.write import FILE
 from afm_rl.storage.manifest import write_manifest
 from afm_rl.storage.measures import Measure, Measures
 

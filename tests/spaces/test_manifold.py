@@ -1,18 +1,21 @@
-"""Differences and sums where some coordinates are angles."""
+"""State spaces: differences and sums with angles, rigid bodies against SciPy; draws of points."""
 
 import math
 
 import pytest
+import roma
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.spaces.manifold import Manifold, wrap_angle
+from afm_rl.spaces.manifold import Manifold, RigidBodySpace, draw_states, uniform, wrap_angle
 
 REALS = st.floats(-1e3, 1e3)
 ANGLES = st.floats(-math.pi, math.pi, exclude_max=True)
 SPACE = Manifold(3, angles=[2])
+TURNS = [0.0, 1e-12, 1e-8, 1e-3, 0.1, 1.0, 3.0, math.pi - 1e-6]
 
 
 def poses():
@@ -77,3 +80,98 @@ def test_the_sizes_are_known_and_nothing_is_stored():
 def test_impossible_spaces_are_refused(size, angles):
     with pytest.raises(ConfigurationError, match="manifold"):
         Manifold(size, angles)
+
+
+def states(*batch):
+    state = torch.randn(*batch, 13, dtype=torch.float64)
+    state[..., 6:10] = roma.quat_normalize(state[..., 6:10])
+    return state
+
+
+@pytest.mark.parametrize("angle", TURNS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_turns_of_any_size_keep_their_digits_and_both_modes_of_differentiation(angle, dtype):
+    space, origin, tangent = RigidBodySpace(), states().to(dtype), torch.zeros(12, dtype=dtype)
+    tangent[6:9] = torch.tensor([0.36, 0.48, 0.8], dtype=dtype) * angle
+
+    def there_and_back(tangent):
+        return space.difference(space.add(origin, tangent), origin)
+
+    eps = torch.finfo(dtype).eps
+    torch.testing.assert_close(there_and_back(tangent), tangent, rtol=30 * eps, atol=10 * eps)
+    for mode in (torch.func.jacfwd, torch.func.jacrev):
+        slope = mode(there_and_back)(tangent)
+        limit = 1e4 * eps if angle < 3.1 else 1e-3  # near half a turn a step may lead beyond it
+        torch.testing.assert_close(slope, torch.eye(12, dtype=dtype), rtol=0, atol=limit)
+
+
+@pytest.mark.parametrize("batch", [(), (7,), (2, 3)])
+def test_differences_lead_from_one_state_to_the_other(batch):
+    space, state, origin = RigidBodySpace(), states(*batch), states(*batch)
+    tangent = space.difference(state, origin)
+    assert tangent.shape == (*batch, 12)
+    there = space.add(origin, tangent)
+    sign = torch.sign((there[..., 6:10] * state[..., 6:10]).sum(-1, keepdim=True))
+    torch.testing.assert_close(
+        torch.cat([there[..., :6], there[..., 10:]], -1),
+        torch.cat([state[..., :6], state[..., 10:]], -1),
+    )
+    torch.testing.assert_close(sign * there[..., 6:10], state[..., 6:10])
+
+
+def test_the_sign_of_a_quaternion_makes_no_difference():
+    space, state, origin = RigidBodySpace(), states(), states()
+    flipped = state.clone()
+    flipped[6:10] *= -1
+    torch.testing.assert_close(space.difference(flipped, origin), space.difference(state, origin))
+    assert space.difference(origin, origin).abs().max() < 1e-15
+
+
+def test_tangents_turn_in_the_body_frame():
+    space, origin = RigidBodySpace(), states()
+    tangent = torch.zeros(12, dtype=torch.float64)
+    tangent[6:9] = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)
+    turned = Rotation.from_quat(origin[6:10].numpy()) * Rotation.from_rotvec([0.1, -0.2, 0.3])
+    ours = Rotation.from_quat(space.add(origin, tangent)[6:10].numpy())
+    assert (turned.inv() * ours).magnitude() < 1e-14
+
+
+def test_the_space_has_thirteen_coordinates_and_twelve_directions():
+    space = RigidBodySpace()
+    assert (space.size, space.tangent_size) == (13, 12)
+
+
+def test_numbers_from_a_box_become_states():
+    raw = torch.rand(50, 13, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = RigidBodySpace().project(raw)
+    torch.testing.assert_close(found[:, 6:10].norm(dim=-1), torch.ones(50).double())
+    kept = [*range(6), *range(10, 13)]
+    assert torch.equal(found[:, kept], raw[:, kept])
+    torch.testing.assert_close(RigidBodySpace().project(found), found)
+
+
+def test_points_fill_their_box_evenly():
+    low, high = torch.tensor([-1.0, 5.0]), torch.tensor([3.0, 5.5])
+    points = uniform(low, high, 20_000, torch.Generator().manual_seed(0))
+    assert points.shape == (20_000, 2)
+    assert (points >= low).all() and (points <= high).all()
+    torch.testing.assert_close(points.mean(0), (low + high) / 2, rtol=0, atol=0.03)
+    torch.testing.assert_close(points.std(0), (high - low) / 12**0.5, rtol=0.02, atol=0)
+
+
+def test_the_generator_alone_decides():
+    low, high = torch.zeros(1), torch.ones(1)
+    drawn = []
+    for seed in (3, 3, 4):
+        torch.rand(seed)  # must not matter
+        drawn.append(uniform(low, high, 50, torch.Generator().manual_seed(seed)))
+    assert torch.equal(drawn[0], drawn[1]) and not torch.equal(drawn[0], drawn[2])
+
+
+def test_states_come_from_a_pool_or_a_box():
+    pool = torch.arange(10.0).unsqueeze(-1)
+    drawn = draw_states(pool, 500, torch.Generator().manual_seed(0))
+    assert drawn.shape == (500, 1) and drawn.unique().tolist() == list(range(10))
+    box = torch.zeros(1), torch.ones(1)
+    same = [torch.Generator().manual_seed(1) for _ in range(2)]
+    assert torch.equal(draw_states(box, 9, same[0]), uniform(*box, 9, same[1]))

@@ -8,7 +8,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from afm_rl.cli.trusted import checked
+from afm_rl.cli.overrides import checked
 from afm_rl.missions import build
 
 SUITES = Path(__file__).parents[2] / "benchmarks" / "suites"

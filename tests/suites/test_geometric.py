@@ -12,7 +12,7 @@ from afm_rl.envs import Circle, CrazyflieTrack, Hover
 from afm_rl.errors import ConfigurationError, NonFiniteError
 from afm_rl.planning import GoalDistance, PlanningEnv
 from afm_rl.spaces.airframe import QuadrotorBody, saturate
-from afm_rl.spaces.rigid_body import RigidBodySpace
+from afm_rl.spaces.manifold import RigidBodySpace
 
 BODY, DT = QuadrotorBody(), 0.05
 

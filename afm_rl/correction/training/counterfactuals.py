@@ -12,12 +12,12 @@ from afm_rl.compiling.devices import device_of
 from afm_rl.correction.achievable import intend
 from afm_rl.correction.base import Corrector
 from afm_rl.correction.experts import LIMIT, Rows, fit_experts
-from afm_rl.correction.solver import midpoint
+from afm_rl.correction.network import midpoint
 from afm_rl.correction.training.prior import Draw, Drawn, draw_actions, draw_masks
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.regimes import Regime
-from afm_rl.spaces.sampling import draw_states
+from afm_rl.spaces.manifold import draw_states
 
 if TYPE_CHECKING:
     from afm_rl.correction.action_flow import ActionFlow

@@ -1,16 +1,25 @@
-"""Messages as series of numbers: which fields they have, and what these hold."""
+"""Logs of messages, as series of numbers: MCAP, bags of ROS, PX4's ULog."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import io
+import json
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from afm_rl.diagnosis.readers.source import Series
+from afm_rl.diagnosis.readers.source import Series, Source, check_regular
+from afm_rl.errors import ConfigurationError, printable
 
 Field = tuple[str | int, ...]
 """The way to a number: attributes, keys, places in arrays."""
+MISSING = "needs {}: pip install 'afm-rl[logs]'"
+Messages = Iterator[tuple[str, float, Any]]
+"""Topic, time (s) and content."""
+TIME = "timestamp"  # in microseconds
 
 
 def fields_of(message: Any, depth: int = 8, most: int = 64) -> Iterator[tuple[str, Field]]:
@@ -65,12 +74,7 @@ def value_at(message: Any, way: Field) -> float:
 def series_of(
     messages: Iterable[tuple[str, float, Any]], wanted: Mapping[str, tuple[str, Field]]
 ) -> dict[str, Series]:
-    """Return the series of fields.
-
-    Args:
-        messages: topic, time (s) and content of each.
-        wanted: topic and way of each name.
-    """
+    """Return the series of fields."""
     by_topic: dict[str, list[str]] = {}
     for name, (topic, _) in wanted.items():
         by_topic.setdefault(topic, []).append(name)
@@ -107,3 +111,121 @@ def _parts(message: Any) -> Mapping[str, Any]:
 
 def _get(message: Any, key: Any) -> Any:
     return message[key] if isinstance(message, Mapping) else getattr(message, key)
+
+
+def open_mcap(path: Path) -> Source:
+    """Return the fields of an MCAP file whose messages are those of ROS 2, or JSON."""
+    try:
+        from mcap.reader import make_reader
+    except ImportError as error:
+        raise ConfigurationError(f"an MCAP file {MISSING.format('mcap')}") from error
+
+    def messages(topics: Collection[str] | None) -> Messages:
+        decoders: dict[int, Any] = {}
+        with _reading("MCAP file"), path.open("rb") as file:
+            reader = make_reader(file)
+            for schema, channel, message in reader.iter_messages(topics):
+                if channel.id not in decoders:
+                    decoders[channel.id] = _decoder(schema, channel.message_encoding)
+                decode = decoders[channel.id]
+                if decode is not None:
+                    yield channel.topic, message.log_time / 1e9, decode(message.data)
+
+    return _source(path, messages)
+
+
+def open_bag(path: Path) -> Source:
+    """Return the fields of a bag of ROS 2 (a folder, or ``.db3``), or of ROS 1 (``.bag``)."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ConfigurationError(f"a bag of ROS {MISSING.format('rosbags')}") from error
+    if path.is_dir():
+        for part in path.iterdir():
+            check_regular(part)
+
+    def messages(topics: Collection[str] | None) -> Messages:
+        with _reading("bag of ROS"):
+            types = get_typestore(Stores.LATEST)  # of bags that have none
+            with AnyReader([path], default_typestore=types) as bag:
+                wanted = [c for c in bag.connections if topics is None or c.topic in topics]
+                for connection, t, data in bag.messages(wanted) if wanted else ():
+                    yield connection.topic, t / 1e9, bag.deserialize(data, connection.msgtype)
+
+    return _source(path, messages)
+
+
+def _source(path: Path, messages: Any, looked_at: int = 20) -> Source:
+    """Return a source of messages: a first pass finds the fields, in some of each topic."""
+    fields: dict[str, tuple[str, Field]] = {}
+    counts: dict[str, int] = {}
+    for topic, _, content in messages(None):
+        counts[topic] = counts.get(topic, 0) + 1
+        if counts[topic] <= looked_at:
+            fields |= {f"{topic}{name}": (topic, way) for name, way in fields_of(content)}
+
+    def read(wanted: Sequence[str]) -> dict[str, Series]:
+        chosen = {name: fields[name] for name in wanted}
+        return series_of(messages({topic for topic, _ in chosen.values()}), chosen)
+
+    return Source(path, list(fields), read, topics=counts)
+
+
+def _decoder(schema: Any, encoding: str) -> Any:
+    """Return what makes an object of a message's bytes, or None if nothing here can."""
+    if encoding == "json":
+        return json.loads
+    if encoding != "cdr" or schema is None:
+        return None
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    text = schema.data.decode()
+    if schema.encoding == "ros2idl":
+        store.register(get_types_from_idl(text))
+    else:
+        store.register(get_types_from_msg(text, schema.name))
+    return lambda data: store.deserialize_cdr(data, schema.name)
+
+
+@contextmanager
+def _reading(what: str) -> Iterator[None]:
+    """Turn an error of the reader into one line: of damaged bytes it may be of any kind."""
+    try:
+        yield
+    except (GeneratorExit, ConfigurationError, MemoryError):
+        raise
+    except Exception as error:
+        reason = printable(f"{type(error).__name__}: {error}", 120)
+        raise ConfigurationError(f"no {what}, or a damaged one: {reason}") from error
+
+
+def open_ulog(path: Path) -> Source:
+    """Return the fields of a ULog: ``TOPIC.FIELD``, or ``TOPIC[1].FIELD`` of a second instance."""
+    try:
+        from pyulog import ULog
+    except ImportError as error:
+        raise ConfigurationError("ULog needs pyulog: pip install 'afm-rl[logs]'") from error
+    with _reading("ULog"), path.open("rb") as file, redirect_stdout(io.StringIO()):
+        topics = {
+            f"{data.name}[{data.multi_id}]" if data.multi_id else data.name: data.data
+            for data in ULog(file).data_list
+        }
+    fields = {
+        f"{topic}.{field}": (topic, field)
+        for topic, data in topics.items()
+        for field in data
+        if field != TIME and TIME in data
+    }
+
+    def read(wanted: Sequence[str]) -> dict[str, Series]:
+        found = {}
+        for name in wanted:
+            topic, field = fields[name]
+            t = topics[topic][TIME].astype(float) / 1e6
+            found[name] = sorted_series(topics[topic][field].astype(float), t)
+        return found
+
+    counts = {topic: len(data[TIME]) for topic, data in topics.items() if TIME in data}
+    return Source(path, list(fields), read, topics=counts)

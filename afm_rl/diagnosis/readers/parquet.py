@@ -1,31 +1,40 @@
-"""Parquet files: columns of numbers, and of lists of numbers of one length."""
+"""Parquet files, and LeRobot's data sets of them, versions 2 and 3."""
 
 from __future__ import annotations
 
+import json
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as arrow
 import pyarrow.compute as compute
 import pyarrow.parquet as parquet
 
-from afm_rl.diagnosis.readers.source import Series, Source
+from afm_rl.diagnosis.readers.source import (
+    ACTIONS,
+    STATES,
+    Series,
+    Source,
+    blocks_of,
+    check_regular,
+    thinned_note,
+)
 from afm_rl.diagnosis.readers.tables import EPISODE, TIME
-from afm_rl.diagnosis.readers.thin import blocks_of, thinned_note
 from afm_rl.errors import ConfigurationError, printable
 
-STAMP, FLOATS = "timestamp", ("float", "double")
+STAMP = "timestamp"
 LISTS = (arrow.types.is_list, arrow.types.is_large_list, arrow.types.is_fixed_size_list)
+INFO = "meta/info.json"
+FASTEST, SLOWEST = 1e6, 1e-3  # rates (1/s) that a robot may have
 
 
 def open_parquet(path: Path) -> Source:
-    """Return the columns of a parquet file; a list's numbers are called ``COLUMN.0`` and so on.
-
-    Raises:
-        ConfigurationError: if it is no parquet file.
-    """
+    """Return the columns of a parquet file; a list's numbers are called ``COLUMN.0`` and so on."""
     names: dict[str, tuple[str, int | None]] = {}
     columns = columns_of(path)
     for column in columns:
@@ -34,7 +43,7 @@ def open_parquet(path: Path) -> Source:
             names[column] = (column, None)
         names |= {f"{column}.{k}": (column, k) for k in range(width or 0)}
     # An episode of LeRobot's has the time (s) under another name.
-    time = STAMP if TIME not in columns and str(columns.get(STAMP)) in FLOATS else TIME
+    time = STAMP if TIME not in columns and str(columns.get(STAMP)) in ("float", "double") else TIME
     return source_of(path, [path], names, time)
 
 
@@ -47,17 +56,7 @@ def source_of(
     frame: float = 0.0,
     notes: tuple[str, ...] = (),
 ) -> Source:
-    """Return the rows of parquet files, one after the other, as a source.
-
-    Args:
-        path: what they belong to.
-        files: in order.
-        names: of numbers: a column, and the place in its lists.
-        time: name of the time.
-        episode: name of the number of the episode.
-        frame: time between command and response of a healthy robot (s).
-        notes: what a reader must know.
-    """
+    """Return the rows of parquet files, one after the other, as a source."""
     sizes = [_rows(file) for file in files]
     blocks = blocks_of(sum(sizes))
 
@@ -124,17 +123,14 @@ def _read(
                     parts[column].append(_values(column, batch.column(column)))
         begin += size
     for column, found in parts.items():
-        if len({part.shape[1:] for part in found}) > 1:
+        kinds = {str(part.shape[1]) if part.ndim > 1 else "single" for part in found}
+        if len(kinds) > 1:
             raise ConfigurationError(
-                f"{printable(column)}: lists of {' and '.join(_widths(found))} numbers: expected "
+                f"{printable(column)}: lists of {' and '.join(sorted(kinds))} numbers: expected "
                 "one length"
             )
     joined = {name: np.concatenate(found or [np.empty(0)]) for name, found in parts.items()}
     return np.concatenate(numbers), joined
-
-
-def _widths(found: Sequence[np.ndarray]) -> list[str]:
-    return sorted({str(part.shape[1]) if part.ndim > 1 else "single" for part in found})
 
 
 def _batches(
@@ -189,3 +185,111 @@ def _reading(file: Path) -> Iterator[None]:
         raise ConfigurationError(
             f"{printable(str(file), 200)}: no parquet file: {reason}"
         ) from error
+
+
+def open_lerobot(folder: Path) -> Source:
+    """Return actions and states of a data set: ``action.NAME``, ``observation.state.NAME``.
+
+    A state is read before the action is sent, so that a healthy robot is late by one frame.
+    """
+    features, fps = _info(check_regular(folder / INFO))
+    files, notes = _files(folder)
+    for file in files:
+        if EPISODE not in columns_of(file):
+            raise ConfigurationError(f"{file}: no column {EPISODE}")
+    columns = columns_of(files[0])
+    names: dict[str, tuple[str, int | None]] = {}
+    for heads in (ACTIONS, STATES):
+        head = next((h for h in heads if h in features), None)
+        if head is None:
+            raise ConfigurationError(f"{INFO}: no feature {' or '.join(heads)}")
+        if head not in columns:
+            raise ConfigurationError(f"{files[0]}: no column {head}")
+        names |= _named(files[0], head, features[head])
+    every = all(STAMP in columns_of(file) for file in files)
+    names |= {name: (name, None) for name in (EPISODE, *((STAMP,) if every else ()))}
+    source = source_of(folder, files, names, STAMP, EPISODE, 1 / fps, notes)
+
+    def read(wanted: Sequence[str]) -> dict[str, Series]:
+        found = dict(source.read([name for name in wanted if name in names]))
+        row = next(iter(found.values())).row
+        t = found[STAMP].values if every else np.asarray(row) / fps
+        whole = np.round(t * fps) / fps  # stored in single precision, a little off
+        t = np.where(np.abs(t - whole) < 0.02 / fps, whole, t)
+        return found | {STAMP: Series(t, row=row)}
+
+    return replace(source, read=read, time=STAMP)
+
+
+def _info(file: Path) -> tuple[dict[str, Any], float]:
+    """Return the features of a data set, and its rate (1/s)."""
+    try:
+        info = json.loads(file.read_text(encoding="utf-8"))
+        features, fps = info["features"], float(info["fps"])
+        if not isinstance(features, dict):
+            raise TypeError("features")
+    except (ValueError, KeyError, TypeError, ArithmeticError, RecursionError) as error:
+        reason = printable(repr(error), 60)
+        raise ConfigurationError(
+            f"{INFO}: damaged: {reason}; expected fps, and features {ACTIONS[0]} and {STATES[0]}"
+        ) from error
+    if not SLOWEST <= fps <= FASTEST:
+        raise ConfigurationError(
+            f"{INFO}: fps={fps}: expected a rate between {SLOWEST:g} and {FASTEST:g}"
+        )
+    return features, fps
+
+
+def _files(folder: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """Return the parquet files of a data set, and a note of what was skipped."""
+    found = sorted(folder.glob("data/chunk-*/*.parquet"))
+    regular = [file for file in found if _is_regular(file)]
+    if not regular:
+        raise ConfigurationError("no data/chunk-*/*.parquet: expected at least one file")
+    skipped = [printable(file.name) for file in found if file not in set(regular)]
+    if not skipped:
+        return regular, ()
+    return regular, (f"skipped, no regular file: {', '.join(skipped[:8])}",)
+
+
+def _is_regular(file: Path) -> bool:
+    try:
+        return stat.S_ISREG(file.stat().st_mode)
+    except OSError:
+        return False
+
+
+def _named(file: Path, head: str, feature: Any) -> dict[str, tuple[str, int | None]]:
+    """Return the names of a feature's numbers: as given, or their places."""
+    width = width_of(file, head)  # one number is no list
+    places: list[int | None] = [None] if width is None else list(range(width))
+    given = feature.get("names") if isinstance(feature, dict) else None
+    if isinstance(given, dict) and all(type(place) is int for place in given.values()):
+        given = sorted(given, key=given.__getitem__)
+    try:
+        names = list(_flat(given))
+    except RecursionError as error:
+        raise ConfigurationError(f"{INFO}: {head}: names nested too deeply") from error
+    if names and len(names) != len(places):
+        raise ConfigurationError(
+            f"{head}: {len(places)} numbers per row, but {len(names)} names in {INFO}"
+        )
+    names = names or [str(place) for place in range(len(places))]
+    if len(set(names)) < len(places):
+        raise ConfigurationError(f"{INFO}: {head}: two of the {len(places)} names are the same")
+    return {f"{head}.{n}": (head, place) for n, place in zip(names, places, strict=True)}
+
+
+def _flat(names: Any) -> Iterator[str]:
+    """Yield the names of lists in lists, and of lists under headings.
+
+    >>> list(_flat({"arm": [["a", "b"]], "hand": ["c"]})), list(_flat(None))
+    (['a', 'b', 'c'], [])
+    """
+    if isinstance(names, dict):
+        names = list(names.values())
+    if isinstance(names, list):
+        for part in names:
+            yield from _flat(part)
+    elif names is not None:
+        yield str(names)

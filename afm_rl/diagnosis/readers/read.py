@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from afm_rl.diagnosis.log import FEWEST, Log
-from afm_rl.diagnosis.readers import bags, lerobot, parquet, tables, ulog
-from afm_rl.diagnosis.readers.choose import choose
-from afm_rl.diagnosis.readers.source import Columns, Series, Source, check_regular
+from afm_rl.diagnosis.readers import messages, parquet, tables
+from afm_rl.diagnosis.readers.source import Columns, Series, Source, check_regular, choose
 from afm_rl.errors import ConfigurationError, printable
 
 PAIRS = ("command", "response")
@@ -26,11 +25,11 @@ READERS: dict[str, Callable[[Path], Source]] = {
     ".csv": tables.open_csv,
     ".parquet": parquet.open_parquet,
     ".pq": parquet.open_parquet,
-    ".ulg": ulog.open_ulog,
-    ".ulog": ulog.open_ulog,
-    ".mcap": bags.open_mcap,
-    ".bag": bags.open_bag,
-    ".db3": bags.open_bag,
+    ".ulg": messages.open_ulog,
+    ".ulog": messages.open_ulog,
+    ".mcap": messages.open_mcap,
+    ".bag": messages.open_bag,
+    ".db3": messages.open_bag,
 }
 EXPECTED = (
     "expected a file .csv, .parquet, .ulg, .mcap, .db3 or .bag, or a folder of LeRobot or ROS"
@@ -38,18 +37,14 @@ EXPECTED = (
 
 
 def open_source(path: Path) -> Source:
-    """Return what there is in a file or folder.
-
-    Raises:
-        ConfigurationError: if it cannot be read.
-    """
+    """Return what there is in a file or folder."""
     if path.is_dir():
-        if (path / lerobot.INFO).parent.exists():
-            return lerobot.open_lerobot(path)
+        if (path / parquet.INFO).parent.exists():
+            return parquet.open_lerobot(path)
         if (path / "metadata.yaml").exists():
-            return bags.open_bag(path)
+            return messages.open_bag(path)
         raise ConfigurationError(
-            f"{path}: a folder without {lerobot.INFO} (LeRobot) or metadata.yaml (ROS); {EXPECTED}"
+            f"{path}: a folder without {parquet.INFO} (LeRobot) or metadata.yaml (ROS); {EXPECTED}"
         )
     if not path.is_symlink() and not path.exists():
         raise ConfigurationError(f"{path}: no such file; {EXPECTED}")
@@ -112,11 +107,7 @@ def read_columns(
     response: Sequence[str] = (),
     episode: str | None = None,
 ) -> Columns:
-    """Read two groups of columns, ``command.*`` and ``response.*`` or ``action.*`` and ``state.*``.
-
-    Raises:
-        ConfigurationError: if the file cannot be used.
-    """
+    """Read groups of columns: ``command.*``, ``response.*`` or ``action.*``, ``state.*``."""
     with _about(path):
         source = open_source(path)
         if episode is not None:

@@ -1,7 +1,8 @@
-"""What a reader gives: names, and a function that reads some of them."""
+"""What a reader gives, and which of its names are commands and which are responses."""
 
 from __future__ import annotations
 
+import difflib
 import re
 import stat
 from collections import Counter
@@ -12,6 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from afm_rl.errors import ConfigurationError, printable
+
+Pairs = tuple[list[str], list[str]]
+"""Names of the first and of the second group."""
+
+ACTIONS = ("action", "actions")  # LeRobot's words, and older ones
+STATES = ("observation.state", "state", "states", "observation.states")
 
 
 @dataclass(frozen=True)
@@ -96,12 +103,7 @@ class Columns:
 
 
 class Unchosen(ConfigurationError):
-    """It is not known what is a command and what a response.
-
-    Args:
-        message: one line.
-        listing: what there is, a line each.
-    """
+    """It is not known what is a command and what a response."""
 
     def __init__(self, message: str, listing: Sequence[str]) -> None:
         super().__init__(message)
@@ -109,11 +111,7 @@ class Unchosen(ConfigurationError):
 
 
 def check_regular(path: Path) -> Path:
-    """Return a path if it leads to a file that ends.
-
-    Raises:
-        ConfigurationError: for what cannot be read, a device, a pipe.
-    """
+    """Return a path if it leads to a file that ends."""
     try:
         kind = path.stat().st_mode
     except (OSError, ValueError) as error:
@@ -127,3 +125,133 @@ def check_regular(path: Path) -> Path:
             "expected a file"
         )
     return path
+
+
+def blocks_of(rows: int, most: int = 400_000, count: int = 8) -> list[tuple[int, int]]:
+    """Return first and last row (exclusive) of what is read of a log.
+
+    All rows, or blocks that are evenly spread: a block is long enough for every delay, and changes
+    on the way are seen. 400,000 rows of twenty numbers take 64 MB.
+
+    >>> blocks_of(100), blocks_of(1000, most=100, count=2)
+    ([(0, 100)], [(0, 50), (950, 1000)])
+    """
+    if rows <= most:
+        return [(0, rows)]
+    length = most // count
+    return [(int(a), int(a) + length) for a in np.linspace(0, rows - length, count)]
+
+
+def thinned_note(rows: int, blocks: list[tuple[int, int]]) -> tuple[str, ...]:
+    """Return what must be said where rows were left out.
+
+    >>> thinned_note(1000, [(0, 50), (950, 1000)])
+    ('1,000 rows are many: 2 blocks of 50 were read',)
+    """
+    if len(blocks) == 1:
+        return ()
+    length = blocks[0][1] - blocks[0][0]
+    return (f"{rows:,} rows are many: {len(blocks)} blocks of {length:,} were read",)
+
+
+def choose(
+    source: Source,
+    kinds: tuple[str, str],
+    command: Sequence[str],
+    response: Sequence[str],
+    paired: bool,
+) -> tuple[Pairs, Pairs, tuple[str, ...]]:
+    """Return which names to read, what they are called, and notes.
+
+    Args:
+        source: what there is.
+        kinds: ``command`` and ``response``: names that begin with these are taken.
+        command: names that the user gave, ``FIELD`` or ``NAME=FIELD``; a topic or an array stands
+            for all its fields.
+        response: the same, one for each command.
+        paired: each command has a response.
+    """
+    if command or response:
+        if not (command and response):
+            raise ConfigurationError("expected both --command and --response, or none of them")
+        (read_first, first), (read_second, second) = (
+            _expanded(source, option, given)
+            for option, given in (("--command", command), ("--response", response))
+        )
+        if paired and len(first) != len(second):
+            raise ConfigurationError(
+                f"{len(first)} commands ({_some(first)}), but {len(second)} responses "
+                f"({_some(second)}): expected a response for each command, in the same order"
+            )
+        return (read_first, read_second), (first, first if paired else second), ()
+    found = [[n for n in source.names if n.startswith(f"{kind}.")] for kind in kinds]
+    heads = list(kinds)
+    if not all(found):
+        found, heads = map(list, zip(*(_group(source, h) for h in (ACTIONS, STATES)), strict=True))
+    if not all(found):
+        if source.topics is not None:
+            raise Unchosen(
+                f"{len(source.names)} fields of {len(source.topics)} topics: name commands and "
+                "responses, with --command TOPIC.FIELD --response TOPIC.FIELD",
+                source.listing(),
+            )
+        raise Unchosen(
+            f"columns {_some(source.names) or 'none'}: expected {kinds[0]}.NAME and "
+            f"{kinds[1]}.NAME; rename them, or name what is there with --command and --response",
+            source.listing(),
+        )
+    first, second = ([n[len(h) + 1 :] for n in g] for g, h in zip(found, heads, strict=True))
+    if not paired:
+        return (found[0], found[1]), (first, second), ()
+    alone = sorted(set(first) - set(second)) or sorted(set(second) - set(first))
+    if set(first) - set(second):
+        alone = sorted(set(first) ^ set(second))
+        raise ConfigurationError(
+            f"{_some(alone)}: expected a command and a response of each actuator, under the same "
+            "name; or name them in pairs, with --command and --response"
+        )
+    notes = (f"responses without a command were left out: {_some(alone)}",) if alone else ()
+    partner = dict(zip(second, found[1], strict=True))
+    return (found[0], [partner[name] for name in first]), (first, first), notes
+
+
+def _group(source: Source, heads: Sequence[str]) -> tuple[list[str], str]:
+    """Return the names under the first of some heads that there is, and that head."""
+    for head in heads:
+        names = [name for name in source.names if name.startswith(f"{head}.")]
+        if names:
+            return names, head
+    return [], ""
+
+
+def _expanded(source: Source, option: str, given: Sequence[str]) -> Pairs:
+    """Return the fields that were given, and what to call them."""
+    fields: list[str] = []
+    called: list[str | None] = []
+    for text in given:
+        own, _, field = text.rpartition("=")
+        if text in source.names:
+            own, field = "", text
+        found = [field] if field in source.names else []
+        found = found or [n for n in source.names if n.startswith((f"{field}.", f"{field}["))]
+        if not found:
+            near = difflib.get_close_matches(field, source.names, n=1)
+            advice = f"did you mean {printable(near[0])}?" if near else "leave it out for a listing"
+            raise ConfigurationError(
+                f"{option} {printable(field)}: there is no such name; {advice}"
+            )
+        fields += found
+        called += [own or None] if len(found) == 1 else [None] * len(found)
+    short = [name.rpartition("/")[2].partition(".")[2] or name for name in fields]
+    names = [
+        own or (s if short.count(s) == 1 else n)
+        for own, s, n in zip(called, short, fields, strict=True)
+    ]
+    if len(set(names)) < len(names):
+        double = next(name for name in names if names.count(name) > 1)
+        raise ConfigurationError(f"{option} {printable(double)}: given twice; expected it once")
+    return fields, names
+
+
+def _some(names: Sequence[str], most: int = 8) -> str:
+    return ", ".join(printable(name, 40) for name in names[:most])

@@ -11,19 +11,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from afm_rl.diagnosis.readers.source import Series, Source
-from afm_rl.diagnosis.readers.thin import blocks_of, thinned_note
+from afm_rl.diagnosis.readers.source import Series, Source, blocks_of, thinned_note
 from afm_rl.errors import ConfigurationError, printable
 
 TIME, EPISODE = "t", "episode_index"
 
 
 def open_csv(path: Path) -> Source:
-    """Return the columns of a CSV file with a head line.
-
-    Raises:
-        ConfigurationError: if it is no CSV file.
-    """
+    """Return the columns of a CSV file with a head line."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             head = file.readline(1 << 20)
@@ -112,11 +107,7 @@ def _parse(
 
 
 def _numbers(name: str, column: pd.Series) -> np.ndarray:
-    """Return a column as numbers, NaN where a cell is empty.
-
-    Raises:
-        ConfigurationError: for text, with its row.
-    """
+    """Return a column as numbers, NaN where a cell is empty."""
     # A column with text holds objects, among them whole numbers of any size.
     cells = column.astype(str) if column.dtype == object else column
     numbers = pd.to_numeric(cells, errors="coerce")

@@ -11,13 +11,12 @@ import torch
 from safetensors.torch import load
 from tensordict import TensorDict
 
-import afm_rl.correction.weights
+import afm_rl.correction.network
 from afm_rl.correction.experts import fit_experts
-from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.network import AxisNetwork, load_universal
 from afm_rl.correction.training import CFMLoss, draw_examples, train_flow
 from afm_rl.correction.training.pretrain import pretrain
 from afm_rl.correction.training.refine import EFFECT_WEIGHT, PRECISION, flow_losses
-from afm_rl.correction.weights import load_universal
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ArtefactError, ConfigurationError
 
@@ -202,7 +201,7 @@ def test_a_flipped_bit_in_the_weights_is_refused(place, tmp_path, monkeypatch):
     said = folder.joinpath("universal.safetensors.sha256").read_text()
     (tmp_path / "universal.safetensors.sha256").write_text(said)
     assert hashlib.sha256(data).hexdigest() not in said
-    monkeypatch.setattr(afm_rl.correction.weights, "files", lambda package: tmp_path)
+    monkeypatch.setattr(afm_rl.correction.network, "files", lambda package: tmp_path)
     with pytest.raises(ArtefactError, match="universal.safetensors: damaged"):
         load_universal()
 

@@ -1,0 +1,163 @@
+"""What a fit leaves: what it depends on, and rows in which an actuator does not follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from afm_rl.diagnosis.changes import Part
+from afm_rl.diagnosis.log import GAP, Log
+from afm_rl.diagnosis.model import Model, Problem, cut
+from afm_rl.diagnosis.response import look_back, respond
+from afm_rl.diagnosis.search import Lead, beginning
+
+SIZE, SPEED, EARLIER = "the size of its command", "how fast its command changes", "earlier commands"
+OTHERS, TIME = "other commands", "the time"
+OWN = (SIZE, SPEED, EARLIER)
+LIKE = {SIZE: ", as if its gain varied", SPEED: ", as if its delay varied"}  # scatter with these
+
+
+def find_pattern(
+    problem: Problem, model: Model, most: int = 3000, least: float = 0.2, scatter: float = 0.15
+) -> tuple[str, float]:
+    """Return in words what the residual depends on, and which share of its variance that predicts.
+
+    Functions of the own command, its speed, its past, other commands and the time are fitted to one
+    half of the rows, and tried on the other one. If none predicts the residual, but one its
+    absolute value, the name is that of the scatter, and the share 0.
+
+    Returns:
+        ``("", 0.0)`` if the residual looks like noise.
+    """
+    rows = np.flatnonzero(problem.use)
+    rows = rows[:: max(len(rows) // most, 1)]
+    residual = cut((problem.y - model.predict(problem))[rows])
+    residual -= residual.mean()
+    if not residual.any():
+        return "", 0.0
+    size = np.abs(residual) - np.abs(residual).mean()
+    shares, scatters = {}, {}
+    for name, (first, *more) in _features(problem, model).items():
+        columns = np.column_stack([first, *more])[rows]
+        shares[name] = predictable(columns, residual)
+        grows = name not in LIKE or size @ np.abs(first[rows]) > 0
+        scatters[name] = predictable(columns, size) if grows else 0.0
+    best, widest = max(shares, key=shares.__getitem__), max(scatters, key=scatters.__getitem__)
+    if shares[best] > least:
+        return f"it depends on {best}", shares[best]
+    if scatters[widest] > scatter:
+        return f"its scatter depends on {widest}{LIKE.get(widest, '')}", 0.0
+    return "", 0.0
+
+
+def _features(problem: Problem, model: Model) -> dict[str, list[np.ndarray]]:
+    """Return groups of functions, each ``(N,)`` or ``(N, F)``."""
+    u, clock, linear = problem.u, problem.clock, model.shape.linear._replace(hold=1, phase=0)
+    own, followed = u[:, model.driver], model.parts(problem)[0]
+    around = (-4, -3, -2, -1, 1, 2, 3, 4, 6, 8, 12)  # steps before the command that is followed
+    late = [look_back(clock, own, linear._replace(delay=linear.delay + k)) for k in around]
+    speed, slow = late[3] - late[4], late[1] - late[6]  # over 2 and 6 steps
+    time = hats(np.arange(len(own)))
+    others = np.delete(look_back(clock, u, linear), model.driver, axis=1)
+    others = others[:, others.std(0) > 0]
+    with_others = [others, np.abs(others), others * followed[:, None]]
+    found = {
+        SIZE: [followed, hats(followed)],
+        SPEED: [speed, slow, hats(speed), hats(slow)],
+        EARLIER: late,
+        TIME: [time, time * followed[:, None]],
+    }
+    return found | ({OTHERS: with_others} if others.shape[1] else {})
+
+
+def hats(x: np.ndarray, count: int = 8) -> np.ndarray:
+    """Return piecewise linear functions of x between its quantiles, ``(N, K)``."""
+    knots = np.unique(np.quantile(x, np.linspace(0.01, 0.99, count)))
+    return np.column_stack([np.interp(x, knots, unit) for unit in np.eye(len(knots))])
+
+
+def predictable(columns: np.ndarray, y: np.ndarray, folds: int = 20) -> float:
+    """Return the share of the variance that lines in one half of the rows predict in the other."""
+    rows = len(y)
+    design = np.column_stack([np.ones(rows), columns])
+    held_out = np.arange(rows) * folds // rows % 2 == 0
+    missed = 0.0
+    for test in (held_out, ~held_out):
+        x = design[~test]
+        gram = x.T @ x
+        gram += 1e-4 * gram.trace() / len(gram) * np.eye(len(gram))
+        missed += float(((y - design @ np.linalg.solve(gram, x.T @ y[~test]))[test] ** 2).sum())
+    return 1.0 - missed / max(float((y**2).sum()), 1e-300)
+
+
+def without_lost(
+    log: Log, j: int, lead: Lead, parts: Sequence[Part], repeats: bool, apart: float = 5.0
+) -> tuple[Log, float]:
+    """Return the log with one response as it would be if it always followed, and the share lost.
+
+    A line is fitted to the rows that it fits best (least trimmed squares), behind the delay, lag
+    and rate limit that leave least. The other rows are lost if they are all over the log, if
+    neither the command nor its last moves predict which they are, and if no explanation of all
+    rows comes near.
+    """
+    y, clock = log.response[:, j], lead.clock_of(log)
+    best = y - y.mean()
+    for part in parts:
+        best[part.rows] = (y - part.predict(log, j))[part.rows]
+    if lead.left < 0.004 or best.std() < 0.05 * y.std():  # nothing to look for
+        return log, 0.0
+    u, begin = log.command[:, lead.driver], None
+    if lead.line is not None:
+        begin = beginning(clock, u, y, lead.line)
+    known = np.ones(len(y), dtype=bool)
+    if repeats:
+        known &= np.diff(y, prepend=np.inf) != 0
+    options = []
+    for shape in lead.starts:
+        place = clock.places(shape.delay).astype(int)
+        near = clock.time[np.minimum(place + 1, len(y) - 1)] - clock.time[place] < GAP
+        x = respond(clock, u, shape, begin)
+        options.append(_trimmed(np.column_stack([x, np.ones(len(y))]), y, known & near, apart))
+    line, chosen = min(options, key=lambda option: np.abs(y - option[0])[option[1]].mean())
+    far = np.abs(y - line)
+    residual = (y - line)[chosen]
+    lost = far > max(apart * _scale(residual), 1e-9)
+    share = float(lost.mean())
+    blocks = np.array([block.mean() for block in np.array_split(lost, 8)])
+    if not 0.006 < share < 0.45 or (blocks > 0.2 * share).sum() < 5:
+        return log, 0.0
+    late = clock.places(max(shape.delay for shape in lead.starts)).astype(int)
+    moves = [hats(np.abs(u - u[np.maximum(late - k, clock.start)])) for k in (2, 8, 20)]
+    since = hats(np.minimum(np.arange(len(y)) - clock.start, 100.0))  # what was before is not known
+    if predictable(np.column_stack([hats(u[late]), since, *moves]), lost - share) > 0.25:
+        return log, 0.0
+    explained = (best[lost] ** 2).mean() < 0.3 * (far[lost] ** 2).mean()
+    if explained or residual.std() > 0.35 * best.std():
+        return log, 0.0
+    response = log.response.copy()
+    drawn = np.random.default_rng(0).choice(residual, int(lost.sum()))
+    response[lost, j] = line[lost] + drawn
+    return replace(log, response=response), share
+
+
+def _trimmed(
+    design: np.ndarray, y: np.ndarray, known: np.ndarray, apart: float, kept: float = 0.55
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the line through the share of rows that it fits best, and which rows are near it."""
+    chosen = known
+    for _ in range(15):
+        line = design @ np.linalg.lstsq(design[chosen], y[chosen], rcond=None)[0]
+        far = np.abs(y - line)
+        chosen = known & (far <= np.quantile(far[known], kept))
+    for _ in range(2):
+        chosen = known & (far <= apart * _scale(far[chosen]))
+        line = design @ np.linalg.lstsq(design[chosen], y[chosen], rcond=None)[0]
+        far = np.abs(y - line)
+    return line, chosen
+
+
+def _scale(residual: np.ndarray) -> float:
+    """Return the standard deviation of residuals, whatever half of them is."""
+    return float(np.median(np.abs(residual))) / 0.6745
