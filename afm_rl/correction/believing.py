@@ -228,7 +228,9 @@ class Believer(PairCorrector):
         parts = self.look(memory, model)
         innovation = parts["pairs"][..., -1, -self.tail]
         awake = parts["misaligned"].squeeze(-1) == 1.0
-        return self.pack(parts), self.pack(self.asleep(parts, planned)), awake, innovation
+        memory = self.pack(parts)
+        idle = memory if all_hold(awake) else self.pack(self.asleep(parts, planned))
+        return memory, idle, awake, innovation
 
     def decide(self, memory: Tensor, planned: Tensor, box: Tensor) -> tuple[Tensor, ...]:
         """Return the next memories, and what to execute, of B missions with a surprise.
