@@ -18,11 +18,11 @@ if "afm_rl/UGVTrack-v0" not in gymnasium.registry:  # strings only: nothing heav
     gymnasium.register(
         id="afm_rl/UGVTrack-v0",
         entry_point="afm_rl.envs.ugv.gym:UGVTrackGym",
-        vector_entry_point="afm_rl.envs.ugv.vector:UGVTrackVectorEnv",
+        vector_entry_point="afm_rl.envs.ugv.gym:UGVTrackVectorEnv",
         max_episode_steps=5000,
     )
     gymnasium.register(
-        id="afm_rl/CrazyflieTrack-v0", entry_point="afm_rl.envs.quadrotor.gym:CrazyflieTrackGym"
+        id="afm_rl/CrazyflieTrack-v0", entry_point="afm_rl.envs.quadrotor.env:CrazyflieTrackGym"
     )
 
 

@@ -1,29 +1,31 @@
 """Environments: robots whose dynamics change under way."""
 
-from afm_rl.envs.courses.course import Course
-from afm_rl.envs.courses.flights import Circle, FigureEight, Hover, Waypoints, find_reference
-from afm_rl.envs.courses.reference import Reference
+from afm_rl.envs.courses.flights import (
+    Circle,
+    FigureEight,
+    Hover,
+    Reference,
+    Table,
+    Waypoints,
+    find_reference,
+    load_reference,
+)
 from afm_rl.envs.courses.rendering import TrackCanvas
-from afm_rl.envs.courses.table import Table, load_reference
-from afm_rl.envs.courses.track import Track
+from afm_rl.envs.courses.track import Course, Track
 from afm_rl.envs.courses.tracks import load_track
-from afm_rl.envs.missions.format import MissionFormat
-from afm_rl.envs.missions.noise import MissionNoise
+from afm_rl.envs.missions.format import MissionFormat, MissionNoise
 from afm_rl.envs.missions.settings import schedule_in_seconds
-from afm_rl.envs.quadrotor.env import CrazyflieTrack
-from afm_rl.envs.quadrotor.gym import CrazyflieTrackGym
+from afm_rl.envs.quadrotor.env import CrazyflieTrack, CrazyflieTrackGym
 from afm_rl.envs.quadrotor.rotorpy import RotorPyTrack, rotorpy_crazyflie
 from afm_rl.envs.task.arm import arm_task
 from afm_rl.envs.task.env import TaskEnv
-from afm_rl.envs.task.gym import gymnasium_task
 from afm_rl.envs.task.hosts import environment_task
 from afm_rl.envs.task.own import function_task, mujoco_task
-from afm_rl.envs.task.suite import dm_control_task
+from afm_rl.envs.task.published import dm_control_task, gymnasium_task
 from afm_rl.envs.task.task import Task
 from afm_rl.envs.ugv.env import UGVTrack
-from afm_rl.envs.ugv.gym import UGVTrackGym
+from afm_rl.envs.ugv.gym import UGVTrackGym, UGVTrackVectorEnv
 from afm_rl.envs.ugv.skid_steer import WheelPhysics, skid_steer
-from afm_rl.envs.ugv.vector import UGVTrackVectorEnv
 
 __all__ = [
     "Circle",

@@ -1,17 +1,15 @@
 """Dynamics models: interchangeable ``(state, action) -> next state``."""
 
-from afm_rl.dynamics.base import DynamicsModel
+from afm_rl.dynamics.base import DynamicsModel, UnknownDynamics
 from afm_rl.dynamics.calibrated import Calibrated
 from afm_rl.dynamics.dubins import Dubins, dubins_step
 from afm_rl.dynamics.ensemble import Ensemble
 from afm_rl.dynamics.inverse import EffectiveAction, effective_action
 from afm_rl.dynamics.knode import KNODE
-from afm_rl.dynamics.known import KnownDynamics
+from afm_rl.dynamics.known import KnownDynamics, ParametricDynamics, PhysicsModel
 from afm_rl.dynamics.mujoco import MuJoCoDynamics
 from afm_rl.dynamics.oracle import Oracle
-from afm_rl.dynamics.parametric import ParametricDynamics, PhysicsModel
 from afm_rl.dynamics.quadrotor import Quadrotor
-from afm_rl.dynamics.unknown import UnknownDynamics
 
 __all__ = [
     "KNODE",

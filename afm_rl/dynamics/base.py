@@ -1,14 +1,16 @@
-"""The contract that every dynamics model keeps."""
+"""The contract that every dynamics model keeps, alone or with parameters for each mission."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from afm_rl.dynamics.derivatives import derivative, linearised, pushed_forward
-from afm_rl.errors import check_count
+from afm_rl.dynamics.rates import derivative, linearised, pushed_forward
+from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.spaces.manifold import Manifold
 
 
@@ -60,13 +62,14 @@ class DynamicsModel(nn.Module, ABC):
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the expected next state ``(*L, *N, S)``."""
 
-    @abstractmethod
     def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance ``(*L, *N, M, D)`` of the standardised state change.
 
-        ``M`` counts ensemble members, 1 for a single model. Only mean, log-variance and
-        :meth:`standardise` together mean something: the scale is the model's own.
+        ``M`` counts ensemble members, 1 for a single model, whose variance is one. Only mean,
+        log-variance and :meth:`standardise` together mean something: the scale is the model's own.
         """
+        mean = self.standardise(self.manifold.difference(self(state, action), state))
+        return mean.unsqueeze(-2), torch.zeros_like(mean).unsqueeze(-2)
 
     def standardise(self, change: Tensor) -> Tensor:
         """Express a state change ``(*B, D)`` in the units of :meth:`moments`."""
@@ -144,3 +147,81 @@ def jacobian_of_linearised(model: DynamicsModel, state: Tensor, action: Tensor) 
     ahead, _, by_action = model.linearise(state, action)
     origin = state.unsqueeze(-2)
     return pushed_forward(lambda s: model.manifold.difference(s, origin), ahead, by_action)[1]
+
+
+Self = TypeVar("Self", bound="PerMissionModel")
+
+
+class PerMissionModel(DynamicsModel):
+    """A dynamics model whose parameters can have a leading dimension of missions.
+
+    Subclasses name these parameters and buffers in :meth:`_owned`.
+
+    :attr:`missions` holds the numbers of the missions that are left, ``(l)``; () while all share
+    one model. Whoever remembers something of single missions compares it with this.
+    """
+
+    missions: Tensor
+
+    def __init__(self, manifold: Manifold, action_size: int) -> None:
+        super().__init__(manifold, action_size)
+        self.register_buffer("missions", torch.zeros((), dtype=torch.int64), persistent=False)
+
+    @property
+    def lead(self) -> torch.Size:
+        return self.missions.shape
+
+    @abstractmethod
+    def _owned(self) -> Iterable[tuple[nn.Module, str]]:
+        """Return the parameters and buffers of missions: the module and the name in it."""
+
+    def expand_(self: Self, missions: int) -> Self:
+        if self.lead:
+            raise ConfigurationError(f"dynamics: already expanded to {tuple(self.lead)} missions")
+        self._replace_owned(lambda part: part.expand(missions, *part.shape).clone())
+        self.missions = torch.arange(missions, device=self.missions.device)
+        return self
+
+    def select_(self: Self, index: Tensor) -> Self:
+        """Keep the missions in ``index``, in place; a shared model stays as it is."""
+        if self.lead:
+            self._replace_owned(lambda part: part[index])
+            self.missions = self.missions[index]
+        return self
+
+    def _replace_owned(self, change: Callable[[Tensor], Tensor]) -> None:
+        for owner, name in self._owned():
+            part = getattr(owner, name)
+            if isinstance(part, nn.Parameter):  # optimisers hold it: only its data may change
+                part.data, part.grad = change(part.data), None
+            else:
+                setattr(owner, name, change(part))
+
+    def _check_lead(self, batch: torch.Size) -> None:
+        """Refuse a batch that does not begin with the missions."""
+        lead = self.lead
+        if batch[: len(lead)] != lead:
+            raise ConfigurationError(
+                f"dynamics: the model holds {tuple(lead)} missions, got a batch of shape "
+                f"{tuple(batch)}; expected ({', '.join(map(str, lead))}, ...)"
+            )
+
+
+class UnknownDynamics(DynamicsModel):
+    """The sizes of a model, and nothing else: whatever it is asked, it raises.
+
+    >>> from afm_rl.spaces.manifold import Manifold
+    >>> UnknownDynamics(Manifold(3), action_size=2).state_size
+    3
+    """
+
+    def forward(self, state: Tensor, action: Tensor) -> Tensor:
+        """Raise a :class:`~afm_rl.errors.ConfigurationError`."""
+        raise ConfigurationError(
+            "robot.model: the physics of this robot are not known; choose dynamics=pe, which "
+            "learns from the robot's own transitions (method=frozen_pe, afm_frozen_pe, ...), or "
+            "give a model"
+        )
+
+    def noise_scale(self, state: Tensor, action: Tensor) -> Tensor:
+        return self(state, action)

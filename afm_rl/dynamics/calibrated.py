@@ -6,9 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.compiling.tracing import may_look
-from afm_rl.dynamics.base import DynamicsModel
-from afm_rl.dynamics.derivatives import linearised
-from afm_rl.dynamics.per_mission import PerMissionModel
+from afm_rl.dynamics.base import DynamicsModel, PerMissionModel
+from afm_rl.dynamics.rates import linearised
 from afm_rl.errors import ConfigurationError
 
 CALIBRATION = ("matrix", "bias", "offset")

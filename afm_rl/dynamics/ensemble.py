@@ -10,10 +10,14 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from afm_rl.compiling.devices import CastCache
-from afm_rl.dynamics.per_mission import PerMissionModel
-from afm_rl.dynamics.running_stats import RunningStats
-from afm_rl.dynamics.sparse import sparse_layer, uniform_layer
-from afm_rl.dynamics.stacked import stacked_mlp, stacked_mlp_tangent
+from afm_rl.dynamics.base import PerMissionModel
+from afm_rl.dynamics.stacked import (
+    RunningStats,
+    sparse_layer,
+    stacked_mlp,
+    stacked_mlp_tangent,
+    uniform_layer,
+)
 from afm_rl.errors import (
     ConfigurationError,
     check_choice,

@@ -9,14 +9,10 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from afm_rl.dynamics.base import DynamicsModel, jacobian_of_linearised
-from afm_rl.dynamics.hybrid_rate import HeldHybrid
-from afm_rl.dynamics.per_mission import PerMissionModel
-from afm_rl.dynamics.quadrotor import Quadrotor
-from afm_rl.dynamics.quadrotor_equations import HeldFlight
-from afm_rl.dynamics.rates import HeldFunction, HeldRate
-from afm_rl.dynamics.residual import Network, draw_network, network_shapes
-from afm_rl.dynamics.runge_kutta import runge_kutta, runge_kutta_linearised
+from afm_rl.dynamics.base import DynamicsModel, PerMissionModel, jacobian_of_linearised
+from afm_rl.dynamics.quadrotor import HeldFlight, Quadrotor
+from afm_rl.dynamics.rates import HeldFunction, HeldRate, runge_kutta, runge_kutta_linearised
+from afm_rl.dynamics.residual import HeldHybrid, Network, draw_network, network_shapes
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
 
 
@@ -186,11 +182,6 @@ class KNODE(PerMissionModel):
 
     def jacobian(self, state: Tensor, action: Tensor) -> Tensor:
         return jacobian_of_linearised(self, state, action)
-
-    def moments(self, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a single member's mean and unit variance, in the nominal model's units."""
-        mean = self.standardise(self.manifold.difference(self(state, action), state))
-        return mean.unsqueeze(-2), torch.zeros_like(mean).unsqueeze(-2)
 
     def standardise(self, change: Tensor) -> Tensor:
         return self.nominal.standardise(change)

@@ -9,10 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from afm_rl.dynamics.known import KnownDynamics
-from afm_rl.dynamics.mujoco_model import HUGE, actuator_names, read_model, space_of, state_names
-from afm_rl.dynamics.mujoco_physics import changed_model
-from afm_rl.dynamics.parametric import PhysicsModel
+from afm_rl.dynamics.known import KnownDynamics, PhysicsModel
+from afm_rl.dynamics.mujoco_model import (
+    HUGE,
+    actuator_names,
+    changed_model,
+    read_model,
+    space_of,
+    state_names,
+)
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.regimes import Physics
 
@@ -29,15 +34,10 @@ NOMINAL = dict(zip(Physics.names, Physics.identity, strict=True))
 
 
 class Simulator:
-    """Simulates many copies of a MuJoCo model from given states, on some threads.
+    """Simulates copies of an ``MjModel``, ``frame_skip`` steps per action, on some threads.
 
-    Args:
-        model: an ``MjModel``; not copied.
-        frame_skip: simulation steps per action.
-        threads: 0 for the calling thread.
-        change: see :class:`MuJoCoDynamics`.
-        nominal: the row of physics that changes nothing.
-        most: models with changed physics that are kept.
+    ``change`` makes models with other physics, of which the ``most`` latest are kept; the row
+    ``nominal`` changes nothing.
     """
 
     def __init__(

@@ -1,15 +1,85 @@
-"""What a MuJoCo model is read from, and whether it can be simulated."""
+"""MuJoCo models: how they are read, their state space, and other physics."""
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import roma
+import torch
+from torch import Tensor
 
-from afm_rl.dynamics.mujoco_space import MuJoCoSpace
 from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.regimes import Physics
+from afm_rl.spaces.manifold import Manifold, wrap_angle
+
+
+class MuJoCoSpace(Manifold):
+    r"""Positions, velocities and activations, :math:`(q, \dot q, w)`, with angles and rotations.
+
+    Quaternions are scalar-first in the state, as in MuJoCo, and rotation vectors in the body's
+    frame in the tangent space, as in its velocities: ``difference`` agrees with
+    ``mj_differentiatePos``.
+
+    Args:
+        size: number of state coordinates, S.
+        angles: coordinates that wrap at +-pi: hinges without limits.
+        quaternions: first coordinate of each quaternion: ball and free joints.
+
+    >>> space = MuJoCoSpace(5, angles=[4], quaternions=[0])
+    >>> level = torch.tensor([1.0, 0.0, 0.0, 0.0, 3.0])
+    >>> moved = space.add(level, torch.tensor([0.0, 0.0, 0.1, 0.5]))
+    >>> space.difference(moved, level)
+    tensor([0.0000, 0.0000, 0.1000, 0.5000])
+    """
+
+    def __init__(
+        self, size: int, angles: Sequence[int] = (), quaternions: Sequence[int] = ()
+    ) -> None:
+        super().__init__(size, angles)
+        self.quaternions = list(quaternions)
+        self.tangent_size = size - len(self.quaternions)
+
+    def _parts(self, vector: Tensor, width: int) -> list[Tensor]:
+        """Split at the quaternions, each ``width`` wide: plain, turn, plain, turn, ..., plain."""
+        sizes, at = [], 0
+        for first in self.quaternions:
+            sizes += [first - at, width]
+            at = first + 4
+        return list(vector.split([*sizes, self.size - at], -1))
+
+    def project(self, raw: Tensor) -> Tensor:
+        """Scale the quaternions in ``(*B, S)`` to length 1."""
+        parts = self._parts(raw, 4)
+        parts[1::2] = [roma.quat_normalize(part) for part in parts[1::2]]
+        return torch.cat(parts, -1)
+
+    def difference(self, state: Tensor, origin: Tensor) -> Tensor:
+        """Return the tangent vector ``(*B, D)`` that leads from ``origin`` to ``state``."""
+        raw = state - origin
+        raw = torch.where(self.is_angle, wrap_angle(raw), raw)
+        if not self.quaternions:
+            return raw
+        parts = self._parts(raw, 4)
+        for k, first in enumerate(self.quaternions):
+            here, there = (x[..., first : first + 4].roll(-1, -1) for x in (origin, state))
+            turn = roma.quat_product(roma.quat_conjugation(here), there)
+            parts[2 * k + 1] = roma.unitquat_to_rotvec(turn)
+        return torch.cat(parts, -1)
+
+    def add(self, origin: Tensor, tangent: Tensor) -> Tensor:
+        """Return the state ``(*B, S)`` reached from ``origin`` along ``tangent``."""
+        turns = self._parts(tangent, 3)
+        for k, first in enumerate(self.quaternions):
+            here = origin[..., first : first + 4].roll(-1, -1)
+            turned = roma.quat_product(here, roma.rotvec_to_unitquat(turns[2 * k + 1]))
+            turns[2 * k + 1] = turned.roll(1, -1) - origin[..., first : first + 4]
+        raw = origin + torch.cat(turns, -1)
+        return torch.where(self.is_angle, wrap_angle(raw), raw)
+
 
 try:
     import mujoco
@@ -20,14 +90,7 @@ HUGE = 1e9  # MuJoCo resets a simulation that holds larger numbers
 
 
 def read_model(source: Any) -> tuple[Any, int]:
-    """Return a copy of the ``MjModel`` in a source, and the simulation steps per action.
-
-    Args:
-        source: see :class:`MuJoCoDynamics`.
-
-    Raises:
-        ConfigurationError: if there is no model in it, none with actuators, or none that moves.
-    """
+    """Return a copy of the ``MjModel`` in a source, and the simulation steps per action."""
     if mujoco is None:
         raise ConfigurationError(
             "dynamics=mujoco: the package mujoco is missing; install afm-rl[mujoco]"
@@ -53,11 +116,7 @@ def read_model(source: Any) -> tuple[Any, int]:
 
 
 def check_numbers(name: str, model: Any) -> None:
-    """Check the time step and the bodies of an ``MjModel``.
-
-    Raises:
-        ConfigurationError: for a step that is not above 0, and masses that nothing can move.
-    """
+    """Refuse a time step that is not above 0, and masses that nothing can move."""
     check_number(f"{name}: timestep", float(model.opt.timestep), low=0.0, open_low=True)
     for kind, values in (("mass", model.body_mass), ("inertia", model.body_inertia)):
         for body, most in enumerate(np.abs(values).reshape(model.nbody, -1).max(-1)):
@@ -125,3 +184,58 @@ def actuator_names(model: Any) -> list[str]:
             name = model.joint(model.actuator_trnid[k, 0]).name
         names.append(name if name and name not in names else f"a_{k}")
     return names
+
+
+NAMES = Physics.names
+SLIDE, FREE = 2, 0  # MuJoCo's numbers of joints that let a body travel
+LONG = (3, 5)  # and of capsules and cylinders, whose second size is half their length
+
+
+def changed_model(model: Any, row: tuple[float, ...]) -> Any:
+    """Return a copy of an ``MjModel`` with other physics, a row of :attr:`Physics.names`.
+
+    ``mass`` scales masses and inertias, ``friction`` that of contacts and joints, ``damping`` that
+    of joints and tendons; wind is an acceleration (m/s^2). ``length`` is of links (bodies that only
+    turn, and what is fixed to them) and of tendons' limits: masses stay, inertias grow with the
+    square. The ``payload``, a share of the whole mass, is at the centre of the heaviest body.
+    """
+    import mujoco
+
+    value = dict(zip(NAMES, row, strict=True))
+    found = copy.copy(model)
+    heaviest = int(model.body_mass[1:].argmax()) + 1
+    load = value["payload"] * model.body_mass[1:].sum() / model.body_mass[heaviest]
+    found.body_mass[:] *= value["mass"]
+    found.body_inertia[:] *= value["mass"]
+    found.body_mass[heaviest] *= 1 + load
+    for part in (found.geom_friction[:, 0], found.pair_friction[:, :2], found.dof_frictionloss):
+        part[:] *= value["friction"]
+    for part in (found.dof_damping, found.tendon_damping):
+        part[:] *= value["damping"]
+    found.opt.gravity[:] *= value["gravity"]
+    found.opt.gravity[:2] += value["wind_x"], value["wind_y"]
+    links = _links(model)
+    below = [body for body in range(1, model.nbody) if model.body_parentid[body] in links]
+    geoms = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] in links]
+    sites = [site for site in range(model.nsite) if model.site_bodyid[site] in links]
+    found.body_pos[below] *= value["length"]
+    found.body_ipos[links] *= value["length"]
+    found.body_inertia[links] *= value["length"] ** 2
+    found.geom_pos[geoms] *= value["length"]
+    found.site_pos[sites] *= value["length"]
+    found.geom_size[[geom for geom in geoms if model.geom_type[geom] in LONG], 1] *= value["length"]
+    found.tendon_range[:] *= value["length"]
+    mujoco.mj_setConst(found, mujoco.MjData(found))
+    return found
+
+
+def _links(model: Any) -> list[int]:
+    """Return the moving bodies that do not travel by themselves."""
+    links: list[int] = []
+    for body in range(1, model.nbody):
+        first = model.body_jntadr[body]
+        kinds = model.jnt_type[first : first + model.body_jntnum[body]] if first >= 0 else ()
+        carried = model.body_parentid[body] in links
+        if (carried or len(kinds)) and not any(kind in (SLIDE, FREE) for kind in kinds):
+            links.append(body)
+    return links

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics.base import DynamicsModel
-from afm_rl.dynamics.derivatives import linearised
 from afm_rl.dynamics.mujoco import MuJoCoDynamics
+from afm_rl.dynamics.rates import linearised
 from afm_rl.regimes import Regime
 
 

@@ -1,12 +1,15 @@
-"""Many small networks of one shape as single batched matrix products."""
+"""Many small networks of one shape as single batched matrix products: weights, runs, statistics."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from torch import Tensor
+from torch import Tensor, nn
+
+from afm_rl.errors import ConfigurationError, check_count, check_number
 
 SLOPE = 0.01  # of the LeakyReLU
 EPS = 1e-5  # of the layer norm: torch's own
@@ -20,13 +23,8 @@ def stacked_mlp(
 ) -> Tensor:
     """Run M perceptrons with LeakyReLU on M batches: ``(M, N, in) -> (M, N, out)``.
 
-    Each layer runs in the precision of its parameters.
-
-    Args:
-        inputs: ``(M, N, in)``.
-        weights: one ``(M, in, out)`` per layer.
-        biases: one ``(M, 1, out)`` per layer.
-        layer_norm: standardise the units of a layer before each LeakyReLU.
+    Each layer runs in the precision of its parameters, weights ``(M, in, out)`` and biases
+    ``(M, 1, out)``; with ``layer_norm`` units are standardised before each LeakyReLU.
 
     >>> stacked_mlp(torch.ones(2, 7, 3), [torch.ones(2, 3, 1)], [torch.zeros(2, 1, 1)])[0, 0]
     tensor([3.])
@@ -54,18 +52,7 @@ def stacked_mlp_tangent(
     biases: Sequence[Tensor],
     layer_norm: bool = False,
 ) -> Tensor:
-    """Push A tangent vectors through the networks of :func:`stacked_mlp`.
-
-    Args:
-        inputs: ``(M, N, in)``.
-        tangents: ``(A, in)``, the same for every row.
-        weights: one ``(M, in, out)`` per layer.
-        biases: one ``(M, 1, out)`` per layer.
-        layer_norm: standardise the units of a layer before each LeakyReLU.
-
-    Returns:
-        Directional derivatives ``(M, N, A, out)``.
-    """
+    """Push tangents ``(A, in)``, the same for all rows, through them: ``(M, N, A, out)``."""
     axes = tangents.unsqueeze(1).expand(len(inputs), -1, *inputs.shape[1:])
     moved = torch.cat([inputs.unsqueeze(1), axes], 1)  # (M, 1 + A, N, in): values, then tangents
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
@@ -90,3 +77,126 @@ def _layer_norm_tangent(value: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
     normed = centred * scale
     along = (normed * change).mean(-1, keepdim=True)
     return normed, (change - change.mean(-1, keepdim=True) - normed * along) * scale
+
+
+def uniform_layer(
+    members: int, fan_in: int, fan_out: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Draw weights ``(M, in, out)`` and biases ``(M, 1, out)`` as ``nn.Linear`` does."""
+    drawn = _uniform(members, fan_in + 1, fan_out, fan_in, generator)
+    return drawn[:, :fan_in].clone(), drawn[:, fan_in:].clone()
+
+
+def sparse_layer(
+    members: int, fan_in: int, fan_out: int, generator: torch.Generator, density: float = 0.1
+) -> tuple[Tensor, Tensor]:
+    r"""Draw weights ``(M, in, out)`` of which most are zero; biases ``(M, 1, out)`` are.
+
+    Each unit keeps a random tenth of its incoming weights, at least one, drawn from
+    :math:`U(\pm 1/\sqrt{\text{fan-in}})` (Elsayed et al. 2024, section 3): units that look
+    at different inputs disturb each other less when they learn from one sample at a time.
+
+    >>> weight, bias = sparse_layer(2, 50, 7, torch.Generator().manual_seed(0))
+    >>> (weight != 0).sum(1).unique(), bias.abs().sum()
+    (tensor([5]), tensor(0.))
+    """
+    check_number("density", density, low=0.0, high=1.0, open_low=True)
+    keep = max(1, round(density * fan_in))
+    weight = _uniform(members, fan_in, fan_out, fan_in, generator)
+    rank = torch.rand(weight.shape, generator=generator).argsort(1).argsort(1)
+    return torch.where(rank < keep, weight, 0.0), torch.zeros(members, 1, fan_out)
+
+
+def _uniform(
+    members: int, rows: int, columns: int, fan_in: int, generator: torch.Generator
+) -> Tensor:
+    uniform = torch.rand(members, rows, columns, generator=generator)
+    return (2 * uniform - 1) * (1 / math.sqrt(fan_in))
+
+
+class RunningStats(nn.Module):
+    r"""Standardise by the mean and standard deviation of everything seen so far.
+
+    Welford's method, one sample :math:`x` at a time:
+
+    .. math:: n \leftarrow n + 1,\quad d = x - m,\quad m \leftarrow m + d / n,\quad
+              q \leftarrow q + d\,(x - m),\quad \sigma^2 = q / (n - 1)
+
+    and Chan's generalisation where several arrive together. Streams in the leading
+    dimensions ``L`` are independent of each other.
+
+    Args:
+        size: number of features, D.
+        lead: leading dimensions, L.
+        min_std: least standard deviation, > 0, in the features' units.
+
+    >>> stats = RunningStats(1)
+    >>> for x in (1.0, 2.0, 6.0):
+    ...     stats.update_(torch.tensor([x]))
+    >>> stats.mean, stats.std, stats(torch.tensor([3.0]))
+    (tensor([3.]), tensor([2.6458]), tensor([0.]))
+    """
+
+    mean: Tensor
+    """Mean ``(*L, D)``."""
+    scatter: Tensor
+    """Sum of squared deviations, q ``(*L, D)``."""
+    count: Tensor
+    """Number of samples, n ``(*L, 1)``."""
+
+    def __init__(self, size: int, lead: Sequence[int] = (), min_std: float = 1e-8) -> None:
+        super().__init__()
+        self.size = check_count("size", size)
+        self.min_std = check_number("min_std", min_std, low=0.0, open_low=True)
+        for name, width in (("mean", size), ("scatter", size), ("count", 1)):
+            self.register_buffer(name, torch.zeros(*lead, width))
+
+    @property
+    def lead(self) -> torch.Size:
+        """Leading dimensions of the streams."""
+        return self.mean.shape[:-1]
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviation ``(*L, D)``; 1 before the second sample."""
+        variance = self.scatter / (self.count - 1).clamp_min(1)
+        return torch.where(self.count > 1, variance.sqrt().clamp_min(self.min_std), 1.0)
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Standardise ``(*L, *N, D)``."""
+        further = [1] * (values.dim() - self.mean.dim())
+        mean, std = (x.reshape(*self.lead, *further, self.size) for x in (self.mean, self.std))
+        return (values - mean) / std
+
+    def start_(self, mean: Tensor, std: Tensor, count: int) -> None:
+        """Begin as if ``count`` samples of this mean and deviation ``(D,)`` had been seen."""
+        self.count.fill_(check_count("count", count))
+        self.mean.copy_(mean)
+        self.scatter.copy_(std.square() * (count - 1))
+
+    @torch.no_grad()
+    def update_(self, values: Tensor, where: Tensor | None = None) -> None:
+        """Take in finite samples ``(*L, *N, D)``, those of ``where`` ``(*L, *N)``; all if None."""
+        batch = values.shape[:-1]
+        if batch[: len(self.lead)] != self.lead or values.shape[-1:] != (self.size,):
+            raise ConfigurationError(
+                f"values of shape {tuple(values.shape)}: expected "
+                f"({', '.join(map(str, (*self.lead, '...', self.size)))})"
+            )
+        if where is None:
+            where = torch.ones(batch, dtype=torch.bool, device=values.device)
+        elif where.shape != batch:
+            raise ConfigurationError(
+                f"where of shape {tuple(where.shape)}: expected {tuple(batch)}"
+            )
+        counts = where.reshape(*self.lead, -1, 1)
+        values = values.reshape(*self.lead, -1, self.size).to(self.mean)
+        values = torch.where(counts, values, 0.0)  # NaN times zero would be NaN
+        new = counts.sum(-2).to(self.count)
+        centre = values.sum(-2) / new.clamp_min(1)
+        spread = torch.where(counts, values - centre.unsqueeze(-2), 0.0).square().sum(-2)
+        total = (self.count + new).clamp_min(1)
+        gap = torch.where(new > 0, centre - self.mean, 0.0)
+        self.scatter += spread + gap.square() * self.count * new / total
+        self.mean += gap * new / total
+        self.count += new

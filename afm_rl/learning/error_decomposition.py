@@ -29,10 +29,7 @@ class ErrorParts(NamedTuple):
 
 
 def check_half_range(scale: Sequence[float] | Tensor, size: int) -> Tensor:
-    """Return the half ranges of ``size`` actions, an updater's ``scale``, as a tensor ``(A,)``.
-
-    Raises:
-        ConfigurationError: unless there is a positive number for each.
+    """Return an updater's ``scale``, the half ranges of actions, as ``(A,)``; refuse what is none.
 
     >>> check_half_range([1.0, 1.5], 2)
     tensor([1.0000, 1.5000])
@@ -56,12 +53,7 @@ def decompose_error(
 
     .. math:: r = (I - J J^+)\, N^{-1} (s_{t+1} \ominus f(s_t, v))
 
-    Args:
-        model: the dynamics, f.
-        state: ``(*B, S)``.
-        action: the executed action, where the search begins, ``(*B, A)``.
-        next_state: the realised one, ``(*B, S)``.
-        half_range: half ranges of the action, ``(A,)``.
+    The search for v begins at the executed action.
 
     >>> from afm_rl.dynamics import Dubins
     >>> s, u = torch.zeros(3), torch.tensor([0.5, 0.2])

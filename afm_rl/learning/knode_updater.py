@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -19,13 +19,26 @@ from afm_rl.errors import (
     check_number,
 )
 from afm_rl.faults import whole
-from afm_rl.learning.flight_window import FlightWindow, Rows
 from afm_rl.learning.knode_fit import fit_network
-from afm_rl.learning.learner import Learner
-from afm_rl.learning.nll import GaussianNLLLoss
+from afm_rl.learning.loss import GaussianNLLLoss
+from afm_rl.learning.updater import Learner
 from afm_rl.mission_state import MissionState
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
+
+
+class Rows(NamedTuple):
+    """Steps of flights: l missions, n flights of each, R steps."""
+
+    state: Tensor
+    """``(l, n, R, S)``."""
+    action: Tensor
+    """``(l, n, R, A)``."""
+    after: Tensor
+    """The next state, ``(l, n, R, S)``."""
+    counts: Tensor
+    """Whether the step is to be learnt from, ``(l, n, R)``; the others hold zeros."""
+
 
 TRAINERS = ("fast", "exact")
 NONE = -1  # no network is under way
@@ -40,11 +53,6 @@ class Pending(NamedTuple):
     outer_bias: Tensor
     taught: Tensor
     """Did the mission have anything to learn from? ``(l)``."""
-
-    @classmethod
-    def empty(cls) -> Pending:
-        """Return no networks."""
-        return cls(*(torch.zeros(0) for _ in cls._fields))
 
 
 class KNODEUpdater(Learner):
@@ -138,7 +146,7 @@ class KNODEUpdater(Learner):
             None if key is None else as_key(key) for key in (trace_key, seed_key)
         )
         self.streams = Streams(salt=4, seed=check_count("updater.seed", seed, low=0))
-        self.window, self.pending = FlightWindow(), MissionState(Pending.empty())
+        self.window, self.pending = (MissionState(_nothing(kind)) for kind in (Rows, Pending))
         self.tick, self.due = 0, NONE
 
     @property
@@ -150,8 +158,8 @@ class KNODEUpdater(Learner):
         """Forget the window and the network under way; the pool stays."""
         super().start()
         self.tick, self.due = 0, NONE
-        self.window.clear()
-        self.pending.keep(Pending.empty())
+        self.window.keep(_nothing(Rows))
+        self.pending.keep(_nothing(Pending))
 
     def _sound(self, tensordict: TensorDictBase) -> Tensor:
         """Return which transitions are sound ``(*B)``, the steps of their trace included."""
@@ -164,12 +172,21 @@ class KNODEUpdater(Learner):
         rows = self._rows(transitions, learn)
         each = rows.counts.shape[-1]
         if self.tick >= self.first:
-            self.window.gather(rows, self.ticks * each)
+            self._gather(rows, self.ticks * each)
         self.tick += 1
         self._deliver()
-        if self.window.size == self.ticks * each and self.due == NONE:
+        if self.window.parts.counts.shape[-1] == self.ticks * each and self.due == NONE:
             self._train(transitions, self.model.dt / each)
             self._deliver()
+
+    def _gather(self, rows: Rows, most: int) -> None:
+        """Add rows and keep the latest ``most``; those that do not count become zeros."""
+        counts = rows.counts.unsqueeze(-1)
+        state, action, after = (torch.where(counts, part, 0.0) for part in rows[:3])
+        rows = Rows(state, action, after, rows.counts)
+        if self.window.parts.counts.dim() > 1:
+            rows = Rows(*(torch.cat(pair, 2) for pair in zip(self.window.parts, rows, strict=True)))
+        self.window.keep(Rows(*(part[:, :, -most:].contiguous() for part in rows)))
 
     def _rows(self, tensordict: TensorDictBase, learn: Tensor) -> Rows:
         """Return the rows of a transition, of which those of ``learn`` ``(*B)`` count."""
@@ -207,7 +224,7 @@ class KNODEUpdater(Learner):
         taught = rows.counts.flatten(1).any(-1)  # nothing is learnt from nothing
         self.pending.keep(Pending(*network, taught))
         self.due = self.tick + self.delay
-        self.window.clear()
+        self.window.keep(_nothing(Rows))
 
     def _numbers(self, tensordict: TensorDictBase, rows: Rows) -> tuple[Tensor, ...]:
         """Return standard normal numbers for a network, for states and for actions.
@@ -233,6 +250,11 @@ class KNODEUpdater(Learner):
             parts = (part.reshape(*lead, *part.shape[1:]) for part in network)
             self.model.push_(Network(*parts), taught.reshape(lead))
             self.due = NONE
+
+
+def _nothing(kind: Any) -> Any:
+    """Return a record without any rows."""
+    return kind(*(torch.zeros(0) for _ in kind._fields))
 
 
 def _ticks(time: float, dt: float) -> int:

@@ -1,14 +1,17 @@
-"""What the losses of this library share."""
+"""How well a dynamics model explains transitions, and what the losses of this library share."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import dataclass, fields
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import dispatch
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from afm_rl.errors import check_choice
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import check_choice, check_flag, check_instance
 
 REDUCTIONS = ("mean", "sum", "none")
 
@@ -51,3 +54,77 @@ class InPlaceLoss(LossModule):
         """Return the loss, reduced, under its key."""
         loss = self._reduce_loss(loss, tensordict=tensordict)
         return TensorDict({self.out_keys[0]: loss}, loss.shape)
+
+
+def gaussian_nll(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
+    r"""Return :math:`(\mu - y)^2 e^{-\ell} + \ell`, elementwise.
+
+    Twice the Gaussian negative log-likelihood without its constant, :math:`\ell` the
+    log-variance (Chua et al. 2018, eq. 1).
+
+    >>> import torch
+    >>> gaussian_nll(torch.zeros(1), torch.zeros(1), torch.full((1,), 3.0))
+    tensor([9.])
+    """
+    return (mean - target) ** 2 * (-log_variance).exp() + log_variance
+
+
+class GaussianNLLLoss(InPlaceLoss):
+    """Gaussian negative log-likelihood of the state change under a dynamics model.
+
+    The mean is taken over ensemble members and coordinates, the ``reduction`` over the
+    batch. Parameters stay where they are (the loss is not functional): planner, transform
+    and optimiser go on sharing one model.
+
+    Args:
+        model: any :class:`~afm_rl.dynamics.DynamicsModel`.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (one value per transition).
+        wrap: take state changes on the manifold; False subtracts angles as they are, so that
+            each crossing of pi is an outlier of 2 pi, as in the published runs.
+
+    Keys (change them with ``set_keys``): ``state`` ("observation"), ``action`` ("action"),
+    ``next_state`` (("next", "observation")).
+
+    >>> import torch
+    >>> from tensordict import TensorDict
+    >>> from afm_rl.dynamics import Dubins
+    >>> loss = GaussianNLLLoss(Dubins())
+    >>> s, a = torch.zeros(4, 3), torch.ones(4, 2)
+    >>> td = TensorDict({"observation": s, "action": a}, [4])
+    >>> loss(td.set(("next", "observation"), Dubins()(s, a)))["loss_nll"]
+    tensor(0.)
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Default keys."""
+
+        state: NestedKey = "observation"
+        action: NestedKey = "action"
+        next_state: NestedKey = ("next", "observation")
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    model: DynamicsModel
+    model_params: None
+    target_model_params: None
+    out_keys = ["loss_nll"]
+
+    def __init__(self, model: DynamicsModel, reduction: str = "mean", wrap: bool = True) -> None:
+        super().__init__(reduction)
+        self.model = check_instance("loss.model", model, DynamicsModel)
+        self.wrap = check_flag("loss.wrap", wrap)
+
+    def target(self, state: Tensor, next_state: Tensor) -> Tensor:
+        """Return the standardised state change ``(*B, D)``."""
+        change = self.model.manifold.difference if self.wrap else torch.sub
+        return self.model.standardise(change(next_state, state))
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return ``loss_nll`` for transitions ``(*L, *N)``."""
+        state, action, next_state = (tensordict.get(key) for key in self.in_keys)
+        target = self.target(state, next_state).unsqueeze(-2)
+        mean, log_variance = self.model.moments(state, action)
+        loss = gaussian_nll(mean, log_variance, target).mean((-2, -1))
+        return self._reduced(loss, tensordict)

@@ -1,17 +1,22 @@
-"""Learning by gradients."""
+"""Learning by gradients, from each transition, or from what no action can undo."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.optim import Optimizer
 
-from afm_rl.errors import ConfigurationError, check_flag
-from afm_rl.learning.learner import Learner
-from afm_rl.learning.nll import GaussianNLLLoss
+from afm_rl.dynamics import Ensemble
+from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance, check_number
+from afm_rl.learning.error_decomposition import check_half_range, decompose_error
+from afm_rl.learning.loss import GaussianNLLLoss, gaussian_nll
+from afm_rl.learning.optimisers import ObGD
+from afm_rl.learning.updater import Learner, Updater
 
 
 class OnlineUpdater(Learner):
@@ -68,3 +73,181 @@ class OnlineUpdater(Learner):
         self.optimizer.zero_grad(set_to_none=True)
         torch.where(learn, found["loss"], 0.0).sum().backward()
         self.optimizer.step()
+
+
+FORMS = ("error", "loss")
+
+
+class StreamXUpdater(OnlineUpdater):
+    r"""One overshooting-bounded step on the latest transition, per mission and member.
+
+    The stream-x recipe (Elsayed et al. 2024, arXiv 2410.14606) for one-step supervised
+    learning: :class:`~afm_rl.learning.ObGD` without traces, :math:`z = g`, on
+
+    * ``form="error"``: the members' error :math:`\delta = \|y - \mu\|_2` in standardised
+      units, :math:`z = \nabla_w \delta`. The head of the log-variance :math:`\ell`, which
+      this does not reach, takes a step on the likelihood: :math:`\delta = 1`,
+      :math:`z = \nabla \sum_d [(y_d - \mu_d)^2 e^{-\ell_d} + \ell_d] / D`.
+    * ``form="loss"``: the likelihood for everything, the literal reading: steps of one size
+      however small the error.
+
+    Then the model's running statistics, if it has any, see the transition. Missions,
+    ``mask_key`` and faulty transitions are as in :class:`~afm_rl.learning.OnlineUpdater`.
+
+    Args:
+        loss: a loss over an :class:`~afm_rl.dynamics.Ensemble`.
+        form: ``"error"`` or ``"loss"``.
+        lr: step size, > 0; 1 leaves it to the bound.
+        kappa: strictness of the bound, > 0.
+        mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
+        wrap: see :class:`~afm_rl.learning.GaussianNLLLoss`.
+
+    Raises:
+        ConfigurationError: for settings out of range, or a model that is no ensemble.
+
+    >>> from tensordict import TensorDict
+    >>> from afm_rl.spaces.manifold import Manifold
+    >>> model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], layer_norm=True)
+    >>> updater = StreamXUpdater(GaussianNLLLoss(model.expand_(4)))
+    >>> td = TensorDict({"observation": torch.zeros(4, 3), "action": torch.ones(4, 2)}, [4])
+    >>> td = td.set(("next", "observation"), torch.ones(4, 3))
+    >>> bool((updater(td)["loss"] > updater(td)["loss"]).all())
+    True
+    """
+
+    optimizer: ObGD
+
+    def __init__(
+        self,
+        loss: GaussianNLLLoss,
+        form: str = "error",
+        lr: float = 1.0,
+        kappa: float = 2.0,
+        mask_key: NestedKey | None = None,
+        wrap: bool = True,
+    ) -> None:
+        if not isinstance(loss.model, Ensemble):
+            raise ConfigurationError(
+                f"updater: {type(self).__name__} teaches an Ensemble, got "
+                f"{type(loss.model).__name__}; choose an ensemble, such as dynamics=pe_stream_x"
+            )
+        super().__init__(loss, partial(ObGD, lr=lr, kappa=kappa, lead_dims=1), mask_key, wrap)
+        self.form = check_choice("updater.form", form, FORMS)
+
+    def _measure(self, transitions: TensorDictBase) -> dict[str, Tensor]:
+        """Return the loss ``(*B)`` and what it is made of, ``(*B, E, D)`` each."""
+        model = cast(Ensemble, self.loss.model)
+        state, action, next_state = (transitions.get(key) for key in self.loss.in_keys)
+        target = self.loss.target(state, next_state).unsqueeze(-2)
+        mean, log_variance = model.moments(state, action)
+        loss = gaussian_nll(mean, log_variance, target).mean((-2, -1))
+        found = {"loss": loss, "error": target - mean, "log_variance": log_variance}
+        return {**found, "state": state, "action": action}
+
+    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+        """Take one step, or one for the mean and one for the log-variance."""
+        model, optimizer = cast(Ensemble, self.loss.model), self.optimizer
+        optimizer.param_groups[0]["lead_dims"] = len(model.lead) + 1
+        error = found["error"]
+        residual = error.detach() if self.form == "error" else error
+        likelihood = gaussian_nll(residual, found["log_variance"], torch.zeros_like(residual))
+        spread = self._per_learner(likelihood.mean(-1), learn).sum()
+        optimizer.zero_grad(set_to_none=True)
+        if self.form == "error":
+            head = [model.weights[-1], model.biases[-1]]
+            gradients = torch.autograd.grad(spread, head, retain_graph=True)
+            delta = self._per_learner(torch.linalg.vector_norm(error, dim=-1), learn)
+            delta.sum().backward()
+            optimizer.step(delta.detach())
+            optimizer.zero_grad(set_to_none=True)
+            for parameter, gradient in zip(head, gradients, strict=True):
+                parameter.grad = gradient
+        else:
+            spread.backward()
+        optimizer.step()
+        model.observe_(found["state"], found["action"], learn)
+
+    def _per_learner(self, values: Tensor, learn: Tensor) -> Tensor:
+        """Average ``(*L, *N, E)`` over the transitions to learn from: ``(*L, E)``."""
+        lead = self.loss.model.lead
+        chosen = torch.where(learn.unsqueeze(-1), values, 0.0)
+        count = learn.reshape(*lead, -1, 1).sum(-2).clamp_min(1)
+        return chosen.reshape(*lead, -1, values.shape[-1]).sum(-2) / count
+
+
+MASK = "unmatched"
+
+
+class UnmatchedUpdater(Updater):
+    r"""Another updater, which learns from effective actions, not from executed ones.
+
+    The transform undoes what actions can undo. A model that learns the same from the executed
+    actions works against it: both correct one error, and the transform reads its window through
+    a model that keeps changing. Here each transition is taken apart first
+    (:func:`~afm_rl.learning.error_decomposition.decompose_error`) into the action v that explains
+    it best and a rest, in standard deviations of the model,
+
+    .. math:: r = N^{-1}\,(s_{t+1} \ominus f(s_t, v)).
+
+    Where :math:`\max_d |r_d|` exceeds the gate the updater learns from :math:`(s_t, v, s_{t+1})`;
+    elsewhere actions explain everything, and the model stays as it is. The loss is that of the
+    executed action, as with any updater.
+
+    Args:
+        loss: the loss to descend.
+        updater: makes the updater that learns, ``updater(loss)``.
+        scale: half range of each action, ``(A,)``.
+        gate: standard deviations of the model that the rest must exceed, >= 0.
+
+    Raises:
+        ConfigurationError: for a scale that does not fit the model, or an updater with a
+            mask of its own.
+
+    >>> from functools import partial
+    >>> from tensordict import TensorDict
+    >>> from afm_rl.dynamics import Ensemble
+    >>> from afm_rl.spaces.manifold import Manifold
+    >>> model = Ensemble(Manifold(3, angles=[2]), 2, features=[2])
+    >>> sgd = partial(OnlineUpdater, optimizer=partial(torch.optim.SGD, lr=1e-4))
+    >>> updater = UnmatchedUpdater(GaussianNLLLoss(model), sgd, [1.0, 1.5])
+    >>> td = TensorDict({"observation": torch.zeros(4, 3), "action": torch.ones(4, 2)}, [4])
+    >>> updater(td.set(("next", "observation"), torch.ones(4, 3)))["loss"].shape
+    torch.Size([4])
+    """
+
+    learns = True
+    scale: Tensor
+
+    def __init__(
+        self,
+        loss: GaussianNLLLoss,
+        updater: Callable[[GaussianNLLLoss], OnlineUpdater],
+        scale: Sequence[float] | Tensor,
+        gate: float = 5.0,
+    ) -> None:
+        super().__init__(loss)
+        self.updater = check_instance("updater.updater", updater(loss), OnlineUpdater)
+        if self.updater.mask_key is not None:
+            raise ConfigurationError(
+                f"updater.updater.mask_key={self.updater.mask_key!r}: expected none; where to "
+                "learn is decided here, by updater.gate"
+            )
+        self.updater.mask_key = MASK
+        self.register_buffer(
+            "scale", check_half_range(scale, loss.model.action_size), persistent=False
+        )
+        self.gate = check_number("updater.gate", gate, low=0.0)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        with torch.no_grad():
+            loss = self.loss(tensordict)["loss_nll"]
+        shown = tensordict.select(*self.loss.in_keys, self.updater.sound_key, strict=False).copy()
+        state, action, after = (shown.get(key) for key in self.loss.in_keys)
+        scale = self.scale.to(action)
+        with torch.no_grad():
+            parts = decompose_error(self.loss.model, state, action, after, scale)
+        action = torch.where(action.isfinite(), (parts.effective * scale).to(action), action)
+        shown.set(self.loss.in_keys[1], action)  # a faulty action stays one
+        learnt = self.updater(shown.set(MASK, (parts.unmatched.abs() > self.gate).any(-1)))
+        self.refused = self.updater.refused
+        return learnt.set("loss", torch.where(learnt["loss"].isnan(), torch.nan, loss))

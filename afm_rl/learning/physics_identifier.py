@@ -13,8 +13,8 @@ from torch import Tensor
 from afm_rl.dynamics import PhysicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.learning.error_decomposition import check_half_range, decompose_error
-from afm_rl.learning.learner import Learner
-from afm_rl.learning.nll import GaussianNLLLoss
+from afm_rl.learning.loss import GaussianNLLLoss
+from afm_rl.learning.updater import Learner
 from afm_rl.mission_state import MissionState
 
 

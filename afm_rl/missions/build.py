@@ -1,10 +1,13 @@
-"""From a configuration to a robot, its agent and its missions."""
+"""From a configuration to a robot, its agent and its missions; and the agent's training."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,6 +17,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
+from afm_rl._version import __version__
 from afm_rl.compiling.devices import check_device
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
@@ -31,6 +35,7 @@ from afm_rl.missions.selection import (
     select_tracks,
 )
 from afm_rl.planning import Cost, PlanningEnv
+from afm_rl.storage.artefacts import cached
 from afm_rl.targets import check_targets
 from afm_rl.transforms import ActionFlowTransform, Guard
 
@@ -215,3 +220,37 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
         settings=settings,
     )
     return agent.to(device)
+
+
+def prepare(
+    agent: Agent, cache: str | Path, progress: bool = False, echo: Callable[[str], None] = print
+) -> None:
+    """Train what needs training, or take it from the cache; say the held-out errors.
+
+    Args:
+        agent: its parts are trained in place.
+        cache: folder of trained parts.
+        progress: show progress bars.
+        echo: receives one line per part.
+
+    Raises:
+        ConfigurationError: if the cache cannot be written; before anything is trained.
+        ArtefactError: if a part in the cache is damaged.
+    """
+    folder = Path(cache).expanduser()
+
+    for part in agent.trainings:
+        description = {"name": part.title, "version": __version__, "settings": part.settings}
+        description.update(getattr(part.module, "signature", {}))
+        start = time.perf_counter()
+        known, found = cached(folder, part.module, description, partial(part.train, progress))
+        spent = "from the cache" if found else f"trained in {time.perf_counter() - start:.0f} s"
+        known = known if isinstance(known, Mapping) else {"error": known}
+        echo(f"{part.title}: held-out error {known['error']:.4f} {part.unit} ({spent})")
+        if "rms" in known:
+            pairs = zip(known["names"], known["rms"], strict=True)
+            each = ", ".join(f"{name} {error:.2g}" for name, error in pairs)
+            echo(f"{part.title}: root mean square error of a step: {each}")
+        if "rewards" in known:
+            rewards = ", ".join(f"{reward:.3g}" for reward in known["rewards"])
+            echo(f"{part.title}: reward per step of each round of data, random first: {rewards}")

@@ -26,10 +26,7 @@ KEYS = ("seed_key", "mask_key", "regime_key")  # settings that name an entry of 
 
 @contextmanager
 def blaming(group: str) -> Iterator[None]:
-    """Turn what a maker of parts raises into an error that names the settings at fault.
-
-    Raises:
-        ConfigurationError: naming ``group``, or the key inside it that Hydra blames.
+    """Turn what a maker of parts raises into an error that names the group, or Hydra's key.
 
     >>> with blaming("planner"):
     ...     dict(horizon=5, horizn=3)["population"]
@@ -59,13 +56,10 @@ def blaming(group: str) -> Iterator[None]:
 def check_training(
     group: str, train: Callable[..., Any], settings: Mapping[str, Any], **least: int
 ) -> None:
-    """Check the ``settings`` of a training function by its defaults.
+    """Check the ``settings`` of a training function by its defaults, which say what there is.
 
     Counts must be at least 1, or what ``least`` says; other numbers must not be negative, and step
     sizes at most 1.
-
-    Raises:
-        ConfigurationError: for an unknown setting, or one out of range.
     """
     known = {
         name: parameter.default
@@ -89,10 +83,7 @@ def check_training(
 
 
 def check_label(label: Any) -> str | None:
-    """Return the name of a method, which also becomes the name of a file.
-
-    Raises:
-        ConfigurationError: if it is no text, or leads out of the folder of results.
+    """Return the name of a method, which becomes that of a file, too: it must not lead elsewhere.
 
     >>> check_label("physics+corrector=l1")
     'physics+corrector=l1'
@@ -108,11 +99,7 @@ def check_label(label: Any) -> str | None:
 
 
 def check_updater(updater: Updater, model: DynamicsModel) -> None:
-    """Check that the updater sets what the model is conditioned on, and nothing else.
-
-    Raises:
-        ConfigurationError: otherwise.
-    """
+    """Check that the updater sets what the model is conditioned on, and nothing else."""
     wanted, given = model.conditioned_on, updater.sets
     optional = wanted == "calibration" and not updater.learns  # without one it is the identity
     if wanted == given or (given is None and optional):
@@ -131,14 +118,8 @@ def check_updater(updater: Updater, model: DynamicsModel) -> None:
 def check_cost(cost: Cost, env: EnvBase, stages: int | None = None) -> None:
     """Check that the environment gives what the cost reads.
 
-    Args:
-        cost: the cost.
-        env: the environment.
-        stages: how many numbers in a row, one per planned state, the planner takes; None for
-            planners that take the present ones only.
-
-    Raises:
-        ConfigurationError: otherwise.
+    ``stages`` says how many numbers in a row, one per planned state, the planner takes; None: only
+    one.
     """
     spec = env.observation_spec
     for key, size in zip(cost.in_keys, cost.in_sizes, strict=True):
@@ -158,11 +139,7 @@ def check_cost(cost: Cost, env: EnvBase, stages: int | None = None) -> None:
 
 
 def check_keys(group: str, part: Any, env: EnvBase, names: Iterable[str] = KEYS) -> None:
-    """Check that the entries that a part was told to read are there.
-
-    Raises:
-        ConfigurationError: otherwise.
-    """
+    """Check that the entries that a part was told to read are there."""
     given = list(env.observation_spec.keys(True, True))
     for name in names:
         key = getattr(part, name, None)

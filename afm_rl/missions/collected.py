@@ -19,8 +19,7 @@ from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import Ensemble
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import collect, fit_ensemble
-from afm_rl.missions.collection import Collection
-from afm_rl.missions.robot import Robot
+from afm_rl.missions.robot import Collection, Robot
 from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.planning.costs import KnownReward
 from afm_rl.regimes import Schedule
@@ -68,9 +67,8 @@ def transitions(
 def fit_collected(model: Ensemble, robot: Robot, how: Collection, progress: bool) -> dict[str, Any]:
     """Collect transitions round by round and fit the model to all.
 
-    Returns:
-        The last :class:`~afm_rl.learning.FitReport`, by name, and ``rewards``, the mean reward per
-        step of each round.
+    Returns the last :class:`~afm_rl.learning.FitReport`, by name, and ``rewards``, the mean reward
+    per step of each round.
     """
     cost = _cost(robot, how)
     first, parts, planner = copy.deepcopy(model.state_dict()), [], None

@@ -30,16 +30,7 @@ def effective_log(
     """Return what states ``(N, S)`` show of actions ``(N, A)``: responses are effective actions.
 
     The last row of each episode has no next state, and is left out; so are rows in which the
-    effective action cannot be seen.
-
-    Args:
-        model: of the healthy robot.
-        names: of the actions.
-        states: before each action.
-        actions: as they were executed.
-        t: times (s), ``(N,)``.
-        episode: numbers of episodes, ``(N,)``.
-        unseen: half ranges; effective actions with a larger standard deviation are left out.
+    effective action cannot be seen: its standard deviation is above ``unseen`` half ranges.
 
     Raises:
         ConfigurationError: if too few states show what an action did.
@@ -122,17 +113,9 @@ def _made_up(
     near: float = 0.05,
     most: float = 0.9,
 ) -> bool:
-    """Did an actuator with a fault do what was planned, so many steps before, in the end?
+    """Did an actuator with a fault do what was planned, at most ``late`` steps before, in the end?
 
-    Args:
-        actuator: as it was found.
-        planned: for it, ``(N,)``.
-        response: in ``rows``.
-        rows: numbers of the steps that are looked at.
-        log: of these.
-        late: delays that were planned for (steps).
-        near: distance that counts as the same, in half ranges of the plan.
-        most: share of the steps in which it has to be.
+    That is, to within ``near`` half ranges of the plan in a share ``most`` of the steps.
     """
     steps = round(actuator.delay_s / log.step)
     if actuator.status != "changed" or not 0 <= steps <= late:

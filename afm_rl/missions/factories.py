@@ -64,11 +64,7 @@ class Part(NamedTuple):
 
 
 def as_part(group: str, found: Any, kind: type) -> Part:
-    """Return what a maker gave as a part: a bare module needs no training.
-
-    Raises:
-        ConfigurationError: if it is neither.
-    """
+    """Return what a maker gave as a part: a bare module needs no training."""
     if isinstance(found, Part):
         return found
     return Part(check_instance(f"{group}: its maker", found, kind))
@@ -82,24 +78,14 @@ def physics(robot: Robot) -> DynamicsModel:
 
 
 def oracle(robot: Robot, base: Callable[[Robot], Part | DynamicsModel]) -> Part:
-    """Return another model seen through the true regime.
-
-    Args:
-        robot: whose regime it is.
-        base: makes the model.
-    """
+    """Return another model, which ``base`` makes, seen through the true regime."""
     part = as_part("dynamics.base", base(robot), DynamicsModel)
     settings = {"model": "oracle", **(part.settings or {})}
     return part._replace(module=Oracle(part.module, robot.regime), settings=settings)
 
 
 def calibrated(robot: Robot, base: Callable[[Robot], Part | DynamicsModel]) -> Part:
-    """Return another model, frozen, with a calibration per mission.
-
-    Args:
-        robot: whose action box gives the unit.
-        base: makes the model.
-    """
+    """Return another model, which ``base`` makes, frozen, with a calibration per mission."""
     part = as_part("dynamics.base", base(robot), DynamicsModel)
     low, high = robot.usual_box
     return part._replace(module=Calibrated(part.module, (high - low) / 2))
@@ -133,16 +119,10 @@ def knode(
     randomised: bool = False,
     **settings: Any,
 ) -> Part:
-    """Return the nominal physics plus networks, the first of them to be pre-trained if told.
+    """Return a quadrotor's physics plus networks; ``pretrain`` says how the first one is trained.
 
-    Args:
-        robot: a quadrotor.
-        pretrain: settings of the pre-training; None for no network yet.
-        randomised: pre-train on flights under regimes of the prior, not under the nominal one.
-        settings: further arguments of :class:`~afm_rl.dynamics.KNODE`.
-
-    Raises:
-        ConfigurationError: for another robot, whose rate of change is not known.
+    If ``randomised``, on flights under regimes of the prior, not under the nominal one; further
+    ``settings`` are those of :class:`~afm_rl.dynamics.KNODE`.
     """
     nominal = robot.model
     if not isinstance(nominal, Quadrotor):
@@ -169,11 +149,7 @@ def knode(
 
 
 def reward(robot: Robot) -> KnownReward:
-    """Return the cost that is the negative reward of the robot's task.
-
-    Args:
-        robot: one with a reward.
-    """
+    """Return the cost that is the negative reward of the robot's task."""
     if robot.reward is None:
         raise ConfigurationError(
             f"cost=reward: robot={robot.name} has no reward; choose cost=goal_position, or a "
@@ -210,11 +186,7 @@ def paper_flow(
     checkpoint: str | None = None,
     **settings: Any,
 ) -> Part:
-    """Return the published flow, to be trained over the dynamics model.
-
-    Raises:
-        ConfigurationError: if states turn: the flow reads errors as differences of numbers.
-    """
+    """Return the published flow, to be trained over a model whose states are plain numbers."""
     model = dynamics.module
     if model.manifold.tangent_size != model.state_size:
         raise ConfigurationError(

@@ -7,15 +7,44 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.missions.collection import Collection
-from afm_rl.missions.laps import LapScore
-from afm_rl.missions.score import Score
+from afm_rl.errors import ConfigurationError, check_count, check_counts, check_number
+from afm_rl.missions.scores import LapScore, Score
+from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.regimes import Regime, Schedule
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collection:
+    """How transitions are collected, with nominal dynamics if not told otherwise.
+
+    Args:
+        planner: makes a planner from a :class:`~afm_rl.planning.PlanningEnv`.
+        rounds: transitions of each round: random actions first, then those of the planner, in the
+            model that was learned from all rounds before.
+        cost: to plan with, or what makes it from the robot; the robot's reward if None.
+        fit: settings of :func:`~afm_rl.learning.fit_ensemble`.
+        regimes: one for each episode of a round, by turns, from its first step on: domain
+            randomisation. Parameters that are not named are nominal.
+        seed: of the episodes.
+    """
+
+    planner: Callable[[PlanningEnv], TensorDictModuleBase]
+    rounds: Sequence[int] = (2000, 1000)
+    cost: Cost | Callable[[Any], Cost] | None = None
+    fit: Mapping[str, Any] = field(default_factory=dict)
+    regimes: Sequence[Mapping[str, float]] = ()
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check counts."""
+        check_counts("robot.data.rounds", self.rounds, least=1)
+        check_count("robot.data.seed", self.seed, low=0)
+
 
 SHAPE_TRAINING = (
     *("action_low", "action_high", "state_low", "state_high"),
@@ -48,7 +77,7 @@ class Robot:
         tracks: names of all tracks, or of whatever else missions differ in.
         paper_regimes: the regimes of the published study.
         families: regimes of which every seed gets a draw of its own, by name; see
-            :class:`~afm_rl.missions.families.Family`.
+            :class:`~afm_rl.missions.selection.Family`.
         score: the metrics of missions; targets reached if None.
         usual_low: lowest corner of the box that actions mostly keep to, the unit of calibrations
             and the box in which residual networks are trained; the action box if None.
@@ -98,12 +127,7 @@ class Robot:
     data: Collection | None = None
 
     def __post_init__(self) -> None:
-        """Check that boxes, names and features fit the model.
-
-        Raises:
-            ConfigurationError: if a box has the wrong size or is turned inside out, a
-                coordinate lacks its name, or a feature is no coordinate.
-        """
+        """Check that boxes, names and features fit the model."""
         for kind, size in (("action", self.model.action_size), ("state", self.model.state_size)):
             self._check_box(kind, size)
             names = list(getattr(self, f"{kind}_names"))

@@ -16,9 +16,7 @@ from torchrl.envs.utils import step_mdp
 
 from afm_rl.errors import AFMError, NonFiniteError
 from afm_rl.missions.build import Agent
-from afm_rl.missions.log import StepLog
-from afm_rl.missions.state import Loop, leave, owner, restore, snapshot
-from afm_rl.missions.unsaved import unsaved
+from afm_rl.missions.state import Loop, StepLog, leave, owner, restore, snapshot, unsaved
 from afm_rl.progress import Bar
 from afm_rl.storage.artefacts import Checkpoints
 from afm_rl.storage.measures import Measures

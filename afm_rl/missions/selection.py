@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
@@ -10,9 +12,137 @@ import torch
 from tensordict import TensorDictBase
 
 from afm_rl.errors import ConfigurationError, check_choice, check_count
-from afm_rl.missions.families import Family, Listed, find_family
 from afm_rl.missions.robot import Robot
-from afm_rl.regimes import Schedule
+from afm_rl.regimes import Compose, Schedule
+
+KEYS = ("draw", "set", "ramp", "changes")
+
+
+@dataclass(frozen=True)
+class Listed:
+    """Regimes that are listed: a mission's seed says which one it meets; of one, every mission.
+
+    Args:
+        name: what they are called in configurations and tables.
+        given: arguments of ``env.mission``: ``regime``, and ``at`` and ``ramp`` if there are any.
+
+    >>> Listed("heavy", [{"regime": {"mass": 1.5}}, {"regime": {"mass": 2.0}}]).mission(seed=3)
+    {'regime': {'mass': 2.0}}
+    """
+
+    name: str
+    given: Sequence[Mapping[str, Any]]
+
+    def mission(self, seed: int) -> dict[str, Any]:
+        """Return the arguments of ``env.mission``."""
+        return dict(self.given[seed % len(self.given)])
+
+
+@dataclass(frozen=True)
+class Family:
+    """A family of regimes.
+
+    What a mission meets is drawn from the family's name and the mission's seed alone: it is the
+    same on every track, and for every method.
+
+    Args:
+        name: what it is called in configurations and tables.
+        regime: the robot's regime, whose families are drawn.
+        draw: lists of their names; each draw picks one list and draws all in it.
+        fixed: parameters that are set after the draw.
+        ramp: steps over which each change comes about; 0 for sudden changes.
+        changes: number of changes, each to a new draw, at random progress. 0: one change, on the
+            robot's schedule.
+        between: progress between which these are drawn.
+
+    Raises:
+        ConfigurationError: for names and numbers that cannot be used.
+
+    >>> from afm_rl.regimes import ActionGain
+    >>> regime = Compose({"gain": ActionGain(["v_gain", "omega_gain"])})
+    >>> turned = Family("turned", regime, [["gain"]], {"v_gain": -1.0})
+    >>> turned.mission(seed=3)["regime"]["v_gain"]
+    -1.0
+    """
+
+    name: str
+    regime: Compose
+    draw: Sequence[Sequence[str]] = ((),)
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    ramp: int = 0
+    changes: int = 0
+    between: tuple[float, float] = (0.1, 0.9)
+
+    def __post_init__(self) -> None:
+        """Check names and numbers."""
+        where, regime, rows = f"robot.families.{self.name}", self.regime, self.draw
+        if not isinstance(regime, Compose):
+            raise ConfigurationError(
+                f"{where}: expected robot.regime to be a Compose, to draw from"
+            )
+        if not isinstance(rows, list | tuple) or not all(
+            isinstance(row, list | tuple) for row in rows
+        ):
+            raise ConfigurationError(
+                f"{where}.draw={rows!r}: expected names among {', '.join(regime.regimes)}, or "
+                "lists of these to pick from"
+            )
+        for family in (family for row in rows for family in row):
+            check_choice(f"{where}.draw", family, regime.regimes)
+        if not isinstance(self.fixed, Mapping):
+            raise ConfigurationError(
+                f"{where}.set={self.fixed!r}: expected a mapping of {', '.join(regime.names)}"
+            )
+        regime.encode(self.fixed)
+        check_count(f"{where}.changes", self.changes, low=0)
+        check_count(f"{where}.ramp", self.ramp, low=0)
+
+    def mission(self, seed: int) -> dict[str, Any]:
+        """Return the arguments of ``env.mission``: ``regime``, ``at`` and ``ramp``."""
+        generator = torch.Generator().manual_seed(_stable(self.name, seed))
+        if not self.changes:
+            return {"regime": self._values(generator), "ramp": self.ramp}
+        low, high = self.between
+        at = low + (high - low) * torch.rand(self.changes, generator=generator)
+        phases = [{}, *(self._values(generator) for _ in range(self.changes))]
+        return {"regime": phases, "at": at.sort().values.tolist(), "ramp": self.ramp}
+
+    def _values(self, generator: torch.Generator) -> dict[str, float]:
+        """Return a draw of all parameters, by name."""
+        names = self.draw[int(torch.randint(len(self.draw), (), generator=generator))]
+        row = self.regime.draw(names, (), generator)
+        return {**dict(zip(self.regime.names, row.tolist(), strict=True)), **self.fixed}
+
+
+def find_family(name: str, robot: Robot) -> Family | Listed:
+    """Return a family of the robot's configuration."""
+    given: Any = robot.families[check_choice("regimes", name, robot.families)]
+    where = f"robot.families.{name}"
+    if isinstance(given, Mapping) and "list" in given:
+        return Listed(name, [{"regime": regime} for regime in given["list"]])
+    if not isinstance(given, Mapping):
+        raise ConfigurationError(f"{where}={given!r}: expected a mapping of {', '.join(KEYS)}")
+    for key in given:
+        check_choice(f"{where}: setting", key, KEYS)
+    rows = given.get("draw", [])
+    if isinstance(rows, list) and all(isinstance(entry, str) for entry in rows):
+        rows = [rows]
+    regime: Any = robot.regime
+    numbers = {key: given[key] for key in ("ramp", "changes") if key in given}
+    family = Family(name, regime, rows, given.get("set", {}), **numbers)
+    if family.changes and robot.schedule.by != "progress":
+        raise ConfigurationError(
+            f"{where}.changes={family.changes}: breakpoints are drawn in the progress; choose "
+            "robot.schedule.by=progress"
+        )
+    return family
+
+
+def _stable(name: str, seed: int) -> int:
+    """Return a seed for (name, seed) that is the same in every process."""
+    digest = hashlib.sha256(f"{name} {seed}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1  # a generator takes 63 bits
+
 
 Entry = Family | Listed
 PLAN = ("phases", "at", "ramp")

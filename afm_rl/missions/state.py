@@ -1,24 +1,162 @@
-"""The whole state of missions under way: written down, and taken up again."""
+"""The whole state of missions under way: written down, taken up again, and watched for the rest."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+import pandas as pd
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
+from torchrl.envs import EnvBase
 
 from afm_rl._version import __version__
+from afm_rl.compiling.devices import CastCache
+from afm_rl.errors import ConfigurationError
+from afm_rl.mission_state import MissionState
 from afm_rl.missions.build import Agent
-from afm_rl.missions.log import StepLog
-from afm_rl.missions.unsaved import PLAIN, TORCH, check_saved, has_extra_state, whole
+from afm_rl.regimes import Regime
 from afm_rl.storage.artefacts import digest_of
 from afm_rl.storage.manifest import influential
 from afm_rl.streams import Streams
+
+
+class StepLog:
+    """One row per mission and step, kept in memory until a table is asked for.
+
+    Args:
+        columns: names of the values.
+        whole: the columns that hold whole numbers.
+        room: rows that there is room for at first.
+
+    >>> log = StepLog(["x", "reached"], whole=["reached"])
+    >>> log.add(torch.tensor([4, 7]), 0, torch.tensor([[0.5, 1.0], [0.6, 2.0]]))
+    >>> log.table().values.tolist()
+    [[4.0, 0.0, 0.5, 1.0], [7.0, 0.0, 0.6000000238418579, 2.0]]
+    """
+
+    def __init__(self, columns: Sequence[str], whole: Sequence[str] = (), room: int = 4096) -> None:
+        self.columns = list(columns)
+        self.whole = list(whole)
+        self._count = 0
+        self._values = torch.empty(room, len(self.columns))
+        self._keys = torch.empty(room, 2, dtype=torch.int64)  # mission, step
+
+    def __len__(self) -> int:
+        return self._count
+
+    def add(self, missions: Tensor, step: int, values: Tensor) -> None:
+        """Add one step of the missions ``(B,)``: ``(B, C)``."""
+        rows = slice(self._count, self._count + len(missions))
+        while rows.stop > len(self._keys):
+            # One block that doubles: thousands of small tensors would pin the heap in pieces
+            # between the large temporaries of a learning model, and memory would grow.
+            self._values = torch.cat([self._values, torch.empty_like(self._values)])
+            self._keys = torch.cat([self._keys, torch.empty_like(self._keys)])
+        self._values[rows] = values.detach().to(self._values)
+        self._keys[rows, 0] = missions.to(self._keys)
+        self._keys[rows, 1] = step
+        self._count = rows.stop
+
+    def table(self) -> pd.DataFrame:
+        """Return everything, ordered by mission and step."""
+        missions, steps = self._keys[: self._count].unbind(-1)
+        order = torch.argsort(missions * (self._keys[: self._count, 1].max() + 1) + steps)
+        frame = pd.DataFrame(self._values[: self._count][order].numpy(), columns=self.columns)
+        frame.insert(0, "t", steps[order].int().numpy())
+        frame.insert(0, "mission", missions[order].int().numpy())
+        return frame.astype({name: "int32" for name in self.whole})
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return all rows so far."""
+        return {"values": self._values[: self._count], "keys": self._keys[: self._count]}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        self._count = len(state["keys"])
+        spare = max(self._count, len(self._keys))
+        self._values, self._keys = (
+            torch.cat([rows, rows.new_empty(spare, rows.shape[-1])])
+            for rows in (state["values"], state["keys"])
+        )
+
+
+PLAIN = (bool, int, float, str, type(None))
+LIBRARIES = ("torch", "torchrl", "tensordict")  # their modules fill caches of their own
+TORCH = frozenset(vars(nn.Module()))  # attributes that every module has
+
+
+def check_saved(agent: Agent, before: Mapping[str, Any]) -> None:
+    """Refuse what changes and is neither saved in checkpoints nor cut with the missions.
+
+    ``before`` is what :func:`unsaved` found at their start.
+    """
+    now = unsaved(agent)
+    changed = sorted(name for name in now if now[name] != before.get(name, now[name]))
+    changed += sorted(now.keys() - before.keys() if before else ())
+    if changed:
+        raise ConfigurationError(
+            f"{changed[0]} changes during missions, but is neither saved in checkpoints nor cut "
+            "when missions finish; keep what belongs to single missions in an "
+            "afm_rl.mission_state.MissionState, and give the rest out by get_extra_state"
+        )
+
+
+def unsaved(agent: Agent) -> dict[str, Any]:
+    """Return a description of what :func:`snapshot` does not save or no one cuts, by name.
+
+    These are attributes that are not plain, and buffers outside the model that belong to no
+    :class:`~afm_rl.mission_state.MissionState`. Environments keep their state in the tensordict.
+    """
+    found = {}
+    for name, module in whole(agent).named_modules():
+        if isinstance(module, MissionState | EnvBase) or has_extra_state(module):
+            continue
+        if type(module).__module__.partition(".")[0] in LIBRARIES:
+            continue
+        for leaf, value in vars(module).items():
+            if leaf not in TORCH and not isinstance(value, PLAIN):
+                found[f"{name}.{leaf}"] = _described(value)
+        if not name.startswith("model"):
+            for leaf, buffer in module.named_buffers(recurse=False):
+                found[f"{name}.{leaf}"] = _described(buffer)
+    return found
+
+
+def _described(value: Any, above: tuple[int, ...] = ()) -> Any:
+    """Return what can be compared with the same a while later."""
+    if isinstance(value, PLAIN):
+        return value
+    if isinstance(value, Tensor):
+        return digest_of({"": value.detach().contiguous()})
+    kinds = nn.Module | torch.Generator | Streams | Optimizer | Regime | CastCache
+    if isinstance(value, kinds) or callable(value):
+        return None  # saved by themselves, or without a state that matters
+    if id(value) in above:
+        return None
+    above = (*above, id(value))
+    if isinstance(value, Mapping):
+        return [(repr(key), _described(part, above)) for key, part in value.items()]
+    if isinstance(value, list | tuple | deque):
+        return [_described(part, above) for part in value]
+    if hasattr(value, "__dict__"):
+        return _described(vars(value), above)
+    return repr(value)
+
+
+def whole(agent: Agent) -> nn.ModuleDict:
+    """Return all modules of an agent as one; a module that is shared has one name."""
+    parts = {"model": agent.model, "env": agent.env}
+    return nn.ModuleDict({**parts, "planner": agent.planner, "updater": agent.updater})
+
+
+def has_extra_state(module: nn.Module) -> bool:
+    """Return whether a module gives out a state of its own kind."""
+    return type(module).get_extra_state is not nn.Module.get_extra_state
 
 
 @dataclass
@@ -45,10 +183,6 @@ def snapshot(agent: Agent, loop: Loop) -> dict[str, Any]:
     That is the loop itself, the global generator, and of each module of the agent: all tensors
     (also those that are not persistent), plain numbers and texts, and whatever has a state of its
     own (generators, :class:`Streams`, optimisers, an extra state as defined by ``nn.Module``).
-
-    Raises:
-        ConfigurationError: if something else has changed since the start, see
-            :func:`check_saved`.
     """
     check_saved(agent, loop.unsaved)
     return {
@@ -63,13 +197,7 @@ def snapshot(agent: Agent, loop: Loop) -> dict[str, Any]:
 
 
 def restore(agent: Agent, loop: Loop, state: dict[str, Any]) -> None:
-    """Put ``agent`` and ``loop`` where a :func:`snapshot` was taken.
-
-    Args:
-        agent: like the one of the snapshot, at the start of its missions.
-        loop: at their start.
-        state: the snapshot; what it holds is taken over, not copied.
-    """
+    """Put an agent and its loop, both at their start, where a :func:`snapshot` was taken."""
     for name, _, write in _holders(agent):
         write(state["agent"][name])
     torch.random.set_rng_state(state["global"])
@@ -110,11 +238,7 @@ def _set(device: torch.device, owner: Any, name: str, value: Any) -> None:
 
 
 def leave(agent: Agent, loop: Loop, keep: Tensor) -> None:
-    """Go on with the missions in ``keep`` only: the others are finished.
-
-    Raises:
-        ConfigurationError: if something per mission cannot be cut, see :func:`check_saved`.
-    """
+    """Go on with the missions in ``keep`` only: the others are finished."""
     loop.ids, loop.td = loop.ids[keep], loop.td[keep]
     agent.model.select_(keep)
     agent.updater.follow()

@@ -9,9 +9,8 @@ from typing import Any
 
 from afm_rl.dynamics import DynamicsModel, MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.missions.collection import Collection
-from afm_rl.missions.return_score import ReturnScore
-from afm_rl.missions.robot import Robot
+from afm_rl.missions.robot import Collection, Robot
+from afm_rl.missions.scores import ReturnScore
 from afm_rl.regimes import Compose, Physics, Regime, Schedule, actuator_regimes
 from afm_rl.targets import CODE, find_code
 

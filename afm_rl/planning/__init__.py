@@ -1,16 +1,20 @@
 """Planners, and the world in which they imagine."""
 
-from afm_rl.planning.costs import Cost, GoalDistance, KnownReward
+from afm_rl.planning.costs import Cost, GoalDistance, KnownReward, QuadraticCost, TrackingCost
 from afm_rl.planning.handover import Handover
 from afm_rl.planning.icem import ICEM
 from afm_rl.planning.imported_policy import policy_from_cleanrl, policy_from_sb3
-from afm_rl.planning.law import LawPlanner
 from afm_rl.planning.mpc import MPC
 from afm_rl.planning.mppi import MPPI
 from afm_rl.planning.planning_env import PlanningEnv
+from afm_rl.planning.policies import (
+    LawPlanner,
+    PolicyPlanner,
+    StoredPolicy,
+    load_policy,
+    save_policy,
+)
 from afm_rl.planning.shooting import CEM, TorchRLMPPI
-from afm_rl.planning.stored_policy import PolicyPlanner, StoredPolicy, load_policy, save_policy
-from afm_rl.planning.tracking import QuadraticCost, TrackingCost
 
 __all__ = [
     "CEM",

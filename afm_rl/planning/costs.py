@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,6 +14,7 @@ from torch import Tensor, nn
 
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.spaces.keys import as_keys
+from afm_rl.spaces.manifold import wrap_angle
 
 
 class Cost(nn.Module, ABC):
@@ -94,9 +96,6 @@ class GoalDistance(Cost):
 def check_arguments(name: str, function: Callable[..., Any], count: int) -> None:
     """Check that a function takes ``count`` arguments, as far as it says so.
 
-    Raises:
-        ConfigurationError: otherwise.
-
     >>> check_arguments("cost.reward", lambda state, action, next_state: 0.0, 3)
     """
     try:
@@ -143,3 +142,133 @@ class KnownReward(Cost):
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, *task: Tensor) -> Tensor:
         """Return the negative reward ``(*B)``."""
         return -self.reward(state, action, next_state, *task)
+
+
+class QuadraticCost(Cost):
+    """A cost that also says how it grows around a trajectory, for :class:`~.mpc.MPC`."""
+
+    @abstractmethod
+    def quadratic(
+        self, states: Tensor, actions: Tensor, *task: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Expand the cost of a trajectory to second order, Hessians positive semi-definite.
+
+        Args:
+            states: ``(*B, N + 1, S)``.
+            actions: ``(*B, N, A)``.
+            task: the entries of ``in_keys``, each ``(*B, N + 1, size)``, or ``(*B, 1, size)``
+                where they hold for all stages.
+
+        Returns:
+            Hessian ``(*B, N + 1, S, S)`` and gradient ``(*B, N + 1, S)`` in the states, and
+            ``(*B, N, A, A)`` and ``(*B, N, A)`` in the actions.
+        """
+
+
+class TrackingCost(QuadraticCost):
+    r"""Weighted squared distance to a reference, and squared control.
+
+    .. math:: \sum_i w_i\,(x_i - \bar x_i)^2 + \sum_j \rho_j\,u_j^2
+
+    The reference gives :math:`\bar x` for some coordinates, constants for the others.
+    :class:`~.mpc.MPC` takes one reference per stage, or one held over the horizon.
+    As the cost of a step, for planners that sample, it looks at the state that the step
+    leads to, and knows held references only: the planning environment counts no stages.
+
+    Args:
+        weights: w, one per state coordinate, in cost per squared unit.
+        action_weights: :math:`\rho`, one per action component.
+        coordinates: indices of the coordinates that the reference gives, in its order.
+        rest: targets of the other coordinates, one per state coordinate; zeros if None.
+        angles: indices of the coordinates in rad, whose difference wraps.
+        in_keys: the reference's key; none without a reference.
+
+    Raises:
+        ConfigurationError: for settings that do not fit together.
+
+    >>> cost = TrackingCost([1.0, 0.5], [2.0], coordinates=[0])  # a cart: position, speed
+    >>> here = torch.tensor([3.0, 2.0])
+    >>> cost(here, torch.ones(1), here, torch.tensor([1.0]))
+    tensor(8.)
+    """
+
+    weights: Tensor
+    action_weights: Tensor
+    rest: Tensor
+    select: Tensor
+
+    def __init__(
+        self,
+        weights: Sequence[float],
+        action_weights: Sequence[float],
+        coordinates: Sequence[int],
+        rest: Sequence[float] | None = None,
+        angles: Sequence[int] = (),
+        in_keys: Sequence[NestedKey] = ("reference",),
+    ) -> None:
+        super().__init__()
+        size, self.in_keys = len(weights), as_keys(in_keys)
+        if len(self.in_keys) != bool(coordinates):
+            raise ConfigurationError(
+                f"cost.in_keys={self.in_keys}: expected one key, or none without coordinates"
+            )
+        for name, indices in (("coordinates", coordinates), ("angles", angles)):
+            fits = all(isinstance(i, int) and 0 <= i < size for i in indices)
+            if not fits or len(set(indices)) < len(indices):
+                raise ConfigurationError(
+                    f"cost.{name}={list(indices)}: expected distinct indices in 0..{size - 1}"
+                )
+        rest = [0.0] * size if rest is None else list(rest)
+        if len(rest) != size:
+            raise ConfigurationError(f"cost.rest={rest}: expected {size} numbers")
+        self.in_sizes, self.angles = [len(coordinates)] * len(self.in_keys), list(angles)
+        select = torch.zeros(len(coordinates), size).double()
+        for row, coordinate in enumerate(coordinates):
+            select[row, coordinate] = 1.0
+        for name, values, low in (
+            ("weights", weights, 0.0),
+            ("action_weights", action_weights, 0.0),
+            ("rest", rest, -math.inf),
+        ):
+            checked = [check_number(f"cost.{name}", x, low=low) for x in values]
+            self.register_buffer(name, torch.tensor(checked, dtype=torch.float64), persistent=False)
+        self.rest *= 1.0 - select.sum(0)
+        self.register_buffer("select", select, persistent=False)
+
+    def forward(self, state: Tensor, action: Tensor, next_state: Tensor, *task: Tensor) -> Tensor:
+        """Return the cost ``(*B)`` of an action and of the state that it leads to."""
+        self._check_sizes(next_state, action)
+        off = self._gap(next_state, *task).square() @ self.weights.to(next_state)
+        return off + action.square() @ self.action_weights.to(action)
+
+    def quadratic(
+        self, states: Tensor, actions: Tensor, *task: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the expansion, which is exact."""
+        self._check_sizes(states, actions)
+        state_twice = 2.0 * self.weights.to(states)
+        action_twice = 2.0 * self.action_weights.to(actions)
+        return (
+            state_twice.diag().expand(*states.shape, -1),
+            state_twice * self._gap(states, *task),
+            action_twice.diag().expand(*actions.shape, -1),
+            action_twice * actions,
+        )
+
+    def _check_sizes(self, states: Tensor, actions: Tensor) -> None:
+        sizes = states.shape[-1], actions.shape[-1]
+        if sizes != (len(self.weights), len(self.action_weights)):
+            raise ConfigurationError(
+                f"cost: weights for {len(self.weights)} state coordinates and "
+                f"{len(self.action_weights)} action components, but there are "
+                f"{sizes[0]} and {sizes[1]}"
+            )
+
+    def _gap(self, state: Tensor, *reference: Tensor) -> Tensor:
+        """Return by how much states ``(*B, S)`` miss the targets."""
+        gap = state - self.rest.to(state)
+        for given in reference:
+            gap = gap - given.to(state) @ self.select.to(state)
+        if self.angles:
+            gap[..., self.angles] = wrap_angle(gap[..., self.angles])
+        return gap

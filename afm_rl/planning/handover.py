@@ -10,10 +10,10 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_instance, check_number
+from afm_rl.planning.costs import QuadraticCost
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.planning.riccati import stationary_value
-from afm_rl.planning.tracking import QuadraticCost
 
 
 class Handover(RecedingHorizonPlanner):

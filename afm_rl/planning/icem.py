@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -10,8 +12,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.errors import ConfigurationError, check_count, check_number
-from afm_rl.planning.receding import action_spec_of
-from afm_rl.planning.sampling_planner import SamplingPlanner
+from afm_rl.planning.receding import SamplingPlanner, action_spec_of
 from afm_rl.spaces.keys import as_key
 
 WITHOUT_NOISE = (
@@ -23,13 +24,10 @@ WITHOUT_NOISE = (
 
 
 def coloured(noise: Tensor, beta: float) -> Tensor:
-    r"""Colour white noise in time: power spectrum :math:`\propto f^{-\beta}`, variance 1.
+    r"""Colour white noise ``(*B, H, A)`` in time: spectrum :math:`\propto f^{-\beta}`, variance 1.
 
-    The lowest frequency, 1/H, stands in for frequency 0.
-
-    Args:
-        noise: standard normal numbers, ``(*B, H, A)``.
-        beta: 0 leaves the noise white, 1 is pink, 2 red; large ones are all but constant.
+    0 leaves it white, 1 is pink, 2 red; large ones are all but constant. The lowest frequency, 1/H,
+    stands in for frequency 0.
 
     >>> white = torch.randn(1000, 5, 2)
     >>> torch.allclose(coloured(white, 0.0), white, atol=1e-5)
@@ -78,13 +76,10 @@ class ICEM(SamplingPlanner):
         momentum: :math:`\alpha` in [0, 1]: weight of the old mean and standard deviation.
         hold: steps that each action of a plan lasts. A new plan is made every ``hold`` steps, and
             looks ``H * hold`` steps ahead.
-        backend: see :class:`MPPI`, also for the arguments that follow.
         memory_key: where ``mean`` ``(*B, H, A)`` and ``elites`` ``(*B, k, H, A)`` are kept; with
             ``hold`` above 1 also ``held`` ``(*B, A + 1)``, an action and how long it lasts.
-        seed_key: entry ``(*B)`` with each mission's seed.
-        box_key: entry with the lowest and highest action to plan with.
-        action_key: where the action goes.
-        seed: seed of the noise without ``seed_key``.
+        settings: further arguments of :class:`~afm_rl.planning.receding.SamplingPlanner`:
+            ``backend``, ``seed_key``, ``box_key``, ``action_key`` and ``seed``.
 
     >>> from tensordict import TensorDict
     >>> from torchrl.envs import TransformedEnv
@@ -110,12 +105,8 @@ class ICEM(SamplingPlanner):
         beta: float = 1.0,
         momentum: float = 0.1,
         hold: int = 1,
-        backend: str | None = None,
         memory_key: NestedKey = "icem",
-        seed_key: NestedKey | None = None,
-        box_key: NestedKey | None = None,
-        action_key: NestedKey = "action",
-        seed: int = 0,
+        **settings: Any,
     ) -> None:
         check_count("planner.elites", elites)
         check_number("planner.keep", keep, low=0.0, high=1.0, open_low=True)
@@ -127,19 +118,7 @@ class ICEM(SamplingPlanner):
         memory = {(*root, "mean"): plan, (*root, "elites"): (kept, *plan)}
         if check_count("planner.hold", hold) > 1:
             memory[(*root, "held")] = (size + 1,)
-        super().__init__(
-            env,
-            memory,
-            horizon,
-            population,
-            iterations,
-            backend=backend,
-            seed_key=seed_key,
-            box_key=box_key,
-            action_key=action_key,
-            seed=seed,
-            hold=hold,
-        )
+        super().__init__(env, memory, horizon, population, iterations, hold=hold, **settings)
         if population < 2 * elites:
             raise ConfigurationError(
                 f"planner.elites={elites}: expected at most half of planner.population={population}"

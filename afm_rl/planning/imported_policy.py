@@ -17,7 +17,7 @@ from gymnasium.spaces import Box
 from torch import Tensor
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.planning.stored_policy import StoredPolicy
+from afm_rl.planning.policies import StoredPolicy
 
 # How the weights of an actor are called, hidden layers and last one; its usual activation; and
 # whether a tanh ends it.
@@ -98,10 +98,6 @@ def read_normaliser(file: str | Path) -> tuple[Tensor, float]:
 
     The file is a pickle. It is not unpickled: its stream of operations is read for the numbers that
     follow these names, which can do no harm.
-
-    Raises:
-        ConfigurationError: if there is no such file.
-        ArtefactError: if there are no such numbers in it.
     """
     content, wanted, word, began = _existing(file).read_bytes(), "", None, False
     found: dict[str, Any] = {}

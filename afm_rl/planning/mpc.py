@@ -11,10 +11,10 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.planning.costs import QuadraticCost
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.planning.riccati import LQProblem, solve_lq
-from afm_rl.planning.tracking import QuadraticCost
 from afm_rl.spaces.keys import as_key
 from afm_rl.spaces.manifold import Manifold, wrap_angle
 
@@ -27,19 +27,11 @@ def linear_quadratic(
     low: Tensor,
     high: Tensor,
 ) -> LQProblem:
-    r"""Return the problem of the best small change of a trajectory (multiple shooting).
+    """Return the problem of the best small change of a trajectory (multiple shooting).
 
-    Around states x and actions u the dynamics are
+    Around states x ``(*B, N + 1, S)`` and actions u ``(*B, N, A)`` the dynamics are
     :math:`dx_{k+1} = A_k dx_k + B_k du_k + f(x_k, u_k) - x_{k+1}`, as the trajectory need not
     follow them; the cost is expanded to second order. :math:`dx_0 = 0`.
-
-    Args:
-        world: dynamics and quadratic cost.
-        states: x, ``(*B, N + 1, S)``.
-        actions: u, ``(*B, N, A)``.
-        task: the cost's task entries, see :meth:`QuadraticCost.quadratic`.
-        low: lowest action, ``(A,)``.
-        high: highest action, ``(A,)``.
     """
     ahead, by_state, by_action = world.dynamics.linearise(states[..., :-1, :], actions)
     gap = _raw_difference(world.dynamics.manifold, ahead, states[..., 1:, :])
@@ -203,11 +195,7 @@ class MPC(RecedingHorizonPlanner):
         return [states + found.states, actions], found.exact
 
     def _task(self, batch: torch.Size, entries: Sequence[Tensor]) -> list[Tensor]:
-        """Return the cost's entries, each ``(*B, N + 1, size)`` or ``(*B, 1, size)``.
-
-        Raises:
-            ConfigurationError: for an entry of another shape.
-        """
+        """Return the cost's entries, ``(*B, N + 1, size)`` or ``(*B, 1, size)``; refuse others."""
         cost, task = self.env.cost, []
         for key, size, entry in zip(cost.in_keys, cost.in_sizes, entries, strict=True):
             held, staged = (*batch, size), (*batch, self.horizon + 1, size)

@@ -13,22 +13,14 @@ from torchrl.envs import EnvBase
 from afm_rl.compiling.machine_code import MachineCode
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.errors import check_choice, check_flag, check_number
-from afm_rl.planning.receding import action_spec_of
-from afm_rl.planning.sampling_planner import SamplingPlanner
+from afm_rl.planning.receding import SamplingPlanner, action_spec_of
 from afm_rl.spaces.keys import as_key
 
 
 def smooth(plan: Tensor, past: Tensor, beta: float, low: Tensor, high: Tensor) -> Tensor:
-    r"""Filter plans in time, within the action box.
+    r"""Filter plans x ``(*B, H, A)`` in time, within the action box; ``beta`` 1 does not smooth.
 
     .. math:: u_h = \mathrm{clamp}(\beta\,x_h + (1 - \beta)\,u_{h-1}),\qquad u_{-1} = u_\text{past}
-
-    Args:
-        plan: raw actions x, ``(*B, H, A)``.
-        past: the action before the plan, broadcastable to ``(*B, A)``.
-        beta: weight of the new action in (0, 1]; 1 does not smooth.
-        low: lowest action, ``(A,)``.
-        high: highest action, ``(A,)``.
 
     >>> box = -torch.ones(1), torch.ones(1)
     >>> smooth(torch.tensor([[1.0], [1.0], [9.0]]), torch.zeros(1), 0.5, *box).squeeze(-1)
@@ -103,23 +95,13 @@ class MPPI(SamplingPlanner):
             as in the published runs, where sigma had no effect.
         past: the action that smoothing starts from: ``"previous"``, the one last planned,
             or ``"shifted"``, the first of the shifted mean, as in the published runs.
-        backend: ``"fast"`` uses ``env.returns``, ``"env"`` steps the environment, ``None``
-            takes the fast way where there is one. Both give the same plans.
         mean_key: where the mean plan is kept.
-        seed_key: entry ``(*B)`` with each mission's seed: missions of one seed share their
-            noise whoever else is in the batch. Without it noise is drawn for the batch.
-        box_key: entry ``(*B, 2, A)`` with the lowest and highest action to plan with, such as the
-            ``effect_bounds`` of :class:`~afm_rl.transforms.ActionFlowTransform`; the action's own
-            bounds, with a warning, where there is none.
-        action_key: where the action goes.
-        seed: seed of the noise without ``seed_key``.
         compile: roll out and weigh as machine code, if the model is made of equations and stays
             as it is. It is compiled once and kept in the cache. Where there is no compiler, the
             planner works as without, with a warning.
         cache: folder of compiled functions.
-
-    Returns that are not finite are ignored and counted in :attr:`discarded`; where all are,
-    the shifted plan stands and a warning is given.
+        settings: further arguments of :class:`~afm_rl.planning.receding.SamplingPlanner`:
+            ``backend``, ``seed_key``, ``box_key``, ``action_key`` and ``seed``.
 
     >>> from tensordict import TensorDict
     >>> from afm_rl.dynamics import Dubins
@@ -143,27 +125,13 @@ class MPPI(SamplingPlanner):
         truncate: float = 2.0,
         noise: str = "scaled",
         past: str = "previous",
-        backend: str | None = None,
         mean_key: NestedKey = ("mppi", "mean"),
-        seed_key: NestedKey | None = None,
-        box_key: NestedKey | None = None,
-        action_key: NestedKey = "action",
-        seed: int = 0,
         compile: bool = False,
         cache: str | Path = "~/.cache/afm_rl",
+        **settings: Any,
     ) -> None:
-        super().__init__(
-            env,
-            {as_key(mean_key): (horizon, *action_spec_of(env).shape)},
-            horizon,
-            population,
-            iterations,
-            backend=backend,
-            seed_key=seed_key,
-            box_key=box_key,
-            action_key=action_key,
-            seed=seed,
-        )
+        memory = {as_key(mean_key): (horizon, *action_spec_of(env).shape)}
+        super().__init__(env, memory, horizon, population, iterations, **settings)
         self.temperature = check_number("planner.temperature", temperature, low=0, open_low=True)
         self.sigma = check_number("planner.sigma", sigma, low=0.0, high=100.0)
         self.beta = check_number("planner.beta", beta, low=0.0, high=1.0, open_low=True)

@@ -18,11 +18,7 @@ from afm_rl.spaces.keys import as_key
 
 
 def raise_missing(env: EnvBase, tensordict: TensorDictBase) -> None:
-    """Say which entry a planner looks for in vain.
-
-    Raises:
-        ConfigurationError: always, unless all entries of the planning environment are there.
-    """
+    """Say which entry a planner looks for in vain, if there is any."""
     for key in env.observation_spec.keys(True, True):
         if tensordict.get(key, None) is None:
             there = [name for name in tensordict.keys(True, True) if "next" not in name]
@@ -105,11 +101,7 @@ class PlanningEnv(ModelBasedEnvBase):
         self.reward_spec = Unbounded((1,), dtype=low.dtype, device=device)
 
     def _try(self, low: Tensor) -> None:
-        """Try step function and cost on a batch whose size is no other size.
-
-        Raises:
-            ConfigurationError: if one of them is not batched.
-        """
+        """Try step function and cost on a batch whose size is no other size: are they batched?"""
         model, low = self.dynamics, low.to(self.device)
         batch = max(model.state_size, model.action_size) + 2, 1
         state, action = low.new_zeros(*batch, model.state_size), low.expand(*batch, -1)

@@ -1,4 +1,4 @@
-"""Planners whose plan travels with the tensordict."""
+"""Planners whose plan travels with the tensordict, and those of them that try many candidates."""
 
 from __future__ import annotations
 
@@ -10,21 +10,42 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs import EnvBase
-from torchrl.modules.planners.common import MPCPlannerBase
+from torchrl.envs import EnvBase, TensorDictPrimer
+from torchrl.modules.planners.common import (
+    MPCPlannerBase,
+    _mask_post_done_reward,
+    _planning_done_keys,
+)
 
 from afm_rl.compiling.devices import moved
-from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.planning.primer import ZeroPrimer
+from afm_rl.compiling.tracing import may_look
+from afm_rl.errors import ConfigurationError, check_choice, check_count, check_instance
 from afm_rl.spaces.keys import as_key
+from afm_rl.streams import Streams
+
+
+class ZeroPrimer(TensorDictPrimer):
+    """A primer of zeros that fills the batch of the reset, not that of the environment."""
+
+    def __init__(self, spec: Composite) -> None:
+        super().__init__(spec, default_value=0.0, expand_specs=True)
+        self.bare = spec.clone()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Put the entries into a tensordict of any batch shape, where there is no environment."""
+        return self._reset_func(tensordict, tensordict)
+
+    def _reset_func(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        batch = tensordict_reset.batch_size  # the environment merges partial resets itself
+        for key, leaf in self.bare.items(True, True):
+            tensordict_reset.set(key, leaf.zero(batch).to(tensordict_reset.device))
+        return tensordict_reset
 
 
 def action_spec_of(env: EnvBase) -> TensorSpec:
-    """Return the spec of an environment's action, whatever its key.
-
-    Raises:
-        ConfigurationError: if there are several actions.
-    """
+    """Return the spec of an environment's one action, whatever its key."""
     if len(check_instance("planner.env", env, EnvBase).action_keys) != 1:
         raise ConfigurationError(
             f"planner: {type(env).__name__} takes the actions {env.action_keys}; expected one"
@@ -113,3 +134,139 @@ class RecedingHorizonPlanner(MPCPlannerBase):
             self._told = True
         like = {"device": self.action_spec.device, "dtype": self.action_spec.dtype}
         return [torch.zeros((*td.batch_size, *shape), **like) for shape in self.memory.values()]
+
+
+class SamplingPlanner(RecedingHorizonPlanner):
+    """A planner that draws candidates and rolls them out in the planning environment.
+
+    Args:
+        env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
+        memory: entries that are kept from plan to plan, with their shapes.
+        horizon: steps of a plan, H.
+        population: candidates per iteration, N.
+        iterations: refinements per step.
+        backend: ``"fast"`` uses ``env.returns``, ``"env"`` steps the environment, ``None``
+            takes the fast way where there is one. Both give the same plans.
+        seed_key: entry ``(*B)`` with each mission's seed: missions of one seed share their
+            noise whoever else is in the batch. Without it noise is drawn for the batch.
+        box_key: entry ``(*B, 2, A)`` with the lowest and highest action to plan with, such as the
+            ``effect_bounds`` of :class:`~afm_rl.transforms.ActionFlowTransform`; the action's own
+            bounds, with a warning, where there is none.
+        action_key: where the action goes.
+        seed: seed of the noise without ``seed_key``.
+        hold: steps that each action of a plan lasts.
+
+    Returns that are not finite are ignored and counted in :attr:`discarded`; where all are,
+    the shifted plan stands and a warning is given.
+    """
+
+    scale: Tensor  # standard deviation of the first noise, per action
+
+    def __init__(
+        self,
+        env: EnvBase,
+        memory: Mapping[NestedKey, Sequence[int]],
+        horizon: int,
+        population: int,
+        iterations: int,
+        backend: str | None = None,
+        seed_key: NestedKey | None = None,
+        box_key: NestedKey | None = None,
+        action_key: NestedKey = "action",
+        seed: int = 0,
+        hold: int = 1,
+    ) -> None:
+        super().__init__(env, memory, action_key)
+        self.hold = check_count("planner.hold", hold)
+        self.horizon = check_count("planner.horizon", horizon, high=10_000)
+        self.population = check_count("planner.population", population, high=1_000_000)
+        self.iterations = check_count("planner.iterations", iterations, high=10_000)
+        if backend is None:
+            backend = "fast" if hasattr(env, "returns") else "env"
+        self.backend = check_choice("planner.backend", backend, ("fast", "env"))
+        if self.backend == "fast" and not hasattr(env, "returns"):
+            raise ConfigurationError(
+                f"planner.backend='fast': {type(env).__name__} has no `returns`; use 'env'"
+            )
+        self.seed_key = None if seed_key is None else as_key(seed_key)
+        self.in_keys = [*env.observation_spec.keys(True, True), *self.memory]
+        if self.seed_key is not None:
+            self.in_keys.append(self.seed_key)
+        self.box_key = None if box_key is None else as_key(box_key)
+        if self.box_key is not None:
+            self.in_keys.append(self.box_key)
+        self.streams = Streams(salt=1, seed=check_count("planner.seed", seed, low=0))
+        self.discarded = 0
+
+    def _noise(
+        self, td: TensorDictBase, like: Tensor, count: int, bound: float | None = None
+    ) -> Tensor:
+        """Draw standard normal numbers ``(*B, count, H, A)`` for plans like ``(*B, H, A)``."""
+        return self.streams.normal(
+            (count, *like.shape[-2:]),
+            batch=like.shape[:-2],
+            seeds=None if self.seed_key is None else td.get(self.seed_key),
+            bound=bound,
+            device=like.device,
+            dtype=like.dtype,
+        )
+
+    def _box(self, td: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        """Return lowest and highest action and the noise's size, ``(*B, 1, A)`` or ``(A,)``."""
+        space = self.action_spec.space
+        box = None if self.box_key is None else td.get(self.box_key, None)
+        if box is None:
+            if self.box_key is not None:
+                warnings.warn(
+                    f"planner.box_key={self.box_key!r}: the tensordict has no such entry, so plans "
+                    "keep to the action's own bounds",
+                    stacklevel=2,
+                )
+            return space.low, space.high, self.scale
+        low, high = box.unsqueeze(-3).unbind(-2)
+        return low, high, self.scale * (high - low) / (space.high - space.low)
+
+    def _allowed(self, action: Tensor, td: TensorDictBase) -> Tensor:
+        low, high, _ = self._box(td)
+        wide = action.unsqueeze(-2)
+        return torch.minimum(torch.maximum(wide, low), high).squeeze(-2)
+
+    def _returns(self, td: TensorDictBase, plans: Tensor) -> Tensor:
+        """Return the return ``(*B, N)`` of each plan ``(*B, N, H, A)``, whose actions are held."""
+        if self.hold > 1:
+            plans = plans.repeat_interleave(self.hold, -2)
+        if self.backend == "fast":
+            state, *task = self.env.entries(td)
+            returns = self.env.returns(state, plans, *task)
+            return returns.to(plans)  # states may be in double precision, plans in single
+        batch = plans.shape[:-2]
+        start = td.select(*self.env.observation_spec.keys(True, True), strict=False)
+        start = start.unsqueeze(-1).expand(batch).clone()
+        steps, action_key = iter(plans.unbind(-2)), self.env.action_key
+        rollout = self.env.rollout(
+            plans.shape[-2],
+            policy=lambda now: now.set(action_key, next(steps)),
+            auto_reset=False,
+            tensordict=start,
+            break_when_any_done=False,
+            trust_policy=True,  # it takes the tensordict itself
+        )
+        rewards = _mask_post_done_reward(
+            rollout,
+            reward_key=("next", self.env.reward_key),
+            done_key=_planning_done_keys(self.env),
+        )
+        return rewards.sum((-2, -1)).to(plans)
+
+    def _discard(self, finite: Tensor) -> None:
+        """Count the returns ``(*B, N)`` that are not finite; warn where none is."""
+        if not may_look(finite):
+            return  # an exported planner does not count, nor does one on a GPU
+        self.discarded += int((~finite).sum())
+        lost = ~finite.any(-1)
+        if bool(lost.any()):
+            warnings.warn(
+                f"planner: no finite return for {int(lost.sum())} of {lost.numel()} plans; "
+                "the previous plan stands",
+                stacklevel=5,
+            )

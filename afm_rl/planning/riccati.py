@@ -124,13 +124,6 @@ def stationary_value(
     Each round of the structure-preserving doubling algorithm (Chu et al. 2004) doubles the number
     of stages that P looks ahead. In double precision, returned in that of A.
 
-    Args:
-        A: ``(*B, S, S)``.
-        B: ``(*B, S, A)``.
-        Q: positive semi-definite, ``(*B, S, S)``.
-        R: positive definite, ``(*B, A, A)``.
-        doublings: rounds at most; fewer if P no longer changes.
-
     >>> one = torch.ones(1, 1)
     >>> stationary_value(one, one, one, one)  # the golden ratio, and its inverse
     (tensor([[1.6180]]), tensor([[0.6180]]))

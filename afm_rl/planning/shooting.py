@@ -15,11 +15,7 @@ from afm_rl.planning.planning_env import raise_missing
 
 
 def _check(env: EnvBase, horizon: int, population: int, iterations: int, elites: int) -> None:
-    """Check what both planners share.
-
-    Raises:
-        ConfigurationError: for a setting or environment that cannot be used.
-    """
+    """Check what both planners share."""
     if check_instance("planner.env", env, EnvBase).action_keys != ["action"]:
         raise ConfigurationError(
             f"planner: TorchRL's planners write 'action', but {type(env).__name__} reads "

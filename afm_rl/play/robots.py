@@ -17,7 +17,7 @@ from torchrl.envs.utils import step_mdp
 
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, MuJoCoDynamics, Quadrotor
-from afm_rl.envs.task.pendulum import pendulum_step
+from afm_rl.envs.task.rewards import pendulum_step
 from afm_rl.errors import ConfigurationError, check_choice
 from afm_rl.planning import MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost, load_policy
 from afm_rl.planning.riccati import stationary_value

@@ -1,14 +1,8 @@
 """Regimes: what changes under the robot, and when."""
 
-from afm_rl.regimes.actuators import actuator_regimes
-from afm_rl.regimes.asymmetric import AsymmetricGain
-from afm_rl.regimes.backlash import Backlash
 from afm_rl.regimes.base import DelayedRegime, Regime, StaticRegime
-from afm_rl.regimes.bias import Bias
-from afm_rl.regimes.compose import Compose
-from afm_rl.regimes.dead import DeadActuator
-from afm_rl.regimes.dead_zone import DeadZone
-from afm_rl.regimes.delay import Delay
+from afm_rl.regimes.commands import DeadZone, Permutation, Quantisation, Rotation, Saturation
+from afm_rl.regimes.compose import Compose, actuator_regimes
 from afm_rl.regimes.flight import (
     InertiaFactor,
     MassFactor,
@@ -18,17 +12,11 @@ from afm_rl.regimes.flight import (
     flight_regimes,
     wind_of,
 )
-from afm_rl.regimes.gain import ActionGain
-from afm_rl.regimes.gain_noise import GainNoise
-from afm_rl.regimes.lag import Lag
-from afm_rl.regimes.patches import Patches
-from afm_rl.regimes.permutation import Permutation
+from afm_rl.regimes.gains import ActionGain, AsymmetricGain, Bias, DeadActuator, GainNoise
+from afm_rl.regimes.ground import Patches, WheelSlip
+from afm_rl.regimes.late import Backlash, Delay, Lag
 from afm_rl.regimes.physics import Physics
-from afm_rl.regimes.quantisation import Quantisation
-from afm_rl.regimes.rotation import Rotation
-from afm_rl.regimes.saturation import Saturation
 from afm_rl.regimes.schedule import Schedule, blend_phases, phase_parameters
-from afm_rl.regimes.slip import WheelSlip
 
 __all__ = [
     "ActionGain",

@@ -10,8 +10,74 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError
-from afm_rl.regimes.settings import draw_between
+from afm_rl.errors import ConfigurationError, check_number
+
+MOST = 10.0  # half ranges: more are typing errors
+
+
+class Constant:
+    """A row of numbers as a tensor of any type and on any device, made once for each.
+
+    >>> Constant([1, 2]).like(torch.zeros(2, dtype=torch.float64))
+    tensor([1., 2.], dtype=torch.float64)
+    """
+
+    def __init__(self, values: Iterable[float]) -> None:
+        self.values = tuple(float(value) for value in values)
+        self._tensors: dict[tuple[torch.dtype, torch.device], Tensor] = {}
+
+    def like(self, other: Tensor) -> Tensor:
+        """Return the numbers ``(N,)`` with type and device of ``other``."""
+        key = other.dtype, other.device
+        if key not in self._tensors:
+            self._tensors[key] = other.new_tensor(self.values)
+        return self._tensors[key]
+
+
+class HalfRange(Constant):
+    """Half ranges of the A action axes, finite and above zero: the unit of many parameters.
+
+    >>> HalfRange([1.0, 1.5]).values
+    (1.0, 1.5)
+    """
+
+    def __init__(self, values: Sequence[float]) -> None:
+        given = list(values) if isinstance(values, Sequence) else []
+        numbers = [x for x in given if isinstance(x, (int, float)) and 0 < x < math.inf]
+        if not given or len(numbers) < len(given):
+            raise ConfigurationError(
+                f"half_range={values!r}: expected a finite number above 0 per action axis, half "
+                "of action_high - action_low"
+            )
+        super().__init__(given)
+
+
+def check_span(
+    name: str, span: Sequence[float], low: float = -math.inf, high: float = math.inf
+) -> tuple[float, float]:
+    """Return the two ends of a range to draw from: finite numbers in [low, high], in order.
+
+    >>> check_span("span", [0.2, 0.6], low=0.0)
+    (0.2, 0.6)
+    """
+    if isinstance(span, str) or not isinstance(span, Sequence) or len(span) != 2:
+        raise ConfigurationError(f"{name}={span!r}: expected two numbers, lowest and highest")
+    first, last = (check_number(name, value, low=low, high=high) for value in span)
+    if first > last:
+        raise ConfigurationError(f"{name}={span!r}: expected the lower number first")
+    return first, last
+
+
+def draw_between(
+    span: tuple[float, float], size: tuple[int, ...], generator: torch.Generator | None
+) -> Tensor:
+    """Draw numbers of shape ``size``, uniform in the range.
+
+    >>> draw_between((2.0, 2.0), (3,), None)
+    tensor([2., 2., 2.])
+    """
+    low, high = span
+    return low + (high - low) * torch.rand(size, generator=generator)
 
 
 class Regime(ABC):
@@ -19,7 +85,8 @@ class Regime(ABC):
 
     The same object serves the simulator, the oracle and the counterfactual generator. Its
     parameters are one row of named numbers, so a batch of missions, each under a regime of
-    its own, is one tensor ``(*B, F)``.
+    its own, is one tensor ``(*B, F)``. A family that is made with settings that cannot be used
+    raises a :class:`~afm_rl.errors.ConfigurationError`.
 
     Attributes:
         names: names of the F parameters, in order.
@@ -123,11 +190,7 @@ class Regime(ABC):
 
     @staticmethod
     def distinct(names: Sequence[str], axes: int | None = None) -> tuple[str, ...]:
-        """Return ``names`` as a tuple, one per action axis.
-
-        Raises:
-            ConfigurationError: unless they are distinct, and as many as there are ``axes``.
-        """
+        """Return ``names`` as a tuple; they must be distinct, one for each of the ``axes``."""
         found = tuple(names)
         if not found or len(set(found)) < len(found) or len(found) != (axes or len(found)):
             count = "" if axes is None else f"{axes} "
@@ -135,11 +198,7 @@ class Regime(ABC):
         return found
 
     def check_names(self, names: Iterable[str]) -> None:
-        """Check that all ``names`` are parameters.
-
-        Raises:
-            ConfigurationError: naming the first that is not.
-        """
+        """Check that all ``names`` are parameters; the error names the first that is not."""
         for name in names:
             if name not in self.names:
                 raise ConfigurationError(
@@ -147,11 +206,7 @@ class Regime(ABC):
                 )
 
     def check_limits(self, parameters: Tensor) -> None:
-        """Check that parameters ``(*B, F)`` are within their limits.
-
-        Raises:
-            ConfigurationError: naming the first that is not.
-        """
+        """Check that parameters ``(*B, F)`` are within their limits; the error names the first."""
         for name, (low, high) in self.limits.items():
             values = parameters[..., self.names.index(name)]
             wrong = values[~((values >= low) & (values <= high))]

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime, StaticRegime
+from afm_rl.regimes.base import Regime, StaticRegime, check_span, draw_between
 from afm_rl.regimes.compose import Compose
-from afm_rl.regimes.gain import ActionGain, divide
-from afm_rl.regimes.settings import check_span, draw_between
+from afm_rl.regimes.gains import ActionGain, divide
 from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix
 
 LEAST, MOST = 0.01, 100.0  # factors beyond these are typing errors
@@ -45,9 +44,6 @@ class MassFactor(_Divisor):
     Args:
         span: lowest and highest factor c in the prior, uniform.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> light = MassFactor()
     >>> light.apply(torch.tensor([0.3, 0, 0, 0]), light.encode({"mass": 0.5}), torch.zeros(13))
     tensor([0.6000, 0.0000, 0.0000, 0.0000])
@@ -67,9 +63,6 @@ class InertiaFactor(_Divisor):
 
     Args:
         span: lowest and highest factor c in the prior, uniform.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
 
     >>> heavy = InertiaFactor()
     >>> row = heavy.encode({"inertia": 2.0})
@@ -97,9 +90,6 @@ class MotorEfficiency(StaticRegime):
         body: the quadrotor, a Crazyflie if None.
         span: lowest and highest share in the prior, uniform.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> worn = MotorEfficiency()
     >>> row = worn.encode({"motor_1": 0.5, "motor_3": 0.5})
     >>> worn.apply(torch.tensor([0.4, 0, 0, 0]), row, torch.zeros(13))[0]
@@ -117,7 +107,6 @@ class MotorEfficiency(StaticRegime):
         self.span = check_span("span", span, 0.0, 1.0)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        """Take away what is lost."""
         return action + mix(unmix(action, self.body) * (parameters - 1), self.body)
 
     def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
@@ -140,9 +129,6 @@ class Payload(StaticRegime):
         share: lowest and highest p in the prior, uniform.
         offset: lowest and highest x and y (m) in the prior, uniform.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> load = Payload()
     >>> row = load.encode({"payload": 0.25, "payload_x": 0.01})
     >>> load.apply(torch.tensor([0.5, 0, 0, 0]), row, torch.zeros(13))
@@ -160,17 +146,14 @@ class Payload(StaticRegime):
         self.offset = check_span("offset", offset)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        """Share the thrust and tilt."""
         thrust = action[..., :1]
         return action / self._weight(parameters) + thrust * self._levers(parameters)
 
     def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Push more, and lean against the tilt."""
         needed = effect * self._weight(parameters)
         return needed - needed[..., :1] * self._levers(parameters)
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw p, x and y ``(*shape, 3)``, uniform."""
         share = draw_between(self.share, (*shape, 1), generator)
         return torch.cat([share, draw_between(self.offset, (*shape, 2), generator)], -1)
 
@@ -193,9 +176,6 @@ class Wind(StaticRegime):
 
     Args:
         span: lowest and highest acceleration per axis in the prior, uniform.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
 
     >>> wind = Wind()
     >>> wind_of(wind, wind.encode({"wind_x": -1.5}))

@@ -29,16 +29,13 @@ class Physics(StaticRegime):
     """Other physics; actions stay what they are.
 
     A world that knows these parameters moves differently, see
-    :func:`afm_rl.dynamics.mujoco_physics.changed_model` for what they do there: factors ``mass``,
+    :func:`afm_rl.dynamics.mujoco_model.changed_model` for what they do there: factors ``mass``,
     ``friction``, ``damping``, ``gravity`` and ``length`` (of links, whose masses stay what they
     are); ``payload``, a share of the whole mass; ``wind_x`` and ``wind_y``, steady accelerations
     (m/s^2).
 
     Args:
         ranges: of the parameters that are drawn, lowest and highest value by name; of all if none.
-
-    Raises:
-        ConfigurationError: for a name that there is not, or what is no range.
 
     >>> heavy = Physics().encode({"mass": 2.0})
     >>> Physics().physics_of(heavy)[0]
@@ -71,7 +68,6 @@ class Physics(StaticRegime):
         return effect
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
-        """Draw one parameter each, uniform in its range; the others stay nominal."""
         low, high = torch.tensor(list(self.ranges.values())).unbind(-1)
         drawn = low + (high - low) * torch.rand(*shape, len(low), generator=generator)
         chosen = torch.randint(len(low), (*shape, 1), generator=generator)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from afm_rl.compiling.machine_code import checksum_of, has_compiler, package, settings_for, trace
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.planning.sampling_planner import SamplingPlanner
+from afm_rl.planning.receding import SamplingPlanner
 from afm_rl.storage.files import write_whole
 from afm_rl.streams import Streams
 from afm_rl.transforms.policy import ActionFlowPolicy

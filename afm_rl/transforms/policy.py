@@ -15,7 +15,7 @@ from afm_rl.correction import Corrector
 from afm_rl.correction.arrival import arrival
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
-from afm_rl.planning.primer import ZeroPrimer
+from afm_rl.planning.receding import ZeroPrimer
 from afm_rl.spaces.keys import as_key
 from afm_rl.transforms.memory import (
     begin,

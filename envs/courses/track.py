@@ -1,13 +1,62 @@
-"""What a track is."""
+"""What a track is, several of them as tensors, and how files of numbers are read."""
 
 from __future__ import annotations
 
+import csv
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from afm_rl.errors import ConfigurationError, check_number
+
+
+def read_columns(
+    path: str | Path, headers: Sequence[tuple[str, ...]]
+) -> tuple[tuple[str, ...], Tensor]:
+    """Return the header of a CSV file, one of ``headers``, and its finite numbers ``(R, C)``.
+
+    Raises:
+        ConfigurationError: naming file and line, if it cannot be read as that.
+
+    >>> read_columns(Path(__file__).with_name("maps") / "ethz_2.csv", [("x", "y", "radius")])[0]
+    ('x', 'y', 'radius')
+    """
+    path = Path(path)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            lines = [(i, line) for i, line in enumerate(csv.reader(file), start=1) if any(line)]
+    except OSError as error:
+        raise ConfigurationError(f"tracks: cannot read {path}: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ConfigurationError(f"tracks: {path} is not a text file of columns") from error
+    header = tuple(cell.strip().lower() for cell in lines[0][1]) if lines else ()
+    if header not in headers:
+        allowed = " or ".join(",".join(columns) for columns in headers)
+        found = ",".join(header) or "nothing"
+        raise ConfigurationError(f"tracks: {path}: the first line is {found}, expected {allowed}")
+    rows = []
+    for number, line in lines[1:]:
+        if len(line) != len(header):
+            raise ConfigurationError(
+                f"tracks: {path}, line {number}: {len(line)} values, expected {len(header)}"
+            )
+        rows.append([_finite(cell, f"{path}, line {number}") for cell in line])
+    return header, torch.tensor(rows, dtype=torch.float64).reshape(len(rows), len(header))
+
+
+def _finite(cell: str, where: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ConfigurationError(f"tracks: {where}: {cell!r} is not a finite number")
+    return value
+
 
 GRID = 1e3  # m: origins are multiples of it
 FARTHEST = 1e8  # m from zero: there is no such place on Earth
@@ -27,11 +76,7 @@ def local_origin(points: Tensor) -> Tensor:
 
 
 def check_near(points: Tensor, name: str) -> None:
-    """Refuse ``points`` ``(N, D)`` that are nowhere on Earth.
-
-    Raises:
-        ConfigurationError: naming the first.
-    """
+    """Refuse ``points`` ``(N, D)`` that are nowhere on Earth, naming the first."""
     far = points.abs().amax(-1) > FARTHEST
     if far.any():
         first = int(far.nonzero()[0])
@@ -98,11 +143,7 @@ class Track:
 
 
 def check_closed(points: Tensor, name: str, what: str) -> None:
-    """Refuse ``points`` that are no closed course: at least two, neighbours distinct, not absurd.
-
-    Raises:
-        ConfigurationError: naming the track and the first offending point or pair.
-    """
+    """Refuse ``points`` that are no closed course: two or more, neighbours distinct, not absurd."""
     if points.dim() != 2 or points.shape[-1] != 2 or not points.isfinite().all():
         raise ConfigurationError(
             f"tracks: {name}: {what} table {tuple(points.shape)}: expected finite numbers (W, 2)"
@@ -123,3 +164,50 @@ def check_closed(points: Tensor, name: str, what: str) -> None:
             f"tracks: {name}: {what} {first} and {what} {first % len(points) + 1} coincide; the "
             "track closes by itself, so leave one of them out"
         )
+
+
+class Course(nn.Module):
+    """The targets of T tracks, looked up per mission.
+
+    Args:
+        tracks: the tracks.
+        dtype: floating-point type.
+
+    Attributes:
+        targets: targets (m), ``(T, N, 2)``, short rows padded with their last target.
+        counts: number n of targets per track, ``(T,)``.
+        starts: start poses (m, m, rad), ``(T, 3)``.
+
+    >>> from afm_rl.envs.courses.tracks import load_track
+    >>> course = Course([load_track("ethz_1"), load_track("ethz_2")])
+    >>> course.counts
+    tensor([34, 19])
+    >>> course.progress(torch.tensor([0, 1]), torch.tensor([17, 19]))
+    tensor([0.5000, 1.0000])
+    """
+
+    targets: Tensor
+    counts: Tensor
+    starts: Tensor
+
+    def __init__(self, tracks: Sequence[Track], dtype: torch.dtype = torch.float32) -> None:
+        super().__init__()
+        rows = [track.targets for track in tracks]
+        counts = [len(row) for row in rows]
+        padded = [torch.cat([row, row[-1:].expand(max(counts) - len(row), 2)]) for row in rows]
+        starts = torch.stack([track.start for track in tracks])
+        self.register_buffer("targets", torch.stack(padded).to(dtype), persistent=False)
+        self.register_buffer("counts", torch.tensor(counts), persistent=False)
+        self.register_buffer("starts", starts.to(dtype), persistent=False)
+
+    def goal(self, track: Tensor, reached: Tensor) -> Tensor:
+        """Return the current target ``(*B, 2)``; after the last one it stays the last."""
+        return self.targets[track, reached.minimum(self.counts[track] - 1)]
+
+    def progress(self, track: Tensor, reached: Tensor) -> Tensor:
+        """Return the share of targets reached ``(*B)``, in [0, 1]."""
+        return reached.to(self.targets.dtype) / self.counts[track]
+
+    def finished(self, track: Tensor, reached: Tensor) -> Tensor:
+        """Return whether all targets are reached ``(*B)``."""
+        return reached >= self.counts[track]

@@ -1,8 +1,8 @@
-"""What environments of missions share: settings, specs, resets, and which mission follows."""
+"""What environments of missions share: settings, specs, resets, phases, and what follows."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from inspect import signature
 from typing import Any
@@ -13,9 +13,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from afm_rl.envs.missions.format import MissionFormat
-from afm_rl.envs.missions.noise import MissionNoise
-from afm_rl.envs.missions.phases import PhasedSimulation
+from afm_rl.envs.missions.format import MissionFormat, MissionNoise
 from afm_rl.envs.missions.settings import check_batch, check_dtype, check_missions
 from afm_rl.errors import (
     ConfigurationError,
@@ -24,6 +22,78 @@ from afm_rl.errors import (
     check_count,
     check_number,
 )
+from afm_rl.regimes import Regime, Schedule, blend_phases
+
+
+class PhasedSimulation(ABC):
+    """Base class of simulations: pure functions of missions and states.
+
+    A state is a mapping with at least ``pose``, ``step``, ``since`` (step at which the present
+    phase began) and, for a regime with a history, ``past``.
+
+    Attributes:
+        regime: regime family.
+        schedule: when regimes change.
+        steps: most steps of an episode.
+    """
+
+    regime: Regime
+    schedule: Schedule
+    steps: int
+
+    @abstractmethod
+    def begin(self, mission: TensorDictBase, dtype: torch.dtype) -> dict[str, Tensor]:
+        """Return the state at the beginning of missions, without noise."""
+
+    @abstractmethod
+    def displaced(self, pose: Tensor, noise: Tensor) -> Tensor:
+        """Return poses moved by start noise."""
+
+    @abstractmethod
+    def describe(self, mission: TensorDictBase, state: dict[str, Tensor]) -> TensorDict:
+        """Return the state and what is seen of it."""
+
+    @abstractmethod
+    def progress(self, mission: TensorDictBase, state: Any) -> Tensor:
+        """Return the share of the mission that is done, ``(*B)`` in [0, 1]."""
+
+    def phase(self, mission: TensorDictBase, state: Any) -> Tensor:
+        """Return the index of the present phase, ``(*B)``."""
+        return self.schedule.phase(self.progress(mission, state), state["step"], mission["at"])
+
+    def regime_now(self, mission: TensorDictBase, state: Any) -> Tensor:
+        """Return the parameters ``(*B, F)`` that act on the next action."""
+        phase, age = self.phase(mission, state), state["step"] - state["since"]
+        return blend_phases(mission["parameters"], phase, age, mission["ramp"])
+
+    def started(
+        self, pose: Tensor, mission: TensorDictBase, actions: int, **more: Tensor
+    ) -> dict[str, Tensor]:
+        """Return a state before the first step, with ``more`` entries."""
+        none = torch.zeros_like(mission["seed"])
+        state = {"pose": pose, "step": none, "since": none.clone(), **more}
+        if self.regime.history:
+            state["past"] = pose.new_zeros(*none.shape, self.regime.history, actions)
+        return state
+
+    def followed(
+        self, mission: TensorDictBase, before: Any, after: dict[str, Tensor], action: Tensor
+    ) -> dict[str, Tensor]:
+        """Return the state ``after`` a step with ``since``, and ``past`` with its ``action``."""
+        same = self.phase(mission, before) == self.phase(mission, after)
+        after["since"] = torch.where(same, before["since"], after["step"])
+        if self.regime.history:
+            after["past"] = torch.cat([action.unsqueeze(-2), before["past"][..., :-1, :]], -2)
+        return after
+
+    def described(
+        self, mission: TensorDictBase, state: dict[str, Tensor], **seen: Tensor
+    ) -> TensorDict:
+        """Return the state, the mission, the regime (hidden truth) and what is ``seen``."""
+        parameters = self.regime_now(mission, state)
+        entries = {**state, "mission": mission.clone(recurse=False), **seen, "regime": parameters}
+        entries["regime_active"] = ~self.regime.is_identity(parameters)
+        return TensorDict(entries, mission.batch_size, device=mission.device)
 
 
 class MissionEnv(EnvBase):
@@ -34,10 +104,12 @@ class MissionEnv(EnvBase):
     environment.
 
     Args:
+        start_noise: standard deviation of the start pose.
         batch_size: number of missions, or ``()`` for any.
         seed: missions without a seed of their own get ``seed, seed + 1, ...``.
-        start_noise: standard deviation of the start pose.
         device: where the tensors live.
+        missions: what missions are unless ``reset`` is given others: a tensordict that
+            broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
         dtype: floating-point type, torch's default if None.
 
     Attributes:
@@ -48,15 +120,17 @@ class MissionEnv(EnvBase):
     mission_format: MissionFormat
     noise: MissionNoise
     simulation: PhasedSimulation
+    more: Sequence[str] = ()  # arguments of `mission` beside those of the format
     _last: TensorDictBase | None = None
 
     def __init__(
         self,
-        batch_size: Sequence[int],
-        seed: int,
         start_noise: float,
-        device: torch.device | str | None,
-        dtype: torch.dtype | None,
+        batch_size: Sequence[int] = (),
+        seed: int = 0,
+        device: torch.device | str | None = None,
+        missions: TensorDictBase | Mapping[str, Any] | None = None,
+        dtype: torch.dtype | None = None,
     ) -> None:
         batch = check_batch(batch_size)
         super().__init__(device=device, batch_size=batch)
@@ -64,25 +138,24 @@ class MissionEnv(EnvBase):
         self.dtype = check_dtype(dtype)
         self.seed = check_count("seed", seed, low=0)
         self.start_noise = check_number("start_noise", start_noise, low=0.0)
+        self._given = missions
 
     @property
     def max_steps(self) -> int:
         """Most steps of an episode."""
         return self.simulation.steps
 
-    def _complete(
-        self,
-        tracks: Sequence[str],
-        missions: TensorDictBase | Mapping[str, Any] | None,
-        bounds: tuple[Tensor, Tensor],
-    ) -> None:
+    def _complete(self, tracks: Sequence[str], bounds: tuple[Tensor, Tensor]) -> None:
         """Set up missions and specs, once the simulation is there."""
         simulation, batch, device = self.simulation, self.batch_size, self.device
+        missions, self._given = self._given, None
         self.regime, self.schedule = simulation.regime, simulation.schedule
         self.mission_format = MissionFormat(tracks, self.regime, self.schedule, self.dtype)
         if isinstance(missions, Mapping) and not isinstance(missions, TensorDictBase):
             for key in missions:
-                check_choice("missions", key, signature(self.mission).parameters)
+                check_choice(
+                    "missions", key, (*signature(self.mission_format.build).parameters, *self.more)
+                )
             missions = self.mission(**missions)
         self._default = check_missions(missions, batch)
         mission = self._missions_of(None, batch)  # a wrong default fails here
@@ -111,16 +184,9 @@ class MissionEnv(EnvBase):
         }
         self.full_done_spec = Composite(flags, shape=batch, device=device)
 
-    def mission(
-        self,
-        track: int | str = 0,
-        seed: int | None = None,
-        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
-        at: Sequence[float] | None = None,
-        ramp: int = 0,
-    ) -> TensorDict:
+    def mission(self, *args: Any, **entries: Any) -> TensorDict:
         """Describe one mission; see :meth:`~afm_rl.envs.missions.format.MissionFormat.build`."""
-        return self.mission_format.build(track, seed, regime, at, ramp).to(self.device)
+        return self.mission_format.build(*args, **entries).to(self.device)
 
     @abstractmethod
     def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -18,12 +18,7 @@ from afm_rl.envs.missions.env import MissionEnv
 
 
 class MissionGym(gymnasium.Env):
-    """One mission of a native environment.
-
-    Args:
-        native: the environment.
-        bound: largest size of each number of the observation.
-    """
+    """One mission of a native environment; ``bound`` is the largest size of what is observed."""
 
     def __init__(self, native: MissionEnv, bound: Sequence[float]) -> None:
         self.native = native
@@ -72,11 +67,7 @@ def reseed(env: MissionEnv, random, seed: int | None, data: TensorDictBase | Non
 
 
 def require_reset(data: TensorDictBase | None) -> TensorDictBase:
-    """Return ``data``, which is None before the first reset.
-
-    Raises:
-        gymnasium.error.ResetNeeded: if it is None.
-    """
+    """Return ``data``, which is None before the first reset."""
     if data is None:
         raise ResetNeeded("call reset() before step() or render()")
     return data

@@ -16,9 +16,6 @@ from afm_rl.regimes import Regime, Schedule
 def check_batch(batch_size: Sequence[int] | int) -> torch.Size:
     """Return the batch shape; a number counts as one dimension.
 
-    Raises:
-        ConfigurationError: unless every size is a whole number of at least 1.
-
     >>> check_batch(4)
     torch.Size([4])
     """
@@ -28,9 +25,6 @@ def check_batch(batch_size: Sequence[int] | int) -> torch.Size:
 
 def check_dtype(dtype: torch.dtype | None) -> torch.dtype:
     """Return the floating-point type, by default torch's.
-
-    Raises:
-        ConfigurationError: if it is not torch.float32 or torch.float64.
 
     >>> check_dtype(None)
     torch.float32
@@ -42,11 +36,7 @@ def check_dtype(dtype: torch.dtype | None) -> torch.dtype:
 
 
 def check_names(setting: str, names: Sequence[str]) -> None:
-    """Check that there are names, and that they are distinct.
-
-    Raises:
-        ConfigurationError: otherwise.
-    """
+    """Check that there are names, and that they are distinct."""
     if not names or len(set(names)) < len(names):
         raise ConfigurationError(f"{setting}={names}: expected at least one, with distinct names")
 
@@ -54,10 +44,7 @@ def check_names(setting: str, names: Sequence[str]) -> None:
 def check_regime(
     regime: Regime | None, default: Callable[[], Regime], states: int, actions: int
 ) -> Regime:
-    """Return the regime family, or the default one.
-
-    Raises:
-        ConfigurationError: if it is no family, or does not fit the number of actions.
+    """Return the regime family, or the default one; it must fit the number of actions.
 
     >>> from afm_rl.regimes import ActionGain
     >>> check_regime(None, lambda: ActionGain(["v_gain"]), states=3, actions=1).names
@@ -78,10 +65,7 @@ def check_regime(
 def check_bounds(
     low: Sequence[float], high: Sequence[float], actions: Sequence[str]
 ) -> tuple[Tensor, Tensor]:
-    """Return the lowest and the highest action ``(A,)``, in double precision.
-
-    Raises:
-        ConfigurationError: unless there is a finite number for each of the ``actions``, low < high.
+    """Return the lowest and the highest action ``(A,)``, low < high, in double precision.
 
     >>> check_bounds([-1, -2], [1, 2], ["v (m/s)", "omega (rad/s)"])[1]
     tensor([1., 2.], dtype=torch.float64)
@@ -101,9 +85,6 @@ def check_bounds(
 
 def check_missions(missions: TensorDictBase | None, batch: torch.Size) -> TensorDictBase | None:
     """Return the default missions, to be expanded to batches that end in their shape.
-
-    Raises:
-        ConfigurationError: if there is no ``mission`` entry, or it does not broadcast.
 
     >>> check_missions(None, torch.Size([4])) is None
     True
@@ -140,10 +121,7 @@ def schedule_in_seconds(times: Sequence[float], dt: float = 0.05) -> Schedule:
 
 
 def steps_at(times: Sequence[float], dt: float) -> list[float]:
-    """Return breakpoints in steps: half a step before the first one at or after each time.
-
-    Raises:
-        ConfigurationError: unless the times are increasing numbers above 0.
+    """Return breakpoints in steps: half a step before the first one at or after each time (s).
 
     >>> steps_at([0.12], dt=0.05)
     [2.5]

@@ -6,15 +6,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from afm_rl.dynamics.quadrotor import check_body
-from afm_rl.envs.courses.flights import find_reference
-from afm_rl.envs.courses.reference import Reference, check_reference
+from afm_rl.envs.courses.flights import Reference, check_reference, find_reference
 from afm_rl.envs.missions.env import MissionEnv
-from afm_rl.envs.missions.noise import flight_noise
+from afm_rl.envs.missions.format import flight_noise
+from afm_rl.envs.missions.gym import MissionGym
 from afm_rl.envs.missions.settings import (
     check_bounds,
     check_names,
@@ -34,7 +35,7 @@ UNIT = 1e-3  # how far a quaternion's length may be from 1
 class CrazyflieTrack(MissionEnv):
     r"""Quadrotors that follow position references, tick by tick, batched.
 
-    The plant is the rigid body of :func:`~afm_rl.dynamics.quadrotor_equations.quadrotor_rate`,
+    The plant is the rigid body of :func:`~afm_rl.dynamics.quadrotor.quadrotor_rate`,
     integrated at 500 Hz while the action :math:`u = (T, M_x, M_y, M_z)` in N and N m is held for a
     control tick of 50 ms. What the motors can give of it (:func:`~afm_rl.spaces.airframe.saturate`)
     goes through a regime whose parameters follow the mission's phases. There is no ground, no drag
@@ -90,14 +91,10 @@ class CrazyflieTrack(MissionEnv):
         dt: control tick (s).
         substeps: plant steps per tick, K.
         trace: whether to publish the states in between.
-        batch_size: number of flights, or ``()`` for any.
-        seed: missions without a seed of their own get ``seed, seed + 1, ...``.
-        device: where the tensors live.
-        missions: what missions are unless ``reset`` is given others: a tensordict that
-            broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
         action_low: lowest action, ``(4,)``; what the motors can do if None.
         action_high: highest action.
-        dtype: floating-point type, torch's default if None.
+        settings: further arguments of :class:`~afm_rl.envs.missions.env.MissionEnv`:
+            ``batch_size``, ``seed``, ``device``, ``missions`` and ``dtype``.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -114,6 +111,7 @@ class CrazyflieTrack(MissionEnv):
 
     simulation: QuadrotorSimulation
     plant: type[QuadrotorSimulation] = QuadrotorSimulation
+    more = ("times",)
 
     def __init__(
         self,
@@ -132,16 +130,11 @@ class CrazyflieTrack(MissionEnv):
         substeps: int = 25,
         trace: bool = False,
         max_steps: int = 5000,
-        batch_size: Sequence[int] = (),
-        seed: int = 0,
-        device: torch.device | str | None = None,
-        missions: TensorDictBase | Mapping[str, Any] | None = None,
-        *,
         action_low: Sequence[float] | None = None,
         action_high: Sequence[float] | None = None,
-        dtype: torch.dtype | None = None,
+        **settings: Any,
     ) -> None:
-        super().__init__(batch_size, seed, start_noise, device, dtype)
+        super().__init__(start_noise, **settings)
         if isinstance(tracks, (str, Path)) or not isinstance(tracks, Iterable):
             tracks = (tracks,)
         self.references = tuple(
@@ -176,36 +169,28 @@ class CrazyflieTrack(MissionEnv):
         )
         pairs = zip((action_low, action_high), self.body.bounds, strict=True)
         low, high = (most if given is None else given for given, most in pairs)
-        self._complete(names, missions, check_bounds(low, high, ACTIONS))
+        self._complete(names, check_bounds(low, high, ACTIONS))
 
     def mission(
-        self,
-        track: int | str = 0,
-        seed: int | None = None,
-        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
-        at: Sequence[float] | None = None,
-        ramp: int = 0,
-        times: Sequence[float] | None = None,
+        self, *args: Any, times: Sequence[float] | None = None, **entries: Any
     ) -> TensorDict:
         """Describe one mission; see :meth:`~afm_rl.envs.missions.format.MissionFormat.build`.
 
         Args:
-            track: index or name of the reference.
-            seed: seed of its noise.
-            regime: parameters that are not nominal, for the second phase or for each.
-            at: breakpoints in the unit of the schedule: a phase begins beyond them.
-            ramp: ticks that a change takes.
-            times: breakpoints in s instead: a phase begins with the first tick from then on.
+            args: as there; the track is the reference. times: breakpoints in s instead of ``at``: a
+            phase begins with the first tick from then on. entries: as there.
 
         Raises:
             ConfigurationError: for a value that cannot be used.
         """
         if times is not None:
-            if at is not None:
-                raise ConfigurationError(f"missions: at={at!r}, times={times!r}: expected one")
+            if entries.get("at") is not None:
+                raise ConfigurationError(
+                    f"missions: at={entries['at']!r}, times={times!r}: expected one"
+                )
             whole = self.simulation.steps if self.schedule.by == "progress" else 1
-            at = [tick / whole for tick in steps_at(times, self.simulation.dt)]
-        return self.mission_format.build(track, seed, regime, at, ramp).to(self.device)
+            entries["at"] = [tick / whole for tick in steps_at(times, self.simulation.dt)]
+        return super().mission(*args, **entries)
 
     def _check_pose(self, pose: Tensor) -> None:
         if pose.shape[-1] != 13 or not pose.isfinite().all():
@@ -256,3 +241,59 @@ def _sensor_noise(std: float | Sequence[float]) -> Tensor:
         raise ConfigurationError(f"sensor_noise={std!r}: expected one number, or four")
     checked = [check_number("sensor_noise", value, low=0.0) for value in given]
     return torch.tensor(checked, dtype=torch.float64).repeat_interleave(3)
+
+
+class CrazyflieTrackGym(MissionGym):
+    """One mission of :class:`~afm_rl.envs.CrazyflieTrack`.
+
+    The observation holds the state (position in m, velocity in m/s, quaternion, body rate in rad/s)
+    and the present reference (position, velocity), the action thrust (N) and moments (N m). The
+    info holds the time (s), the squared error per axis of the last tick (m^2) and, as a truth
+    hidden from the observation, ``regime_active``.
+
+    Args:
+        reference: a reference or the path of a CSV file; a circle if None.
+        regime: regime parameters of the changed phase, or one mapping per phase.
+        times: when phases begin (s); at 2 s and 5 s if None.
+        ramp: ticks over which the regime changes; 0 for sudden changes.
+        render_mode: None; there is nothing to see.
+        settings: further arguments of :class:`~afm_rl.envs.CrazyflieTrack`.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+        NonFiniteError: at a step whose action is NaN or infinite.
+
+    >>> import gymnasium, afm_rl  # registers the name
+    >>> env = gymnasium.make("afm_rl/CrazyflieTrack-v0", regime={"mass": 0.5}, times=[2.0])
+    >>> observation, info = env.reset(seed=0)
+    >>> observation.shape, info["time"]
+    ((19,), 0.0)
+    """
+
+    native: CrazyflieTrack
+    metadata: dict[str, Any] = {"render_modes": [], "render_fps": 20}
+
+    def __init__(
+        self,
+        reference: Reference | str | Path | None = None,
+        regime: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+        times: Sequence[float] | None = None,
+        ramp: int = 0,
+        render_mode: None = None,
+        **settings: Any,
+    ) -> None:
+        if render_mode is not None:
+            raise ConfigurationError(f"render_mode={render_mode!r}: expected none")
+        missions = {"regime": regime, "ramp": ramp}
+        tracks = "circle_2m_0.8mps" if reference is None else reference
+        settings.setdefault("start", "moving")
+        native = CrazyflieTrack(tracks, schedule=times, missions=missions, **settings)
+        super().__init__(native, [np.inf] * 19)
+
+    def _seen(self, data: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        info = {
+            "time": data["step"].double() * self.native.simulation.dt,
+            "square_error": data["square_error"],
+            "regime_active": data["regime_active"],
+        }
+        return torch.cat([data["observation"], data["reference"][..., 0, :]], -1), info

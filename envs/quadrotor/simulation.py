@@ -10,9 +10,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from afm_rl.dynamics.quadrotor_equations import quadrotor_path
-from afm_rl.envs.courses.reference import Reference, references_at
-from afm_rl.envs.missions.phases import PhasedSimulation
+from afm_rl.dynamics.quadrotor import quadrotor_path
+from afm_rl.envs.courses.flights import Reference, references_at
+from afm_rl.envs.missions.env import PhasedSimulation
 from afm_rl.regimes import Regime, Schedule, wind_of
 from afm_rl.spaces.airframe import QuadrotorBody, saturate
 from afm_rl.spaces.manifold import RigidBodySpace
@@ -113,11 +113,8 @@ class QuadrotorSimulation(PhasedSimulation):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the state after each plant step, and what the plant remembers beside it.
 
-        Args:
-            data: as for :meth:`advance`.
-            action: wrench that the motors are asked for, ``(*B, 4)``.
-            parameters: of the regime, ``(*B, F)``.
-            noise: standard normal numbers for a noisy regime, ``(*B, 4)``.
+        Given are the state before, the wrench ``(*B, 4)`` that the motors are asked for, the
+        regime's parameters ``(*B, F)``, and numbers for a noisy one.
         """
         pose, past = data["pose"], data["past"] if self.regime.history else None
         effective = self.regime.apply(action, parameters, pose, past, noise)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.envs.task.simulated import EXACT, Limits
+from afm_rl.envs.task.own import EXACT, Limits
 from afm_rl.envs.task.task import Reward, Task, trust
 from afm_rl.errors import check_count
 
@@ -48,16 +48,7 @@ def tip_of(angles: Tensor, offsets: Tensor, axes: Tensor) -> Tensor:
 def miss(
     state: Tensor, action: Tensor, after: Tensor, goal: Tensor, offsets: Tensor, axes: Tensor
 ) -> Tensor:
-    """Reward: how far the tip is from where it would be at the goal's joint angles (m), negative.
-
-    Args:
-        state: not used.
-        action: not used.
-        after: angles and speeds of the joints, ``(*B, 2 N)``.
-        goal: wanted angles, ``(*B, N)``.
-        offsets: see :func:`chain`.
-        axes: see :func:`chain`.
-    """
+    """Reward: minus the distance (m) of the tip from where the goal's joint angles bring it."""
     angles = after[..., : len(axes)]
     return -(tip_of(angles, offsets, axes) - tip_of(goal, offsets, axes)).norm(dim=-1)
 

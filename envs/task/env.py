@@ -12,9 +12,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.envs.missions.env import MissionEnv
-from afm_rl.envs.missions.noise import MissionNoise
-from afm_rl.envs.missions.phases import PhasedSimulation
+from afm_rl.envs.missions.env import MissionEnv, PhasedSimulation
+from afm_rl.envs.missions.format import MissionNoise
 from afm_rl.envs.missions.settings import check_bounds, check_regime
 from afm_rl.envs.task.film import curves, film
 from afm_rl.envs.task.task import Task
@@ -43,12 +42,8 @@ class TaskEnv(MissionEnv):
         max_steps: length of an episode, at most the task's; the task's if None.
         action_low: lower bounds of the actions; the task's if None.
         action_high: upper bounds. Actions are clamped before the regime acts on them.
-        batch_size: number of missions, or ``()`` for any.
-        seed: missions without a seed of their own get ``seed, seed + 1, ...``.
-        device: where the tensors live.
-        missions: what missions are unless ``reset`` is given others, see
-            :class:`~afm_rl.envs.UGVTrack`.
-        dtype: floating-point type, torch's default if None.
+        settings: further arguments of :class:`~afm_rl.envs.missions.env.MissionEnv`:
+            ``batch_size``, ``seed``, ``device``, ``missions`` and ``dtype``.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -66,14 +61,9 @@ class TaskEnv(MissionEnv):
         max_steps: int | None = None,
         action_low: Sequence[float] | None = None,
         action_high: Sequence[float] | None = None,
-        batch_size: Sequence[int] = (),
-        seed: int = 0,
-        device: torch.device | str | None = None,
-        missions: TensorDictBase | Mapping[str, Any] | None = None,
-        *,
-        dtype: torch.dtype | None = None,
+        **settings: Any,
     ) -> None:
-        super().__init__(batch_size, seed, 0.0, device, dtype)
+        super().__init__(0.0, **settings)
         if tracks is not None and list(tracks) != [task.name]:
             raise ConfigurationError(f"tracks={list(tracks)}: expected all, or {task.name}")
         low, high = (
@@ -95,7 +85,7 @@ class TaskEnv(MissionEnv):
             bounds[1].to(self.dtype),
             min(steps, task.steps),
         ).to(self.device)
-        self._complete([task.name], missions, bounds)
+        self._complete([task.name], bounds)
 
     def draw(self, steps: pd.DataFrame) -> Iterator[np.ndarray]:
         """Yield a picture ``(H, W, 3)`` of each row of a table of steps.

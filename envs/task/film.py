@@ -18,12 +18,7 @@ BODY, FIXED = "#0072b2", "#999999"
 
 
 def film(model: Any, states: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield a picture ``(H, W, 3)`` of each state.
-
-    Args:
-        model: an ``MjModel``.
-        states: rows (qpos, ...), ``(T, S)``.
-    """
+    """Yield a picture ``(H, W, 3)`` of each state (qpos, ...) of an ``MjModel``, ``(T, S)``."""
     import mujoco
 
     if not can_render():
@@ -102,13 +97,7 @@ def segments(model: Any, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def curves(t: np.ndarray, states: np.ndarray, names: Sequence[str]) -> Iterator[np.ndarray]:
-    """Yield pictures of curves that grow, one panel per state coordinate.
-
-    Args:
-        t: numbers of steps, ``(T,)``.
-        states: rows, ``(T, S)``.
-        names: of the coordinates.
-    """
+    """Yield pictures of curves that grow, one panel per coordinate of states ``(T, S)``."""
     figure = _sheet(layout="constrained")
     canvas = FigureCanvasAgg(figure)
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]

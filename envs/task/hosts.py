@@ -18,12 +18,7 @@ from afm_rl.spaces.manifold import Manifold
 
 
 class Host:
-    """One environment, and what led to its present state: its seed, and all actions since.
-
-    Args:
-        env: without a batch dimension.
-        key: of the observation, a vector.
-    """
+    """One environment without a batch, and what led to its state: seed and actions since."""
 
     def __init__(self, env: EnvBase, key: NestedKey) -> None:
         self.env, self.key = env, key

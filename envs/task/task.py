@@ -198,17 +198,10 @@ def trust(
     high: Sequence[float],
     share: float = 0.1,
 ) -> KnownDynamics:
-    """Bound a model's noise by a share of what actions effect in a step.
+    """Bound a model's noise, in place, by a share of what the largest actions effect in a step.
 
     Short steps have small effects; a change of what they are would be lost in the noise of long
     ones.
-
-    Args:
-        world: the model, changed in place.
-        state: where effects are measured, ``(S,)``.
-        low: lowest action, ``(A,)``.
-        high: highest action, ``(A,)``.
-        share: of the largest actions' effect on each coordinate.
     """
     half = (torch.tensor([list(high), list(low)]).diff(dim=0)[0] / 2).abs().nan_to_num(posinf=1.0)
     slopes = world.jacobian(state.float(), torch.zeros(len(half))).abs()

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.dynamics.mujoco_physics import changed_model
+from afm_rl.dynamics.mujoco_model import changed_model
 from afm_rl.errors import check_count, check_number
 from afm_rl.regimes import Physics
 
@@ -78,12 +78,7 @@ class WheelPhysics(Physics):
 
 
 def changed_wheels(model: Any, row: tuple[float, ...]) -> Any:
-    """Return a copy of the robot's ``MjModel`` with other physics.
-
-    Args:
-        model: the nominal model.
-        row: values of ``WheelPhysics.names``.
-    """
+    """Return a copy of the robot's model with other physics, a row of ``WheelPhysics.names``."""
     import mujoco
 
     value = dict(zip(WheelPhysics.names, row, strict=True))

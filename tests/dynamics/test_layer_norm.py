@@ -7,8 +7,7 @@ import torch
 from torch import nn
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.dynamics.sparse import sparse_layer
-from afm_rl.dynamics.stacked import SLOPE
+from afm_rl.dynamics.stacked import SLOPE, sparse_layer
 from afm_rl.errors import ConfigurationError
 
 HIDDEN = [[16], [8, 8, 8]]

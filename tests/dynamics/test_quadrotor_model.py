@@ -6,8 +6,8 @@ import roma
 import torch
 
 from afm_rl.dynamics import Dubins, DynamicsModel, Oracle, Quadrotor
-from afm_rl.dynamics import quadrotor_equations as equations
-from afm_rl.dynamics.quadrotor_equations import quadrotor_path, quadrotor_rate, quadrotor_step
+from afm_rl.dynamics import quadrotor as equations
+from afm_rl.dynamics.quadrotor import quadrotor_path, quadrotor_rate, quadrotor_step
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import flight_regimes
 from afm_rl.spaces.airframe import QuadrotorBody, mix, saturate, unmix

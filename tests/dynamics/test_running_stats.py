@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from afm_rl.dynamics.running_stats import RunningStats
+from afm_rl.dynamics.stacked import RunningStats
 from afm_rl.errors import ConfigurationError
 
 
@@ -56,18 +56,6 @@ def test_they_go_on_from_where_they_are_told():
     stats.update_(second)
     both = torch.cat([first, second])
     torch.testing.assert_close((stats.mean, stats.std), (both.mean(0), both.std(0)))
-
-
-def test_streams_part_and_leave():
-    data = stream(10, 2)
-    stats = RunningStats(2).double()
-    stats.update_(data)
-    assert stats.expand_(3) is stats and stats.lead == (3,)
-    stats.update_(stream(3, 2, seed=1), torch.tensor([False, True, True]))
-    kept = stats.std[[2, 0]].clone()
-    assert stats.select_(torch.tensor([2, 0])) is stats
-    assert torch.equal(stats.std, kept) and stats.count.flatten().tolist() == [11, 10]
-    torch.testing.assert_close(stats.mean[1], data.mean(0))
 
 
 def test_nothing_is_divided_by_zero():

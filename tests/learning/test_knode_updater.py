@@ -8,13 +8,12 @@ from tensordict import TensorDict
 from torch import nn
 
 from afm_rl.dynamics import KNODE, Dubins, Quadrotor
-from afm_rl.dynamics.quadrotor_equations import quadrotor_path
+from afm_rl.dynamics.quadrotor import quadrotor_path
 from afm_rl.dynamics.residual import Network
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, KNODEUpdater
 from afm_rl.learning.knode_fit import first_order, fit_network, through_integration
-from afm_rl.missions.log import StepLog
-from afm_rl.missions.state import Loop, restore, snapshot
+from afm_rl.missions.state import Loop, StepLog, restore, snapshot
 from afm_rl.spaces.airframe import QuadrotorBody
 from afm_rl.storage.artefacts import Checkpoints
 
@@ -221,7 +220,11 @@ def test_start_forgets_the_flight_but_not_the_pool():
     model, updater = teach(ticks)
     pool = model.networks.inner.clone()
     updater.start(ticks[0])
-    assert updater.window.size == 0 and int(updater.tick) == 0 and int(updater.due) == -1
+    assert (
+        not updater.window.parts.counts.numel()
+        and int(updater.tick) == 0
+        and int(updater.due) == -1
+    )
     assert torch.equal(model.networks.inner, pool)
     assert not any("window" in name or name == "tick" for name in updater.state_dict())
 

@@ -5,7 +5,7 @@ import torch
 
 from afm_rl.dynamics import KNODE, Oracle, Quadrotor
 from afm_rl.errors import ConfigurationError
-from afm_rl.learning.pretrain_knode import pretrain_knode
+from afm_rl.learning.knode_fit import pretrain_knode
 from afm_rl.regimes import MassFactor
 
 LEVEL = torch.zeros(13).index_fill(0, torch.tensor(9), 1.0)

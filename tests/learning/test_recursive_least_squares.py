@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from afm_rl.dynamics import Calibrated, Dubins
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, RLSUpdater
-from afm_rl.learning.least_squares import Rows, advance, nothing
+from afm_rl.learning.rls_updater import Rows, advance, nothing
 
 HALF = torch.tensor([1.0, 1.5], dtype=torch.float64)
 EYE = torch.eye(2, dtype=torch.float64)

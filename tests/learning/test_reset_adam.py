@@ -6,7 +6,7 @@ from torch import nn
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import ResetAdam
-from afm_rl.learning import reset_adam as module
+from afm_rl.learning import optimisers as module
 
 
 def parameters(seed=0):

@@ -3,8 +3,8 @@
 import pytest
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.missions.families import Family
 from afm_rl.missions.selection import (
+    Family,
     build_missions,
     fit_schedule,
     name_regimes,

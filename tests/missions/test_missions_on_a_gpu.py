@@ -13,10 +13,10 @@ RUN = sys.modules["afm_rl.missions.run"]
 ALWAYS = {  # what a step waits for, whatever the method
     "env._checked",  # is an action not finite?
     "compose._active",  # which families of regimes are there?
-    "log.add",  # the log is kept on the CPU
+    "state.add",  # the log is kept on the CPU
     "run._advance",  # has a mission ended?
 }
-LEARNING = {"learner.forward"}
+LEARNING = {"updater.forward"}
 METHODS = {
     "oracle": set(),
     "afm_physics": set(),

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.missions.families import Family, find_family
+from afm_rl.missions.selection import Family, find_family
 from afm_rl.regimes import ActionGain, Compose, Schedule
 
 ALL = (
@@ -69,7 +69,7 @@ def test_another_process_draws_the_same():
     regime = Compose({"gain": ActionGain(["v_gain", "omega_gain"])})
     family = Family("gains", regime, [["gain"]], {})
     code = (
-        "from afm_rl.missions.families import Family\n"
+        "from afm_rl.missions.selection import Family\n"
         "from afm_rl.regimes import ActionGain, Compose\n"
         "regime = Compose({'gain': ActionGain(['v_gain', 'omega_gain'])})\n"
         "print(Family('gains', regime, [['gain']], {}).mission(5))"

@@ -2,7 +2,7 @@
 
 import torch
 
-from afm_rl.missions.log import StepLog
+from afm_rl.missions.state import StepLog
 
 
 def test_steps_are_ordered_by_mission_whatever_left_the_batch():

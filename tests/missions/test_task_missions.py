@@ -12,8 +12,8 @@ from hydra import compose, initialize_config_module
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, prepare, run
-from afm_rl.missions.return_score import _measured
 from afm_rl.missions.run import Stopped
+from afm_rl.missions.scores import _measured
 from afm_rl.progress import Bar
 
 FLIP = "regimes=[{gain_0: -1}]"

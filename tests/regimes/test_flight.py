@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from afm_rl.dynamics.quadrotor_equations import quadrotor_rate
+from afm_rl.dynamics.quadrotor import quadrotor_rate
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import (
     Compose,

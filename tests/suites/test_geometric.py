@@ -7,7 +7,7 @@ from flight.geometric import Gains, GeometricController, geometric_wrench
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins, Quadrotor
-from afm_rl.dynamics.quadrotor_equations import quadrotor_path, quadrotor_step
+from afm_rl.dynamics.quadrotor import quadrotor_path, quadrotor_step
 from afm_rl.envs import Circle, CrazyflieTrack, Hover
 from afm_rl.errors import ConfigurationError, NonFiniteError
 from afm_rl.planning import GoalDistance, PlanningEnv

@@ -6,7 +6,7 @@ from flight import MassEstimator
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Oracle, Quadrotor
-from afm_rl.dynamics.quadrotor_equations import quadrotor_step
+from afm_rl.dynamics.quadrotor import quadrotor_step
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss
 from afm_rl.regimes import MassFactor, flight_regimes

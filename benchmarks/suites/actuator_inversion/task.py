@@ -15,10 +15,10 @@ from xml.etree import ElementTree
 from actuator_inversion.contexts import Span, body_regime, contexts_of
 from actuator_inversion.toys import SIGNS, TOYS
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.dynamics.mujoco_physics import NAMES, changed_model
+from afm_rl.dynamics.mujoco_model import NAMES, changed_model
 from afm_rl.envs import dm_control_task
-from afm_rl.envs.task.quiet import quiet
-from afm_rl.envs.task.simulated import Limits
+from afm_rl.envs.task.own import Limits
+from afm_rl.envs.task.published import quiet
 from afm_rl.envs.task.task import Reward, Task, trust
 from afm_rl.errors import check_choice, check_count
 

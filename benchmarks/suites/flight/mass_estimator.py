@@ -11,8 +11,8 @@ from torch import Tensor
 
 from afm_rl.dynamics import Oracle, Quadrotor
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.learning.learner import Learner
-from afm_rl.learning.nll import GaussianNLLLoss
+from afm_rl.learning.loss import GaussianNLLLoss
+from afm_rl.learning.updater import Learner
 from afm_rl.spaces.airframe import saturate
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.envs.task.simulated import Limits
+from afm_rl.envs.task.own import Limits
 from afm_rl.envs.task.task import NOWHERE, Reward, Task
 from afm_rl.errors import check_count
 from afm_rl.regimes import Regime

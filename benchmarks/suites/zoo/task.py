@@ -11,7 +11,7 @@ import torch
 from faults import faults_of, regime_of
 from gymnasium.vector import SyncVectorEnv
 
-from afm_rl.envs.task.pendulum import pendulum_step
+from afm_rl.envs.task.rewards import pendulum_step
 from afm_rl.planning import load_policy
 
 POLICIES = Path(__file__).parents[3] / "examples" / "policies" / "zoo"

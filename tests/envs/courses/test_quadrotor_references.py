@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from afm_rl.envs import Circle, FigureEight, Hover, Table, Waypoints, load_reference
-from afm_rl.envs.courses.reference import references_at
+from afm_rl.envs.courses.flights import references_at
 from afm_rl.errors import ConfigurationError
 
 SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0.5]]

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from afm_rl.envs.courses.geometry import poses_at, round_corners, station_of
+from afm_rl.envs.courses.tracks import poses_at, round_corners, station_of
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import wrap_angle
 

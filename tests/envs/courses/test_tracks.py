@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from afm_rl.envs import Track, load_track
-from afm_rl.envs.courses.columns import read_columns
-from afm_rl.envs.courses.geometry import poses_at, round_corners
-from afm_rl.envs.courses.tracks import MAPS
+from afm_rl.envs.courses.track import read_columns
+from afm_rl.envs.courses.tracks import MAPS, poses_at, round_corners
 from afm_rl.errors import ConfigurationError
 
 

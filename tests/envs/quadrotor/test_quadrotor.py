@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from afm_rl.dynamics import Quadrotor
-from afm_rl.dynamics.quadrotor_equations import quadrotor_path
+from afm_rl.dynamics.quadrotor import quadrotor_path
 from afm_rl.envs import Circle, CrazyflieTrack, Hover, Reference, schedule_in_seconds
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import ActionGain, Delay, GainNoise, MassFactor, Schedule, flight_regimes

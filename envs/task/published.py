@@ -1,7 +1,12 @@
-"""Tasks of gymnasium."""
+"""Tasks of gymnasium and of dm_control's suite."""
 
 from __future__ import annotations
 
+import logging
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -10,14 +15,53 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
+from afm_rl.dynamics.mujoco import Change
+from afm_rl.dynamics.mujoco_model import changed_model
 from afm_rl.envs.task.hosts import environment_task
-from afm_rl.envs.task.pendulum import pendulum_observation, pendulum_step
-from afm_rl.envs.task.quiet import quiet
-from afm_rl.envs.task.rewards import GYMNASIUM
-from afm_rl.envs.task.simulated import EXACT, Limits, known_of, simulated, state_of
+from afm_rl.envs.task.own import EXACT, Limits, known_of, simulated, state_of
+from afm_rl.envs.task.rewards import (
+    DM_CONTROL,
+    GYMNASIUM,
+    pendulum_observation,
+    pendulum_step,
+    seen_target,
+)
 from afm_rl.envs.task.task import NOWHERE, Reward, Task, trust
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Silence what packages say of missing screens, and of old settings in files of theirs."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    with warnings.catch_warnings(), _deprecations_of_mujoco_unsaid():
+        warnings.simplefilter("ignore")
+        try:
+            yield
+        finally:
+            logger.setLevel(level)
+            absl: Any = sys.modules.get("absl.logging")
+            if absl is not None:  # it would close what stood for stderr when it was imported
+                absl.get_absl_handler().python_handler.stream = sys.__stderr__
+
+
+@contextmanager
+def _deprecations_of_mujoco_unsaid() -> Iterator[None]:
+    try:
+        from mujoco import get_mju_user_warning, set_mju_user_warning
+    except ImportError:  # an extra
+        yield
+        return
+    before = get_mju_user_warning()
+    tell = partial(print, file=sys.stderr) if before is None else before
+    set_mju_user_warning(lambda text: None if "deprecated" in text else tell(text))
+    try:
+        yield
+    finally:
+        set_mju_user_warning(before)
 
 
 def gymnasium_task(
@@ -106,3 +150,59 @@ def _observation_of(env: Any, state: Tensor) -> Tensor:
         env.set_state(position, velocity)
         shown.append(env._get_obs())
     return torch.from_numpy(np.stack(shown)).to(state).reshape(*state.shape[:-1], -1)
+
+
+def dm_control_task(
+    domain: str,
+    task: str,
+    reward: Reward | None = None,
+    steps: int = 1000,
+    action_low: Limits = None,
+    action_high: Limits = None,
+    change: Change = changed_model,
+) -> Task:
+    """Return a task of dm_control's suite.
+
+    Args:
+        domain: such as ``reacher``.
+        task: such as ``hard``.
+        reward: see :func:`gymnasium_task`.
+        steps: length of an episode.
+        action_low: lowest action; the task's if None.
+        action_high: highest action.
+        change: see :class:`~afm_rl.dynamics.MuJoCoDynamics`.
+
+    Raises:
+        ConfigurationError: if there is no dm_control, no such task, or nothing is known of it.
+    """
+    draws = np.random.RandomState()
+    with quiet():
+        try:
+            from dm_control import suite
+
+            env = suite.load(domain, task, task_kwargs={"random": draws})
+        except ImportError as error:
+            raise ConfigurationError(
+                "robot=dm_control: the package dm_control is missing; install afm-rl[dm_control]"
+            ) from error
+        except ValueError as error:
+            raise ConfigurationError(f"robot.domain={domain} robot.task={task}: {error}") from error
+    known = known_of(
+        f"robot.domain={domain} robot.task",
+        task,
+        DM_CONTROL.get(domain, {}),
+        reward,
+        env.physics.model,
+    )
+    targets = domain == "reacher"
+
+    def start(seed: int) -> tuple[Tensor, Tensor]:
+        draws.seed(seed % 2**32)
+        env.reset()
+        goal = env.physics.named.model.geom_pos["target", :2] if targets else ()
+        return state_of(env.physics.data), torch.tensor(np.array(goal))
+
+    goals = {"goal_names": ["target_x", "target_y"], "goal_in": seen_target} if targets else {}
+    limits = action_low, action_high
+    world = MuJoCoDynamics(env, change=change)
+    return simulated(f"{domain}_{task}", world, start, {**known, **goals}, steps, *limits)
