@@ -29,11 +29,6 @@ from afm_rl.streams import Streams
 class StepLog:
     """One row per mission and step, kept in memory until a table is asked for.
 
-    Args:
-        columns: names of the values.
-        whole: the columns that hold whole numbers.
-        room: rows that there is room for at first.
-
     >>> log = StepLog(["x", "reached"], whole=["reached"])
     >>> log.add(torch.tensor([4, 7]), 0, torch.tensor([[0.5, 1.0], [0.6, 2.0]]))
     >>> log.table().values.tolist()

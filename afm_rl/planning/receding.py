@@ -58,12 +58,7 @@ class RecedingHorizonPlanner(MPCPlannerBase):
 
     So every mission of a batch has its own, resets start afresh, and branches are exact: append
     :meth:`make_tensordict_primer` to the environment. Without it each plan starts cold, and a
-    warning is given once.
-
-    Args:
-        env: batch-unlocked environment to plan in.
-        memory: entries that are kept, with their shapes.
-        action_key: where the action goes.
+    warning is given once. ``memory`` are the entries that are kept, with their shapes.
     """
 
     def __init__(

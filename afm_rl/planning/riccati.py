@@ -63,15 +63,10 @@ def solve_lq(problem: LQProblem, sweeps: int = 300, patience: float = 3.0) -> LQ
     neither happens. Where it stops this way the solution is exact to rounding: it satisfies
     the optimality conditions of a convex problem. One sweep does where no bound is active.
     So that sets cannot recur, components change sides one at a time, the last first, while
-    their number does not shrink (Judice and Pires 1994).
+    their number does not shrink for ``patience`` sweeps (Judice and Pires 1994).
 
     After ``sweeps`` sets the controls are clamped and ``exact`` is false. Problems whose
     reduced Hessian is not positive definite, or that are not finite, give NaN.
-
-    Args:
-        problem: what to solve, float32 or float64.
-        sweeps: most active sets to try; a handful do unless most components are at a bound.
-        patience: sweeps without progress before components change sides one at a time.
 
     >>> one = torch.ones(1, 1)
     >>> problem = LQProblem(  # one stage: move a point to 0, at a price

@@ -70,13 +70,8 @@ class QuadrotorSimulation(PhasedSimulation):
     ) -> TensorDict:
         """Return what one control tick leads to.
 
-        Args:
-            data: ``mission``, ``pose``, ``step``, ``since``, ``lost``, ``action`` and, for a
-                regime with a history, ``past``; ``observation``, where the trace begins.
-            sensor: standard normal numbers for the observation, ``(*B, 12)``; None for none.
-            between: such numbers for the trace between two observations,
-                ``(*B, 12 (substeps - 1))``.
-            actuator: standard normal numbers for a noisy regime, ``(*B, 4)``.
+        The numbers, standard normal, are for the observation ``(*B, 12)``, for the trace between
+        two observations ``(*B, 12 (substeps - 1))``, and for a noisy regime ``(*B, 4)``.
         """
         mission, pose, step = data["mission"], data["pose"], data["step"]
         action = saturate(data["action"].to(pose.dtype), self.body)

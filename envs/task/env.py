@@ -179,12 +179,7 @@ class TaskSimulation(nn.Module, PhasedSimulation):
         return (begun < first.unsqueeze(-1)).sum(-1)
 
     def advance(self, data: TensorDictBase, actuator: Tensor | None = None) -> TensorDict:
-        """Return what one step leads to.
-
-        Args:
-            data: the state, ``mission`` and ``action``.
-            actuator: standard normal numbers for a noisy regime, ``(*B, A)``.
-        """
+        """Return what one step leads to; ``actuator`` is for a noisy regime, ``(*B, A)``."""
         mission, pose = data["mission"], data["pose"]
         action = data["action"].to(pose.dtype).clamp(self.low, self.high)
         past = data["past"] if self.regime.history else None

@@ -74,14 +74,7 @@ class UGVSimulation(nn.Module, PhasedSimulation):
     def advance(
         self, data: TensorDictBase, noise: Tensor, actuator: Tensor | None = None
     ) -> TensorDict:
-        """Return what one step leads to.
-
-        Args:
-            data: ``mission``, ``pose``, ``reached``, ``step``, ``since``, ``action`` and, for a
-                regime with a history, ``past``.
-            noise: what is added to the poses (m, m, rad), ``(*B, 3)``.
-            actuator: standard normal numbers for a noisy regime, ``(*B, 2)``.
-        """
+        """Return what one step leads to, with noise of the poses (m, m, rad) ``(*B, 3)``."""
         mission, pose, before = data["mission"], data["pose"], data["reached"]
         action = data["action"].to(pose.dtype).clamp(self.low, self.high)
         past = data["past"] if self.regime.history else None
