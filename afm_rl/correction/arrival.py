@@ -67,7 +67,8 @@ def steps_late(
     kept = torch.where((before > 0).unsqueeze(-1), stays, first)
     shown = evidence.log()
     found = (kept.log() + shown.sum(-1)).argmax(-1)
-    others = (kept / first).log().unsqueeze(-1) + shown.sum(-1, keepdim=True) - shown
+    odds = (kept.clamp_min(1e-30) / first.clamp_min(1e-30)).log().unsqueeze(-1)
+    others = odds + shown.sum(-1, keepdim=True) - shown
     against = (others - others[..., :1, :]).clamp(math.log(LEAST), 0.0)
     changed = (weights[..., 0, :] < 0.5).any(-1) | (before > 0)
     return torch.where(changed, found, 0), against
