@@ -112,7 +112,8 @@ def test_flights_of_a_batch_are_independent(batch):
     action = steer(state)
     assert action.shape == (*batch, 4)
     alone = [steer(one) for one in state.reshape(-1, 13)]
-    assert torch.equal(action.reshape(-1, 4), torch.stack(alone))
+    alike = {"rtol": 1e-6, "atol": 1e-9}  # to rounding, which depends on processor and batch
+    torch.testing.assert_close(action.reshape(-1, 4), torch.stack(alone), **alike)
     torch.testing.assert_close(saturate(action, BODY), action)  # the motors can do it
 
 
