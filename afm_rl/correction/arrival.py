@@ -7,7 +7,6 @@ through the effects of the commands that are still under way.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -22,10 +21,8 @@ if TYPE_CHECKING:
 LEAST = 1e-3  # share of the best that every delay keeps on every axis: none decides alone
 
 
-def steps_late(
-    weights: Tensor, prior: Tensor, delays: Tensor, before: Tensor, most: int
-) -> tuple[Tensor, Tensor]:
-    r"""Return the most probable delay of commands in steps, ``(*B)``, and what speaks against each.
+def steps_late(weights: Tensor, prior: Tensor, delays: Tensor, before: Tensor, most: int) -> Tensor:
+    r"""Return the most probable delay of commands in steps, ``(*B)``.
 
     .. math:: k = \operatorname{argmax}_k \log p_k + \sum_a \log\frac{p_{ka}}{p_k}
 
@@ -42,14 +39,9 @@ def steps_late(
         before: the delay until now, ``(*B)``.
         most: the longest delay, K.
 
-    Returns:
-        The delay, and log-odds of every delay against none on every axis, by what the *other* axes
-        have shown, ``(*B, K + 1, A)``; none above 0. A motor that is reversed in a gait looks late
-        by half a period, until one asks the others.
-
     >>> weights = torch.tensor([[0.8, 0.1], [0.1, 0.8], [0.1, 0.1]])
     >>> delays = torch.tensor([0, 1, 1])
-    >>> steps_late(weights, torch.zeros(3, 1), delays, torch.tensor(0), 1)[0]
+    >>> steps_late(weights, torch.zeros(3, 1), delays, torch.tensor(0), 1)
     tensor(1)
     """
     every = torch.arange(most + 1, device=weights.device)
@@ -65,13 +57,8 @@ def steps_late(
     stays = (before.unsqueeze(-1) == every).to(first)
     stays = torch.lerp(first, stays, share[..., 0, :1])
     kept = torch.where((before > 0).unsqueeze(-1), stays, first)
-    shown = evidence.log()
-    found = (kept.log() + shown.sum(-1)).argmax(-1)
-    odds = (kept.clamp_min(1e-30) / first.clamp_min(1e-30)).log().unsqueeze(-1)
-    others = odds + shown.sum(-1, keepdim=True) - shown
-    against = (others - others[..., :1, :]).clamp(math.log(LEAST), 0.0)
-    changed = (weights[..., 0, :] < 0.5).any(-1) | (before > 0)
-    return torch.where(changed, found, 0), against
+    found = (kept.log() + evidence.log().sum(-1)).argmax(-1)
+    return torch.where((weights[..., 0, :] < 0.5).any(-1) | (before > 0), found, 0)
 
 
 def ago(commands: Tensor, late: Tensor) -> Tensor:

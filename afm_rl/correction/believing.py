@@ -120,8 +120,7 @@ class Believer(PairCorrector):
         """Return names and shapes, with the belief; its noise is the last part."""
         size, count = self.action_size, len(self.models)
         belief = {"losses": (count, size), "forecasts": (count, size), "noise": (size,)}
-        late = {"late": (1,), "against": (self.most_late + 1, size)}
-        late["under_way"] = (self.most_late + self.delay, size)
+        late = {"late": (1,), "under_way": (self.most_late + self.delay, size)}
         return {**super().shapes(state_size), **late, **belief}
 
     def begin(self, state: Tensor) -> Tensor:
@@ -138,13 +137,8 @@ class Believer(PairCorrector):
         return prior_of(self.worth.to(parts["noise"]), self.odds, parts["noise"], self.least_noise)
 
     def weights(self, parts: Fields) -> Tensor:
-        """Return the probabilities of the models ``(*B, M, A)``.
-
-        Of late ones they are less where the other axes are not so late.
-        """
-        delays = self.delays_now(parts["late"].squeeze(-1).long()).unsqueeze(-1)
-        against = parts["against"].gather(-2, delays.expand(*delays.shape[:-1], self.action_size))
-        return self.belief(parts).weights(self.prior(parts) + against)
+        """Return the probabilities of the models ``(*B, M, A)``."""
+        return self.belief(parts).weights(self.prior(parts))
 
     def look(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts of the memory with the newest pairs and the belief after them."""
@@ -157,11 +151,9 @@ class Believer(PairCorrector):
         belief = belief._replace(losses=self.surprised(parts["losses"], belief.losses))
         awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
         before = parts["late"].squeeze(-1).long()
-        parts["against"] = torch.zeros_like(parts["against"])
         if not all_hold(~awake.squeeze(-1) & (before == 0)):
-            late, against, losses = self.delayed(belief, prior, before)
+            late, losses = self.delayed(belief, prior, before)
             parts["late"], belief = late.unsqueeze(-1).to(newest), belief._replace(losses=losses)
-            parts["against"] = torch.where(awake.unsqueeze(-1), against, parts["against"])
         begins = (parts["misaligned"] != 1.0) & awake
         count = 1 if model.taught_in is None else self.recent
         parts["pairs"] = self.aged(parts["pairs"], begins, count)
@@ -185,19 +177,17 @@ class Believer(PairCorrector):
         """Return the delays of all models ``(*B, M)`` while ``late`` ``(*B)`` is believed."""
         return torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
 
-    def delayed(self, belief: Belief, prior: Tensor, before: Tensor) -> tuple[Tensor, ...]:
-        """Return the delay ``(*B)`` that is believed now, what speaks against each, and the losses.
+    def delayed(self, belief: Belief, prior: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the delay ``(*B)`` that is believed now, and the losses ``(*B, M, A)``.
 
-        These are ``(*B, K + 1, A)`` and ``(*B, M, A)``: models that follow a new delay begin as
-        good as the best that had it already.
+        Models that follow a new one begin as good as the best that had it already.
         """
         now = self.delays_now(before)
-        weights = belief.weights(prior)
-        late, against = steps_late(weights, prior, now, before, self.most_late)
+        late = steps_late(belief.weights(prior), prior, now, before, self.most_late)
         theirs = (self.delays == late.unsqueeze(-1)).unsqueeze(-1)
         best = torch.where(theirs, belief.losses, torch.inf).amin(-2, keepdim=True)
         begin = (self.delays < 0) & (late != before).unsqueeze(-1)
-        return late, against, torch.where(begin.unsqueeze(-1), best, belief.losses)
+        return late, torch.where(begin.unsqueeze(-1), best, belief.losses)
 
     def asleep(self, parts: Fields, action: Tensor) -> Fields:
         """Return the parts if ``action`` ``(*B, A)`` is executed, and nothing has changed.

@@ -143,9 +143,8 @@ def fit_experts(rows: Rows) -> Experts:
     flat = torch.cat([weights, moved], -2).flatten(0, 1)  # (N A, 3, K)
     moments = torch.baddbmm(prior, flat, terms)
     gains = moments[:, :2, 3] / moments[:, :2, 0]
-    slopes, offsets = solve_line(
-        *moments[:, lines, places].unbind(-1)
-    )  # with offset, with friction
+    # Of two lines: with an offset, with friction.
+    slopes, offsets = solve_line(*moments[:, lines, places].unbind(-1))
     miss = e.flatten(0, 1) - torch.addcmul(offsets[:, :1], slopes[:, :1], u.flatten(0, 1))
     robust = flat[:, 1] / (1 + (miss / OUTLIER).square())
     robust = torch.baddbmm(prior[1:2], robust.unsqueeze(1), terms)[:, 0, places[0]]

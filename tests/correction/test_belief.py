@@ -3,7 +3,6 @@
 import torch
 
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.arrival import steps_late
 from afm_rl.correction.belief import Belief, haste, prior_of
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.spaces.manifold import Manifold
@@ -50,32 +49,3 @@ def test_in_noise_the_belief_looks_back_longer():
     after = belief.update(torch.zeros(2, 2), noise, torch.ones(2, 1), prior, *rules)
     torch.testing.assert_close(after.losses[0, 0], torch.tensor([4.5, 4.995]))
     assert haste(torch.tensor(0.01), 0.02) == 1.0
-
-
-def test_a_motor_reversed_in_a_gait_is_not_late_since_the_others_are_not():
-    low, count = -torch.ones(4), 8
-    model = KnownDynamics(lambda state, action: state + 0.2 * action, Manifold(4), 4)
-    flow, box = ActionFlow(low, -low), torch.stack([low, -low]).expand(count, 2, 4)
-    sign, phase = torch.tensor([-1.0, 1.0, 1.0, 1.0]), torch.linspace(0.0, 6.0, count)
-    memory = flow.begin(state := torch.zeros(count, 4))
-    late = torch.tensor(["late" in cause for cause in flow.causes])
-    for step in range(40):
-        angle = 0.4 * step + phase.unsqueeze(-1) + torch.arange(4)
-        memory, found = flow.correct(memory, 0.8 * angle.sin(), model, box)
-        state = model(state, (sign if step >= 30 else 1.0) * found.executed)
-        memory = flow.observe(memory, state)
-        assert step < 30 or flow.belief_in(memory)[:, late].sum(1)[:, 0].max() < 0.2
-
-
-def test_no_axis_speaks_against_its_own_delay():
-    """One of three axes looks a step late, the others not at all."""
-    weights = torch.tensor([[0.02, 0.45, 0.45], [0.02, 0.45, 0.45], [0.9, 0.05, 0.05]])
-    weights = torch.cat([weights, 1 - weights.sum(0, keepdim=True)])
-    given = torch.zeros(4, 1), torch.tensor([0, 0, 1, 2]), torch.tensor(0), 2
-    against = steps_late(weights, *given)[1]
-    assert (against <= 0).all()
-    assert (against[0] == 0).all()
-    assert (against[1:, 0] < -3).all()
-    other = weights.clone()
-    other[:, 0] = torch.tensor([0.45, 0.45, 0.05, 0.05])
-    torch.testing.assert_close(steps_late(other, *given)[1][:, 0], against[:, 0])
