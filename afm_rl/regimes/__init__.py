@@ -14,7 +14,7 @@ from afm_rl.regimes.flight import (
 )
 from afm_rl.regimes.gains import ActionGain, AsymmetricGain, Bias, DeadActuator, GainNoise
 from afm_rl.regimes.ground import Patches, WheelSlip
-from afm_rl.regimes.late import Backlash, Delay, Lag, RateLimit
+from afm_rl.regimes.late import Backlash, Delay, Lag
 from afm_rl.regimes.physics import Physics
 from afm_rl.regimes.schedule import Schedule, blend_phases, phase_parameters
 
@@ -38,7 +38,6 @@ __all__ = [
     "Permutation",
     "Physics",
     "Quantisation",
-    "RateLimit",
     "Regime",
     "Rotation",
     "Saturation",

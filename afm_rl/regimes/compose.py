@@ -12,7 +12,7 @@ from afm_rl.errors import ConfigurationError, check_choice
 from afm_rl.regimes.base import Constant, Regime
 from afm_rl.regimes.commands import DeadZone, Permutation, Quantisation, Saturation
 from afm_rl.regimes.gains import ActionGain, AsymmetricGain, Bias, DeadActuator, GainNoise
-from afm_rl.regimes.late import Backlash, Delay, Lag, RateLimit
+from afm_rl.regimes.late import Backlash, Delay, Lag
 
 
 class Compose(Regime):
@@ -198,8 +198,8 @@ def actuator_regimes(low: Sequence[float], high: Sequence[float]) -> dict[str, R
 
     Parameters of single actuators end in their index: ``gain_0``, ``bias_0``, ``from_0`` (which
     command actuator 0 gets), ``gain_0_up`` and ``gain_0_down`` (by direction), ``loss_0`` (share
-    of its effect that is lost). Those of all are ``delay``, ``lag``, ``rate``, ``backlash``,
-    ``quantum``, ``saturation``, ``dead_zone`` and ``gain_noise``.
+    of its effect that is lost). Those of all are ``delay``, ``lag``, ``backlash``, ``quantum``,
+    ``saturation``, ``dead_zone`` and ``gain_noise``.
 
     Args:
         low: lowest action, ``(A,)``.
@@ -217,7 +217,6 @@ def actuator_regimes(low: Sequence[float], high: Sequence[float]) -> dict[str, R
     families: dict[str, Regime] = {
         "delay": Delay(),
         "lag": Lag(),
-        "rate": RateLimit(half),
         "backlash": Backlash(half),
         "permutation": Permutation([f"from_{k}" for k in axes], half),
         "quantisation": Quantisation(half),

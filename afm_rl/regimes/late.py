@@ -1,8 +1,7 @@
-"""Commands that act late: delay, lag, limited rate, backlash."""
+"""Commands that act late: delay, lag, backlash."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -62,24 +61,10 @@ class Delay(DelayedRegime):
         return torch.randint(low, high + 1, (*shape, 1), generator=generator).float()
 
 
-class Follower(DelayedRegime):
-    """An effect that follows the commands; it begins at the oldest one that is remembered."""
-
-    @abstractmethod
-    def follow(self, effect: Tensor, command: Tensor, parameters: Tensor) -> Tensor:
-        """Return the effect ``(*B, A)`` of a command after an ``effect``."""
-
-    def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
-        effect, *later = reversed(past.unbind(-2))
-        for command in (*later, action):
-            effect = self.follow(effect, command, parameters)
-        return effect
-
-
 SLOWEST = 8.0  # steps
 
 
-class Lag(Follower):
+class Lag(DelayedRegime):
     r"""A low-pass filter of first order with a time constant of T steps, the same on all axes.
 
     .. math:: y_t = a_t + e^{-1 / T} (y_{t-1} - a_t)
@@ -105,50 +90,16 @@ class Lag(Follower):
         self.span = check_span("span", span, 0.0, SLOWEST)
         self.history = check_count("history", history)
 
-    def follow(self, effect: Tensor, command: Tensor, parameters: Tensor) -> Tensor:
+    def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
         keep = (-1 / parameters.abs()).exp()  # 0 where there is no lag
-        return command + keep * (effect - command)
+        oldest, *later = reversed(past.unbind(-2))
+        effect = oldest
+        for command in (*later, action):
+            effect = command + keep * (effect - command)
+        return effect
 
 
-class RateLimit(Follower):
-    r"""Actuators that move by no more than r in a step, the same on all axes.
-
-    .. math:: y_t = \min(\max(a_t, y_{t-1} - r), y_{t-1} + r)
-
-    r and a are in half ranges; at 2, from one end to the other, nothing is limited. y begins at
-    the oldest command that is remembered. Without the previous commands there is no limit.
-
-    Args:
-        half_range: half ranges of the action axes.
-        span: lowest and highest rate r in the prior, uniform.
-        history: number of commands that are remembered.
-
-    >>> slow, past = RateLimit(half_range=[1.0], history=3), torch.zeros(3, 1)
-    >>> slow.apply(torch.ones(1), slow.encode({"rate": 0.2}), torch.zeros(3), past)
-    tensor([0.2000])
-    """
-
-    names = ("rate",)
-    identity = (2.0,)
-    limits = {"rate": (0.0, 2.0)}
-
-    def __init__(
-        self,
-        half_range: Sequence[float],
-        span: Sequence[float] = (0.1, 0.5),
-        history: int = 8,
-    ) -> None:
-        self.half_range = HalfRange(half_range)
-        self.span = check_span("span", span, 0.0, 2.0)
-        self.history = check_count("history", history)
-
-    def follow(self, effect: Tensor, command: Tensor, parameters: Tensor) -> Tensor:
-        most = parameters * self.half_range.like(command)
-        free = torch.minimum(torch.maximum(command, effect - most), effect + most)
-        return torch.where(parameters < 2.0, free, command)
-
-
-class Backlash(Follower):
+class Backlash(DelayedRegime):
     r"""The play operator, the same width on all axes: a hysteresis.
 
     .. math:: y_t = \min(\max(y_{t-1}, u_t - b), u_t + b)
@@ -181,6 +132,10 @@ class Backlash(Follower):
         self.span = check_span("span", span, 0.0, 1.0)
         self.history = check_count("history", history)
 
-    def follow(self, effect: Tensor, command: Tensor, parameters: Tensor) -> Tensor:
-        width = parameters * self.half_range.like(command)
-        return torch.minimum(torch.maximum(effect, command - width), command + width)
+    def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
+        width = parameters * self.half_range.like(action)
+        oldest, *later = reversed(past.unbind(-2))
+        effect = oldest
+        for command in (*later, action):
+            effect = torch.minimum(torch.maximum(effect, command - width), command + width)
+        return effect

@@ -21,7 +21,6 @@ from afm_rl.regimes import (
     Patches,
     Permutation,
     Quantisation,
-    RateLimit,
     Rotation,
     Saturation,
     WheelSlip,
@@ -48,7 +47,6 @@ FAMILIES = {
     "quantisation": Quantisation(HALF),
     "backlash": Backlash(HALF),
     "lag": Lag(),
-    "rate": RateLimit(HALF),
 }
 every_family = pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
 
@@ -129,7 +127,6 @@ def test_the_generator_decides_the_draw(family, shape):
         ("quantisation", [0.1], [0.5]),
         ("backlash", [0.05], [0.3]),
         ("lag", [0.5], [3.0]),
-        ("rate", [0.1], [0.5]),
     ],
 )
 def test_the_prior_covers_its_range(family, least, most):
@@ -255,17 +252,6 @@ def test_a_lag_is_a_filter_of_first_order():
     assert effects == pytest.approx([1 - math.exp(-k / 2) for k in range(1, 9)])
 
 
-def test_a_limited_rate_is_a_ramp_in_half_ranges():
-    family = FAMILIES["rate"]
-    row, past = family.encode({"rate": 0.25}), torch.zeros(8, 2)
-    effects = []
-    for _ in range(4):
-        effects.append(family.apply(torch.tensor([0.6, -1.5]), row, STATE, past))
-        past = torch.cat([torch.tensor([[0.6, -1.5]]), past[:-1]])
-    assert torch.stack(effects)[:, 0].tolist() == pytest.approx([0.25, 0.5, 0.6, 0.6])
-    assert torch.stack(effects)[:, 1].tolist() == pytest.approx([-0.375, -0.75, -1.125, -1.5])
-
-
 def test_patches_depend_on_the_place():
     family = Patches(size=2.0, where=[0, 1], names=["gain"])
     row = family.encode({"gain": -1.0})
@@ -302,7 +288,6 @@ def test_a_row_is_described_by_what_is_not_nominal(gains):
         ("gain", {"v_gain": 1e30}, r"v_gain=1e\+30: .* in \[-100, 100\]"),
         ("permutation", {"v_from": 1}, r".*expected each of 0..1 once"),
         ("lag", {"lag": 9}, r"lag=9: .* in \[0, 8\]"),
-        ("rate", {"rate": 3}, r"rate=3: .* in \[0, 2\]"),
         ("slip", {"slip_at": -1}, r"slip_at=-1: .* in \[0, 10\]"),
         ("slip", {"slip_peak": "much"}, "slip_peak='much': expected a finite number"),
         ("delay", {"delay": 11}, r"delay=11: expected a finite number in \[0, 10\]"),

@@ -11,9 +11,7 @@ from torch import Tensor
 
 from afm_rl.regimes import Compose, actuator_regimes
 
-FAMILIES = ("delay", "lag", "rate", "permutation", "gain", "dead", "bias")
-SLOW = ("lag 1", "lag 3", "rate .3", "rate .2")
-"""Faults that are played only if they are asked for."""
+FAMILIES = ("delay", "lag", "permutation", "gain", "dead", "bias")
 
 
 def regime_of(low: np.ndarray, high: np.ndarray) -> Compose:
@@ -35,8 +33,7 @@ def faults_of(actuators: int) -> dict[str, dict[str, float]]:
         "dead": {"loss_0": 1.0},
         "bias .3": {f"bias_{k}": 0.3 for k in every},
         **{f"late {steps}": {"delay": steps} for steps in (1, 2, 4, 8)},
-        **{f"lag {steps}": {"lag": float(steps)} for steps in (1, 2, 3)},
-        **{f"rate .{tenths}": {"rate": tenths / 10} for tenths in (3, 2)},
+        "lag 2": {"lag": 2.0},
         "reversed and late 2": {**reversed_, "delay": 2},
     }
     if actuators == 1:
