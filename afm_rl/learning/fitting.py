@@ -52,6 +52,7 @@ def fit_ensemble(
     epochs: int = 40,
     batch_size: int = 256,
     lr: float = 2e-3,
+    beta: float = 0.0,
     held_out: float = 0.1,
     keys: tuple[NestedKey, NestedKey, NestedKey] = (
         "observation",
@@ -74,6 +75,8 @@ def fit_ensemble(
         batch_size: transitions per step and member, at most; fewer where a pass would otherwise
             have fewer than eight steps.
         lr: largest step size.
+        beta: 0 to 1: how little a row's stated variance takes from its weight, see
+            :func:`~afm_rl.learning.loss.gaussian_nll`.
         held_out: share of the transitions, picked at random, that only judges.
         keys: where state, action and next state are.
         names: of the coordinates of the tangent space.
@@ -115,6 +118,7 @@ def fit_ensemble(
         epochs=check_count("epochs", epochs),
         batch_size=min(check_count("batch_size", batch_size), max(16, samples // 8), samples),
         lr=check_number("lr", lr, low=0.0, open_low=True),
+        beta=check_number("beta", beta, low=0.0, high=1.0),
         generator=generator,
         title="fitting the ensemble",
         names=names,
@@ -136,6 +140,7 @@ def fit_changes(
     title: str,
     names: Sequence[str] | None,
     progress: bool,
+    beta: float = 0.0,
 ) -> FitReport:
     """Fit to state changes ``(N, D)``, of which all but the first ``samples`` are held out."""
     model.normalise_(model.inputs(state, action)[:samples], change[:samples])
@@ -152,7 +157,7 @@ def fit_changes(
             order = order.to(inputs.device)
             for rows in order[:, : steps * batch_size].split(batch_size, -1):
                 mean, log_variance = model.member_moments(inputs[rows])
-                loss = gaussian_nll(mean, log_variance, target[rows]).mean((-2, -1)).sum()
+                loss = gaussian_nll(mean, log_variance, target[rows], beta).mean((-2, -1)).sum()
                 optimizer.zero_grad(set_to_none=True)
                 loss.backward()
                 optimizer.step()

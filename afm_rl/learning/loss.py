@@ -56,17 +56,19 @@ class InPlaceLoss(LossModule):
         return TensorDict({self.out_keys[0]: loss}, loss.shape)
 
 
-def gaussian_nll(mean: Tensor, log_variance: Tensor, target: Tensor) -> Tensor:
-    r"""Return :math:`(\mu - y)^2 e^{-\ell} + \ell`, elementwise.
+def gaussian_nll(mean: Tensor, log_variance: Tensor, target: Tensor, beta: float = 0.0) -> Tensor:
+    r"""Return :math:`e^{\beta\ell} ((\mu - y)^2 e^{-\ell} + \ell)`, elementwise.
 
     Twice the Gaussian negative log-likelihood without its constant, :math:`\ell` the
-    log-variance (Chua et al. 2018, eq. 1).
+    log-variance (Chua et al. 2018, eq. 1), times a power of the variance, of which no gradient is
+    taken: so means of rows that are hard to predict are not given up (Seitzer et al. 2022, ICLR).
 
     >>> import torch
     >>> gaussian_nll(torch.zeros(1), torch.zeros(1), torch.full((1,), 3.0))
     tensor([9.])
     """
-    return (mean - target) ** 2 * (-log_variance).exp() + log_variance
+    loss = (mean - target) ** 2 * (-log_variance).exp() + log_variance
+    return loss * (beta * log_variance.detach()).exp() if beta else loss
 
 
 class GaussianNLLLoss(InPlaceLoss):

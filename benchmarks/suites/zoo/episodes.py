@@ -85,8 +85,8 @@ def rewards_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return rewards ``(T, N)``, 0 after the end of an episode, and how long each one lasted."""
     torch.manual_seed(0)
-    rows = torch.stack([task.regime.encode(task.faults[fault]) for fault, _ in pairs])
-    inner = FaultyVector(task.vector(len(pairs)), task.regime, rows, task.at)
+    faults = [task.faults[fault] for fault, _ in pairs]
+    inner = FaultyVector(task.vector(len(pairs)), task.regime, faults, task.at)
     envs, act = METHODS[method](task, inner)
     observations, _ = envs.reset(seed=[episode for _, episode in pairs])
     rewards, alive = np.zeros((steps, len(pairs))), np.ones(len(pairs), dtype=bool)

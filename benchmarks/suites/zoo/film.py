@@ -31,8 +31,7 @@ GOES_ON = {"hopper_trpo": {"terminate_when_unhealthy": False}}
 
 def record(task: Task, fault: str, method: str, at: int, steps: int) -> list[np.ndarray]:
     """Return the ends of all capsules, x and z, ``(G, 2, 2)``, at every step."""
-    row = task.regime.encode(task.faults[fault]).unsqueeze(0)
-    inner = FaultyVector(task.vector(1), task.regime, row, at)
+    inner = FaultyVector(task.vector(1), task.regime, [task.faults[fault]], at)
     envs, act = METHODS[method](task, inner)
     world = inner.env.envs[0].unwrapped
     observations, _ = envs.reset(seed=[0])

@@ -15,7 +15,7 @@ from pathlib import Path
 import pandas as pd
 import torch
 from episodes import complete
-from faults import faults_of
+from faults import SLOW, faults_of
 from methods import METHODS
 from show import draw, ordered, print_tables, shares
 from task import POLICIES, Task
@@ -24,7 +24,7 @@ from task import POLICIES, Task
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--policies", nargs="*", help="names of files; default: all")
-    parser.add_argument("--faults", nargs="*", help="default: all")
+    parser.add_argument("--faults", nargs="*", help="default: all but slow ones")
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS))
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--steps", type=int, help="cut episodes (use another --out)")
@@ -35,7 +35,8 @@ def main() -> None:
     names = args.policies or sorted(file.stem for file in args.folder.glob("*.safetensors"))
     for name in names:
         task = Task(args.folder / f"{name}.safetensors")
-        faults = [fault for fault in args.faults or task.faults if fault in task.faults]
+        usual = [fault for fault in task.faults if fault not in SLOW]
+        faults = [fault for fault in args.faults or usual if fault in task.faults]
         for method in args.methods:
             complete(task, method, faults, args.episodes, args.out, args.steps)
     results = read(args.out)
