@@ -52,12 +52,16 @@ class Watching:
     True
     """
 
-    transitions: int = 20_000
+    transitions: int = 24_000
     error: float = 0.5
-    noise: float = 0.2
+    noise: float = 0.4
     hold: int = 20
-    fit: Mapping[str, Any] = field(default_factory=lambda: {"epochs": 100})
-    model: Mapping[str, Any] = field(default_factory=lambda: {"hidden": [200, 200]})
+    fit: Mapping[str, Any] = field(
+        default_factory=lambda: {"epochs": 100, "batch_size": 128, "lr": 8e-3, "beta": 0.5}
+    )
+    model: Mapping[str, Any] = field(
+        default_factory=lambda: {"hidden": [256] * 3, "members": 3, "layer_norm": True}
+    )
     manifold: Manifold | None = None
     seed: int = 0
     fitted: Ensemble | None = field(default=None, init=False, repr=False)

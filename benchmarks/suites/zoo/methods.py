@@ -17,7 +17,7 @@ from afm_rl.correction import L1Augmentation, LeastSquares
 from afm_rl.learning.watching import Watching
 
 Acting = Callable[[np.ndarray], np.ndarray]
-WATCHED = 20  # healthy environments that a model is learned from, side by side
+WATCHED = 24  # healthy environments that a model is learned from, side by side
 
 
 def alone(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:

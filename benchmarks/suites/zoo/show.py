@@ -88,10 +88,16 @@ def draw(results: pd.DataFrame, file: Path) -> None:
     """Draw the shares: a panel per method, a row per fault, a column per policy."""
     methods, faults = (list(results[name].cat.categories) for name in ("method", "fault"))
     policies = sorted(set(results["policy"]))
-    wide = max(0.34 * len(policies), 1.6)
-    figure = Figure(figsize=(1.9 + wide * len(methods), 1.6 + 0.34 * len(faults)), dpi=160)
-    panels = figure.subplots(1, len(methods), sharey=True, squeeze=False)[0]
-    for panel, method in zip(panels, methods, strict=True):
+    few = len(policies) <= NUMBERED
+    across = len(methods) if few else 2
+    down = -(-len(methods) // across)
+    wide, high = max(0.34 * len(policies), 1.6), 1.6 + 0.34 * len(faults)
+    figure = Figure(figsize=(1.9 + wide * across, high * down), dpi=160 if few else 100)
+    grid = figure.subplots(down, across, sharey=True, squeeze=False, gridspec_kw={"hspace": 0.5})
+    panels = grid.flatten()
+    for spare in panels[len(methods) :]:
+        spare.set_axis_off()
+    for panel, method in zip(panels, methods, strict=False):
         mine = results[results["method"] == method]
         table = mine.pivot_table(index="fault", columns="policy", values="share", observed=False)
         table = table.reindex(index=faults, columns=policies)
@@ -101,7 +107,7 @@ def draw(results: pd.DataFrame, file: Path) -> None:
         panel.set_xticks(range(len(policies)), names, rotation=90, fontsize=7)
         panel.set_yticks(range(len(faults)), faults, fontsize=8)
         panel.tick_params(length=0)
-        if len(policies) <= NUMBERED:
+        if few:
             for row, column in np.argwhere(table.notna().to_numpy()):
                 value = table.iloc[row, column]
                 colour = "white" if value < 0.55 else "black"
