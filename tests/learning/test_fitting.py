@@ -46,6 +46,25 @@ def test_it_learns_what_was_observed(make_ensemble, observed, transitions):
     assert miss < 0.4 * change
 
 
+@pytest.mark.filterwarnings("ignore:the model leaves")
+def test_rows_that_are_hard_to_predict_are_not_given_up():
+    draw = torch.Generator().manual_seed(0)
+    state = 2 * torch.rand(2000, 1, generator=draw) - 1
+    rough = torch.where(state > 0, (10 * state).sin(), 0.1 * state)  # half of it is easy
+    data = TensorDict({"observation": state, "action": state}, [2000])
+    data = data.set(("next", "observation"), state + rough)
+    errors = [
+        fit_ensemble(
+            Ensemble(Manifold(1), 1, features=[0], members=2, hidden=[32, 32]),
+            data,
+            epochs=40,
+            beta=beta,
+        ).error
+        for beta in (0.0, 1.0)
+    ]
+    assert errors[1] < 0.9 * errors[0]
+
+
 @pytest.mark.parametrize("heading", ["wrapped", "unwrapped"])
 def test_headings_are_read_as_cosine_and_sine(heading):
     draw = torch.Generator().manual_seed(0)

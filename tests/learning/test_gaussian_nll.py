@@ -33,6 +33,20 @@ def test_it_is_twice_the_negative_log_likelihood_without_its_constant():
     torch.testing.assert_close(gaussian_nll(mean, log_variance, target), expected)
 
 
+def test_beta_takes_the_variance_out_of_the_means_weight():
+    mean, target = torch.randn(2, 50, dtype=torch.float64)
+    mean.requires_grad_()
+    log_variance = torch.linspace(-5, 2, 50, dtype=torch.float64, requires_grad=True)
+    for beta, weight in ((1.0, torch.ones(50)), (0.5, (-0.5 * log_variance).exp())):
+        loss = gaussian_nll(mean, log_variance, target, beta).sum()
+        of_mean, of_variance = torch.autograd.grad(loss, (mean, log_variance))
+        torch.testing.assert_close(of_mean, (2 * weight * (mean - target)).detach())
+        scaled = (mean - target).square() * (-log_variance).exp()
+        torch.testing.assert_close(
+            of_variance, ((beta * log_variance).exp() * (1 - scaled)).detach()
+        )
+
+
 def test_it_is_averaged_over_members_and_coordinates(data):
     model, td = data
     change = model.manifold.difference(td["next", "observation"], td["observation"])
