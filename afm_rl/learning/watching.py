@@ -119,7 +119,8 @@ class Watching:
         names = ("observation", "action", ("next", "observation"))
         parts = rows.split([states, actions, states], -1)
         data = TensorDict({}, [len(rows)]).update(dict(zip(names, parts, strict=True)))
-        self.report = fit_ensemble(model, data, **{"seed": self.seed, **self.fit})
+        settings = {"seed": self.seed, "progress": True, **self.fit}
+        self.report = fit_ensemble(model, data, **settings)
         if self.report.error <= self.error:
             self.fitted = model.requires_grad_(False)
         else:
