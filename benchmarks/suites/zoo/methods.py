@@ -63,7 +63,8 @@ def afm_learned(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
 class Truth:
     """The policy, given the faults as soon as they are there.
 
-    It is asked about the state in which its command will act, and its answer is inverted.
+    It is asked about the state in which its command will act, and its answer is inverted. A limited
+    rate is left as it is: no command makes up for it.
     """
 
     def __init__(self, task: Task, envs: FaultyVector) -> None:
