@@ -14,6 +14,7 @@ from afm_rl.correction.fits import LEAST_GAIN, PRIOR, not_zero, solve_line
 from afm_rl.spaces.small_matrices import solve_positive
 
 LINEAR = (
+    "reversed",
     "offset_1",
     "offset_3",
     "gain_3",
@@ -25,7 +26,7 @@ LINEAR = (
     "arx",
     "affine",
 )
-"""Offset at a gain of one; gain; gain and offset (*line*); gain and the newest offset (*drift*);
+"""The opposite of the command; offset at a gain of one; gain; gain and offset (*line*); gain and the newest offset (*drift*);
 what goes on from row to row (*arx*); affine map. Of the newest rows, or of all pairs."""
 CALM = ("only so fast", "noisy readings")
 """Models by which there is nothing to correct: :func:`within_rate`, and :func:`sensor_noise`."""
@@ -83,8 +84,8 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
     slope, rest = solve_line(square, mean, mass, cross, shift)
     zero, one = torch.zeros_like(gain[..., 0]), torch.ones_like(gain[..., 0])
     drift = (shift - gain[..., 2:3] * mean)[..., 0] / mass[..., 0]
-    gains = [one, one, gain[..., 1], gain[..., 2], gain[..., 3], slope[..., 2], slope[..., 3]]
-    biases = [offset[..., 0], offset[..., 1], zero, zero, zero, rest[..., 2], rest[..., 3]]
+    gains = [-one, one, one, gain[..., 1], gain[..., 2], gain[..., 3], slope[..., 2], slope[..., 3]]
+    biases = [zero, offset[..., 0], offset[..., 1], zero, zero, zero, rest[..., 2], rest[..., 3]]
     slope, rest = _autoregressive(u, v, weight)
     gains, biases = [*gains, gain[..., 2], slope], [*biases, drift, rest]
     matrix = torch.diag_embed(torch.stack(gains, 1))  # (B, L - 1, A, A)

@@ -80,7 +80,7 @@ def play(
         if corrector is not None:
             memory = corrector.observe(memory, reading)
         if later:
-            costs += world.cost(state, time) / (world.steps - since)
+            costs += world.cost(state, time + 1) / (world.steps - since)
     return costs.view(len(situations), seeds)
 
 
