@@ -5,11 +5,12 @@ Two rows may tell a sign, but in noise it takes many; so the belief has windows 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from afm_rl.compiling.tracing import cached
 from afm_rl.correction.fits import LEAST_GAIN, PRIOR, not_zero, solve_line
 from afm_rl.spaces.small_matrices import solve_positive
 
@@ -68,36 +69,41 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
     >>> lines.effect(torch.ones(1, 1, 1))[0, LINEAR.index("line_12")].round(decimals=2)
     tensor([[-1.9000]])
     """
-    size, length = sent.shape[-1], sent.shape[-2]
+    size = sent.shape[-1]
+    newest, prior, fixed, nominal = _constants(sent.shape[-2], size, sent.device)
     weight = valid * (std.square() + PRIOR).reciprocal()
     scale = weight.amax(-2, keepdim=True).clamp_min(PRIOR)
     u, v, weight = (part.mT.double() for part in (sent, came, weight / scale))  # (B, A, M)
-    age = torch.arange(length - 1, -1, -1, device=sent.device)
-    newest = torch.stack([age < (rows or length) for rows in WINDOWS]).to(u)
-    ones = torch.ones_like(u)
-    terms = torch.stack([u * u, u, ones, u * v, v], -1)  # (B, A, M, 5)
-    moments = (newest * weight.unsqueeze(-2)) @ terms  # (B, A, W, 5)
+    terms = torch.stack([u * u, u, torch.ones_like(u), u * v, v], -1)  # (B, A, M, 5)
+    moments = (newest * weight.unsqueeze(-2)) @ terms + prior  # (B, A, W, 5)
     square, mean, mass, cross, shift = moments.unbind(-1)
-    square, mass, cross = square + PRIOR, mass + 10 * PRIOR, cross + PRIOR
-    gain = not_zero(cross / square)
-    offset = (shift - mean) / mass
+    gain, offset = not_zero(cross / square), (shift - mean) / mass
     slope, rest = solve_line(square, mean, mass, cross, shift)
-    zero, one = torch.zeros_like(gain[..., 0]), torch.ones_like(gain[..., 0])
-    drift = (shift - gain[..., 2:3] * mean)[..., 0] / mass[..., 0]
-    gains = [-one, one, one, gain[..., 1], gain[..., 2], gain[..., 3], slope[..., 2], slope[..., 3]]
-    biases = [zero, offset[..., 0], offset[..., 1], zero, zero, zero, rest[..., 2], rest[..., 3]]
-    slope, rest = _autoregressive(u, v, weight)
-    gains, biases = [*gains, gain[..., 2], slope], [*biases, drift, rest]
-    matrix = torch.diag_embed(torch.stack(gains, 1))  # (B, L - 1, A, A)
+    gain_12 = gain[..., 2:3]
+    drift = (shift - gain_12 * mean)[..., :1] / mass[..., :1]
+    arx, goes_on = _autoregressive(u, v, weight)
+    one, none = fixed.expand(2, *gain.shape[:-1], 3)
+    gains = torch.cat([one, gain[..., 1:], slope[..., 2:], gain_12, arx], -1)
+    biases = [none[..., :1], offset[..., :2], none, rest[..., 2:], drift, goes_on]
     outer = torch.nn.functional.pad(u.mT, (0, 1), value=1.0)  # (B, M, A + 1)
-    nominal = PRIOR * torch.eye(size + 1, device=sent.device, dtype=u.dtype)
     pairs = (outer.unsqueeze(-1) * outer.unsqueeze(-2)).flatten(-2)
     left = (weight @ pairs).unflatten(-1, (size + 1, size + 1)) + nominal
     right = (weight * v) @ outer + nominal[:-1]
-    solution = solve_positive(left, right.unsqueeze(-1)).squeeze(-1)  # (B, A, A + 1)
-    matrix = torch.cat([matrix, solution[:, None, :, :-1]], 1)
-    bias = torch.cat([torch.stack(biases, 1), solution[:, None, :, -1]], 1)
+    affine = solve_positive(left, right.unsqueeze(-1)).mT  # (B, A, 1, A + 1)
+    matrix = torch.cat([torch.diag_embed(gains.mT), affine[..., 0, :-1].unsqueeze(1)], 1)
+    bias = torch.cat([*biases, affine[..., -1]], -1).mT
     return Lines(matrix.to(sent), bias.to(sent))
+
+
+@cached(maxsize=16)
+def _constants(length: int, size: int, device: torch.device) -> tuple[Tensor, ...]:
+    """Return the windows ``(W, M)``, the prior's moments, and the gains that are not fitted."""
+    kind: dict[str, Any] = {"dtype": torch.float64, "device": device}
+    age = torch.arange(length - 1, -1, -1, device=device)
+    newest = torch.stack([age < (rows or length) for rows in WINDOWS]).to(**kind)
+    prior = PRIOR * torch.tensor([1.0, 0.0, 10.0, 1.0, 0.0], **kind)
+    fixed = torch.tensor([[-1.0, 1.0, 1.0], [0.0, 0.0, 0.0]], **kind)[:, None, None]
+    return newest, prior, fixed, PRIOR * torch.eye(size + 1, **kind)
 
 
 def sensor_noise(sent: Tensor, came: Tensor, valid: Tensor, keep: float = 0.7) -> Tensor:
@@ -143,7 +149,7 @@ def within_rate(came: Tensor, valid: Tensor, rows: int = 12, least: float = 0.05
 
 
 def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Return gain and offset ``(B, A)`` of :math:`v_k = b u_k + c u_{k-1} + a v_{k-1} + d`.
+    r"""Return gain and offset ``(B, A, 1)`` of :math:`v_k = b u_k + c u_{k-1} + a v_{k-1} + d`.
 
     The row before is known, so this is a line in u. Rows after one that does not count do not.
 
@@ -153,12 +159,12 @@ def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tenso
         weight: of the rows.
     """
     sound = (weight > 0).to(u)
-    before = torch.stack([u, v], -1) * sound.unsqueeze(-1)
-    x = torch.cat([u.unsqueeze(-1), before.roll(1, -2), torch.ones_like(u).unsqueeze(-1)], -1)
-    follows = sound.roll(1, -1) * (torch.arange(u.shape[-1], device=u.device) > 0)
-    pull = (weight * follows).unsqueeze(-1) * x
+    before = torch.stack([u * sound, v * sound], -1)
+    now = u[..., 1:].unsqueeze(-1)
+    x = torch.cat([now, before[..., :-1, :], torch.ones_like(now)], -1)
+    pull = (weight[..., 1:] * sound[..., :-1]).unsqueeze(-1) * x
     left = pull.mT @ x + RIDGE * torch.eye(4, device=u.device, dtype=u.dtype)
-    right = pull.mT @ (v - u).unsqueeze(-1)
-    b, c, a, d = solve_positive(left, right).squeeze(-1).unbind(-1)
-    last_u, last_v = before[..., -1, :].unbind(-1)
-    return not_zero(1 + b), c * last_u + a * last_v + d
+    right = pull.mT @ (v - u)[..., 1:].unsqueeze(-1)
+    b, from_before, d = solve_positive(left, right).split([1, 2, 1], -2)  # (B, A, ., 1)
+    goes_on = before[..., -1:, :] @ from_before
+    return not_zero(1 + b).squeeze(-1), (goes_on + d).squeeze(-1)
