@@ -9,7 +9,7 @@ from afm_rl.regimes import Regime
 
 LIMIT = 4.0  # half ranges: effects beyond carry no more news
 MODES = ("mixed", "direction", "clip")
-LEAST = 0.3  # share of an action that must be had for "mixed" to clip it
+LEAST = 0.1  # share of an action that must be had for "mixed" to clip it
 DEAD = 0.025  # share of which nothing can be had
 ROUNDS, TOLERANCE = 8, 0.01  # bisection of the scale; miss in half ranges that still counts
 
@@ -21,7 +21,7 @@ def saturate(unit: Tensor, mode: str, dim: int = -1) -> Tensor:
 
     ``"clip"`` cuts each component for itself; ``"direction"`` shrinks all alike, so that the
     robot does the same thing slower: the ratio of turning to driving is kept. ``"mixed"``
-    clips what can be had to 30 % at least, and does the rest slower.
+    clips what can be had to 10 % at least, and does the rest slower.
 
     >>> saturate(torch.tensor([0.5, 2.0]), "direction")
     tensor([0.2500, 1.0000])
@@ -56,32 +56,30 @@ def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
     return unit * share if mode == "direction" else torch.where(share < LEAST, unit * share, unit)
 
 
-def extend(reach: Tensor, box: Tensor, tried: Tensor, mode: str) -> Tensor:
+def extend(reach: Tensor, box: Tensor) -> Tensor:
     """Return the bounds ``(*B, 2, A)`` that plans should keep, given what can be reached.
 
-    All of the box where a plan is not cut but done slower: there it may ask for more. But no
-    slowness helps where nothing can be reached at all; and where only a small part of the box was
-    tried, plans that stay within reach try more of it.
+    All of the box, and what can be had beyond. A plan that asks for more than can be had is cut or
+    done slower, and shows more of the robot than a timid one. But where nothing can be reached,
+    nothing is to be planned.
 
     Args:
         reach: lowest and highest effect, ``(*B, 2, A)``.
         box: lowest and highest action, ``(*B, 2, A)``.
-        tried: range of the actions that were tried, ``(*B, A)``.
-        mode: see :func:`saturate`.
 
-    >>> box, all_of_it = torch.tensor([[-1.0], [1.0]]), torch.tensor([2.0])
-    >>> [extend(share * box, box, all_of_it, "mixed")[1].item() for share in (0.0, 0.25, 0.5)]
-    [0.0, 1.0, 0.5]
+    >>> box = torch.tensor([[-1.0], [1.0]])
+    >>> [extend(share * box, box)[1].item() for share in (0.0, 0.25, 2.0)]
+    [0.0, 1.0, 2.0]
     """
-    if mode == "clip":
-        return reach
-    width = box.diff(dim=-2)
-    share = reach.diff(dim=-2) / width
-    slower = (share > DEAD) & (tried.unsqueeze(-2) > 0.1 * width)
-    if mode == "mixed":
-        slower = slower & (share < LEAST)
-    (low, high), (least, most) = reach.unbind(-2), box.unbind(-2)
-    return torch.where(slower, torch.stack([low.fmin(least), high.fmax(most)], -2), reach)
+    some = reach.diff(dim=-2) > DEAD * box.diff(dim=-2)
+    wider = torch.stack(
+        [
+            torch.minimum(reach[..., 0, :], box[..., 0, :]),
+            torch.maximum(reach[..., 1, :], box[..., 1, :]),
+        ],
+        -2,
+    )
+    return torch.where(some, wider, reach)
 
 
 def intend(
@@ -97,7 +95,7 @@ def intend(
 
     .. math:: u = T^{-1}(s\,a),\qquad s = \max\{s \in [0, 1] : s\,a \in T(\text{box})\}
 
-    with ``mode="direction"``; with ``"clip"``, or ``"mixed"`` and s > 0.3, u has the nearest
+    with ``mode="direction"``; with ``"clip"``, or ``"mixed"`` and s > 0.1, u has the nearest
     effect there is.
     """
     intended = regime.inverse(planned, parameters, state, low, high)

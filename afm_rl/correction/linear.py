@@ -27,8 +27,9 @@ LINEAR = (
     "arx",
     "affine",
 )
-"""The opposite of the command; offset at a gain of one; gain; gain and offset (*line*); gain and the newest offset (*drift*);
-what goes on from row to row (*arx*); affine map. Of the newest rows, or of all pairs."""
+"""The opposite of the command; offset at a gain of one; gain; gain and offset (*line*); gain and
+the newest offset (*drift*); what goes on from row to row (*arx*); affine map. Of the newest rows,
+or of all pairs."""
 CALM = ("only so fast", "noisy readings")
 """Models by which there is nothing to correct: :func:`within_rate`, and :func:`sensor_noise`."""
 WINDOWS = (1, 3, 12, 0)  # rows; 0: all
