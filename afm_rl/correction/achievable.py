@@ -10,6 +10,7 @@ from afm_rl.regimes import Regime
 LIMIT = 4.0  # half ranges: effects beyond carry no more news
 MODES = ("mixed", "direction", "clip")
 LEAST = 0.1  # share of an action that must be had for "mixed" to clip it
+LITTLE = 0.3  # share of the box that must be reached for plans to keep to it
 DEAD = 0.025  # share of which nothing can be had
 ROUNDS, TOLERANCE = 8, 0.01  # bisection of the scale; miss in half ranges that still counts
 
@@ -59,27 +60,22 @@ def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
 def extend(reach: Tensor, box: Tensor) -> Tensor:
     """Return the bounds ``(*B, 2, A)`` that plans should keep, given what can be reached.
 
-    All of the box, and what can be had beyond. A plan that asks for more than can be had is cut or
-    done slower, and shows more of the robot than a timid one. But where nothing can be reached,
-    nothing is to be planned.
+    That is what they keep best. But where it is less than 30 %, a plan is better made with all of
+    the box, to be cut or done slower: a few steps ahead, a planner sees no way with so little.
+    Where nothing can be reached, nothing is to be planned.
 
     Args:
         reach: lowest and highest effect, ``(*B, 2, A)``.
         box: lowest and highest action, ``(*B, 2, A)``.
 
     >>> box = torch.tensor([[-1.0], [1.0]])
-    >>> [extend(share * box, box)[1].item() for share in (0.0, 0.25, 2.0)]
-    [0.0, 1.0, 2.0]
+    >>> [extend(share * box, box)[1].item() for share in (0.0, 0.25, 0.5, 2.0)]
+    [0.0, 1.0, 0.5, 2.0]
     """
-    some = reach.diff(dim=-2) > DEAD * box.diff(dim=-2)
-    wider = torch.stack(
-        [
-            torch.minimum(reach[..., 0, :], box[..., 0, :]),
-            torch.maximum(reach[..., 1, :], box[..., 1, :]),
-        ],
-        -2,
-    )
-    return torch.where(some, wider, reach)
+    share = reach.diff(dim=-2) / box.diff(dim=-2)
+    (low, high), (least, most) = reach.unbind(-2), box.unbind(-2)
+    wider = torch.stack([low.fmin(least), high.fmax(most)], -2)
+    return torch.where((share > DEAD) & (share < LITTLE), wider, reach)
 
 
 def intend(
