@@ -16,6 +16,7 @@ from afm_rl.correction.fits import (
     STUCK,
     apply_friction,
     confidence,
+    fit_affine,
     invert_friction,
     not_zero,
     solve_line,
@@ -132,8 +133,8 @@ def fit_experts(rows: Rows) -> Experts:
     """
     inputs, valid = rows.executed.double(), rows.valid.double().mT
     u, e = inputs.mT, rows.effective.double().mT  # (N, A, K)
-    size, (count, axes, length) = u.shape[-2], u.shape
-    ages, prior, nominal, lines, places = _constants(length, size, u.device)
+    count, axes, length = u.shape
+    ages, prior, lines, places = _constants(length, u.device)
     weights = ages * (valid * confidence(rows.std.double().mT)).unsqueeze(-2)  # (N, A, 2, K)
     long = weights[..., 1, :]
     moved = (long * (e.abs() > STUCK)).unsqueeze(-2)
@@ -151,13 +152,12 @@ def fit_experts(rows: Rows) -> Experts:
     slope, offset = solve_line(*robust.unsqueeze(1).unbind(-1))
     gain = not_zero(torch.cat([gains, slope, slopes[:, 1:]], -1))
     offset = torch.cat([torch.zeros_like(gains), offset, offsets[:, 1:]], -1)
-    outer = torch.nn.functional.pad(inputs, (0, 1), value=1.0)  # (N, K, A + 1)
-    square = (outer.unsqueeze(-1) * outer.unsqueeze(-2)).flatten(-2)
-    square = torch.baddbmm(nominal.flatten(), long, square).unflatten(-1, (size + 1, size + 1))
-    cross = torch.baddbmm(nominal[:-1], long * e, outer)
-    solution = solve_positive(square, cross.unsqueeze(-1)).squeeze(-1)  # (N, A, A + 1)
-    solution = torch.where(*_drivers(u, e, long), solution)
-    matrix, bias = solution[..., :-1], solution[..., -1:]
+    matrix, bias = fit_affine(inputs, e.mT, long.mT)
+    explained, driver, alone = _drivers(u, e, long)
+    matrix, bias = (
+        torch.where(explained, driver, matrix),
+        torch.where(explained, alone, bias.unsqueeze(-1)),
+    )
     inverse = invert_matrix(matrix)
     wide = (count, axes, 1)
     experts = Experts(
@@ -185,7 +185,7 @@ def invert_matrix(matrix: Tensor) -> Tensor:
     return solve_positive(ridge + matrix.mT @ matrix, matrix.mT)
 
 
-def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Fit every effect to the one command that drives it: swapped cables need no more.
 
     Of many axes an affine map needs many rows, and a gait that repeats itself shows only a few.
@@ -196,8 +196,8 @@ def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         weight: of both.
 
     Returns:
-        Which axes are explained by one command, ``(N, A, 1)``, and their rows of the affine map,
-        ``(N, A, A + 1)``.
+        Which axes are explained by one command, ``(N, A, 1)``, their rows of the affine map's
+        matrix, ``(N, A, A)``, and of its offset, ``(N, A, 1)``.
     """
     own = torch.eye(u.shape[-2], device=u.device, dtype=u.dtype)
     pull = weight * e
@@ -210,21 +210,20 @@ def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     limit = torch.where(own.bool(), 0.0, EXACT**2).expand_as(slope).gather(-1, driver)
     explained = (left < limit) & (mass > LEAST_ROWS)
     chosen = torch.zeros_like(slope).scatter(-1, driver, slope.gather(-1, driver))
-    return explained, torch.cat([chosen, offset.gather(-1, driver)], -1)
+    return explained, chosen, offset.gather(-1, driver)
 
 
 @cached(maxsize=16)
-def _constants(rows: int, size: int, device: torch.device) -> tuple[Tensor, ...]:
+def _constants(rows: int, device: torch.device) -> tuple[Tensor, ...]:
     """Return the weights by age ``(2, K)``, the moments of the priors, and indices.
 
-    The moments of the lines are ``(3, 8)``, those of the affine map ``(A + 1, A + 1)``. The indices
-    are rows and columns of the moments of the two lines that are fitted with an offset.
+    The moments are ``(3, 8)``. The indices are rows and columns of the moments of the two lines
+    that are fitted with an offset.
     """
     kind: dict[str, Any] = {"dtype": torch.float64, "device": device}
     age = torch.arange(rows - 1, -1, -1, **kind)
     prior = torch.zeros(3, 8, **kind)
     prior[:, [0, 3]], prior[:, [2, 7]] = PRIOR, 10 * PRIOR
-    nominal = PRIOR * torch.eye(size + 1, **kind)
     lines = torch.tensor([[1], [2]], device=device)
     places = torch.tensor([[0, 1, 7, 3, 4], [0, 5, 2, 3, 6]], device=device)
-    return torch.stack([SHORT**age, LONG**age]), prior, nominal, lines, places
+    return torch.stack([SHORT**age, LONG**age]), prior, lines, places

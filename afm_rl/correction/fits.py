@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from afm_rl.spaces.small_matrices import solve_positive
+
 STUCK = 5e-3  # half ranges: an action with less effect is held by friction
 PRIOR = 1e-4  # weight of the nominal map in every fit
 LEAST_GAIN = 0.02  # smallest gain that is divided by
@@ -131,16 +133,11 @@ def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Ten
     """
     size = executed.shape[-1]
     inputs = torch.nn.functional.pad(executed, (0, 1), value=1.0)
-    nominal = torch.eye(size + 1, device=inputs.device, dtype=inputs.dtype)
-    if weight.shape[-1] == 1:
-        moments = (weight * inputs).mT @ torch.cat([inputs, effective], -1)
-        moments = moments + PRIOR * torch.cat([nominal, nominal[:, :-1]], -1)
-        solution = torch.linalg.solve(moments[..., : size + 1], moments[..., size + 1 :]).mT
-        return solution[..., :-1], solution[..., -1]
+    nominal = PRIOR * torch.eye(size + 1, device=inputs.device, dtype=inputs.dtype)
     outer = (inputs.unsqueeze(-1) * inputs.unsqueeze(-2)).flatten(-2)  # (*B, K, (A + 1)^2)
-    square = (weight.mT @ outer).unflatten(-1, (size + 1, size + 1)) + PRIOR * nominal
-    cross = (weight * effective).mT @ inputs + PRIOR * nominal[:-1]
-    solution = torch.linalg.solve(square, cross)
+    square = (weight.mT @ outer).unflatten(-1, (size + 1, size + 1)) + nominal
+    cross = (weight * effective).mT @ inputs + nominal[:-1]
+    solution = solve_positive(square, cross.unsqueeze(-1)).squeeze(-1)
     return solution[..., :-1], solution[..., -1]
 
 
@@ -150,8 +147,8 @@ def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:
     A small ridge keeps it finite where the matrix is all but singular.
     """
     ridge = LEAST_GAIN**2 * torch.eye(unit.shape[-1], device=unit.device, dtype=unit.dtype)
-    target = (matrix * (unit - bias).unsqueeze(-1)).sum(-2, keepdim=True).mT
-    return torch.linalg.solve(matrix.mT @ matrix + ridge, target).squeeze(-1)
+    pull = matrix.mT @ (unit - bias).unsqueeze(-1)
+    return solve_positive(matrix.mT @ matrix + ridge, pull).squeeze(-1)
 
 
 def not_zero(gain: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.compiling.tracing import cached
-from afm_rl.correction.fits import LEAST_GAIN, PRIOR, not_zero, solve_line
+from afm_rl.correction.fits import PRIOR, fit_affine, invert_affine, not_zero, solve_line
 from afm_rl.spaces.small_matrices import solve_positive
 
 LINEAR = (
@@ -50,10 +50,7 @@ class Lines(NamedTuple):
 
     def invert(self, planned: Tensor) -> Tensor:
         """Return the actions ``(B, L, A)`` whose effects come nearest to plans ``(B, A)``."""
-        eye = torch.eye(planned.shape[-1], device=planned.device, dtype=planned.dtype)
-        ridge = self.matrix.mT @ self.matrix + LEAST_GAIN**2 * eye
-        pull = self.matrix.mT @ (planned.unsqueeze(1) - self.bias).unsqueeze(-1)
-        return solve_positive(ridge, pull).squeeze(-1)
+        return invert_affine(self.matrix, self.bias, planned.unsqueeze(1))
 
 
 def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
@@ -70,8 +67,7 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
     >>> lines.effect(torch.ones(1, 1, 1))[0, LINEAR.index("line_12")].round(decimals=2)
     tensor([[-1.9000]])
     """
-    size = sent.shape[-1]
-    newest, prior, fixed, nominal = _constants(sent.shape[-2], size, sent.device)
+    newest, prior, fixed = _constants(sent.shape[-2], sent.device)
     weight = valid * (std.square() + PRIOR).reciprocal()
     scale = weight.amax(-2, keepdim=True).clamp_min(PRIOR)
     u, v, weight = (part.mT.double() for part in (sent, came, weight / scale))  # (B, A, M)
@@ -86,25 +82,21 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
     one, none = fixed.expand(2, *gain.shape[:-1], 3)
     gains = torch.cat([one, gain[..., 1:], slope[..., 2:], gain_12, arx], -1)
     biases = [none[..., :1], offset[..., :2], none, rest[..., 2:], drift, goes_on]
-    outer = torch.nn.functional.pad(u.mT, (0, 1), value=1.0)  # (B, M, A + 1)
-    pairs = (outer.unsqueeze(-1) * outer.unsqueeze(-2)).flatten(-2)
-    left = (weight @ pairs).unflatten(-1, (size + 1, size + 1)) + nominal
-    right = (weight * v) @ outer + nominal[:-1]
-    affine = solve_positive(left, right.unsqueeze(-1)).mT  # (B, A, 1, A + 1)
-    matrix = torch.cat([torch.diag_embed(gains.mT), affine[..., 0, :-1].unsqueeze(1)], 1)
-    bias = torch.cat([*biases, affine[..., -1]], -1).mT
+    affine, shift = fit_affine(u.mT, v.mT, weight.mT)
+    matrix = torch.cat([torch.diag_embed(gains.mT), affine.unsqueeze(1)], 1)
+    bias = torch.cat([*biases, shift.unsqueeze(-1)], -1).mT
     return Lines(matrix.to(sent), bias.to(sent))
 
 
 @cached(maxsize=16)
-def _constants(length: int, size: int, device: torch.device) -> tuple[Tensor, ...]:
+def _constants(length: int, device: torch.device) -> tuple[Tensor, ...]:
     """Return the windows ``(W, M)``, the prior's moments, and the gains that are not fitted."""
     kind: dict[str, Any] = {"dtype": torch.float64, "device": device}
     age = torch.arange(length - 1, -1, -1, device=device)
     newest = torch.stack([age < (rows or length) for rows in WINDOWS]).to(**kind)
     prior = PRIOR * torch.tensor([1.0, 0.0, 10.0, 1.0, 0.0], **kind)
     fixed = torch.tensor([[-1.0, 1.0, 1.0], [0.0, 0.0, 0.0]], **kind)[:, None, None]
-    return newest, prior, fixed, PRIOR * torch.eye(size + 1, **kind)
+    return newest, prior, fixed
 
 
 def sensor_noise(sent: Tensor, came: Tensor, valid: Tensor, keep: float = 0.7) -> Tensor:
