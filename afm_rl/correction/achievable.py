@@ -11,6 +11,7 @@ LIMIT = 4.0  # half ranges: effects beyond carry no more news
 MODES = ("mixed", "direction", "clip")
 LEAST = 0.1  # share of an action that must be had for "mixed" to clip it
 LITTLE = 0.3  # share of the box that must be reached for plans to keep to it
+TRIED = 0.1  # share of the box that must have been tried to know that little can be reached
 DEAD = 0.025  # share of which nothing can be had
 ROUNDS, TOLERANCE = 8, 0.01  # bisection of the scale; miss in half ranges that still counts
 
@@ -57,25 +58,28 @@ def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
     return unit * share if mode == "direction" else torch.where(share < LEAST, unit * share, unit)
 
 
-def extend(reach: Tensor, box: Tensor) -> Tensor:
+def extend(reach: Tensor, box: Tensor, tried: Tensor) -> Tensor:
     """Return the bounds ``(*B, 2, A)`` that plans should keep, given what can be reached.
 
     That is what they keep best. But where it is less than 30 %, a plan is better made with all of
-    the box, to be cut or done slower: a few steps ahead, a planner sees no way with so little.
-    Where nothing can be reached, nothing is to be planned.
+    the box, to be cut or done slower: a few steps ahead, a planner sees no way with so little. Not
+    where nothing can be reached at all; and where only a small part of the box was tried, plans
+    that stay within reach try more of it.
 
     Args:
         reach: lowest and highest effect, ``(*B, 2, A)``.
         box: lowest and highest action, ``(*B, 2, A)``.
+        tried: range of the actions that were tried, ``(*B, A)``.
 
-    >>> box = torch.tensor([[-1.0], [1.0]])
-    >>> [extend(share * box, box)[1].item() for share in (0.0, 0.25, 0.5, 2.0)]
+    >>> box, all_of_it = torch.tensor([[-1.0], [1.0]]), torch.tensor([2.0])
+    >>> [extend(share * box, box, all_of_it)[1].item() for share in (0.0, 0.25, 0.5, 2.0)]
     [0.0, 1.0, 0.5, 2.0]
     """
-    share = reach.diff(dim=-2) / box.diff(dim=-2)
+    width = box.diff(dim=-2)
+    share = reach.diff(dim=-2) / width
+    little = (share > DEAD) & (share < LITTLE) & (tried.unsqueeze(-2) > TRIED * width)
     (low, high), (least, most) = reach.unbind(-2), box.unbind(-2)
-    wider = torch.stack([low.fmin(least), high.fmax(most)], -2)
-    return torch.where((share > DEAD) & (share < LITTLE), wider, reach)
+    return torch.where(little, torch.stack([low.fmin(least), high.fmax(most)], -2), reach)
 
 
 def intend(

@@ -21,7 +21,7 @@ from afm_rl.correction.fits import (
     not_zero,
     solve_line,
 )
-from afm_rl.spaces.small_matrices import solve_positive
+from afm_rl.spaces.small_matrices import add_diagonal, solve_positive
 
 EXACT = 0.02  # half ranges: a fit that misses by less explains all rows
 LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
@@ -88,7 +88,7 @@ class Experts(NamedTuple):
         The action that each of the five fits would execute, saturated; the kernel average of the
         actions whose effects came nearest to the plan, and that effect.
         """
-        plan = planned.mT.to(self.bias)
+        plan = planned.mT
         unit = plan.unsqueeze(-1)
         linear = (unit - self.offset[..., :3]) / self.gain[..., :3]
         rubbed = invert_friction(self.gain[..., 3:], self.offset[..., 3:], unit)
@@ -96,7 +96,7 @@ class Experts(NamedTuple):
         exact = saturate(torch.cat([linear, rubbed, affine], -1), mode, dim=-3)
         share = self._likeness(self.effective, unit).softmax(-1)
         pairs = torch.cat([self.executed, self.effective], -2).mT
-        return torch.cat([exact, share @ pairs], -1).to(planned)
+        return torch.cat([exact, share @ pairs], -1)
 
     def effect(self, executed: Tensor) -> Tensor:
         """Return answers ``(N, A, C, 7)`` about actions ``(N, C, A)``.
@@ -104,13 +104,13 @@ class Experts(NamedTuple):
         The effect that each of the five fits predicts, the kernel average of the effects of the
         nearest actions, and how near those are.
         """
-        actions = executed.mT.to(self.bias)
+        actions = executed.mT
         unit = actions.unsqueeze(-1)
         likeness = self._likeness(self.executed, unit)
         nearest = likeness.softmax(-1) @ self.effective.mT
         nearness = likeness.exp().sum(-1, keepdim=True).clamp_max(1.0)
         answers = torch.cat([*self.predict(actions), nearest, nearness], -1)
-        return answers.clamp(-LIMIT, LIMIT).to(executed)
+        return answers.clamp(-LIMIT, LIMIT)
 
     def predict(self, actions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return what the fits predict of actions ``(N, A, C)``: ``(N, A, C, 5)`` in parts."""
@@ -127,9 +127,9 @@ class Experts(NamedTuple):
 def fit_experts(rows: Rows) -> Experts:
     """Fit all experts to N sets of rows ``(N, K, A)``.
 
-    In double precision: where all actions are alike, gain and friction can hardly be told apart.
-    The fits per axis share one product of weights and terms; they are those of
-    :mod:`~afm_rl.correction.fits`, the robust one with one round.
+    In double precision, but for the answer: where all actions are alike, gain and friction can
+    hardly be told apart. The fits per axis share one product of weights and terms; they are
+    those of :mod:`~afm_rl.correction.fits`, the robust one with one round.
     """
     inputs, valid = rows.executed.double(), rows.valid.double().mT
     u, e = inputs.mT, rows.effective.double().mT  # (N, A, K)
@@ -176,13 +176,15 @@ def fit_experts(rows: Rows) -> Experts:
     mass = weights.sum(-1, keepdim=True).clamp_min(LEAST_MISS)
     left = weights @ residuals.square() / mass
     left = torch.cat([left[..., :1, :1], left[..., 1:, 1:]], -1)
-    return experts._replace(residuals=residuals, misses=(left.sqrt() + LEAST_MISS).log())
+    experts = experts._replace(residuals=residuals, misses=(left.sqrt() + LEAST_MISS).log())
+    return Experts(*(part.to(rows.executed) for part in experts))
 
 
 def invert_matrix(matrix: Tensor) -> Tensor:
     """Return the inverse of matrices ``(*B, A, A)``, regularised by the least gain there is."""
-    ridge = LEAST_GAIN**2 * torch.eye(matrix.shape[-1], device=matrix.device, dtype=matrix.dtype)
-    return solve_positive(ridge + matrix.mT @ matrix, matrix.mT)
+    wide = matrix.double()
+    ridge = add_diagonal(wide.mT @ wide, LEAST_GAIN**2)
+    return solve_positive(ridge, wide.mT).to(matrix)
 
 
 def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from afm_rl.spaces.small_matrices import solve_positive
+from afm_rl.spaces.small_matrices import add_diagonal, solve_positive
 
 STUCK = 5e-3  # half ranges: an action with less effect is held by friction
 PRIOR = 1e-4  # weight of the nominal map in every fit
@@ -133,10 +133,9 @@ def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Ten
     """
     size = executed.shape[-1]
     inputs = torch.nn.functional.pad(executed, (0, 1), value=1.0)
-    nominal = PRIOR * torch.eye(size + 1, device=inputs.device, dtype=inputs.dtype)
     outer = (inputs.unsqueeze(-1) * inputs.unsqueeze(-2)).flatten(-2)  # (*B, K, (A + 1)^2)
-    square = (weight.mT @ outer).unflatten(-1, (size + 1, size + 1)) + nominal
-    cross = (weight * effective).mT @ inputs + nominal[:-1]
+    square = add_diagonal((weight.mT @ outer).unflatten(-1, (size + 1, size + 1)), PRIOR)
+    cross = add_diagonal((weight * effective).mT @ inputs, PRIOR)
     solution = solve_positive(square, cross.unsqueeze(-1)).squeeze(-1)
     return solution[..., :-1], solution[..., -1]
 
@@ -146,9 +145,8 @@ def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:
 
     A small ridge keeps it finite where the matrix is all but singular.
     """
-    ridge = LEAST_GAIN**2 * torch.eye(unit.shape[-1], device=unit.device, dtype=unit.dtype)
     pull = matrix.mT @ (unit - bias).unsqueeze(-1)
-    return solve_positive(matrix.mT @ matrix + ridge, pull).squeeze(-1)
+    return solve_positive(add_diagonal(matrix.mT @ matrix, LEAST_GAIN**2), pull).squeeze(-1)
 
 
 def not_zero(gain: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from afm_rl.compiling.tracing import cached
 from afm_rl.correction.fits import PRIOR, fit_affine, invert_affine, not_zero, solve_line
-from afm_rl.spaces.small_matrices import solve_positive
+from afm_rl.spaces.small_matrices import add_diagonal, solve_positive
 
 LINEAR = (
     "reversed",
@@ -156,7 +156,7 @@ def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tenso
     now = u[..., 1:].unsqueeze(-1)
     x = torch.cat([now, before[..., :-1, :], torch.ones_like(now)], -1)
     pull = (weight[..., 1:] * sound[..., :-1]).unsqueeze(-1) * x
-    left = pull.mT @ x + RIDGE * torch.eye(4, device=u.device, dtype=u.dtype)
+    left = add_diagonal(pull.mT @ x, RIDGE)
     right = pull.mT @ (v - u)[..., 1:].unsqueeze(-1)
     b, from_before, d = solve_positive(left, right).split([1, 2, 1], -2)  # (B, A, ., 1)
     goes_on = before[..., -1:, :] @ from_before

@@ -159,7 +159,7 @@ class AxisNetwork(nn.Module):
         """Read plans ``(N, C, A)``; ``mode`` says how those that cannot be had are saturated."""
         answers = encoded.experts.execute(planned, mode)
         which = self.modes[MODES.index(mode)]
-        given = [planned.mT.unsqueeze(-1), answers, encoded.experts.misses.to(planned), which]
+        given = [planned.mT.unsqueeze(-1), answers, encoded.experts.misses, which]
         shape = (*answers.shape[:-1], -1)
         asked = torch.cat([part.expand(shape) for part in given], -1)
         hidden = self.plan_code(encoded.code) + self.plan_query(asked)
@@ -187,7 +187,7 @@ class AxisNetwork(nn.Module):
     def effect(self, encoded: Encoded, executed: Tensor) -> Tensor:
         """Return the effects ``(N, C, A)`` that actions ``(N, C, A)`` are predicted to have."""
         answers = encoded.experts.effect(executed)
-        misses = encoded.experts.misses.to(executed).expand(*answers.shape[:-1], -1)
+        misses = encoded.experts.misses.expand(*answers.shape[:-1], -1)
         asked = torch.cat([executed.mT.unsqueeze(-1), answers, misses], -1)
         hidden = (self.effect_code(encoded.code) + self.effect_query(asked)).relu()
         return self._blend(self.effect_head(hidden), answers[..., :EXPERTS])
@@ -206,7 +206,7 @@ class AxisNetwork(nn.Module):
         loud = (std + LEAST_MISS).log() if self.noise else torch.zeros_like(std)
         age = torch.linspace(1.0, 0.0, executed.shape[-1], device=std.device, dtype=std.dtype)
         own = [executed, effective, loud, age.expand_as(std), valid.expand_as(std)]
-        left = experts.residuals.clamp(-LIMIT, LIMIT).to(std)
+        left = experts.residuals.clamp(-LIMIT, LIMIT)
         features = torch.cat([torch.stack(own, -1), left], -1) * valid.unsqueeze(-1)
         return features.to(self.modes.dtype)
 

@@ -133,7 +133,7 @@ class Tick(nn.Module):
         low, high = reach.unbind(-2)
         wanted = attainable(unit, low, high, self.saturation)
         sent = pairs[..., : len(self.scale)]
-        bounds = extend(reach, ends)
+        bounds = extend(reach, ends, sent.amax(1) - sent.amin(1))
         action, effects = self.decide(models, proposals, expected, wanted, noise)
         lag = (self.filtered.to(weights) @ weights).argmax(1)  # the most probable one
         if not all_hold(lag == 0):

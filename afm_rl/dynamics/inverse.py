@@ -9,7 +9,7 @@ from torch import Tensor
 
 from afm_rl.compiling.tracing import all_hold
 from afm_rl.dynamics.base import DynamicsModel
-from afm_rl.spaces.small_matrices import invert_positive
+from afm_rl.spaces.small_matrices import add_diagonal, invert_positive
 
 
 class EffectiveAction(NamedTuple):
@@ -97,12 +97,11 @@ def effective_action(
         there = model.manifold.difference(next_state, model(state, guess)) / noise
         better = there.square().sum(-1, True) < error.square().sum(-1, True)
         effective, error = torch.where(better, guess, action), torch.where(better, there, error)
-    prior = unseen**-2 * torch.eye(len(half_range), dtype=torch.float64, device=action.device)
     limit = torch.ones_like(innovation).unsqueeze(-1)
     going, covariance = limit > 0, limit.double().unsqueeze(-1)
     for last in (False,) * (rounds - 1) + (True,):
         jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()
-        inverse = invert_positive(jacobian.mT @ jacobian + prior)
+        inverse = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
         covariance = torch.where(going.unsqueeze(-1), inverse, covariance)
         slope = jacobian.mT @ error.unsqueeze(-1).double()
         step = (covariance @ slope).squeeze(-1)

@@ -44,6 +44,17 @@ def _written_out(matrix: Tensor) -> bool:
     return torch.compiler.is_compiling() and matrix.shape[-1] <= FEW
 
 
+def add_diagonal(matrix: Tensor, value: float) -> Tensor:
+    """Return matrices ``(*B, N, M)`` with ``value`` added to their diagonals, in place.
+
+    >>> add_diagonal(torch.zeros(2, 3), 1.0)
+    tensor([[1., 0., 0.],
+            [0., 1., 0.]])
+    """
+    matrix.diagonal(dim1=-2, dim2=-1).add_(value)
+    return matrix
+
+
 def eliminate(matrix: Tensor, right: Tensor) -> Tensor:
     """Return :math:`A^{-1} B` by Gaussian elimination, which needs no pivots here.
 

