@@ -59,8 +59,6 @@ class ActionFlow(Believer):
         place_scale: distance at which ground counts as other ground, in their unit.
         plain: prior log-odds of a linear model against a reading: a line that predicts what is done
             now knows nothing of other actions.
-        turned: prior log-odds that an actuator is reversed against a reading: wires are swapped
-            more often than not, and a robot that is reversed falls before anything is fitted.
         samples: starting points of the flow.
         source_std: :math:`\sigma`, a share of the largest action.
         steps: midpoint steps.
@@ -101,7 +99,6 @@ class ActionFlow(Believer):
         place: Sequence[int] = (),
         place_scale: float = 0.5,
         plain: float = -6.0,
-        turned: float = 2.0,
         samples: int = 16,
         source_std: float = 0.3,
         steps: int = 1,
@@ -121,7 +118,7 @@ class ActionFlow(Believer):
         only, simple = (READINGS[name] for name in late), [Reading()] * len(LINEAR)
         read = [Reading(), *chosen, *simple, *only, *[Reading()] * len(CALM)]
         acting = lay_out(read, rows).acting
-        worth[models.index("reversed")] = turned
+        worth[models.index("reversed")] = 0.0  # says what every action does
         follows = [r.varied or r.near for r in read]
         first = 1 + len(names)
         follows[first : first + len(LINEAR)] = [True] * len(LINEAR)
