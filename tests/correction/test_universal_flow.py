@@ -64,6 +64,15 @@ def test_faults_are_corrected_within_few_steps(line, drive, plans, name, size):
     assert foreseen < 0.12
 
 
+@pytest.mark.parametrize("size", SIZES)
+def test_reversed_actuators_do_as_planned_from_the_third_step_on(line, drive, plans, size):
+    planned = plans(8, 32, size, size=0.5)
+    _, effects = drive(flow_of(size), line(size), REGIMES["reversed"], planned)
+    assert torch.equal(effects[:2], -planned[:2])  # of the first step alone nothing is concluded
+    right = (effects - planned)[2:].abs() < 0.05 + 0.1 * planned[2:].abs()
+    assert right.float().mean() > 0.85
+
+
 @pytest.mark.parametrize("name", ["bias", "two swapped"])
 def test_what_one_map_explains_is_undone_exactly(line, drive, plans, name):
     planned = plans(MANY, 8, 3, size=0.5)
