@@ -57,8 +57,8 @@ class ActionFlow(Believer):
         place: coordinates of the state in which the ground may differ; readings by place are
             left out if there are none.
         place_scale: distance at which ground counts as other ground, in their unit.
-        plain: prior log-odds of a linear model against a reading: a line that predicts what is done
-            now knows nothing of other actions.
+        plain: prior log-odds of a linear model that is fitted against a reading: a line that
+            predicts what is done now knows nothing of other actions.
         samples: starting points of the flow.
         source_std: :math:`\sigma`, a share of the largest action.
         steps: midpoint steps.

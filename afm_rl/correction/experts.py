@@ -153,11 +153,9 @@ def fit_experts(rows: Rows) -> Experts:
     gain = not_zero(torch.cat([gains, slope, slopes[:, 1:]], -1))
     offset = torch.cat([torch.zeros_like(gains), offset, offsets[:, 1:]], -1)
     matrix, bias = fit_affine(inputs, e.mT, long.mT)
-    explained, driver, alone = _drivers(u, e, long)
-    matrix, bias = (
-        torch.where(explained, driver, matrix),
-        torch.where(explained, alone, bias.unsqueeze(-1)),
-    )
+    explained, driver, shift = _drivers(u, e, long)
+    matrix = torch.where(explained, driver, matrix)
+    bias = torch.where(explained, shift, bias.unsqueeze(-1))
     inverse = invert_matrix(matrix)
     wide = (count, axes, 1)
     experts = Experts(
