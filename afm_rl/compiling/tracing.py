@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache, wraps
 from typing import TypeVar
 
@@ -58,3 +58,47 @@ def cached(maxsize: int) -> Callable[[Callable[..., Result]], Callable[..., Resu
         return call
 
     return decorate
+
+
+def somewhere(
+    mask: Tensor, work: Callable[..., Sequence[Tensor]], still: Sequence[Tensor], *given: Tensor
+) -> list[Tensor]:
+    """Return what ``work(*given)`` returns where a mask ``(*B)`` holds, and ``still`` elsewhere.
+
+    The work is not done if it holds nowhere; if something is given, not in an exported function
+    either. It gets the rows where the mask holds, if :func:`one may look <may_look>`, else all.
+
+    Args:
+        mask: where.
+        work: returns as many tensors ``(*B, ...)`` as there are in ``still``.
+        still: what is elsewhere, of the same shapes.
+        given: tensors ``(*B, ...)``.
+
+    >>> mask = torch.tensor([True, False])
+    >>> somewhere(mask, lambda x: [1 / x], [torch.zeros(2)], torch.tensor([4.0, 0.0]))
+    [tensor([0.2500, 0.0000])]
+    """
+
+    def everywhere() -> list[Tensor]:
+        at = [mask[(..., *[None] * (old.dim() - mask.dim()))] for old in still]
+        parts = zip(at, work(*given), still, strict=True)
+        return [torch.where(here, new.to(old.dtype), old).contiguous() for here, new, old in parts]
+
+    if not may_look(mask):
+        # torch 2.13 has no branches within branches, nor for a number of missions not known yet.
+        static = not any(isinstance(n, torch.SymInt) for n in mask.shape)
+        if not (given and static and torch.compiler.is_compiling()):
+            return everywhere()
+        kept = [old.contiguous() for old in still]
+        return list(torch.cond(mask.any(), everywhere, lambda: [old.clone() for old in kept]))
+    if not bool(mask.any()):
+        return list(still)
+    if bool(mask.all()):
+        pairs = zip(work(*given), still, strict=True)
+        return [new.to(old.dtype, copy=new.is_inference()) for new, old in pairs]
+    if not given:
+        return everywhere()
+    found = [old.clone() for old in still]
+    for old, new in zip(found, work(*(part[mask] for part in given)), strict=True):
+        old[mask] = new.to(old.dtype)
+    return found

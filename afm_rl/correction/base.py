@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from afm_rl.compiling.tracing import may_look
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.faults import count_repeats, trusted
@@ -40,40 +38,6 @@ class Correction(NamedTuple):
     """Is the action corrected? ``(*B)``."""
     noise: Tensor
     """Standard deviation of effects that nothing explains, ``(*B, A)``."""
-
-
-def rows_of(mask: Tensor) -> Any:
-    """Return an index of the missions of a mask ``(*B)``: of all of them one that copies nothing.
-
-    All of them where :func:`nothing may depend on numbers <afm_rl.compiling.tracing.may_look>`.
-
-    >>> rows_of(torch.tensor([True, True])), rows_of(torch.tensor([True, False]))
-    (Ellipsis, tensor([ True, False]))
-    """
-    return mask if may_look(mask) and not bool(mask.all()) else ...
-
-
-def put(part: Tensor, mask: Tensor, use: Any, values: Tensor) -> Tensor:
-    """Return a part ``(*B, ...)`` with values where a mask ``(*B)`` holds.
-
-    Args:
-        part: what is elsewhere.
-        mask: where.
-        use: :func:`rows_of` the mask, for which there are values.
-        values: of these missions.
-
-    >>> mask = torch.tensor([True, False])
-    >>> put(torch.zeros(2), mask, rows_of(mask), torch.ones(1))
-    tensor([1., 0.])
-    """
-    values = values.to(part.dtype, copy=values.is_inference())
-    if use is not ...:
-        part = part.clone()
-        part[use] = values
-        return part
-    if not may_look(mask):
-        return torch.where(mask[(..., *[None] * (part.dim() - mask.dim()))], values, part)
-    return values
 
 
 class Corrector(nn.Module, ABC):
@@ -116,6 +80,7 @@ class Corrector(nn.Module, ABC):
                 f"corrector: action bounds {low.tolist()}, {high.tolist()}: expected two lists of "
                 "one size, finite, low < high"
             )
+        self.layouts: dict[int, tuple[list, list, list]] = {}  # by the size of a state
         self.recent = check_count("corrector.recent", recent)
         scale = torch.maximum(low.abs(), high.abs())
         self.action_size = len(scale)
@@ -282,12 +247,11 @@ class Corrector(nn.Module, ABC):
 
     def _layout(self, state_size: int) -> tuple[list[str], list[int], list[tuple[int, ...]]]:
         """Return names, sizes and shapes of the parts of a memory, computed once."""
-        known = LAYOUTS.setdefault(self, {})
-        if state_size not in known:
+        if state_size not in self.layouts:
             shapes = self.shapes(state_size)
             sizes = [math.prod(shape) for shape in shapes.values()]
-            known[state_size] = list(shapes), sizes, list(shapes.values())
-        return known[state_size]
+            self.layouts[state_size] = list(shapes), sizes, list(shapes.values())
+        return self.layouts[state_size]
 
     def split_transitions(self, rows: Tensor, state_size: int) -> tuple[Tensor, ...]:
         """Return state, planned, executed, next state and validity of rows of transitions."""
@@ -310,7 +274,3 @@ class Corrector(nn.Module, ABC):
     def within(self, share: Tensor) -> Tensor:
         """Return the u whose place between lowest (-1) and highest (1) is ``share`` ``(*B, A)``."""
         return self.lowest + 0.5 * (share + 1) * (self.highest - self.lowest)
-
-
-LAYOUTS: WeakKeyDictionary[Corrector, dict[int, tuple[list, list, list]]] = WeakKeyDictionary()
-"""Layouts that were computed, by corrector and size of the state."""

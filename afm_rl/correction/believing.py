@@ -9,9 +9,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from afm_rl.compiling.tracing import all_hold
+from afm_rl.compiling.tracing import all_hold, somewhere
 from afm_rl.correction.arrival import ago, steps_late
-from afm_rl.correction.base import Correction, Fields, put, rows_of
+from afm_rl.correction.base import Correction, Fields
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel
@@ -151,9 +151,12 @@ class Believer(PairCorrector):
         belief = belief._replace(losses=self.surprised(parts["losses"], belief.losses))
         awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
         before = parts["late"].squeeze(-1).long()
-        if not all_hold(~awake.squeeze(-1) & (before == 0)):
-            late, losses = self.delayed(belief, prior, before)
-            parts["late"], belief = late.unsqueeze(-1).to(newest), belief._replace(losses=losses)
+        late, losses = somewhere(
+            awake.squeeze(-1) | (before > 0),
+            lambda: self.delayed(belief, prior, before),
+            [before, belief.losses],
+        )
+        parts["late"], belief = late.unsqueeze(-1).to(newest), belief._replace(losses=losses)
         begins = (parts["misaligned"] != 1.0) & awake
         count = 1 if model.taught_in is None else self.recent
         parts["pairs"] = self.aged(parts["pairs"], begins, count)
@@ -256,19 +259,17 @@ class Believer(PairCorrector):
         self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
     ) -> tuple[Tensor, Correction]:
         """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
+        calm = planned.clamp(*box.unbind(-2))
         with torch.no_grad():
-            memory, idle, awake, innovation = self._watch(memory, planned, model)
-            found = self.unchanged(planned, innovation, box)
+            memory, idle, awake, innovation = self._watch(memory, calm, model)
+            found = self.unchanged(calm, innovation, box)
             found = found._replace(noise=self.noise_in(memory))
-            if all_hold(~awake):
-                return idle, found
-            use = rows_of(awake)
-            after, *answer = self._decide(memory[use], planned[use], box[use])
-            given = dict(zip(Answer._fields[:-2], answer, strict=True))
-            given["misaligned"] = given.pop("corrects")
-            now = found._asdict()
-            changed = {name: put(now[name], awake, use, part) for name, part in given.items()}
-            return put(idle, awake, use, after), found._replace(**changed)
+            names = ["memory", *Answer._fields[:-2]]
+            still = [idle, *found[:4], found.misaligned]
+            changed = somewhere(awake, self._decide, still, memory, planned, box)
+            now = dict(zip(names, changed, strict=True))
+            now["misaligned"] = now.pop("corrects")
+            return now.pop("memory"), found._replace(**now)
 
     def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the state, the newest commands' effects, and how many of them are to come."""
@@ -326,13 +327,13 @@ class Believer(PairCorrector):
         parts = self.unpack(memory, self.states_in(memory))
         awake = parts["misaligned"].squeeze(-1) == 1.0
         idle = self.asleep(parts, executed)
-        found = [idle[name] for name in ("forecasts", "under_way")]
-        if not all_hold(~awake):
-            use = rows_of(awake)
-            asked = {name: part[use] for name, part in parts.items()}
-            pairs = zip(found, self.foresee(asked, executed[use]), strict=True)
-            found = [put(calm, awake, use, new) for calm, new in pairs]
-        return self.pack({**parts, "forecasts": found[0], "under_way": found[1]})
+
+        def asked(memory: Tensor, executed: Tensor) -> Sequence[Tensor]:
+            return self.foresee(self.unpack(memory, self.states_in(memory)), executed)
+
+        still = [idle["forecasts"], idle["under_way"]]
+        forecasts, under_way = somewhere(awake, asked, still, memory, executed)
+        return self.pack({**parts, "forecasts": forecasts, "under_way": under_way})
 
     def _watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
         return self.watch(memory, planned, model)

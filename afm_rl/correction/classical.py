@@ -8,9 +8,9 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
-from afm_rl.compiling.tracing import all_hold
+from afm_rl.compiling.tracing import somewhere
 from afm_rl.correction.achievable import MODES, saturate
-from afm_rl.correction.base import Correction, Fields, put, rows_of
+from afm_rl.correction.base import Correction, Fields
 from afm_rl.correction.experts import Rows
 from afm_rl.correction.fits import (
     confidence,
@@ -55,16 +55,16 @@ class ClassicalCorrector(PairCorrector):
         """Answer where the model is contradicted."""
         parts = self._watched(memory, model)
         innovation, misaligned = self._innovation(parts)
+
+        def answer(pairs: Tensor, planned: Tensor) -> tuple[Tensor, Tensor]:
+            rows = self.rows({"pairs": pairs})
+            unit = self.inverse(rows, self.normalise(planned))
+            return self.denormalise(unit), self.denormalise(self.effect(rows, unit))
+
+        still = [planned, planned]
+        executed, predicted = somewhere(misaligned, answer, still, parts["pairs"], planned)
         found = self.unchanged(planned, innovation, box)
-        if not all_hold(~misaligned):
-            use = rows_of(misaligned)
-            rows = self.rows({"pairs": parts["pairs"][use]})
-            unit = self.inverse(rows, self.normalise(planned[use]))
-            executed, predicted = (
-                put(planned, misaligned, use, self.denormalise(part))
-                for part in (unit, self.effect(rows, unit))
-            )
-            found = found._replace(executed=executed, predicted=predicted, misaligned=misaligned)
+        found = found._replace(executed=executed, predicted=predicted, misaligned=misaligned)
         parts |= {"planned": planned, "executed": found.executed, "acting": found.predicted}
         parts["misaligned"] = misaligned.unsqueeze(-1).to(planned.dtype)
         return self.pack(parts), found
@@ -148,7 +148,8 @@ class LeastSquares(ClassicalCorrector):
         """Invert the fit."""
         matrix, offset = self._fit(rows)
         if self.form == "affine":
-            return saturate(invert_affine(matrix, offset, planned), self.saturation)
+            columns = (part.unsqueeze(-1) for part in (offset, planned))
+            return saturate(invert_affine(matrix, *columns).squeeze(-1), self.saturation)
         return saturate((planned - offset) / matrix, self.saturation)
 
     def effect(self, rows: Rows, executed: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,18 +10,17 @@ from torch import Tensor
 from afm_rl.compiling.tracing import cached
 from afm_rl.correction.achievable import LIMIT, saturate
 from afm_rl.correction.fits import (
-    LEAST_GAIN,
     OUTLIER,
     PRIOR,
     STUCK,
     apply_friction,
     confidence,
     fit_affine,
+    invert_affine,
     invert_friction,
     not_zero,
     solve_line,
 )
-from afm_rl.spaces.small_matrices import add_diagonal, solve_positive
 
 EXACT = 0.02  # half ranges: a fit that misses by less explains all rows
 LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
@@ -29,6 +28,10 @@ LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
 NEAR = 0.15  # half ranges: a pair so far from the question counts half as much
 SHORT, LONG = 0.5, 0.9  # forgetting per row
 EXPERTS = 6
+MOMENTS = torch.zeros(3, 8, dtype=torch.float64)  # of the priors: short and long memory, friction
+MOMENTS[:, [0, 3]], MOMENTS[:, [2, 7]] = PRIOR, 10 * PRIOR
+LINES = torch.tensor([[1], [2]])  # rows of the moments, of the two lines that have an offset
+PLACES = torch.tensor([[0, 1, 7, 3, 4], [0, 5, 2, 3, 6]])  # and their columns
 ANSWERS = EXPERTS + 1  # the experts' answers, and the effect or nearness of the nearest pairs
 MISSES = EXPERTS - 1  # the nearest pairs have no residual of their own
 
@@ -67,8 +70,6 @@ class Experts(NamedTuple):
     """Their offsets; the last one's is against the motion, ``(N, A, 1, 4)``."""
     matrix: Tensor
     """Of the affine map, ``(N, A, A)``."""
-    inverse: Tensor
-    """Its regularised inverse, ``(N, A, A)``."""
     bias: Tensor
     """Of the affine map, ``(N, A, 1)``."""
     residuals: Tensor
@@ -92,7 +93,7 @@ class Experts(NamedTuple):
         unit = plan.unsqueeze(-1)
         linear = (unit - self.offset[..., :3]) / self.gain[..., :3]
         rubbed = invert_friction(self.gain[..., 3:], self.offset[..., 3:], unit)
-        affine = (self.inverse @ (plan - self.bias)).unsqueeze(-1)
+        affine = invert_affine(self.matrix, self.bias, plan).unsqueeze(-1)
         exact = saturate(torch.cat([linear, rubbed, affine], -1), mode, dim=-3)
         share = self._likeness(self.effective, unit).softmax(-1)
         pairs = torch.cat([self.executed, self.effective], -2).mT
@@ -156,13 +157,11 @@ def fit_experts(rows: Rows) -> Experts:
     explained, driver, shift = _drivers(u, e, long)
     matrix = torch.where(explained, driver, matrix)
     bias = torch.where(explained, shift, bias.unsqueeze(-1))
-    inverse = invert_matrix(matrix)
     wide = (count, axes, 1)
     experts = Experts(
         gain.unflatten(0, wide[:2]).unsqueeze(-2),
         offset.unflatten(0, wide[:2]).unsqueeze(-2),
         matrix,
-        inverse,
         bias,
         bias,  # until the residuals are known
         bias,
@@ -176,13 +175,6 @@ def fit_experts(rows: Rows) -> Experts:
     left = torch.cat([left[..., :1, :1], left[..., 1:, 1:]], -1)
     experts = experts._replace(residuals=residuals, misses=(left.sqrt() + LEAST_MISS).log())
     return Experts(*(part.to(rows.executed) for part in experts))
-
-
-def invert_matrix(matrix: Tensor) -> Tensor:
-    """Return the inverse of matrices ``(*B, A, A)``, regularised by the least gain there is."""
-    wide = matrix.double()
-    ridge = add_diagonal(wide.mT @ wide, LEAST_GAIN**2)
-    return solve_positive(ridge, wide.mT).to(matrix)
 
 
 def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -201,7 +193,8 @@ def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tens
     """
     own = torch.eye(u.shape[-2], device=u.device, dtype=u.dtype)
     pull = weight * e
-    square, mean, cross = weight @ (u * u).mT + PRIOR, weight @ u.mT, pull @ u.mT + PRIOR * own
+    square, mean = (weight @ torch.cat([u * u, u], -2).mT).chunk(2, -1)
+    square, cross = square + PRIOR, pull @ u.mT + PRIOR * own
     mass, shift = weight.sum(-1, keepdim=True) + 10 * PRIOR, pull.sum(-1, keepdim=True)
     slope, offset = solve_line(square, mean, mass, cross, shift)
     left = (pull * e).sum(-1, keepdim=True) - slope * cross - offset * shift
@@ -215,15 +208,7 @@ def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tens
 
 @cached(maxsize=16)
 def _constants(rows: int, device: torch.device) -> tuple[Tensor, ...]:
-    """Return the weights by age ``(2, K)``, the moments of the priors, and indices.
-
-    The moments are ``(3, 8)``. The indices are rows and columns of the moments of the two lines
-    that are fitted with an offset.
-    """
-    kind: dict[str, Any] = {"dtype": torch.float64, "device": device}
-    age = torch.arange(rows - 1, -1, -1, **kind)
-    prior = torch.zeros(3, 8, **kind)
-    prior[:, [0, 3]], prior[:, [2, 7]] = PRIOR, 10 * PRIOR
-    lines = torch.tensor([[1], [2]], device=device)
-    places = torch.tensor([[0, 1, 7, 3, 4], [0, 5, 2, 3, 6]], device=device)
-    return torch.stack([SHORT**age, LONG**age]), prior, lines, places
+    """Return the weights by age, ``(2, K)``, and the constants below, on a device."""
+    age = torch.arange(rows - 1, -1, -1, dtype=torch.float64, device=device)
+    rest = (part.to(device) for part in (MOMENTS, LINES, PLACES))
+    return torch.stack([SHORT**age, LONG**age]), *rest

@@ -141,12 +141,17 @@ def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Ten
 
 
 def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:
-    """Return the action ``(*B, A)`` whose effect under :func:`fit_affine` is nearest to ``unit``.
+    """Return the actions ``(*B, A, C)`` whose effects come nearest to what is wanted.
 
-    A small ridge keeps it finite where the matrix is all but singular.
+    Of :func:`fit_affine`. A small ridge keeps them finite where the matrix is all but singular.
+
+    Args:
+        matrix: D, ``(*B, A, A)``.
+        bias: b, ``(*B, A, 1)``.
+        unit: what is wanted, ``(*B, A, C)``.
     """
-    pull = matrix.mT @ (unit - bias).unsqueeze(-1)
-    return solve_positive(add_diagonal(matrix.mT @ matrix, LEAST_GAIN**2), pull).squeeze(-1)
+    square = add_diagonal(matrix.mT @ matrix, LEAST_GAIN**2)
+    return solve_positive(square, matrix.mT @ (unit - bias))
 
 
 def not_zero(gain: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ Two rows may tell a sign, but in noise it takes many; so the belief has windows 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -33,6 +33,7 @@ or of all pairs."""
 CALM = ("only so fast", "noisy readings")
 """Models by which there is nothing to correct: :func:`within_rate`, and :func:`sensor_noise`."""
 WINDOWS = (1, 3, 12, 0)  # rows; 0: all
+MOMENTS = PRIOR * torch.tensor([1.0, 0.0, 10.0, 1.0, 0.0], dtype=torch.float64)  # of the prior
 RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for a few noisy rows
 
 
@@ -50,7 +51,8 @@ class Lines(NamedTuple):
 
     def invert(self, planned: Tensor) -> Tensor:
         """Return the actions ``(B, L, A)`` whose effects come nearest to plans ``(B, A)``."""
-        return invert_affine(self.matrix, self.bias, planned.unsqueeze(1))
+        plan = planned[:, None, :, None]
+        return invert_affine(self.matrix, self.bias.unsqueeze(-1), plan).squeeze(-1)
 
 
 def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
@@ -67,21 +69,21 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
     >>> lines.effect(torch.ones(1, 1, 1))[0, LINEAR.index("line_12")].round(decimals=2)
     tensor([[-1.9000]])
     """
-    newest, prior, fixed = _constants(sent.shape[-2], sent.device)
     weight = valid * (std.square() + PRIOR).reciprocal()
     scale = weight.amax(-2, keepdim=True).clamp_min(PRIOR)
     u, v, weight = (part.mT.double() for part in (sent, came, weight / scale))  # (B, A, M)
     terms = torch.stack([u * u, u, torch.ones_like(u), u * v, v], -1)  # (B, A, M, 5)
-    moments = (newest * weight.unsqueeze(-2)) @ terms + prior  # (B, A, W, 5)
+    newest = _windows(u.shape[-1], u.device) * weight.unsqueeze(-2)
+    moments = newest @ terms + MOMENTS.to(u.device)  # (B, A, W, 5)
     square, mean, mass, cross, shift = moments.unbind(-1)
     gain, offset = not_zero(cross / square), (shift - mean) / mass
     slope, rest = solve_line(square, mean, mass, cross, shift)
     gain_12 = gain[..., 2:3]
     drift = (shift - gain_12 * mean)[..., :1] / mass[..., :1]
     arx, goes_on = _autoregressive(u, v, weight)
-    one, none = fixed.expand(2, *gain.shape[:-1], 3)
-    gains = torch.cat([one, gain[..., 1:], slope[..., 2:], gain_12, arx], -1)
-    biases = [none[..., :1], offset[..., :2], none, rest[..., 2:], drift, goes_on]
+    one, none = torch.ones_like(arx), torch.zeros_like(gain)
+    gains = torch.cat([-one, one, one, gain[..., 1:], slope[..., 2:], gain_12, arx], -1)
+    biases = [none[..., :1], offset[..., :2], none[..., 1:], rest[..., 2:], drift, goes_on]
     affine, shift = fit_affine(u.mT, v.mT, weight.mT)
     matrix = torch.cat([torch.diag_embed(gains.mT), affine.unsqueeze(1)], 1)
     bias = torch.cat([*biases, shift.unsqueeze(-1)], -1).mT
@@ -89,14 +91,10 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
 
 
 @cached(maxsize=16)
-def _constants(length: int, device: torch.device) -> tuple[Tensor, ...]:
-    """Return the windows ``(W, M)``, the prior's moments, and the gains that are not fitted."""
-    kind: dict[str, Any] = {"dtype": torch.float64, "device": device}
+def _windows(length: int, device: torch.device) -> Tensor:
+    """Return which rows are in each window, ``(W, M)``."""
     age = torch.arange(length - 1, -1, -1, device=device)
-    newest = torch.stack([age < (rows or length) for rows in WINDOWS]).to(**kind)
-    prior = PRIOR * torch.tensor([1.0, 0.0, 10.0, 1.0, 0.0], **kind)
-    fixed = torch.tensor([[-1.0, 1.0, 1.0], [0.0, 0.0, 0.0]], **kind)[:, None, None]
-    return newest, prior, fixed
+    return torch.stack([age < (rows or length) for rows in WINDOWS]).double()
 
 
 def sensor_noise(sent: Tensor, came: Tensor, valid: Tensor, keep: float = 0.7) -> Tensor:

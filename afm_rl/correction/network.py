@@ -20,7 +20,6 @@ from afm_rl.correction.experts import (
     MISSES,
     Experts,
     Rows,
-    invert_matrix,
 )
 from afm_rl.errors import ArtefactError, check_count
 
@@ -59,6 +58,8 @@ class Encoded(NamedTuple):
     """The experts' fits."""
     code: Tensor
     """A code per axis, ``(N, A, 1, L)``."""
+    effect: Tensor
+    """Its part in the first layer about effects, ``(N, A, 1, W)``."""
 
     def choose(self, which: Tensor) -> Encoded:
         """Return one model of B missions, axis by axis from the R sets of rows that each has.
@@ -71,8 +72,7 @@ class Encoded(NamedTuple):
         at = row * (self.code.shape[0] // count) + which
         axis = torch.arange(axes, device=which.device)
         parts = {name: part[at, axis] for name, part in self.experts._asdict().items()}
-        parts["inverse"] = invert_matrix(parts["matrix"])
-        return Encoded(Experts(**parts), self.code[at, axis])
+        return Encoded(Experts(**parts), self.code[at, axis], self.effect[at, axis])
 
 
 class Asked(NamedTuple):
@@ -153,7 +153,8 @@ class AxisNetwork(nn.Module):
         if self.across:
             others = torch.cat([code.mean(-2, keepdim=True), code.amax(-2, keepdim=True)], -1)
             code = code + self.mixed(torch.cat([code, others.expand(*code.shape[:-1], -1)], -1))
-        return Encoded(experts, code.unsqueeze(-2))
+        code = code.unsqueeze(-2)
+        return Encoded(experts, code, self.effect_code(code))
 
     def ask(self, encoded: Encoded, planned: Tensor, mode: str) -> Asked:
         """Read plans ``(N, C, A)``; ``mode`` says how those that cannot be had are saturated."""
@@ -189,7 +190,7 @@ class AxisNetwork(nn.Module):
         answers = encoded.experts.effect(executed)
         misses = encoded.experts.misses.expand(*answers.shape[:-1], -1)
         asked = torch.cat([executed.mT.unsqueeze(-1), answers, misses], -1)
-        hidden = (self.effect_code(encoded.code) + self.effect_query(asked)).relu()
+        hidden = (encoded.effect + self.effect_query(asked)).relu()
         return self._blend(self.effect_head(hidden), answers[..., :EXPERTS])
 
     def _blend(self, output: Tensor, answers: Tensor) -> Tensor:

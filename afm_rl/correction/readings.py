@@ -188,8 +188,9 @@ def read_rows(
     effects = pairs.index_select(-2, newest - layout.effect)
     commands = pairs[..., -layout.command.shape[-1] :, :]
     lost = (commands[..., 3 * size : 3 * size + 1] == 0).to(commands)
-    valid = ((layout.command > 0).to(lost) @ lost == 0).to(lost)
-    executed = layout.command.to(lost) @ commands[..., :size]
+    sent = torch.cat([commands[..., :size], lost], -1)
+    executed, lost = (layout.command.to(sent) @ sent).split([size, 1], -1)
+    valid = (lost == 0).to(sent)
     effective, std, came = effects[..., size : 3 * size + 1].split([size, size, 1], -1)
     came = (came == 1.0).to(came)  # what was sound before a change tells nothing about it
     parts = [part.unflatten(-2, (-1, rows)) for part in (executed, effective, std, valid * came)]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from afm_rl.compiling.tracing import all_hold
+from afm_rl.compiling.tracing import somewhere
 from afm_rl.correction.achievable import MODES, attainable, extend
 from afm_rl.correction.arrival import ago, aligned
 from afm_rl.correction.belief import mean_and_std
@@ -136,13 +136,16 @@ class Tick(nn.Module):
         bounds = extend(reach, ends, sent.amax(1) - sent.amin(1))
         action, effects = self.decide(models, proposals, expected, wanted, noise)
         lag = (self.filtered.to(weights) @ weights).argmax(1)  # the most probable one
-        if not all_hold(lag == 0):
-            action, acts = self.lead(action, lag, torch.cat([sent, waiting], 1), ends)
-            effects = self.expect(models, acts.unsqueeze(1)).squeeze(2)
+
+        def led() -> tuple[Tensor, Tensor]:
+            first, acts = self.lead(action, lag, torch.cat([sent, waiting], 1), ends)
+            return first, self.expect(models, acts.unsqueeze(1)).squeeze(2)
+
+        action, effects = somewhere((lag > 0).any(-1), led, [action, effects])
         calm = weights[:, 0] + weights[:, -len(CALM) :].sum(1)
         changed = calm < 0.5  # else the plan, to the bit
         corrects = changed & action.isfinite().all(-1, True)
-        action = torch.where(corrects, action, unit)
+        action = torch.where(corrects, action, proposals[:, 0])
         effects = torch.where(corrects.unsqueeze(1), effects, expected[:, :, 0])
         predicted = (models.weights * effects).sum(1)
         ahead = torch.cat([waiting, action.unsqueeze(1)], 1)
@@ -233,13 +236,19 @@ class Tick(nn.Module):
         joint = cost.sum(-1).argmin(1)[:, None, None].expand_as(each)
         action, least = proposals.gather(1, joint), cost.gather(1, joint)
         effect = expected.gather(2, joint.unsqueeze(1).expand_as(expected[:, :, :1]))
-        if not all_hold(each == joint):
-            mixed = proposals.gather(1, each)
-            foreseen = self.expect(models, mixed)
+
+        def mixed() -> tuple[Tensor, Tensor]:
+            other = proposals.gather(1, each)
+            foreseen = self.expect(models, other)
             loss = self.loss(models, foreseen, wanted, noise).sum(-1, keepdim=True)
             better = loss <= least.sum(-1, keepdim=True) + 1e-6
-            action = torch.where(better, mixed, action)
-            effect = torch.where(better.unsqueeze(1), foreseen, effect)
+            return (
+                torch.where(better, other, action),
+                torch.where(better.unsqueeze(1), foreseen, effect),
+            )
+
+        differ = (each != joint).flatten(1).any(-1)
+        action, effect = somewhere(differ, mixed, [action, effect])
         return action.squeeze(1), effect.squeeze(2)
 
     def lead(self, acts: Tensor, lag: Tensor, sent: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
@@ -293,13 +302,14 @@ class Tick(nn.Module):
         linear = read.lines.effect(acting).squeeze(2)
         calmly = [acting.clamp(*read.slow.split(1, 1)), acting + read.noisy]
         forecasts = torch.cat([now, found, linear, acts[:, self.late], *calmly], 1)
-        waits = late + ahead.shape[1] > 1
-        if not all_hold(~waits):
+
+        def on_its_way() -> list[Tensor]:
             so_late = ((self.delays < 0) | (self.delays == late.unsqueeze(-1))).unsqueeze(-1)
             models = self.most_likely(read, torch.where(so_late, weights.clamp_min(1e-9), 0.0))
             shares = models.weights / models.weights.sum(1, keepdim=True)
-            effects = (shares.unsqueeze(2) * self.expect(models, newest)).sum(1)
-            newest = torch.where(waits[:, None, None], effects, newest)
+            return [(shares.unsqueeze(2) * self.expect(models, newest)).sum(1)]
+
+        (newest,) = somewhere(late + ahead.shape[1] > 1, on_its_way, [newest])
         return forecasts, newest
 
 

@@ -11,7 +11,6 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
-from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction import ActionFlow, Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_instance
@@ -147,7 +146,7 @@ def correct(
 
     Args:
         memory: up to the present state.
-        planned: the planner's action.
+        planned: the planner's action; where it is not finite, the one before is taken.
         model: the dynamics model as it is now.
         corrector: the correction.
         action_spec: actions that can be executed.
@@ -162,21 +161,17 @@ def correct(
     check_numbers(key, planned, (*memory.shape[:-1], corrector.action_size))
     planned = computable(planned, low, high, memory.dtype)
     box = box_of(action_spec, planned)
-    before = memory
-    memory, found = corrector.correct(memory, planned, model, box)
-    wanted = found.executed if enabled else planned
+    _, last, sent = corrector.latest(memory)
+    plan = torch.where(planned.isfinite().all(-1, keepdim=True), planned, last)
+    memory, found = corrector.correct(memory, plan, model, box)
     # The last clamp depends on nothing but the spec, whatever the corrector answers.
-    executed = wanted.clamp(low, high).to(memory.dtype)
-    predicted, misaligned = found.predicted, found.misaligned
-    if not all_hold(executed == found.executed):  # what is no number equals nothing
-        executed, _ = safe_action(wanted, low, high, corrector.latest(before)[2])
-        memory = corrector.executing(memory, planned, executed)
-        touched = (executed != found.executed).any(-1, keepdim=True)
-        predicted = torch.where(touched & ~misaligned.unsqueeze(-1), executed, predicted)
-    if not enabled:
-        predicted = executed
-    else:
+    executed, _ = safe_action(found.executed if enabled else plan, low, high, sent)
+    executed, predicted = executed.to(memory.dtype), found.predicted
+    if enabled:  # a corrector that keeps to the box has noted all of it
+        memory = Corrector.executing(corrector, memory, plan, executed)
         executed = corrector.sending(memory, executed)
+    else:
+        memory, predicted = corrector.executing(memory, plan, executed), executed
     bounds = found.bounds if enabled else box
     if not (extend_action_box and model.extrapolates):
         low, high = box.unbind(-2)
@@ -189,7 +184,7 @@ def correct(
         "spread": found.spread if enabled else torch.zeros_like(found.spread),
         "noise": found.noise,
         "innovation": found.innovation,
-        "misaligned": misaligned,
+        "misaligned": found.misaligned,
         "memory": memory,
     }
     return TensorDict(entries, planned.shape[:-1], device=planned.device)

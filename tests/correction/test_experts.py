@@ -111,8 +111,8 @@ def test_the_fits_are_those_of_the_single_functions():
         torch.testing.assert_close(found, expected)
     assert not offset[..., :2].any()
     planned = drawn(5, 1, 3, seed=4).double()
-    inverse = invert_affine(experts.matrix, experts.bias[..., 0], planned.squeeze(1))
-    found = experts.execute(planned, "clip")[..., 0, AFFINE]
+    inverse = invert_affine(experts.matrix, experts.bias, planned.mT)
+    found = experts.execute(planned, "clip")[..., AFFINE]
     torch.testing.assert_close(found, inverse.clamp(-1, 1))
 
 

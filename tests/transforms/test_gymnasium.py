@@ -123,7 +123,7 @@ def test_plans_beyond_the_space_are_brought_into_it(plan, dtype):
             told = env.step(np.array([sign * plan, 0.3]))[-1]["afm"]
             np.testing.assert_allclose(told["executed"], [sign * gain, gain * 0.3], atol=0.02)
     held = env.step(np.array([np.inf, 0.3]))[-1]["afm"]["executed"]
-    np.testing.assert_array_equal(held, told["executed"])
+    np.testing.assert_allclose(held, told["executed"], atol=1e-3)  # the plan before
 
 
 NO_ACTIONS = {
