@@ -30,7 +30,7 @@ class Belief(NamedTuple):
         prior: Tensor,
         discount: float,
         rate: float,
-        floor: float,
+        floor: Tensor | float,
         tails: float,
     ) -> Belief:
         r"""Return the belief after an effect was seen.
@@ -80,7 +80,7 @@ class Belief(NamedTuple):
         return (prior - self.losses).softmax(-2)
 
 
-def haste(noise: Tensor, floor: float) -> Tensor:
+def haste(noise: Tensor, floor: Tensor | float) -> Tensor:
     r"""Return :math:`q = \min\{1, (s_0 / s)^2\}`: how little a row tells in noise, ``(*B, A)``.
 
     >>> haste(torch.tensor([0.02, 0.04]), floor=0.02)
@@ -89,7 +89,7 @@ def haste(noise: Tensor, floor: float) -> Tensor:
     return (floor / noise).square().clamp_max(1.0)
 
 
-def prior_of(worth: Tensor, odds: float, noise: Tensor, floor: float) -> Tensor:
+def prior_of(worth: Tensor, odds: float, noise: Tensor, floor: Tensor | float) -> Tensor:
     """Return the prior log-odds of the models, that of *nothing has changed* first, ``(*B, M, A)``.
 
     What one model is worth more than another counts where it is quiet: in noise none is exact.

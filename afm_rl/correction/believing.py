@@ -64,8 +64,10 @@ class Believer(PairCorrector):
         discount: of the losses; .95 looks back on twenty steps.
         noise: standard deviation that no model explains, at first, a share of the largest action.
         noise_rate: share of its square that is renewed at every step.
-        least_noise: its floor: effects nearer than that are all the same. In more noise a belief
-            looks back longer.
+        least_noise: its floor, a share of the largest command that is remembered: effects nearer
+            than that are all the same. In more noise a belief looks back longer.
+        least_command: what the largest command counts as at least, a share of the largest action: a
+            quadrotor that hovers needs a hundredth of its moments.
         quiet: normalised innovation up to which a transition needs no explanation.
         delay: steps that are known, D at most; those of the models come on top.
     """
@@ -91,6 +93,7 @@ class Believer(PairCorrector):
         noise: float = 0.05,
         noise_rate: float = 0.1,
         least_noise: float = 0.02,
+        least_command: float = 0.25,
         quiet: float = 1.0,
         tails: float = 1.0,
         delay: int | Sequence[int] = 0,
@@ -105,6 +108,9 @@ class Believer(PairCorrector):
             "corrector.least_noise", least_noise, low=0.0, open_low=True
         )
         self.noise = check_number("corrector.noise", noise, low=self.least_noise)
+        self.least_command = check_number(
+            "corrector.least_command", least_command, low=0.0, high=1.0, open_low=True
+        )
         self.tails = check_number("corrector.tails", tails, low=0.0, open_low=True)
         among = torch.zeros(len(models)) if worth is None else torch.tensor(worth)
         self.register_buffer("worth", among, persistent=False)
@@ -134,7 +140,13 @@ class Believer(PairCorrector):
 
     def prior(self, parts: Fields) -> Tensor:
         """Return the prior log-odds of the models ``(*B, M, A)``."""
-        return prior_of(self.worth.to(parts["noise"]), self.odds, parts["noise"], self.least_noise)
+        worth, floor = self.worth.to(parts["noise"]), self.floor(parts)
+        return prior_of(worth, self.odds, parts["noise"], floor)
+
+    def floor(self, parts: Fields) -> Tensor:
+        """Return the least noise ``(*B, A)``: effects nearer than that are all the same."""
+        largest = parts["pairs"][..., : self.action_size].abs().amax(-2)
+        return self.least_noise * largest.clamp(self.least_command, 1.0)
 
     def weights(self, parts: Fields) -> Tensor:
         """Return the probabilities of the models ``(*B, M, A)``."""
@@ -145,7 +157,7 @@ class Believer(PairCorrector):
         parts = super().look(memory, model)
         newest, size = parts["pairs"][..., -1, :], self.action_size
         _, effect, std, valid, _ = newest.split([size, size, size, 1, self.tail], -1)
-        rules = (self.discount, self.noise_rate, self.least_noise, self.tails)
+        rules = (self.discount, self.noise_rate, self.floor(parts), self.tails)
         prior = self.prior(parts)
         belief = self.belief(parts).update(effect, std, valid, prior, *rules)
         belief = belief._replace(losses=self.surprised(parts["losses"], belief.losses))

@@ -73,6 +73,20 @@ def test_reversed_actuators_do_as_planned_from_the_third_step_on(line, drive, pl
     assert right.float().mean() > 0.85
 
 
+@pytest.mark.parametrize("size", [1, 2, 6])
+@pytest.mark.parametrize("name", ["reversed", "half reversed"])
+def test_a_robot_that_needs_little_of_its_actuators_is_corrected(line, drive, plans, name, size):
+    """As a quadrotor that hovers, whose moments are hundredths of what they can be."""
+    planned, change = plans(136, 8, size, size=0.01), 40
+
+    def effect(sent):
+        return sent[-1] if len(sent) <= change else REGIMES[name](sent)
+
+    _, effects = drive(flow_of(size), line(size, 1e-5), effect, planned)
+    assert torch.equal(effects[:change], planned[:change])
+    assert miss_of(effects, planned, change + 64).median() < 0.25 * 0.01
+
+
 @pytest.mark.parametrize("name", ["bias", "two swapped"])
 def test_what_one_map_explains_is_undone_exactly(line, drive, plans, name):
     planned = plans(MANY, 8, 3, size=0.5)
