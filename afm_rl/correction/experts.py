@@ -9,19 +9,11 @@ from torch import Tensor
 
 from afm_rl.compiling.tracing import cached
 from afm_rl.correction.achievable import LIMIT, saturate
-from afm_rl.correction.fits import (
-    OUTLIER,
-    PRIOR,
-    STUCK,
-    apply_friction,
-    confidence,
-    fit_affine,
-    invert_affine,
-    invert_friction,
-    not_zero,
-    solve_line,
-)
+from afm_rl.correction.linear import PRIOR, fit_affine, invert_affine, not_zero, solve_line
 
+STUCK = 5e-3  # half ranges: an action with less effect is held by friction
+NOISE = 0.1  # half ranges: a pair with this standard deviation counts half
+OUTLIER = 0.1  # half ranges: a residual of this size halves a pair's weight in the robust fit
 EXACT = 0.02  # half ranges: a fit that misses by less explains all rows
 LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
 LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
@@ -129,8 +121,7 @@ def fit_experts(rows: Rows) -> Experts:
     """Fit all experts to N sets of rows ``(N, K, A)``.
 
     In double precision, but for the answer: where all actions are alike, gain and friction can
-    hardly be told apart. The fits per axis share one product of weights and terms; they are
-    those of :mod:`~afm_rl.correction.fits`, the robust one with one round.
+    hardly be told apart. The fits per axis share one product of weights and terms.
     """
     inputs, valid = rows.executed.double(), rows.valid.double().mT
     u, e = inputs.mT, rows.effective.double().mT  # (N, A, K)
@@ -212,3 +203,33 @@ def _constants(rows: int, device: torch.device) -> tuple[Tensor, ...]:
     age = torch.arange(rows - 1, -1, -1, dtype=torch.float64, device=device)
     rest = (part.to(device) for part in (MOMENTS, LINES, PLACES))
     return torch.stack([SHORT**age, LONG**age]), *rest
+
+
+def confidence(std: Tensor) -> Tensor:
+    r"""Return the weight of effective actions by their noise, :math:`1 / (1 + (s / 0.1)^2)`.
+
+    >>> confidence(torch.tensor([0.0, 0.1, 4.0]))
+    tensor([1.0000e+00, 5.0000e-01, 6.2461e-04])
+    """
+    return (1 + (std / NOISE).square()).reciprocal()
+
+
+def apply_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
+    r"""Return the effect of ``unit`` ``(*B, A)`` under dry friction or a dead zone.
+
+    .. math:: v = g u + h\,\mathrm{sign}(u)
+
+    and 0 where that is held, against the motion.
+
+    >>> apply_friction(torch.tensor(1.0), torch.tensor(-0.5), torch.tensor([-0.75, 0.25])).tolist()
+    [-0.25, 0.0]
+    """
+    pull = gain * unit
+    effect = pull + offset * unit.sign()
+    return torch.where(effect * pull < 0, 0.0, effect)
+
+
+def invert_friction(gain: Tensor, offset: Tensor, unit: Tensor) -> Tensor:
+    """Return the action ``(*B, A)`` that has the effect ``unit`` under :func:`apply_friction`."""
+    ratio = unit / gain
+    return ratio - offset / gain * ratio.sign()

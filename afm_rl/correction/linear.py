@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from afm_rl.compiling.tracing import cached
-from afm_rl.correction.fits import PRIOR, fit_affine, invert_affine, not_zero, solve_line
 from afm_rl.spaces.small_matrices import add_diagonal, solve_positive
 
 LINEAR = (
@@ -32,6 +31,8 @@ the newest offset (*drift*); what goes on from row to row (*arx*); affine map. O
 or of all pairs."""
 CALM = ("only so fast", "noisy readings")
 """Models by which there is nothing to correct: :func:`within_rate`, and :func:`sensor_noise`."""
+PRIOR = 1e-4  # weight of the nominal map in every fit
+LEAST_GAIN = 0.02  # smallest gain that is divided by
 WINDOWS = (1, 3, 12, 0)  # rows; 0: all
 MOMENTS = PRIOR * torch.tensor([1.0, 0.0, 10.0, 1.0, 0.0], dtype=torch.float64)  # of the prior
 RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for a few noisy rows
@@ -159,3 +160,55 @@ def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tenso
     b, from_before, d = solve_positive(left, right).split([1, 2, 1], -2)  # (B, A, ., 1)
     goes_on = before[..., -1:, :] @ from_before
     return not_zero(1 + b).squeeze(-1), (goes_on + d).squeeze(-1)
+
+
+def solve_line(
+    square: Tensor, mean: Tensor, mass: Tensor, cross: Tensor, shift: Tensor
+) -> tuple[Tensor, Tensor]:
+    r"""Return slope and offset ``(*B)`` of weighted least squares, given its moments ``(*B)``.
+
+    These are :math:`\sum w u^2`, :math:`\sum w u`, :math:`\sum w`, :math:`\sum w u v` and
+    :math:`\sum w v`, with a prior, so that none vanishes.
+    """
+    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
+    slope = (mass * cross - mean * shift) / determinant
+    return slope, (square * shift - mean * cross) / determinant
+
+
+def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Fit :math:`u_\mathrm{eff} = D u + b` with a weak prior D = 1, b = 0.
+
+    Args:
+        executed: u, ``(*B, K, A)``.
+        effective: its effective action, ``(*B, K, A)``.
+        weight: of pairs, ``(*B, K, 1)``, or of pairs and axes: then every row of D has its own.
+
+    Returns:
+        D ``(*B, A, A)`` and b ``(*B, A)``.
+    """
+    size = executed.shape[-1]
+    inputs = torch.nn.functional.pad(executed, (0, 1), value=1.0)
+    outer = (inputs.unsqueeze(-1) * inputs.unsqueeze(-2)).flatten(-2)  # (*B, K, (A + 1)^2)
+    square = add_diagonal((weight.mT @ outer).unflatten(-1, (size + 1, size + 1)), PRIOR)
+    cross = add_diagonal((weight * effective).mT @ inputs, PRIOR)
+    solution = solve_positive(square, cross.unsqueeze(-1)).squeeze(-1)
+    return solution[..., :-1], solution[..., -1]
+
+
+def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:
+    """Return the actions ``(*B, A, C)`` whose effects come nearest to what is wanted.
+
+    Of :func:`fit_affine`. A small ridge keeps them finite where the matrix is all but singular.
+
+    Args:
+        matrix: D, ``(*B, A, A)``.
+        bias: b, ``(*B, A, 1)``.
+        unit: what is wanted, ``(*B, A, C)``.
+    """
+    square = add_diagonal(matrix.mT @ matrix, LEAST_GAIN**2)
+    return solve_positive(square, matrix.mT @ (unit - bias))
+
+
+def not_zero(gain: Tensor) -> Tensor:
+    """Return gains that can be divided by: none smaller than 0.02 in size."""
+    return gain.abs().clamp_min(LEAST_GAIN).copysign(gain)

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from afm_rl.correction.achievable import MODES
+from afm_rl.correction.classical import fit_gain, fit_gain_offset, weigh
 from afm_rl.correction.experts import (
     ANSWERS,
     LIMIT,
@@ -12,18 +13,12 @@ from afm_rl.correction.experts import (
     NEAR,
     SHORT,
     Rows,
-    fit_experts,
-)
-from afm_rl.correction.fits import (
     apply_friction,
     confidence,
-    fit_affine,
-    fit_gain,
-    fit_gain_offset,
-    invert_affine,
+    fit_experts,
     invert_friction,
-    weigh,
 )
+from afm_rl.correction.linear import fit_affine, invert_affine
 
 AXIS = torch.linspace(-1, 1, 5)
 ASKED = torch.cartesian_prod(AXIS, AXIS).unsqueeze(0)
