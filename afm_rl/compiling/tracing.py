@@ -87,7 +87,7 @@ def somewhere(
     if not may_look(mask):
         # torch 2.13 has no branches within branches, nor for a number of missions not known yet.
         static = not any(isinstance(n, torch.SymInt) for n in mask.shape)
-        if not (given and static and torch.compiler.is_compiling()):
+        if not (given and static and torch.compiler.is_exporting()):
             return everywhere()
         kept = [old.contiguous() for old in still]
         return list(torch.cond(mask.any(), everywhere, lambda: [old.clone() for old in kept]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,10 +20,6 @@ LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
 NEAR = 0.15  # half ranges: a pair so far from the question counts half as much
 SHORT, LONG = 0.5, 0.9  # forgetting per row
 EXPERTS = 6
-MOMENTS = torch.zeros(3, 8, dtype=torch.float64)  # of the priors: short and long memory, friction
-MOMENTS[:, [0, 3]], MOMENTS[:, [2, 7]] = PRIOR, 10 * PRIOR
-LINES = torch.tensor([[1], [2]])  # rows of the moments, of the two lines that have an offset
-PLACES = torch.tensor([[0, 1, 7, 3, 4], [0, 5, 2, 3, 6]])  # and their columns
 ANSWERS = EXPERTS + 1  # the experts' answers, and the effect or nearness of the nearest pairs
 MISSES = EXPERTS - 1  # the nearest pairs have no residual of their own
 
@@ -126,22 +122,25 @@ def fit_experts(rows: Rows) -> Experts:
     inputs, valid = rows.executed.double(), rows.valid.double().mT
     u, e = inputs.mT, rows.effective.double().mT  # (N, A, K)
     count, axes, length = u.shape
-    ages, prior, lines, places = _constants(length, u.device)
+    ages, prior = _constants(length, u.device)
     weights = ages * (valid * confidence(rows.std.double().mT)).unsqueeze(-2)  # (N, A, 2, K)
     long = weights[..., 1, :]
     moved = (long * (e.abs() > STUCK)).unsqueeze(-2)
     sign = u.sign()
-    each = [u * u, u, sign * sign, u * e, e, sign * u, sign * e, torch.ones_like(u)]
+    each = [u * u, u * e, u, torch.ones_like(u), e, sign * u, sign * sign, sign * e]
     terms = torch.stack(each, -1).flatten(0, 1)  # (N A, K, 8)
     flat = torch.cat([weights, moved], -2).flatten(0, 1)  # (N A, 3, K)
     moments = torch.baddbmm(prior, flat, terms)
-    gains = moments[:, :2, 3] / moments[:, :2, 0]
-    # Of two lines: with an offset, with friction.
-    slopes, offsets = solve_line(*moments[:, lines, places].unbind(-1))
+    gains = moments[:, :2, 1] / moments[:, :2, 0]
+    # Of two lines: one has an offset, the other's is against the motion.
+    square, cross, rest = moments[:, 1:].split([1, 1, 6], -1)
+    mean, mass, shift = rest.unflatten(-1, (2, 3)).diagonal(0, 1, 2).unbind(1)
+    slopes, offsets = solve_line(square[..., 0], mean, mass, cross[..., 0], shift)
     miss = e.flatten(0, 1) - torch.addcmul(offsets[:, :1], slopes[:, :1], u.flatten(0, 1))
     robust = flat[:, 1] / (1 + (miss / OUTLIER).square())
-    robust = torch.baddbmm(prior[1:2], robust.unsqueeze(1), terms)[:, 0, places[0]]
-    slope, offset = solve_line(*robust.unsqueeze(1).unbind(-1))
+    robust = torch.baddbmm(prior[:, :5], robust.unsqueeze(1), terms[..., :5])
+    square, cross, mean, mass, shift = robust.unbind(-1)
+    slope, offset = solve_line(square, mean, mass, cross, shift)
     gain = not_zero(torch.cat([gains, slope, slopes[:, 1:]], -1))
     offset = torch.cat([torch.zeros_like(gains), offset, offsets[:, 1:]], -1)
     matrix, bias = fit_affine(inputs, e.mT, long.mT)
@@ -199,10 +198,11 @@ def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tens
 
 @cached(maxsize=16)
 def _constants(rows: int, device: torch.device) -> tuple[Tensor, ...]:
-    """Return the weights by age, ``(2, K)``, and the constants below, on a device."""
-    age = torch.arange(rows - 1, -1, -1, dtype=torch.float64, device=device)
-    rest = (part.to(device) for part in (MOMENTS, LINES, PLACES))
-    return torch.stack([SHORT**age, LONG**age]), *rest
+    """Return the weights by age, ``(2, K)``, and the moments of the prior, ``(1, 8)``."""
+    kind: dict[str, Any] = {"dtype": torch.float64, "device": device}
+    age, prior = torch.arange(rows - 1, -1, -1, **kind), torch.zeros(1, 8, **kind)
+    prior[:, :2], prior[:, 3::3] = PRIOR, 10 * PRIOR
+    return torch.stack([SHORT**age, LONG**age]), prior
 
 
 def confidence(std: Tensor) -> Tensor:

@@ -34,7 +34,6 @@ CALM = ("only so fast", "noisy readings")
 PRIOR = 1e-4  # weight of the nominal map in every fit
 LEAST_GAIN = 0.02  # smallest gain that is divided by
 WINDOWS = (1, 3, 12, 0)  # rows; 0: all
-MOMENTS = PRIOR * torch.tensor([1.0, 0.0, 10.0, 1.0, 0.0], dtype=torch.float64)  # of the prior
 RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for a few noisy rows
 
 
@@ -74,8 +73,8 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
     scale = weight.amax(-2, keepdim=True).clamp_min(PRIOR)
     u, v, weight = (part.mT.double() for part in (sent, came, weight / scale))  # (B, A, M)
     terms = torch.stack([u * u, u, torch.ones_like(u), u * v, v], -1)  # (B, A, M, 5)
-    newest = _windows(u.shape[-1], u.device) * weight.unsqueeze(-2)
-    moments = newest @ terms + MOMENTS.to(u.device)  # (B, A, W, 5)
+    newest, prior = _constants(u.shape[-1], u.device)
+    moments = (newest * weight.unsqueeze(-2)) @ terms + prior  # (B, A, W, 5)
     square, mean, mass, cross, shift = moments.unbind(-1)
     gain, offset = not_zero(cross / square), (shift - mean) / mass
     slope, rest = solve_line(square, mean, mass, cross, shift)
@@ -92,10 +91,12 @@ def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
 
 
 @cached(maxsize=16)
-def _windows(length: int, device: torch.device) -> Tensor:
-    """Return which rows are in each window, ``(W, M)``."""
+def _constants(length: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return which rows are in each window, ``(W, M)``, and the moments of the prior, ``(5,)``."""
     age = torch.arange(length - 1, -1, -1, device=device)
-    return torch.stack([age < (rows or length) for rows in WINDOWS]).double()
+    prior = torch.zeros(5, dtype=torch.float64, device=device)
+    prior[::3], prior[2] = PRIOR, 10 * PRIOR
+    return torch.stack([age < (rows or length) for rows in WINDOWS]).double(), prior
 
 
 def sensor_noise(sent: Tensor, came: Tensor, valid: Tensor, keep: float = 0.7) -> Tensor:
