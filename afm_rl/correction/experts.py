@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -199,9 +199,10 @@ def _drivers(u: Tensor, e: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tens
 @cached(maxsize=16)
 def _constants(rows: int, device: torch.device) -> tuple[Tensor, ...]:
     """Return the weights by age, ``(2, K)``, and the moments of the prior, ``(1, 8)``."""
-    kind: dict[str, Any] = {"dtype": torch.float64, "device": device}
-    age, prior = torch.arange(rows - 1, -1, -1, **kind), torch.zeros(1, 8, **kind)
-    prior[:, :2], prior[:, 3::3] = PRIOR, 10 * PRIOR
+    age = torch.arange(rows - 1, -1, -1, dtype=torch.float64, device=device)
+    moment = torch.arange(8, device=device).unsqueeze(0)
+    slope, mass = moment < 2, (moment == 3) | (moment == 6)
+    prior = PRIOR * (slope.double() + 10 * mass.double())  # written so that it can be exported
     return torch.stack([SHORT**age, LONG**age]), prior
 
 
