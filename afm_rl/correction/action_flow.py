@@ -13,18 +13,11 @@ from torch import Tensor
 from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.correction.base import Fields
 from afm_rl.correction.believing import Answer, Believer
-from afm_rl.correction.linear import CALM, LINEAR
+from afm_rl.correction.late import LATE, NOW, Late, acting_of
+from afm_rl.correction.linear import CALM, LINEAR, MIXING
 from afm_rl.correction.network import AxisNetwork, load_universal
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.correction.readings import (
-    READINGS,
-    Reading,
-    cause_of,
-    check_readings,
-    late_ones,
-    lay_out,
-    memory_of,
-)
+from afm_rl.correction.readings import READINGS, cause_of, check_readings
 from afm_rl.correction.tick import Tick
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_flag, check_number
@@ -110,19 +103,22 @@ class ActionFlow(Believer):
     ) -> None:
         size, place = len(torch.as_tensor(action_low)), list(place)
         rows = max(12, size + 4) if rows is None else check_count("corrector.rows", rows)
-        names = check_readings(list(READINGS) if readings is None else readings, bool(place))
-        chosen = [READINGS[name] for name in names]
-        late = late_ones(names)
-        models = [*names, *LINEAR, *(f"only {name}" for name in late), *CALM]
-        worth = [0.0] * len(names) + [plain] * len(LINEAR) + [0.0] * (len(late) + len(CALM))
-        only, simple = (READINGS[name] for name in late), [Reading()] * len(LINEAR)
-        read = [Reading(), *chosen, *simple, *only, *[Reading()] * len(CALM)]
-        acting = lay_out(read, rows).acting
-        worth[models.index("reversed")] = 0.0  # says what every action does
-        follows = [r.varied or r.near for r in read]
-        first = 1 + len(names)
-        follows[first : first + len(LINEAR)] = [True] * len(LINEAR)
-        follows[-len(CALM) :] = [True] * len(CALM)
+        every = [*READINGS, *LATE] if readings is None else readings
+        names, late = check_readings(every, bool(place))
+        only = [f"only {name}" for name in late]
+        models = [*names, *LINEAR, *only, NOW, *late, *CALM]
+        # What says what every action does is worth more than a line through what is done now; and
+        # late commands with some gain are one model, which the ways to be late share.
+        worths = dict.fromkeys((*LINEAR, NOW), plain) | {
+            "reversed": 0.0,
+            "driven": 0.0,
+            "affine": 0.0,
+        }
+        worths |= dict.fromkeys(late, -math.log(max(1, len(late))))
+        worth = [worths.get(name, 0.0) for name in models]
+        acting = acting_of([LATE.get(name.removeprefix("only "), Late()) for name in ["", *models]])
+        follows = [False, *(name not in {NOW, *MIXING, *late, *only} for name in models)]
+        longest = rows + acting.shape[-1] - 1
         super().__init__(
             action_low,
             action_high,
@@ -135,14 +131,14 @@ class ActionFlow(Believer):
             follows=follows,
             **rules,
         )
-        self.readings, self.place = names, place
+        self.readings, self.place = [*names, *late], place
         self.place_scale = check_number(
             "corrector.place_scale", place_scale, low=0.0, open_low=True
         )
-        if self.memory < memory_of(chosen, rows):
+        if self.memory < longest:
             raise ConfigurationError(
-                f"corrector.memory={memory!r}: expected at least {memory_of(chosen, rows)} for "
-                f"{rows} rows and the readings {', '.join(names)}"
+                f"corrector.memory={memory!r}: expected at least {longest} for {rows} rows and the "
+                f"readings {', '.join(self.readings)}"
             )
         by_model = [cause_of(name, self.delay) for name in self.models]
         late_by = [cause_of(f"delay_{k}", self.delay) for k in range(1, self.most_late + 1)]

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from afm_rl.compiling.tracing import all_hold, somewhere
-from afm_rl.correction.arrival import ago, steps_late
 from afm_rl.correction.base import Correction, Fields
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
+from afm_rl.correction.late import ago, delay_tables, steps_late
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_number
@@ -75,6 +75,8 @@ class Believer(PairCorrector):
     worth: Tensor
     delays: Tensor
     acting: Tensor
+    told: Tensor
+    first: Tensor
 
     def __init__(
         self,
@@ -120,6 +122,9 @@ class Believer(PairCorrector):
         late = acting.shape[-1] - 1 - acting.argmax(-1)
         late = late if follows is None else late.masked_fill(torch.tensor(follows), -1)
         self.register_buffer("delays", late, persistent=False)
+        prior = torch.cat([torch.full((1,), self.odds), among.log_softmax(0)])
+        for name, table in zip(("told", "first"), delay_tables(late, prior), strict=True):
+            self.register_buffer(name, table, persistent=False)
         self.most_late = max(late.tolist())
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
@@ -138,11 +143,6 @@ class Believer(PairCorrector):
         """Return the belief in the parts of a memory."""
         return Belief(parts["losses"], parts["forecasts"], parts["noise"])
 
-    def prior(self, parts: Fields) -> Tensor:
-        """Return the prior log-odds of the models ``(*B, M, A)``."""
-        worth, floor = self.worth.to(parts["noise"]), self.floor(parts)
-        return prior_of(worth, self.odds, parts["noise"], floor)
-
     def floor(self, parts: Fields) -> Tensor:
         """Return the least noise ``(*B, A)``: effects nearer than that are all the same."""
         largest = parts["pairs"][..., : self.action_size].abs().amax(-2)
@@ -150,22 +150,25 @@ class Believer(PairCorrector):
 
     def weights(self, parts: Fields) -> Tensor:
         """Return the probabilities of the models ``(*B, M, A)``."""
-        return self.belief(parts).weights(self.prior(parts))
+        noise = parts["noise"]
+        prior = prior_of(self.worth.to(noise), self.odds, noise, self.floor(parts))
+        return self.belief(parts).weights(prior)
 
     def look(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts of the memory with the newest pairs and the belief after them."""
         parts = super().look(memory, model)
         newest, size = parts["pairs"][..., -1, :], self.action_size
         _, effect, std, valid, _ = newest.split([size, size, size, 1, self.tail], -1)
-        rules = (self.discount, self.noise_rate, self.floor(parts), self.tails)
-        prior = self.prior(parts)
+        floor = self.floor(parts)
+        rules = (self.discount, self.noise_rate, floor, self.tails)
+        prior = prior_of(self.worth.to(floor), self.odds, parts["noise"], floor)
         belief = self.belief(parts).update(effect, std, valid, prior, *rules)
         belief = belief._replace(losses=self.surprised(parts["losses"], belief.losses))
         awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
         before = parts["late"].squeeze(-1).long()
         late, losses = somewhere(
             awake.squeeze(-1) | (before > 0),
-            lambda: self.delayed(belief, prior, before),
+            lambda: self.delayed(belief, belief.weights(prior), before),
             [before, belief.losses],
         )
         parts["late"], belief = late.unsqueeze(-1).to(newest), belief._replace(losses=losses)
@@ -192,13 +195,12 @@ class Believer(PairCorrector):
         """Return the delays of all models ``(*B, M)`` while ``late`` ``(*B)`` is believed."""
         return torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
 
-    def delayed(self, belief: Belief, prior: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+    def delayed(self, belief: Belief, weights: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Return the delay ``(*B)`` that is believed now, and the losses ``(*B, M, A)``.
 
         Models that follow a new one begin as good as the best that had it already.
         """
-        now = self.delays_now(before)
-        late = steps_late(belief.weights(prior), prior, now, before, self.most_late)
+        late = steps_late(weights, before, self.told, self.first)
         theirs = (self.delays == late.unsqueeze(-1)).unsqueeze(-1)
         best = torch.where(theirs, belief.losses, torch.inf).amin(-2, keepdim=True)
         begin = (self.delays < 0) & (late != before).unsqueeze(-1)

@@ -18,21 +18,26 @@ LINEAR = (
     "offset_1",
     "offset_3",
     "gain_3",
-    "gain_12",
     "gain",
     "line_12",
     "line",
     "drift",
     "arx",
     "affine",
+    "driven",
 )
 """The opposite of the command; offset at a gain of one; gain; gain and offset (*line*); gain and
-the newest offset (*drift*); what goes on from row to row (*arx*); affine map. Of the newest rows,
-or of all pairs."""
+the newest offset (*drift*); what goes on from row to row (*arx*); affine map; an axis as one
+command drives it (swapped cables). Of the newest rows, or of all pairs."""
+MIXING = ("affine", "driven")
+"""Those by which a command moves other axes. Of a gait they say what a delay says, so they are of
+what is sent now whatever delay is believed: else that would never be taken back."""
 CALM = ("only so fast", "noisy readings")
 """Models by which there is nothing to correct: :func:`within_rate`, and :func:`sensor_noise`."""
 PRIOR = 1e-4  # weight of the nominal map in every fit
 LEAST_GAIN = 0.02  # smallest gain that is divided by
+EXACT = 0.02  # a fit that misses by less explains all rows
+LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
 WINDOWS = (1, 3, 12, 0)  # rows; 0: all
 RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for a few noisy rows
 
@@ -46,8 +51,9 @@ class Lines(NamedTuple):
     """b, ``(B, L, A)``."""
 
     def effect(self, actions: Tensor) -> Tensor:
-        """Return the effects ``(B, L, C, A)`` of actions ``(B, C, A)``."""
-        return actions.unsqueeze(1) @ self.matrix.mT + self.bias.unsqueeze(2)
+        """Return the effects ``(B, L, C, A)`` of actions ``(B, C, A)``, or ``(B, L, C, A)``."""
+        actions = actions if actions.dim() == 4 else actions.unsqueeze(1)
+        return actions @ self.matrix.mT + self.bias.unsqueeze(2)
 
     def invert(self, planned: Tensor) -> Tensor:
         """Return the actions ``(B, L, A)`` whose effects come nearest to plans ``(B, A)``."""
@@ -55,49 +61,91 @@ class Lines(NamedTuple):
         return invert_affine(self.matrix, self.bias.unsqueeze(-1), plan).squeeze(-1)
 
 
-def fit_lines(sent: Tensor, came: Tensor, std: Tensor, valid: Tensor) -> Lines:
+def weigh(std: Tensor, valid: Tensor) -> Tensor:
+    r"""Return the weights ``(B, M, A)`` of rows: :math:`1 / \sigma^2`, less than that of the best.
+
+    Args:
+        std: standard deviation of the effects, ``(B, M, A)``.
+        valid: which rows count, ``(B, M, 1)``, 0 or 1.
+    """
+    weight = valid * (std.square() + PRIOR).reciprocal()
+    return weight / weight.amax(-2, keepdim=True).clamp_min(PRIOR)
+
+
+def fit_late(acted: Tensor, came: Tensor, weight: Tensor) -> Tensor:
+    """Return the gains ``(B, W, A)`` of commands that act late in W ways.
+
+    Args:
+        acted: of commands what acted, ``(B, K, W, A)``.
+        came: effects, ``(B, K, A)``.
+        weight: of the rows, ``(B, K, A)``.
+
+    >>> acted = torch.tensor([[[[0.5], [0.0]], [[-1.0], [0.5]]]])
+    >>> fit_late(acted, torch.tensor([[[0.0], [-0.5]]]), torch.ones(1, 2, 1)).round(decimals=1)
+    tensor([[[ 0.4000],
+             [-1.0000]]])
+    """
+    pull = weight.unsqueeze(-2) * acted
+    cross, square = (pull * came.unsqueeze(-2)).sum(1), (pull * acted).sum(1)
+    return (cross + PRIOR) / (square + PRIOR)
+
+
+def fit_lines(sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor) -> Lines:
     r"""Fit all :data:`LINEAR` models by least squares, with a weak prior D = 1, b = 0.
 
     Args:
-        sent: executed actions, the oldest first, ``(B, M, A)``.
-        came: their effects.
-        std: of the effects; a row counts by :math:`1 / \sigma^2`.
-        valid: which rows count, ``(B, M, 1)``, 0 or 1.
+        sent: commands, the oldest first, ``(B, M, A)``; what mixes axes (:data:`MIXING`) is fitted
+            to them.
+        acted: those that acted, if they act late; the others are fitted to them.
+        came: the effects.
+        weight: of the rows, ``(B, M, A)``.
 
     >>> u = torch.tensor([[[0.5], [-1.0], [0.2]]])
-    >>> lines = fit_lines(u, 0.1 - 2 * u, torch.full((1, 3, 1), 0.02), torch.ones(1, 3, 1))
+    >>> lines = fit_lines(u, u, 0.1 - 2 * u, torch.ones(1, 3, 1))
     >>> lines.effect(torch.ones(1, 1, 1))[0, LINEAR.index("line_12")].round(decimals=2)
     tensor([[-1.9000]])
     """
-    weight = valid * (std.square() + PRIOR).reciprocal()
-    scale = weight.amax(-2, keepdim=True).clamp_min(PRIOR)
-    u, v, weight = (part.mT.double() for part in (sent, came, weight / scale))  # (B, A, M)
-    terms = torch.stack([u * u, u, torch.ones_like(u), u * v, v], -1)  # (B, A, M, 5)
-    newest, prior = _constants(u.shape[-1], u.device)
-    moments = (newest * weight.unsqueeze(-2)) @ terms + prior  # (B, A, W, 5)
-    square, mean, mass, cross, shift = moments.unbind(-1)
+    sent, u, v, weight = (x.mT.double() for x in (sent, acted, came, weight))  # (B, A, M)
+    newest = _windows(u.shape[-1], u.device) * weight.unsqueeze(-2)
+    square, mean, mass, cross, shift = moments_of(newest, u, v)  # (B, A, W)
     gain, offset = not_zero(cross / square), (shift - mean) / mass
     slope, rest = solve_line(square, mean, mass, cross, shift)
     gain_12 = gain[..., 2:3]
     drift = (shift - gain_12 * mean)[..., :1] / mass[..., :1]
     arx, goes_on = _autoregressive(u, v, weight)
     one, none = torch.ones_like(arx), torch.zeros_like(gain)
-    gains = torch.cat([-one, one, one, gain[..., 1:], slope[..., 2:], gain_12, arx], -1)
-    biases = [none[..., :1], offset[..., :2], none[..., 1:], rest[..., 2:], drift, goes_on]
-    affine, shift = fit_affine(u.mT, v.mT, weight.mT)
-    matrix = torch.cat([torch.diag_embed(gains.mT), affine.unsqueeze(1)], 1)
-    bias = torch.cat([*biases, shift.unsqueeze(-1)], -1).mT
-    return Lines(matrix.to(sent), bias.to(sent))
+    gains = torch.cat([-one, one, one, gain[..., 1::2], slope[..., 2:], gain_12, arx], -1)
+    biases = [none[..., :1], offset[..., :2], none[..., :2], rest[..., 2:], drift, goes_on]
+    affine, shift = fit_affine(sent.mT, v.mT, weight.mT)
+    driven, rest = _driven(sent, v, weight, affine, shift.unsqueeze(-1))
+    matrix = torch.cat([torch.diag_embed(gains.mT), torch.stack([affine, driven], 1)], 1)
+    bias = torch.cat([*biases, shift.unsqueeze(-1), rest], -1).mT
+    return Lines(matrix.to(came), bias.to(came))
 
 
 @cached(maxsize=16)
-def _constants(length: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return which rows are in each window, ``(W, M)``, and the moments of the prior, ``(5,)``."""
+def _windows(length: int, device: torch.device) -> Tensor:
+    """Return which rows are in each window, ``(W, M)``."""
     age = torch.arange(length - 1, -1, -1, device=device)
+    return torch.stack([age < (rows or length) for rows in WINDOWS]).double()
+
+
+@cached(maxsize=16)
+def _prior(device: torch.device) -> Tensor:
+    """Return the moments of the prior, ``(5,)``."""
     moment = torch.arange(5, device=device)
     slope, mass = (moment == 0) | (moment == 3), moment == 2
-    prior = PRIOR * (slope.double() + 10 * mass.double())  # written so that it can be exported
-    return torch.stack([age < (rows or length) for rows in WINDOWS]).double(), prior
+    return PRIOR * (slope.double() + 10 * mass.double())  # written so that it can be exported
+
+
+def moments_of(weights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, ...]:
+    r"""Return what a line needs to know of rows u, v ``(*B, K)``, with a weak prior.
+
+    These are :math:`\sum w u^2`, :math:`\sum w u`, :math:`\sum w`, :math:`\sum w u v` and
+    :math:`\sum w v`, ``(*B, W)`` each, for W weights of the rows ``(*B, W, K)``.
+    """
+    terms = torch.stack([u * u, u, torch.ones_like(u), u * v, v], -1)
+    return (weights @ terms + _prior(u.device)).unbind(-1)
 
 
 def sensor_noise(sent: Tensor, came: Tensor, valid: Tensor, keep: float = 0.7) -> Tensor:
@@ -164,13 +212,39 @@ def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tenso
     return not_zero(1 + b).squeeze(-1), (goes_on + d).squeeze(-1)
 
 
+def _driven(
+    u: Tensor, v: Tensor, weight: Tensor, else_matrix: Tensor, else_bias: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return matrix ``(B, A, A)`` and offset ``(B, A, 1)`` of axes that one command drives each.
+
+    Of many axes an affine map needs many rows, and a gait that repeats itself shows only a few; but
+    swapped cables need no more than gains. It stands where one explains all rows.
+
+    Args:
+        u: executed actions, ``(B, A, K)``.
+        v: effects.
+        weight: of both.
+        else_matrix: of the axes that are not explained, ``(B, A, A)``.
+        else_bias: likewise, ``(B, A, 1)``.
+    """
+    other = 1 - torch.eye(u.shape[-2], device=u.device, dtype=u.dtype)
+    pull, mass = weight * v, weight.sum(-1, keepdim=True)
+    cross = pull @ u.mT + PRIOR * (1 - other)
+    gain = cross / (weight @ u.square().mT + PRIOR)
+    left = ((pull * v).sum(-1, keepdim=True) - gain * cross) / (mass + PRIOR)
+    # An axis that its own command explains is driven by it, whatever else fits by chance.
+    left, driver = (left + EXACT**2 * other).min(-1, keepdim=True)
+    explained = (left < 2 * EXACT**2) & (mass > LEAST_ROWS)
+    chosen = torch.zeros_like(gain).scatter(-1, driver, gain.gather(-1, driver))
+    return torch.where(explained, chosen, else_matrix), torch.where(explained, 0.0, else_bias)
+
+
 def solve_line(
     square: Tensor, mean: Tensor, mass: Tensor, cross: Tensor, shift: Tensor
 ) -> tuple[Tensor, Tensor]:
     r"""Return slope and offset ``(*B)`` of weighted least squares, given its moments ``(*B)``.
 
-    These are :math:`\sum w u^2`, :math:`\sum w u`, :math:`\sum w`, :math:`\sum w u v` and
-    :math:`\sum w v`, with a prior, so that none vanishes.
+    See :func:`moments_of`.
     """
     determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
     slope = (mass * cross - mean * shift) / determinant

@@ -118,7 +118,7 @@ class AxisNetwork(nn.Module):
 
     def __init__(
         self,
-        width: int = 128,
+        width: int = 64,
         latent: int = 64,
         across: bool = True,
         experts: bool = True,

@@ -1,23 +1,22 @@
 """Readings: which remembered pairs tell what an action does now.
 
-The newest pairs tell it, unless commands act late, the ground changes from place to place, or the
-newest commands were all alike. Each reading is a model of the belief, by what the network answers.
+The newest pairs tell it, unless the ground changes from place to place, or the newest commands were
+all alike. Each reading is a model of the belief, by what the network answers.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from afm_rl.correction.experts import Rows
+from afm_rl.correction.late import LATE
 from afm_rl.correction.linear import CALM
 from afm_rl.errors import ConfigurationError, check_choice
 
-FILTER = 12  # commands that a lag looks back on
 AGE = 20.0  # steps that separate two pairs as much as one unit of place does
 FAR = 1e3  # squared distance beyond all
 OLDER = 1e-6  # squared distance that a pair is worth less, times its squared age
@@ -26,86 +25,83 @@ OLDER = 1e-6  # squared distance that a pair is worth less, times its squared ag
 class Reading(NamedTuple):
     """One way of reading the memory."""
 
+    kind: str = "newest"
+    """Which pairs it reads: the "newest", those "near" in place, or some as "varied" as can be."""
     share: float = 0.5
     """Part of the K rows that is filled."""
-    delay: int = 0
-    """Steps from a command to its effect."""
-    lag: float = 0.0
-    """Time constant with which effects follow commands, in steps."""
-    near: bool = False
-    """Whether it reads the pairs nearest in place instead of in time."""
-    varied: bool = False
-    """Whether it reads pairs whose commands differ as much as possible."""
 
 
 READINGS = {
     "recent": Reading(),
     "newest": Reading(share=1 / 6),  # right after a change
     "long": Reading(share=1.0),
-    "varied": Reading(share=1.0, varied=True),  # also when it was at rest of late
-    **{f"delay_{k}": Reading(delay=k) for k in range(1, 9)},
-    **{f"lag_{k}": Reading(lag=k) for k in range(1, 4)},
-    "near": Reading(near=True),
-    "nearest": Reading(share=1 / 6, near=True),
-    "here": Reading(share=1 / 12, near=True),  # at the edge of two grounds
+    "varied": Reading("varied", share=1.0),  # also when it was at rest of late
+    "near": Reading("near"),
+    "nearest": Reading("near", share=1 / 6),
+    "here": Reading("near", share=1 / 12),  # at the edge of two grounds
 }
 
 
-class Layout(NamedTuple):
-    """How H readings fill K rows, in the order of :func:`check_readings`.
+class Reader(nn.Module):
+    """Reads a memory in H ways.
 
-    Ages count from the newest pair, 0.
+    Args:
+        names: of :data:`READINGS`.
+        rows: of a reading, K.
+        size: number of actions, A.
+
+    >>> u = torch.tensor([[0.1], [0.2], [0.3]])
+    >>> pairs = torch.cat([u, 10 * u, 0 * u, torch.ones(3, 1), torch.zeros(3, 1)], -1)
+    >>> rows = Reader(["long", "newest"], rows=2, size=1)(pairs, torch.zeros(0))
+    >>> rows.executed.squeeze(-1), rows.valid.squeeze(-1)
+    (tensor([[0.2000, 0.3000],
+            [0.0000, 0.3000]]), tensor([[1., 1.],
+            [0., 1.]]))
     """
 
-    command: Tensor
-    """What the commands of the readings by time weigh, by age, the oldest first, ``(T K, L)``."""
-    effect: Tensor
-    """Ages of their effects, ``(T K,)``."""
+    source: Tensor
     filled: Tensor
-    """Which rows are filled, ``(H, K, 1)``, 0 or 1."""
-    acting: Tensor
-    """What commands weigh in what acts now, by age, the oldest first, ``(H, L)``."""
+    least: Tensor
 
+    def __init__(self, names: Sequence[str], rows: int, size: int) -> None:
+        super().__init__()
+        chosen = [READINGS[name] for name in names]
+        self.rows, self.size = rows, size
+        self.kinds = tuple(dict.fromkeys(reading.kind for reading in chosen))
+        count = torch.tensor([max(1, round(reading.share * rows)) for reading in chosen])
+        # What was sound before a change tells nothing about it, but of its place.
+        least = [0.0 if reading.kind == "near" else 0.5 for reading in chosen]
+        fixed = {
+            "source": torch.tensor([self.kinds.index(reading.kind) for reading in chosen]),
+            "filled": torch.arange(rows - 1, -1, -1).unsqueeze(-1) < count[:, None, None],
+            "least": torch.tensor(least)[:, None, None],
+        }
+        for name, value in fixed.items():
+            self.register_buffer(name, value, persistent=False)
 
-def lay_out(readings: Sequence[Reading], rows: int) -> Layout:
-    """Return the layout of K ``rows``.
+    def forward(self, pairs: Tensor, place: Tensor) -> Rows:
+        """Return the rows of each reading, ``(*B, H, K, A)``.
 
-    >>> lay_out([Reading(share=1.0, delay=1)], rows=2).command
-    tensor([[1., 0., 0.],
-            [0., 1., 0.]])
-    """
-    age = torch.arange(rows - 1, -1, -1)
-    timed = [h for h in readings if not (h.near or h.varied)]
-    length = memory_of(readings, rows)
-    acting = torch.stack([_weights(h, length) for h in readings])
-    command = torch.stack([w.roll(-int(k)) for w in acting[: len(timed)] for k in age])
-    count = torch.tensor([max(1, round(h.share * rows)) for h in readings])
-    filled = (age < count.unsqueeze(-1)).unsqueeze(-1).float()
-    return Layout(command, age.repeat(len(timed)), filled, acting)
+        Args:
+            pairs: the memory, the oldest first: executed, effective, standard deviation, valid, and
+                innovation and place, ``(*B, M, D)``.
+            place: where the robots are, ``(*B, P)``.
+        """
+        read = torch.stack([self._read(kind, pairs, place) for kind in self.kinds], -3)
+        sizes, tail = [self.size] * 3 + [1], pairs.shape[-1] - 3 * self.size - 1
+        u, v, std, valid, _ = read.index_select(-3, self.source).split([*sizes, tail], -1)
+        known = ((valid > self.least) & self.filled).to(pairs)
+        return Rows(u * known, v * known, std * known, known)
 
-
-def _weights(reading: Reading, length: int) -> Tensor:
-    """Return what the newest commands weigh in what acts now, the oldest first, ``(length,)``."""
-    newest = torch.zeros(length)
-    count, keep = (FILTER, math.exp(-1 / reading.lag)) if reading.lag else (1, 0.0)
-    for k in range(count):
-        share = 1.0 if k == count - 1 else 1 - keep  # the oldest stands for those before it
-        newest[reading.delay + k] = share * keep**k
-    return newest.flip(0)
-
-
-def memory_of(readings: Sequence[Reading], rows: int) -> int:
-    """Return how many pairs the readings of K ``rows`` read at most."""
-    return rows + max(h.delay + (FILTER - 1 if h.lag else 0) for h in readings)
-
-
-def late_ones(names: Sequence[str]) -> list[str]:
-    """Return the readings by which actions act late, or slowly.
-
-    >>> late_ones(["recent", "delay_2", "lag_1"])
-    ['delay_2', 'lag_1']
-    """
-    return [name for name in names if READINGS[name].delay or READINGS[name].lag]
+    def _read(self, kind: str, pairs: Tensor, place: Tensor) -> Tensor:
+        if kind == "near":
+            away = (pairs[..., 3 * self.size + 2 :] - place.unsqueeze(-2)).square().sum(-1)
+            # Only a row that counts has a place.
+            away = torch.where(pairs[..., 3 * self.size] > 0, away, torch.inf)
+            return _nearest(pairs, away, self.rows)
+        if kind == "varied":
+            return _varied(pairs, self.size, self.rows)
+        return pairs[..., -self.rows :, :]
 
 
 def cause_of(model: str, known: int = 0) -> str:
@@ -118,96 +114,39 @@ def cause_of(model: str, known: int = 0) -> str:
     >>> [cause_of(model) for model in ("delay_2", "only lag_1", "gain_12")]
     ['2 steps late', 'slow', 'a recent change']
     """
-    reading = READINGS.get(model.removeprefix("only "), Reading())
-    if reading.delay:
-        steps = reading.delay + known
-        return f"{steps} step{'s' * (steps > 1)} late"
-    if reading.lag:
-        return "slow"
-    if reading.near:
+    name = model.removeprefix("only ")
+    if name in LATE:
+        steps = LATE[name].delay + known
+        return "slow" if LATE[name].lag else f"{steps} step{'s' * (steps > 1)} late"
+    if name in READINGS and READINGS[name].kind == "near":
         return "another ground"
     return model if model in ("nothing has changed", *CALM) else "a recent change"
 
 
-def check_readings(names: Sequence[str], by_place: bool) -> list[str]:
-    """Return the names in the order of :func:`read_rows`: by time, by variety, by place.
+def check_readings(names: Sequence[str], by_place: bool) -> tuple[list[str], list[str]]:
+    """Return the names of readings, and those of :data:`~afm_rl.correction.late.LATE`.
 
-    Those by place are dropped without a place.
+    Readings by place are dropped without a place.
 
     Raises:
-        ConfigurationError: if it is no list of readings, or none by time is left.
+        ConfigurationError: if it is no list of such names, or none by time is left.
 
-    >>> check_readings(["near", "recent"], by_place=True)
-    ['recent', 'near']
+    >>> check_readings(["near", "delay_1", "recent"], by_place=True)
+    (['near', 'recent'], ['delay_1'])
     """
     if isinstance(names, str) or not isinstance(names, Sequence) or not names:
         raise ConfigurationError(
-            f"corrector.readings={names!r}: expected a list of {', '.join(READINGS)}"
+            f"corrector.readings={names!r}: expected a list of {', '.join([*READINGS, *LATE])}"
         )
     for name in names:
-        check_choice("corrector.readings", name, READINGS)
-    near = [name for name in names if READINGS[name].near]
-    varied = [name for name in names if READINGS[name].varied]
-    timed = [name for name in names if name not in near + varied]
-    if not timed:
+        check_choice("corrector.readings", name, {**READINGS, **LATE})
+    kinds = {name: READINGS[name].kind for name in names if name in READINGS}
+    if "newest" not in kinds.values():
         raise ConfigurationError(
             f"corrector.readings={list(names)!r}: expected one by time, such as recent"
         )
-    return timed + varied + (near if by_place else [])
-
-
-def read_rows(
-    pairs: Tensor,
-    layout: Layout,
-    size: int,
-    away: Tensor | None,
-    varied: int = 0,
-    follow: Tensor | None = None,
-) -> Rows:
-    """Return the rows of each reading, ``(*B, H, K, A)``.
-
-    Args:
-        pairs: the memory, oldest first: executed, effective, standard deviation, valid, and what
-            else there is, ``(*B, M, D)``.
-        layout: of the readings.
-        size: number of actions, A.
-        away: squared distance in place of each pair from here, ``(*B, M)``; None without
-            readings by place.
-        varied: number of readings by variety.
-        follow: the pairs that readings by variety and place read, if they are others: those of
-            commands with their late effects.
-
-    >>> u = torch.tensor([[0.1], [0.2], [0.3]])
-    >>> pairs = torch.cat([u, 10 * u, 0 * u, torch.ones(3, 1)], -1)
-    >>> late = lay_out([Reading(share=1.0, delay=1)], rows=2)
-    >>> rows = read_rows(pairs, late, 1, None)
-    >>> rows.executed.flatten(), rows.effective.flatten()
-    (tensor([0.1000, 0.2000]), tensor([2., 3.]))
-    """
-    newest, rows = pairs.shape[-2] - 1, layout.filled.shape[-2]
-    effects = pairs.index_select(-2, newest - layout.effect)
-    commands = pairs[..., -layout.command.shape[-1] :, :]
-    lost = (commands[..., 3 * size : 3 * size + 1] == 0).to(commands)
-    sent = torch.cat([commands[..., :size], lost], -1)
-    executed, lost = (layout.command.to(sent) @ sent).split([size, 1], -1)
-    valid = (lost == 0).to(sent)
-    effective, std, came = effects[..., size : 3 * size + 1].split([size, size, 1], -1)
-    came = (came == 1.0).to(came)  # what was sound before a change tells nothing about it
-    parts = [part.unflatten(-2, (-1, rows)) for part in (executed, effective, std, valid * came)]
-    by_time = parts[0].shape[-3]
-    pairs = pairs if follow is None else follow
-    found = [(_varied(pairs, size, rows), varied)] if varied else []
-    if away is not None:
-        found.append((_nearest(pairs, away, rows), len(layout.filled) - by_time - varied))
-    for read, count in found:
-        shape = (*read.shape[:-2], count, *read.shape[-2:])
-        sizes = [size, size, size, 1, read.shape[-1] - 3 * size - 1]
-        more = read.unsqueeze(-3).expand(shape).split(sizes, -1)
-        more = (*more[:3], (more[3] > 0).to(pairs))
-        parts = [torch.cat([part, new], -3) for part, new in zip(parts, more, strict=False)]
-    filled = parts[3] * layout.filled
-    executed, effective, std = (part * filled for part in parts[:3])
-    return Rows(executed, effective, std, filled)
+    read = [name for name in kinds if by_place or kinds[name] != "near"]
+    return read, [name for name in names if name in LATE]
 
 
 def _nearest(pairs: Tensor, away: Tensor, rows: int) -> Tensor:

@@ -11,14 +11,26 @@ from torch import Tensor, nn
 
 from afm_rl.compiling.tracing import somewhere
 from afm_rl.correction.achievable import MODES, attainable, extend
-from afm_rl.correction.arrival import ago, aligned
 from afm_rl.correction.belief import mean_and_std
 from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
-from afm_rl.correction.linear import CALM, LINEAR, Lines, fit_lines, sensor_noise, within_rate
+from afm_rl.correction.late import ago, aligned
+from afm_rl.correction.linear import (
+    CALM,
+    LINEAR,
+    MIXING,
+    Lines,
+    fit_late,
+    fit_lines,
+    sensor_noise,
+    weigh,
+    within_rate,
+)
 from afm_rl.correction.network import AxisNetwork, Encoded, midpoint
-from afm_rl.correction.readings import READINGS, Layout, late_ones, lay_out, read_rows
+from afm_rl.correction.readings import Reader
 from afm_rl.errors import check_choice, check_count, check_number
+
+ENOUGH = 0.02  # expected loss that an action must save to be preferred to the plan
 
 
 class Read(NamedTuple):
@@ -28,6 +40,8 @@ class Read(NamedTuple):
     """What the R readings have read, B R sets."""
     lines: Lines
     """The linear models."""
+    late: Tensor
+    """Gains of commands that act late, ``(B, W, A)``."""
     noisy: Tensor
     """What errors of the readings add to the next effect, ``(B, 1, A)``."""
     slow: Tensor
@@ -40,7 +54,7 @@ class Models(NamedTuple):
     encoded: Encoded
     """What the most likely reading of every axis has read."""
     lines: Lines
-    """The linear models."""
+    """The linear models, the last one a gain of commands that act late."""
     weights: Tensor
     """Probabilities ``(B, 2 + L, A)``: that actions have their nominal effect, now or late;
     of a reading; of the linear models."""
@@ -57,11 +71,13 @@ class Tick(nn.Module):
     scale: Tensor
     points: Tensor
     probes: Tensor
-    late: Tensor
     delays: Tensor
+    earlier: Tensor
     filters: Tensor
     filtered: Tensor
-    rows_acting: Tensor
+    mixing: Tensor
+    ways: Tensor
+    windows: Tensor
 
     def __init__(
         self,
@@ -81,23 +97,26 @@ class Tick(nn.Module):
         self.source_std = check_number("corrector.source_std", source_std, low=0.0)
         self.steps = check_count("corrector.steps", steps)
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
-        chosen = [READINGS[name] for name in readings]
-        self.by_place = any(r.near for r in chosen)
-        self.varied = sum(r.varied for r in chosen)
-        self.counts = [1, len(chosen), len(LINEAR), len(late_ones(readings)), len(CALM)]
+        self.reader = Reader(readings, rows, size)
+        self.rows = rows
+        ways = (len(delays) - 2 - len(readings) - len(LINEAR) - len(CALM)) // 2
+        self.counts = [1, len(readings), len(LINEAR), ways, ways + 1, len(CALM)]
         self.most_late = max(delays.tolist())
-        late = [k for k, name in enumerate(readings) if name in late_ones(readings)]
+        first = sum(self.counts[:3])
         filters, which = filters_of(acting)
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "delays": delays,
+            # Of readings that are alike the first, on any machine and in any batch.
+            "earlier": 1 - 1e-4 * torch.arange(len(readings)).unsqueeze(-1),
             "filters": filters,
             "filtered": torch.nn.functional.one_hot(which).T.to(scale),
-            "late": torch.tensor(late, dtype=torch.long),
+            "mixing": torch.tensor([name in MIXING for name in LINEAR]).unsqueeze(-1),
+            "windows": torch.arange(rows).unsqueeze(-1) + torch.arange(acting.shape[-1]),
+            "ways": acting[first + ways : first + 2 * ways + 1],
         }
-        fixed |= {f"rows_{k}": part for k, part in lay_out(chosen, rows)._asdict().items()}
         for name, value in fixed.items():
             self.register_buffer(name, value, persistent=False)
 
@@ -162,31 +181,32 @@ class Tick(nn.Module):
 
     def read(self, pairs: Tensor, noise: Tensor, place: Tensor, late: Tensor) -> Read:
         """Return what the memory says of actions, by all models."""
-        away, size = None, len(self.scale)
-        if self.by_place:
-            first = 3 * size + 2
-            away = (pairs[..., first:] - place.unsqueeze(-2)).square().sum(-1)
-            away = torch.where(pairs[..., first - 2] > 0, away, torch.inf)
-        layout = Layout(*(getattr(self, f"rows_{name}") for name in Layout._fields))
+        size = len(self.scale)
         follow = aligned(pairs, late, size)
-        rows = read_rows(pairs, layout, size, away, self.varied, follow)
+        rows = self.reader(follow, place)
         loud = torch.hypot(rows.std, noise[:, None, None]) * rows.valid
         rows = Rows(*(part.flatten(0, 1) for part in rows._replace(std=loud)))
+        encoded = self.network.encode(rows, fit_experts(rows))
         sent, came, std, valid = follow[..., : 3 * size + 1].split([size, size, size, 1], -1)
         sound = (valid == 1.0).to(pairs)
-        lines = fit_lines(sent, came, torch.hypot(std, noise.unsqueeze(1)), sound)
-        encoded = self.network.encode(rows, fit_experts(rows))
-        return Read(encoded, lines, sensor_noise(sent, came, sound), within_rate(came, sound))
+        weight = weigh(torch.hypot(std, noise.unsqueeze(1)), sound)
+        newest = pairs[:, 1 - self.rows - self.ways.shape[-1] :, :size]
+        acted = self.ways @ newest[:, self.windows]  # (B, K, W, A)
+        gains = fit_late(acted, came[:, -self.rows :], weight[:, -self.rows :])
+        lines = fit_lines(pairs[..., :size], sent, came, weight)
+        noisy, slow = sensor_noise(sent, came, sound), within_rate(came, sound)
+        return Read(encoded, lines, gains, noisy, slow)
 
     def most_likely(self, found: Read, weights: Tensor) -> Models:
         """Return the models of which an action is chosen."""
-        still, read, linear, late, calm = weights.split(self.counts, 1)
-        # Of readings that are alike the first, on any machine and in any batch.
-        order = torch.arange(read.shape[1], device=read.device).view(-1, 1)
-        best = found.encoded.choose((read * (1 - 1e-4 * order)).argmax(1))
+        still, read, linear, late, gained, calm = weights.split(self.counts, 1)
+        best = found.encoded.choose((read * self.earlier).argmax(1))
+        gain = found.late.gather(1, gained.argmax(1, keepdim=True))  # (B, 1, A)
+        matrix = torch.cat([found.lines.matrix, torch.diag_embed(gain)], 1)
+        lines = Lines(matrix, torch.nn.functional.pad(found.lines.bias, (0, 0, 0, 1)))
         still = torch.cat([still, late, calm], 1).sum(1, keepdim=True)
-        shares = torch.cat([still, read.sum(1, keepdim=True), linear], 1)
-        return Models(best, found.lines, shares)
+        read, gained = (part.sum(1, keepdim=True) for part in (read, gained))
+        return Models(best, lines, torch.cat([still, read, linear, gained], 1))
 
     def propose(self, models: Models, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions ``(B, C, A)``, the first the planned one, and the samples' deviation.
@@ -229,9 +249,11 @@ class Tick(nn.Module):
         over the proposals, axis by axis, if these actions together are no worse than the best
         proposal as a whole, as they may be where one command moves several axes. The loss averages
         models that differ by less than the noise s, and decides between those that differ by
-        more: half of two opposite answers would do nothing, and tell nothing.
+        more: half of two opposite answers would do nothing, and tell nothing. So would small
+        actions in noise: the plan is kept where they promise hardly less.
         """
         cost = self.loss(models, expected, wanted, noise)  # (B, C, A)
+        cost = torch.cat([cost[:, :1] - ENOUGH, cost[:, 1:]], 1)
         each = cost.argmin(1, keepdim=True)
         joint = cost.sum(-1).argmin(1)[:, None, None].expand_as(each)
         action, least = proposals.gather(1, joint), cost.gather(1, joint)
@@ -294,14 +316,15 @@ class Tick(nn.Module):
         every, now = torch.cat([pairs[..., : len(self.scale)], ahead], 1), ahead[:, :1]
         acted = every[:, : pairs.shape[1] + 1]
         acting = ago(acted, late).unsqueeze(1)
-        acts = self.rows_acting @ acted[:, -self.rows_acting.shape[-1] :]  # (B, R, A)
-        follows = (self.delays[1 : acts.shape[1] + 1] < 0).unsqueeze(-1)
-        acts = torch.where(follows, acting, acts)
+        ways = self.ways @ acted[:, -self.ways.shape[-1] :]  # (B, W, A)
         newest = every[:, every.shape[1] - self.most_late - ahead.shape[1] + 1 :]
-        found = self.network.effect(read.encoded, acts.flatten(0, 1).unsqueeze(1)).view_as(acts)
-        linear = read.lines.effect(acting).squeeze(2)
+        shape = -1, self.counts[1], acting.shape[-1]
+        asked = acting.expand(shape).flatten(0, 1).unsqueeze(1)
+        found = self.network.effect(read.encoded, asked).view(shape)
+        each = torch.where(self.mixing, now, acting).unsqueeze(2)  # (B, L, 1, A)
+        linear = read.lines.effect(each).squeeze(2)
         calmly = [acting.clamp(*read.slow.split(1, 1)), acting + read.noisy]
-        forecasts = torch.cat([now, found, linear, acts[:, self.late], *calmly], 1)
+        forecasts = torch.cat([now, found, linear, ways[:, 1:], read.late * ways, *calmly], 1)
 
         def on_its_way() -> list[Tensor]:
             so_late = ((self.delays < 0) | (self.delays == late.unsqueeze(-1))).unsqueeze(-1)

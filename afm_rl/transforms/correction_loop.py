@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.data import Bounded
 
 from afm_rl.correction import ActionFlow, Corrector
-from afm_rl.correction.arrival import arrival
+from afm_rl.correction.late import arrival
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.diagnosis import explain
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics

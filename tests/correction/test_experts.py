@@ -13,26 +13,19 @@ from afm_rl.correction.experts import (
     NEAR,
     SHORT,
     Rows,
-    apply_friction,
     confidence,
     fit_experts,
-    invert_friction,
 )
-from afm_rl.correction.linear import fit_affine, invert_affine
+from afm_rl.correction.linear import fit_affine
 
 AXIS = torch.linspace(-1, 1, 5)
 ASKED = torch.cartesian_prod(AXIS, AXIS).unsqueeze(0)
 EXECUTED = torch.tensor([[0.9, -0.4], [-0.5, 0.8], [0.7, 0.6], [-0.8, -0.7], [0.4, 0.9], [0.6, -1]])
-FRICTION, AFFINE, NEAREST = 3, 4, 5  # places of the answers
-DEAD = torch.tensor([0.55, 0.5])  # of some of these actions nothing is left
-TURN = torch.tensor([[0.6, -0.8], [0.8, 0.6]])
+NEAREST = 3  # place of the answer
 MAPS = {
-    "gain": (lambda u: torch.tensor([-1.6, 1.3]) * u, range(5)),
-    "gain and offset": (lambda u: torch.tensor([-1.6, 1.3]) * u + 0.2, (2, AFFINE)),
+    "gain": (lambda u: torch.tensor([-1.6, 1.3]) * u, range(3)),
+    "gain and offset": (lambda u: torch.tensor([-1.6, 1.3]) * u + 0.2, (2,)),
     "small gain": (lambda u: torch.tensor([0.05, -0.3]) * u, (0, 1, 2)),
-    "friction": (lambda u: u - 0.3 * u.sign(), (FRICTION,)),
-    "dead zone": (lambda u: u - u.clamp(-DEAD, DEAD), (FRICTION,)),
-    "affine": (lambda u: u @ TURN.mT + 0.1, (AFFINE,)),
 }
 
 
@@ -63,11 +56,8 @@ def test_effects_are_exact_where_a_fit_can_express_them(example):
     regime, experts, exact = example
     found = answers(experts.effect(ASKED))
     assert found.shape == (25, ANSWERS, 2)
-    asked = ASKED[0].abs() > 0  # at rest nothing moves, whatever friction would do to it
     for k in exact:
-        assert (found[:, k] - regime(ASKED[0]))[asked].abs().max() < (
-            0.08 if k == FRICTION else 0.02
-        )
+        assert (found[:, k] - regime(ASKED[0])).abs().max() < 0.02
 
 
 def test_actions_are_exact_where_a_fit_can_express_them(example):
@@ -100,15 +90,10 @@ def test_the_fits_are_those_of_the_single_functions():
         (gain[..., 0], fit_gain(*pairs, short)),
         (gain[..., 1], fit_gain(*pairs, long)),
         *zip((gain[..., 2], offset[..., 2]), fit_gain_offset(*pairs, long, rounds=1), strict=True),
-        *zip((experts.matrix, experts.bias[..., 0]), fit_affine(*pairs, long), strict=True),
     ]
     for found, expected in one_by_one:
         torch.testing.assert_close(found, expected)
     assert not offset[..., :2].any()
-    planned = drawn(5, 1, 3, seed=4).double()
-    inverse = invert_affine(experts.matrix, experts.bias, planned.mT)
-    found = experts.execute(planned, "clip")[..., AFFINE]
-    torch.testing.assert_close(found, inverse.clamp(-1, 1))
 
 
 def test_sets_of_rows_do_not_mix():
@@ -188,30 +173,6 @@ def test_what_cannot_be_had_gives_way_by_the_mode(mode):
     found = answers(experts.execute(torch.tensor([[[0.8, 0.4]]]), mode))[0]
     expected = torch.tensor([1.0, 1.0] if mode == "clip" else [1.0, 0.5])
     torch.testing.assert_close(found[:2], expected.expand(2, 2), rtol=0, atol=0.03)
-
-
-def test_pairs_without_effect_tell_nothing_of_friction():
-    gain, offset = torch.tensor([1.0, 1.0]), torch.tensor([-0.55, -0.5])
-    effective = MAPS["dead zone"][0](EXECUTED)
-    assert 0 < (effective == 0).sum() < effective.numel() / 2  # some are held
-    found = fit_experts(rows_of(EXECUTED, effective))
-    fitted = [part[0, :, 0, FRICTION].float() for part in (found.gain, found.offset)]
-    torch.testing.assert_close(fitted[0], gain, rtol=0, atol=0.1)
-    torch.testing.assert_close(fitted[1], offset, rtol=0, atol=0.1)
-    torch.testing.assert_close(apply_friction(gain, offset, EXECUTED), effective)
-
-
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_friction_is_overcome(sign):
-    gain, offset = torch.tensor([-0.8, 1.2]), sign * torch.tensor([0.2, -0.3])
-    effective = gain * EXECUTED + offset * EXECUTED.sign()
-    found = fit_experts(rows_of(EXECUTED, effective))
-    fitted = [part[0, :, 0, FRICTION].float() for part in (found.gain, found.offset)]
-    torch.testing.assert_close(fitted[0], gain, rtol=0, atol=0.05)
-    torch.testing.assert_close(fitted[1], offset, rtol=0, atol=0.05)
-    wanted = torch.tensor([0.5, -0.7])
-    action = invert_friction(gain, offset, wanted)
-    torch.testing.assert_close(gain * action + offset * action.sign(), wanted)
 
 
 def test_the_nearest_pairs_answer_what_no_fit_can():

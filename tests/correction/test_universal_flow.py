@@ -118,6 +118,15 @@ def test_late_commands_of_a_slow_plan_are_no_offset(line, drive, delay):
     assert (found[0] - planned)[begins + 5 :].abs().quantile(0.9) < 0.05
 
 
+def test_swapped_commands_of_a_gait_are_not_taken_for_late_ones(line, drive):
+    """A quarter of a period late, each of two axes looks like the other."""
+    time, phase = torch.arange(120.0)[:, None, None], torch.tensor([0.0, 1.57])
+    start = torch.linspace(0, 6, 12)[:, None]
+    planned = 0.6 * torch.sin(6.28 * time / 24 + phase + start)
+    _, effects = drive(flow_of(2), line(2), REGIMES["two swapped"], planned)
+    assert miss_of(effects, planned, 60).median() < 0.05
+
+
 @pytest.mark.parametrize("size", [2, 6])
 def test_what_was_learnt_before_a_rest_is_known_after_it(line, drive, plans, size):
     moving, rest = (

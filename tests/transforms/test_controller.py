@@ -15,7 +15,7 @@ from torchrl.envs import Compose
 from torchrl.envs.utils import step_mdp
 
 from afm_rl.compiling.machine_code import has_compiler
-from afm_rl.correction import ActionFlow, LeastSquares, experts
+from afm_rl.correction import ActionFlow, LeastSquares, linear
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
@@ -130,7 +130,7 @@ def test_what_an_export_traces_says_the_same_and_spoils_nothing(kind):
     def policy():
         return policy_of() if kind is ActionFlow else policy_of(LeastSquares(LOW, HIGH))
 
-    experts._constants.cache_clear()
+    linear._windows.cache_clear()
     controller = Controller(planner_of(), policy())
     example = tuple(torch.zeros(size).double() for size in controller.sizes.values())
     exported = torch.export.export(controller, example)

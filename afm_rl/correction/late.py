@@ -1,0 +1,164 @@
+r"""Commands that act late, and where a robot will be when they do.
+
+Commands that act late cannot be undone by others. But policy or planner can be asked about the
+state in which their command will act (Smith 1957, Chem. Eng. Progress 53): the model is rolled
+through the effects of the commands that are still under way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from afm_rl.compiling.tracing import all_hold, may_look
+from afm_rl.dynamics import DynamicsModel
+
+if TYPE_CHECKING:
+    from afm_rl.correction.base import Corrector
+
+LEAST = 1e-3  # share of the best that every delay keeps on every axis: none decides alone
+FILTER = 12  # commands that a lag looks back on
+
+
+class Late(NamedTuple):
+    """When commands act."""
+
+    delay: int = 0
+    """Steps from a command to its effect."""
+    lag: float = 0.0
+    """Time constant with which effects follow commands, in steps."""
+
+
+LATE = {f"delay_{k}": Late(delay=k) for k in range(1, 9)}
+LATE |= {f"lag_{k}": Late(lag=k) for k in range(1, 4)}
+NOW = "gain_12"
+"""The gain of commands that are not late, as there is one for each way of :data:`LATE`."""
+
+
+def acting_of(ways: Sequence[Late]) -> Tensor:
+    """Return what commands weigh in what acts now, by age, the oldest first, ``(W, L)``.
+
+    >>> acting_of([Late(), Late(delay=2)])
+    tensor([[0., 0., 1.],
+            [1., 0., 0.]])
+    """
+    length = 1 + max((way.delay + (FILTER - 1 if way.lag else 0) for way in ways), default=0)
+    acting = torch.zeros(len(ways), length)
+    for row, (delay, lag) in zip(acting, ways, strict=True):
+        count, keep = (FILTER, math.exp(-1 / lag)) if lag else (1, 0.0)
+        for k in range(count):
+            share = 1.0 if k == count - 1 else 1 - keep  # the oldest stands for those before it
+            row[-1 - delay - k] = share * keep**k
+    return acting
+
+
+def delay_tables(delays: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Return what models tell of delays, and the log prior of these, by the delay until now.
+
+    The first is :math:`m / p_k` for the models that are k steps late, whose prior is :math:`p_k`.
+
+    None, k = 0, is as probable, a priori, as all models that are not late; *nothing has changed*
+    counts among them no more than the others together. A delay that was found stays, as actuators'
+    delays do, until the evidence for another one exceeds the odds of *nothing has changed*. None is
+    not favoured so: a robot that is eight steps late falls before there is much evidence.
+
+    Args:
+        delays: of the M models, the first of which is *nothing has changed*; -1: they take any.
+        prior: log-odds of the models, ``(M,)``.
+
+    Returns:
+        Both for every delay until now, ``(K + 1, K + 1, M)`` and ``(K + 1, K + 1)``.
+
+    >>> told, first = delay_tables(torch.tensor([0, -1, 1]), torch.zeros(3))
+    >>> told[0]
+    tensor([[1.5000, 1.5000, 0.0000],
+            [0.0000, 0.0000, 3.0000]])
+    """
+    every = torch.arange(int(delays.max()) + 1)
+    now = torch.where(delays < 0, every.unsqueeze(-1), delays).unsqueeze(1)
+    among = (now == every.unsqueeze(-1)).to(prior)  # (K + 1, K + 1, M)
+    share = prior.softmax(0)
+    rest = share[1:][delays[1:] <= 0].sum()
+    among[..., 0] *= (rest / share[0]).clamp_max(1.0)
+    first = among @ share
+    told, first = among / first.unsqueeze(-1), first / first.sum(-1, keepdim=True)
+    stays = torch.lerp(first[1:], torch.eye(len(every))[1:], share[0])
+    return told, torch.cat([first[:1], stays]).log()
+
+
+def steps_late(weights: Tensor, before: Tensor, told: Tensor, first: Tensor) -> Tensor:
+    r"""Return the most probable delay of commands in steps, ``(*B)``.
+
+    .. math:: k = \operatorname{argmax}_k \log p_k + \sum_a \log\frac{p_{ka}}{p_k}
+
+    One for all axes, from the evidence of all: an axis whose commands hardly change shows none.
+    None while *nothing has changed* is believed everywhere.
+
+    Args:
+        weights: probabilities of the models on every axis, ``(*B, M, A)``.
+        before: the delay until now, ``(*B)``.
+        told: of :func:`delay_tables`.
+        first: likewise.
+
+    >>> weights = torch.tensor([[0.1, 0.1], [0.1, 0.1], [0.8, 0.8]])
+    >>> tables = delay_tables(torch.tensor([0, -1, 1]), torch.zeros(3))
+    >>> steps_late(weights, torch.tensor(0), *tables)
+    tensor(1)
+    """
+    evidence = told[before].to(weights) @ weights  # (*B, K + 1, A)
+    evidence = (evidence / evidence.amax(-2, keepdim=True)).clamp_min(LEAST).log()
+    found = (first[before].to(weights) + evidence.sum(-1)).argmax(-1)
+    return torch.where((weights[..., 0, :] < 0.5).any(-1) | (before > 0), found, 0)
+
+
+def ago(commands: Tensor, late: Tensor) -> Tensor:
+    """Return the command ``(*B, A)`` that acts now, of all ``(*B, N, A)``, the newest last."""
+    row = (commands.shape[-2] - 1 - late)[..., None, None]
+    return commands.gather(-2, row.expand(*row.shape[:-1], commands.shape[-1])).squeeze(-2)
+
+
+def aligned(pairs: Tensor, late: Tensor, size: int) -> Tensor:
+    """Return pairs ``(*B, M, D)`` with the commands of so many steps before each effect.
+
+    >>> pairs = torch.tensor([[0.1, 7.0, 0.0, 1.0], [0.2, 8.0, 0.0, 1.0]])
+    >>> aligned(pairs, torch.tensor(1), 1)[..., [0, 3]]
+    tensor([[0.1000, 0.0000],
+            [0.1000, 1.0000]])
+    """
+    if all_hold(late == 0):
+        return pairs
+    row = torch.arange(pairs.shape[-2], device=pairs.device) - late.unsqueeze(-1)
+    sent = pairs[..., :size]
+    sent = sent.gather(-2, row.clamp_min(0).unsqueeze(-1).expand_as(sent))
+    valid = pairs[..., 3 * size :][..., :1] * (row >= 0).unsqueeze(-1)
+    return torch.cat([sent, pairs[..., size : 3 * size], valid, pairs[..., 3 * size + 1 :]], -1)
+
+
+def arrival(corrector: Corrector, memory: Tensor, model: DynamicsModel) -> tuple[Tensor, Tensor]:
+    """Return the state ``(*B, S)`` in which the next command will act, and in how many steps.
+
+    The present state where no command is late, or where the model leads to no number.
+
+    Args:
+        corrector: whose memory it is.
+        memory: up to the present state, ``(*B, P)``.
+        model: the dynamics model as it is now.
+    """
+    with torch.no_grad():
+        state, effects, steps = corrector.under_way(memory)
+        if not effects.shape[-2] or all_hold(steps == 0):
+            return state, steps
+        most = int(steps.max()) if may_look(steps) else effects.shape[-2]
+        # Every mission's commands under way, the oldest first; what follows them is not looked at.
+        ages = effects.shape[-2] - steps.unsqueeze(-1) + torch.arange(most, device=steps.device)
+        ages = ages.clamp_max(effects.shape[-2] - 1).unsqueeze(-1)
+        plan = effects.gather(-2, ages.expand(*ages.shape[:-1], effects.shape[-1]))
+        states = model.rollout(state, plan.unsqueeze(-3)).squeeze(-3)
+        last = (steps - 1).clamp_min(0)[..., None, None].expand(*steps.shape, 1, state.shape[-1])
+        found = states.gather(-2, last).squeeze(-2).to(state)
+        late = (steps > 0).unsqueeze(-1) & found.isfinite().all(-1, keepdim=True)
+        return torch.where(late, found, state), steps

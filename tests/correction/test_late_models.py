@@ -1,0 +1,81 @@
+"""Commands that act late, or slowly."""
+
+import math
+
+import pytest
+import torch
+
+from afm_rl.correction.late import FILTER, Late, acting_of, aligned, delay_tables, steps_late
+from afm_rl.correction.linear import fit_late
+
+
+@pytest.mark.parametrize("lag", [1, 2, 3])
+@pytest.mark.parametrize("delay", [0, 2])
+def test_what_acts_follows_the_commands_as_a_low_pass_filter_does(lag, delay):
+    commands = torch.rand(FILTER + delay, generator=torch.Generator().manual_seed(0))
+    slow = commands[0]  # those before the oldest were the same
+    for command in commands[1 : len(commands) - delay]:
+        slow = command + math.exp(-1 / lag) * (slow - command)
+    torch.testing.assert_close((acting_of([Late(delay, lag)]) * commands).sum(), slow)
+
+
+def test_without_any_way_a_command_acts_at_once():
+    assert torch.equal(acting_of([Late()]), torch.ones(1, 1))
+
+
+@pytest.mark.parametrize("late", [1, 3])
+def test_a_command_joins_the_effect_that_came_later(late):
+    age, count = torch.arange(6.0).unsqueeze(-1), torch.ones(6, 1)
+    pairs = torch.cat([age, 100 + age, 0 * age, count, 0 * age], -1).expand(2, 6, 5)
+    steps = torch.tensor([0, late])
+    still, found = aligned(pairs, steps, 1)
+    assert torch.equal(still, pairs[0])
+    assert found[late:, 0].tolist() == list(range(6 - late)) and found[:, 3].sum() == 6 - late
+    assert torch.equal(found[:, 1], pairs[1, :, 1])
+
+
+def test_gains_of_late_commands_are_found():
+    u = torch.rand(1, 9, 1, generator=torch.Generator().manual_seed(0))
+    acted = torch.stack([u[:, 1:], u[:, :-1]], 2)
+    gains = fit_late(acted, -0.7 * u[:, :-1], torch.ones(1, 8, 1)).flatten()
+    torch.testing.assert_close(gains[1], torch.tensor(-0.7), rtol=0, atol=1e-3)
+    assert abs(gains[0] + 0.7) > 0.1
+    nothing = fit_late(0 * acted, 0 * u[:, 1:], torch.ones(1, 8, 1))
+    assert torch.equal(nothing, torch.ones(1, 2, 1))  # a gain of which nothing is known is one
+
+
+DELAYS = torch.tensor([0, -1, 1, 2, 2])  # nothing, one that takes any, late, late, late with a gain
+TABLES = delay_tables(DELAYS, torch.tensor([1.0, 0.0, 0.0, 0.0, -2.0]).log_softmax(0))
+
+
+@pytest.mark.parametrize(
+    ("believed", "before", "late"),
+    [
+        (0, 0, 0),
+        (1, 0, 0),
+        (2, 0, 1),
+        (3, 0, 2),
+        (4, 0, 2),
+        (1, 2, 2),  # what takes any delay keeps the one that was found
+        (0, 2, 0),
+        (2, 2, 1),
+    ],
+)
+def test_the_delay_is_that_of_the_models_that_are_believed(believed, before, late):
+    weights = torch.full((5, 2), 0.02)
+    weights[believed] = 0.92
+    assert steps_late(weights, torch.tensor(before), *TABLES) == late
+    batch = steps_late(weights.expand(3, 5, 2), torch.full((3,), before), *TABLES)
+    assert batch.tolist() == [late] * 3
+
+
+def test_one_delay_is_found_from_the_evidence_of_all_axes():
+    weights = torch.tensor([[0.05, 0.2], [0.05, 0.2], [0.6, 0.05], [0.25, 0.5], [0.05, 0.05]])
+    assert steps_late(weights[:, :1], torch.tensor(0), *TABLES) == 1
+    assert steps_late(weights, torch.tensor(0), *TABLES) == 2
+
+
+def test_a_delay_that_was_found_stays_for_a_while():
+    weights = torch.tensor([[0.05], [0.05], [0.5], [0.3], [0.1]])
+    assert steps_late(weights, torch.tensor(0), *TABLES) == 1
+    assert steps_late(weights, torch.tensor(2), *TABLES) == 2
