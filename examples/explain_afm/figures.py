@@ -28,14 +28,7 @@ TRAPS = {
     "reversed motors, commands two steps late": "regimes=[{v_gain: -1, delay: 2}]",
     "patches of ground on which driving is reversed": "regimes=[{patch_v_gain: -1}]",
 }
-NAMES = {
-    "nothing has changed": "nothing has changed",
-    "recent": "recent",
-    "varied": "varied",
-    "delay_2": "two steps late",
-    "nearest": "nearest in place",
-    "here": "the one nearest",
-}
+CAUSES = ("nothing has changed", "a recent change", "2 steps late", "another ground")
 
 
 def agent_of(*overrides: str) -> Agent:
@@ -80,9 +73,9 @@ def draw_belief(above: Axes, below: Axes, regimes: str, budget: int) -> None:
     }
     draw_lines(above, times, {name: values[shown] for name, values in driving.items()})
     flow = agent.transform.corrector
-    believed = flow.believed(entries["memory"])[shown, :, 0]
-    models = {NAMES[name]: believed[:, flow.models.index(name)] for name in NAMES}
-    draw_lines(below, times, models)
+    believed = flow.belief_in(entries["memory"])[shown, :, 0]
+    causes = {name: believed[:, flow.causes.index(name)] for name in CAUSES}
+    draw_lines(below, times, causes)
     above.set(ylabel="v (m/s)", ylim=(-1.1, 1.1))
     below.set(xlabel="step", ylabel="probability", ylim=(0, 1))
 
