@@ -110,8 +110,7 @@ def draw(log: Log, window: int = 15) -> Figure:
                 axes.text(start + 5, axes.get_ylim()[1], text, fontsize=style.SMALL, va="top")
         axes.set_ylabel(("v (m/s)", "yaw rate (rad/s)")[j], fontsize=style.SMALL)
         axes.set_ylim(bottom=0)
-        style.dress(axes)
-        style.grid(axes)
+        style.dress(axes, lines="y")
     axes.set_xlabel("time on the ground (s)", fontsize=style.SMALL)
     style.legend_above(figure, *axes.get_legend_handles_labels())
     return figure
