@@ -27,7 +27,7 @@ LINEAR = (
     "driven",
 )
 """The opposite of the command; offset at a gain of one; gain; gain and offset (*line*); gain and
-the newest offset (*drift*); what goes on from row to row (*arx*); affine map; an axis as one
+the newest offset (*drift*); what goes on from row to row (*arx*); affine map; an axis as another
 command drives it (swapped cables). Of the newest rows, or of all pairs."""
 MIXING = ("affine", "driven")
 """Those by which a command moves other axes. Of a gait they say what a delay says, so they are of
@@ -215,7 +215,7 @@ def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tenso
 def _driven(
     u: Tensor, v: Tensor, weight: Tensor, else_matrix: Tensor, else_bias: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return matrix ``(B, A, A)`` and offset ``(B, A, 1)`` of axes that one command drives each.
+    """Return matrix ``(B, A, A)`` and offset ``(B, A, 1)`` of axes that another command drives.
 
     Of many axes an affine map needs many rows, and a gait that repeats itself shows only a few; but
     swapped cables need no more than gains. It stands where one explains all rows.
@@ -234,7 +234,8 @@ def _driven(
     left = ((pull * v).sum(-1, keepdim=True) - gain * cross) / (mass + PRIOR)
     # An axis that its own command explains is driven by it, whatever else fits by chance.
     left, driver = (left + EXACT**2 * other).min(-1, keepdim=True)
-    explained = (left < 2 * EXACT**2) & (mass > LEAST_ROWS)
+    swapped = other.expand_as(gain).gather(-1, driver) > 0
+    explained = swapped & (left < 2 * EXACT**2) & (mass > LEAST_ROWS)
     chosen = torch.zeros_like(gain).scatter(-1, driver, gain.gather(-1, driver))
     return torch.where(explained, chosen, else_matrix), torch.where(explained, 0.0, else_bias)
 
