@@ -109,11 +109,7 @@ class ActionFlow(Believer):
         models = [*names, *LINEAR, *only, NOW, *late, *CALM]
         # What says what every action does is worth more than a line through what is done now; and
         # late commands with some gain are one model, which the ways to be late share.
-        worths = dict.fromkeys((*LINEAR, NOW), plain) | {
-            "reversed": 0.0,
-            "driven": 0.0,
-            "affine": 0.0,
-        }
+        worths = dict.fromkeys((*LINEAR, NOW), plain) | dict.fromkeys(("reversed", *MIXING), 0.0)
         worths |= dict.fromkeys(late, -math.log(max(1, len(late))))
         worth = [worths.get(name, 0.0) for name in models]
         acting = acting_of([LATE.get(name.removeprefix("only "), Late()) for name in ["", *models]])
@@ -155,6 +151,7 @@ class ActionFlow(Believer):
             rows,
             self.delays,
             self.acting,
+            acting_of([Late(), *(LATE[name] for name in late)]),
             samples,
             source_std,
             steps,

@@ -61,7 +61,7 @@ class Lines(NamedTuple):
         return invert_affine(self.matrix, self.bias.unsqueeze(-1), plan).squeeze(-1)
 
 
-def weigh(std: Tensor, valid: Tensor) -> Tensor:
+def precision_of(std: Tensor, valid: Tensor) -> Tensor:
     r"""Return the weights ``(B, M, A)`` of rows: :math:`1 / \sigma^2`, less than that of the best.
 
     Args:

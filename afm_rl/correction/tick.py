@@ -22,8 +22,8 @@ from afm_rl.correction.linear import (
     Lines,
     fit_late,
     fit_lines,
+    precision_of,
     sensor_noise,
-    weigh,
     within_rate,
 )
 from afm_rl.correction.network import AxisNetwork, Encoded, midpoint
@@ -87,6 +87,7 @@ class Tick(nn.Module):
         rows: int,
         delays: Tensor,
         acting: Tensor,
+        ways: Tensor,
         samples: int,
         source_std: float,
         steps: int,
@@ -99,10 +100,8 @@ class Tick(nn.Module):
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
         self.reader = Reader(readings, rows, size)
         self.rows = rows
-        ways = (len(delays) - 2 - len(readings) - len(LINEAR) - len(CALM)) // 2
-        self.counts = [1, len(readings), len(LINEAR), ways, ways + 1, len(CALM)]
+        self.counts = [1, len(readings), len(LINEAR), len(ways) - 1, len(ways), len(CALM)]
         self.most_late = max(delays.tolist())
-        first = sum(self.counts[:3])
         filters, which = filters_of(acting)
         fixed = {
             "scale": scale.to(network.modes),
@@ -114,8 +113,8 @@ class Tick(nn.Module):
             "filters": filters,
             "filtered": torch.nn.functional.one_hot(which).T.to(scale),
             "mixing": torch.tensor([name in MIXING for name in LINEAR]).unsqueeze(-1),
-            "windows": torch.arange(rows).unsqueeze(-1) + torch.arange(acting.shape[-1]),
-            "ways": acting[first + ways : first + 2 * ways + 1],
+            "windows": torch.arange(rows).unsqueeze(-1) + torch.arange(ways.shape[-1]),
+            "ways": ways,
         }
         for name, value in fixed.items():
             self.register_buffer(name, value, persistent=False)
@@ -189,7 +188,7 @@ class Tick(nn.Module):
         encoded = self.network.encode(rows, fit_experts(rows))
         sent, came, std, valid = follow[..., : 3 * size + 1].split([size, size, size, 1], -1)
         sound = (valid == 1.0).to(pairs)
-        weight = weigh(torch.hypot(std, noise.unsqueeze(1)), sound)
+        weight = precision_of(torch.hypot(std, noise.unsqueeze(1)), sound)
         newest = pairs[:, 1 - self.rows - self.ways.shape[-1] :, :size]
         acted = self.ways @ newest[:, self.windows]  # (B, K, W, A)
         gains = fit_late(acted, came[:, -self.rows :], weight[:, -self.rows :])
