@@ -1,9 +1,5 @@
 """What the actuators of a robot do, from what it logged."""
 
-from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
-from afm_rl.diagnosis.live import explain
-from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.settings import Settings
-from afm_rl.diagnosis.verdict import diagnose
+import lazy_loader
 
-__all__ = ["Actuator", "Change", "Diagnosis", "Log", "Settings", "diagnose", "explain"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

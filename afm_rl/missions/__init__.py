@@ -1,22 +1,5 @@
 """Missions: compose an agent from a configuration and run it."""
 
-from afm_rl.missions.build import Agent, build, prepare
-from afm_rl.missions.robot import Collection, Robot
-from afm_rl.missions.run import Results, run
-from afm_rl.missions.scores import LapScore, ReturnScore, Score, TrackingScore
-from afm_rl.missions.task_robot import TaskRobot
+import lazy_loader
 
-__all__ = [
-    "Agent",
-    "Collection",
-    "LapScore",
-    "Results",
-    "ReturnScore",
-    "Robot",
-    "Score",
-    "TaskRobot",
-    "TrackingScore",
-    "build",
-    "prepare",
-    "run",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

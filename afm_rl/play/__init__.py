@@ -1,6 +1,5 @@
 """A page in the browser to play with: the same policy on two robots, alone and with AFM."""
 
-from afm_rl.play.robots import ROBOTS, Robot, make_robot
-from afm_rl.play.world import Actuators, Side, World
+import lazy_loader
 
-__all__ = ["ROBOTS", "Actuators", "Robot", "Side", "World", "make_robot"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

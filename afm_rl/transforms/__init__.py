@@ -1,8 +1,5 @@
 """TorchRL transforms, and the same correction as a policy and as gymnasium's wrappers."""
 
-from afm_rl.transforms.action_flow import ActionFlowTransform
-from afm_rl.transforms.guard import Guard
-from afm_rl.transforms.policy import ActionFlowPolicy
-from afm_rl.transforms.regime import RegimeTransform
+import lazy_loader
 
-__all__ = ["ActionFlowPolicy", "ActionFlowTransform", "Guard", "RegimeTransform"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

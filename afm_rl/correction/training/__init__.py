@@ -1,6 +1,5 @@
 """How the flow is trained: on regimes without a robot, and refined on one."""
 
-from afm_rl.correction.training.prior import draw_examples
-from afm_rl.correction.training.refine import CFMLoss, train_flow
+import lazy_loader
 
-__all__ = ["CFMLoss", "draw_examples", "train_flow"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

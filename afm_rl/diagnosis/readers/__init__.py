@@ -5,7 +5,6 @@ what was logged, and a function that reads some of it. What is a command and wha
 chosen afterwards, the same way for all formats.
 """
 
-from afm_rl.diagnosis.readers.read import PAIRS, TRANSITIONS, read_columns, read_log
-from afm_rl.diagnosis.readers.source import Columns, Unchosen
+import lazy_loader
 
-__all__ = ["PAIRS", "TRANSITIONS", "Columns", "Unchosen", "read_columns", "read_log"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
