@@ -83,8 +83,8 @@ def _run(options: argparse.Namespace) -> None:
     found = diagnose(log)
     replayed = None
     if options.replay is not None:
+        from afm_rl.diagnosis.replay import replay
         from afm_rl.progress import Bar
-        from afm_rl.replay import replay
         from afm_rl.report.diagnosis import print_replay, write_replay
 
         with Bar(total=1.0, desc="replaying", delay=3.0) as bar:  # s

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from rich.text import Text
 
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
-from afm_rl.replay import Table as Replayed
-from afm_rl.replay.table import AFM, ALONE, SHARES
+from afm_rl.diagnosis.replay import Table as Replayed
+from afm_rl.diagnosis.replay.table import AFM, ALONE, SHARES
 from afm_rl.report import style
 from afm_rl.report.figures import Picture
 from afm_rl.report.tables import Table, grid_of, terminal
@@ -200,7 +200,7 @@ def print_replay(replayed: Replayed, file: IO[str] | None = None) -> None:
     """Print the errors over the whole log, and what a correction would have done.
 
     >>> from afm_rl.diagnosis import Log
-    >>> from afm_rl.replay.table import errors_of
+    >>> from afm_rl.diagnosis.replay.table import errors_of
     >>> u = np.linspace(-1, 1, 40)[:, None]
     >>> log, found = Log(("pan",), u, 0.5 * u), {ALONE: u, AFM: 0.5 * u}
     >>> table = Replayed(log, found, 0 * u, errors_of(log, found), {"pan": 1.0})

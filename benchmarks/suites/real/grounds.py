@@ -21,9 +21,9 @@ from matplotlib.figure import Figure
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.diagnosis import Log
 from afm_rl.diagnosis.readers import read_log
-from afm_rl.replay import replay
-from afm_rl.replay.belief import believe
-from afm_rl.replay.table import AFM, ALONE, SIMPLE, Predictor
+from afm_rl.diagnosis.replay import replay
+from afm_rl.diagnosis.replay.belief import believe
+from afm_rl.diagnosis.replay.table import AFM, ALONE, SIMPLE, Predictor
 from afm_rl.report import style
 from afm_rl.storage.files import write_whole
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from afm_rl.diagnosis.log import Log
-from afm_rl.replay.table import AFM, SIMPLE, Table, errors_of, removed_by, slow_in
+from afm_rl.diagnosis.replay.table import AFM, SIMPLE, Table, errors_of, removed_by, slow_in
 
 __all__ = ["Table", "replay"]
 
@@ -17,7 +17,7 @@ def replay(log: Log, seen: Callable[[float], object] = lambda share: None) -> Ta
 
     The robot's state is its response, and the model says that a response is its command. So the
     correction learns what commands do, as it would have on the robot, without acting; beside it
-    stand the predictions of plain methods (:mod:`~afm_rl.replay.table`). Where an
+    stand the predictions of plain methods (:mod:`~afm_rl.diagnosis.replay.table`). Where an
     episode begins, or rows are missing, the command before is not known.
 
     Args:
@@ -28,7 +28,7 @@ def replay(log: Log, seen: Callable[[float], object] = lambda share: None) -> Ta
     >>> replay(Log(("pan",), u, -0.5 * u)).sentence
     'A correction would have removed 100 % of the error of pan.'
     """
-    from afm_rl.replay.belief import BLANK, believe_log, watcher  # torch takes seconds
+    from afm_rl.diagnosis.replay.belief import BLANK, believe_log, watcher  # torch takes seconds
 
     steps = np.round(np.diff(log.seconds, prepend=log.seconds[0]) / log.step)
     missing = np.where(log.begins, BLANK, (steps - 1).clip(0, BLANK)).astype(int)

@@ -9,9 +9,17 @@ from scipy.signal import lfilter
 
 from afm_rl.diagnosis import Log
 from afm_rl.diagnosis.readers import read_log
-from afm_rl.replay import replay
-from afm_rl.replay.belief import believe, identity, watcher
-from afm_rl.replay.table import AFM, ALONE, Table, affine, arx, quantile_with_interval, running_gain
+from afm_rl.diagnosis.replay import replay
+from afm_rl.diagnosis.replay.belief import believe, identity, watcher
+from afm_rl.diagnosis.replay.table import (
+    AFM,
+    ALONE,
+    Table,
+    affine,
+    arx,
+    quantile_with_interval,
+    running_gain,
+)
 
 LOGS = Path(__file__).parents[2] / "examples" / "real_logs"
 
