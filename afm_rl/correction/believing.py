@@ -173,8 +173,7 @@ class Believer(PairCorrector):
         )
         parts["late"], belief = late.unsqueeze(-1).to(newest), belief._replace(losses=losses)
         begins = (parts["misaligned"] != 1.0) & awake
-        count = 1 if model.taught_in is None else self.recent
-        parts["pairs"] = self.aged(parts["pairs"], begins, count)
+        parts["pairs"] = self.aged(parts["pairs"], begins)
         return parts | belief._asdict() | {"misaligned": awake.to(newest)}
 
     def surprised(self, before: Tensor, losses: Tensor) -> Tensor:

@@ -78,10 +78,9 @@ class ClassicalCorrector(PairCorrector):
     def _watched(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts with the newest pairs, older ones marked where a change begins."""
         parts = self.look(memory, model)
-        count = 1 if model.taught_in is None else self.recent
         surprise = parts["pairs"][..., -1:, -self.tail] > self.quiet
         begins = (parts["misaligned"] != 1.0) & surprise
-        return parts | {"pairs": self.aged(parts["pairs"], begins, count)}
+        return parts | {"pairs": self.aged(parts["pairs"], begins)}
 
     def _innovation(self, parts: Fields) -> tuple[Tensor, Tensor]:
         innovation = parts["pairs"][..., -self.recent :, -self.tail].amax(-1)

@@ -92,20 +92,21 @@ class PairCorrector(Corrector):
             -1,
         )
         sound = (valid == 1.0) & rows.isfinite().all(-1, keepdim=True)
-        older = parts["pairs"][..., 1 : self.memory - count + 1, :]
+        older, asked = parts["pairs"][..., 1:, :].split([self.memory - count, count - 1], -2)
         rows = torch.where(sound | self.is_command, rows, 0.0)  # what was sent is known
+        before = torch.nn.functional.pad(asked == 0.5, (0, 0, 0, 1)) & self.is_valid
+        rows = torch.where(before, 0.5 * rows, rows)
         return parts | {"pairs": torch.cat([older, rows], -2)}
 
-    def aged(self, pairs: Tensor, begins: Tensor, newest: int) -> Tensor:
-        """Return pairs ``(*B, M, D)`` with those before the newest marked as old.
+    def aged(self, pairs: Tensor, begins: Tensor) -> Tensor:
+        """Return pairs ``(*B, M, D)`` with all but the newest marked as old.
 
         "valid" is halved: a change has begun since, which only those by place may ignore.
 
         Args:
             pairs: the oldest first.
             begins: does a change begin? ``(*B, 1)``.
-            newest: number of pairs that are of the change.
         """
-        is_old = torch.arange(self.memory, device=pairs.device) < self.memory - newest
+        is_old = torch.arange(self.memory, device=pairs.device) < self.memory - 1
         old = self.is_valid & is_old.unsqueeze(-1) & begins.unsqueeze(-1)
         return torch.where(old, 0.5 * pairs, pairs)

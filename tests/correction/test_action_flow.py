@@ -1,5 +1,7 @@
 """The action flow, whatever its weights."""
 
+import os
+
 import pytest
 import torch
 
@@ -47,6 +49,24 @@ def test_corrections_are_finite_and_in_the_box(line, drive, plans, size, mode):
     assert all(part.isfinite().all() for part in found) and misaligned[2:].any()
     assert (executed.abs() <= 1 + 1e-6).all()
     assert (bounds[:, :, 0] < bounds[:, :, 1]).all()
+
+
+@pytest.mark.parametrize("kind", [ActionFlow, LeastSquares])
+def test_rows_from_before_a_change_stay_old_when_a_learning_model_is_asked_again(line, kind):
+    corrector, model, box = (
+        kind(-torch.ones(1), torch.ones(1)),
+        line(1),
+        torch.tensor([[-1.0], [1.0]]),
+    )
+    model.taught_in = os.getpid()
+    memory, state = corrector.begin(torch.zeros(1)), torch.zeros(1)
+    for step in range(10):
+        memory, found = corrector.correct(memory, torch.full((1,), 0.5), model, box)
+        state = model(state, found.executed if step < 6 else -found.executed)
+        memory = corrector.observe(memory, state)
+    memory, _ = corrector.correct(memory, torch.full((1,), 0.5), model, box)
+    valid = corrector.unpack(memory, 1)["pairs"][-10:, 3]
+    assert valid.tolist() == 6 * [0.5] + 4 * [1.0]
 
 
 @pytest.mark.parametrize("corrector", [ActionFlow, LeastSquares])

@@ -169,6 +169,14 @@ def test_who_learns_keeps_the_height_better(fly):
     assert learner["mse_z"] < 0.2 * physics["mse_z"]
 
 
+def test_a_correction_does_no_harm_beside_a_learner(fly):
+    settings = {"robot.env.preview": False, "robot.schedule.times": [2.0, 9.0]}
+    settings |= {"budget": 60, "tracks": "circle_2m_0.3mps"}
+    alone = fly("method=online_knode", **settings).missions.iloc[0]
+    corrected = fly("method=afm_online_knode", **settings).missions.iloc[0]
+    assert corrected["mse_z"] < alone["mse_z"]
+
+
 def test_networks_learn_from_the_plants_own_steps_and_by_seed(make_agent):
     settings = {**QUICK, "updater.begin": 0.0, "updater.epochs": 2, "budget": 6}
     agent, windows = make_agent("robot=quadrotor", "method=online_knode", seeds=2, **settings), []
