@@ -5,25 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from afm_rl.compiling.machine_code import MachineCode, in_one_batch
-from afm_rl.correction.base import Fields
-from afm_rl.correction.believing import Answer, Believer
-from afm_rl.correction.late import LATE, NOW, Late, acting_of
-from afm_rl.correction.linear import CALM, LINEAR, MIXING
+from afm_rl.compiling.tracing import all_hold, somewhere
+from afm_rl.correction.base import Correction, Fields
+from afm_rl.correction.belief import Belief, mean_and_std, prior_of
+from afm_rl.correction.hypotheses import CHOICES, acting_of, choose, delayed
+from afm_rl.correction.late import ago, delay_tables, steps_late
 from afm_rl.correction.network import AxisNetwork, load_universal
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.correction.readings import READINGS, cause_of, check_readings
-from afm_rl.correction.tick import Tick
+from afm_rl.correction.tick import Answer, Tick
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_flag, check_number
 
 
-class ActionFlow(Believer):
+class ActionFlow(PairCorrector):
     r"""The flow from noise around the planned action to the action that has its effect.
 
     A regime is described by pairs (executed, effective action), which mean the same for every
@@ -32,26 +31,27 @@ class ActionFlow(Believer):
     of actions. At every tick (:meth:`correct`):
 
     1. *Measure*: the last transition gives a pair (u, v) and how sure v is.
-    2. *Believe*: the models that predicted v well gain weight, axis by axis
-       (:mod:`~afm_rl.correction.belief`). That nothing has changed is one of them; the others are
-       ways to read the memory (:mod:`~afm_rl.correction.readings`) with the network, or a plain
-       least-squares fit, to answer. The noise that nothing explains is learnt.
+    2. *Believe*: the hypotheses (:mod:`~afm_rl.correction.hypotheses`) that predicted v well gain
+       weight, axis by axis (:mod:`~afm_rl.correction.belief`); the noise that none explains is
+       learnt. The first is that *nothing has changed*. No loss is negative, so while its own is
+       below its ``odds`` no other one can outweigh it: the planned action is executed, and nothing
+       more is computed. When it is exceeded, the pairs from before are marked as old.
     3. *Flow*: straight paths :math:`x_\tau = (1-\tau)(u_0 + \sigma\epsilon) + \tau u_1` lead from
        around the plan :math:`u_0` to the inverse :math:`u_1 = T^{-1}(u_0)`.
     4. *Act*: of the plan, the flow's samples and the exact inverses of the fits, the action with
-       the least expected squared miss under the belief is executed.
+       the least expected loss under the belief is executed.
 
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        readings: names of :data:`~afm_rl.correction.readings.READINGS`; all if None.
+        readings: names of :data:`~afm_rl.correction.hypotheses.CHOICES`; all if None.
         rows: pairs of a reading, K; None: 12, or more for more than eight actions.
         memory: pairs that are remembered.
         place: coordinates of the state in which the ground may differ; readings by place are
             left out if there are none.
         place_scale: distance at which ground counts as other ground, in their unit.
-        plain: prior log-odds of a linear model that is fitted against a reading: a line that
-            predicts what is done now knows nothing of other actions.
+        plain: prior log-odds of a linear model that is fitted against a reading: a local fit does
+            not extrapolate.
         samples: starting points of the flow.
         source_std: :math:`\sigma`, a share of the largest action.
         steps: midpoint steps.
@@ -62,7 +62,20 @@ class ActionFlow(Believer):
             tick runs as it is. Results agree to rounding.
         cache: folder of compiled ticks.
         network: the network; None: the universal one that comes with the package.
-        rules: of the belief, see :class:`~afm_rl.correction.Believer`.
+        odds: prior log-odds of *nothing has changed* against all other models together; a larger
+            one acts later, and a legged robot that is reversed falls.
+        most_odds: what evidence for *nothing has changed* can make of them: what was learnt in a
+            thousand healthy steps must not hide a change for longer than a few.
+        discount: of the losses; .95 looks back on twenty steps.
+        noise: standard deviation that no model explains, at first, a share of the largest action.
+        noise_rate: share of its square that is renewed at every step.
+        least_noise: its floor, a share of the largest command that is remembered: effects nearer
+            than that are all the same. In more noise a belief looks back longer.
+        least_command: what the largest command counts as at least, a share of the largest action: a
+            quadrotor that hovers needs a hundredth of its moments.
+        quiet: normalised innovation up to which a transition needs no explanation.
+        tails: degrees of freedom of the Student-t distribution of what is missed.
+        delay: steps that are known, D at most; those of the models come on top.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -80,6 +93,11 @@ class ActionFlow(Believer):
     """
 
     _machine_code: MachineCode
+    worth: Tensor
+    delays: Tensor
+    acting: Tensor
+    told: Tensor
+    first: Tensor
     cause: Tensor
 
     def __init__(
@@ -99,63 +117,71 @@ class ActionFlow(Believer):
         compile: bool = False,
         cache: str | Path = "~/.cache/afm_rl",
         network: AxisNetwork | None = None,
-        **rules: Any,
+        odds: float = 1.0,
+        most_odds: float = 16.0,
+        discount: float = 0.95,
+        noise: float = 0.05,
+        noise_rate: float = 0.1,
+        least_noise: float = 0.02,
+        least_command: float = 0.25,
+        quiet: float = 1.0,
+        tails: float = 1.0,
+        delay: int | Sequence[int] = 0,
     ) -> None:
         size, place = len(torch.as_tensor(action_low)), list(place)
         rows = max(12, size + 4) if rows is None else check_count("corrector.rows", rows)
-        every = [*READINGS, *LATE] if readings is None else readings
-        names, late = check_readings(every, bool(place))
-        only = [f"only {name}" for name in late]
-        models = [*names, *LINEAR, *only, NOW, *late, *CALM]
-        # What says what every action does is worth more than a line through what is done now; and
-        # late commands with some gain are one model, which the ways to be late share.
-        worths = dict.fromkeys((*LINEAR, NOW), plain) | dict.fromkeys(("reversed", *MIXING), 0.0)
-        worths |= dict.fromkeys(late, -math.log(max(1, len(late))))
-        worth = [worths.get(name, 0.0) for name in models]
-        acting = acting_of([LATE.get(name.removeprefix("only "), Late()) for name in ["", *models]])
-        follows = [False, *(name not in {NOW, *MIXING, *late, *only} for name in models)]
-        longest = rows + acting.shape[-1] - 1
-        super().__init__(
-            action_low,
-            action_high,
-            recent=rows,
-            memory=memory,
-            models=models,
-            place=len(place),
-            worth=worth,
-            acting=acting,
-            follows=follows,
-            **rules,
+        super().__init__(action_low, action_high, rows, memory, len(place), quiet, delay)
+        self.hypotheses = choose(readings, bool(place), plain)
+        self.models = tuple(row.name for row in self.hypotheses)
+        self.odds = check_number("corrector.odds", odds, low=0.0)
+        self.most_odds = check_number("corrector.most_odds", most_odds, low=0.0)
+        self.discount = check_number("corrector.discount", discount, low=0.0, high=1.0)
+        self.noise_rate = check_number("corrector.noise_rate", noise_rate, low=0.0, high=1.0)
+        self.least_noise = check_number(
+            "corrector.least_noise", least_noise, low=0.0, open_low=True
         )
-        self.readings, self.place = [*names, *late], place
+        self.noise = check_number("corrector.noise", noise, low=self.least_noise)
+        self.least_command = check_number(
+            "corrector.least_command", least_command, low=0.0, high=1.0, open_low=True
+        )
+        self.tails = check_number("corrector.tails", tails, low=0.0, open_low=True)
+        self.place = place
         self.place_scale = check_number(
             "corrector.place_scale", place_scale, low=0.0, open_low=True
         )
+        nominal, *others = self.hypotheses
+        worth = torch.tensor([row.log_prior for row in others])
+        prior = torch.cat([torch.full((1,), self.odds), worth.log_softmax(0)])
+        # Of a model: its delay; -1: the one that is believed.
+        delays = torch.tensor([-1 if row.follows_delay else row.delay for row in self.hypotheses])
+        told, first = delay_tables(delays, prior)
+        self.most_late = max(delays.tolist())
+        causes = [
+            delayed(row.delay + self.delay) if row.delay else row.cause for row in self.hypotheses
+        ]
+        late = [delayed(k + self.delay) for k in range(1, self.most_late + 1)]
+        self.causes = tuple(dict.fromkeys([nominal.cause, *late, *causes]))
+        fixed = {
+            "worth": worth,
+            "acting": acting_of(self.hypotheses),
+            "delays": delays,
+            "told": told,
+            "first": first,
+            "cause": torch.tensor([self.causes.index(cause) for cause in causes]),
+        }
+        for name, value in fixed.items():
+            self.register_buffer(name, value, persistent=False)
+        longest = rows + self.acting.shape[-1] - 1
         if self.memory < longest:
             raise ConfigurationError(
                 f"corrector.memory={memory!r}: expected at least {longest} for {rows} rows and the "
-                f"readings {', '.join(self.readings)}"
+                f"readings {', '.join(row.name for row in others if row.name in CHOICES)}"
             )
-        by_model = [cause_of(name, self.delay) for name in self.models]
-        late_by = [cause_of(f"delay_{k}", self.delay) for k in range(1, self.most_late + 1)]
-        self.causes = tuple(dict.fromkeys([by_model[0], *late_by, *by_model]))
-        cause = torch.tensor([self.causes.index(name) for name in by_model])
-        self.register_buffer("cause", cause, persistent=False)
         self.compiles = check_flag("corrector.compile", compile)
         self.__dict__["_machine_code"] = MachineCode(self, cache)
         network = load_universal() if network is None else network
         self.tick = Tick(
-            network,
-            self.scale,
-            names,
-            rows,
-            self.delays,
-            self.acting,
-            acting_of([Late(), *(LATE[name] for name in late)]),
-            samples,
-            source_std,
-            steps,
-            saturation,
+            network, self.scale, self.hypotheses, rows, samples, source_std, steps, saturation
         )
 
     @property
@@ -188,11 +214,228 @@ class ActionFlow(Believer):
         """Return where a state is, in the unit in which ground differs."""
         return state[..., self.place] / self.place_scale if self.place else state[..., :0]
 
-    def answer(self, parts: Fields, weights: Tensor, planned: Tensor, box: Tensor) -> Answer:
-        """Ask the :class:`~afm_rl.correction.tick.Tick`."""
-        late, sent = parts["late"].squeeze(-1).long(), self.normalise(parts["sent"])
-        rest = (x.to(self.tick.scale) for x in (sent, planned, box))
-        return self.tick(*self._read(parts, weights), late, *rest)
+    def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
+        """Return names and shapes, with the belief; its noise is the last part."""
+        size, count = self.action_size, len(self.models)
+        belief = {"losses": (count, size), "forecasts": (count, size), "noise": (size,)}
+        late = {"late": (1,), "under_way": (self.most_late + self.delay, size)}
+        return {**super().shapes(state_size), **late, **belief}
+
+    def begin(self, state: Tensor) -> Tensor:
+        """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
+        parts = self.unpack(super().begin(state), state.shape[-1])
+        return self.pack({**parts, "noise": torch.full_like(parts["noise"], self.noise)})
+
+    def belief(self, parts: Fields) -> Belief:
+        """Return the belief in the parts of a memory."""
+        return Belief(parts["losses"], parts["forecasts"], parts["noise"])
+
+    def floor(self, parts: Fields) -> Tensor:
+        """Return the least noise ``(*B, A)``: effects nearer than that are all the same."""
+        largest = parts["pairs"][..., : self.action_size].abs().amax(-2)
+        return self.least_noise * largest.clamp(self.least_command, 1.0)
+
+    def weights(self, parts: Fields) -> Tensor:
+        """Return the probabilities of the models ``(*B, M, A)``."""
+        noise = parts["noise"]
+        prior = prior_of(self.worth.to(noise), self.odds, noise, self.floor(parts))
+        return self.belief(parts).weights(prior)
+
+    def look(self, memory: Tensor, model: DynamicsModel) -> Fields:
+        """Return the parts of the memory with the newest pairs and the belief after them."""
+        parts = super().look(memory, model)
+        newest, size = parts["pairs"][..., -1, :], self.action_size
+        _, effect, std, valid, _ = newest.split([size, size, size, 1, self.tail], -1)
+        floor = self.floor(parts)
+        rules = (self.discount, self.noise_rate, floor, self.tails)
+        prior = prior_of(self.worth.to(floor), self.odds, parts["noise"], floor)
+        belief = self.belief(parts).update(effect, std, valid, prior, *rules)
+        belief = belief._replace(losses=self.surprised(parts["losses"], belief.losses))
+        awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
+        before = parts["late"].squeeze(-1).long()
+        late, losses = somewhere(
+            awake.squeeze(-1) | (before > 0),
+            lambda: self.delayed(belief, belief.weights(prior), before),
+            [before, belief.losses],
+        )
+        parts["late"], belief = late.unsqueeze(-1).to(newest), belief._replace(losses=losses)
+        begins = (parts["misaligned"] != 1.0) & awake
+        parts["pairs"] = self.aged(parts["pairs"], begins)
+        return parts | belief._asdict() | {"misaligned": awake.to(newest)}
+
+    def surprised(self, before: Tensor, losses: Tensor) -> Tensor:
+        """Return the losses ``(*B, M, A)`` as models may have them until a change is known.
+
+        What surprises *nothing has changed* surprises all models that have yet to learn of it. One
+        that foresaw it better, as some delay may by chance, leads by no more than the odds. And
+        while nothing has changed, no model falls farther behind than a change may need: it may
+        come at any step (fixed share: Herbster and Warmuth 1998, Machine Learning 32).
+        """
+        nothing = losses[..., :1, :]
+        first = (before[..., :1, :] <= self.odds) & (nothing > self.odds)
+        losses = torch.where(first, torch.maximum(losses, nothing - self.odds), losses)
+        healthy = (nothing <= losses.amin(-2, keepdim=True) + self.odds).all(-1, keepdim=True)
+        return torch.where(healthy, torch.minimum(losses, nothing + self.most_odds), losses)
+
+    def delays_now(self, late: Tensor) -> Tensor:
+        """Return the delays of all models ``(*B, M)`` while ``late`` ``(*B)`` is believed."""
+        return torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
+
+    def delayed(self, belief: Belief, weights: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the delay ``(*B)`` that is believed now, and the losses ``(*B, M, A)``.
+
+        Models that follow a new one begin as good as the best that had it already.
+        """
+        late = steps_late(weights, before, self.told, self.first)
+        theirs = (self.delays == late.unsqueeze(-1)).unsqueeze(-1)
+        best = torch.where(theirs, belief.losses, torch.inf).amin(-2, keepdim=True)
+        begin = (self.delays < 0) & (late != before).unsqueeze(-1)
+        return late, torch.where(begin.unsqueeze(-1), best, belief.losses)
+
+    def asleep(self, parts: Fields, action: Tensor) -> Fields:
+        """Return the parts if ``action`` ``(*B, A)`` is executed, and nothing has changed.
+
+        All models predict effects as they are sent, now or late. They are believed alike, but
+        that late ones keep what they predict better, as in a cumulative sum: so they are found as
+        soon as there is a surprise. And a delay that is believed keeps what it predicts worse.
+        """
+        losses, late = parts["losses"], parts["late"].squeeze(-1).long()
+        commands = self.commands(parts, action)
+        acted = commands[..., : commands.shape[-2] - self.delay, :]
+        acts = self.acting.to(acted) @ acted[..., acted.shape[-2] - self.acting.shape[-1] :, :]
+        follows = (self.delays < 0).unsqueeze(-1)
+        acts = torch.where(follows, ago(acted, late).unsqueeze(-2), acts)
+        believed = (self.delays_now(late) == late.unsqueeze(-1)) & (late > 0).unsqueeze(-1)
+        best = torch.minimum(losses, losses[..., :1, :])
+        alike = {"planned": action, "executed": action}
+        alike |= {"acting": self.denormalise(ago(acted, late)), "forecasts": acts}
+        alike |= {"losses": torch.where(believed.unsqueeze(-1), losses, best)}
+        newest = commands.shape[-2] - parts["under_way"].shape[-2]
+        return {**parts, **alike, "under_way": commands[..., newest:, :]}
+
+    def commands(self, parts: Fields, executed: Tensor) -> Tensor:
+        """Return all commands up to the present one, ``(*B, M + D + 1, A)``, in u.
+
+        Those that have acted, those that are known to wait, and ``executed`` ``(*B, A)``.
+        """
+        acted = parts["pairs"][..., : self.action_size]
+        ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
+        return torch.cat([acted, self.normalise(ahead)], -2)
+
+    def watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> tuple[Tensor, ...]:
+        """Return the memory with the newest pair, and what it is if the plan is executed.
+
+        Returns:
+            Both, is any other model to be asked? ``(*B)``, and the innovation ``(*B)``.
+        """
+        parts = self.look(memory, model)
+        innovation = parts["pairs"][..., -1, -self.tail]
+        awake = parts["misaligned"].squeeze(-1) == 1.0
+        memory = self.pack(parts)
+        idle = memory if all_hold(awake) else self.pack(self.asleep(parts, planned))
+        return memory, idle, awake, innovation
+
+    def decide(self, memory: Tensor, planned: Tensor, box: Tensor) -> tuple[Tensor, ...]:
+        """Return the next memories, and what to execute, of B missions with a surprise.
+
+        Args:
+            memory: with the newest pair, ``(B, P)``.
+            planned: ``(B, A)``.
+            box: lowest and highest action, ``(B, 2, A)``.
+
+        Returns:
+            The next memory, and the parts of an :class:`Answer` but the last two.
+        """
+        parts = self.unpack(memory, self.states_in(memory))
+        weights, late = self.weights(parts), parts["late"].squeeze(-1).long()
+        known = (self.normalise(parts["sent"]), planned, box)
+        known = (part.to(self.tick.scale) for part in known)
+        answer = self.tick(*self._read(parts, weights), late, *known)
+        acting = self.denormalise((weights * answer.forecasts.to(memory)).sum(-2))
+        parts |= {"planned": planned, "executed": answer.executed.to(memory), "acting": acting}
+        parts["forecasts"] = answer.forecasts.to(memory)
+        parts["under_way"] = answer.under_way.to(memory)
+        return (self.pack(parts), *answer[:-2])
+
+    def correct(
+        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
+    ) -> tuple[Tensor, Correction]:
+        """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
+        calm = planned.clamp(*box.unbind(-2))
+        with torch.no_grad():
+            memory, idle, awake, innovation = self._watch(memory, calm, model)
+            found = self.unchanged(calm, innovation, box)
+            found = found._replace(noise=self.noise_in(memory))
+            names = ["memory", *Answer._fields[:-2]]
+            still = [idle, *found[:4], found.misaligned]
+            changed = somewhere(awake, self._decide, still, memory, planned, box)
+            now = dict(zip(names, changed, strict=True))
+            now["misaligned"] = now.pop("corrects")
+            return now.pop("memory"), found._replace(**now)
+
+    def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the state, the newest commands' effects, and how many of them are to come."""
+        parts = self.unpack(memory, self.states_in(memory))
+        steps = parts["late"].squeeze(-1).long() + self.delay
+        return parts["state"], self.denormalise(parts["under_way"]), steps
+
+    def noise_in(self, memory: Tensor) -> Tensor:
+        """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
+        return self.denormalise(memory[..., -self.action_size :])
+
+    def believed(self, memory: Tensor) -> Tensor:
+        """Return how probable the :attr:`models` are, by axis, ``(*B, M, A)``."""
+        parts = self.unpack(memory, self.states_in(memory))
+        return self.weights(parts)
+
+    def predict(
+        self, memory: Tensor, action: Tensor, model: DynamicsModel
+    ) -> tuple[Tensor, Tensor]:
+        """Return the effect that an action ``(*B, A)`` will have, and its standard deviation.
+
+        Both in units of the action, ``(*B, A)``: what the model would have to be given, so that it
+        expects what the robot will do. With a delay it is what acts now, of earlier commands.
+
+        Args:
+            memory: up to the present state, ``(*B, P)``; it is not changed.
+            action: what would be executed.
+            model: the dynamics model as it is now.
+        """
+        with torch.no_grad():
+            seen = self._foresee(self.pack(self.look(memory, model)), action)
+            parts = self.unpack(seen, model.state_size)
+            weights = self.weights(parts)
+            mean, std = mean_and_std(parts["forecasts"], weights)
+            return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))
+
+    def executing(
+        self, memory: Tensor, planned: Tensor, executed: Tensor, misaligned: Tensor | None = None
+    ) -> Tensor:
+        """Return the memory with the actions that are planned and executed now, ``(*B, A)``."""
+        return self._foresee(super().executing(memory, planned, executed, misaligned), executed)
+
+    def reported(self, memory: Tensor, given: Tensor) -> Tensor:
+        """Return the memory with forecasts moved by what was given more than sent."""
+        _, planned, sent = self.latest(memory)
+        parts = self.unpack(super().reported(memory, given), self.states_in(memory))
+        if self.delay:
+            sent = self.unpack(memory, self.states_in(memory))["sent"][..., 0, :]
+        more = self.normalise(given - sent).unsqueeze(-2)
+        return self.pack({**parts, "forecasts": parts["forecasts"] + more})
+
+    @torch.no_grad()
+    def _foresee(self, memory: Tensor, executed: Tensor) -> Tensor:
+        """Return the memory with forecasts of what is executed, where models are to be asked."""
+        parts = self.unpack(memory, self.states_in(memory))
+        awake = parts["misaligned"].squeeze(-1) == 1.0
+        idle = self.asleep(parts, executed)
+
+        def asked(memory: Tensor, executed: Tensor) -> Sequence[Tensor]:
+            return self.foresee(self.unpack(memory, self.states_in(memory)), executed)
+
+        still = [idle["forecasts"], idle["under_way"]]
+        forecasts, under_way = somewhere(awake, asked, still, memory, executed)
+        return self.pack({**parts, "forecasts": forecasts, "under_way": under_way})
 
     def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
         """Return the forecasts of all models, and what is under way."""

@@ -7,9 +7,7 @@ through the effects of the commands that are still under way.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -21,39 +19,6 @@ if TYPE_CHECKING:
     from afm_rl.correction.base import Corrector
 
 LEAST = 1e-3  # share of the best that every delay keeps on every axis: none decides alone
-FILTER = 12  # commands that a lag looks back on
-
-
-class Late(NamedTuple):
-    """When commands act."""
-
-    delay: int = 0
-    """Steps from a command to its effect."""
-    lag: float = 0.0
-    """Time constant with which effects follow commands, in steps."""
-
-
-LATE = {f"delay_{k}": Late(delay=k) for k in range(1, 9)}
-LATE |= {f"lag_{k}": Late(lag=k) for k in range(1, 4)}
-NOW = "gain_12"
-"""The gain of commands that are not late, as there is one for each way of :data:`LATE`."""
-
-
-def acting_of(ways: Sequence[Late]) -> Tensor:
-    """Return what commands weigh in what acts now, by age, the oldest first, ``(W, L)``.
-
-    >>> acting_of([Late(), Late(delay=2)])
-    tensor([[0., 0., 1.],
-            [1., 0., 0.]])
-    """
-    length = 1 + max((way.delay + (FILTER - 1 if way.lag else 0) for way in ways), default=0)
-    acting = torch.zeros(len(ways), length)
-    for row, (delay, lag) in zip(acting, ways, strict=True):
-        count, keep = (FILTER, math.exp(-1 / lag)) if lag else (1, 0.0)
-        for k in range(count):
-            share = 1.0 if k == count - 1 else 1 - keep  # the oldest stands for those before it
-            row[-1 - delay - k] = share * keep**k
-    return acting
 
 
 def delay_tables(delays: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:

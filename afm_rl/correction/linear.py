@@ -13,27 +13,6 @@ from torch import Tensor
 from afm_rl.compiling.tracing import cached
 from afm_rl.spaces.small_matrices import add_diagonal, solve_positive
 
-LINEAR = (
-    "reversed",
-    "offset_1",
-    "offset_3",
-    "gain_3",
-    "gain",
-    "line_12",
-    "line",
-    "drift",
-    "arx",
-    "affine",
-    "driven",
-)
-"""The opposite of the command; offset at a gain of one; gain; gain and offset (*line*); gain and
-the newest offset (*drift*); what goes on from row to row (*arx*); affine map; an axis as another
-command drives it (swapped cables). Of the newest rows, or of all pairs."""
-MIXING = ("affine", "driven")
-"""Those by which a command moves other axes. Of a gait they say what a delay says, so they are of
-what is sent now whatever delay is believed: else that would never be taken back."""
-CALM = ("only so fast", "noisy readings")
-"""Models by which there is nothing to correct: :func:`within_rate`, and :func:`sensor_noise`."""
 PRIOR = 1e-4  # weight of the nominal map in every fit
 LEAST_GAIN = 0.02  # smallest gain that is divided by
 EXACT = 0.02  # a fit that misses by less explains all rows
@@ -91,18 +70,19 @@ def fit_late(acted: Tensor, came: Tensor, weight: Tensor) -> Tensor:
 
 
 def fit_lines(sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor) -> Lines:
-    r"""Fit all :data:`LINEAR` models by least squares, with a weak prior D = 1, b = 0.
+    r"""Fit all linear :data:`~afm_rl.correction.hypotheses.HYPOTHESES`, in their order.
+
+    By least squares, with a weak prior D = 1, b = 0.
 
     Args:
-        sent: commands, the oldest first, ``(B, M, A)``; what mixes axes (:data:`MIXING`) is fitted
-            to them.
+        sent: commands, the oldest first, ``(B, M, A)``; what mixes axes is fitted to them.
         acted: those that acted, if they act late; the others are fitted to them.
         came: the effects.
         weight: of the rows, ``(B, M, A)``.
 
     >>> u = torch.tensor([[[0.5], [-1.0], [0.2]]])
     >>> lines = fit_lines(u, u, 0.1 - 2 * u, torch.ones(1, 3, 1))
-    >>> lines.effect(torch.ones(1, 1, 1))[0, LINEAR.index("line_12")].round(decimals=2)
+    >>> lines.effect(torch.ones(1, 1, 1))[0, 5].round(decimals=2)  # a line through twelve rows
     tensor([[-1.9000]])
     """
     sent, u, v, weight = (x.mT.double() for x in (sent, acted, came, weight))  # (B, A, M)

@@ -13,9 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.correction.experts import Rows
-from afm_rl.correction.late import LATE
-from afm_rl.correction.linear import CALM
-from afm_rl.errors import ConfigurationError, check_choice
 
 AGE = 20.0  # steps that separate two pairs as much as one unit of place does
 FAR = 1e3  # squared distance beyond all
@@ -102,51 +99,6 @@ class Reader(nn.Module):
         if kind == "varied":
             return _varied(pairs, self.size, self.rows)
         return pairs[..., -self.rows :, :]
-
-
-def cause_of(model: str, known: int = 0) -> str:
-    """Return what a model of the belief says of the actuators, in plain words.
-
-    Args:
-        model: name of one.
-        known: steps that actions are known to be late by.
-
-    >>> [cause_of(model) for model in ("delay_2", "only lag_1", "gain_12")]
-    ['2 steps late', 'slow', 'a recent change']
-    """
-    name = model.removeprefix("only ")
-    if name in LATE:
-        steps = LATE[name].delay + known
-        return "slow" if LATE[name].lag else f"{steps} step{'s' * (steps > 1)} late"
-    if name in READINGS and READINGS[name].kind == "near":
-        return "another ground"
-    return model if model in ("nothing has changed", *CALM) else "a recent change"
-
-
-def check_readings(names: Sequence[str], by_place: bool) -> tuple[list[str], list[str]]:
-    """Return the names of readings, and those of :data:`~afm_rl.correction.late.LATE`.
-
-    Readings by place are dropped without a place.
-
-    Raises:
-        ConfigurationError: if it is no list of such names, or none by time is left.
-
-    >>> check_readings(["near", "delay_1", "recent"], by_place=True)
-    (['near', 'recent'], ['delay_1'])
-    """
-    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
-        raise ConfigurationError(
-            f"corrector.readings={names!r}: expected a list of {', '.join([*READINGS, *LATE])}"
-        )
-    for name in names:
-        check_choice("corrector.readings", name, {**READINGS, **LATE})
-    kinds = {name: READINGS[name].kind for name in names if name in READINGS}
-    if "newest" not in kinds.values():
-        raise ConfigurationError(
-            f"corrector.readings={list(names)!r}: expected one by time, such as recent"
-        )
-    read = [name for name in kinds if by_place or kinds[name] != "near"]
-    return read, [name for name in names if name in LATE]
 
 
 def _nearest(pairs: Tensor, away: Tensor, rows: int) -> Tensor:

@@ -12,13 +12,10 @@ from torch import Tensor, nn
 from afm_rl.compiling.tracing import somewhere
 from afm_rl.correction.achievable import MODES, attainable, extend
 from afm_rl.correction.belief import mean_and_std
-from afm_rl.correction.believing import Answer
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
+from afm_rl.correction.hypotheses import KINDS, Hypothesis, acting_of
 from afm_rl.correction.late import ago, aligned
 from afm_rl.correction.linear import (
-    CALM,
-    LINEAR,
-    MIXING,
     Lines,
     fit_late,
     fit_lines,
@@ -31,6 +28,26 @@ from afm_rl.correction.readings import Reader
 from afm_rl.errors import check_choice, check_count, check_number
 
 ENOUGH = 0.02  # expected loss that an action must save to be preferred to the plan
+
+
+class Answer(NamedTuple):
+    """What the models make of plans, in units of the action."""
+
+    executed: Tensor
+    """The action, ``(B, A)``."""
+    predicted: Tensor
+    """The effect that is expected of it, ``(B, A)``."""
+    spread: Tensor
+    """Standard deviation of the proposals, ``(B, A)``."""
+    bounds: Tensor
+    """Lowest and highest effect that an action may have, ``(B, 2, A)``."""
+    corrects: Tensor
+    """Is any model believed more than that nothing has changed? ``(B)``."""
+    forecasts: Tensor
+    """The effects that the models expect of what acts now, shares of the largest action,
+    ``(B, M, A)``; the first is that of *nothing has changed*."""
+    under_way: Tensor
+    """The effects that the newest commands have or will have, likewise, ``(B, K + D, A)``."""
 
 
 class Read(NamedTuple):
@@ -83,36 +100,35 @@ class Tick(nn.Module):
         self,
         network: AxisNetwork,
         scale: Tensor,
-        readings: Sequence[str],
+        hypotheses: Sequence[Hypothesis],
         rows: int,
-        delays: Tensor,
-        acting: Tensor,
-        ways: Tensor,
         samples: int,
         source_std: float,
         steps: int,
         saturation: str,
     ) -> None:
         super().__init__()
-        self.network, size = network, len(scale)
+        self.network, self.rows, size = network, rows, len(scale)
         self.source_std = check_number("corrector.source_std", source_std, low=0.0)
         self.steps = check_count("corrector.steps", steps)
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
-        self.reader = Reader(readings, rows, size)
-        self.rows = rows
-        self.counts = [1, len(readings), len(LINEAR), len(ways) - 1, len(ways), len(CALM)]
+        kinds = {kind: [row for row in hypotheses if row.kind == kind] for kind in KINDS}
+        self.counts = [len(of_kind) for of_kind in kinds.values()]
+        self.reader = Reader([row.name for row in kinds["network"]], rows, size)
+        ways = acting_of([*kinds["nominal"], *kinds["delay"]])
+        delays = torch.tensor([-1 if row.follows_delay else row.delay for row in hypotheses])
         self.most_late = max(delays.tolist())
-        filters, which = filters_of(acting)
+        filters, which = filters_of(acting_of(hypotheses))
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "delays": delays,
             # Of readings that are alike the first, on any machine and in any batch.
-            "earlier": 1 - 1e-4 * torch.arange(len(readings)).unsqueeze(-1),
+            "earlier": 1 - 1e-4 * torch.arange(self.counts[1]).unsqueeze(-1),
             "filters": filters,
             "filtered": torch.nn.functional.one_hot(which).T.to(scale),
-            "mixing": torch.tensor([name in MIXING for name in LINEAR]).unsqueeze(-1),
+            "mixing": torch.tensor([row.mixes_axes for row in kinds["linear"]]).unsqueeze(-1),
             "windows": torch.arange(rows).unsqueeze(-1) + torch.arange(ways.shape[-1]),
             "ways": ways,
         }
@@ -160,7 +176,7 @@ class Tick(nn.Module):
             return first, self.expect(models, acts.unsqueeze(1)).squeeze(2)
 
         action, effects = somewhere((lag > 0).any(-1), led, [action, effects])
-        calm = weights[:, 0] + weights[:, -len(CALM) :].sum(1)
+        calm = weights[:, 0] + weights[:, -self.counts[-1] :].sum(1)
         changed = calm < 0.5  # else the plan, to the bit
         corrects = changed & action.isfinite().all(-1, True)
         action = torch.where(corrects, action, proposals[:, 0])
@@ -198,12 +214,12 @@ class Tick(nn.Module):
 
     def most_likely(self, found: Read, weights: Tensor) -> Models:
         """Return the models of which an action is chosen."""
-        still, read, linear, late, gained, calm = weights.split(self.counts, 1)
+        still, read, linear, late, gained, healthy = weights.split(self.counts, 1)
         best = found.encoded.choose((read * self.earlier).argmax(1))
         gain = found.late.gather(1, gained.argmax(1, keepdim=True))  # (B, 1, A)
         matrix = torch.cat([found.lines.matrix, torch.diag_embed(gain)], 1)
         lines = Lines(matrix, torch.nn.functional.pad(found.lines.bias, (0, 0, 0, 1)))
-        still = torch.cat([still, late, calm], 1).sum(1, keepdim=True)
+        still = torch.cat([still, late, healthy], 1).sum(1, keepdim=True)
         read, gained = (part.sum(1, keepdim=True) for part in (read, gained))
         return Models(best, lines, torch.cat([still, read, linear, gained], 1))
 

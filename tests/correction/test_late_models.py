@@ -1,26 +1,10 @@
 """Commands that act late, or slowly."""
 
-import math
-
 import pytest
 import torch
 
-from afm_rl.correction.late import FILTER, Late, acting_of, aligned, delay_tables, steps_late
+from afm_rl.correction.late import aligned, delay_tables, steps_late
 from afm_rl.correction.linear import fit_late
-
-
-@pytest.mark.parametrize("lag", [1, 2, 3])
-@pytest.mark.parametrize("delay", [0, 2])
-def test_what_acts_follows_the_commands_as_a_low_pass_filter_does(lag, delay):
-    commands = torch.rand(FILTER + delay, generator=torch.Generator().manual_seed(0))
-    slow = commands[0]  # those before the oldest were the same
-    for command in commands[1 : len(commands) - delay]:
-        slow = command + math.exp(-1 / lag) * (slow - command)
-    torch.testing.assert_close((acting_of([Late(delay, lag)]) * commands).sum(), slow)
-
-
-def test_without_any_way_a_command_acts_at_once():
-    assert torch.equal(acting_of([Late()]), torch.ones(1, 1))
 
 
 @pytest.mark.parametrize("late", [1, 3])

@@ -3,8 +3,10 @@
 import pytest
 import torch
 
-from afm_rl.correction.linear import LINEAR, fit_lines
+from afm_rl.correction.hypotheses import HYPOTHESES
+from afm_rl.correction.linear import fit_lines
 
+LINEAR = [row.name for row in HYPOTHESES if row.kind == "linear"]
 DRIVEN, AFFINE = LINEAR.index("driven"), LINEAR.index("affine")
 
 

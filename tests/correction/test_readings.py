@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from afm_rl.correction import readings
-from afm_rl.correction.readings import READINGS, Reader, Reading, check_readings
-from afm_rl.errors import ConfigurationError
+from afm_rl.correction.readings import READINGS, Reader, Reading
 
 MANY = 20
 AGES = torch.arange(float(MANY)).unsqueeze(-1)
@@ -96,27 +95,6 @@ def test_batches_are_read_one_by_one(axes):
     for k in range(5):
         single = reader(pairs[k], place[k])
         assert all(torch.equal(one, many[k]) for one, many in zip(single, together, strict=True))
-
-
-def test_names_of_readings_and_of_ways_to_be_late():
-    mixed = ["near", "varied", "recent", "lag_1", "delay_3"]
-    assert check_readings(mixed, by_place=True) == (mixed[:3], mixed[3:])
-    assert check_readings(mixed, by_place=False) == (mixed[1:3], mixed[3:])
-
-
-@pytest.mark.parametrize(
-    ("names", "complaint"),
-    [
-        ("recent", "expected a list of"),
-        ([], "expected a list of"),
-        (["late"], "'late': expected one of recent"),
-        (["near", "delay_1"], "expected one by time"),
-    ],
-    ids=str,
-)
-def test_a_list_that_cannot_be_used_is_refused(names, complaint):
-    with pytest.raises(ConfigurationError, match=f"corrector.readings=.*{complaint}"):
-        check_readings(names, by_place=True)
 
 
 def test_varied_pairs_are_the_newest_and_those_farthest_from_all_of_them():

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from afm_rl.correction import ActionFlow, Believer
+from afm_rl.correction import ActionFlow
 from afm_rl.correction.belief import mean_and_std
 from afm_rl.dynamics import DynamicsModel, KnownDynamics
 from afm_rl.spaces.manifold import Manifold
@@ -38,11 +38,11 @@ def identity(size: int) -> KnownDynamics:
 
 
 def follow(
-    corrector: Believer, memory: Tensor, action: Tensor, model: DynamicsModel
+    corrector: ActionFlow, memory: Tensor, action: Tensor, model: DynamicsModel
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the memory when somebody else sends ``action`` ``(*B, A)``, its effect, and the std.
 
-    What :meth:`~afm_rl.correction.Believer.predict` says, and the memory as if the action had
+    What :meth:`~afm_rl.correction.ActionFlow.predict` says, and the memory as if the action had
     been corrected to itself, for the price of one of them.
     """
     seen, idle, awake, _ = corrector.watch(memory, action, model)
@@ -55,7 +55,7 @@ def follow(
 
 @torch.no_grad()
 def believe(
-    corrector: Believer,
+    corrector: ActionFlow,
     command: np.ndarray,
     response: np.ndarray,
     seen: Callable[[int], object] = lambda row: None,
@@ -85,7 +85,7 @@ def believe(
 
 
 def believe_log(
-    corrector: Believer,
+    corrector: ActionFlow,
     command: np.ndarray,
     response: np.ndarray,
     missing: np.ndarray,

@@ -1,0 +1,163 @@
+"""The hypotheses of the belief, in one table: what may the actuators do with commands?
+
+Each row of :data:`HYPOTHESES` is one model of the belief; the tick reads the table, and a new model
+is a row and the function that fits it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from afm_rl.correction.readings import READINGS
+from afm_rl.errors import ConfigurationError, check_choice
+
+FILTER = 12  # commands that a lag looks back on
+KINDS = ("nominal", "network", "linear", "delay", "delayed gain", "healthy")
+
+
+class Hypothesis(NamedTuple):
+    """One model of what commands do."""
+
+    name: str
+    kind: str
+    """What forecasts. "nominal": the command itself; "network": the network, which has read some
+    pairs (:mod:`~afm_rl.correction.readings`); "linear": a fit
+    (:func:`~afm_rl.correction.linear.fit_lines`, in this order); "delay": earlier commands, as the
+    row says; "delayed gain": the same times a gain that is fitted; "healthy": models by which there
+    is nothing to correct (:func:`~afm_rl.correction.linear.within_rate`,
+    :func:`~afm_rl.correction.linear.sensor_noise`)."""
+    delay: int = 0
+    """Steps from a command to its effect."""
+    lag: float = 0.0
+    """Time constant with which effects follow commands, in steps."""
+    follows_delay: bool = True
+    """Does it take any delay that is believed, or always its own?"""
+    log_prior: float | None = 0.0
+    """Prior log-odds against a network's reading; None: those of a fit, ``plain``."""
+    cause: str = "a recent change"
+    """In plain words."""
+
+    @property
+    def mixes_axes(self) -> bool:
+        """Can a command move other axes?"""
+        return self.kind == "linear" and not self.follows_delay
+
+
+def delayed(steps: int) -> str:
+    """Return in words that commands are late.
+
+    >>> delayed(1), delayed(2)
+    ('1 step late', '2 steps late')
+    """
+    return f"{steps} step{'s' * (steps > 1)} late"
+
+
+def _slow(kind: str, prefix: str = "") -> list[Hypothesis]:
+    """Return the rows of a kind for delays of one to eight steps, and for three lags."""
+    late = [
+        Hypothesis(f"{prefix}delay_{k}", kind, delay=k, follows_delay=False, cause=delayed(k))
+        for k in range(1, 9)
+    ]
+    return late + [
+        Hypothesis(f"{prefix}lag_{k}", kind, lag=k, follows_delay=False, cause="slow")
+        for k in range(1, 4)
+    ]
+
+
+NOMINAL = Hypothesis("nothing has changed", "nominal", follows_delay=False)
+HYPOTHESES = (
+    NOMINAL._replace(cause=NOMINAL.name),
+    *(
+        Hypothesis(name, "network", cause="another ground" if by_place else "a recent change")
+        for name, by_place in ((name, row.kind == "near") for name, row in READINGS.items())
+    ),
+    # The opposite of the command: it needs no fit, and says what every action does.
+    Hypothesis("reversed", "linear"),
+    # An offset at a gain of one; a gain; gain and offset (a line): of the newest rows, or of all.
+    Hypothesis("offset_1", "linear", log_prior=None),
+    Hypothesis("offset_3", "linear", log_prior=None),
+    Hypothesis("gain_3", "linear", log_prior=None),
+    Hypothesis("gain", "linear", log_prior=None),
+    Hypothesis("line_12", "linear", log_prior=None),
+    Hypothesis("line", "linear", log_prior=None),
+    Hypothesis("drift", "linear", log_prior=None),  # gain, and the newest offset
+    Hypothesis("arx", "linear", log_prior=None),  # what goes on from row to row
+    # In periodic motion coupling looks like a delay. These are of the present command, whatever
+    # delay is believed, so that a wrong one can be rejected.
+    Hypothesis("affine", "linear", follows_delay=False),
+    Hypothesis("driven", "linear", follows_delay=False),  # by the command of another axis: swapped
+    *_slow("delay"),
+    # The gain of commands that are not late, as there is one for every delay and lag.
+    Hypothesis("gain_now", "delayed gain", follows_delay=False, log_prior=None),
+    *_slow("delayed gain", "gain_"),
+    Hypothesis("only so fast", "healthy", cause="only so fast"),
+    Hypothesis("noisy readings", "healthy", cause="noisy readings"),
+)
+"""All of them, kind by kind in the order of :data:`KINDS`. The prior of the first is a setting,
+``odds``, and those with a delayed gain share one."""
+CHOICES = [row.name for row in HYPOTHESES if row.kind in ("network", "delay")]
+"""What a robot may name: the others are always there, a delayed gain with its delay."""
+
+
+def choose(names: Sequence[str] | None, by_place: bool, plain: float) -> tuple[Hypothesis, ...]:
+    """Return the hypotheses of a robot, each with its prior log-odds.
+
+    Args:
+        names: of :data:`CHOICES`; all if None.
+        by_place: may the ground differ from place to place? Readings by place are dropped else.
+        plain: prior log-odds of a fit against a reading of the network.
+
+    Raises:
+        ConfigurationError: if it is no list of such names, or none by time is left.
+
+    >>> rows = choose(["near", "recent", "lag_1"], by_place=False, plain=-6.0)
+    >>> [row.name for row in rows if row.kind not in ("linear", "healthy")]
+    ['nothing has changed', 'recent', 'lag_1', 'gain_now', 'gain_lag_1']
+    """
+    names = CHOICES if names is None else names
+    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
+        raise ConfigurationError(
+            f"corrector.readings={names!r}: expected a list of {', '.join(CHOICES)}"
+        )
+    for name in names:
+        check_choice("corrector.readings", name, CHOICES)
+    if not any(name in READINGS and READINGS[name].kind != "near" for name in names):
+        raise ConfigurationError(
+            f"corrector.readings={list(names)!r}: expected one by time, such as recent"
+        )
+
+    def chosen(row: Hypothesis) -> bool:
+        if row.kind == "network" and READINGS[row.name].kind == "near" and not by_place:
+            return False
+        name = row.name.removeprefix("gain_") if row.kind == "delayed gain" else row.name
+        return name in names or name not in CHOICES
+
+    rows = [row for row in HYPOTHESES if chosen(row)]
+    shared = math.log(max(1, sum(row.kind == "delay" for row in rows)))
+    priors = [
+        plain if row.log_prior is None else row.log_prior - shared * (row.kind == "delayed gain")
+        for row in rows
+    ]
+    return tuple(row._replace(log_prior=prior) for row, prior in zip(rows, priors, strict=True))
+
+
+def acting_of(rows: Sequence[Hypothesis]) -> Tensor:
+    """Return what commands weigh in what acts now, by age, the oldest first, ``(W, L)``.
+
+    >>> acting_of([NOMINAL, NOMINAL._replace(delay=2)])
+    tensor([[0., 0., 1.],
+            [1., 0., 0.]])
+    """
+    length = 1 + max((row.delay + (FILTER - 1 if row.lag else 0) for row in rows), default=0)
+    acting = torch.zeros(len(rows), length)
+    for weights, row in zip(acting, rows, strict=True):
+        count, keep = (FILTER, math.exp(-1 / row.lag)) if row.lag else (1, 0.0)
+        for k in range(count):
+            share = 1.0 if k == count - 1 else 1 - keep  # the oldest stands for those before it
+            weights[-1 - row.delay - k] = share * keep**k
+    return acting
