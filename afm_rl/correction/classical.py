@@ -11,8 +11,14 @@ from torch import Tensor
 from afm_rl.compiling.tracing import somewhere
 from afm_rl.correction.achievable import MODES, saturate
 from afm_rl.correction.base import Correction, Fields
-from afm_rl.correction.experts import OUTLIER, Rows, confidence
-from afm_rl.correction.linear import PRIOR, fit_affine, invert_affine, not_zero, solve_line
+from afm_rl.correction.experts import Rows, confidence
+from afm_rl.correction.least_squares import (
+    fit_affine,
+    fit_gain,
+    fit_line,
+    invert_affine,
+    not_zero,
+)
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_choice, check_number
@@ -99,7 +105,7 @@ class LeastSquares(ClassicalCorrector):
     r"""Certainty-equivalent adaptive control: fit the regime, execute the inverse.
 
     Executes :math:`g^{-1} u_0` (``form="gain"``), :math:`g^{-1} (u_0 - b)` with a robust fit
-    (``"gain_offset"``, :func:`fit_gain_offset`) or :math:`D^{-1} (u_0 - b)`
+    (``"gain_offset"``, :func:`fit_line`) or :math:`D^{-1} (u_0 - b)`
     (``"affine"``), saturated. Pairs count by their age and, all but ``"affine"``, by their noise.
     Nothing is trained; any control engineer's first answer, and the bar for a learned flow.
 
@@ -159,9 +165,9 @@ class LeastSquares(ClassicalCorrector):
             return fit_affine(executed, effective, weight)
         weight = weight * confidence(std)
         if self.form == "gain":
-            gain = fit_gain(executed, effective, weight)
+            gain = not_zero(fit_gain(executed, effective, weight))
             return gain, torch.zeros_like(gain)
-        return fit_gain_offset(executed, effective, weight)
+        return fit_line(executed, effective, weight)
 
 
 class L1Augmentation(ClassicalCorrector):
@@ -259,59 +265,3 @@ def weigh(valid: Tensor, forgetting: float) -> Tensor:
     """
     age = torch.arange(valid.shape[-2] - 1, -1, -1, device=valid.device, dtype=valid.dtype)
     return valid * (forgetting**age).unsqueeze(-1)
-
-
-def fit_gain(executed: Tensor, effective: Tensor, weight: Tensor) -> Tensor:
-    r"""Fit :math:`u_\mathrm{eff} = g \odot u`, each axis for itself, with a weak prior g = 1.
-
-    .. math:: g = \frac{\sum_k w_k u_k u_{\mathrm{eff},k} + \rho}{\sum_k w_k u_k^2 + \rho}
-
-    Args:
-        executed: u, ``(*B, K, A)``.
-        effective: its effective action, ``(*B, K, A)``.
-        weight: of pairs, ``(*B, K, 1)``, or of pairs and axes, ``(*B, K, A)``.
-
-    Returns:
-        Gains ``(*B, A)``, none smaller than 0.02 in size.
-
-    >>> u = torch.tensor([[0.5], [-1.0]])
-    >>> fit_gain(u, -2 * u, weigh(torch.ones(2, 1), 0.8)).round(decimals=2)
-    tensor([-2.])
-    """
-    pull = weight * executed
-    cross = (pull * effective).sum(-2) + PRIOR
-    return not_zero(cross / ((pull * executed).sum(-2) + PRIOR))
-
-
-def fit_gain_offset(
-    executed: Tensor, effective: Tensor, weight: Tensor, rounds: int = 2
-) -> tuple[Tensor, Tensor]:
-    r"""Fit :math:`u_\mathrm{eff} = g \odot u + b` robustly, each axis for itself.
-
-    Iteratively reweighted least squares with Cauchy weights
-    :math:`1 / (1 + (r / 0.1)^2)` of the residuals r, and a weak prior g = 1, b = 0.
-
-    Args:
-        executed: u, ``(*B, K, A)``.
-        effective: its effective action, ``(*B, K, A)``.
-        weight: of pairs and axes, ``(*B, K, A)``.
-        rounds: times that the weights are renewed.
-
-    Returns:
-        Gains, none smaller than 0.02 in size, and offsets, ``(*B, A)`` each.
-
-    >>> u = torch.tensor([[0.5], [-1.0], [0.2]])
-    >>> gain, offset = fit_gain_offset(u, 0.5 * u + 0.1, torch.ones(3, 1))
-    >>> gain.round(decimals=2), offset.round(decimals=2)
-    (tensor([0.5000]), tensor([0.1000]))
-    """
-    ones = torch.ones_like(executed)
-    terms = torch.stack([executed * executed, executed, ones, executed * effective, effective], -3)
-    robust = weight
-    for turn in range(rounds + 1):
-        square, mean, mass, cross, shift = (terms * robust.unsqueeze(-3)).sum(-2).unbind(-2)
-        gain, offset = solve_line(square + PRIOR, mean, mass + 10 * PRIOR, cross + PRIOR, shift)
-        if turn < rounds:
-            miss = effective - (gain.unsqueeze(-2) * executed + offset.unsqueeze(-2))
-            robust = weight / (1 + (miss / OUTLIER).square())
-    return not_zero(gain), offset

@@ -9,10 +9,9 @@ from torch import Tensor
 
 from afm_rl.compiling.tracing import cached
 from afm_rl.correction.achievable import LIMIT, saturate
-from afm_rl.correction.linear import moments_of, not_zero, solve_line
+from afm_rl.correction.least_squares import OUTLIER, moments_of, not_zero, solve_line
 
 NOISE = 0.1  # half ranges: a pair with this standard deviation counts half
-OUTLIER = 0.1  # half ranges: a residual of this size halves a pair's weight in the robust fit
 LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
 NEAR = 0.15  # half ranges: a pair so far from the question counts half as much
 SHORT, LONG = 0.5, 0.9  # forgetting per row

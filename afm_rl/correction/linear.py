@@ -11,10 +11,16 @@ import torch
 from torch import Tensor
 
 from afm_rl.compiling.tracing import cached
+from afm_rl.correction.least_squares import (
+    PRIOR,
+    fit_affine,
+    invert_affine,
+    moments_of,
+    not_zero,
+    solve_line,
+)
 from afm_rl.spaces.small_matrices import add_diagonal, solve_positive
 
-PRIOR = 1e-4  # weight of the nominal map in every fit
-LEAST_GAIN = 0.02  # smallest gain that is divided by
 EXACT = 0.02  # a fit that misses by less explains all rows
 LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
 WINDOWS = (1, 3, 12, 0)  # rows; 0: all
@@ -38,35 +44,6 @@ class Lines(NamedTuple):
         """Return the actions ``(B, L, A)`` whose effects come nearest to plans ``(B, A)``."""
         plan = planned[:, None, :, None]
         return invert_affine(self.matrix, self.bias.unsqueeze(-1), plan).squeeze(-1)
-
-
-def precision_of(std: Tensor, valid: Tensor) -> Tensor:
-    r"""Return the weights ``(B, M, A)`` of rows: :math:`1 / \sigma^2`, less than that of the best.
-
-    Args:
-        std: standard deviation of the effects, ``(B, M, A)``.
-        valid: which rows count, ``(B, M, 1)``, 0 or 1.
-    """
-    weight = valid * (std.square() + PRIOR).reciprocal()
-    return weight / weight.amax(-2, keepdim=True).clamp_min(PRIOR)
-
-
-def fit_late(acted: Tensor, came: Tensor, weight: Tensor) -> Tensor:
-    """Return the gains ``(B, W, A)`` of commands that act late in W ways.
-
-    Args:
-        acted: of commands what acted, ``(B, K, W, A)``.
-        came: effects, ``(B, K, A)``.
-        weight: of the rows, ``(B, K, A)``.
-
-    >>> acted = torch.tensor([[[[0.5], [0.0]], [[-1.0], [0.5]]]])
-    >>> fit_late(acted, torch.tensor([[[0.0], [-0.5]]]), torch.ones(1, 2, 1)).round(decimals=1)
-    tensor([[[ 0.4000],
-             [-1.0000]]])
-    """
-    pull = weight.unsqueeze(-2) * acted
-    cross, square = (pull * came.unsqueeze(-2)).sum(1), (pull * acted).sum(1)
-    return (cross + PRIOR) / (square + PRIOR)
 
 
 def fit_lines(sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor) -> Lines:
@@ -108,24 +85,6 @@ def _windows(length: int, device: torch.device) -> Tensor:
     """Return which rows are in each window, ``(W, M)``."""
     age = torch.arange(length - 1, -1, -1, device=device)
     return torch.stack([age < (rows or length) for rows in WINDOWS]).double()
-
-
-@cached(maxsize=16)
-def _prior(device: torch.device) -> Tensor:
-    """Return the moments of the prior, ``(5,)``."""
-    moment = torch.arange(5, device=device)
-    slope, mass = (moment == 0) | (moment == 3), moment == 2
-    return PRIOR * (slope.double() + 10 * mass.double())  # written so that it can be exported
-
-
-def moments_of(weights: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, ...]:
-    r"""Return what a line needs to know of rows u, v ``(*B, K)``, with a weak prior.
-
-    These are :math:`\sum w u^2`, :math:`\sum w u`, :math:`\sum w`, :math:`\sum w u v` and
-    :math:`\sum w v`, ``(*B, W)`` each, for W weights of the rows ``(*B, W, K)``.
-    """
-    terms = torch.stack([u * u, u, torch.ones_like(u), u * v, v], -1)
-    return (weights @ terms + _prior(u.device)).unbind(-1)
 
 
 def sensor_noise(sent: Tensor, came: Tensor, valid: Tensor, keep: float = 0.7) -> Tensor:
@@ -218,54 +177,3 @@ def _driven(
     explained = swapped & (left < 2 * EXACT**2) & (mass > LEAST_ROWS)
     chosen = torch.zeros_like(gain).scatter(-1, driver, gain.gather(-1, driver))
     return torch.where(explained, chosen, else_matrix), torch.where(explained, 0.0, else_bias)
-
-
-def solve_line(
-    square: Tensor, mean: Tensor, mass: Tensor, cross: Tensor, shift: Tensor
-) -> tuple[Tensor, Tensor]:
-    r"""Return slope and offset ``(*B)`` of weighted least squares, given its moments ``(*B)``.
-
-    See :func:`moments_of`.
-    """
-    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
-    slope = (mass * cross - mean * shift) / determinant
-    return slope, (square * shift - mean * cross) / determinant
-
-
-def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Fit :math:`u_\mathrm{eff} = D u + b` with a weak prior D = 1, b = 0.
-
-    Args:
-        executed: u, ``(*B, K, A)``.
-        effective: its effective action, ``(*B, K, A)``.
-        weight: of pairs, ``(*B, K, 1)``, or of pairs and axes: then every row of D has its own.
-
-    Returns:
-        D ``(*B, A, A)`` and b ``(*B, A)``.
-    """
-    size = executed.shape[-1]
-    inputs = torch.nn.functional.pad(executed, (0, 1), value=1.0)
-    outer = (inputs.unsqueeze(-1) * inputs.unsqueeze(-2)).flatten(-2)  # (*B, K, (A + 1)^2)
-    square = add_diagonal((weight.mT @ outer).unflatten(-1, (size + 1, size + 1)), PRIOR)
-    cross = add_diagonal((weight * effective).mT @ inputs, PRIOR)
-    solution = solve_positive(square, cross.unsqueeze(-1)).squeeze(-1)
-    return solution[..., :-1], solution[..., -1]
-
-
-def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:
-    """Return the actions ``(*B, A, C)`` whose effects come nearest to what is wanted.
-
-    Of :func:`fit_affine`. A small ridge keeps them finite where the matrix is all but singular.
-
-    Args:
-        matrix: D, ``(*B, A, A)``.
-        bias: b, ``(*B, A, 1)``.
-        unit: what is wanted, ``(*B, A, C)``.
-    """
-    square = add_diagonal(matrix.mT @ matrix, LEAST_GAIN**2)
-    return solve_positive(square, matrix.mT @ (unit - bias))
-
-
-def not_zero(gain: Tensor) -> Tensor:
-    """Return gains that can be divided by: none smaller than 0.02 in size."""
-    return gain.abs().clamp_min(LEAST_GAIN).copysign(gain)

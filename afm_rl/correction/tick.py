@@ -15,11 +15,10 @@ from afm_rl.correction.belief import mean_and_std
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.hypotheses import KINDS, Hypothesis, acting_of
 from afm_rl.correction.late import ago, aligned
+from afm_rl.correction.least_squares import fit_gain, precision_of
 from afm_rl.correction.linear import (
     Lines,
-    fit_late,
     fit_lines,
-    precision_of,
     sensor_noise,
     within_rate,
 )
@@ -206,8 +205,9 @@ class Tick(nn.Module):
         sound = (valid == 1.0).to(pairs)
         weight = precision_of(torch.hypot(std, noise.unsqueeze(1)), sound)
         newest = pairs[:, 1 - self.rows - self.ways.shape[-1] :, :size]
-        acted = self.ways @ newest[:, self.windows]  # (B, K, W, A)
-        gains = fit_late(acted, came[:, -self.rows :], weight[:, -self.rows :])
+        acted = (self.ways @ newest[:, self.windows]).transpose(1, 2)  # (B, W, K, A)
+        newest = (part[:, None, -self.rows :] for part in (came, weight))
+        gains = fit_gain(acted, *newest)
         lines = fit_lines(pairs[..., :size], sent, came, weight)
         noisy, slow = sensor_noise(sent, came, sound), within_rate(came, sound)
         return Read(encoded, lines, gains, noisy, slow)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from afm_rl.correction.achievable import MODES
-from afm_rl.correction.classical import fit_gain, fit_gain_offset, weigh
+from afm_rl.correction.classical import weigh
 from afm_rl.correction.experts import (
     ANSWERS,
     LIMIT,
@@ -16,7 +16,7 @@ from afm_rl.correction.experts import (
     confidence,
     fit_experts,
 )
-from afm_rl.correction.linear import fit_affine
+from afm_rl.correction.least_squares import fit_affine, fit_gain, fit_line, not_zero
 
 AXIS = torch.linspace(-1, 1, 5)
 ASKED = torch.cartesian_prod(AXIS, AXIS).unsqueeze(0)
@@ -87,9 +87,9 @@ def test_the_fits_are_those_of_the_single_functions():
     experts, pairs = fit_experts(rows), rows[:2]
     gain, offset = experts.gain.squeeze(-2), experts.offset.squeeze(-2)
     one_by_one = [
-        (gain[..., 0], fit_gain(*pairs, short)),
-        (gain[..., 1], fit_gain(*pairs, long)),
-        *zip((gain[..., 2], offset[..., 2]), fit_gain_offset(*pairs, long, rounds=1), strict=True),
+        (gain[..., 0], not_zero(fit_gain(*pairs, short))),
+        (gain[..., 1], not_zero(fit_gain(*pairs, long))),
+        *zip((gain[..., 2], offset[..., 2]), fit_line(*pairs, long, rounds=1), strict=True),
     ]
     for found, expected in one_by_one:
         torch.testing.assert_close(found, expected)
@@ -109,7 +109,7 @@ def test_sets_of_rows_do_not_mix():
             torch.testing.assert_close(found, together.execute(asked, mode)[k])
 
 
-@pytest.mark.parametrize("form", [fit_gain, fit_gain_offset, fit_affine])
+@pytest.mark.parametrize("form", [fit_gain, fit_line, fit_affine])
 def test_each_axis_has_weights_of_its_own(form):
     executed = drawn(9, 2)
     effective = torch.where(torch.arange(9).unsqueeze(-1) < 4, -executed, 0.5 * executed)
@@ -121,7 +121,7 @@ def test_each_axis_has_weights_of_its_own(form):
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=str)
-@pytest.mark.parametrize("form", [fit_gain, fit_gain_offset, fit_affine])
+@pytest.mark.parametrize("form", [fit_gain, fit_line, fit_affine])
 def test_fits_take_any_batch(form, batch):
     executed, effective = drawn(*batch, 7, 2), drawn(*batch, 7, 2, seed=1)
     found = form(executed, effective, torch.ones(*batch, 7, 2))
@@ -162,7 +162,7 @@ def test_one_outlier_does_not_move_the_robust_fit():
     executed = drawn(12, 1)
     effective = -0.7 * executed + 0.1
     effective[5] += 1.5
-    gain, offset = fit_gain_offset(executed, effective, torch.ones(12, 1))
+    gain, offset = fit_line(executed, effective, torch.ones(12, 1))
     torch.testing.assert_close(gain, torch.tensor([-0.7]), rtol=0, atol=0.06)
     torch.testing.assert_close(offset, torch.tensor([0.1]), rtol=0, atol=0.06)
 

@@ -5,8 +5,8 @@ import torch
 
 from afm_rl.correction import LeastSquares
 from afm_rl.correction.achievable import MODES
-from afm_rl.correction.classical import fit_gain, weigh
-from afm_rl.correction.linear import fit_affine
+from afm_rl.correction.classical import weigh
+from afm_rl.correction.least_squares import fit_affine, fit_gain
 from afm_rl.errors import ConfigurationError
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
