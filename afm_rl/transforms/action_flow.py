@@ -48,6 +48,8 @@ class ActionFlowTransform(CarriedTransform):
       corrected (with ``enabled=False``: so that they would be)?
     * ``(prefix, "observation")`` and ``(prefix, "arrival")`` ``(*B, S)``: the measured state, and
       the one in which the next action will act; while no action is late, the same,
+    * ``(prefix, "delay")`` ``(*B)``: in how many steps that will be, an integer; 0 at once, and
+      with ``enabled=False``,
     * ``(prefix, "innovation")`` ``(*B)``: the misalignment, in the unit of the gate,
     * ``(prefix, "spread")`` ``(*B, A)``: standard deviation of the flow's samples,
     * ``(prefix, "noise")`` ``(*B, A)``: standard deviation of effects that nothing explains,
@@ -166,7 +168,7 @@ class ActionFlowTransform(CarriedTransform):
             self.action_key,
         )
         tensordict.set(self.action_key, entries.get("executed_action").to(planned.dtype))
-        kept = tensordict.get(self.prefix).select("observation", "arrival")
+        kept = tensordict.get(self.prefix).select("observation", "arrival", "delay")
         # Environments without a state of their own go on from what is under this key.
         tensordict.set(self.observation_key, kept.get("observation"))
         return tensordict.set(self.prefix, self._believed(entries.update(kept)))
@@ -211,9 +213,9 @@ class ActionFlowTransform(CarriedTransform):
     def _seen(self, memory: Tensor, measured: Tensor) -> dict[str, Tensor]:
         """Return the entries of the present state and of that in which the next action acts."""
         there, steps = arrival(self.corrector, memory, self.model)
-        there = there.to(measured.dtype)
-        late = (steps > 0).unsqueeze(-1) & self.enabled
-        return {"observation": measured.clone(), "arrival": torch.where(late, there, measured)}
+        delay = steps if self.enabled else torch.zeros_like(steps)
+        there = torch.where((delay > 0).unsqueeze(-1), there.to(measured.dtype), measured)
+        return {"observation": measured.clone(), "arrival": there, "delay": delay}
 
     def _show(self, tensordict: TensorDictBase, there: Tensor) -> None:
         """Let policies find the state in which their action will act."""
@@ -257,6 +259,7 @@ class ActionFlowTransform(CarriedTransform):
         size = (*spec.shape, self.model.state_size)
         entries["observation"] = Unbounded(size, dtype=found.dtype)
         entries["arrival"] = Unbounded(size, dtype=found.dtype)
+        entries["delay"] = Unbounded(spec.shape, dtype=torch.long)
         if self.belief:
             size = (*spec.shape, len(self._believer.causes), self.corrector.action_size)
             entries["belief"] = Unbounded(size, dtype=found.dtype)
