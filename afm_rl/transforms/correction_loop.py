@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -25,13 +26,22 @@ from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_in
 from afm_rl.faults import fault_of, safe_action
 from afm_rl.learning.watching import Watching
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.transforms.arrival import UNSEEN, simulated_observations
-from afm_rl.transforms.memory import LATE, begin, computable, correct, corrector_for, observe
+from afm_rl.transforms.memory import (
+    LATE,
+    UNSEEN,
+    begin,
+    computable,
+    correct,
+    corrector_for,
+    observe,
+)
+from afm_rl.transforms.simulation import Simulation
 
 Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str
 State = Callable[[Any, Any], Any]
 Observe = Callable[[np.ndarray], Any]
 AS_EXPECTED = "as the model expects"
+UNKNOWN = f"{UNSEEN}; give observe=, a function from states (N, S) to observations, or late='leave'"
 SHOWN = {
     "planned": "planned_action",
     "executed": "executed_action",
@@ -94,11 +104,12 @@ class CorrectionLoop:
                 "or a DynamicsModel"
             )
         self.corrector: Any = corrector
-        if observe is None and state is None and isinstance(self.model, MuJoCoDynamics):
-            observe = simulated_observations(source, observations)
-        self.seen_in: Observe | None = observe  # None: known at the first reset, or not at all
         if state is None and isinstance(self.model, MuJoCoDynamics):
             state = _vector_state if isinstance(source, VectorEnv) else _env_state
+            simulation = Simulation(source)
+            if observe is None and simulation.seen:
+                observe = partial(_observed_in, simulation)
+        self.seen_in: Observe | None = observe  # None: known at the first reset, or not at all
         if state is None and not (isinstance(observations, Box) and len(observations.shape) == 1):
             raise ConfigurationError(
                 f"ActionFlowWrapper: observation_space={observations}: expected a Box of one "
@@ -161,7 +172,7 @@ class CorrectionLoop:
         if self.seen_in is None and np.array_equal(observations, states.numpy()):
             self.seen_in = _states
         if self.seen_in is None and self.delay is not None and self.late == "predict":
-            raise ConfigurationError(f"ActionFlowWrapper: delay={self.delay!r}: {UNSEEN}")
+            raise ConfigurationError(f"ActionFlowWrapper: delay={self.delay!r}: {UNKNOWN}")
         size, count = states.shape[-1], self.space.shape[0]
         if self.model is None:
             self.model = UnknownDynamics(Manifold(size), count)
@@ -244,7 +255,7 @@ class CorrectionLoop:
         if not self.predicts or not rows.any():
             return observations
         if self.seen_in is None:
-            warnings.warn(f"ActionFlowWrapper: commands act late: {UNSEEN}", stacklevel=3)
+            warnings.warn(f"ActionFlowWrapper: commands act late: {UNKNOWN}", stacklevel=3)
             return observations
         found = np.array(observations)
         found[rows] = self.seen_in(states.numpy()[rows])
@@ -309,6 +320,10 @@ def _observed(env: Any, observation: Any) -> Any:
 
 def _states(states: np.ndarray) -> np.ndarray:
     return states
+
+
+def _observed_in(simulation: Simulation, states: np.ndarray) -> np.ndarray:
+    return simulation.observe(states)["observation"]
 
 
 def _env_state(env: Any, observation: Any) -> np.ndarray:
