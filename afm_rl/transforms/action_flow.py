@@ -48,7 +48,8 @@ class ActionFlowTransform(CarriedTransform):
     own, and resets, branches and resumed rollouts are exact. Of use to others are
 
     * ``(prefix, "planned_action")`` and ``(prefix, "executed_action")`` ``(*B, A)``: the root
-      action stays the planned one, so losses should read the executed one,
+      action stays the planned one, which losses of policies need; models learn from the executed
+      one,
     * ``(prefix, "predicted_effect")`` ``(*B, A)``: the effect that the executed action is
       predicted to have; where nothing is corrected, itself,
     * ``(prefix, "misaligned")`` ``(*B)``: does the model misjudge actions, so that they are

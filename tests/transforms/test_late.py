@@ -1,6 +1,8 @@
 """Commands that act late: whoever acts is asked about the state in which they will."""
 
+import runpy
 from collections import deque
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -21,7 +23,7 @@ from afm_rl.regimes import Delay
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform, RegimeTransform
 
-STEPS = 60
+STEPS, ROOT = 60, Path(__file__).resolve().parents[2]
 
 
 def glide(state, action):
@@ -218,6 +220,16 @@ def test_the_transform_shows_the_same_and_keeps_what_was_measured():
         torch.testing.assert_close(td["afm", "belief"].sum(-2), torch.ones_like(ends))
     assert env.transform[1].corrector.causes[:2] == ("nothing has changed", "3 steps late")
     check_env_specs(env)
+
+
+def test_who_follows_a_clock_looks_ahead():
+    """A reference that is taken at arrival is followed as by a healthy robot."""
+    example = runpy.run_path(str(ROOT / "examples" / "transform" / "follow_a_clock.py"))
+    body, follow = example["Cart"](), example["follow"]
+    robot = ActionFlowWrapper(example["Robot"](body), body.move)
+    healthy = follow(body, example["Robot"](body, healthy=True), steps=130)
+    now, ahead = (follow(body, robot, ahead, steps=130) for ahead in (False, True))
+    assert ahead < 1.2 * healthy and now > 5 * healthy
 
 
 def test_a_policy_without_an_environment_is_told_the_same():
