@@ -281,16 +281,21 @@ class ActionFlowTransform(CarriedTransform):
         there, steps = arrival(self.corrector, memory, self.model)
         delay = steps if self.enabled else torch.zeros_like(steps)
         there = torch.where((delay > 0).unsqueeze(-1), there.to(state.dtype), state)
-        seen = tensordict.select(*self._shown).clone()
+        measured = self._measured(tensordict, state).clone()
         if self.late == "predict":
             self._show(tensordict, there, delay > 0)
-        measured = {"observation": state if seen.is_empty() else _one_or_all(seen)}
-        return {**measured, "arrival": there, "delay": delay}
+        return {"observation": measured, "arrival": there, "delay": delay}
 
     @property
-    def _shown(self) -> list[NestedKey]:
-        """Keys of what is known at arrival: the state's, or those of the simulation."""
-        return [self.observation_key] if self.simulation is None else self.simulation.seen
+    def _seen_keys(self) -> list[NestedKey]:
+        """Keys of the observations of a simulation, if they are known at arrival."""
+        return [] if self.simulation is None else self.simulation.seen
+
+    def _measured(self, tensordict: TensorDictBase, state: Tensor) -> Any:
+        """Return the observation, before it is replaced: of a simulation, or the state."""
+        if len(self._seen_keys) > 1:
+            return tensordict.select(*self._seen_keys)
+        return tensordict.get(*self._seen_keys) if self._seen_keys else state
 
     def _show(self, tensordict: TensorDictBase, there: Tensor, late: Tensor) -> None:
         """Let policies find what is observed in the state in which their action will act."""
@@ -341,20 +346,15 @@ class ActionFlowTransform(CarriedTransform):
             )
         entries = entries_spec(self.corrector, self.model.state_size, spec.shape, found.dtype)
         size = (*spec.shape, self.model.state_size)
-        seen = Composite({key: specs[key].clone() for key in self._shown}, shape=spec.shape)
-        entries["observation"] = found.clone() if seen.is_empty() else _one_or_all(seen)
+        seen = Composite({key: specs[key] for key in self._seen_keys}, shape=spec.shape)
+        first = next(iter(seen.values()), found)  # of one or none
+        entries["observation"] = (seen if len(self._seen_keys) > 1 else first).clone()
         entries["arrival"] = Unbounded(size, dtype=found.dtype)
         entries["delay"] = Unbounded(spec.shape, dtype=torch.long)
         if self.belief:
             size = (*spec.shape, len(self._believer.causes), self.corrector.action_size)
             entries["belief"] = Unbounded(size, dtype=found.dtype)
         return entries
-
-
-def _one_or_all(entries: Any) -> Any:
-    """Return the only entry, or all of several."""
-    found = list(entries.values(True, True))
-    return found[0] if len(found) == 1 else entries
 
 
 def _one_key(name: str, keys: Sequence[NestedKey]) -> NestedKey:
