@@ -106,7 +106,7 @@ def aligned(pairs: Tensor, late: Tensor, size: int) -> Tensor:
 def arrival(corrector: Corrector, memory: Tensor, model: DynamicsModel) -> tuple[Tensor, Tensor]:
     """Return the state ``(*B, S)`` in which the next command will act, and in how many steps.
 
-    The present state where no command is late, or where the model leads to no number.
+    The present state and 0 where no command is late, or where the model leads to no number.
 
     Args:
         corrector: whose memory it is.
@@ -125,5 +125,5 @@ def arrival(corrector: Corrector, memory: Tensor, model: DynamicsModel) -> tuple
         states = model.rollout(state, plan.unsqueeze(-3)).squeeze(-3)
         last = (steps - 1).clamp_min(0)[..., None, None].expand(*steps.shape, 1, state.shape[-1])
         found = states.gather(-2, last).squeeze(-2).to(state)
-        late = (steps > 0).unsqueeze(-1) & found.isfinite().all(-1, keepdim=True)
-        return torch.where(late, found, state), steps
+        steps = torch.where(found.isfinite().all(-1), steps, 0)
+        return torch.where((steps > 0).unsqueeze(-1), found, state), steps

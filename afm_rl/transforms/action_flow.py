@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -19,13 +21,18 @@ from afm_rl.spaces.keys import as_key, as_keys
 from afm_rl.transforms.carried import CarriedTransform
 from afm_rl.transforms.memory import (
     LATE,
+    UNSEEN,
     begin,
+    bounds_of,
     correct,
     corrector_for,
     entries_spec,
     observe,
     warn_of_old,
 )
+from afm_rl.transforms.simulation import SIMULATOR_STATE, Simulation, simulation_in
+
+UNKNOWN = f"{UNSEEN}; put the transform before those that change observations, or late='leave'"
 
 
 class ActionFlowTransform(CarriedTransform):
@@ -41,13 +48,16 @@ class ActionFlowTransform(CarriedTransform):
     own, and resets, branches and resumed rollouts are exact. Of use to others are
 
     * ``(prefix, "planned_action")`` and ``(prefix, "executed_action")`` ``(*B, A)``: the root
-      action stays the planned one, so losses should read the executed one,
+      action stays the planned one, which losses of policies need; models learn from the executed
+      one,
     * ``(prefix, "predicted_effect")`` ``(*B, A)``: the effect that the executed action is
       predicted to have; where nothing is corrected, itself,
     * ``(prefix, "misaligned")`` ``(*B)``: does the model misjudge actions, so that they are
       corrected (with ``enabled=False``: so that they would be)?
     * ``(prefix, "observation")`` and ``(prefix, "arrival")`` ``(*B, S)``: the measured state, and
       the one in which the next action will act; while no action is late, the same,
+    * ``(prefix, "delay")`` ``(*B)``: in how many steps that will be, an integer; 0 at once, and
+      with ``enabled=False``,
     * ``(prefix, "innovation")`` ``(*B)``: the misalignment, in the unit of the gate,
     * ``(prefix, "spread")`` ``(*B, A)``: standard deviation of the flow's samples,
     * ``(prefix, "noise")`` ``(*B, A)``: standard deviation of effects that nothing explains,
@@ -60,11 +70,19 @@ class ActionFlowTransform(CarriedTransform):
     Put it first in a ``Compose``: what follows may rescale the observation under another key
     and the action. It needs the state as the model knows it.
 
+    The state ``"simulator_state"`` is the whole one of the MuJoCo simulation inside the
+    environment, which may observe less. It is read there, unless
+    :class:`~afm_rl.transforms.SimulatorState` has written it, as it must around workers. Policies
+    are shown what is observed at arrival, and ``(prefix, "observation")`` is the measured
+    *observation*; where that has several entries, a tensordict of them.
+
     Args:
-        model: dynamics model, shared (it does not become part of the state dict).
+        model: dynamics model, shared (it does not become part of the state dict); ``"mujoco"``: the
+            environment's simulation as it is at first, with the frames that are skipped.
         corrector: the correction, owned; None: the universal
             :class:`~afm_rl.correction.ActionFlow` for the environment's action box.
-        in_keys: the state; ``["observation"]`` if None.
+        in_keys: the state; if None, ``["simulator_state"]`` with ``"mujoco"``, else
+            ``["observation"]``.
         in_keys_inv: the action; ``["action"]`` if None.
         prefix: where the entries are kept.
         enabled: False to watch only.
@@ -72,8 +90,8 @@ class ActionFlowTransform(CarriedTransform):
             predict them.
         reported_key: where the environment reports the action ``(*B, A)`` that its actuators gave
             in a step, if that is known and not what they were sent: motors that lag.
-        late: what policies find under ``in_keys`` while actions act late: ``"predict"``, the state
-            in which the next action will act; ``"leave"``, the measured one.
+        late: what policies are shown while actions act late: ``"predict"``, the state in which the
+            next action will act; ``"leave"``, the measured one.
         delay: steps from an action to its effect that are known, one number or one per axis.
         belief: keep ``(prefix, "belief")`` ``(*B, C, A)``, too: how probable the ``causes`` of the
             :class:`~afm_rl.correction.ActionFlow` are, by axis.
@@ -97,7 +115,7 @@ class ActionFlowTransform(CarriedTransform):
 
     def __init__(
         self,
-        model: DynamicsModel,
+        model: DynamicsModel | str,
         corrector: Corrector | None = None,
         in_keys: Sequence[NestedKey] | None = None,
         in_keys_inv: Sequence[NestedKey] | None = None,
@@ -111,12 +129,18 @@ class ActionFlowTransform(CarriedTransform):
     ) -> None:
         self.delay, self.belief = delay, check_flag("transform.belief", belief)
         self.late = check_choice("transform.late", late, LATE)
-        state = _one_key("in_keys", ["observation"] if in_keys is None else in_keys)
+        usual, known = "observation", None
+        if isinstance(model, str):
+            check_choice("transform.model", model, ["mujoco"])
+            usual = SIMULATOR_STATE
+        else:
+            known = check_instance("transform.model", model, DynamicsModel)
+        state = _one_key("in_keys", [usual] if in_keys is None else in_keys)
         action = _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv)
         super().__init__(state, action, prefix)
-        self.__dict__["model"] = check_instance("transform.model", model, DynamicsModel)
-        if corrector is not None:
-            corrector = corrector_for("transform", model, corrector, None, delay)
+        self.__dict__.update(_model=known, _simulation=(None, None))  # shared: not registered
+        if corrector is not None and known is not None:
+            corrector = corrector_for("transform", known, corrector, None, delay)
         self._corrector = corrector
         self.enabled = check_flag("transform.enabled", enabled)
         self.extend_action_box = check_flag("transform.extend_action_box", extend_action_box)
@@ -137,6 +161,36 @@ class ActionFlowTransform(CarriedTransform):
         return self._corrector
 
     @property
+    def model(self) -> DynamicsModel:
+        """The dynamics model; that of a simulation is known inside an environment."""
+        if self._model is None:
+            if self.parent is None:
+                raise ConfigurationError(
+                    "ActionFlowTransform.model: the simulation is not known yet; put the transform "
+                    "around an environment first"
+                )
+            try:
+                found = Simulation(self.parent).dynamics(*bounds_of(self._action_spec))
+            except ConfigurationError as error:
+                raise ConfigurationError(f"ActionFlowTransform: model='mujoco': {error}") from error
+            if self._corrector is not None:
+                corrector_for("transform", found, self._corrector, None, self.delay)
+            self.__dict__["_model"] = found
+        return self._model
+
+    @property
+    def simulation(self) -> Simulation | None:
+        """The simulation that the state is of, if it is ``"simulator_state"``."""
+        parent, found = self._simulation
+        if self.observation_key == SIMULATOR_STATE and parent is not self.parent:
+            found = simulation_in(self.parent)
+            unknown = found is not None and self.late == "predict" and not found.seen
+            if unknown and self.delay is not None:
+                raise ConfigurationError(f"ActionFlowTransform: delay={self.delay!r}: {UNKNOWN}")
+            self.__dict__["_simulation"] = self.parent, found
+        return found
+
+    @property
     def _action_spec(self):
         return self._entry("in_keys_inv", self.parent.full_action_spec)
 
@@ -147,9 +201,17 @@ class ActionFlowTransform(CarriedTransform):
         if found is None:
             raise ConfigurationError(
                 f"ActionFlowTransform: {name}=[{key!r}]: the environment has no such entry, but "
-                f"{list(specs.keys(True, True))}"
+                f"{list(specs.keys(True, True))}{self._way if name == 'in_keys' else ''}"
             )
         return found
+
+    @property
+    def _way(self) -> str:
+        """Where the whole state is, for messages."""
+        if self.observation_key == SIMULATOR_STATE or simulation_in(self.parent) is None:
+            return ""
+        way = "the whole state of its simulation is in_keys=['simulator_state'], or model='mujoco'"
+        return f"; {way}"
 
     def act(self, tensordict: TensorDictBase, memory: Tensor) -> TensorDictBase:
         """Replace the planned action by the corrected one."""
@@ -166,9 +228,10 @@ class ActionFlowTransform(CarriedTransform):
             self.action_key,
         )
         tensordict.set(self.action_key, entries.get("executed_action").to(planned.dtype))
-        kept = tensordict.get(self.prefix).select("observation", "arrival")
-        # Environments without a state of their own go on from what is under this key.
-        tensordict.set(self.observation_key, kept.get("observation"))
+        kept = tensordict.get(self.prefix).select("observation", "arrival", "delay")
+        if self.simulation is None:
+            # Environments without a state of their own go on from what is under this key.
+            tensordict.set(self.observation_key, kept.get("observation"))
         return tensordict.set(self.prefix, self._believed(entries.update(kept)))
 
     def _believed(self, entries: TensorDictBase) -> TensorDictBase:
@@ -188,37 +251,60 @@ class ActionFlowTransform(CarriedTransform):
         if self.reported_key is not None:
             given = next_tensordict.get(self.reported_key).to(memory.dtype)
             memory = self.corrector.reported(memory, given)
-        state = next_tensordict.get(self.observation_key, None)
+        state = self._state(next_tensordict)
         memory = observe(memory, state, self.model, self.corrector, self.observation_key)
-        entries |= {"memory": memory, **self._seen(memory, state)}
+        entries |= {"memory": memory, **self._seen(memory, state, next_tensordict)}
         # Of the device that the next tensordict names: else every entry is moved to where it is.
         device, batch = next_tensordict.device, next_tensordict.batch_size
-        self._show(next_tensordict, entries["arrival"])
         return next_tensordict.set(self.prefix, TensorDict(entries, batch, device=device))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         self._check_process()
-        state = tensordict_reset.get(self.observation_key, None)
+        state = self._state(tensordict_reset)
         if state is None:
             self._entry("in_keys", self.parent.full_observation_spec)
         entries = begin(self.corrector, state, self._action_spec)
-        entries.update(self._seen(entries.get("memory"), state))
-        self._show(tensordict_reset, entries.get("arrival"))
+        entries.update(self._seen(entries.get("memory"), state, tensordict_reset))
         return tensordict_reset.set(self.prefix, self._believed(entries))
 
-    def _seen(self, memory: Tensor, measured: Tensor) -> dict[str, Tensor]:
-        """Return the entries of the present state and of that in which the next action acts."""
-        there, steps = arrival(self.corrector, memory, self.model)
-        there = there.to(measured.dtype)
-        late = (steps > 0).unsqueeze(-1) & self.enabled
-        return {"observation": measured.clone(), "arrival": torch.where(late, there, measured)}
+    def _state(self, tensordict: TensorDictBase) -> Any:
+        """Return the measured state; None if there is none."""
+        state = tensordict.get(self.observation_key, None)
+        if state is None and self.simulation is not None:
+            state = self.simulation.state.to(tensordict.device or "cpu")
+        return state
 
-    def _show(self, tensordict: TensorDictBase, there: Tensor) -> None:
-        """Let policies find the state in which their action will act."""
+    def _seen(self, memory: Tensor, state: Tensor, tensordict: TensorDictBase) -> dict[str, Any]:
+        """Return the entries of what was measured and of where the next action acts."""
+        there, steps = arrival(self.corrector, memory, self.model)
+        delay = steps if self.enabled else torch.zeros_like(steps)
+        there = torch.where((delay > 0).unsqueeze(-1), there.to(state.dtype), state)
+        measured = self._measured(tensordict, state).clone()
         if self.late == "predict":
+            self._show(tensordict, there, delay > 0)
+        return {"observation": measured, "arrival": there, "delay": delay}
+
+    @property
+    def _seen_keys(self) -> list[NestedKey]:
+        """Keys of the observations of a simulation, if they are known at arrival."""
+        return [] if self.simulation is None else self.simulation.seen
+
+    def _measured(self, tensordict: TensorDictBase, state: Tensor) -> Any:
+        """Return the observation, before it is replaced: of a simulation, or the state."""
+        if len(self._seen_keys) > 1:
+            return tensordict.select(*self._seen_keys)
+        return tensordict.get(*self._seen_keys) if self._seen_keys else state
+
+    def _show(self, tensordict: TensorDictBase, there: Tensor, late: Tensor) -> None:
+        """Let policies find what is observed in the state in which their action will act."""
+        if self.simulation is None:
             tensordict.set(self.observation_key, there)
+        elif self.simulation.seen and late.any():
+            self.simulation.show(tensordict, there, late)
+        elif late.any():
+            warnings.warn(f"ActionFlowTransform: actions act late: {UNKNOWN}", stacklevel=2)
 
     def _check_process(self) -> None:
         """Refuse a copy of a model that learns in another process: it would stay behind."""
@@ -246,17 +332,25 @@ class ActionFlowTransform(CarriedTransform):
     def memory_spec(self, spec: Composite, executed: bool) -> Composite:
         """Return the specs of the entries."""
         self._check_order()
-        found = self._entry("in_keys", self.parent.full_observation_spec)
+        specs = self.parent.full_observation_spec
+        if self.simulation is not None and self.observation_key not in specs.keys(True, True):
+            state = self.simulation.state
+            found: TensorSpec = Unbounded((*spec.shape, *state.shape), dtype=state.dtype)
+        else:
+            found = self._entry("in_keys", specs)
         if not found.shape or found.shape[-1] != self.model.state_size:
             raise ConfigurationError(
                 f"ActionFlowTransform: in_keys={self.in_keys}: of the shape "
                 f"{tuple(found.shape)}, but the dynamics model's state has "
-                f"{self.model.state_size} numbers"
+                f"{self.model.state_size} numbers{self._way}"
             )
         entries = entries_spec(self.corrector, self.model.state_size, spec.shape, found.dtype)
         size = (*spec.shape, self.model.state_size)
-        entries["observation"] = Unbounded(size, dtype=found.dtype)
+        seen = Composite({key: specs[key] for key in self._seen_keys}, shape=spec.shape)
+        first = next(iter(seen.values()), found)  # of one or none
+        entries["observation"] = (seen if len(self._seen_keys) > 1 else first).clone()
         entries["arrival"] = Unbounded(size, dtype=found.dtype)
+        entries["delay"] = Unbounded(spec.shape, dtype=torch.long)
         if self.belief:
             size = (*spec.shape, len(self._believer.causes), self.corrector.action_size)
             entries["belief"] = Unbounded(size, dtype=found.dtype)

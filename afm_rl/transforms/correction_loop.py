@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -25,13 +26,22 @@ from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_in
 from afm_rl.faults import fault_of, safe_action
 from afm_rl.learning.watching import Watching
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.transforms.arrival import UNSEEN, simulated_observations
-from afm_rl.transforms.memory import LATE, begin, computable, correct, corrector_for, observe
+from afm_rl.transforms.memory import (
+    LATE,
+    UNSEEN,
+    begin,
+    computable,
+    correct,
+    corrector_for,
+    observe,
+)
+from afm_rl.transforms.simulation import Simulation
 
 Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str
 State = Callable[[Any, Any], Any]
 Observe = Callable[[np.ndarray], Any]
 AS_EXPECTED = "as the model expects"
+UNKNOWN = f"{UNSEEN}; give observe=, a function from states (N, S) to observations, or late='leave'"
 SHOWN = {
     "planned": "planned_action",
     "executed": "executed_action",
@@ -94,15 +104,12 @@ class CorrectionLoop:
                 "or a DynamicsModel"
             )
         self.corrector: Any = corrector
-        if observe is None and state is None and isinstance(self.model, MuJoCoDynamics):
-            observe = simulated_observations(source, observations)
-        elif observe is None and state is None:
-            observe = _states
-        self.seen_in: Observe | None = observe
-        if delay is not None and late == "predict" and observe is None:
-            raise ConfigurationError(f"ActionFlowWrapper: delay={delay!r}: {UNSEEN}")
         if state is None and isinstance(self.model, MuJoCoDynamics):
             state = _vector_state if isinstance(source, VectorEnv) else _env_state
+            simulation = Simulation(source)
+            if observe is None and simulation.seen:
+                observe = partial(_observed_in, simulation)
+        self.seen_in: Observe | None = observe  # None: known at the first reset, or not at all
         if state is None and not (isinstance(observations, Box) and len(observations.shape) == 1):
             raise ConfigurationError(
                 f"ActionFlowWrapper: observation_space={observations}: expected a Box of one "
@@ -123,15 +130,31 @@ class CorrectionLoop:
         """Shape of one state, once it is known."""
         return None if self.entries is None else tuple(self.states.shape[1:])
 
+    @property
+    def predicts(self) -> bool:
+        """Are observations at arrival shown while commands act late?"""
+        return self.late == "predict" and self.enabled and not self.learning
+
     @torch.no_grad()
     def begin(
-        self, states: Tensor, rows: np.ndarray | None = None, seed: int | None = None
+        self,
+        states: Tensor,
+        rows: np.ndarray | None = None,
+        seed: int | None = None,
+        observations: Any = None,
     ) -> None:
-        """Begin episodes in ``states`` ``(N, S)``; only in ``rows`` ``(N,)``, if given."""
+        """Begin episodes in ``states`` ``(N, S)``; only in ``rows`` ``(N,)``, if given.
+
+        Args:
+            states: of all environments.
+            rows: in which of them.
+            seed: of the noise of watching.
+            observations: what was measured ``(N, ...)``; the states themselves if None.
+        """
         if self.watching and seed is not None:
             self.watching.restart(seed)
         if self.entries is None:
-            self._complete(states)
+            self._complete(states, states if observations is None else observations)
         if self.watching and self.learning and self.watching.due:
             self.watching.learn()
             self.model, rows = self.watching.fitted or self.model, None
@@ -144,8 +167,12 @@ class CorrectionLoop:
             self.states = torch.where(mask.unsqueeze(-1), states, self.states)
         self.told = self._tell()
 
-    def _complete(self, states: Tensor) -> None:
+    def _complete(self, states: Tensor, observations: Any) -> None:
         """Build what depends on size and precision of the state."""
+        if self.seen_in is None and np.array_equal(observations, states.numpy()):
+            self.seen_in = _states
+        if self.seen_in is None and self.delay is not None and self.late == "predict":
+            raise ConfigurationError(f"ActionFlowWrapper: delay={self.delay!r}: {UNKNOWN}")
         size, count = states.shape[-1], self.space.shape[0]
         if self.model is None:
             self.model = UnknownDynamics(Manifold(size), count)
@@ -212,20 +239,23 @@ class CorrectionLoop:
     def at_arrival(self, observations: Any, over: np.ndarray | None = None) -> Any:
         """Return the observations ``(N, ...)`` in the states in which the next commands act.
 
+        In how many steps that is, is noted in :attr:`told`.
+
         Args:
             observations: what was measured.
             over: where episodes have ended, and nothing is predicted, ``(N,)``.
         """
-        if self.late == "leave" or not self.enabled or self.watching and self.learning:
-            return observations
         memory = self.entries.get("memory")
-        states, steps = arrival(self.corrector, memory, self.model)
-        rows = (steps > 0).numpy() & (states != self.states).any(-1).numpy()
-        rows &= np.ones_like(rows) if over is None else ~over
-        if not rows.any():
+        if self.predicts:
+            states, steps = arrival(self.corrector, memory, self.model)
+        else:
+            states, steps = self.states, self.corrector.under_way(memory)[2] * self.enabled
+        self.told["delay"] = steps.numpy().copy()
+        rows = (steps > 0).numpy() & (True if over is None else ~over)
+        if not self.predicts or not rows.any():
             return observations
         if self.seen_in is None:
-            warnings.warn(f"ActionFlowWrapper: commands act late: {UNSEEN}", stacklevel=3)
+            warnings.warn(f"ActionFlowWrapper: commands act late: {UNKNOWN}", stacklevel=3)
             return observations
         found = np.array(observations)
         found[rows] = self.seen_in(states.numpy()[rows])
@@ -233,18 +263,23 @@ class CorrectionLoop:
 
     def diagnosis(self, row: int) -> str:
         """Say in words what the pairs that an environment remembers show of its actuators."""
-        corrects = self.entries is not None and bool(self.entries.get("misaligned")[row])
-        if not corrects or not isinstance(self.corrector, PairCorrector):
+        if self.entries is None:
             return AS_EXPECTED
         memory, size = self.entries.get("memory")[row], len(self.names)
-        pairs = self.corrector.unpack(memory, self.states.shape[-1])["pairs"][:, : 3 * size + 1]
-        executed, effective, std, valid = (x.numpy() for x in pairs.split([size, size, size, 1], 1))
-        use, step = valid[:, 0] > 0, getattr(self.model, "dt", 1.0)
-        found = str(explain(executed[use], effective[use], self.names, std[use], step))
-        late = int(self.corrector.under_way(memory)[2])
-        if late and self.late == "predict" and self.enabled:
-            found += f"\nlateness: {late} step{'s' * (late > 1)}, made up for"
-        return found
+        late, text = int(self.corrector.under_way(memory)[2]), AS_EXPECTED
+        found = late - self.corrector.delay  # beside the steps that are known
+        changed = found > 0 or bool(self.entries.get("misaligned")[row])
+        if changed and isinstance(self.corrector, PairCorrector):
+            pairs = self.corrector.unpack(memory, self.states.shape[-1])["pairs"][:, : 3 * size + 1]
+            parts = (x.numpy() for x in pairs.split([size, size, size, 1], 1))
+            executed, effective, std, valid = parts
+            use, step = valid[:, 0] > 0, getattr(self.model, "dt", 1.0)
+            how = {"std": std[use], "step": step, "delays": max(5, found + 1)}
+            text = str(explain(executed[use], effective[use], self.names, **how))
+        if late:
+            shown = self.predicts and self.seen_in is not None
+            text += f"\nlateness: {late} step{'s' * (late > 1)}{', made up for' * shown}"
+        return text
 
     def _tell(self) -> dict[str, Any]:
         """Return what is known of the newest step, ``(N, ...)`` each."""
@@ -285,6 +320,10 @@ def _observed(env: Any, observation: Any) -> Any:
 
 def _states(states: np.ndarray) -> np.ndarray:
     return states
+
+
+def _observed_in(simulation: Simulation, states: np.ndarray) -> np.ndarray:
+    return simulation.observe(states)["observation"]
 
 
 def _env_state(env: Any, observation: Any) -> np.ndarray:

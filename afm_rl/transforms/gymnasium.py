@@ -28,8 +28,9 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
     ``info["afm"]`` has, after each step, ``planned``, ``executed`` and ``predicted`` ``(A,)``, the
     last being the effect that the executed action is expected to have; ``corrects``, whether the
     planned action was replaced by the corrector's; the ``innovation``, in standard deviations of
-    the model; and the ``noise`` ``(A,)`` of the effects that was learnt. :attr:`diagnosis` says in
-    words what the actuators seem to do.
+    the model; the ``noise`` ``(A,)`` of the effects that was learnt; and the ``delay``, in how many
+    steps the next action will act, known and found: who follows a clock looks as far ahead. With
+    ``enabled=False`` it is 0. :attr:`diagnosis` says in words what the actuators seem to do.
 
     What the model takes for the state is, with ``"mujoco"`` or a
     :class:`~afm_rl.dynamics.MuJoCoDynamics`, the whole state of the environment's simulation, else
@@ -52,7 +53,8 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
             the state in which its next command will act; ``"leave"``, what was measured. That is in
             ``info["afm"]["observation"]`` in any case. Rewards and ends stay the environment's own.
         observe: ``observe(states)`` returns what is observed in states ``(N, S)``, arrays both;
-            None: the states, or what a gymnasium task with MuJoCo observes in them.
+            None: the states, if they are what is observed at the first reset, or what a gymnasium
+            task with MuJoCo observes in them.
         delay: steps from a command to its effect that are known, one number or one per actuator:
             used from the first step on. What comes on top of it is found out.
         belief: have ``info["afm"]["belief"]``, too: how probable ``(A,)`` each cause is, by name,
@@ -101,9 +103,10 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Begin an episode with an empty memory."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._loop.begin(self._state(observation), seed=seed)
-        info = {**info, "afm": self._told(observation)}
-        return self._loop.at_arrival(np.asarray(observation)[None])[0], info
+        measured = np.asarray(observation)[None]
+        self._loop.begin(self._state(observation), seed=seed, observations=measured)
+        shown = self._loop.at_arrival(measured)[0]
+        return shown, {**info, "afm": self._told(observation)}
 
     def step(self, action: Any):
         """Execute the corrected action."""
@@ -111,10 +114,10 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         executed = self._loop.act(planned[None])[0]
         observation, reward, terminated, truncated, info = self.env.step(executed)
         self._loop.observe(self._state(observation))
+        over = np.array([terminated or truncated])
+        shown = self._loop.at_arrival(np.asarray(observation)[None], over)[0]
         info = {**info, "afm": self._told(observation)}
-        if not (terminated or truncated):
-            observation = self._loop.at_arrival(np.asarray(observation)[None])[0]
-        return observation, reward, terminated, truncated, info
+        return shown, reward, terminated, truncated, info
 
     @property
     def watching(self) -> Watching | None:
@@ -180,10 +183,10 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         rows = np.ones(self.env.num_envs, dtype=bool) if rows is None else rows.copy()
         observations, infos = self.env.reset(seed=seed, options=options)
         first = seed[0] if isinstance(seed, list | tuple) else seed
-        self._loop.begin(self._states(observations), rows, first)
+        self._loop.begin(self._states(observations), rows, first, observations)
         self._over &= ~rows
-        told = {**self._loop.told, "observation": observations}
-        return self._loop.at_arrival(observations), {**infos, "afm": told, "_afm": rows}
+        shown = self._loop.at_arrival(observations)
+        return shown, {**infos, "afm": self._told(observations), "_afm": rows}
 
     def step(self, actions: Any):
         """Execute the corrected actions."""
@@ -193,9 +196,9 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         same = self._mode is AutoresetMode.SAME_STEP
         self._loop.observe(self._states(observations), over if same else self._over)
         self._over = over & (self._mode is AutoresetMode.NEXT_STEP)
-        infos = {**infos, "afm": {**self._loop.told, "observation": observations}, "_afm": made}
-        observations = self._loop.at_arrival(observations, over)
-        return observations, rewards, terminated, truncated, infos
+        shown = self._loop.at_arrival(observations, None if same else over)
+        infos = {**infos, "afm": self._told(observations), "_afm": made}
+        return shown, rewards, terminated, truncated, infos
 
     @property
     def watching(self) -> Watching | None:
@@ -206,6 +209,9 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
     def diagnosis(self) -> list[str]:
         """What the actuators of each environment seem to do, in words."""
         return [self._loop.diagnosis(row) for row in range(self.num_envs)]
+
+    def _told(self, observations: Any) -> dict[str, Any]:
+        return {**self._loop.told, "observation": observations}
 
     def _states(self, observations: Any) -> Tensor:
         states, shape = self._loop.state(self.env, observations), self._loop.state_shape

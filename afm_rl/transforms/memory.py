@@ -18,6 +18,7 @@ from afm_rl.faults import check_numbers, safe_action
 
 LATE = ("predict", "leave")
 """What a policy is shown while its actions act late: the state at arrival, or the measured one."""
+UNSEEN = "what is observed in the state in which they act is not known"
 
 
 def corrector_for(

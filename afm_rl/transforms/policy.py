@@ -150,6 +150,8 @@ class ActionFlowPolicy(TensorDictModuleBase):
 class Arrival(TensorDictModuleBase):
     """Writes the state in which the next action will act to ``(prefix, "arrival")``.
 
+    And in how many steps that will be to ``(prefix, "delay")`` ``(*B)``.
+
     Put it before the planner, which reads that: ``PlanningEnv(..., observation_key=("afm",
     "arrival"))``.
 
@@ -161,15 +163,16 @@ class Arrival(TensorDictModuleBase):
         super().__init__()
         self.__dict__["policy"] = policy  # shared, so not registered
         self.in_keys = [policy.observation_key, unravel_key((policy.prefix, "memory"))]
-        self.out_keys = [unravel_key((policy.prefix, "arrival"))]
+        self.out_keys = [unravel_key((policy.prefix, name)) for name in ("arrival", "delay")]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Look at the state, and roll the model to where the next action will act."""
         policy, (key, kept) = self.policy, self.in_keys
         state, model = tensordict.get(key, None), policy.model
         memory = observe(tensordict.get(kept), state, model, policy.corrector, key)
-        there, _ = arrival(policy.corrector, memory, model)
-        return tensordict.set(self.out_keys[0], there.to(state.dtype))
+        there, steps = arrival(policy.corrector, memory, model)
+        there_key, delay_key = self.out_keys
+        return tensordict.set(there_key, there.to(state.dtype)).set(delay_key, steps)
 
 
 class MemoryPrimer(ZeroPrimer):

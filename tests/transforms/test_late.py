@@ -1,6 +1,8 @@
 """Commands that act late: whoever acts is asked about the state in which they will."""
 
+import runpy
 from collections import deque
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 from tensordict import TensorDict
+from torchrl.data import Bounded
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -18,9 +21,9 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.planning import KnownReward, PlanningEnv
 from afm_rl.regimes import Delay
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.transforms import ActionFlowTransform, RegimeTransform
+from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform, RegimeTransform
 
-STEPS = 60
+STEPS, ROOT = 60, Path(__file__).resolve().parents[2]
 
 
 def glide(state, action):
@@ -98,6 +101,85 @@ def test_a_delay_is_found_and_made_up_for(sign):
     assert 10 * cost["predict"] < cost["leave"], cost
 
 
+WAYS = {  # delays of the robot, settings, steps that are told at the end, what is said of them
+    "found": ((8, 8), {}, 8, "8 steps late\nlateness: 8 steps, made up for"),
+    "known": ((3, 3), {"delay": 3}, 3, "as the model expects\nlateness: 3 steps, made up for"),
+    "both": ((5, 5), {"delay": 3}, 5, "2 steps late\nlateness: 5 steps, made up for"),
+    "left": ((8, 8), {"late": "leave"}, 8, "8 steps late\nlateness: 8 steps"),
+    "watched": ((2, 2), {"enabled": False}, 0, "2 steps late\nlateness: 2 steps"),
+    "none": ((0, 0), {}, 0, "as the model expects"),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_the_steps_until_commands_act_are_told_and_said(way):
+    """Also while plans are executed as they are, as at the end of these."""
+    late, settings, steps, words = WAYS[way]
+    env = ActionFlowWrapper(Carts(late), glide, **settings)
+    assert env.reset(seed=0)[1]["afm"]["delay"] == settings.get("delay", 0)
+    info = drive(env, 100)[1]["afm"]
+    assert info["delay"] == steps and isinstance(info["delay"], int)
+    assert not info["corrects"] or way in ("found", "left")
+    assert env.diagnosis.endswith(words)
+
+
+def test_the_steps_are_those_of_the_state_that_is_shown():
+    """The state in so many steps is what was shown."""
+    env = ActionFlowWrapper(Carts((4, 4), at=5), glide)
+    seen, info = env.reset(seed=0)
+    shown, measured = [], []
+    for _ in range(40):
+        shown.append((len(measured), info["afm"]["delay"], seen))
+        measured.append(info["afm"]["observation"])
+        seen, _, _, _, info = env.step(law(seen))
+    told = [delay for _, delay, _ in shown]
+    assert set(told) == {0, 4}
+    for now, delay, seen in shown[told.index(4) + 3 : -4]:
+        np.testing.assert_allclose(measured[now + delay], seen, atol=1e-4)
+
+
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_a_state_that_is_the_observation_needs_no_observe(precision):
+    """As of legged robots: it is given, and found to be what is observed."""
+
+    class Legged(Carts):
+        observation_space = Box(-np.inf, np.inf, (4,), precision)
+
+        def step(self, action):
+            seen, *rest = super().step(action)
+            return seen.astype(precision), *rest
+
+        def reset(self, **given):
+            seen, info = super().reset(**given)
+            return seen.astype(precision), info
+
+    def state(env, seen):
+        return seen.astype(np.float64)
+
+    told, _ = drive(ActionFlowWrapper(Legged((3, 3)), glide, state, delay=3))
+    same, _ = drive(ActionFlowWrapper(Legged((3, 3)), glide, state, delay=3, observe=lambda s: s))
+    np.testing.assert_array_equal(told, same)
+
+
+def test_episodes_that_follow_at_once_begin_at_arrival_too():
+    """As by a reset: a vector that resets in the same step shows where the first command acts."""
+
+    class Short(Carts):
+        def step(self, action):
+            seen, reward, *_, info = super().step(action)
+            return seen, reward, self.count % 5 == 0, False, info
+
+    mode = gymnasium.vector.AutoresetMode.SAME_STEP
+    envs = gymnasium.vector.SyncVectorEnv([lambda: Short((3, 3))], autoreset_mode=mode)
+    envs = ActionFlowVectorWrapper(envs, glide, delay=3)
+    first, info = envs.reset(seed=0)
+    for _ in range(5):
+        again, _, over, _, info = envs.step(law(first))
+    assert over.all()
+    np.testing.assert_array_equal(again, first)
+    assert info["afm"]["delay"].tolist() == [3]
+
+
 def test_nothing_is_predicted_while_nothing_is_late(monkeypatch):
     def refuse(*_):
         raise AssertionError("asked for a prediction")
@@ -134,9 +216,29 @@ def test_the_transform_shows_the_same_and_keeps_what_was_measured():
         td = env.step_mdp(env.step(td))
         np.testing.assert_allclose(td["afm", "observation"], measured, atol=1e-9)
         assert torch.equal(td["observation"], td["afm", "arrival"])
+        assert td["afm", "delay"].equal(torch.tensor(2))
         torch.testing.assert_close(td["afm", "belief"].sum(-2), torch.ones_like(ends))
     assert env.transform[1].corrector.causes[:2] == ("nothing has changed", "3 steps late")
     check_env_specs(env)
+
+
+def test_who_follows_a_clock_looks_ahead():
+    """A reference that is taken at arrival is followed as by a healthy robot."""
+    example = runpy.run_path(str(ROOT / "examples" / "transform" / "follow_a_clock.py"))
+    body, follow = example["Cart"](), example["follow"]
+    robot = ActionFlowWrapper(example["Robot"](body), body.move)
+    healthy = follow(body, example["Robot"](body, healthy=True), steps=130)
+    now, ahead = (follow(body, robot, ahead, steps=130) for ahead in (False, True))
+    assert ahead < 1.2 * healthy and now > 5 * healthy
+
+
+def test_a_policy_without_an_environment_is_told_the_same():
+    ends = torch.ones(2, dtype=torch.float64)
+    policy = ActionFlowPolicy(
+        KnownDynamics(glide, Manifold(4), 2), Bounded(-ends, ends, (2,)), delay=2
+    )
+    td = policy.make_tensordict_primer()(TensorDict({"observation": torch.zeros(4).double()}))
+    assert policy.arrival()(td)["afm", "delay"].equal(torch.tensor(2))
 
 
 @pytest.mark.parametrize(
@@ -148,7 +250,7 @@ def test_the_transform_shows_the_same_and_keeps_what_was_measured():
         ({"belief": True, "corrector": LeastSquares([-1.0] * 2, [1.0] * 2)}, "a ActionFlow"),
         ({"belief": "yes"}, "belief='yes'"),
         ({"late": "ignore"}, "predict, leave|'predict'"),
-        ({"delay": 2, "state": lambda env, seen: seen}, "observe="),
+        ({"delay": 2, "state": lambda env, seen: 2 * seen}, "observe="),
         ({"delay": 2, "corrector": ActionFlow(-torch.ones(2), torch.ones(2))}, "corrector"),
     ],
 )

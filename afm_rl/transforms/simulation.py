@@ -1,0 +1,239 @@
+"""The MuJoCo simulation inside an environment: its state, and what is observed in others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from copy import copy
+from functools import cached_property, partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv, VectorObservationWrapper
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import (
+    DTypeCastTransform,
+    EnvBase,
+    FrameSkipTransform,
+    GymLikeEnv,
+    ParallelEnv,
+    SerialEnv,
+    Transform,
+    TransformedEnv,
+)
+
+from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.dynamics.mujoco_model import read_model
+from afm_rl.errors import ConfigurationError
+from afm_rl.transforms.carried import CarriedTransform
+
+SIMULATOR_STATE = "simulator_state"
+"""The key of a simulation's whole state: positions, velocities and activations."""
+CHANGED = gymnasium.ObservationWrapper, VectorObservationWrapper
+
+
+class Simulation:
+    """The MuJoCo simulation inside an environment, which is not touched.
+
+    What is observed in other states is looked at through the environment's own eyes, in a
+    simulation beside its own. Of environments that run elsewhere, as those of a vector or of
+    workers, one is made here.
+
+    Args:
+        env: of gymnasium, dm_control or TorchRL, or a vector or batch of such.
+
+    Raises:
+        ConfigurationError: if there is no such simulation.
+
+    >>> simulation = Simulation(gymnasium.make("Reacher-v5"))
+    >>> simulation.observe(np.zeros((3, 8)))["observation"].shape
+    (3, 10)
+    """
+
+    def __init__(self, env: Any) -> None:
+        self.layers = _layers(env)
+        self.inner = self.layers[-1]
+        self.host = getattr(self.inner, "physics", self.inner)  # dm_control's
+        if not all(hasattr(self.host, name) for name in ("data", "model")):
+            raise ConfigurationError(f"{' '.join(str(env).split())} has no MuJoCo model")
+
+    @property
+    def state(self) -> Tensor:
+        """Positions, velocities and activations at present, ``(S,)``.
+
+        Raises:
+            ConfigurationError: if this is not the environment's own simulation.
+        """
+        if any(isinstance(layer, ParallelEnv | SerialEnv | VectorEnv) for layer in self.layers):
+            raise ConfigurationError(
+                f"{SIMULATOR_STATE!r}: the simulations run elsewhere; append SimulatorState() to "
+                "the environment that each worker of ParallelEnv makes, or put ActionFlowTransform "
+                "around that one"
+            )
+        return torch.from_numpy(self._state)
+
+    @property
+    def _state(self) -> np.ndarray:
+        data = self.host.data
+        return np.concatenate([data.qpos, data.qvel, data.act])
+
+    def dynamics(self, low: Tensor, high: Tensor) -> MuJoCoDynamics:
+        """Return the model of one action, with the frames that are skipped.
+
+        Args:
+            low: lowest action, ``(*B, A)``.
+            high: highest action.
+
+        Raises:
+            ConfigurationError: if actions between these are not the simulation's controls.
+        """
+        _, skip = read_model(self.inner)
+        skips = [t.frame_skip for t in self._transforms if isinstance(t, FrameSkipTransform)]
+        skips += [
+            getattr(e, "wrapper_frame_skip", 1) for e in self.layers if isinstance(e, GymLikeEnv)
+        ]
+        found = MuJoCoDynamics(self.inner, skip * math.prod(skips))
+        for given, own in ((low, found.action_low), (high, found.action_high)):
+            alike = given.shape[-1:] == own.shape and given.to(own).isclose(own, atol=1e-6)
+            if not torch.as_tensor(alike | own.isinf()).all():
+                raise ConfigurationError(
+                    f"actions are between {low.tolist()} and {high.tolist()}, the controls of the "
+                    f"simulation between {found.action_low.tolist()} and "
+                    f"{found.action_high.tolist()}; put the transform before those that change "
+                    "actions"
+                )
+        return found
+
+    @cached_property
+    def seen(self) -> list[NestedKey]:
+        """Keys of the observations, if they are those of :meth:`observe`: nothing changes them."""
+        env = self.layers[0]
+        if self._twin is None or any(isinstance(layer, CHANGED) for layer in self.layers):
+            return []
+        if isinstance(env, EnvBase):
+            specs, lead = env.full_observation_spec.items(True, True), len(env.batch_size)
+            shapes = {key: spec.shape[lead:] for key, spec in specs}
+        else:
+            space = getattr(env, "single_observation_space", env.observation_space)
+            shapes = {"observation": space.shape}
+        harmless = DTypeCastTransform, CarriedTransform
+        changes = [t for t in self._transforms if not isinstance(t, harmless)]
+        changed = {key for t in changes for key in (*t.in_keys, *t.out_keys)}
+        found = {key: value.shape[1:] for key, value in self.observe(self._state[None]).items()}
+        alike = all(shapes.get(key) == shape for key, shape in found.items())
+        return list(found) if alike and changed.isdisjoint(found) else []
+
+    def observe(self, states: np.ndarray) -> dict[Any, np.ndarray]:
+        """Return what is observed in states ``(N, S)``, by key, ``(N, ...)`` each.
+
+        One array of gymnasium's is ``"observation"``.
+        """
+        import mujoco
+
+        model, data, look = self._twin
+        ends, rows = [model.nq, model.nq + model.nv], []
+        for state in states:
+            data.qpos[:], data.qvel[:], data.act[:] = np.split(state, ends)
+            mujoco.mj_forward(model, data)
+            mujoco.mj_rnePostConstraint(model, data)  # forces of contacts
+            seen = look()
+            seen = seen if isinstance(seen, Mapping) else {"observation": seen}
+            rows.append({key: np.array(value, ndmin=1) for key, value in seen.items()})
+        return {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+
+    def show(self, tensordict: TensorDictBase, states: Tensor, rows: Tensor) -> None:
+        """Replace what was observed by what is in states ``(*B, S)``, in ``rows`` ``(*B)``."""
+        for key, value in self.observe(states[rows].cpu().double().numpy()).items():
+            shown = tensordict.get(key).clone()
+            shown[rows] = torch.from_numpy(value).to(shown)
+            tensordict.set(key, shown)
+
+    @cached_property
+    def _twin(self) -> Any:
+        """Model and data of a simulation beside the environment's, and what is observed in it."""
+        import mujoco
+
+        if hasattr(self.inner, "_get_obs"):
+            twin = copy(self.inner)
+            twin.data = mujoco.MjData(twin.model)
+            return twin.model, twin.data, twin._get_obs
+        if hasattr(getattr(self.inner, "task", None), "get_observation"):
+            physics = self.host.copy(share_model=True)
+            look = partial(self.inner.task.get_observation, physics)
+            return physics.model.ptr, physics.data.ptr, look
+        return None
+
+    @property
+    def _transforms(self) -> list[Transform]:
+        chains = [layer.transform for layer in self.layers if isinstance(layer, TransformedEnv)]
+        return [t for chain in chains for t in getattr(chain, "transforms", [chain])]
+
+
+def simulation_in(env: Any) -> Simulation | None:
+    """Return the simulation inside an environment, if there is one."""
+    try:
+        return Simulation(env)
+    except ConfigurationError:
+        return None
+
+
+def _layers(env: Any) -> list[Any]:
+    """Return the wrappers of an environment, the outermost first, and itself."""
+    found = [env]
+    while True:
+        layer: Any = found[-1]
+        if isinstance(layer, TransformedEnv):
+            inner = layer.base_env
+        elif isinstance(layer, ParallelEnv | SerialEnv):
+            inner = layer.create_env_fn[0](**layer.create_env_kwargs[0])
+        elif isinstance(layer, EnvBase):
+            inner = vars(layer).get("_env")
+        elif getattr(layer, "env_fns", None):  # of a vector
+            inner = layer.env_fns[0]()
+        else:
+            inner = getattr(layer, "env", None)
+        if inner is None:
+            return found
+        found.append(inner)
+
+
+class SimulatorState(Transform):
+    """Writes the state of the MuJoCo simulation inside an environment to ``"simulator_state"``.
+
+    Positions, velocities and activations, ``(S,)``: for an
+    :class:`~afm_rl.transforms.ActionFlowTransform` around workers, whose simulations it cannot
+    read, or for models that learn.
+
+    Raises:
+        ConfigurationError: if there is no simulation, or it runs elsewhere.
+
+    >>> from torchrl.envs import GymEnv
+    >>> env = TransformedEnv(GymEnv("HalfCheetah-v5"), SimulatorState())
+    >>> env.reset()["simulator_state"].shape
+    torch.Size([18])
+    """
+
+    def __init__(self) -> None:
+        super().__init__(in_keys=[], out_keys=[SIMULATOR_STATE])
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        state = Simulation(self.parent).state
+        return next_tensordict.set(SIMULATOR_STATE, state.to(next_tensordict.device or "cpu"))
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        state = Simulation(self.parent).state
+        spec = Unbounded(state.shape, dtype=state.dtype, device=observation_spec.device)
+        observation_spec[SIMULATOR_STATE] = spec
+        return observation_spec

@@ -1,0 +1,214 @@
+"""MuJoCo simulations in TorchRL: their whole state is read, and what is observed at arrival."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import (
+    ActionScaling,
+    Compose,
+    DoubleToFloat,
+    GymEnv,
+    GymWrapper,
+    ObservationNorm,
+    ParallelEnv,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
+from torchrl.envs.utils import check_env_specs
+
+from afm_rl import ActionFlowWrapper
+from afm_rl.correction import LeastSquares
+from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.errors import ConfigurationError
+from afm_rl.regimes import Delay
+from afm_rl.transforms import ActionFlowTransform, RegimeTransform, SimulatorState
+
+pytest.importorskip("mujoco")
+LATE = 2
+
+
+def cheetah(**settings):
+    return GymEnv("HalfCheetah-v5", **settings)
+
+
+def skipping():
+    return cheetah(frame_skip=2)
+
+
+def cartpole():
+    pytest.importorskip("dm_control")
+    from torchrl.envs import DMControlEnv
+
+    return DMControlEnv("cartpole", "balance")
+
+
+def walker():  # one of its observations is a number, not a vector
+    pytest.importorskip("dm_control")
+    from torchrl.envs import DMControlEnv
+
+    return DMControlEnv("walker", "walk")
+
+
+def robot(make, *more):
+    """A robot whose commands act late."""
+    env = make()
+    key = "velocity" if "velocity" in env.observation_spec.keys() else "observation"
+    late = RegimeTransform(Delay(), [{"delay": float(LATE)}], observation_key=key)
+    return TransformedEnv(env, Compose(late, *more))
+
+
+def afm(**settings):
+    return ActionFlowTransform("mujoco", delay=LATE, **settings)
+
+
+def beside(make):
+    return robot(make, afm())
+
+
+def inside(make, batch=SerialEnv, **settings):
+    return batch(2, lambda: robot(make, afm()), **settings)
+
+
+def around(make, batch=SerialEnv, **settings):
+    workers = batch(2, lambda: robot(make, SimulatorState()), **settings)
+    return TransformedEnv(workers, afm())
+
+
+PLACES = [beside, inside, around]
+ROBOTS = [cheetah, skipping, cartpole, walker]
+
+
+def check_shown(env, keys):
+    """What policies are shown is what is measured when their action acts."""
+    data = env.rollout(12, break_when_any_done=False)
+    assert (data["afm", "delay"] == LATE).all() and data["afm", "delay"].dtype is torch.int64
+    assert not data["next", "afm", "misaligned"].any()
+    measured = data["afm", "observation"]
+    measured = measured if len(keys) > 1 else {keys[0]: measured}
+    for key in keys:
+        assert data[key].dtype is measured[key].dtype
+        shown, later = data[key][..., :-LATE, :], measured[key][..., LATE:, :]
+        torch.testing.assert_close(shown, later, atol=1e-5, rtol=1e-4)
+        assert not torch.equal(data[key], measured[key])
+
+
+@pytest.mark.parametrize("make", ROBOTS)
+@pytest.mark.parametrize("place", PLACES)
+def test_policies_are_shown_what_is_observed_at_arrival(place, make):
+    env = place(make)
+    check_env_specs(env)
+    check_shown(env, list(make().observation_spec.keys()))
+
+
+@pytest.mark.parametrize("place", [inside, around])
+def test_in_processes_of_their_own(place):
+    env = place(cartpole, ParallelEnv, mp_start_method="fork")
+    try:
+        check_shown(env, ["position", "velocity"])
+    finally:
+        env.close(raise_if_closed=False)
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_casts_may_stand_on_either_side(first):
+    chain = [afm(), DoubleToFloat(), StepCounter()]
+    env = robot(cartpole, *chain if first else chain[1::-1])
+    check_env_specs(env)
+    check_shown(env, ["position", "velocity"])
+
+
+class Late(gymnasium.ActionWrapper):
+    """Commands of a gymnasium environment act late."""
+
+    def reset(self, **given):
+        self.waiting = [np.zeros(self.action_space.shape, np.float32)] * LATE
+        return super().reset(**given)
+
+    def action(self, action):
+        self.waiting.append(action)
+        return self.waiting.pop(0)
+
+
+def test_it_is_the_wrapper_of_gymnasium():
+    """Also while the delay has yet to be found."""
+    one, two = (Late(gymnasium.make("HalfCheetah-v5", reset_noise_scale=0.0)) for _ in range(2))
+    wrapper = ActionFlowWrapper(one, "mujoco")
+    env = TransformedEnv(GymWrapper(two), ActionFlowTransform("mujoco"))
+    td = env.reset()
+    wrapper.reset()
+    draw = np.random.default_rng(0)
+    for _ in range(15):
+        action = draw.uniform(-1, 1, 6).astype(np.float32)
+        td = env.step_mdp(env.step(td.set("action", torch.from_numpy(action))))
+        seen, _, _, _, info = wrapper.step(action)
+        np.testing.assert_allclose(td["observation"], seen, atol=1e-3)
+        np.testing.assert_allclose(td["afm", "observation"], info["afm"]["observation"], atol=1e-3)
+        assert td["afm", "delay"] == info["afm"]["delay"]
+    assert td["afm", "delay"] == LATE
+
+
+def test_a_model_of_ones_own_reads_the_whole_state_too():
+    model = MuJoCoDynamics(cheetah()._env)
+    chain = Compose(SimulatorState(), ActionFlowTransform(model, in_keys=["simulator_state"]))
+    data = TransformedEnv(cheetah(), chain).rollout(5)
+    assert data["simulator_state"].shape == data["afm", "arrival"].shape == (5, 18)
+    assert data["next", "afm", "innovation"].max() < 1e-6
+
+
+REFUSED = {
+    "'simulator_state': the simulations run elsewhere; append SimulatorState()": lambda: (
+        SerialEnv(2, cheetah),
+        ActionFlowTransform("mujoco"),
+    ),
+    r"\(17,\), but the .* state has 18 numbers; .*model='mujoco'": lambda: (
+        cheetah(),
+        ActionFlowTransform(MuJoCoDynamics(cheetah()._env)),
+    ),
+    r"no such entry, but \['position', 'velocity'\]; .*model='mujoco'": lambda: (
+        cartpole(),
+        ActionFlowTransform(MuJoCoDynamics(cartpole()._env)),
+    ),
+    "Pendulum-v1.* has no MuJoCo model": lambda: (
+        GymEnv("Pendulum-v1"),
+        ActionFlowTransform("mujoco"),
+    ),
+    "actions are between .*put the transform before those that change actions": lambda: (
+        cheetah(),
+        Compose(ActionScaling(loc=0.0, scale=2.0), ActionFlowTransform("mujoco")),
+    ),
+    "delay=2: what is observed .*before those that change observations": lambda: (
+        cheetah(),
+        Compose(ObservationNorm(0.0, 2.0, ["observation"]), afm()),
+    ),
+    "made for 1 actions, but the dynamics model has 6": lambda: (
+        cheetah(),
+        ActionFlowTransform("mujoco", LeastSquares([-1.0], [1.0])),
+    ),
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_what_cannot_be_read_is_refused_with_the_way(words):
+    env, chain = REFUSED[words]()
+    with pytest.raises(ConfigurationError, match=words) as error:
+        TransformedEnv(env, chain).reset()
+    assert "\n" not in str(error.value)
+
+
+def test_without_an_environment_there_is_no_simulation():
+    with pytest.raises(ConfigurationError, match="put the transform around an environment first"):
+        ActionFlowTransform("mujoco").model  # noqa: B018
+    with pytest.raises(ConfigurationError, match="transform.model='dart': .*mujoco"):
+        ActionFlowTransform("dart")
+
+
+def test_observations_that_change_on_the_way_are_shown_as_measured():
+    """And a warning says so, where the delay is found out."""
+    chain = Compose(ObservationNorm(0.0, 2.0, ["observation"]), ActionFlowTransform("mujoco"))
+    env = TransformedEnv(robot(cheetah), chain)
+    with pytest.warns(UserWarning, match="before those that change observations"):
+        data = env.rollout(15)
+    assert data["next", "afm", "delay"][-1] == LATE
+    assert data["next", "afm", "arrival"].shape == (15, 18)
