@@ -9,7 +9,7 @@ from afm_rl.regimes import Regime
 
 LIMIT = 4.0  # half ranges: effects beyond carry no more news
 MODES = ("mixed", "direction", "clip")
-LEAST = 0.1  # share of an action that must be had for "mixed" to clip it
+LEAST = 0.15  # share of an action that must be had for "mixed" to clip it
 LITTLE = 0.3  # share of the box that must be reached for plans to keep to it
 TRIED = 0.1  # share of the box that must have been tried to know that little can be reached
 DEAD = 0.025  # share of which nothing can be had
@@ -23,7 +23,7 @@ def saturate(unit: Tensor, mode: str, dim: int = -1) -> Tensor:
 
     ``"clip"`` cuts each component for itself; ``"direction"`` shrinks all alike, so that the
     robot does the same thing slower: the ratio of turning to driving is kept. ``"mixed"``
-    clips what can be had to 10 % at least, and does the rest slower.
+    clips what can be had to 15 % at least, and does the rest slower.
 
     >>> saturate(torch.tensor([0.5, 2.0]), "direction")
     tensor([0.2500, 1.0000])

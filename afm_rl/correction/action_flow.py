@@ -348,9 +348,8 @@ class ActionFlow(PairCorrector):
         """
         parts = self.unpack(memory, self.states_in(memory))
         weights, late = self.weights(parts), parts["late"].squeeze(-1).long()
-        known = (self.normalise(parts["sent"]), planned, box)
-        known = (part.to(self.tick.scale) for part in known)
-        answer = self.tick(*self._read(parts, weights), late, *known)
+        rest = [x.to(self.tick.scale) for x in (self.normalise(parts["sent"]), planned, box)]
+        answer = self.tick(*self._read(parts, weights), late, *rest)
         acting = self.denormalise((weights * answer.forecasts.to(memory)).sum(-2))
         parts |= {"planned": planned, "executed": answer.executed.to(memory), "acting": acting}
         parts["forecasts"] = answer.forecasts.to(memory)

@@ -206,8 +206,8 @@ class Tick(nn.Module):
         weight = precision_of(torch.hypot(std, noise.unsqueeze(1)), sound)
         newest = pairs[:, 1 - self.rows - self.ways.shape[-1] :, :size]
         acted = (self.ways @ newest[:, self.windows]).transpose(1, 2)  # (B, W, K, A)
-        newest = (part[:, None, -self.rows :] for part in (came, weight))
-        gains = fit_gain(acted, *newest)
+        recent = slice(-self.rows, None)
+        gains = fit_gain(acted, came[:, None, recent], weight[:, None, recent])
         lines = fit_lines(pairs[..., :size], sent, came, weight)
         noisy, slow = sensor_noise(sent, came, sound), within_rate(came, sound)
         return Read(encoded, lines, gains, noisy, slow)

@@ -70,7 +70,7 @@ class Maps(NamedTuple):
 
         What is out of reach is saturated as :func:`~afm_rl.correction.achievable.intend` does:
         as much of its direction as there is (``"direction"``), every axis as far as it goes
-        (``"clip"``), or the first of both only where less than 10 % can be had (``"mixed"``).
+        (``"clip"``), or the first of both only where less than 15 % can be had (``"mixed"``).
         """
         bias = self.bias.unsqueeze(-2)
         still = torch.linalg.solve(self.matrix, -bias.mT).mT
