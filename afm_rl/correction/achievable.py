@@ -95,7 +95,7 @@ def intend(
 
     .. math:: u = T^{-1}(s\,a),\qquad s = \max\{s \in [0, 1] : s\,a \in T(\text{box})\}
 
-    with ``mode="direction"``; with ``"clip"``, or ``"mixed"`` and s > 0.1, u has the nearest
+    with ``mode="direction"``; with ``"clip"``, or ``"mixed"`` and s > 0.15, u has the nearest
     effect there is.
     """
     intended = regime.inverse(planned, parameters, state, low, high)
