@@ -71,7 +71,9 @@ def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
     bare = [(key, re.sub(r"\[.*]|\{.*}", "", value)) for key, _, value in own]  # lists do not sweep
     swept = [key.strip("+~") for key, value in bare if re.search(r"[,(]", value)]
     name = "-".join([*swept, hashlib.sha256("\0".join(asked).encode()).hexdigest()[:6]])
-    return [*arguments, f"hydra.sweep.dir=multirun/{re.sub(r'[^-.0-9A-Z_a-z]', '_', name[-60:])}"]
+    folder = f"hydra.sweep.dir=multirun/{re.sub(r'[^-.0-9A-Z_a-z]', '_', name[-60:])}"
+    beside = max((n for n, text in enumerate(arguments) if text[:1] != "-" and "=" in text), default=-1)
+    return [*arguments[: beside + 1], folder, *arguments[beside + 1 :]]  # Hydra wants them together
 
 
 def optional(overrides: Sequence[str]) -> dict[str, str]:
