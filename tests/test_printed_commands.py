@@ -198,8 +198,8 @@ def check_completion(words):
     typed = f'COMP_LINE="{line}" COMP_POINT={len(line)} COMP_CWORD=1'
     script = f'eval "{words[1]}"; {typed}; hydra_bash_completion; echo "${{COMPREPLY[@]}}"'
     path = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
-    done = subprocess.run(["bash", "-c", script], env=os.environ | {"PATH": path}, stdout=subprocess.PIPE)
-    assert done.stdout.split() == [b"method=afm_physics"]
+    said = subprocess.check_output(["bash", "-c", script], env=os.environ | {"PATH": path})
+    assert said.split() == [b"method=afm_physics"]
 
 
 ELSEWHERE = {"pip": check_install, "make": check_make, "sh": check_file, "eval": check_completion}

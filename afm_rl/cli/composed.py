@@ -17,13 +17,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from afm_rl.errors import ConfigurationError
-from afm_rl.targets import check_name, check_targets, leaves
+from afm_rl.errors import ConfigurationError, printable
+from afm_rl.targets import check_name, find_code, leaves
 
 CALLED = ("hydra.callbacks", "hydra.launcher", "hydra.sweeper", "hydra.job.env_set")
 """What Hydra calls, or sets."""
 GUARDED = re.compile(
-    r"overwrite|hydra\.(launcher|output_subdir|(job|hydra)_logging|job\.(chdir|name|env_set))(\..*)?"
+    r"overwrite|hydra\.(launcher|output_subdir|(job|hydra)_logging|job\.(chdir|name|env_set))(\..*)?",
+    re.DOTALL,
 )
 """What a file may set only as :data:`FREE` says."""
 FREE = re.compile(
@@ -41,7 +42,8 @@ FREE = re.compile(
       )
     | hydra\.(job|hydra)_logging\.(
         (version|disable_existing_loggers)=\w+ | (root|loggers)\.[\w.-]+=[\w.]*
-        | formatters\.\w+\.(format=([][()|/.:, -]|HYDRA|%\(\w+\)[-\d.]*[sdf])*|datefmt=([:,./ -]|%\w)*)
+        | formatters\.\w+\.format=([][()|/.:, -]|HYDRA|%\(\w+\)[-\d.]*[sdf])*
+        | formatters\.\w+\.datefmt=([:,./ -]|%\w)*
         | handlers\.\w+\.(
             (level|formatter)=\w+ | class=logging\.StreamHandler | stream=ext://sys\.std(out|err)
           )
@@ -72,7 +74,9 @@ def given_by(arguments: Sequence[str]) -> dict[str, Any]:
     texts = [text for text in arguments if re.match(r"\+{0,2}(hydra[.=]|overwrite=)", text)]
     given = {}
     for each in OverridesParser.create().parse_overrides(texts):
-        given.update({place: value for place, _, value in leaves({each.key_or_group: each.value()})})
+        given.update(
+            {place: value for place, _, value in leaves({each.key_or_group: each.value()})}
+        )
     return given
 
 
@@ -110,20 +114,24 @@ def check_composed(cfg: DictConfig, overrides: Sequence[str], given: Mapping[str
                 OmegaConf.update(cfg, place, fixed, merge=False)
     settings: Any = OmegaConf.to_container(cfg)
     own = settings["hydra"]
-    other_launcher = (own["launcher"] or {}).get("_target_") not in PLUGINS  # then it is trusted
+    launcher = own["launcher"].get("_target_") if isinstance(own["launcher"], Mapping) else None
     for place, key, value in leaves(settings):
-        unknown = isinstance(value, str) and "${" in value
-        if unknown and place.startswith(CALLED):
+        called, text = place.startswith(CALLED), isinstance(value, str)
+        if called and text and "${" in value:
             raise ConfigurationError(f"{place}={value!r}: expected a value")
-        if key == "_target_" and not unknown and not (place in PLUGGED and value in PLUGINS):
-            check_name(place, value)
-        free = not GUARDED.fullmatch(place) or FREE.fullmatch(f"{place}={value}") or value is None
-        free = free or (other_launcher and place.startswith("hydra.launcher."))
+        if key == "_target_" and not (place in PLUGGED and value in PLUGINS):
+            if called:
+                find_code(place, value)
+            elif not (text and "${" in value):  # else it is judged once it is known
+                check_name(place, value)
+        free = not GUARDED.fullmatch(place) or FREE.fullmatch(f"{place}={value}")
+        free = free or value in (None, "???")
+        free = free or (place.startswith("hydra.launcher.") and launcher not in (None, *PLUGINS))
         if not free and (place not in given or given[place] != written.get(place)):
             raise ConfigurationError(
-                f"{place}={value!r}: a file may not set this; it counts on the command line only"
+                f"{printable(place)}={value!r}: a file may not set this; it counts on the command "
+                "line only"
             )
-    check_targets({"hydra": {"callbacks": own["callbacks"]}})
     if sorted([*own["overrides"]["task"], *own["overrides"]["hydra"]]) != sorted(overrides):
         raise ConfigurationError("hydra.overrides: a file may not add to the command line")
     _check_links(cfg)

@@ -72,7 +72,9 @@ def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
     swept = [key.strip("+~") for key, value in bare if re.search(r"[,(]", value)]
     name = "-".join([*swept, hashlib.sha256("\0".join(asked).encode()).hexdigest()[:6]])
     folder = f"hydra.sweep.dir=multirun/{re.sub(r'[^-.0-9A-Z_a-z]', '_', name[-60:])}"
-    beside = max((n for n, text in enumerate(arguments) if text[:1] != "-" and "=" in text), default=-1)
+    beside = max(
+        (n for n, text in enumerate(arguments) if text[:1] != "-" and "=" in text), default=-1
+    )
     return [*arguments[: beside + 1], folder, *arguments[beside + 1 :]]  # Hydra wants them together
 
 
@@ -134,7 +136,11 @@ def checked(arguments: Sequence[str]) -> Iterator[list[str]]:
 
     @functools.wraps(load)
     def checking(
-        self: ConfigLoaderImpl, config_name: str | None, overrides: list[str], *args: Any, **how: Any
+        self: ConfigLoaderImpl,
+        config_name: str | None,
+        overrides: list[str],
+        *args: Any,
+        **how: Any,
     ) -> DictConfig:
         primary = config_name and self.repository.load_config(config_path=config_name)
         if primary:

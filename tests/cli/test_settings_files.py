@@ -20,20 +20,25 @@ os.system shutil.copyfile logging.FileHandler pandas.eval numpy.savetxt multipro
 COPY = {"_target_": "${lead}", "src": "/etc/hostname", "dst": "canary"}
 SAVED = {"_target_": "afm_rl.planning.policies.save_policy", "file": "canary"}
 LOG = "hydra.job_logging.handlers.file"
-FILE = {f"{LOG}.class": "logging.FileHandler", f"{LOG}.filename": "${hydra.runtime.output_dir}/a.log"}
-TOKEN = "the command line only"
+FILE = {
+    f"{LOG}.class": "logging.FileHandler",
+    f"{LOG}.filename": "${hydra.runtime.output_dir}/a.log",
+}
+ALONE = "the command line only"
 ATTACKS = [
-    *(({"hydra.job.env_set": {name: "x"}}, f"hydra.job.env_set.{name}='x': a file may not")
-      for name in ("AFM_RL_TRUST", "LD_PRELOAD", "PYTHONPATH", "PATH", "RAY_ADDRESS", "HOME")),
-    ({"hydra.job.env_set.OMP_NUM_THREADS": "1\nx"}, TOKEN),
+    *(
+        ({"hydra.job.env_set": {name: "x"}}, f"hydra.job.env_set.{name}='x': a file may not")
+        for name in ("AFM_RL_TRUST", "LD_PRELOAD", "PYTHONPATH", "PATH", "RAY_ADDRESS", "HOME")
+    ),
+    ({"hydra.job.env_set.OMP_NUM_THREADS": "1\nx"}, ALONE),
     ({"hydra.job.env_set": "${x}", "x": {"LD_PRELOAD": "x"}}, "env_set.LD_PRELOAD='x'"),
     ({"hydra.job.env_copy": ["PATH"]}, "hydra.job.env_set.PATH"),
-    ({"hydra.job.chdir": True}, TOKEN),
-    ({"hydra.job.name": "../../x"}, TOKEN),
-    ({"hydra.output_subdir": "../.."}, TOKEN),
+    ({"hydra.job.chdir": True}, ALONE),
+    ({"hydra.job.name": "../../x"}, ALONE),
+    ({"hydra.output_subdir": "../.."}, ALONE),
     ({"hydra.overrides.task": ["trust=[os]"]}, "hydra.overrides: a file may not"),
     ({"hydra.overrides.hydra": ["hydra.launcher.address=x"]}, "hydra.overrides: a file may not"),
-    ({"overwrite": True}, TOKEN),
+    ({"overwrite": True}, ALONE),
     # What Hydra calls itself.
     ({"lead": "shutil.copyfile", "hydra.callbacks": {"x": COPY}}, "callbacks.x._target_='shutil"),
     ({"lead": "shutil.copyfile", "x": {"y": COPY}, "hydra.callbacks": "${x}"}, "callbacks.y._t"),
@@ -41,29 +46,35 @@ ATTACKS = [
     ({"hydra.callbacks.x": "\\${lead}"}, "hydra.callbacks.x='${lead}': expected a value"),
     ({"hydra.callbacks.x": SAVED}, "is code of afm_rl.planning.policies"),
     ({"hydra.launcher.n_jobs": "${x}", "x": COPY, "lead": "os.system"}, "_target_='os.system'"),
+    ({"hydra.sweeper.params": {"x": SAVED}}, "is code of afm_rl.planning.policies"),
+    ({"hydra.launcher": {"address": "x"}}, ALONE),
     ({"hydra.launcher._target_": "hydra_plugins.hydra_joblib_launcher.X"}, "trust=[PACKAGE]"),
     ({"hydra.sweeper._target_": "hydra_plugins.hydra_optuna_sweeper.X"}, "trust=[PACKAGE]"),
     ({"hydra.launcher.address": "evil.example:6379"}, "hydra.launcher.address='evil.example:6379'"),
     ({"hydra.launcher.parameters.slurm_setup": ["touch canary"]}, "slurm_setup.0='touch canary'"),
-    ({"hydra.launcher.parameters.slurm_srun_args": ["--x"]}, TOKEN),
-    ({"hydra.launcher.parameters.slurm_additional_parameters.x": "x"}, TOKEN),
+    ({"hydra.launcher.parameters.slurm_srun_args": ["--x"]}, ALONE),
+    ({"hydra.launcher.parameters.slurm_additional_parameters.x": "x"}, ALONE),
     ({"hydra.launcher.parameters": "${x}", "x": {"slurm_setup": ["x"]}}, "slurm_setup.0='x'"),
-    ({"hydra.launcher.parameters.slurm_qos": "x\ntouch canary #"}, TOKEN),
+    ({"hydra.launcher.parameters.slurm_qos": "x\ntouch canary #"}, ALONE),
     # What is logged, and where.
     ({**FILE, f"{LOG}.filename": "/tmp/.profile"}, f"{LOG}.filename='/tmp/.profile'"),
-    ({**FILE, f"{LOG}.filename": "${hydra.runtime.output_dir}/.profile"}, TOKEN),
-    ({**FILE, f"{LOG}.filename": "${hydra.runtime.output_dir}/../x.log"}, TOKEN),
-    ({**FILE, f"{LOG}.class": "logging.handlers.SocketHandler"}, TOKEN),
-    ({**FILE, f"{LOG}.()": "os.system"}, TOKEN),
-    ({**FILE, f"{LOG}.level": "ext://antigravity.x"}, TOKEN),
-    ({"hydra.job_logging.formatters.simple.format": "rm -r ~ # %(message)s"}, TOKEN),
-    ({"hydra.job_logging.formatters.simple.class": "os.system"}, TOKEN),
-    ({"hydra.job_logging.handlers": "${x}", "x": {"y": {"class": "os.system"}}}, TOKEN),
-    ({"hydra.hydra_logging.handlers.x.class": "logging.FileHandler"}, TOKEN),
+    ({**FILE, f"{LOG}.filename": "${hydra.runtime.output_dir}/.profile"}, ALONE),
+    ({**FILE, f"{LOG}.filename": "${hydra.runtime.output_dir}/../x.log"}, ALONE),
+    ({**FILE, f"{LOG}.class": "logging.handlers.SocketHandler"}, ALONE),
+    ({**FILE, f"{LOG}.()": "os.system"}, ALONE),
+    ({**FILE, f"{LOG}.level": "ext://antigravity.x"}, ALONE),
+    ({"hydra.job_logging.formatters.simple.format": "rm -r ~ # %(message)s"}, ALONE),
+    ({"hydra.job_logging.handlers": {"x\n": {"class": "logging.FileHandler"}}}, ALONE),
+    ({"hydra.job_logging.formatters.simple.class": "os.system"}, ALONE),
+    ({"hydra.job_logging.handlers": "${x}", "x": {"y": {"class": "os.system"}}}, ALONE),
+    ({"hydra.hydra_logging.handlers.x.class": "logging.FileHandler"}, ALONE),
     # Where Hydra looks for files: it imports the package.
     ({"hydra.searchpath": ["pkg://afm_rl.conf", "pkg://stranger"]}, "hydra.searchpath='stranger'"),
     ({"hydra.searchpath": ["pkg://afm_rl.conf", "pkg:///stranger/"]}, "hydra.searchpath="),
-    *(({"cost.x._target_": target}, f"cost.x._target_='{target}': only parts") for target in TARGETS),
+    *(
+        ({"cost.x._target_": target}, f"cost.x._target_='{target}': only parts")
+        for target in TARGETS
+    ),
     ({"label": {"_target_": "os.system"}}, "label._target_='os.system': only parts"),
     ({"trust": ["os"], "planner": {"_target_": "os.system"}}, "planner._target_='os.system'"),
 ]
@@ -173,7 +184,9 @@ def test_what_a_file_may_set_of_hydra_does_its_work(write, afm_rl, tmp_path, qui
     monkeypatch.setattr(
         executor.LocalExecutor,
         "start",
-        lambda self, jobs: [seen.append(os.environ["CUDA_VISIBLE_DEVICES"]), *start(self, jobs)][1:],
+        lambda self, jobs: [seen.append(os.environ["CUDA_VISIBLE_DEVICES"]), *start(self, jobs)][
+            1:
+        ],
     )
     harmless = {
         **{"hydra.job.env_set.CUDA_VISIBLE_DEVICES": "1", "cores": 1, "hydra.verbose": "none"},
