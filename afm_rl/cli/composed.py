@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ GUARDED = re.compile(
 )
 """What a file may set only as :data:`FREE` says."""
 FREE = re.compile(
-    r"""overwrite=False | hydra\.job\.(chdir=False | name=[\w.-]+)
+    r"""overwrite=False | hydra\.(output_subdir=\.hydra | job\.(chdir=False | name=[\w.-]+))
     | hydra\.job\.env_set\.(
         (OMP|MKL|OPENBLAS|NUMEXPR)_NUM_THREADS | CUDA_(VISIBLE_DEVICES|DEVICE_ORDER|LAUNCH_BLOCKING)
         | CUBLAS_WORKSPACE_CONFIG | MUJOCO_GL
@@ -62,6 +63,11 @@ PLUGINS = (
 )
 PLUGGED = ("hydra.launcher._target_", "hydra.sweeper._target_")
 """Where these launchers and this sweeper need no trust."""
+WRITTEN = (
+    *("multirun.yam[l]", "*.log", ".hydr[a]", ".hydr[a]/*"),
+    *("*/*.log", "*/.hydr[a]", "*/.hydr[a]/*"),
+)
+"""What Hydra writes into its folders, as patterns that links to nothing match, too."""
 SOURCES = ("afm_rl.conf", "hydra.conf")
 
 
@@ -142,6 +148,6 @@ def _check_links(cfg: DictConfig) -> None:
     for place in ("hydra.run.dir", "hydra.sweep.dir"):
         with suppress(OmegaConfBaseException):  # a folder that is known only later is a new one
             folder = Path(str(OmegaConf.select(cfg, place)))
-            for path in (*folder.glob("*.log"), *folder.glob("*/*.log"), folder / "multirun.yaml"):
+            for path in chain.from_iterable(map(folder.glob, WRITTEN)):
                 if path.is_symlink():
                     raise ConfigurationError(f"{place}={folder}: {path} is a link; remove it")

@@ -36,6 +36,7 @@ ATTACKS = [
     ({"hydra.job.chdir": True}, ALONE),
     ({"hydra.job.name": "../../x"}, ALONE),
     ({"hydra.output_subdir": "../.."}, ALONE),
+    ({"hydra.output_subdir": "x"}, ALONE),
     ({"hydra.overrides.task": ["trust=[os]"]}, "hydra.overrides: a file may not"),
     ({"hydra.overrides.hydra": ["hydra.launcher.address=x"]}, "hydra.overrides: a file may not"),
     ({"overwrite": True}, ALONE),
@@ -169,7 +170,8 @@ def test_trust_is_what_the_command_and_the_environment_said_before(monkeypatch):
 
 
 def test_a_link_in_the_folder_of_results_is_not_followed(composed, tmp_path):
-    for place, name in (("run", "cli.log"), ("sweep", "multirun.yaml"), ("sweep", "0/cli.log")):
+    links = {"run": ["cli.log", ".hydra/x"], "sweep": ["multirun.yaml", "0/cli.log", "0/.hydra"]}
+    for place, name in ((place, name) for place, names in links.items() for name in names):
         folder = tmp_path / place / name.replace("/", "-")
         (folder / name).parent.mkdir(parents=True)
         (folder / name).symlink_to(tmp_path / "profile")
