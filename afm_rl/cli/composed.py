@@ -130,10 +130,12 @@ def check_composed(cfg: DictConfig, overrides: Sequence[str], given: Mapping[str
                 find_code(place, value)
             elif not (text and "${" in value):  # else it is judged once it is known
                 check_name(place, value)
-        free = not GUARDED.fullmatch(place) or FREE.fullmatch(f"{place}={value}")
-        free = free or value in (None, "???")
-        free = free or (place.startswith("hydra.launcher.") and launcher not in (None, *PLUGINS))
-        if not free and (place not in given or given[place] != written.get(place)):
+        trusted = place.startswith("hydra.launcher.") and launcher not in (None, *PLUGINS)
+        if trusted or value in (None, "???") or not GUARDED.fullmatch(place):
+            continue
+        if place in given and given[place] == written.get(place):
+            continue
+        if not FREE.fullmatch(f"{place}={value}"):
             raise ConfigurationError(
                 f"{printable(place)}={value!r}: a file may not set this; it counts on the command "
                 "line only"
