@@ -137,7 +137,7 @@ def _described(stream: io.BytesIO, kinds: dict[str, str]) -> Any:
     """Follow a pickle up to its end; ``kinds`` gets those of the storages that it names."""
     stack: list[Any] = []
     marks: list[int] = []
-    memo: dict[int, Any] = {}
+    memo: dict[Any, Any] = {}
 
     def newest(count: int) -> list[Any]:
         items = stack[len(stack) - count :]
