@@ -204,7 +204,7 @@ def test_a_flood_ends_nothing(page, browser):
     with pytest.raises(ConnectionClosed):
         browser.send(message("GuiUpdateMessage", uuid="x" * 10**6, updates={"value": 1}))
         while True:
-            browser.recv()
+            browser.recv(timeout=30)
 
 
 def test_a_viser_that_serves_in_another_way_is_refused(monkeypatch):
