@@ -64,16 +64,17 @@ def _run(options: argparse.Namespace) -> None:
     from afm_rl.errors import check_number, printable
     from afm_rl.report.diagnosis import print_diagnosis, write_diagnosis
 
-    fields = [
+    command, response = (
         [field.strip() for text in given for field in text.split(",")]
         for given in (options.command, options.response)
-    ]
+    )
     notes: tuple[str, ...] = ()
     try:
         if options.model is None:
-            log = read_log(options.file, *fields, options.episode)
+            log = read_log(options.file, command, response, options.episode)
         else:
-            columns = read_columns(options.file, TRANSITIONS, *fields, options.episode)
+            names = TRANSITIONS, command, response
+            columns = read_columns(options.file, *names, options.episode)
             from afm_rl.cli import log_model  # torch takes seconds
 
             model = log_model.model_of(options.model, options.trust, columns)

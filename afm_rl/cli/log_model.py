@@ -69,7 +69,7 @@ def columns_of(model: DynamicsModel, columns: Columns) -> Columns:
     apart = (np.diff(columns.episode[rows]) != 0) | (np.diff(rows) > 1)
     return replace(
         columns,
-        names=tuple([printable(name) for name in names] for names in (actions, states)),
+        names=([printable(x) for x in actions], [printable(x) for x in states]),
         first=action[rows],
         second=state[rows],
         t=columns.t[rows],

@@ -21,7 +21,7 @@ class FirstSteps:
     >>> first = FirstSteps()
     >>> with warnings.catch_warnings(record=True) as said:
     ...     for _ in range(200):
-    ...         first.note(torch.ones(3, dtype=torch.bool), lambda: "gain 0.5 on all")
+    ...         first(torch.ones(3, dtype=torch.bool), lambda: "gain 0.5 on all")
     >>> [str(warning.message)[:68] for warning in said]
     ['100 % of the first 60 steps were corrected (gain 0.5 on all): the ro']
     """
@@ -29,8 +29,8 @@ class FirstSteps:
     def __init__(self) -> None:
         self.corrected: list[Tensor] = []
 
-    def note(self, corrected: Tensor, cause: Callable[[], str]) -> None:
-        """Note whether the missions of a step are corrected, ``(*B)``.
+    def __call__(self, corrected: Tensor, cause: Callable[[], str]) -> None:
+        """Note whether the missions of a step are corrected.
 
         Args:
             corrected: by mission.
@@ -40,6 +40,8 @@ class FirstSteps:
             return
         if corrected.is_cuda and torch.cuda.is_current_stream_capturing():
             return
+        if self.corrected and self.corrected[0].device != corrected.device:
+            self.corrected.clear()  # moved to another device
         self.corrected.append(corrected.float().mean())
         if len(self.corrected) < STEPS:
             return

@@ -121,15 +121,17 @@ def usual_mistakes(
         pairs = zip(gains, actuators, strict=True)
         each = some_of([f"{k:.3g} times {name}" for k, name in pairs if abs(k - 1) > NEAR])
         yield Mistake(f"acts on {each or 'all'} (signs, gains or units)", left, gains, axes)
-    if flat and not model.stiff:  # a simulator knows its units
+    if flat:
         yield from _other_units(seen, size, names)
 
 
 def _other_units(seen: Transitions, size: Tensor, names: Sequence[str]) -> Iterator[Mistake]:
     """Yield mistakes in the units of the state's entries, in the motion and in forces only."""
-    count, motion = len(size), seen.motion()
-    for unit, words in ANGLES.items():
-        lengths = range(1, count + 1) if count <= SMALL else (1, count)
+    count, motion, stiff = len(size), seen.motion(), seen.model.stiff
+    lengths = [count] if stiff else [1, count] if count > SMALL else range(1, count + 1)
+    for unit, words in list(ANGLES.items())[: 1 if stiff else 2]:  # simulators have radians
+        step = seen.step(unit, unit)
+        yield Mistake(f"has states and actions in {words}", motion - step, [unit], 1)
         for chosen in (c for length in lengths for c in combinations(range(count), length)):
             which = torch.zeros(count, dtype=torch.bool)
             which[list(chosen)] = True
@@ -137,17 +139,19 @@ def _other_units(seen: Transitions, size: Tensor, names: Sequence[str]) -> Itera
             step, told = seen.step(scale=scale), f"has {_where(names, which)} in {words}"
             yield Mistake(told, motion - step, scale.tolist(), 1)
             yield Mistake(told, motion - scale * step, scale.tolist(), 1)
+    if stiff:
+        return
     starts = [[math.log(k)] * count + [0.01] * count for k in SCALES]
     found, left = _fit(
         seen, size, starts, lambda x: {"scale": x[:count].exp(), "offset": x[count:]}, len(SCALES)
     )
-    scale, zero = [math.exp(x) for x in found[:count]], found[count:]
-    pairs = zip(scale, names, zero, strict=True)
+    factor = [math.exp(x) for x in found[:count]]
+    pairs = zip(factor, names, found[count:], strict=True)
     each = some_of([f"{k:.3g} {name} {round(b, 4) + 0.0:+.3g}" for k, name, b in pairs])
-    near = all(abs(k - 1) < NEAR for k in scale)
+    near = all(abs(k - 1) < NEAR for k in factor)
     reason = "another zero, the sign of gravity" if near else "normalised observations, units"
     told = f"has states that the model knows as {each} ({reason})"
-    yield Mistake(told, left, scale, 2 * count)
+    yield Mistake(told, left, factor, 2 * count)
 
 
 def _fit(
@@ -173,7 +177,7 @@ def _fit(
         return seen.motion(**seen_from) - seen.step(**given)
 
     def residual(x: Any) -> np.ndarray:
-        return (left(x) / size).nan_to_num(1e3, 1e3, -1e3).double().numpy().ravel()
+        return (left(x) / size).nan_to_num(1e3, 1e3, -1e3).double().cpu().numpy().ravel()
 
     def slope(x: np.ndarray) -> np.ndarray:  # in single precision, SciPy's steps are too small
         steps = np.diag(np.maximum(3e-3 * np.abs(x), 1e-4))
@@ -209,9 +213,10 @@ def _without_forces(seen: Transitions, miss: Tensor) -> tuple[Tensor, int]:
     model, before = seen.model, seen.before
     free = model.manifold.difference(model(before, torch.zeros_like(seen.action)), before)
     known, left, fitted = free.isfinite().all(-1), torch.full_like(miss, torch.nan), 0
-    for j, own in enumerate(miss[known].double().T):
+    for j, own in enumerate(miss[known].double().cpu().T):
         rows = torch.cat([torch.ones_like(free[:, :1]), before, free[:, j : j + 1]], -1)[known]
-        rows = rows.double() / rows.double().square().mean(0).sqrt().clamp_min(1e-9)
+        rows = rows.double().cpu()
+        rows = rows / rows.square().mean(0).sqrt().clamp_min(1e-9)
         line = torch.linalg.lstsq(rows, own.unsqueeze(-1), driver="gelsd").solution
         rest = own - (rows @ line).squeeze(-1)
         explains = bool(rest.abs().mean() < 0.5 * own.abs().mean())

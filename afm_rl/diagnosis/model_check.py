@@ -152,8 +152,8 @@ def check_transitions(
         clear = (share(new) - share(old) > BETTER) | (gained > math.log(2))
         if known.sum() >= FEWEST and nats > most and bool(clear.any()):
             most, corrected = nats, float(share(new).nanmean())
-            told = {"cause": mistake.cause, "factor": tuple(mistake.factor)}
-            found = replace(found, corrected=corrected, **told)
+            cause, factor = mistake.cause, tuple(mistake.factor)
+            found = replace(found, cause=cause, factor=factor, corrected=corrected)
             if corrected > EXACT:
                 break
     return found

@@ -60,10 +60,10 @@ def check_model(
     """
     check_count("check_model: steps", steps)
     roll_out = _in_torchrl if isinstance(env, EnvBase) else _in_gymnasium
-    model, rows = roll_out(env, model, policy, state, steps, seed)
+    known, (states, actions, after) = roll_out(env, model, policy, state, steps, seed)
     from afm_rl.diagnosis.model_check import check_transitions
 
-    return check_transitions(model, *rows)
+    return check_transitions(known, states, actions, after)
 
 
 def _in_gymnasium(
@@ -73,9 +73,9 @@ def _in_gymnasium(
     wrapper = ActionFlowWrapper(env, model, state, enabled=False, late="leave")
     if wrapper.watching is not None:
         raise ConfigurationError("check_model: model='learn': there is no model yet to check")
-    space, rows = env.action_space, []
+    space: Any = env.action_space
     space.seed(seed)
-    observation, _ = wrapper.reset(seed=seed)
+    rows, (observation, _) = [], wrapper.reset(seed=seed)
     for _ in range(steps):
         wanted = space.sample() if policy is None else policy(observation)
         planned = as_numbers("action", wanted, space.shape).numpy()

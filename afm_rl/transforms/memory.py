@@ -166,7 +166,7 @@ def correct(
     plan = torch.where(planned.isfinite().all(-1, keepdim=True), planned, last)
     memory, found = corrector.correct(memory, plan, model, box)
     if enabled:
-        corrector.first_steps.note(found.misaligned, partial(corrector.cause_in, memory))
+        corrector.first_steps(found.misaligned, partial(corrector.cause_in, memory))
     # The last clamp depends on nothing but the spec, whatever the corrector answers.
     executed, _ = safe_action(found.executed if enabled else plan, low, high, sent)
     executed, predicted = executed.to(memory.dtype), found.predicted

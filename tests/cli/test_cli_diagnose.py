@@ -134,16 +134,22 @@ def test_columns_are_those_that_a_simulator_names(call, cart):
 
 
 @pytest.mark.parametrize(
-    ("change", "cause"),
+    ("factors", "cause"),
     [
         ({"t": None}, "makes 5 steps of the model in one (dt, frame_skip)"),
         ({"action.push": -1.0}, "acts on -1 times the action (a sign)"),
+        (
+            dict.fromkeys(("state.", "action."), 180 / np.pi),
+            "has states and actions in degrees, the model in radians",
+        ),
     ],
 )
-def test_what_is_wrong_with_a_model_is_said_first(call, cart, change, cause):
-    ((name, factor),) = change.items()
-    table = {**cart, name: None if factor is None else factor * cart[name]}
-    pd.DataFrame({k: v for k, v in table.items() if v is not None}).to_csv("log.csv", index=False)
+def test_what_is_wrong_with_a_model_is_said_first(call, cart, factors, cause):
+    for part, factor in factors.items():
+        for name in [name for name in cart if name.startswith(part)]:
+            cart[name] = None if factor is None else factor * cart[name]
+    table = {name: column for name, column in cart.items() if column is not None}
+    pd.DataFrame(table).to_csv("log.csv", index=False)
     done = call("log.csv", "--model", "cart.xml")
     assert cause in done.out.splitlines()[1] and "push: healthy" not in done.out.splitlines()
 

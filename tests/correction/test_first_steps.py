@@ -14,7 +14,7 @@ def said(steps):
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         for corrected in steps:
-            first.note(torch.tensor([corrected]), lambda: "gain 0.5 on all")
+            first(torch.tensor([corrected]), lambda: "gain 0.5 on all")
     return [str(warning.message) for warning in found]
 
 
@@ -39,13 +39,13 @@ def test_it_is_said_once_where_corrections_began_with_the_first_steps(steps, cou
 def test_numbers_are_not_looked_at_on_the_way_nor_in_a_compiled_tick():
     first = FirstSteps()
     for _ in range(STEPS - 1):
-        first.note(torch.ones(2, dtype=torch.bool, device="meta"), str)
+        first(torch.ones(2, dtype=torch.bool, device="meta"), str)
     assert len(first.corrected) == STEPS - 1
     first = FirstSteps()
 
     @torch.compile(backend="eager", fullgraph=True)
     def tick(values):
-        first.note(values > 0, str)
+        first(values > 0, str)
         return values + 1
 
     assert tick(torch.ones(2)).tolist() == [2, 2] and not first.corrected
