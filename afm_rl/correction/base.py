@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from afm_rl.correction.first_steps import FirstSteps
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.faults import count_repeats, trusted
@@ -81,6 +82,7 @@ class Corrector(nn.Module, ABC):
                 "one size, finite, low < high"
             )
         self.layouts: dict[int, tuple[list, list, list]] = {}  # by the size of a state
+        self.first_steps = FirstSteps()
         self.recent = check_count("corrector.recent", recent)
         scale = torch.maximum(low.abs(), high.abs())
         self.action_size = len(scale)
@@ -166,6 +168,10 @@ class Corrector(nn.Module, ABC):
         action itself, and no deviation.
         """
         return action, torch.zeros_like(action)
+
+    def cause_in(self, memory: Tensor) -> str:
+        """Return in words what memories ``(*B, P)`` show of the actuators; empty by default."""
+        return ""
 
     def latest(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the present state, and the actions planned and executed last."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -165,6 +166,8 @@ def correct(
     _, last, sent = corrector.latest(memory)
     plan = torch.where(planned.isfinite().all(-1, keepdim=True), planned, last)
     memory, found = corrector.correct(memory, plan, model, box)
+    if enabled:
+        corrector.first_steps(found.misaligned, partial(corrector.cause_in, memory))
     # The last clamp depends on nothing but the spec, whatever the corrector answers.
     executed, _ = safe_action(found.executed if enabled else plan, low, high, sent)
     executed, predicted = executed.to(memory.dtype), found.predicted
