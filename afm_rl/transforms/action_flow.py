@@ -154,7 +154,7 @@ class ActionFlowTransform(CarriedTransform):
         self.carry_memory = check_flag("transform.carry_memory", carry_memory)
         keep = check_flag("transform.keep_memory_on_reset", keep_memory_on_reset)
         self.keep_memory_on_reset = keep
-        self._newest: TensorDictBase | None = None  # the entries of the last step, and its memory
+        self._newest: Any = None  # the entries of the newest step, and its memory
 
     @property
     def corrector(self) -> Corrector:
@@ -334,7 +334,7 @@ class ActionFlowTransform(CarriedTransform):
         return entries if self.carry_memory else entries.exclude("memory")
 
     def _rows(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Return which missions begin, one dimension less where all of their agents do; None: all."""
+        """Return which missions begin, or which of their agents; None: all."""
         keys, own = self.parent.reset_keys, self.key("memory")
         for key in keys:
             node = key[:-1] if isinstance(key, tuple) else ()

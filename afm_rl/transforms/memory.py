@@ -110,9 +110,9 @@ def begin(
     entries = entries_spec(corrector, state.shape[:-1], action_spec.dtype).to(state.device).zero()
     entries.set("effect_bounds", box_of(action_spec, entries.get("planned_action")))
     state = state.to(precise(state.dtype))
-    again = before is not None and before.shape[:-1] == state.shape[:-1]
-    memory = corrector.resume(before.to(state), state) if again else corrector.begin(state)
-    return entries.set("memory", memory)
+    if before is None or before.shape[:-1] != state.shape[:-1]:
+        return entries.set("memory", corrector.begin(state))
+    return entries.set("memory", corrector.resume(before.to(state), state))
 
 
 @torch.no_grad()

