@@ -99,6 +99,7 @@ class ActionFlow(PairCorrector):
     told: Tensor
     first: Tensor
     cause: Tensor
+    episodic = (*PairCorrector.episodic, "under_way")
 
     def __init__(
         self,

@@ -65,6 +65,8 @@ class Corrector(nn.Module, ABC):
     lowest: Tensor
     highest: Tensor
     hold: Tensor
+    episodic: tuple[str, ...] = ("state", "planned", "executed", "repeats", "sent")
+    """Parts of a memory that belong to one episode; the others are what was learnt."""
 
     def __init__(
         self,
@@ -107,6 +109,7 @@ class Corrector(nn.Module, ABC):
             "executed": (size,),
             "misaligned": (1,),
             "repeats": (1,),
+            "carryover": (1,),
             "transitions": (self.recent, 2 * state_size + 2 * size + 1),
             "sent": (self.delay, size),
         }
@@ -127,6 +130,18 @@ class Corrector(nn.Module, ABC):
         rest = self.denormalise(torch.zeros_like(self.lowest).clamp(self.lowest, self.highest))
         return self.pack({**parts, "sent": rest.to(memory).expand_as(parts["sent"])})
 
+    def resume(self, memory: Tensor, state: Tensor) -> Tensor:
+        """Return the memory ``(*B, P)`` of missions that begin again in ``state`` ``(*B, S)``.
+
+        What was learnt is kept. The state, the actions of the last step and commands under way are
+        those of a beginning, so that no transition leads from one episode into the next, and while
+        commands of the last one may still act, transitions do not count.
+        """
+        parts, late = self.unpack(memory, state.shape[-1]), self.under_way(memory)[2]
+        begun = self.unpack(self.begin(state.to(memory)), state.shape[-1])
+        parts |= {name: begun[name] for name in self.episodic}
+        return self.pack({**parts, "carryover": late.unsqueeze(-1).to(memory)})
+
     def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
         """Return the memory with the transition to ``next_state`` ``(*B, S)``.
 
@@ -136,6 +151,8 @@ class Corrector(nn.Module, ABC):
         state, count = parts["state"], parts["repeats"].squeeze(-1)
         after = count_repeats(next_state, state, count)
         valid = trusted(state, count) & trusted(next_state, after)
+        valid &= parts["carryover"].squeeze(-1) == 0
+        parts["carryover"] = (parts["carryover"] - 1).clamp_min(0)
         sent = torch.cat([parts["sent"], parts["executed"].unsqueeze(-2)], -2)
         acted, parts["sent"] = sent[..., 0, :], sent[..., 1:, :]
         ends = [state, parts["planned"], acted, next_state, valid.unsqueeze(-1)]

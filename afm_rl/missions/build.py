@@ -172,7 +172,8 @@ def _build(settings: dict[str, Any]) -> Agent:
         if corrector.module is not None:
             around["reported_key"] = robot.reported
             # Scores and updaters read what was measured; planners the state in which they will act.
-            transform = ActionFlowTransform(model, corrector.module, late="leave", **around)
+            around |= {"late": "leave", "carry_memory": True}  # missions leave, and are resumed
+            transform = ActionFlowTransform(model, corrector.module, **around)
     shape = {name: value for name, value in settings["robot"].items() if name in SHAPE_TRAINING}
     trainings = [
         part.training._replace(settings=[shape, *part.training.settings])
