@@ -98,10 +98,11 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
     check_training("dynamics.pretrain", pretrain_ensemble, pretrain, **least)
     model = Ensemble(nominal.manifold, nominal.action_size, list(robot.features), **settings)
     own = _without(settings, "propagation", "precision")
+    rolled = {name: settings[name] for name in ("propagation", "precision") if name in settings}
     unit = "standard deviations of the data"
     if robot.data is not None:
         fit = partial(fit_collected, model, robot, robot.data)
-        return Part(model, Training("ensemble", model, fit, unit, [own]), own)
+        return Part(model, Training("ensemble", model, fit, unit, [own]), {**own, **rolled})
 
     def train(progress: bool) -> Mapping[str, Any]:
         boxes = robot.state_box, robot.action_box
@@ -110,7 +111,7 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
         return asdict(pretrain_ensemble(model, nominal, *boxes, **given))
 
     shape = {"pretrain": dict(pretrain), **own}
-    return Part(model, Training("ensemble", model, train, unit, [shape]), shape)
+    return Part(model, Training("ensemble", model, train, unit, [shape]), {**shape, **rolled})
 
 
 def knode(
@@ -194,7 +195,7 @@ def paper_flow(
         )
     size, features = model.state_size, list(robot.features)
     flow = PaperFlow(*robot.action_box, features=features, state_size=size, **settings)
-    own = _without(settings, "gate", "steps", "error_action", "wrap", "latch")
+    own = _without(settings, "rule", "gate", "steps", "error_action", "latch")
     return Part(flow, _training(flow, robot, dynamics, train, checkpoint, own, "action units"))
 
 
