@@ -156,7 +156,8 @@ class PaperFlow(Corrector):
         state = model.manifold.project(draw_states(states, count, generator))
         box = self.denormalise(self.lowest), self.denormalise(self.highest)
         planned, other = (uniform(*box, count, generator) for _ in range(2))
-        error = self._difference(model, model(state, other), model(state, planned))
+        reached, expected = (model.forecast(state, action)[0] for action in (other, planned))
+        error = self._difference(model, reached, expected)
         return self._features(state, planned, error), planned, other
 
     @torch.no_grad()

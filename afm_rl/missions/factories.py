@@ -98,11 +98,10 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
     check_training("dynamics.pretrain", pretrain_ensemble, pretrain, **least)
     model = Ensemble(nominal.manifold, nominal.action_size, list(robot.features), **settings)
     own = _without(settings, "propagation", "precision")
-    rolled = {name: settings[name] for name in ("propagation", "precision") if name in settings}
     unit = "standard deviations of the data"
     if robot.data is not None:
         fit = partial(fit_collected, model, robot, robot.data)
-        return Part(model, Training("ensemble", model, fit, unit, [own]), {**own, **rolled})
+        return Part(model, Training("ensemble", model, fit, unit, [own]), own)
 
     def train(progress: bool) -> Mapping[str, Any]:
         boxes = robot.state_box, robot.action_box
@@ -111,7 +110,7 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
         return asdict(pretrain_ensemble(model, nominal, *boxes, **given))
 
     shape = {"pretrain": dict(pretrain), **own}
-    return Part(model, Training("ensemble", model, train, unit, [shape]), {**shape, **rolled})
+    return Part(model, Training("ensemble", model, train, unit, [shape]), shape)
 
 
 def knode(
