@@ -78,7 +78,7 @@ def results(tmp_path_factory):
 
 def settings_of_methods(first):
     """Return the settings as they are, or those of each method that is compared, AFM first."""
-    single = {"method", "dynamics", "corrector", "updater"}
+    single = {"agent", "method", "dynamics", "corrector", "updater"}
     if single & {choice.partition("=")[0] for choice in first}:
         return [first]
     whole = compose("config", [choice for choice in first if "." not in choice.partition("=")[0]])
