@@ -65,8 +65,8 @@ def check_training(
 ) -> None:
     """Check the ``settings`` of a training function by its defaults, which say what there is.
 
-    Flags must be flags, counts at least 1, or what ``least`` says; other numbers must not be negative, and step
-    sizes at most 1.
+    Flags must be flags, counts at least 1, or what ``least`` says; other numbers must not be
+    negative, and step sizes at most 1.
     """
     known = {
         name: parameter.default

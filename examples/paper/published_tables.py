@@ -1,10 +1,10 @@
 """Our means beside those that the paper printed: its tables 1 to 4, the means, and the quadrotor's.
 
     python examples/paper/published_tables.py outputs/study/ugv_paper
-    python examples/paper/published_tables.py outputs/study/ugv_paper outputs/study/quadrotor_paper \
-        --page docs/paper.md
+    python examples/paper/published_tables.py outputs/study/ugv_paper --page docs/paper.md
 
-Writes CSV and LaTeX; with a page, the same between the page's marks. The paper gave each mission
+Writes CSV and LaTeX; with a page, the same between the page's marks. Give it the folder of
+study=quadrotor_paper, too, for the quadrotor's. The paper gave each mission
 5000 steps, and one that ran out counts 4999, the number of its last step. Steps of ours compare
 with these only under the same budget: the tables say where it differs.
 """
@@ -71,11 +71,13 @@ def budget_note(missions: pd.DataFrame) -> str:
     if not other:
         return ""
     counted = " or ".join(map(str, other))
-    return f" Ours count {counted}: our budget was another one, so steps and success do not compare."
+    return (
+        f" Ours count {counted}: our budget was another one, so steps and success do not compare."
+    )
 
 
 def cells_table(number: int, ours: pd.DataFrame) -> Table:
-    """Return one of the paper's tables of cells: a row per regime, success / steps of each method."""
+    """Return one of the paper's tables: a row per regime, success / steps of each method."""
     track, others = PRINTED[number]
     figures = published()
     figures = figures[figures["track"] == track]

@@ -118,7 +118,7 @@ def test_methods_seeds_and_settings_make_the_names(sweep, ran, tmp_path):
     assert yaml.safe_load(settings.read_text())["label"] == "physics"
 
 
-@pytest.mark.parametrize("launcher", [[], ["~launcher", "hydra/launcher=basic"]], ids=["own", "hydra"])
+@pytest.mark.parametrize("launcher", [[], ["~launcher", "hydra/launcher=basic"]], ids=str)
 def test_a_sweep_gives_a_setting_to_the_methods_that_have_it(
     sweep, ran, tmp_path, monkeypatch, launcher
 ):

@@ -139,7 +139,7 @@ def train_flow(
     """Train a flow on counterfactuals: what a robot's model would show under imagined regimes.
 
     The universal :class:`~afm_rl.correction.ActionFlow` is refined from where it is, by Adam with a
-    one-cycle step size and clipped gradients; the published flow starts from nothing, by Adam alone.
+    one-cycle step size and clipped gradients; the published flow from nothing, by Adam alone.
 
     Args:
         flow: trained in place.
