@@ -41,7 +41,7 @@ def model_of(name: str, trust: Sequence[str], columns: Columns) -> DynamicsModel
         step = np.median(np.diff(columns.t)[np.diff(columns.episode) == 0])
         return MuJoCoDynamics(name, frame_skip=max(1, round(float(step) / model.dt)))
     with trusting(trust):
-        packages = ["afm_rl.dynamics", *map(name_of, trusted())]
+        packages = ["afm_rl.dynamics", *map(name_of, trusted() or ())]
         if not any(name.startswith(f"{package}.") for package in packages):
             raise ConfigurationError(
                 f"--model {printable(name)}: expected a file .xml, or a function of a package that "

@@ -24,7 +24,9 @@ class LawPlanner(TensorDictModuleBase):
     """A function of the state in the place of a planner: a controller, or a policy.
 
     In an :class:`~afm_rl.dynamics.Oracle` it sends the actions whose effects, under the regime
-    that the oracle is told, are nearest to the law's: the yardstick for corrections.
+    that the oracle is told, are nearest to the law's: the yardstick for corrections. Nothing is
+    planned that could stand where the law's action is not finite: it is passed on, and
+    :class:`~afm_rl.transforms.Guard` holds the last one.
 
     Args:
         env: the planning environment: where state and action are, the action's box, and what the

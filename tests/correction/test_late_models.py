@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from afm_rl.correction.late import aligned, delay_tables, steps_late
+from afm_rl.correction.late import ago, aligned, delay_tables, steps_late
 from afm_rl.correction.least_squares import fit_gain
 
 
@@ -16,6 +16,13 @@ def test_a_command_joins_the_effect_that_came_later(late):
     assert torch.equal(still, pairs[0])
     assert found[late:, 0].tolist() == list(range(6 - late)) and found[:, 3].sum() == 6 - late
     assert torch.equal(found[:, 1], pairs[1, :, 1])
+
+
+def test_the_command_that_acts_is_so_many_steps_older_than_the_newest():
+    commands = torch.arange(24.0).view(3, 4, 2)  # of four steps, the newest last
+    found = ago(commands, torch.tensor([0, 1, 3]))
+    assert torch.equal(found, torch.stack([commands[0, 3], commands[1, 2], commands[2, 0]]))
+    assert torch.equal(ago(commands[0], torch.tensor(2)), commands[0, 1])
 
 
 def test_gains_of_late_commands_are_found():
