@@ -39,7 +39,7 @@ def main() -> None:
     parser = OneLineParser(NAME, ABOUT)
     add = parser.add_argument
     add("file", metavar="FILE", type=Path, help=f"a log: {KINDS}")
-    add("--out", metavar="DIR", type=Path, help="where to (FILE_diagnosis, beside FILE)")
+    add("--out", metavar="DIR", type=Path, help="where to (outputs/FILE_diagnosis)")
     healthy = "delay and lag of the healthy robot (s): 0; one frame in LeRobot's data sets"
     add("--delay", metavar="SECONDS", type=float, help=healthy)
     for name, what in (("command", "commands"), ("response", "their responses, in that order")):
@@ -89,8 +89,7 @@ def _run(options: argparse.Namespace) -> None:
 
         with Bar(total=1.0, desc="replaying", delay=3.0) as bar:  # s
             replayed = replay(log, lambda share: bar.update(share - bar.n))
-    file = options.file.resolve()
-    out = options.out or file.with_name(f"{file.stem}_diagnosis")
+    out = options.out or Path("outputs", f"{options.file.resolve().stem}_diagnosis")
     print_diagnosis(found)
     if replayed is not None:
         print_replay(replayed)
