@@ -94,7 +94,7 @@ def sorted_series(values: np.ndarray, t: np.ndarray) -> Series:
     """Return values in the order of their times, the last one of each time.
 
     >>> sorted_series(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.2, 0.0]))
-    Series(values=array([3., 2.]), t=array([0. , 0.2]), row=None)
+    Series(values=array([3., 2.]), t=array([0. , 0.2]), row=None, rows=0)
     """
     order = np.argsort(t, kind="stable")
     t = t[order]

@@ -12,7 +12,14 @@ import numpy as np
 
 from afm_rl.diagnosis.log import FEWEST, Log
 from afm_rl.diagnosis.readers import messages, parquet, tables
-from afm_rl.diagnosis.readers.source import Columns, Series, Source, check_regular, choose
+from afm_rl.diagnosis.readers.source import (
+    Columns,
+    Series,
+    Source,
+    check_regular,
+    choose,
+    thinned_note,
+)
 from afm_rl.errors import ConfigurationError, printable
 
 PAIRS = ("command", "response")
@@ -129,8 +136,9 @@ def read_columns(
         first, second = (np.column_stack([found[n].values for n in group]) for group in wanted)
         time = found[source.time].values if source.time else clock
         border = found[source.episode].values if source.episode else None
-        number = found[wanted[0][0]].row
-        number = np.arange(len(first)) if number is None else number
+        leading = found[wanted[0][0]]
+        number = np.arange(len(first)) if leading.row is None else leading.row
+        notes = (*source.notes, *thinned_note(number, leading.rows), *notes)
         done = _complete(source, names, first, second, number, time, border, notes)
         return replace(done, effort=_effort(source))
 
@@ -201,7 +209,6 @@ def _complete(
             f"{len(sound)} rows{missing}: expected at least {FEWEST} complete ones, and half of "
             "all; log for a longer time"
         )
-    notes = (*source.notes, *notes)
     if lost:
         notes += (f"{lost} of {len(sound)} rows were dropped: numbers are missing or infinite",)
     rows = np.flatnonzero(sound)
