@@ -62,7 +62,7 @@ def _run(options: argparse.Namespace) -> None:
     from dataclasses import replace
 
     from afm_rl.diagnosis import diagnose
-    from afm_rl.diagnosis.readers import Unchosen, read_log
+    from afm_rl.diagnosis.readers import Unchosen, bounded_memory, read_log
     from afm_rl.errors import check_number, printable
     from afm_rl.report.diagnosis import print_diagnosis, write_diagnosis
 
@@ -72,7 +72,8 @@ def _run(options: argparse.Namespace) -> None:
             for given in (options.command, options.response)
         )
         try:
-            log = read_log(options.file, command, response, options.episode)
+            with bounded_memory(options.file):
+                log = read_log(options.file, command, response, options.episode)
         except Unchosen as error:
             print("\n".join(error.listing))
             raise
@@ -101,13 +102,14 @@ def _run(options: argparse.Namespace) -> None:
 
 def _read_effective(path: Path, name: str) -> Log:
     """Return a log whose commands are the actions, and whose responses are effective actions."""
-    from afm_rl.diagnosis.readers import TRANSITIONS, read_columns
+    from afm_rl.diagnosis.readers import TRANSITIONS, bounded_memory, read_columns
     from afm_rl.dynamics import KnownDynamics  # torch takes seconds
     from afm_rl.missions.explained import effective_log
     from afm_rl.spaces.manifold import Manifold
     from afm_rl.targets import find_code
 
-    found = read_columns(path, TRANSITIONS)
+    with bounded_memory(path):
+        found = read_columns(path, TRANSITIONS)
     sys.path.insert(0, os.getcwd())
     try:
         step = find_code("--model", name)

@@ -5,7 +5,21 @@ what was logged, and a function that reads some of it. What is a command and wha
 chosen afterwards, the same way for all formats.
 """
 
-from afm_rl.diagnosis.readers.read import PAIRS, TRANSITIONS, read_columns, read_log
+from afm_rl.diagnosis.readers.read import (
+    PAIRS,
+    TRANSITIONS,
+    bounded_memory,
+    read_columns,
+    read_log,
+)
 from afm_rl.diagnosis.readers.source import Columns, Unchosen
 
-__all__ = ["PAIRS", "TRANSITIONS", "Columns", "Unchosen", "read_columns", "read_log"]
+__all__ = [
+    "PAIRS",
+    "TRANSITIONS",
+    "Columns",
+    "Unchosen",
+    "bounded_memory",
+    "read_columns",
+    "read_log",
+]

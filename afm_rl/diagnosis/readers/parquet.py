@@ -33,6 +33,8 @@ STAMP = "timestamp"
 LISTS = (arrow.types.is_list, arrow.types.is_large_list, arrow.types.is_fixed_size_list)
 INFO = "meta/info.json"
 FASTEST, SLOWEST = 1e6, 1e-3  # rates (1/s) that a robot may have
+DECODED = 10**9
+"""Most numbers that are unpacked to read a log."""
 
 
 def open_parquet(path: Path) -> Source:
@@ -95,7 +97,7 @@ def columns_of(file: Path) -> dict[str, arrow.DataType]:
 
 
 def widths_of(file: Path, columns: Iterable[str]) -> dict[str, int | None]:
-    """Return how many numbers the first list of each column has; None: they are single numbers.
+    """Return how many numbers the first list of each column has; None: it has no lists of numbers.
 
     Of lists of more than ``WIDEST`` numbers it is the mean, which is known without reading them.
     """
@@ -108,7 +110,8 @@ def widths_of(file: Path, columns: Iterable[str]) -> dict[str, int | None]:
             leaves[field.name], first = first, first + _leaves(field.type)
         means: dict[str, int] = {}
         for name in columns:
-            if any(is_list(schema.field(name).type) for is_list in LISTS):
+            kind = schema.field(name).type
+            if kind != _innermost(kind) and _is_number(_innermost(kind)):
                 count = sum(group.column(leaves[name]).num_values for group in groups)
                 means[name] = count // max(stored.num_rows, 1)
         short = [name for name, mean in means.items() if mean <= WIDEST]
@@ -116,6 +119,23 @@ def widths_of(file: Path, columns: Iterable[str]) -> dict[str, int | None]:
         lengths = {} if row is None or not len(row) else {n: row.column(n)[0] for n in short}
     found = {n: len(cell.values) if cell.is_valid else 0 for n, cell in lengths.items()}
     return {name: found.get(name, means.get(name)) for name in columns}
+
+
+def check_kind(column: str, kind: arrow.DataType) -> None:
+    """Refuse a column of something else than numbers, and lists of them."""
+    if not _is_number(_innermost(kind)):
+        raise ConfigurationError(f"{printable(column)}: {kind}: expected numbers, or lists of them")
+
+
+def _is_number(kind: arrow.DataType) -> bool:
+    types = arrow.types
+    return types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)
+
+
+def _innermost(kind: arrow.DataType) -> arrow.DataType:
+    while any(is_list(kind) for is_list in LISTS):
+        kind = kind.value_type
+    return kind
 
 
 def _leaves(kind: arrow.DataType) -> int:
@@ -154,6 +174,7 @@ def _read(
         wanted = [(a, b) for a, b in wanted if a < b]
         for column, longest in widths_of(file, columns).items():
             check_width(column, longest)
+            check_kind(column, columns_of(file)[column])
         with _reading(file):
             for first, batch in _batches(file, columns, width, wanted):
                 numbers.append(begin + first + np.arange(len(batch)))
@@ -164,8 +185,8 @@ def _read(
         kinds = {str(part.shape[1]) if part.ndim > 1 else "single" for part in found}
         if len(kinds) > 1:
             raise ConfigurationError(
-                f"{printable(column)}: lists of {' and '.join(sorted(kinds)[:8])} numbers: expected "
-                "one length"
+                f"{printable(column)}: lists of {' and '.join(sorted(kinds)[:8])} numbers: "
+                "expected one length"
             )
     joined = {name: np.concatenate(found or [np.empty(0)]) for name, found in parts.items()}
     return np.concatenate(numbers), joined
@@ -175,18 +196,30 @@ def _batches(
     file: Path, columns: Sequence[str], width: int, wanted: Sequence[tuple[int, int]]
 ) -> Iterator[tuple[int, arrow.RecordBatch]]:
     """Yield rows of a file in batches, with the number of the first; only wanted rows."""
-    if not wanted:
-        return
     opened, first = parquet.ParquetFile(file), 0
+    groups: list[tuple[int, int]] = []  # those that hold wanted rows, with their first row
+    rows = 0
+    for k in range(opened.num_row_groups):
+        count = opened.metadata.row_group(k).num_rows
+        if any(low < first + count and first < high for low, high in wanted):
+            groups.append((k, first))
+            rows += count
+        first += count
+    if rows * width > DECODED:
+        raise ConfigurationError(
+            f"{rows:,} rows of {width:,} numbers: expected at most {DECODED:,} numbers in all; "
+            "name fewer columns, or split the file"
+        )
     size = min(1 << 16, (1 << 22) // width + 1)
-    for batch in opened.iter_batches(size, columns=list(columns)):
-        for low, high in wanted:
-            a, b = max(low - first, 0), min(high - first, len(batch))
-            if a < b:
-                yield first + a, batch.slice(a, b - a)
-        first += len(batch)
-        if first >= wanted[-1][1]:
-            return
+    for k, first in groups:
+        for batch in opened.iter_batches(size, row_groups=[k], columns=list(columns)):
+            for low, high in wanted:
+                a, b = max(low - first, 0), min(high - first, len(batch))
+                if a < b:
+                    yield first + a, batch.slice(a, b - a)
+            first += len(batch)
+            if first >= wanted[-1][1]:
+                return
 
 
 def _values(name: str, column: arrow.Array) -> np.ndarray:
@@ -199,10 +232,6 @@ def _values(name: str, column: arrow.Array) -> np.ndarray:
                 "numbers: expected lists of numbers of one length"
             )
         return _values(name, column.flatten()).reshape(len(column), widths[0])
-    kind = column.type
-    is_number = arrow.types.is_integer(kind) or arrow.types.is_floating(kind)
-    if not (is_number or arrow.types.is_boolean(kind)):
-        raise ConfigurationError(f"{printable(name)}: {kind}: expected numbers, or lists of them")
     with np.errstate(invalid="ignore"):  # a signalling NaN
         return column.to_numpy(zero_copy_only=False).astype(float)
 
@@ -263,7 +292,8 @@ def open_lerobot(folder: Path) -> Source:
 def _info(file: Path) -> tuple[dict[str, Any], float]:
     """Return the features of a data set, and its rate (1/s)."""
     try:
-        info = json.loads(file.read_text(encoding="utf-8"))
+        with file.open(encoding="utf-8") as text:
+            info = json.loads(text.read(1 << 24))
         features, fps = info["features"], float(info["fps"])
         if not isinstance(features, dict):
             raise TypeError("features")

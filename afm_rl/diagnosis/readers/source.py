@@ -265,7 +265,8 @@ def _expanded(source: Source, option: str, given: Sequence[str]) -> Pairs:
         found = [field] if field in source.names else []
         found = found or [n for n in source.names if n.startswith((f"{field}.", f"{field}["))]
         if not found:
-            near = difflib.get_close_matches(field, source.names, n=1)
+            some = [name for name in source.names[: NAMES // 10] if len(name) < 200]
+            near = difflib.get_close_matches(field, some, n=1)
             advice = f"did you mean {printable(near[0])}?" if near else "leave it out for a listing"
             raise ConfigurationError(
                 f"{option} {printable(field)}: there is no such name; {advice}"

@@ -48,9 +48,7 @@ def _line(file: BinaryIO) -> bytes:
     return line
 
 
-def _large(
-    path: Path, width: int, large: int = 1 << 25
-) -> tuple[list[tuple[int, int, int]], int]:
+def _large(path: Path, width: int, large: int = 1 << 25) -> tuple[list[tuple[int, int, int]], int]:
     """Return the blocks of a large file, byte, row, and number of rows; and the rows of the file.
 
     A file of less than ``large`` bytes is read as a whole, and has none.
