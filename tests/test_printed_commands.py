@@ -111,7 +111,9 @@ def shrunk(overrides):
         if not each.get_key_element().startswith("hydra.")
     ]
     methods = [each for each in parsed if each.get_key_element() == "method"]
-    swept = [m for each in methods if each.is_sweep_override() for m in each.sweep_string_iterator()]
+    swept = [
+        m for each in methods if each.is_sweep_override() for m in each.sweep_string_iterator()
+    ]
     left_out = ("out=", "launcher=", "method=") if swept else ("out=", "launcher=")
     first = [choice for choice in first if not choice.startswith(left_out)]
     cfg = next(filter(None, map(composed, settings_of_methods(first, swept))))

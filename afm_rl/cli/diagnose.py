@@ -35,7 +35,7 @@ def main() -> None:
     parser = OneLineParser(NAME, ABOUT)
     add = parser.add_argument
     add("file", metavar="FILE", type=Path, help=f"a log: {KINDS}")
-    add("--out", metavar="DIR", type=Path, help="where to (FILE_diagnosis, beside FILE)")
+    add("--out", metavar="DIR", type=Path, help="where to (outputs/FILE_diagnosis)")
     healthy = "delay and lag of the healthy robot (s): 0; one frame in LeRobot's data sets"
     add("--delay", metavar="SECONDS", type=float, help=healthy)
     for name, what in (("command", "commands"), ("response", "their responses, in that order")):
@@ -60,7 +60,13 @@ def _run(options: argparse.Namespace) -> None:
     from dataclasses import replace
 
     from afm_rl.diagnosis import diagnose
-    from afm_rl.diagnosis.readers import TRANSITIONS, Unchosen, read_columns, read_log
+    from afm_rl.diagnosis.readers import (
+        TRANSITIONS,
+        Unchosen,
+        bounded_memory,
+        read_columns,
+        read_log,
+    )
     from afm_rl.errors import check_number, printable
     from afm_rl.report.diagnosis import print_diagnosis, write_diagnosis
 
@@ -71,10 +77,12 @@ def _run(options: argparse.Namespace) -> None:
     notes: tuple[str, ...] = ()
     try:
         if options.model is None:
-            log = read_log(options.file, command, response, options.episode)
+            with bounded_memory(options.file):
+                log = read_log(options.file, command, response, options.episode)
         else:
             names = TRANSITIONS, command, response
-            columns = read_columns(options.file, *names, options.episode)
+            with bounded_memory(options.file):
+                columns = read_columns(options.file, *names, options.episode)
             from afm_rl.cli import log_model  # torch takes seconds
 
             model = log_model.model_of(options.model, options.trust, columns)
@@ -97,8 +105,7 @@ def _run(options: argparse.Namespace) -> None:
 
         with Bar(total=1.0, desc="replaying", delay=3.0) as bar:  # s
             replayed = replay(log, lambda share: bar.update(share - bar.n))
-    file = options.file.resolve()
-    out = options.out or file.with_name(f"{file.stem}_diagnosis")
+    out = options.out or Path("outputs", f"{options.file.resolve().stem}_diagnosis")
     print_diagnosis(found)
     if replayed is not None:
         print_replay(replayed)

@@ -33,7 +33,9 @@ def call(monkeypatch, capsys):
 
 
 @pytest.fixture
-def log(tmp_path):
+def log(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
     rng = np.random.default_rng(0)
     u = rng.uniform(-1, 1, (400, 2))
     y = np.column_stack([u[:, 0], -0.62 * np.roll(u[:, 1], 2)])
@@ -50,7 +52,8 @@ def test_a_log_becomes_a_table_a_file_and_a_page(call, log):
     assert (done.status, done.err) == (0, "")
     assert "pan: healthy" in done.out.splitlines()
     assert "<b>elbow: reversed, 62 % of the command, 2 steps (0.04 s) late" in done.out.splitlines()
-    out = log.parent / "log_diagnosis"
+    out = Path("outputs", "log_diagnosis")
+    assert {path.name for path in log.parent.iterdir()} == {"here", "log.csv"}  # as it was
     pan, elbow = json.loads((out / "diagnosis.json").read_text())["actuators"]
     assert pan["status"] == "healthy" and pan["saturation"] is None
     assert elbow["gain_interval"][0] < elbow["gain"] < elbow["gain_interval"][1] < 0
@@ -173,8 +176,10 @@ def test_a_log_is_replayed(call, log, tmp_path):
     sentence = next(line for line in done.out.splitlines() if line.startswith("A correction"))
     assert sentence.endswith("% of the error of <b>elbow, and none of pan.")
     rows = pd.read_csv(tmp_path / "out.csv")
-    assert len(rows) == 398 and np.isfinite(rows["<b>elbow.afm"]).all()
-    page = (log.parent / "log_diagnosis" / "index.html").read_text()
+    assert len(rows) == 398 and np.isfinite(rows["afm.<b>elbow"]).all()
+    again = call(tmp_path / "out.csv", "--no-page")  # a log like any other
+    assert "pan: healthy" in again.out.splitlines() and again.err == ""
+    page = Path("outputs/log_diagnosis/index.html").read_text()
     assert page.count("data:image/png;base64,") == 3 and "affine least squares" in page
 
 
