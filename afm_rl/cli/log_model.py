@@ -64,7 +64,7 @@ def columns_of(model: DynamicsModel, columns: Columns) -> Columns:
     states, actions = getattr(model, "names", columns.names[::-1])
     action = _chosen("action", actions, columns.names[0], columns.first)
     state = _chosen("state", states, columns.names[1], columns.second)
-    blocks = blocks_of(len(state), SIMULATED if model.stiff else len(state))
+    blocks = blocks_of(len(state), most=SIMULATED if model.stiff else len(state))
     rows = np.concatenate([np.arange(first, last) for first, last in blocks])
     apart = (np.diff(columns.episode[rows]) != 0) | (np.diff(rows) > 1)
     return replace(
@@ -75,7 +75,7 @@ def columns_of(model: DynamicsModel, columns: Columns) -> Columns:
         t=columns.t[rows],
         episode=np.append(0, np.cumsum(apart)),
         row=columns.row[rows],
-        notes=thinned_note(len(columns.t), blocks),
+        notes=thinned_note(rows, len(columns.t)),
     )
 
 
