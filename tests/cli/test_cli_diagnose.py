@@ -98,7 +98,7 @@ def test_effective_actions_of_a_model(call, own_model):
     assert told[1].startswith(
         "Likely cause: the robot acts on -0.5 times 1 (signs, gains or units)"
     )
-    assert json.loads(Path("log_diagnosis/diagnosis.json").read_text())["notes"][:2] == told
+    assert json.loads(Path("outputs/log_diagnosis/diagnosis.json").read_text())["notes"][:2] == told
 
 
 CART = """<mujoco><option timestep="0.01"/><worldbody><body><joint name="rail" type="slide"
