@@ -1,5 +1,6 @@
 """The action flow, whatever its weights."""
 
+import math
 import os
 
 import pytest
@@ -39,6 +40,25 @@ def test_an_aligned_robot_is_left_alone_to_the_bit(line, drive, plans, size, bat
     executed, predicted, spread, _, innovation, misaligned, _ = found
     assert torch.equal(executed, planned) and torch.equal(predicted, planned)
     assert not misaligned.any() and not spread.any() and (innovation < 5).all()
+
+
+@pytest.mark.parametrize(
+    ("reached", "corrected", "pair"),
+    [
+        (0.3005, 0.0, (0.3, 0.3, 1.0)),  # half a standard deviation needs no explanation
+        (0.3005, 1.0, (0.3, 0.3005, 1.0)),  # but where actions are corrected all is looked at
+        (50.0, 0.0, (0.3, 4.0, 1.0)),  # as far as effects carry news
+        (math.nan, 0.0, (0.3, 0.0, 0.0)),  # what was sent is known
+    ],
+)
+def test_a_transition_becomes_a_pair(line, reached, corrected, pair):
+    flow, model = flow_of(1), line(1, noise_std=1e-3)
+    sent = torch.tensor([0.3])
+    memory = flow.executing(flow.begin(torch.zeros(1)), sent, sent)
+    memory = flow.observe(memory, torch.tensor([reached]))
+    memory = flow.pack({**flow.unpack(memory, 1), "misaligned": torch.tensor([corrected])})
+    newest = flow.look(memory, model)["pairs"][-1]
+    torch.testing.assert_close(newest[[0, 1, 3]], torch.tensor(pair), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(
