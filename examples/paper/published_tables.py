@@ -32,6 +32,7 @@ LABELS = {  # ours: the paper's
     "stream_x_pe": "stream_x_pe",
     "physics": "physics",
 }
+MEASURES = {"success": "success_rate", "steps": "steps"}  # the paper's: our column
 CODED = "afm_paper_code"
 PRINTED = {  # number of a table: its track, and its methods after AFM
     1: ("ethz_1", ["stream_x_pe", "physics"]),
@@ -81,7 +82,7 @@ def cells_table(number: int, ours: pd.DataFrame) -> Table:
     track, others = PRINTED[number]
     figures = published()
     figures = figures[figures["track"] == track]
-    own = ours.groupby(["cell", "method"])[["success_rate", "steps"]]
+    own = ours.groupby(["cell", "method"])[list(MEASURES.values())]
     own = own.agg(["mean", lambda values: values.std(ddof=0)])
     rows, numbers = [], []
     for cell, group in figures.groupby("cell", sort=False):
@@ -131,7 +132,8 @@ def means_table(ours: pd.DataFrame) -> Table:
         figure = {"method": method, "missions": len(own), **printed.loc[name]}
         row = {"method": HEADS[method], "missions": str(len(own))}
         pairs = pair(ours, method, "online_pe")
-        for head, column, digits in (("success", "success_rate", 3), ("steps", "steps", 0)):
+        for head, column in MEASURES.items():
+            digits = 3 if head == "success" else 0
             row[f"{head}, ours"] = row[f"{head} - Online PE"] = "-"
             if len(own):
                 figure |= estimate(column, own[column], own["cell"])
@@ -146,7 +148,7 @@ def means_table(ours: pd.DataFrame) -> Table:
         order = ["ours", "published", "- Online PE"]
         heads = [
             f"{head} {end}" if end[0] == "-" else f"{head}, {end}"
-            for head in ("success", "steps")
+            for head in MEASURES
             for end in order
         ]
         rows.append({name: row[name] for name in ("method", "missions", *heads)})
