@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from importlib.util import find_spec
 from pathlib import Path
@@ -116,3 +116,21 @@ def check_trust(entries: Any) -> list[str]:
             f"trust={entries!r}: expected a list of names of packages, or of paths that end in one"
         )
     return list(entries)
+
+
+def trusted_folders() -> list[str]:
+    """Return the folders of what is trusted: of paths, and of packages. A module has none.
+
+    >>> with trusting(["/robots/arm"]):
+    ...     trusted_folders()
+    ['/robots/arm']
+    """
+    folders: list[str] = []
+    for entry in trusted() or ():
+        if "/" in entry:
+            folders.append(entry)
+        else:
+            with suppress(ImportError, ValueError):  # of a package that is not there
+                spec = find_spec(entry)
+                folders += (spec.submodule_search_locations or ()) if spec else ()
+    return folders
