@@ -173,10 +173,10 @@ def tables(missions: pd.DataFrame) -> list[Table]:
     if ours.empty:
         return []
     found = [means_table(ours)]
-    for number, (track, _) in PRINTED.items():
+    for place, (track, _) in PRINTED.items():
         there = ours[ours["track"] == track]
         if len(there):
-            found.append(cells_table(number, there))
+            found.append(cells_table(place, there))
     return found
 
 
