@@ -19,8 +19,9 @@ import pandas as pd
 from afm_rl.report import read_runs
 from afm_rl.report.runs import cell_names
 from afm_rl.report.statistics import estimate, pair
-from afm_rl.report.tables import Table, interval_text, number
+from afm_rl.report.tables import Table, interval_text
 from afm_rl.storage.files import write_whole
+from afm_rl.storage.measures import number
 
 LAST = 4999  # step of a published mission that ran out
 LABELS = {  # ours: the paper's
@@ -129,7 +130,7 @@ def means_table(ours: pd.DataFrame) -> Table:
         own = ours[ours["method"] == method]
         same = figures[figures["cell"].isin(own["cell"])] if len(own) else figures
         whole = own["cell"].nunique() in (0, figures["cell"].nunique())
-        printed = same[same["printed"] == name] if name != "afm_dr" else TEXT[:whole]
+        printed = same[same["printed"] == name] if name != "afm_dr" else TEXT.head(int(whole))
         figure = {"method": method, "missions": len(own)}
         figure |= printed[["success_mean", "steps_mean"]].mean()
         row = {"method": HEADS[method], "missions": str(len(own))}
@@ -157,9 +158,9 @@ def means_table(ours: pd.DataFrame) -> Table:
         numbers.append(figure)
     note = (
         "Means over the cells that were run (all: 22), with 95 % stratified bootstrap intervals "
-        f"(strata: cells; {_seeds(ours)} seeds of a cell); published: means of the printed tables over "
-        "the cells that ours has, of AFM+DR that of the text, over all. Differences from Online PE are paired by cell and seed."
-        + budget_note(ours)
+        f"(strata: cells; {_seeds(ours)} seeds of a cell); published: means of the printed tables "
+        "over the same cells, of AFM+DR that of the text, over all. Differences from Online PE are "
+        "paired by cell and seed." + budget_note(ours)
     )
     title = "All cells: success and steps"
     return Table("paper_means", title, note, pd.DataFrame(numbers), pd.DataFrame(rows))
@@ -172,10 +173,10 @@ def tables(missions: pd.DataFrame) -> list[Table]:
     if ours.empty:
         return []
     found = [means_table(ours)]
-    for number, (track, _) in PRINTED.items():
+    for place, (track, _) in PRINTED.items():
         there = ours[ours["track"] == track]
         if len(there):
-            found.append(cells_table(number, there))
+            found.append(cells_table(place, there))
     return found
 
 
