@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Any
 
 from afm_rl.errors import AFMError, ConfigurationError
-from afm_rl.trust import check_trust, name_of, trusted, trusting
+from afm_rl.trust import check_trust, name_of, restricted, trusted, trusting
 
 PARTS = (
     *("correction", "dynamics", "envs", "learning", "missions", "planning", "regimes"),
@@ -127,13 +127,13 @@ def check_name(place: str, target: Any) -> None:
 def find_code(place: str, target: str) -> Any:
     """Return the class or function that a dotted name leads to, if it is trusted.
 
-    Where no settings are at work, see :func:`~afm_rl.trust.trusted`, that is not asked.
+    Where no settings are at work, see :func:`~afm_rl.trust.restricted`, that is not asked.
 
     Raises:
         ConfigurationError: if it is not trusted, there is none, or the way to it leaves its
             package.
     """
-    if trusted() is not None:
+    if restricted():
         check_name(place, target)
     first, *rest = target.split(".")
     try:
@@ -151,14 +151,15 @@ def find_code(place: str, target: str) -> Any:
     if not callable(found):
         raise ConfigurationError(f"{place}={target!r}: expected a class or a function")
     home = str(getattr(found, "__module__", None) or type(found).__module__)
-    ours = _inside(home, MAKERS) or (isinstance(found, type) and _inside(home, ALLOWED))
-    if trusted() is not None and not ours and not _inside(home, _names()):
+    kind = found if isinstance(found, type) else type(found)
+    ours = _inside(kind.__module__, ALLOWED) or _inside(home, MAKERS)
+    if restricted() and not ours and not _inside(home, _names()):
         raise ConfigurationError(f"{place}={target!r}: is code of {home}; {REMEDY}")
     return found
 
 
 def _names() -> list[str]:
-    return [name_of(entry) for entry in trusted() or ()]
+    return [name_of(entry) for entry in trusted()]
 
 
 def _inside(name: str, packages: Iterable[str]) -> bool:

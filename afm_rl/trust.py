@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,12 +21,14 @@ from afm_rl.errors import ConfigurationError
 _trusted: ContextVar[tuple[str, ...] | None] = ContextVar("trusted", default=None)
 
 
-def trusted() -> tuple[str, ...] | None:
-    """Return what is trusted: names of packages, and paths that end in one.
+def trusted() -> tuple[str, ...]:
+    """Return what is trusted: names of packages, and paths that end in one."""
+    return _trusted.get() or ()
 
-    None where no settings are at work: a program may call what it likes.
-    """
-    return _trusted.get()
+
+def restricted() -> bool:
+    """Tell whether settings are at work; a program may call what it likes."""
+    return _trusted.get() is not None
 
 
 def trust(entries: Iterable[str]) -> list[str]:
@@ -39,7 +41,7 @@ def trust(entries: Iterable[str]) -> list[str]:
         The folders that are searched from now on.
     """
     entries = [os.path.abspath(one) if "/" in one else one for one in entries]
-    _trusted.set(tuple(dict.fromkeys([*(trusted() or ()), *entries])))
+    _trusted.set(tuple(dict.fromkeys([*trusted(), *entries])))
     folders = dict.fromkeys(os.path.dirname(entry) or os.getcwd() for entry in entries)
     added = [folder for folder in folders if folder not in sys.path]
     sys.path.extend(added)
@@ -49,7 +51,7 @@ def trust(entries: Iterable[str]) -> list[str]:
 @contextmanager
 def trusting(entries: Iterable[str]) -> Iterator[None]:
     """Trust these packages, besides those that are trusted, and no other ones, for a while."""
-    before = trusted()
+    before = _trusted.get()
     added = trust(entries)
     try:
         yield
@@ -75,7 +77,7 @@ def conf_folders() -> list[Path]:
         ConfigurationError: for a package that is not there.
     """
     folders = []
-    for entry in trusted() or ():
+    for entry in trusted():
         try:
             spec = find_spec(name_of(entry))
         except Exception as error:  # the packages around it are imported, and may raise anything
@@ -114,3 +116,21 @@ def check_trust(entries: Any) -> list[str]:
             f"trust={entries!r}: expected a list of names of packages, or of paths that end in one"
         )
     return list(entries)
+
+
+def trusted_folders() -> list[str]:
+    """Return the folders of what is trusted: of paths, and of packages. A module has none.
+
+    >>> with trusting(["/robots/arm"]):
+    ...     trusted_folders()
+    ['/robots/arm']
+    """
+    folders: list[str] = []
+    for entry in trusted() or ():
+        if "/" in entry:
+            folders.append(entry)
+        else:
+            with suppress(ImportError, ValueError):  # of a package that is not there
+                spec = find_spec(entry)
+                folders += (spec.submodule_search_locations or ()) if spec else ()
+    return folders

@@ -70,11 +70,12 @@ def test_what_is_no_name_is_refused(target):
 def test_trust_covers_what_a_package_defines_and_nothing_it_imports(tmp_path, monkeypatch):
     (tmp_path / "boat").mkdir()
     (tmp_path / "boat" / "__init__.py").write_text("import os\nfrom json import loads\n")
-    (tmp_path / "boat" / "hull.py").write_text("class Hull: ...\nraised = 3\n")
+    made = "from afm_rl.dynamics import Dubins\nclass Hull: ...\nraised, model = 3, Dubins()\n"
+    (tmp_path / "boat" / "hull.py").write_text(made)
     (tmp_path / "boat" / "broken.py").write_text("1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)
     hull = {"model": {"_target_": "boat.hull.Hull"}}
-    check_targets(hull, trust=["boat"])
+    check_targets([hull, {"_target_": "boat.hull.model"}], trust=["boat"])
     for target in (
         "os.system",
         "loads",
@@ -110,7 +111,7 @@ def test_a_package_is_found_by_its_path_and_brings_its_settings(tmp_path, monkey
         monkeypatch.chdir("/")
         homes = [find_code("x", f"{name}.Hull").__module__ for name in ("punt", "canoe")]
         assert homes == ["punt", "canoe"]
-    assert (trusted(), sys.path) == (None, before)
+    assert (trusted(), sys.path) == ((), before)
 
 
 @pytest.mark.parametrize(

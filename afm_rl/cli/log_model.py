@@ -13,11 +13,12 @@ from afm_rl.diagnosis.model_check import ModelCheck, check_transitions
 from afm_rl.diagnosis.readers import Columns
 from afm_rl.diagnosis.readers.source import blocks_of, thinned_note
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
+from afm_rl.dynamics.mujoco_model import check_files
 from afm_rl.errors import ConfigurationError, printable
 from afm_rl.missions.explained import effective_log
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.targets import find_code
-from afm_rl.trust import name_of, trusted, trusting
+from afm_rl.trust import name_of, trusted, trusted_folders, trusting
 
 SIMULATED = 4000  # rows of a log that a simulator is asked about
 
@@ -28,13 +29,16 @@ def model_of(name: str, trust: Sequence[str], columns: Columns) -> DynamicsModel
     Args:
         name: of an MJCF file, which makes as many steps in a row as the times of the log say; or
             ``PACKAGE.FUNCTION``, a step function or a model.
-        trust: packages whose code may be called.
+        trust: packages whose code may be called, and folders whose files an MJCF may read.
         columns: actions and states.
 
     Raises:
-        ConfigurationError: for a package that is not trusted, or if there is no such model.
+        ConfigurationError: for a package or a file that is not trusted, or if there is no such
+            model.
     """
     if Path(name).suffix.lower() in (".xml", ".mjcf"):
+        with trusting(trust):
+            check_files("--model", name, trusted_folders())
         model = MuJoCoDynamics(name)
         if np.array_equal(columns.t, columns.row):  # no time was logged
             return model

@@ -38,8 +38,9 @@ class FirstSteps:
         """
         if len(self.corrected) == STEPS or torch.compiler.is_compiling():
             return
-        if corrected.is_cuda and torch.cuda.is_current_stream_capturing():
-            return
+        if corrected.is_cuda and torch.cuda.is_available():
+            if torch.cuda.is_current_stream_capturing():
+                return
         if self.corrected and self.corrected[0].device != corrected.device:
             self.corrected.clear()  # moved to another device
         self.corrected.append(corrected.float().mean())

@@ -149,9 +149,12 @@ def check_transitions(
         old, new = miss[known], mistake.miss[known]
         gained = ((old.abs().mean(0) + floor) / (new.abs().mean(0) + floor)).log()
         nats = len(miss) * float(gained.sum()) - SURE * mistake.fitted
-        clear = (share(new) - share(old) > BETTER) | (gained > math.log(2))
+        before, after = share(old), share(new)
+        clear = (after - before > BETTER) | (after > before) & (gained > math.log(2))
+        if mistake.fitted > model.action_size:  # so many numbers would refine any model
+            clear &= (before < GOOD) & (after.nanmean() >= GOOD)
         if known.sum() >= FEWEST and nats > most and bool(clear.any()):
-            most, corrected = nats, float(share(new).nanmean())
+            most, corrected = nats, float(after.nanmean())
             cause, factor = mistake.cause, tuple(mistake.factor)
             found = replace(found, cause=cause, factor=factor, corrected=corrected)
             if corrected > EXACT:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+import os
+import re
+from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,7 @@ import roma
 import torch
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.errors import ConfigurationError, check_number, printable
 from afm_rl.regimes import Physics
 from afm_rl.spaces.manifold import Manifold, wrap_angle
 
@@ -134,12 +137,113 @@ def _parse(source: str | Path) -> Any:
             return mujoco.MjModel.from_xml_string(text)
         if not Path(text).is_file():
             raise ConfigurationError(f"dynamics.model={text}: no such file")
-        return mujoco.MjModel.from_xml_path(text)
+        return mujoco.MjModel.from_xml_path(os.path.abspath(text))  # so that included files include
     except ConfigurationError:
         raise
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise ConfigurationError(f"dynamics.model={text[:80]!r}: {reason}") from error
+
+
+NAMED = re.compile(rb"\b(file\w*|value|assetdir|meshdir|texturedir)\s*=\s*([\"'])")
+"""Attributes that name files or folders; plugins have a ``value``."""
+PACKED = re.compile(r"\.(zip|mjz|mjb)(/|$)", re.IGNORECASE)
+LETTER = re.compile(r"&(?:#x([0-9a-fA-F]{1,6})|#([0-9]{1,7})|(amp|lt|gt|quot|apos));")
+WORDS = {"amp": "&", "lt": "<", "gt": ">", "quot": '"', "apos": "'"}
+LARGEST = 1 << 31  # bytes of a file; MuJoCo reads no larger ones
+MOST = 300_000  # files that one model may name
+
+
+def check_files(place: str, source: str, trusted: Sequence[str] = ()) -> None:
+    """Refuse an MJCF of others that may read files outside its folder, and outside trusted ones.
+
+    Every value that could name a file counts, also in a comment, in each folder that is named; so
+    do those of the files that it may read. An MJCF in a trusted folder may read everything; one
+    that is a text has no folder.
+
+    Args:
+        place: name of the setting.
+        source: path of a file, or text that begins with ``<``; nothing else is looked at.
+        trusted: folders.
+
+    Raises:
+        ConfigurationError: naming the file; also for archives, pipes and devices.
+
+    >>> check_files("robot.xml", '<mujoco><include file="/etc/passwd"/></mujoco>', ["/etc"])
+    >>> check_files("robot.xml", '<mujoco><include file="/etc/passwd"/></mujoco>')
+    Traceback (most recent call last):
+        ...
+    afm_rl.errors.ConfigurationError: robot.xml: may read /etc/passwd, outside its folder; copy it \
+there, or say that you trust its folder, on the command line: trust=[/etc]
+    """
+    homes = [os.path.realpath(folder) for folder in trusted]
+    todo: list[str | bytes] = [source]
+    folder = os.path.dirname(os.path.abspath(source))
+    if source.lstrip().startswith("<"):
+        todo, folder = [source.encode(errors="replace")], os.getcwd()
+    elif not os.path.isfile(source) or _inside(folder, homes):
+        return
+    else:
+        homes.append(os.path.realpath(folder))
+    bases, middles, names, seen = {folder}, {""}, set[str](), set[str]()
+    known = 0
+    while todo:
+        for key, name in _named(todo.pop()):
+            (middles if key.endswith("dir") else names).update((name, os.path.basename(name)))
+        if len(bases) + len(middles) + len(names) == known:
+            continue  # as it is after most meshes
+        known = len(bases) + len(middles) + len(names)
+        packed = next(filter(PACKED.search, names), None)
+        if packed or len(bases) * len(middles) * len(names) > MOST:
+            reason = f"{printable(packed)}, which is packed" if packed else "too many files"
+            raise ConfigurationError(f"{place}: may read {reason}; expected plain files, and few")
+        joined = {os.path.join(*parts) for parts in product(bases, middles, names)}
+        for file in (joined | set(map(os.path.normpath, joined))) - seen:  # MuJoCo reads the latter
+            seen.add(file)
+            if not os.path.exists(file):
+                continue
+            shown = printable(file, 200)
+            if not _inside(file, homes):
+                home = printable(os.path.dirname(os.path.realpath(file)), 200)
+                option = f"--trust {home}" if place.startswith("--") else f"trust=[{home}]"
+                raise ConfigurationError(
+                    f"{place}: may read {shown}, outside its folder; copy it there, or say that "
+                    f"you trust its folder, on the command line: {option}"
+                )
+            if os.path.isfile(file):
+                bases.add(os.path.dirname(os.path.normpath(file)))
+                todo.append(file)
+            elif not os.path.isdir(file):
+                raise ConfigurationError(f"{place}: may read {shown}: expected a file")
+
+
+def _inside(path: str, folders: Sequence[str]) -> bool:
+    real = Path(os.path.realpath(path))
+    return any(real.is_relative_to(folder) for folder in folders)
+
+
+def _named(source: str | bytes) -> Iterator[tuple[str, str]]:
+    """Yield attribute and value of whatever in a file, or a text, could name a file or a folder.
+
+    >>> list(_named(b"<include file = 'a&#46;xml'/>"))
+    [('file', 'a.xml'), ('file', 'a.xml')]
+    """
+    text = source
+    if isinstance(text, str):
+        text = Path(text).read_bytes() if os.path.getsize(text) < LARGEST else b""
+    for match in NAMED.finditer(text):
+        end = text.find(match[2], match.end())
+        if end > 0:
+            value = LETTER.sub(_letter, os.fsdecode(text[match.end() : end]))
+            yield from ((match[1].decode(), v) for v in (value, value.replace("\\", "/")))
+
+
+def _letter(match: re.Match[str]) -> str:
+    hexadecimal, decimal, word = match.groups()
+    if word:
+        return WORDS[word]
+    code = int(hexadecimal, 16) if hexadecimal else int(decimal)
+    return chr(code) if code < 0x110000 else match[0]
 
 
 def space_of(model: Any) -> MuJoCoSpace:

@@ -22,7 +22,14 @@ from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_count
 from afm_rl.learning import GaussianNLLLoss, Updater
-from afm_rl.missions.checks import blaming, check_cost, check_keys, check_label, check_updater
+from afm_rl.missions.checks import (
+    blaming,
+    check_cost,
+    check_keys,
+    check_label,
+    check_models,
+    check_updater,
+)
 from afm_rl.missions.factories import Training, as_part
 from afm_rl.missions.robot import SHAPE_TRAINING, Robot
 from afm_rl.missions.selection import (
@@ -127,6 +134,7 @@ def _build(settings: dict[str, Any]) -> Agent:
         if settings.get(name) is None:
             raise ConfigurationError(f"{name}: expected a setting; build needs {', '.join(GROUPS)}")
     check_targets(settings)
+    check_models(settings)
     label = check_label(settings["label"])
     device = check_device("device", settings["device"])
     with blaming("robot"):

@@ -12,6 +12,7 @@ from tensordict import unravel_key
 from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
+from afm_rl.dynamics.mujoco_model import check_files
 from afm_rl.errors import (
     AFMError,
     ConfigurationError,
@@ -22,6 +23,8 @@ from afm_rl.errors import (
 )
 from afm_rl.learning import Updater
 from afm_rl.planning import Cost
+from afm_rl.targets import leaves
+from afm_rl.trust import trusted_folders
 
 MISTAKES = (
     *(ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, RuntimeError),
@@ -46,6 +49,18 @@ def blaming(group: str) -> Iterator[None]:
         raise
     except MISTAKES as error:
         raise ConfigurationError(f"{group}: {str(error) or type(error).__name__}") from error
+
+
+def check_models(settings: Mapping[str, Any]) -> None:
+    """Check that an MJCF that resolved settings name, wherever, reads no files of other folders.
+
+    Raises:
+        ConfigurationError: naming setting and file, see ``check_files``.
+    """
+    folders = trusted_folders()
+    for place, _, value in leaves(settings):
+        if isinstance(value, str):
+            check_files(place, value, folders)
 
 
 def check_training(

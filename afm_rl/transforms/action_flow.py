@@ -324,13 +324,12 @@ class ActionFlowTransform(CarriedTransform):
 
     def _hold(self, entries: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
         """Hold the entries of a step, or of the ``rows`` that begin; return what is carried."""
-        newest = self._newest
+        if self.carry_memory and not self.keep_memory_on_reset:
+            return entries
+        newest, self._newest = self._newest, entries.copy()
         if rows is not None and newest is not None and newest.shape == entries.shape:
             rows = rows[(..., *[None] * (entries.dim() - rows.dim()))]  # for all agents
-            newest = torch.where(rows.expand(entries.shape), entries, newest)
-        else:
-            newest = entries.copy()
-        self._newest = newest
+            self._newest = torch.where(rows.expand(entries.shape), entries, newest)
         return entries if self.carry_memory else entries.exclude("memory")
 
     def _rows(self, tensordict: TensorDictBase) -> Tensor | None:

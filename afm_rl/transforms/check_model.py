@@ -9,13 +9,15 @@ import gymnasium
 import numpy as np
 import torch
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
-from afm_rl.dynamics import DynamicsModel, KnownDynamics
+from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms.correction_loop import Model, State, as_numbers
 from afm_rl.transforms.gymnasium import ActionFlowWrapper
+from afm_rl.transforms.memory import bounds_of
+from afm_rl.transforms.simulation import SIMULATOR_STATE, Simulation, SimulatorState, layers_of
 
 if TYPE_CHECKING:
     from afm_rl.diagnosis.model_check import ModelCheck
@@ -38,11 +40,11 @@ def check_model(
 
     Args:
         env: a gymnasium or TorchRL environment; it is reset, and left where it comes to.
-        model: as in :class:`~afm_rl.ActionFlowWrapper`: ``"mujoco"`` (of gymnasium only), a step
+        model: as in :class:`~afm_rl.ActionFlowWrapper`: ``"mujoco"``, the environment's own, a step
             function in torch, or a :class:`~afm_rl.dynamics.DynamicsModel`.
         policy: returns the action for an observation; in TorchRL, a policy of a rollout. None:
             random actions, which show the most, to a robot that may do anything.
-        state: as in :class:`~afm_rl.ActionFlowWrapper`.
+        state: as in :class:`~afm_rl.ActionFlowWrapper`; in TorchRL, its key.
         steps: that are made.
         seed: of environment and random actions.
 
@@ -75,17 +77,26 @@ def _in_gymnasium(
         raise ConfigurationError("check_model: model='learn': there is no model yet to check")
     space: Any = env.action_space
     space.seed(seed)
+    # What normalises observations by what it has seen must keep still to be seen through.
+    layers = [one for one in layers_of(env) if getattr(one, "update_running_mean", False)]
     rows, (observation, _) = [], wrapper.reset(seed=seed)
-    for _ in range(steps):
-        wanted = space.sample() if policy is None else policy(observation)
-        planned = as_numbers("action", wanted, space.shape).numpy()
-        action = np.clip(planned, space.low, space.high).astype(space.dtype)
-        before = wrapper._state(observation)[0]
-        observation, _, terminated, truncated, _ = env.step(action)
-        rows.append((before, torch.from_numpy(action), wrapper._state(observation)[0]))
-        if terminated or truncated:
-            observation, _ = env.reset()
-    return wrapper._loop.model, [torch.stack(column) for column in zip(*rows, strict=True)]
+    try:
+        for step in range(-steps if layers else 0, steps):
+            for layer in layers:
+                layer.update_running_mean = step < 0
+            wanted = space.sample() if policy is None else policy(observation)
+            planned = as_numbers("action", wanted, space.shape).numpy()
+            action = np.clip(planned, space.low, space.high).astype(space.dtype)
+            before = wrapper._state(observation)[0]
+            observation, _, terminated, truncated, _ = env.step(action)
+            rows.append((before, torch.from_numpy(action), wrapper._state(observation)[0]))
+            if terminated or truncated:
+                observation, _ = env.reset()
+    finally:
+        for layer in layers:
+            layer.update_running_mean = True
+    columns = zip(*rows[-steps:], strict=True)
+    return wrapper._loop.model, [torch.stack(column) for column in columns]
 
 
 def _in_torchrl(
@@ -93,9 +104,13 @@ def _in_torchrl(
 ) -> tuple[DynamicsModel, list[Tensor]]:
     """Return the same of a rollout; ``state`` is a key."""
     key = "observation" if state is None else state
-    if isinstance(model, str) or not callable(model):
+    if isinstance(model, str) and model == "mujoco":
+        model = Simulation(env).dynamics(*bounds_of(env.full_action_spec[env.action_key]))
+    if isinstance(model, MuJoCoDynamics) and state is None:
+        key, env = SIMULATOR_STATE, TransformedEnv(env, SimulatorState(), auto_unwrap=False)
+    if not callable(model):
         raise ConfigurationError(
-            f"check_model: model={model!r}: expected a step function or a DynamicsModel"
+            f"check_model: model={model!r}: expected 'mujoco', a step function or a DynamicsModel"
         )
     env.set_seed(seed)
     data = env.rollout(steps, policy, break_when_any_done=False)

@@ -19,7 +19,7 @@ FLOORS = [
     {"envs": 0, "transforms": 2},
     {"diagnosis": 4},
     {"correction": 2, "planning": 3},
-    {"learning": 2, "diagnosis": 4},
+    {"learning": 2},
     {"dynamics": 2},
     {"regimes": 2},
     {"spaces": 2, "compiling": 3},

@@ -30,7 +30,7 @@ from afm_rl.envs.task.task import NOWHERE, Reward, Task, trust
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.targets import check_name
-from afm_rl.trust import trusted
+from afm_rl.trust import restricted
 
 
 @contextmanager
@@ -96,7 +96,7 @@ def gymnasium_task(
     import gymnasium
 
     module, colon, _ = str(id).partition(":")
-    if colon and trusted() is not None:  # gymnasium imports it
+    if colon and restricted():  # gymnasium imports it
         check_name("robot.id", module)
     try:
         with quiet():

@@ -15,8 +15,6 @@ from swing_up import make_env
 from torchrl.collectors import Collector
 from torchrl.data import LazyMemmapStorage, TensorDictReplayBuffer
 
-MEMORY = [("afm", "memory"), ("next", "afm", "memory")]  # the corrector's own: most of a transition
-
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--frames", type=int, default=2000)
 asked = parser.parse_args()
@@ -31,7 +29,7 @@ with tempfile.TemporaryDirectory() as folder:
         storage=LazyMemmapStorage(asked.frames, scratch_dir=folder), batch_size=32
     )
     for batch in collector:
-        buffer.extend(batch.exclude(*MEMORY))
+        buffer.extend(batch)
     collector.shutdown()
     sample = buffer.sample()
     planned, executed = sample["action"], sample["next", "afm", "executed_action"]

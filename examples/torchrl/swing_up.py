@@ -2,13 +2,14 @@
 
     python examples/torchrl/swing_up.py
 
-Says how well the model predicts it, and what the correction makes of an action.
+Says how well the model predicts the healthy one, and how often a plan is what the motor does.
 """
 
 import torch
 from torchrl.envs import Compose, GymEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
+from afm_rl import check_model
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.regimes import ActionGain
 from afm_rl.spaces.manifold import Manifold
@@ -39,14 +40,12 @@ if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.manual_seed(0)
     check_env_specs(make_env())
-    for gain in (1.0, -1.0):
-        env = make_env(gain)
+    print(check_model(GymEnv("Pendulum-v1"), swing))
+    for corrected in (False, True):
+        env = make_env(corrected=corrected)
         env.set_seed(0)
         data = env.rollout(100)
-        effect = data["next", "regime", "effective_action"]
-        missed = swing(data["observation"], effect) - data["next", "observation"]
-        same = (effect - data["action"]).abs() < 0.1 * env.action_spec.space.high
-        print(
-            f"gain {gain:+.0f}: the model misses by {missed.abs().max():.0e}, "
-            f"the motor did what was planned in {same.float().mean():.0%} of the steps"
-        )
+        miss = (data["next", "regime", "effective_action"] - data["action"]).abs()
+        same = (miss < 0.1 * env.action_spec.space.high).float().mean()
+        how = "corrected" if corrected else "alone"
+        print(f"reversed, {how}: the motor does what was planned in {same:.0%} of the steps")

@@ -90,9 +90,9 @@ def write(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
 
-    def make(settings):
+    def make(settings, base=("config", "_self_")):
         places = {"hydra.searchpath": ["pkg://afm_rl.conf"], **settings}
-        cfg = OmegaConf.create({"defaults": ["config", "_self_"]})
+        cfg = OmegaConf.create({"defaults": list(base)})
         for place, value in places.items():
             OmegaConf.update(cfg, place, value, force_add=True)
         (tmp_path / "conf" / "evil.yaml").write_text(OmegaConf.to_yaml(cfg))
@@ -104,10 +104,11 @@ def write(tmp_path, monkeypatch):
 
 @pytest.fixture
 def composed(write, tmp_path):
-    """Compose a file of settings as the command line does."""
+    """Compose a file of settings as the command line does, without most of what it leads to."""
+    base = [{"launcher": "local"}, {"override hydra/launcher": None}, "_self_"]
 
     def make(settings, *arguments):
-        write(settings)
+        write({"overwrite": False, **settings}, base)
         folder = str(tmp_path / "conf")
         with checked(arguments), initialize_config_dir(folder, version_base="1.3"):
             return compose("evil", list(arguments), return_hydra_config=True)
@@ -166,7 +167,7 @@ def test_trust_is_what_the_command_and_the_environment_said_before(monkeypatch):
     with checked(["trust=[decimal]"]) as names:
         monkeypatch.setenv("AFM_RL_TRUST", "os")
         assert names == ["json", "csv", "decimal"] and trusted() == tuple(names)
-    assert trusted() is None
+    assert trusted() == ()
 
 
 def test_a_link_in_the_folder_of_results_is_not_followed(composed, tmp_path):

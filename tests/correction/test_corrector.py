@@ -118,7 +118,7 @@ def test_arrival_is_the_state_after_the_commands_under_way_or_the_present_one():
     sent = torch.tensor([[[0.5], [0.25]], [[1.0], [0.0]]])  # the second leads to no number
     memory = corrector.pack({**corrector.unpack(memory, 1), "sent": sent})
     state, steps = arrival(corrector, memory, model)
-    assert state.tolist() == [[11.0], [6.0]] and steps.tolist() == [2, 2]
+    assert state.tolist() == [[11.0], [6.0]] and steps.tolist() == [2, 0]
 
 
 def test_another_action_can_be_noted(corrector):

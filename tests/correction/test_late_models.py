@@ -61,6 +61,25 @@ def test_the_delay_is_that_of_the_models_that_are_believed(believed, before, lat
     assert batch.tolist() == [late] * 3
 
 
+@pytest.mark.parametrize("share", [0.2, 0.6])
+def test_nothing_has_changed_counts_what_it_is_worth_and_no_more_than_the_others(share):
+    other = (1 - share) / 2
+    told, first = delay_tables(torch.tensor([0, -1, 1]), torch.tensor([share, other, other]).log())
+    counts = min(share, other)
+    now, late = counts + other, other  # the second model takes any delay, at first none
+    expected = torch.tensor([[counts / share / now, 1 / now, 0.0], [0.0, 0.0, 1 / late]])
+    torch.testing.assert_close(told[0], expected)
+    torch.testing.assert_close(first[0].exp(), torch.tensor([now, late]) / (now + late))
+
+
+def test_no_axis_decides_alone_however_sure_it_is():
+    sure = torch.tensor([1e-12, 1e-12, 1.0, 1e-12, 1e-12])
+    others = torch.tensor([0.005, 0.005, 0.005, 0.98, 0.005])
+    weights = torch.stack([sure, others, others], -1)
+    assert steps_late(weights[:, :2], torch.tensor(0), *TABLES) == 1
+    assert steps_late(weights, torch.tensor(0), *TABLES) == 2
+
+
 def test_one_delay_is_found_from_the_evidence_of_all_axes():
     weights = torch.tensor([[0.05, 0.2], [0.05, 0.2], [0.6, 0.05], [0.25, 0.5], [0.05, 0.05]])
     assert steps_late(weights[:, :1], torch.tensor(0), *TABLES) == 1

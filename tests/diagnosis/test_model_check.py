@@ -34,7 +34,7 @@ def random(state, rng):
     return rng.uniform(-2, 2, 1)
 
 
-def drive(policy=random, noise=0.0, late=0, rows=300):
+def drive(policy=random, noise=0.0, late=0, rows=300, robot=upright):
     """Return states, actions and next states of a healthy robot."""
     rng, state, sent = (
         np.random.default_rng(0),
@@ -44,7 +44,7 @@ def drive(policy=random, noise=0.0, late=0, rows=300):
     seen, told = state.numpy(), []
     for _ in range(rows):
         sent.append(policy(seen, rng))
-        state = upright(state, torch.from_numpy(sent[-1 - late]))
+        state = robot(state, torch.from_numpy(sent[-1 - late]))
         after = state.numpy() + noise * rng.standard_normal(2)
         told.append((seen, sent[-1], after))
         seen = after
@@ -97,6 +97,23 @@ def test_a_right_model_is_not_accused(policy, noise, right):
     assert ("it is right" in str(found) or "model is right" in str(found)) is right
     if not noise:
         assert found.predicted == pytest.approx((1.0, 1.0), abs=1e-4)
+
+
+def finer(state, torque):
+    """Two steps of half the length."""
+    return upright(upright(state, torque, dt=0.025), torque, dt=0.025)
+
+
+def walled(state, torque):
+    """A wall that it falls against."""
+    after = upright(state, torque)
+    return torch.where(after[..., :1] > 0.2, torch.tensor([0.2, 0.0]).double(), after)
+
+
+@pytest.mark.parametrize(("robot", "right"), [(finer, True), (walled, False)])
+def test_what_is_no_usual_mistake_is_none(robot, right):
+    found = check(upright, drive(robot=robot))
+    assert found.right is right and not found.cause
 
 
 @pytest.mark.parametrize("policy", [random, shaken])

@@ -2,12 +2,15 @@
 
 import copy
 import math
+import os
+import zipfile
 
 import numpy as np
 import pytest
 import torch
 
 from afm_rl.dynamics import Dubins, DynamicsModel, MuJoCoDynamics, Oracle, effective_action
+from afm_rl.dynamics.mujoco_model import check_files
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import ActionGain, Compose, Physics
 
@@ -151,6 +154,108 @@ def test_bad_models_are_named(source, word):
     with pytest.raises(ConfigurationError, match=word) as caught:
         MuJoCoDynamics(source)
     assert "\n" not in str(caught.value)
+
+
+def test_what_mujoco_cannot_explain_is_said_in_one_line(monkeypatch):
+    def fail(text):
+        raise RuntimeError("Caught an unknown\nexception!")
+
+    monkeypatch.setattr(mujoco.MjModel, "from_xml_string", fail)
+    with pytest.raises(ConfigurationError, match="Caught an unknown exception!"):
+        MuJoCoDynamics("<mujoco/>")
+
+
+MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+ASSETS = "<asset><mesh name='m' file='%s'/></asset>"
+PART = "<mujoco><worldbody><geom size='0.1'/></worldbody></mujoco>"
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Folders ``robot`` and ``other``, each with a mesh, a part and a folder ``sub``."""
+    for name in ("robot", "other"):
+        (tmp_path / name / "sub").mkdir(parents=True)
+        (tmp_path / name / "mesh.obj").write_text(MESH)
+        (tmp_path / name / "part.xml").write_text(PART)
+    (tmp_path / "robot" / "linked.obj").symlink_to(tmp_path / "other" / "mesh.obj")
+    (tmp_path / "robot" / "linked").symlink_to(tmp_path / "other")
+    (tmp_path / "robot" / "up.xml").write_text(
+        "<mujoco><include file='../other/part.xml'/></mujoco>"
+    )
+    (tmp_path / "robot" / "near.xml").write_text("<mujoco><include file='part.xml'/></mujoco>")
+    (tmp_path / "robot" / "sub" / "up.xml").write_text("<m><include file='../part.xml'/></m>")
+    os.mkfifo(tmp_path / "robot" / "pipe.xml")
+    with zipfile.ZipFile(tmp_path / "robot" / "packed.zip", "w") as file:
+        file.writestr("mesh.obj", MESH)
+    return tmp_path
+
+
+def written(folders, inside):
+    path = folders / "robot" / "robot.xml"
+    path.write_text(JOINTED.replace("<worldbody>", inside.format(folders) + "<worldbody>", 1))
+    return str(path)
+
+
+OUTSIDE = "outside its folder"
+
+
+@pytest.mark.parametrize(
+    ("inside", "message"),
+    [
+        ("<include file='../other/part.xml'/>", OUTSIDE),
+        ('<include\nfile\n=\n"{}/other/part.xml"/>', OUTSIDE),
+        ("<include file='&#46;&#x2e;/other/part.xml'/>", OUTSIDE),
+        ("<include file='..\\other\\part.xml'/>", OUTSIDE),
+        ("<include file='sub/../../other/part.xml'/>", OUTSIDE),
+        ("<include file='up.xml'/>", OUTSIDE),
+        ("<!-- a quote: file=' --><include file='linked/part.xml'/>", OUTSIDE),
+        (ASSETS % "../other/mesh.obj", OUTSIDE),
+        (ASSETS % "linked.obj", OUTSIDE),
+        ("<compiler meshdir='../other'/>" + ASSETS % "mesh.obj", OUTSIDE),
+        ("<compiler assetdir='{}/other'/>" + ASSETS % "mesh.obj", OUTSIDE),
+        ("<compiler meshdir='sub'/>" + ASSETS % "../../other/mesh.obj", OUTSIDE),
+        ("<asset><texture name='t' type='2d' file='../other/mesh.obj'/></asset>", OUTSIDE),
+        ("<asset><texture name='t' type='cube' fileup='../other/mesh.obj'/></asset>", OUTSIDE),
+        ("<asset><hfield name='h' size='1 1 1 1' file='../other/mesh.obj'/></asset>", OUTSIDE),
+        ("<asset><model name='p' file='../other/part.xml'/></asset>", OUTSIDE),
+        ("<deformable><skin file='../other/mesh.obj'/></deformable>", OUTSIDE),
+        ("<plugin plugin='x'><config key='map' value='../other/mesh.obj'/></plugin>", OUTSIDE),
+        ("<include file='pipe.xml'/>", "expected a file"),
+        ("<include file='/dev/zero'/>", OUTSIDE),
+        (ASSETS % "packed.zip/mesh.obj", "which is packed"),
+        ("<include file='part.xml'/>", ""),
+        ("<include file='near.xml'/>", ""),
+        ("<compiler meshdir='sub'/>" + ASSETS % "../mesh.obj", ""),
+        ("<compiler strippath='true'/>" + ASSETS % "/home/elsewhere/mesh.obj", ""),
+        ("<asset><model name='p' file='part.xml'/></asset>", ""),
+    ],
+)
+def test_an_mjcf_of_others_reads_its_own_folder(folders, inside, message):
+    path = written(folders, inside)
+    if not message:
+        check_files("robot.xml", path)
+        assert MuJoCoDynamics(path).mjcf.nu == 2
+        return
+    with pytest.raises(ConfigurationError, match=f"robot.xml: may read .*{message}") as caught:
+        check_files("robot.xml", path)
+    assert "\n" not in str(caught.value)
+    if message == OUTSIDE and "dev" not in inside:
+        check_files("robot.xml", path, [str(folders / "other")])
+    check_files("robot.xml", path, [str(folders)])  # it is trusted itself
+    with pytest.raises(ConfigurationError, match="may read"):
+        check_files("robot.xml", path, [str(folders / "robot" / "sub")])
+
+
+def test_files_that_a_user_names_in_python_are_read(folders):
+    path = written(folders, "<compiler meshdir='../other'/>" + ASSETS % "mesh.obj")
+    assert MuJoCoDynamics(path).mjcf.nmesh == 1
+
+
+def test_an_mjcf_without_a_folder_reads_nothing(folders, monkeypatch):
+    monkeypatch.chdir(folders / "robot")
+    check_files("robot.xml", PART)
+    with pytest.raises(ConfigurationError, match="robot.xml: may read .*part.xml, outside"):
+        check_files("robot.xml", "<mujoco><include file='part.xml'/></mujoco>")
 
 
 POLE = """<mujoco><option timestep="0.01" gravity="0 0 -10"/><worldbody>

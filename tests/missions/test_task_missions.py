@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, prepare, run
@@ -311,6 +312,30 @@ def test_mistakes_in_models_are_said_in_one_line(mine, xml, message):
     with pytest.raises(ConfigurationError, match=message) as error:
         build(cfg, ["mine"])
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("place", ["robot.xml", "robot.model.model"])
+def test_an_mjcf_that_settings_name_reads_no_folder_but_its_own(mine, tmp_path, place):
+    pytest.importorskip("mujoco")
+    for name in ("boat", "parts"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "own.xml").write_text(MODEL)
+    (tmp_path / "parts" / "hull.xml").write_text("<mujoco><option timestep='0.01'/></mujoco>")
+    path = tmp_path / "boat" / "boat.xml"
+    path.write_text(MODEL.replace("<mujoco>", "<mujoco><include file='../parts/hull.xml'/>"))
+    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+        overrides = ["robot=mujoco", f"robot.xml={tmp_path}/own.xml", "robot.reward=mine.home"]
+        cfg = compose("config", [*overrides, "method=physics"])
+    if place == "robot.xml":
+        cfg.robot.xml = str(path)
+    else:
+        model = {"_target_": "afm_rl.dynamics.MuJoCoDynamics", "model": str(path)}
+        cfg = OmegaConf.merge(cfg, {"robot": {"model": model}})
+    message = rf"{place}: may read .*hull.xml, outside .* command line: trust=\[{tmp_path}/parts\]"
+    with pytest.raises(ConfigurationError, match=message):
+        build(cfg, ["mine"])
+    for folder in ("boat", "parts"):
+        assert build(cfg, ["mine", f"{tmp_path}/{folder}"]).robot.name in ("boat", "own")
 
 
 def test_physics_change_under_way_and_the_oracle_knows_them(tmp_path):

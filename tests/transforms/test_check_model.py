@@ -6,10 +6,11 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.wrappers import NormalizeObservation
 from puck import Puck, play, push
 from tensordict import TensorDict
 from torchrl.data import Bounded
-from torchrl.envs import TransformedEnv
+from torchrl.envs import GymEnv, TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper, check_model
@@ -34,14 +35,24 @@ def test_an_environment_of_gymnasium():
     assert nested.right and nested.names[0] == "state[0]"
 
 
+def test_normalised_observations():
+    env = NormalizeObservation(Puck(ends=50))
+    found = check_model(env, push)
+    assert "(normalised observations, units)" in found.cause and found.corrected > 0.99
+    assert found.factor == pytest.approx(np.sqrt(env.obs_rms.var + env.epsilon), rel=0.05)
+    assert env.update_running_mean
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, GymEnv])
 @pytest.mark.parametrize(("skip", "cause"), [(None, ""), (1, "makes 2 steps of the model in one")])
-def test_a_simulator(skip, cause, tmp_path, monkeypatch):
+def test_a_simulator(skip, cause, make, tmp_path, monkeypatch):
     pytest.importorskip("mujoco")
     from afm_rl.dynamics import MuJoCoDynamics
 
     monkeypatch.chdir(tmp_path)  # where MuJoCo would say that a simulation explodes
-    env = gymnasium.make("InvertedPendulum-v5")
-    found = check_model(env, "mujoco" if skip is None else MuJoCoDynamics(env, skip))
+    env = make("InvertedPendulum-v5")
+    inner = getattr(env, "_env", env)
+    found = check_model(env, "mujoco" if skip is None else MuJoCoDynamics(inner, skip))
     assert found.right is (not cause) and found.cause.startswith(cause)
     assert found.names == ("q_slider", "q_hinge", "v_slider", "v_hinge")
     assert not list(tmp_path.iterdir())
@@ -62,7 +73,8 @@ def test_an_environment_of_torchrl(batch):
         (Puck, {"model": Dubins()}, "the state has"),
         (Puck, {"model": push, "steps": 0}, "steps=0"),
         (Puck, {"model": push, "policy": lambda seen: seen}, "action: shape"),
-        (UGVTrack, {}, "model='mujoco': expected a step function"),
+        (UGVTrack, {}, "has no MuJoCo model"),
+        (UGVTrack, {"model": "learn"}, "model='learn': expected 'mujoco', a step function"),
         (UGVTrack, {"model": Dubins(), "state": "pos"}, "state='pos': the environment has no such"),
     ],
 )
