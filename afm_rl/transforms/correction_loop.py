@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import gymnasium
 import numpy as np
@@ -20,11 +20,9 @@ from torchrl.data import Bounded
 from afm_rl.correction import ActionFlow, Corrector
 from afm_rl.correction.late import arrival
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.diagnosis import explain
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
 from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance
 from afm_rl.faults import fault_of, safe_action
-from afm_rl.learning.watching import Watching
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms.memory import (
     LATE,
@@ -38,7 +36,10 @@ from afm_rl.transforms.memory import (
 )
 from afm_rl.transforms.simulation import Simulation
 
-Model = DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str
+if TYPE_CHECKING:  # rooms that are entered when they are asked for
+    from afm_rl.learning.watching import Watching
+
+Model: TypeAlias = "DynamicsModel | Callable[[Tensor, Tensor], Tensor] | Watching | str"
 State = Callable[[Any, Any], Any]
 Observe = Callable[[np.ndarray], Any]
 AS_EXPECTED = "as the model expects"
@@ -97,9 +98,7 @@ class CorrectionLoop:
                 "numbers"
             )
         self.space, self.enabled = actions, check_flag("wrapper.enabled", enabled)
-        self.watching = Watching() if isinstance(model, str) and model == "learn" else None
-        if isinstance(model, Watching):
-            self.watching = deepcopy(model)
+        self.watching = _watching(model)
         self.model: Any = None if self.watching else model
         if isinstance(model, str) and model == "mujoco":
             self.model = _simulation(source)
@@ -288,6 +287,8 @@ class CorrectionLoop:
             parts = (x.numpy() for x in pairs.split([size, size, size, 1], 1))
             executed, effective, std, valid = parts
             use, step = valid[:, 0] > 0, getattr(self.model, "dt", 1.0)
+            from afm_rl.diagnosis import explain
+
             how = {"std": std[use], "step": step, "delays": max(5, found + 1)}
             text = str(explain(executed[use], effective[use], self.names, **how))
         if late:
@@ -306,6 +307,17 @@ class CorrectionLoop:
             belief = self.corrector.belief_in(self.entries.get("memory")).numpy()
             told["belief"] = dict(zip(self.corrector.causes, belief.swapaxes(0, 1), strict=True))
         return told
+
+
+def _watching(model: Model) -> Watching | None:
+    """Return what collects data and fits a model, if there is none yet."""
+    if callable(model) or isinstance(model, str) and model != "learn":
+        return None
+    from afm_rl.learning.watching import Watching
+
+    if isinstance(model, Watching):
+        return deepcopy(model)
+    return Watching() if isinstance(model, str) else None
 
 
 def as_numbers(name: str, given: Any, shape: Sequence[int] | None) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -14,8 +14,10 @@ from torch import Tensor
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.learning.watching import Watching
 from afm_rl.transforms.correction_loop import CorrectionLoop, Model, Observe, State, as_numbers
+
+if TYPE_CHECKING:
+    from afm_rl.learning.watching import Watching
 
 
 class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
