@@ -133,6 +133,9 @@ def test_returns_that_are_not_finite_are_ignored(box, kind, lost, fault):
     torch.testing.assert_close(out["action"][0], sound["action"][0])  # it notices nothing
     if lost == 0:
         assert torch.equal(out["action"], sound["action"])
+    if kind is ICEM and lost == 31:  # no plan that was lost is remembered
+        elites = out["next", "icem", "elites"][1]
+        assert torch.equal(elites, elites[:1].expand_as(elites))
     told = [str(warning.message) for warning in caught]
     if lost < 32:
         assert told == []
@@ -143,6 +146,31 @@ def test_returns_that_are_not_finite_are_ignored(box, kind, lost, fault):
         assert torch.equal(torch.cat([before[..., 1:, :], before[..., -1:, :]], -2), after)
     if kind not in MEMORIES:
         assert (out["action"][1] == 0).all()
+
+
+@pytest.mark.filterwarnings("ignore:planner. no finite return")
+@pytest.mark.parametrize("kind", [MPPI, CEM, TorchRLMPPI])
+def test_an_iteration_that_is_lost_changes_nothing(kind):
+    def plan(iterations):
+        world, count = Cliff(), iter([1.0, 1.0, math.nan])
+        real = world.returns
+        world.returns = lambda *given: next(count) * real(*given)
+        planner = kind(world, horizon=3, population=100, iterations=iterations)
+        return planner(world.start(planner, 4))["action"]
+
+    assert torch.equal(plan(2), plan(3))
+
+
+@pytest.mark.filterwarnings("ignore:planner. no finite return")
+@pytest.mark.parametrize("kind", ALL)
+def test_without_any_finite_return_actions_are_in_the_box(kind):
+    world = PlanningEnv(Dubins(), GoalDistance(), [0.2, -1.0], [1.0, -0.5])
+    world.returns = lambda state, plans, *task: plans[..., 0, 0] * math.nan
+    planner = kind(world, horizon=3, population=60)
+    td = TensorDict({"observation": torch.zeros(3, 3), "goal": torch.ones(3, 2)}, [3])
+    td = planner.make_tensordict_primer()(td)
+    for action in (planner.planning(td), planner(td)["action"]):
+        assert all(world.action_spec.is_in(row) for row in action)
 
 
 @pytest.mark.parametrize("kind", ALL)

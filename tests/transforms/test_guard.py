@@ -103,6 +103,7 @@ def test_any_answer_becomes_a_safe_action(make, data):
 def test_what_cannot_be_executed_at_first_becomes_the_action_nearest_to_zero(box):
     push = KnownDynamics(lambda state, action: state + action, Manifold(1), 1)
     base = PlanningEnv(push, KnownReward(lambda state, action, after: after[..., 0]), *zip(box))
+    assert TransformedEnv(base, Guard()).reset()["guard", "executed_action"] == min(box, key=abs)
     (row,) = drive(base, [Guard()], 1, action=math.nan)
     assert row["guard", "executed_action"] == min(box, key=abs) and row["guard", "held"]
 
