@@ -183,6 +183,19 @@ def test_a_log_is_replayed(call, log, tmp_path):
     assert page.count("data:image/png;base64,") == 3 and "affine least squares" in page
 
 
+def test_a_simulator_of_others_reads_its_own_folder(call, cart, tmp_path):
+    for name in ("robot", "parts"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "parts" / "plain.xml").write_text("<mujoco><size nkey='0'/></mujoco>")
+    text = CART.replace("<mujoco>", "<mujoco><include file='../parts/plain.xml'/>")
+    (tmp_path / "robot" / "cart.xml").write_text(text)
+    done = call("cart.csv", "--model", "robot/cart.xml")
+    assert (done.status, done.out) == (2, "") and done.err.count("\n") == 1
+    assert "--model: may read" in done.err and f"--trust {tmp_path}/parts\n" in done.err
+    done = call("cart.csv", "--model", "robot/cart.xml", "--trust", "parts")
+    assert (done.status, done.err) == (0, "") and "The model is right" in done.out
+
+
 def test_what_is_in_a_log_of_messages_is_listed(call):
     ulog = Path(__file__).parents[2] / "examples" / "real_logs" / "px4_disarmed.ulg"
     done = call(ulog)
