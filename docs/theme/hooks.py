@@ -1,6 +1,5 @@
 """What the site needs beyond its pages: copies, notebooks, a picture of the imports, formulas."""
 
-import ast
 import html
 import re
 from pathlib import Path
@@ -74,9 +73,9 @@ def api_page():
     for title, names in API.items():
         if isinstance(names, str):
             package = names
-            path = ROOT / ("" if package == "envs" else "afm_rl") / package / "__init__.py"
-            public = re.search(r"__all__ = (\[.*?\])", path.read_text(encoding="utf-8"), re.DOTALL)
-            names = [f"{package}.{name}" for name in sorted(ast.literal_eval(public[1]))]
+            path = ROOT / ("" if package == "envs" else "afm_rl") / package / "__init__.pyi"
+            public = re.findall(r" as (\w+)", path.read_text(encoding="utf-8"))
+            names = [f"{package}.{name}" for name in sorted(public)]
         parts += [f"## {title}", *(f"::: afm_rl.{name}" for name in names)]
     return "\n\n".join(parts) + "\n"
 
