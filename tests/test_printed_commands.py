@@ -76,9 +76,11 @@ def results(tmp_path_factory):
     return str(folder)
 
 
-def settings_of_methods(first):
+def settings_of_methods(first, swept=()):
     """Return the settings as they are, or those of each method that is compared, AFM first."""
-    single = {"method", "dynamics", "corrector", "updater"}
+    if swept:
+        return [[*first, f"method={method}"] for method in swept]
+    single = {"agent", "method", "dynamics", "corrector", "updater"}
     if single & {choice.partition("=")[0] for choice in first}:
         return [first]
     whole = compose("config", [choice for choice in first if "." not in choice.partition("=")[0]])
@@ -106,8 +108,11 @@ def shrunk(overrides):
         for each in parsed
         if not each.get_key_element().startswith("hydra.")
     ]
-    first = [choice for choice in first if not choice.startswith(("out=", "launcher="))]
-    cfg = next(filter(None, map(composed, settings_of_methods(first))))
+    methods = [each for each in parsed if each.get_key_element() == "method"]
+    swept = [m for each in methods if each.is_sweep_override() for m in each.sweep_string_iterator()]
+    left_out = ("out=", "launcher=", "method=") if swept else ("out=", "launcher=")
+    first = [choice for choice in first if not choice.startswith(left_out)]
+    cfg = next(filter(None, map(composed, settings_of_methods(first, swept))))
     return shrink(cfg, LITTLE)
 
 

@@ -10,6 +10,7 @@ import pytest
 from afm_rl.report.runs import cell_names
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "paper" / "published_tables.py"
+STEPS = [100, 200, 4999]
 
 
 @pytest.fixture(scope="module")
@@ -19,38 +20,50 @@ def paper():
 
 @pytest.fixture
 def ours(paper):
-    """Two methods under all published regimes on both tracks, three seeds."""
+    """Three methods under all published regimes on both tracks, three seeds."""
     regimes = paper["published"]()[["track", "v_gain", "omega_gain"]].drop_duplicates()
-    every = regimes.merge(pd.DataFrame({"method": ["physics", "mine"]}), how="cross")
+    methods = pd.DataFrame({"method": ["physics", "afm_paper_code", "online_pe", "mine"]})
+    every = regimes.merge(methods, how="cross")
     every = every.merge(pd.DataFrame({"seed": range(3)}), how="cross")
     every = every[["method", "track", "v_gain", "omega_gain", "seed"]]
-    missions = every.assign(success_rate=[0.5, 0.75, 1.0] * 44, steps=[100, 200, 4999] * 44)
-    finished = missions["steps"] < 4999
-    return missions.assign(cell=cell_names(missions), finished=finished)
+    missions = every.assign(success_rate=[0.5, 0.75, 1.0] * 88, steps=STEPS * 88)
+    missions.loc[missions["method"] == "online_pe", "steps"] -= [30, 0, 0] * 22
+    return missions.assign(cell=cell_names(missions), finished=missions["steps"] < 4999)
 
 
 def test_the_published_figures_are_those_of_the_paper(paper):
     figures = paper["published"]()
-    assert len(figures) == 5 * 22 and set(figures["method"]) == set(paper["LABELS"].values())
+    assert len(figures) == 5 * 22 and set(figures["method"]) <= set(paper["LABELS"].values())
     means = figures.groupby("method")[["success_mean", "steps_mean"]].mean()
-    assert means.loc["afm_paper", "success_mean"] == pytest.approx(0.8145, abs=1e-4)
+    assert means.loc["afm", "success_mean"] == pytest.approx(0.8145, abs=1e-4)
     assert means.loc["online_pe", "steps_mean"] == pytest.approx(3239.7, abs=0.1)
 
 
-def test_four_tables_with_ours_beside_the_published(paper, ours):
-    tables = paper["tables"](ours)
-    assert [table.name for table in tables] == [
-        f"paper_ethz_{track}_{measure}" for track in (1, 2) for measure in ("success", "steps")
+def test_the_paper_s_tables_with_ours_beside_the_published(paper, ours):
+    names = [table.name for table in paper["tables"](ours)]
+    assert names == ["paper_means", *(f"paper_table_{number}" for number in (1, 2, 3, 4))]
+    means, first, _, third, _ = paper["tables"](ours)
+    row = first.shown[(first.shown["v_gain"] == "1") & (first.shown["omega_gain"] == "-1")]
+    assert row["Physics"].item() == f"0.75 ± 0.20 / 1766 ± {np.std(STEPS):.0f}"
+    assert row["Physics, published"].item() == "1.00 ± 0.00 / 827 ± 10"
+    assert row["AFM, gate as written"].item() == "-" and row["AFM, gate as coded"].item() != "-"
+    assert row["AFM, published"].item() == "1.00 ± 0.00 / 1826 ± 189"
+    assert {"PE", "Online PE"} <= set(third.shown) and "Physics" not in third.shown
+    assert "ours: 3" in first.note and "another one" not in third.note
+    assert not any("mine" in column for column in first.shown)
+
+
+def test_the_means_and_their_paired_differences(paper, ours):
+    means = paper["tables"](ours)[0].shown.set_index("method")
+    assert means.loc["AFM, gate as coded", "steps - Online PE"].startswith("+10 [+")
+    assert means.loc["AFM, gate as coded", "success - Online PE"] == "+0.000"
+    assert means.loc["Online PE", "steps - Online PE"] == "-"
+    assert means.loc["Physics", "success, ours"].startswith("0.750 [")
+    assert means.loc["AFM, gate as written", "success, ours"] == "-"
+    assert means.loc["AFM+DR", ["success, published", "steps, published"]].tolist() == [
+        "0.836",
+        "3131",
     ]
-    success, steps = tables[:2]
-    row = success.shown[(success.shown["v_gain"] == "1") & (success.shown["omega_gain"] == "-1")]
-    assert row["physics, ours"].item() == "0.75 ± 0.20"
-    assert row["physics, published"].item() == "1.00 ± 0.00"
-    assert row["online_pe, ours"].item() == "-"
-    assert steps.shown["physics, ours"].iloc[0] == f"1766 ± {np.std([100, 200, 4999]):.0f}"
-    assert steps.shown["afm_paper, published"].iloc[0] == "2863 ± 170"
-    assert not any("mine" in column for column in success.shown)
-    assert "4999 of 5000" in success.note and "another one" not in success.note
 
 
 def test_another_budget_is_not_left_unsaid(paper, ours):
@@ -61,4 +74,31 @@ def test_another_budget_is_not_left_unsaid(paper, ours):
 
 def test_other_regimes_make_no_tables(paper, ours):
     assert paper["tables"](ours[ours["method"] == "mine"]) == []
-    assert len(paper["tables"](ours[ours["track"] == "ethz_2"])) == 2
+    assert len(paper["tables"](ours[ours["track"] == "ethz_2"])) == 3
+
+
+def test_the_quadrotor_s_table(paper):
+    rows = [
+        {"method": method, "track": f"circle_2m_{speed}mps", "seed": seed, "mse": mse * speed}
+        for method, mse in (("physics", 0.12), ("online_knode", 0.1), ("afm_online_knode", 0.09))
+        for speed in (0.8, 1.7)
+        for seed in range(2)
+    ]
+    flights = pd.DataFrame(rows)
+    table = paper["flights_table"](flights.assign(cell=flights["track"])).shown.set_index("method")
+    assert table.loc["afm_online_knode, ours", "mean change (%)"] == "-10.0"
+    assert table.loc["online_knode, Jiahao et al.", "0.8 m/s"] == "0.0660"
+    assert table.loc["physics, ours", "1.7 m/s"] == "0.20400"
+    assert table["mean change (%)"].iloc[-1] == "-6.6"
+
+
+def test_tables_replace_those_of_a_page(paper, ours):
+    page = "a\n<!-- tables begin -->\nold\n<!-- tables end -->\nz\n"
+    found = paper["tables"](ours)
+    new = paper["with_tables"](page, "tables", found)
+    assert new.startswith("a\n<!-- tables begin -->\n\n**All cells") and "old" not in new
+    assert new.endswith("<!-- tables end -->\nz\n")
+    assert paper["with_tables"](new, "tables", found) == new
+    assert new.count("\n| --- |") == 5
+    with pytest.raises(SystemExit, match="no marks <!-- flights begin -->"):
+        paper["with_tables"](page, "flights", found)

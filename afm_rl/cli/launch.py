@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from afm_rl.cli.error_messages import explain
-from afm_rl.cli.methods import jobs_of
+from afm_rl.cli.methods import check_had, jobs_of
 from afm_rl.envs import load_track
 from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag, check_number
 from afm_rl.jobs.batch import run_batch
@@ -92,6 +92,7 @@ def sweep(
             jobs |= found
         except (AFMError, HydraException, OmegaConfBaseException) as error:
             failures[" ".join(swept or given)] = explain(error) or str(error)
+    check_had(sorted(set.union(*map(set, overrides))), jobs)
     folder = Path(cfg.hydra.sweep.dir).absolute()
     # As text: an override may hold an interpolation that leads nowhere.
     asked = cast(list, OmegaConf.to_container(cfg.hydra.overrides.task, resolve=False))

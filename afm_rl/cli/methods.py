@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 from hydra import compose
+from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
-from afm_rl.cli.overrides import PARTS, has, optional
+from afm_rl.cli.overrides import OPTIONAL, PARTS, has, optional
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions.selection import select_seeds
 
@@ -24,10 +25,13 @@ def jobs_of(cfg: DictConfig, hydra: DictConfig, swept: Sequence[str] = ()) -> di
     A job is one method; in a study, one method with one seed.
     """
     methods = _methods(cfg, hydra)
+    some = optional(swept)
+    swept = [text.removeprefix(OPTIONAL) for text in swept]
     keys = {text: text.lstrip("+~").split("=")[0] for text in swept}
     jobs: dict[str, DictConfig] = {}
     for method in methods:
         parts = method.label.split("+")
+        parts += [text for text, key in keys.items() if key in some and not _has(method, key)]
         extra = [t for t, key in keys.items() if key not in IN_TABLES and t not in parts]
         method.label = "+".join([method.label, *extra])
         told = [t for t, key in keys.items() if key in IN_TABLES]
@@ -52,11 +56,21 @@ def _methods(cfg: DictConfig, hydra: DictConfig) -> list[DictConfig]:
         if not all(isinstance(n, str) for n in names) or len(set(names)) < len(names):
             raise ConfigurationError(f"compare={compare}: expected a list of distinct methods")
     given = {text.split("=")[0] for text in overrides}
-    by_hand = given.isdisjoint({"compare", "study"}) and not given.isdisjoint(PARTS)
-    alone = method is not None or by_hand or not cfg.compare
-    chosen = (
-        [(method, cfg)] if alone else _compared(list(compare), overrides, hydra.job.config_name)
-    )
+    one = given.isdisjoint({"compare", "study"})
+    by_hand = one and not given.isdisjoint(PARTS)
+    alone = (method is not None and (one or "method" in given)) or by_hand or not cfg.compare
+    root = hydra.job.config_name
+    chosen: list[tuple[str | None, DictConfig]] = [(method, cfg)]
+    if not alone:
+        compared = {name: _fitted([*overrides, f"method={name}"], root) for name in compare}
+        check_had(overrides, compared)
+        chosen = list(compared.items())
+    elif hydra.mode == RunMode.MULTIRUN and optional(overrides):
+        chosen = [(method, _fitted(overrides, root))]
+    for name, each in chosen:
+        for key in optional(overrides):
+            if not _has(each, key):
+                print(f"{_label(name, overrides)}: has no {key}, so it stays as it is")
     own = []
     for name, each in chosen:
         each = OmegaConf.masked_copy(each, [str(k) for k in each if k not in ("hydra", "study")])
@@ -69,38 +83,27 @@ def _methods(cfg: DictConfig, hydra: DictConfig) -> list[DictConfig]:
     return own
 
 
-def _compared(
-    names: Sequence[str], overrides: Sequence[str], root: str
-) -> list[tuple[str, DictConfig]]:
-    """Compose each method with those settings of its parts that it has."""
+def _fitted(overrides: Sequence[str], root: str) -> DictConfig:
+    """Compose a method with those settings of its parts that it has."""
     some = optional(overrides)
-    common = [text for text in overrides if text not in some.values()]
-    bare = {name: compose(root, [*common, f"method={name}"]) for name in names}
-    if not some:
-        return list(bare.items())
-    plain: dict[str, Any] = {
-        name: OmegaConf.to_container(each, resolve=False) for name, each in bare.items()
-    }
-    for key, text in some.items():
-        without = [name for name in names if not has(plain[name], key)]
-        if len(without) == len(names):
-            raise ConfigurationError(f"{text.lstrip('+')}: none of {', '.join(names)} has {key}")
-        for name in without:
-            print(f"{name}: has no {key}, so it stays as it is")
-    return [
-        (
-            name,
-            compose(
-                root,
-                [
-                    *common,
-                    *(text for key, text in some.items() if has(plain[name], key)),
-                    f"method={name}",
-                ],
-            ),
-        )
-        for name in names
-    ]
+    bare = compose(root, [text for text in overrides if text not in some.values()])
+    lacking = [text for key, text in some.items() if not _has(bare, key)]
+    return compose(root, [text for text in overrides if text not in lacking]) if some else bare
+
+
+def check_had(overrides: Sequence[str], methods: Mapping[str, DictConfig]) -> None:
+    """Check that a setting which not every method needs to have is one of some method.
+
+    Raises:
+        ConfigurationError: naming the first setting that none has.
+    """
+    for key, text in optional(overrides).items():
+        if methods and not any(_has(each, key) for each in methods.values()):
+            raise ConfigurationError(f"{text.lstrip('+')}: none of {', '.join(methods)} has {key}")
+
+
+def _has(cfg: DictConfig, key: str) -> bool:
+    return has(cast(Any, OmegaConf.to_container(cfg, resolve=False)), key)
 
 
 def _label(method: str | None, overrides: Sequence[str]) -> str:

@@ -33,16 +33,19 @@ def relaxed(arguments: Sequence[str]) -> list[str]:
     """Let Hydra accept settings of parts before it is known which methods have them.
 
     A comparison's configuration is composed once for the command line as a whole and then for
-    each method; the first must not fail because of what only some methods have. A single
-    method's arguments stay as they are.
+    each method; the first must not fail because of what only some methods have, nor must a job of a
+    sweep over methods. A single method's arguments stay as they are.
 
     >>> relaxed(["study=ugv", "dynamics.propagation=member", "seeds=2"])
     ['study=ugv', '++dynamics.propagation=member', 'seeds=2']
+    >>> relaxed(["-m", "method=physics,frozen_pe", "dynamics.propagation=member"])
+    ['-m', 'method=physics,frozen_pe', '++dynamics.propagation=member']
     >>> relaxed(["method=physics", "dynamics.propagation=member"])
     ['method=physics', 'dynamics.propagation=member']
     """
     keys = {text.partition("=")[0] for text in arguments}
-    if "method" in keys or not (keys & {"study", "compare"} or keys.isdisjoint(PARTS)):
+    several = keys & {"study", "compare"} or keys.isdisjoint({"agent", *PARTS})
+    if not keys & {"-m", "--multirun"} and ("method" in keys or not several):
         return list(arguments)
     return [OPTIONAL + text if _SETTING.match(text) else text for text in arguments]
 
@@ -66,10 +69,10 @@ def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
     if any(key == "hydra.sweep.dir" for key, *_ in given):
         return list(arguments)
     own = [parts for parts in given if not parts[0].startswith(("hydra.", "hydra/"))]
-    asked = sorted("".join(parts) for parts in own if parts[0] not in BESIDE)
+    asked = ["".join(parts).removeprefix(OPTIONAL) for parts in own if parts[0] not in BESIDE]
     bare = [(key, re.sub(r"\[.*]|\{.*}", "", value)) for key, _, value in own]  # lists do not sweep
     swept = [key.strip("+~") for key, value in bare if re.search(r"[,(]", value)]
-    name = "-".join([*swept, hashlib.sha256("\0".join(asked).encode()).hexdigest()[:6]])
+    name = "-".join([*swept, hashlib.sha256("\0".join(sorted(asked)).encode()).hexdigest()[:6]])
     return [*arguments, f"hydra.sweep.dir=multirun/{re.sub(r'[^-.0-9A-Z_a-z]', '_', name[-60:])}"]
 
 

@@ -115,7 +115,8 @@ class Corrector(nn.Module, ABC):
 
     def states_in(self, memory: Tensor) -> int:
         """Return how many numbers a state has in a memory ``(*B, P)``."""
-        return (memory.shape[-1] - self.memory_size(0)) // (2 * self.recent + 1)
+        none, one = self.memory_size(0), self.memory_size(1)
+        return (memory.shape[-1] - none) // (one - none)
 
     def begin(self, state: Tensor) -> Tensor:
         """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.compiling.tracing import all_hold
-from afm_rl.correction.base import Correction, Corrector
+from afm_rl.correction.base import Correction, Corrector, Fields
 from afm_rl.correction.network import midpoint, mlp
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import (
@@ -36,14 +36,18 @@ class PaperFlow(Corrector):
         action_high: highest action, ``(A,)``.
         features: indices of the state coordinates that the network sees.
         state_size: number of state coordinates, D of the error.
+        rule: ``"text"``: transform actions while the model is misaligned, as the paper has it.
+            ``"code"``, as its authors coded it: execute the plan once a misalignment is noted, let
+            the transition before that describe the regime, and transform all actions otherwise.
         gate: the threshold delta_M on the error's norm, in mixed units (m, rad).
         steps: midpoint steps.
-        width: units of every layer, 64 in the paper.
+        width: units of both layers of an encoder, 64 in the paper.
+        head: units of the hidden layers that join the encoders.
         error_action: the action whose prediction the error is taken against: ``"planned"``
             as published, or ``"executed"``.
         wrap: take differences on the manifold; the published runs subtracted angles.
         latch: keep the transition that opened the gate until it closes (as published)
-            instead of using the latest.
+            instead of using the latest; with ``rule="text"``.
         seed: seed of the initial weights.
 
     Raises:
@@ -56,15 +60,18 @@ class PaperFlow(Corrector):
         action_high: Tensor,
         features: Sequence[int],
         state_size: int,
+        rule: str = "text",
         gate: float = 1.0,
         steps: int = 10,
         width: int = 64,
+        head: Sequence[int] = (128, 64),
         error_action: str = "planned",
         wrap: bool = False,
         latch: bool = True,
         seed: int = 0,
     ) -> None:
         super().__init__(action_low, action_high, recent=1)
+        self.rule = check_choice("corrector.rule", rule, ("text", "code"))
         self.gate = check_number("corrector.gate", gate, low=0.0)
         self.state_size = check_count("corrector.state_size", state_size)
         self.state_features = check_counts("corrector.features", features, low=0)
@@ -84,7 +91,8 @@ class PaperFlow(Corrector):
         generator = torch.Generator().manual_seed(check_count("corrector.seed", seed, low=0))
         self.regime_encoder = mlp([self.feature_size, width, width], generator, nn.ELU)
         self.action_encoder = mlp([1 + size, width, width], generator, nn.ELU)
-        self.head = mlp([2 * width, width, width, size], generator, nn.ELU)
+        units = check_counts("corrector.head", head)
+        self.head = mlp([2 * width, *units, size], generator, nn.ELU)
 
     @property
     def feature_size(self) -> int:
@@ -101,8 +109,11 @@ class PaperFlow(Corrector):
         }
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
-        """Return names and shapes, with the features that are kept."""
-        return {**super().shapes(state_size), "features": (self.feature_size,)}
+        """Return names and shapes, with what describes the regime and what the coded rule notes."""
+        own = {"features": (self.feature_size,)}
+        if self.rule == "code":
+            own |= {"expected": (state_size,), "known": (1,), "alarm": (1,)}
+        return {**super().shapes(state_size), **own}
 
     def training_loss(
         self,
@@ -137,7 +148,7 @@ class PaperFlow(Corrector):
 
     def _velocity(self, regime: Tensor, tau: Tensor, point: Tensor) -> Tensor:
         action = self.action_encoder(torch.cat([tau, point], -1))
-        return self.head(nn.functional.elu(torch.cat([regime, action], -1)))
+        return self.head(torch.cat([regime, action], -1))
 
     @torch.no_grad()
     def _examples(self, model, states, count, generator) -> tuple[Tensor, Tensor, Tensor]:
@@ -145,7 +156,8 @@ class PaperFlow(Corrector):
         state = model.manifold.project(draw_states(states, count, generator))
         box = self.denormalise(self.lowest), self.denormalise(self.highest)
         planned, other = (uniform(*box, count, generator) for _ in range(2))
-        error = model.manifold.difference(model(state, other), model(state, planned))
+        reached, expected = (model.forecast(state, action)[0] for action in (other, planned))
+        error = self._difference(model, reached, expected)
         return self._features(state, planned, error), planned, other
 
     @torch.no_grad()
@@ -156,25 +168,56 @@ class PaperFlow(Corrector):
         parts = self.unpack(memory, model.state_size)
         newest = parts["transitions"].squeeze(-2)
         state, plan, executed, reached, valid = self.split_transitions(newest, model.state_size)
-        expected = model(state, plan if self.error_action == "planned" else executed)
-        error = reached - expected
-        if self.wrap:
-            error = model.manifold.difference(reached, expected)
-        valid = valid.squeeze(-1) == 1.0
-        size = torch.where(valid, error.norm(dim=-1), 0.0)
-        misaligned = size >= self.gate
-        features = torch.where(valid.unsqueeze(-1), self._features(state, plan, error), 0.0)
-        if self.latch:
-            held = (parts["misaligned"] == 1.0) & misaligned.unsqueeze(-1)
-            features = torch.where(held, parts["features"], features)
-        found = self.unchanged(planned, size, box)
-        if not all_hold(~misaligned):
-            action = self._integrate(features.to(self.scale), planned.to(self.scale))
-            action = torch.where(misaligned.unsqueeze(-1), action.to(planned), planned)
-            found = found._replace(executed=action, misaligned=misaligned)
-        parts |= {"planned": planned, "executed": found.executed, "features": features}
-        parts["misaligned"] = misaligned.unsqueeze(-1).to(planned)
+        coded = self.rule == "code"
+        # The authors' code predicts a step before the model learns from it, the text after that.
+        expected = parts["expected"] if coded else model(state, self._judged(plan, executed))
+        error = self._difference(model, reached, expected)
+        valid = valid == 1.0
+        size = torch.where(valid, error.norm(dim=-1, keepdim=True), 0.0)
+        if coded:
+            error = torch.where(size < self.gate, 0.0, error)
+        features = torch.where(valid, self._features(state, plan, error), 0.0)
+        transform = (self._as_coded if coded else self._as_written)(parts, size, valid, features)
+        found = self.unchanged(planned, size.squeeze(-1), box)
+        if not all_hold(~transform):
+            action = self._integrate(parts["features"].to(self.scale), planned.to(self.scale))
+            action = torch.where(transform, action.to(planned), planned)
+            found = found._replace(executed=action, misaligned=transform.squeeze(-1))
+        if coded:
+            parts["expected"] = model(parts["state"], self._judged(planned, found.executed))
+        parts |= {"planned": planned, "executed": found.executed}
+        parts["misaligned"] = transform.to(planned)
         return self.pack(parts), found
+
+    def _as_written(self, parts: Fields, size: Tensor, valid: Tensor, features: Tensor) -> Tensor:
+        """Note what describes the regime; return whether the plan is transformed ``(*B, 1)``."""
+        astray = size >= self.gate
+        held = (parts["misaligned"] == 1.0) & astray & self.latch
+        parts["features"] = torch.where(held, parts["features"], features)
+        return astray
+
+    def _as_coded(self, parts: Fields, size: Tensor, valid: Tensor, features: Tensor) -> Tensor:
+        """Do the same as the authors coded it.
+
+        An alarm is raised after a surprise; the next step then describes the regime, and its plan
+        is executed as it is. The first step of a mission raises one, too.
+        """
+        alarm = (parts["alarm"] == 1.0) & valid
+        known = parts["known"] == 1.0
+        parts["features"] = torch.where(alarm, features, parts["features"])
+        parts["known"] = (known | alarm).to(size)
+        parts["alarm"] = (~alarm & (~valid | (size > self.gate))).to(size)
+        return known & ~alarm
+
+    def _judged(self, planned: Tensor, executed: Tensor) -> Tensor:
+        """Return the action whose prediction the error is taken against."""
+        return planned if self.error_action == "planned" else executed
+
+    def _difference(self, model: DynamicsModel, reached: Tensor, expected: Tensor) -> Tensor:
+        """Return the error of a prediction, angles as :attr:`wrap` says."""
+        if self.wrap:
+            return model.manifold.difference(reached, expected)
+        return reached - expected
 
     def _integrate(self, features: Tensor, planned: Tensor) -> Tensor:
         regime = self.regime_encoder(features)

@@ -13,7 +13,14 @@ from tensordict import unravel_key
 from torchrl.envs import EnvBase
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_count, check_number
+from afm_rl.errors import (
+    AFMError,
+    ConfigurationError,
+    check_choice,
+    check_count,
+    check_flag,
+    check_number,
+)
 from afm_rl.learning import Updater
 from afm_rl.planning import Cost
 
@@ -58,8 +65,8 @@ def check_training(
 ) -> None:
     """Check the ``settings`` of a training function by its defaults, which say what there is.
 
-    Counts must be at least 1, or what ``least`` says; other numbers must not be negative, and step
-    sizes at most 1.
+    Flags must be flags, counts at least 1, or what ``least`` says; other numbers must not be
+    negative, and step sizes at most 1.
     """
     known = {
         name: parameter.default
@@ -70,7 +77,9 @@ def check_training(
         check_choice(f"{group}: setting", name, known)
         if value is None and known[name] is None:
             continue
-        if known[name] is None or isinstance(known[name], int):
+        if isinstance(known[name], bool):
+            check_flag(f"{group}.{name}", value)
+        elif known[name] is None or isinstance(known[name], int):
             if name == "seed":
                 check_count(f"{group}.{name}", value, low=0)
             else:

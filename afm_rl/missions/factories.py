@@ -194,7 +194,7 @@ def paper_flow(
         )
     size, features = model.state_size, list(robot.features)
     flow = PaperFlow(*robot.action_box, features=features, state_size=size, **settings)
-    own = _without(settings, "gate", "steps", "error_action", "wrap", "latch")
+    own = _without(settings, "rule", "gate", "steps", "error_action", "latch")
     return Part(flow, _training(flow, robot, dynamics, train, checkpoint, own, "action units"))
 
 

@@ -1,98 +1,259 @@
-"""Our means beside those that the paper printed: four tables, as CSV and LaTeX.
+"""Our means beside those that the paper printed: its tables 1 to 4, the means, and the quadrotor's.
 
     python examples/paper/published_tables.py outputs/study/ugv_paper
+    python examples/paper/published_tables.py outputs/study/ugv_paper --page docs/paper.md
 
-The paper gave each mission 5000 steps, and one that ran out counts 4999, the number of its last
-step. Steps of ours compare with these only under the same budget: the tables say where it differs.
+Writes CSV and LaTeX; with a page, the same between the page's marks. Give it the folder of
+study=quadrotor_paper, too, for the quadrotor's. The paper gave each mission
+5000 steps, and one that ran out counts 4999, the number of its last step. Steps of ours compare
+with these only under the same budget: the tables say where it differs.
 """
 
 import argparse
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pandas as pd
 
 from afm_rl.report import read_runs
 from afm_rl.report.runs import cell_names
-from afm_rl.report.tables import Table
+from afm_rl.report.statistics import estimate, pair
+from afm_rl.report.tables import Table, interval_text
 from afm_rl.storage.files import write_whole
 
 LAST = 4999  # step of a published mission that ran out
-LABELS = {  # the paper's name: our label
-    "afm": "afm_paper",
+LABELS = {  # ours: the paper's
+    "afm_paper": "afm",
+    "afm_paper_code": "afm",
+    "afm_dr": "afm_dr",
     "online_pe": "online_pe",
+    "frozen_pe": "frozen_pe",
     "stream_x_pe": "stream_x_pe",
     "physics": "physics",
-    "frozen_pe": "frozen_pe",
 }
-MEASURES = {"success": ("success_rate", "max", 2), "steps": ("steps", "min", 0)}
-NOTE = (
-    "Mean ± standard deviation over the seeds of one regime on {track}: ours, then as published "
-    "(five seeds; a mission that ran out counts 4999 of 5000 steps). The standard deviation "
-    "divides by n, which is what the published ones fit. A dash: not run here. Bold: the better of "
-    "our methods.{budget}"
-)
+CODED = "afm_paper_code"
+PRINTED = {  # number of a table: its track, and its methods after AFM
+    1: ("ethz_1", ["stream_x_pe", "physics"]),
+    2: ("ethz_2", ["stream_x_pe", "physics"]),
+    3: ("ethz_1", ["frozen_pe", "online_pe"]),
+    4: ("ethz_2", ["frozen_pe", "online_pe"]),
+}
+HEADS = {
+    "afm_paper": "AFM, gate as written",
+    CODED: "AFM, gate as coded",
+    "afm_dr": "AFM+DR",
+    "online_pe": "Online PE",
+    "frozen_pe": "PE",
+    "stream_x_pe": "stream-x PE",
+    "physics": "Physics",
+}
+TEXT = pd.DataFrame([{"method": "afm_dr", "success_mean": 0.836, "steps_mean": 3131.2}])
+FLIGHTS = ("physics", "online_knode", "afm_online_knode", "afm_physics", "oracle")
+JIAHAO = {  # Online-KNODE-MPC, Jiahao et al. 2022, table 1, circles of 2 m: m/s: m²
+    "physics": {0.8: 0.0904, 1.0: 0.1280, 1.2: 0.1705},
+    "online_knode": {0.8: 0.0660, 1.0: 0.1113, 1.2: 0.1678},
+}
+MARKS = r"(<!-- {} begin -->\n).*?(<!-- {} end -->)"
 
 
 def published() -> pd.DataFrame:
-    """Return the published means and standard deviations, with our labels and cells."""
+    """Return the published means and standard deviations, with our cells."""
     figures = pd.read_csv(Path(__file__).with_name("published.csv"))
     figures["track"] = "ethz_" + figures["track"].astype(str)
-    figures["method"] = figures["method"].map(LABELS)
     named = figures[["method", "track", "v_gain", "omega_gain"]].assign(seed=0)
     return figures.assign(cell=cell_names(named))
 
 
-def tables(missions: pd.DataFrame) -> list[Table]:
-    """Return success and steps on each track on which there are missions of a published method."""
-    figures = published()
-    ours = missions.merge(figures[["method", "cell"]], on=["method", "cell"])
-    given_up = ours.loc[~ours["finished"].astype(bool), "steps"]
-    other = sorted(set(given_up) - {LAST})
-    budget = (
-        f" Ours count {' or '.join(map(str, other))}: our budget was another one, so steps and "
-        "success do not compare."
-        if other
-        else ""
+def budget_note(missions: pd.DataFrame) -> str:
+    """Say it where missions of ours had another budget."""
+    other = sorted(set(missions.loc[~missions["finished"].astype(bool), "steps"]) - {LAST})
+    if not other:
+        return ""
+    counted = " or ".join(map(str, other))
+    return (
+        f" Ours count {counted}: our budget was another one, so steps and success do not compare."
     )
-    found = []
-    for track in sorted(ours["track"].unique()):
-        printed = figures[figures["track"] == track]
-        for measure, (column, _, _) in MEASURES.items():
-            means = ours[ours["track"] == track].groupby(["cell", "method"])[column]
-            own = means.agg(["mean", lambda values: values.std(ddof=0), "size"]).reset_index()
-            own.columns = ["cell", "method", "ours_mean", "ours_std", "missions"]
-            found.append(table(track, measure, printed.merge(own, "left"), budget))
+
+
+def cells_table(number: int, ours: pd.DataFrame) -> Table:
+    """Return one of the paper's tables: a row per regime, success / steps of each method."""
+    track, others = PRINTED[number]
+    figures = published()
+    figures = figures[figures["track"] == track]
+    own = ours.groupby(["cell", "method"])[["success_rate", "steps"]]
+    own = own.agg(["mean", lambda values: values.std(ddof=0)])
+    rows, numbers = [], []
+    for cell, group in figures.groupby("cell", sort=False):
+        printed = group.set_index("method")
+        first = group.iloc[0]
+        row = {name: f"{first[name]:g}" for name in ("v_gain", "omega_gain")}
+        for method in ("afm_paper", CODED, *others):
+            numbers.append({"method": method, **printed.loc[LABELS[method]], "cell": cell})
+            row[HEADS[method]] = "-"
+            if (cell, method) in own.index:
+                values = own.loc[(cell, method)].to_list()
+                names = [f"ours_{name}" for name in list(figures)[-5:-1]]
+                numbers[-1] |= dict(zip(names, values, strict=True))
+                row[HEADS[method]] = _both(*values)
+            if method != "afm_paper":
+                head = f"{'AFM' if method == CODED else HEADS[method]}, published"
+                row[head] = _both(*printed.loc[LABELS[method]].iloc[-5:-1])
+        rows.append(row)
+    title = f"Table {number} of the paper: success / steps on {track}"
+    note = (
+        f"Mean ± standard deviation over the seeds of a regime ({_seeds(ours)}; published: five). "
+        "The deviation divides by n, which is what the published ones fit. A dash: not run."
+        + budget_note(ours)
+    )
+    return Table(f"paper_table_{number}", title, note, pd.DataFrame(numbers), pd.DataFrame(rows))
+
+
+def _both(success: float, success_std: float, steps: float, steps_std: float) -> str:
+    return f"{success:.2f} ± {success_std:.2f} / {steps:.0f} ± {steps_std:.0f}"
+
+
+def _seeds(missions: pd.DataFrame) -> str:
+    """Say how many seeds there are of a cell: fewer where a study is under way."""
+    counts = missions.groupby(["method", "cell"])["seed"].nunique()
+    least, most = counts.min(), counts.max()
+    return f"ours: {most}" if least == most else f"ours: {least} to {most}"
+
+
+def means_table(ours: pd.DataFrame) -> Table:
+    """Return the means over all cells, and the paired differences from Online PE."""
+    figures = published().rename(columns={"method": "printed"})
+    printed = figures.groupby("printed")[["success_mean", "steps_mean"]].mean()
+    printed = pd.concat([printed, TEXT.set_index("method")])
+    rows, numbers = [], []
+    for method, name in LABELS.items():
+        own = ours[ours["method"] == method]
+        figure = {"method": method, "missions": len(own), **printed.loc[name]}
+        row = {"method": HEADS[method], "missions": str(len(own))}
+        pairs = pair(ours, method, "online_pe")
+        for head, column, digits in (("success", "success_rate", 3), ("steps", "steps", 0)):
+            row[f"{head}, ours"] = row[f"{head} - Online PE"] = "-"
+            if len(own):
+                figure |= estimate(column, own[column], own["cell"])
+                row[f"{head}, ours"] = interval_text(figure, column, digits)
+            if len(pairs) and method != "online_pe":
+                apart = pairs[column] - pairs[f"{column}_other"]
+                figure |= estimate(f"{column}_apart", apart, pairs["cell"])
+                row[f"{head} - Online PE"] = interval_text(
+                    figure, f"{column}_apart", digits, sign="+"
+                )
+            row[f"{head}, published"] = f"{figure[f'{head}_mean']:.{digits}f}"
+        order = ["ours", "published", "- Online PE"]
+        heads = [
+            f"{head} {end}" if end[0] == "-" else f"{head}, {end}"
+            for head in ("success", "steps")
+            for end in order
+        ]
+        rows.append({name: row[name] for name in ("method", "missions", *heads)})
+        numbers.append(figure)
+    note = (
+        "Means over both tracks and eleven regimes, with 95 % stratified bootstrap intervals "
+        f"(strata: cells; {_seeds(ours)} seeds of a cell); published: means of the printed tables, "
+        "of AFM+DR that of the text. Differences from Online PE are paired by cell and seed."
+        + budget_note(ours)
+    )
+    title = "All cells: success and steps"
+    return Table("paper_means", title, note, pd.DataFrame(numbers), pd.DataFrame(rows))
+
+
+def tables(missions: pd.DataFrame) -> list[Table]:
+    """Return the means and the paper's four tables; none without a mission of a published cell."""
+    ours = missions[missions["method"].isin(list(LABELS))]
+    ours = ours[ours["cell"].isin(published()["cell"])]
+    if ours.empty:
+        return []
+    found = [means_table(ours)]
+    for number, (track, _) in PRINTED.items():
+        there = ours[ours["track"] == track]
+        if len(there):
+            found.append(cells_table(number, there))
     return found
 
 
-def table(track: str, measure: str, figures: pd.DataFrame, budget: str) -> Table:
-    """Return one of the paper's tables: a row per regime, two columns per method."""
-    _, better, digits = MEASURES[measure]
-    rows, bold = [], set()
-    for place, (gains, group) in enumerate(figures.groupby(["v_gain", "omega_gain"], sort=False)):
-        row = dict(zip(("v_gain", "omega_gain"), map("{:g}".format, gains), strict=True))
-        best = group["ours_mean"].agg(better) if group["ours_mean"].nunique() > 1 else None
-        for entry in group.to_dict("records"):
-            if entry["ours_mean"] == best:
-                bold.add((place, len(row)))
-            for whose, name in (("ours", "ours"), (measure, "published")):
-                mean, std = entry[f"{whose}_mean"], entry[f"{whose}_std"]
-                text = "-" if mean != mean else f"{mean:.{digits}f} ± {std:.{digits}f}"
-                row[f"{entry['method']}, {name}"] = text
-        rows.append(row)
-    title = f"{measure.capitalize()} on {track}, ours and as published"
-    note = NOTE.format(track=track, budget=budget)
-    name = f"paper_{track}_{measure}"
-    return Table(name, title, note, figures, pd.DataFrame(rows), frozenset(bold))
+def flights_table(missions: pd.DataFrame) -> Table:
+    """Return the quadrotor's error at each speed, and its mean change over Online-KNODE."""
+    speeds = missions["track"].str.extract(r"_([\d.]+)mps", expand=False).astype(float)
+    ours = missions.assign(speed=speeds)
+    rows, numbers = [], []
+    for method in FLIGHTS:
+        own = ours[ours["method"] == method]
+        for name, values in (("ours", own), ("Jiahao et al.", JIAHAO.get(method, {}))):
+            if not len(values):
+                continue
+            row = {"method": f"{method}, {name}"}
+            for speed in sorted(ours["speed"].unique()):
+                figure = {"method": method, "whose": name, "speed": speed}
+                if isinstance(values, pd.DataFrame):
+                    at = own[own["speed"] == speed]
+                    figure |= estimate("mse", at["mse"], at["speed"])
+                    row[f"{speed:g} m/s"] = interval_text(figure, "mse", 5)
+                elif speed in values:
+                    figure |= {"mse": values[speed]}
+                    row[f"{speed:g} m/s"] = f"{values[speed]:.4f}"
+                numbers.append(figure)
+            if isinstance(values, pd.DataFrame) and method != "online_knode":
+                pairs = pair(ours, method, "online_knode")
+                if len(pairs):
+                    share = 100 * (pairs["mse"] / pairs["mse_other"] - 1)
+                    figure = estimate("share", share, pairs["cell"])
+                    row["mean change (%)"] = interval_text(figure, "share", 1, sign="+")
+            rows.append(row)
+    rows.append({"method": "AFM over Online-KNODE, the paper's text", "mean change (%)": "-6.6"})
+    shown = pd.DataFrame(rows).fillna("")
+    note = (
+        "Mean squared error (m²) with the interval over seeds, and its mean relative change over "
+        "Online-KNODE, paired by speed and seed. The paper prints a figure without numbers; the "
+        "published rows are those of Jiahao et al. (2022)."
+    )
+    title = "The quadrotor, protocol A"
+    return Table("paper_quadrotor", title, note, pd.DataFrame(numbers), shown)
+
+
+def markdown(table: Table) -> str:
+    """Return a table as a page shows it."""
+    lines = [list(table.shown), ["---"] * table.shown.shape[1], *table.shown.to_numpy().tolist()]
+    rows = "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+    return f"**{table.title}**\n\n{rows}\n\n{table.note}\n"
+
+
+def with_tables(page: str, name: str, found: Sequence[Table]) -> str:
+    """Return a page with tables in the place of those between its marks."""
+    text = "\n" + "\n".join(map(markdown, found)) + "\n"
+    marks = re.compile(MARKS.format(name, name), re.DOTALL)
+    if not marks.search(page):
+        raise SystemExit(f"the page has no marks <!-- {name} begin --> and <!-- {name} end -->")
+    return marks.sub(lambda match: match[1] + text + match[2], page)
+
+
+def of_folders(folders: Sequence[Path]) -> Iterator[tuple[str, list[Table]]]:
+    """Yield the name of a part of the page, and its tables, for each kind of mission there is."""
+    kinds: dict[str, list[Path]] = {"tables": [], "flights": []}
+    for folder in folders:
+        columns = read_runs([folder]).missions.columns
+        kinds["flights" if "mse" in columns else "tables"].append(folder)
+    for name, some in kinds.items():
+        if some:
+            missions = read_runs(some).missions
+            yield name, [flights_table(missions)] if name == "flights" else tables(missions)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="+", type=Path, help="results of runs or studies")
     parser.add_argument("--out", type=Path, help="where to (FOLDER/report/tables, of the first)")
+    parser.add_argument("--page", type=Path, help="page with marks between which to write them")
     options = parser.parse_args()
     out = options.out or options.folders[0] / "report" / "tables"
-    for each in tables(read_runs(options.folders).missions):
-        write_whole(out / f"{each.name}.csv", each.to_csv().encode())
-        write_whole(out / f"{each.name}.tex", each.to_latex().encode())
-        print(f"{each.title}. {each.note}\n{each.shown.to_string(index=False)}\n")
+    for part, found in of_folders(options.folders):
+        for each in found:
+            write_whole(out / f"{each.name}.csv", each.to_csv().encode())
+            write_whole(out / f"{each.name}.tex", each.to_latex().encode())
+            print(f"{each.title}. {each.note}\n{each.shown.to_string(index=False)}\n")
+        if options.page:
+            text = with_tables(options.page.read_text(encoding="utf-8"), part, found)
+            write_whole(options.page, text.encode())

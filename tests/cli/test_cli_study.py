@@ -81,8 +81,30 @@ def test_a_comparison_takes_settings_of_some_methods_too(afm_rl, tmp_path, asked
 
 
 @pytest.mark.parametrize(
+    ("chosen", "labels"),
+    [
+        (["study=ugv_paper", "compare=[online_pe,physics]"], ["online_pe", "physics"]),
+        (["agent=paper", "compare=[physics,frozen_pe]"], ["physics", "frozen_pe"]),
+        (["study=ugv_paper", "method=frozen_pe"], ["frozen_pe"]),
+    ],
+)
+def test_an_agent_states_what_its_methods_are(afm_rl, asked, tmp_path, monkeypatch, chosen, labels):
+    monkeypatch.setattr("afm_rl.cli.launch.show", lambda *args: None)
+    settings = ["dynamics.pretrain.batch_size=128", "seeds=1"]
+    assert afm_rl(*chosen, *settings, f"hydra.run.dir={tmp_path}").status == 0
+    found = methods(asked[0][1])
+    assert list(found) == labels
+    for label, cfg in found.items():
+        assert cfg.cost.coordinates == [0, 1, 2] and cfg.planner.noise == "unit"
+        pe = label != "physics"
+        assert (cfg.dynamics.get("propagation") == "sample") is pe
+        assert not pe or cfg.dynamics.pretrain.batch_size == 128  # the command line counts most
+
+
+@pytest.mark.parametrize(
     "arguments",
     [
+        ["agent=paper", "dynamics.x=1"],
         ["method=physics", "dynamics.x=1"],
         ["dynamics=pe", "dynamics.x=1"],
         ["study=ugv", "+dynamics.x=1", "planner.x=1", "dynamics=pe"],

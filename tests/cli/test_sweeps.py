@@ -118,6 +118,43 @@ def test_methods_seeds_and_settings_make_the_names(sweep, ran, tmp_path):
     assert yaml.safe_load(settings.read_text())["label"] == "physics"
 
 
+@pytest.mark.parametrize("launcher", [[], ["~launcher", "hydra/launcher=basic"]], ids=str)
+def test_a_sweep_gives_a_setting_to_the_methods_that_have_it(
+    sweep, ran, tmp_path, monkeypatch, launcher
+):
+    labels = []
+    if launcher:  # jobs in this process
+        monkeypatch.setattr(launch, "build", lambda cfg: labels.append(cfg))
+        monkeypatch.setattr(launch, "_run_alone", lambda *_: None)
+        monkeypatch.setattr(launch, "show", lambda *_: None)
+    done = sweep("-m", "method=physics,online_pe", "dynamics.pretrain.samples=300", *launcher)
+    assert done.status == 0, done.err
+    assert done.out.count("physics: has no dynamics.pretrain.samples, so it stays as it is") == 1
+    if launcher:
+        assert [cfg.label for cfg in labels] == ["physics", "online_pe"]
+        assert labels[1].dynamics.pretrain.samples == 300 and "pretrain" not in labels[0].dynamics
+        return
+    assert names(ran) == ["physics", "online_pe"]
+    stored = (tmp_path / "sweep" / "jobs" / "online_pe" / "config.yaml").read_text()
+    assert yaml.safe_load(stored)["dynamics"]["pretrain"]["samples"] == 300
+
+
+def test_a_method_without_a_swept_setting_has_one_job(sweep, ran):
+    swept = "dynamics.pretrain.samples=300,400"
+    assert sweep("-m", "method=physics,online_pe", swept, "agent=paper").status == 0
+    labels = [f"online_pe+dynamics.pretrain.samples={n}" for n in (300, 400)]
+    assert names(ran) == ["physics", *labels]
+
+
+def test_a_setting_that_no_method_of_a_sweep_has_is_refused(sweep, ran):
+    done = sweep("-m", "method=physics,oracle", "dynamics.pretrain.samples=300")
+    assert (done.status, ran.jobs) == (2, [])
+    assert done.err == (
+        "afm-rl: dynamics.pretrain.samples=300: none of physics, oracle has "
+        "dynamics.pretrain.samples\n"
+    )
+
+
 def test_what_is_asked_twice_is_run_once(sweep, ran):
     assert sweep("-m", "method=physics", "seeds=1,1").status == 0
     assert names(ran) == ["physics"]

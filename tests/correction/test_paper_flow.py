@@ -93,6 +93,44 @@ def test_the_error_is_taken_against_the_chosen_action(
     assert torch.equal(parts["features"][:, 1:3], planned)
 
 
+def test_the_rule_as_the_authors_coded_it(make):
+    """Plan and execute it; a surprise lets the next step describe the regime, untransformed."""
+    flow, model = make(rule="code", gate=0.5), Dubins()
+    state, last = torch.tensor([[0.0, 0.0, 0.3]]), None
+    box = torch.tensor([[[-1.0, -1.6], [1.0, 1.6]]])
+    memory, transformed, registered = flow.begin(state), [], []
+    surprises = [0.0, 0.0, 0.7, 0.6, 0.0, 0.2, 0.0]  # error of the step that was planned last
+    for step, surprise in enumerate(surprises):
+        planned = torch.tensor([[0.1 * (step + 1), -0.2]])
+        if step:
+            state = model(state, last) + torch.tensor([surprise, 0.0, 0.0])
+            memory = flow.observe(memory, state)
+        memory, found = flow.correct(memory, planned, model, box)
+        assert bool(found.misaligned) or torch.equal(found.executed, planned)
+        assert float(found.innovation) == pytest.approx(surprise if step else 0.0, abs=1e-5)
+        transformed.append(bool(found.misaligned))
+        registered.append(flow.unpack(memory, 3)["features"][0].tolist())
+        last = planned
+    # The first step raises an alarm, so the second describes the regime; the surprise of step 2
+    # raises the next one, so step 3 does: with the surprise that it has itself.
+    assert transformed == [False, False, True, False, True, True, True]
+    assert not any(registered[0])
+    for steps, (plan, error) in {(1, 2): (0.1, 0.0), (3, 4, 5, 6): (0.3, 0.6)}.items():
+        for step in steps:
+            assert registered[step][1] == pytest.approx(plan)
+            assert registered[step][3:] == pytest.approx([error, 0.0, 0.0], abs=1e-5)
+
+
+def test_the_rule_as_coded_predicts_before_the_model_learns(make, transitions):
+    flow, (state, action) = make(rule="code", gate=0.5), transitions(2)
+    box = torch.stack([action - 1, action + 1], -2)
+    memory, _ = flow.correct(flow.begin(state), action, Dubins(), box)
+    memory = flow.observe(memory, Dubins()(state, action))
+    other = Dubins(dt=1.0)  # what the model has become since
+    _, found = flow.correct(memory, action, other, box)
+    assert float(found.innovation.max()) == pytest.approx(0.0, abs=1e-6)
+
+
 def test_an_aligned_model_is_never_corrected(make, trained_ensemble, transitions):
     state, action = transitions(200)
     for model in (Dubins(), trained_ensemble):
@@ -101,17 +139,28 @@ def test_an_aligned_model_is_never_corrected(make, trained_ensemble, transitions
         assert not found.misaligned.any()
 
 
-def test_examples_register_one_action_as_if_it_were_another(make, states, box):
-    flow, generator = make(), torch.Generator().manual_seed(0)
+@pytest.mark.parametrize("wrap", [False, True])
+def test_examples_register_one_action_as_if_it_were_another(make, states, box, wrap):
+    flow, generator = make(wrap=wrap), torch.Generator().manual_seed(0)
     features, planned, other = flow._examples(Dubins(), states, 100, generator)
     heading, registered, error = features.split([1, 2, 3], -1)
     assert torch.equal(registered, planned)
     state = torch.cat([torch.zeros(100, 2), heading], -1)
     seen, expected = Dubins()(state, other), Dubins()(state, planned)
-    torch.testing.assert_close(error, Dubins().manifold.difference(seen, expected))
+    wrapped = Dubins().manifold.difference(seen, expected)
+    torch.testing.assert_close(error, wrapped if wrap else seen - expected)
+    assert bool((error[:, 2].abs() > math.pi).any()) is not wrap
     for part in (planned, other):
         assert (part >= box[0]).all() and (part <= box[1]).all()
         assert float(part[:, 0].std()) == pytest.approx(2 / 12**0.5, rel=0.2)
+
+
+def test_training_leaves_the_noise_of_a_sampling_model_alone(make, states, make_ensemble):
+    model = make_ensemble(propagation="sample")
+    before = model._generator.get_state()
+    settings = {"iterations": 2, "batch_size": 8}
+    errors = {train_flow(make(), model, None, states, **settings) for _ in range(2)}
+    assert len(errors) == 1 and torch.equal(model._generator.get_state(), before)
 
 
 def test_the_correction_integrates_from_the_planned_action_in_raw_units(make, transitions):
@@ -127,10 +176,10 @@ def test_the_correction_integrates_from_the_planned_action_in_raw_units(make, tr
 
 
 def test_it_learns_what_it_is_taught(make, states, gains):
-    flow = make(width=32)
+    flow = make(width=32, wrap=True)
     fresh = torch.Generator().manual_seed(5)
     before = flow.held_out_error(Dubins(), gains, states, 1000, fresh)
-    settings = {"iterations": 300, "batch_size": 128, "lr": 1e-2}
+    settings = {"iterations": 1000, "batch_size": 128, "lr": 1e-2}
     assert train_flow(flow, Dubins(), gains, states, **settings) < 0.5 * before
 
 
@@ -140,6 +189,8 @@ def test_it_learns_what_it_is_taught(make, states, gains):
         {"state_size": 0},
         {"steps": 0},
         {"error_action": "wished"},
+        {"rule": "figure"},
+        {"head": [0]},
         {"gate": -1.0},
         {"features": [3]},
         {"features": [-1]},

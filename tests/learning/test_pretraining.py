@@ -45,16 +45,41 @@ def test_the_best_epoch_is_kept_and_its_error_returned(fit, monkeypatch):
 
     def judge(model, *held_out):
         seen.append(copy.deepcopy(model))
-        return torch.full((3,), next(errors)).square()
+        return torch.full((3,), next(errors)).square(), 0.0
 
-    monkeypatch.setattr(fitting, "held_out_error", judge)
+    monkeypatch.setattr(fitting, "judge", judge)
     model, best = fit(epochs=4)
     assert best == pytest.approx(0.2)
     assert [same(model, other) for other in seen] == [False, True, False, False]
 
 
+@pytest.mark.parametrize(("tolerance", "epochs"), [(0.0, 5), (0.1, 3), (0.6, 2)])
+def test_it_stops_once_the_held_out_loss_stays(fit, monkeypatch, tolerance, epochs):
+    losses = iter([3.0, 2.5, 2.45, 9.0, 9.0])
+    seen = []
+    monkeypatch.setattr(
+        fitting, "judge", lambda *_: (torch.ones(3), seen.append(next(losses)) or seen[-1])
+    )
+    fit(epochs=5, tolerance=tolerance)
+    assert len(seen) == epochs
+
+
+def test_the_published_step_size_stays(fit, monkeypatch):
+    made = []
+    plain = torch.optim.Adam
+
+    def adam(*args, **settings):
+        made.append(plain(*args, **settings))
+        return made[-1]
+
+    monkeypatch.setattr(torch.optim, "Adam", adam)
+    for one_cycle in (True, False):
+        fit(lr=3e-3, one_cycle=one_cycle)
+    assert made[0].param_groups[0]["lr"] < 1e-4 and made[1].param_groups[0]["lr"] == 3e-3
+
+
 def test_training_that_breaks_down_is_reported_as_such(fit, monkeypatch):
-    monkeypatch.setattr(fitting, "held_out_error", lambda *_: torch.full((3,), math.nan))
+    monkeypatch.setattr(fitting, "judge", lambda *_: (torch.full((3,), math.nan), 0.0))
     assert fit()[1] == math.inf
 
 

@@ -16,8 +16,8 @@ from afm_rl.missions.state import fingerprint
 from afm_rl.storage.artefacts import Checkpoints, read_tensors
 
 METHODS = [
-    *("online_pe", "oracle", "afm_physics", "afm_paper", "stream_x_pe", "adaptive_gain", "rls"),
-    *("physics planner=cem", "online_pe dynamics.propagation=sample"),
+    *("online_pe", "oracle", "afm_physics", "afm_paper_code", "stream_x_pe", "adaptive_gain"),
+    *("rls", "physics planner=cem", "online_pe dynamics.propagation=sample"),
     "online_pe updater.optimizer._target_=torch.optim.Adam",
 ]
 

@@ -138,8 +138,8 @@ def train_flow(
 ) -> float:
     """Train a flow on counterfactuals: what a robot's model would show under imagined regimes.
 
-    The universal :class:`~afm_rl.correction.ActionFlow` is refined from where it is; the published
-    flow starts from nothing.
+    The universal :class:`~afm_rl.correction.ActionFlow` is refined from where it is, by Adam with a
+    one-cycle step size and clipped gradients; the published flow from nothing, by Adam alone.
 
     Args:
         flow: trained in place.
@@ -180,6 +180,7 @@ def train_flow(
             iterations,
             lr,
             progress,
+            plain=True,
         )
         return paper.held_out_error(*world, 2048, generator)
     windows, network, mode = Windows(flow), flow.network, flow.tick.saturation
@@ -213,23 +214,28 @@ def optimise(
     iterations: int,
     lr: float,
     progress: bool = False,
+    plain: bool = False,
 ) -> None:
     """Minimise a loss that is drawn anew at every step.
 
-    Adam with a one-cycle step size, gradients clipped to norm 1.
+    Adam with a one-cycle step size, gradients clipped to norm 1; ``plain``: Adam alone.
     """
     for parameter in parameters:
         parameter.requires_grad_(True)
     optimizer = torch.optim.Adam(parameters, lr=lr, fused=True)
-    cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=iterations)
+    cycle = None
+    if not plain:
+        cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=iterations)
     bar = Bar(range(iterations), desc="training the flow", shown=progress)
     for step in bar:
         with torch.enable_grad():
             value = loss()
             optimizer.zero_grad(set_to_none=True)
             value.backward()
-        torch.nn.utils.clip_grad_norm_(parameters, 1.0)
+        if cycle is not None:
+            torch.nn.utils.clip_grad_norm_(parameters, 1.0)
         optimizer.step()
-        cycle.step()
+        if cycle is not None:
+            cycle.step()
         if progress and step % 100 == 0:
             bar.set_postfix_str(f"loss {value.item():.4f}", refresh=False)
