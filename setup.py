@@ -2,7 +2,12 @@
 
 from setuptools import find_packages, setup
 
-FOLDERS = {"afm_rl": "afm_rl", "afm_rl.envs": "envs", "afm_rl.conf": "conf"}
+FOLDERS = {
+    "afm_rl": "afm_rl",
+    "afm_rl.envs": "envs",
+    "afm_rl.conf": "conf",
+    "afm_rl.play.policies": "examples/policies/zoo",  # those that the page plays, by pyproject.toml
+}
 
 packages = [
     ".".join(filter(None, (root, sub)))

@@ -1,7 +1,8 @@
 """Action Flow Matching for continual robot learning, on TorchRL.
 
 Importing the package registers its gymnasium environments, and gives the two wrappers for
-gymnasium when they are asked for; everything else is imported from its own module, for example
+gymnasium and ``check_model`` when they are asked for; everything else is imported from its own
+module, for example
 ``from afm_rl.transforms import ActionFlowTransform``.
 """
 
@@ -12,7 +13,7 @@ import gymnasium
 
 from afm_rl._version import __version__
 
-__all__ = ["ActionFlowVectorWrapper", "ActionFlowWrapper", "__version__"]
+__all__ = ["ActionFlowVectorWrapper", "ActionFlowWrapper", "__version__", "check_model"]
 
 if "afm_rl/UGVTrack-v0" not in gymnasium.registry:  # strings only: nothing heavy is imported
     gymnasium.register(
@@ -27,7 +28,8 @@ if "afm_rl/UGVTrack-v0" not in gymnasium.registry:  # strings only: nothing heav
 
 
 def __getattr__(name: str) -> Any:
-    """Import the wrappers when they are asked for: they are heavy."""
+    """Import what is heavy when it is asked for."""
     if name not in __all__:
         raise AttributeError(f"module 'afm_rl' has no attribute {name!r}")
-    return getattr(import_module("afm_rl.transforms.gymnasium"), name)
+    module = "check_model" if name == "check_model" else "gymnasium"
+    return getattr(import_module(f"afm_rl.transforms.{module}"), name)

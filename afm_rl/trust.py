@@ -1,6 +1,8 @@
-"""Packages that a command trusts: their code may be called, and their settings chosen.
+"""Packages that are trusted while settings are at work: their code may be called.
 
-A package brings settings in its folder ``conf``, a module in the folder ``conf`` beside it.
+They are named on the command line, in the environment as it was before Hydra, or in the call of
+:func:`~afm_rl.missions.build`; settings themselves cannot add to them. A package brings settings in
+its folder ``conf``, a module in the folder ``conf`` beside it.
 """
 
 from __future__ import annotations
@@ -9,46 +11,54 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from afm_rl.errors import ConfigurationError
 
-TRUST = "AFM_RL_TRUST"
-"""Environment variable in which the command line tells its other processes what is trusted."""
+_trusted: ContextVar[tuple[str, ...] | None] = ContextVar("trusted", default=None)
 
 
-def trusted() -> list[str]:
-    """Return what this process trusts: names of packages, and paths that end in one."""
-    return [entry for entry in os.environ.get(TRUST, "").split(",") if entry]
+def trusted() -> tuple[str, ...]:
+    """Return what is trusted: names of packages, and paths that end in one."""
+    return _trusted.get() or ()
 
 
-def trust(entries: Iterable[str]) -> None:
-    """Trust packages, here and in processes that this one starts.
+def restricted() -> bool:
+    """Tell whether settings are at work; a program may call what it likes."""
+    return _trusted.get() is not None
+
+
+def trust(entries: Iterable[str]) -> list[str]:
+    """Trust packages from now on, besides those that are trusted.
 
     They are searched for where their paths lead, in the present folder if there is none, and only
     after all that is installed.
+
+    Returns:
+        The folders that are searched from now on.
     """
     entries = [os.path.abspath(one) if "/" in one else one for one in entries]
-    os.environ[TRUST] = ",".join(dict.fromkeys([*trusted(), *entries]))
-    for entry in trusted():
-        folder = os.path.dirname(entry) or os.getcwd()
-        if folder not in sys.path:
-            sys.path.append(folder)
+    _trusted.set(tuple(dict.fromkeys([*trusted(), *entries])))
+    folders = dict.fromkeys(os.path.dirname(entry) or os.getcwd() for entry in entries)
+    added = [folder for folder in folders if folder not in sys.path]
+    sys.path.extend(added)
+    return added
 
 
 @contextmanager
 def trusting(entries: Iterable[str]) -> Iterator[None]:
-    """Trust packages for a while."""
-    before, path = os.environ.get(TRUST), sys.path[:]
-    trust(entries)
+    """Trust these packages, besides those that are trusted, and no other ones, for a while."""
+    before = _trusted.get()
+    added = trust(entries)
     try:
         yield
     finally:
-        sys.path[:] = path
-        os.environ.pop(TRUST)
-        os.environ.update({} if before is None else {TRUST: before})
+        _trusted.set(before)
+        for folder in set(added) & set(sys.path):
+            sys.path.remove(folder)
 
 
 def name_of(entry: str) -> str:

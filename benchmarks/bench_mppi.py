@@ -19,11 +19,14 @@ from statistics import median
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from timing import timed
 from torch import Tensor
+from torchrl.modules import MPPIPlanner
+from torchrl.objectives.value import TDLambdaEstimator
 
 from afm_rl.dynamics import Dubins
-from afm_rl.planning import MPPI, Cost, PlanningEnv, TorchRLMPPI
+from afm_rl.planning import MPPI, Cost, PlanningEnv
 
 try:
     from pytorch_mppi import MPPI as Peer
@@ -83,8 +86,12 @@ def ours(samples: int, **settings) -> Callable[[Tensor], Tensor]:
 def torchrl(samples: int) -> Callable[[Tensor], Tensor]:
     """Return TorchRL's planner, which starts cold, with one iteration."""
     env = PlanningEnv(Dubins(DT), MapCost(), LOW, HIGH)
+    nothing = TensorDictModule(  # is expected beyond the horizon
+        lambda state: torch.zeros_like(state[..., :1]), ["observation"], ["state_value"]
+    )
+    returns = TDLambdaEstimator(gamma=1.0, lmbda=1.0, value_network=nothing)
     # It does not subtract the best return, so at an inverse temperature of 1 all weights are zero.
-    planner = TorchRLMPPI(env, HORIZON, samples, 1, samples // 10, temperature=0.01)
+    planner = MPPIPlanner(env, returns, 0.01, HORIZON, 1, samples, samples // 10)
     td = TensorDict({"goal": GOAL})
     return lambda state: planner(td.set("observation", state))["action"]
 

@@ -14,6 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 INSTALLED_AS = {"afm_rl": "afm_rl", "envs": "afm_rl/envs", "conf": "afm_rl/conf"}
 NOT_INSTALLED = {".md", ".pyc"}  # notes for readers of the tree, caches
+POLICIES = Path("examples/policies/zoo"), "afm_rl/play/policies"  # some of them, for the page
 
 
 def sources(*folders: str) -> set[str]:
@@ -72,7 +73,7 @@ def install(folder: Path, *wheels: Path) -> Path:
 def environment(tmp_path_factory):
     """A new environment that holds the wheel and nothing else."""
     folder = tmp_path_factory.mktemp("wheel")
-    for name in INSTALLED_AS:
+    for name in (*INSTALLED_AS, POLICIES[0]):
         shutil.copytree(
             ROOT / name, folder / "source" / name, ignore=shutil.ignore_patterns("__pycache__")
         )
@@ -112,7 +113,10 @@ patient = pytest.mark.timeout(300)  # whichever test comes first builds the whee
 @patient
 def test_the_wheel_holds_every_source_file_and_no_other(site_packages):
     installed = (p.relative_to(site_packages) for p in site_packages.rglob("*") if p.is_file())
-    assert {p.as_posix() for p in installed if p.parts[0] == "afm_rl"} == sources(*INSTALLED_AS)
+    found = {p.as_posix() for p in installed if p.parts[0] == "afm_rl"}
+    policies = {name for name in found if name.startswith(POLICIES[1])}
+    assert found - policies == sources(*INSTALLED_AS)
+    assert all((ROOT / POLICIES[0] / Path(name).name).is_file() for name in policies)
 
 
 @patient
@@ -122,10 +126,17 @@ def test_the_wheel_takes_one_top_level_name(site_packages):
 
 
 @patient
-def test_the_wheel_imports_from_anywhere(run_there, site_packages):
+def test_the_wheel_imports_and_plays_from_anywhere(run_there, site_packages):
+    pytest.importorskip("mujoco")
+    names = [folder.replace("/", ".") for folder in INSTALLED_AS.values()]
+    code = "from importlib import import_module as of\n"
+    code += f"for name in {names}: print(of(name).__file__)\n"
+    code += "from afm_rl.play import ROBOTS, make_robot\n"
+    code += "for name in ROBOTS: print(make_robot(name).name)"
+    said = run_there("python", "-c", code)
     for folder in INSTALLED_AS.values():
-        code = f"import {folder.replace('/', '.')} as package; print(package.__file__)"
-        assert str(site_packages / folder / "__init__.py") in run_there("python", "-c", code)
+        assert str(site_packages / folder / "__init__.py") in said
+    assert "half_cheetah\nhopper\nwalker2d\nant\nswimmer\npendulum\ncart_pole\n" in said
 
 
 @patient

@@ -2,8 +2,10 @@
 
 import argparse
 import contextlib
+import os
 import re
 import runpy
+import subprocess
 import sys
 import tomllib
 
@@ -109,7 +111,9 @@ def shrunk(overrides):
         if not each.get_key_element().startswith("hydra.")
     ]
     methods = [each for each in parsed if each.get_key_element() == "method"]
-    swept = [m for each in methods if each.is_sweep_override() for m in each.sweep_string_iterator()]
+    swept = [
+        m for each in methods if each.is_sweep_override() for m in each.sweep_string_iterator()
+    ]
     left_out = ("out=", "launcher=", "method=") if swept else ("out=", "launcher=")
     first = [choice for choice in first if not choice.startswith(left_out)]
     cfg = next(filter(None, map(composed, settings_of_methods(first, swept))))
@@ -195,7 +199,17 @@ def check_file(words):
     assert words[0] != "sh" or (ROOT / words[1]).exists()
 
 
-ELSEWHERE = {"pip": check_install, "make": check_make, "sh": check_file}
+def check_completion(words):
+    """Let bash read the line, and complete a choice as it does after a tab."""
+    line = "afm-rl method=afm_ph"
+    typed = f'COMP_LINE="{line}" COMP_POINT={len(line)} COMP_CWORD=1'
+    script = f'eval "{words[1]}"; {typed}; hydra_bash_completion; echo "${{COMPREPLY[@]}}"'
+    path = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
+    said = subprocess.check_output(["bash", "-c", script], env=os.environ | {"PATH": path})
+    assert said.split() == [b"method=afm_physics"]
+
+
+ELSEWHERE = {"pip": check_install, "make": check_make, "sh": check_file, "eval": check_completion}
 ELSEWHERE |= dict.fromkeys(("ray", "kill", "pytest"), check_file)
 
 

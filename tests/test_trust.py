@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.targets import check_composed, check_targets, find_code
+from afm_rl.targets import check_targets, find_code, instantiate
 from afm_rl.trust import conf_folders, trusted, trusting
 
 DANGEROUS = """
@@ -35,6 +35,8 @@ afm_rl.storage.artefacts.write_whole
 afm_rl.missions.factories.load_artefact afm_rl.missions.run afm_rl.missions.build
 afm_rl.cli.main afm_rl.report.write_report afm_rl.dynamics.Ensemble.load_state_dict
 afm_rl.planning.MPPI.__init__ afm_rl.storage.artefacts.remove_parts afm_rl.missions.factories
+afm_rl.planning.policies.save_policy afm_rl.correction.training.pretrain.main
+afm_rl.transforms.controller.export_controller torch.optim.Optimizer.load_state_dict
 afm_rl.learning.updater.os.system afm_rl_other.anything torch.optim.adam.torch.load afm_rl
 hydra_plugins.anything hydra._internal.core_plugins.basic_launcher.BasicLauncher
 """.split()
@@ -54,9 +56,8 @@ def test_every_dangerous_target_is_refused_wherever_it_stands(tmp_path):
         for place in PLACES:
             with pytest.raises(ConfigurationError, match="_target_='"):
                 check_targets(place(evil))
-            if target in DANGEROUS:
-                with pytest.raises(ConfigurationError, match="_target_='"):
-                    check_composed(place(evil))
+        with pytest.raises(ConfigurationError, match="part.x.0._target_='"):  # when it is called
+            instantiate("part", {"x": [evil]})
     assert not canary.exists()
 
 
@@ -69,12 +70,12 @@ def test_what_is_no_name_is_refused(target):
 def test_trust_covers_what_a_package_defines_and_nothing_it_imports(tmp_path, monkeypatch):
     (tmp_path / "boat").mkdir()
     (tmp_path / "boat" / "__init__.py").write_text("import os\nfrom json import loads\n")
-    (tmp_path / "boat" / "hull.py").write_text("class Hull: ...\nraised = 3\n")
+    made = "from afm_rl.dynamics import Dubins\nclass Hull: ...\nraised, model = 3, Dubins()\n"
+    (tmp_path / "boat" / "hull.py").write_text(made)
     (tmp_path / "boat" / "broken.py").write_text("1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)
     hull = {"model": {"_target_": "boat.hull.Hull"}}
-    check_targets(hull, trust=["boat"])
-    check_composed(hull, trust=["boat"])
+    check_targets([hull, {"_target_": "boat.hull.model"}], trust=["boat"])
     for target in (
         "os.system",
         "loads",
@@ -89,24 +90,28 @@ def test_trust_covers_what_a_package_defines_and_nothing_it_imports(tmp_path, mo
     for trust in ([], ["boa"], ["boats"]):
         with pytest.raises(ConfigurationError, match="trust="):
             check_targets(hull, trust)
-    monkeypatch.setenv("AFM_RL_TRUST", "boat")
-    check_targets(hull)
+    with trusting(["boat"]):
+        check_targets(hull)
+    monkeypatch.setenv("AFM_RL_TRUST", "boat")  # which is read once, before Hydra
+    with pytest.raises(ConfigurationError, match="trust="):
+        check_targets(hull)
 
 
 def test_a_package_is_found_by_its_path_and_brings_its_settings(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("lib/punt/conf", "raft/conf", "conf"):
         Path(name).mkdir(parents=True)
-    Path("lib/punt/__init__.py").write_text("Hull = dict")
-    Path("canoe.py").write_text("Hull = dict")
+    Path("lib/punt/__init__.py").write_text("class Hull: ...")
+    Path("canoe.py").write_text("class Hull: ...")
     before = sys.path[:]
     with trusting(["lib/punt", "canoe", "raft"]):  # a path, a module, a folder of settings
         places = [tmp_path / "lib/punt/conf", tmp_path / "conf", tmp_path / "raft/conf"]
         assert [path.resolve() for path in conf_folders()] == places
         assert sys.path[: len(before)] == before  # what is installed comes first
         monkeypatch.chdir("/")
-        assert find_code("x", "punt.Hull") is find_code("x", "canoe.Hull") is dict
-    assert (trusted(), sys.path) == ([], before)
+        homes = [find_code("x", f"{name}.Hull").__module__ for name in ("punt", "canoe")]
+        assert homes == ["punt", "canoe"]
+    assert (trusted(), sys.path) == ((), before)
 
 
 @pytest.mark.parametrize(
@@ -126,3 +131,17 @@ def test_a_package_that_is_not_there_is_named(tmp_path, monkeypatch, entry, word
 def test_names_are_checked_without_torch():
     code = "import afm_rl.targets, sys; assert 'torch' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_parts_are_made_as_hydra_makes_them(monkeypatch, tmp_path):
+    (tmp_path / "raft.py").write_text("def made(*args, **parts): return args, parts")
+    monkeypatch.syspath_prepend(tmp_path)
+    made = {"_target_": "raft.made", "_args_": ["${x}", 2], "_convert_": "all"}
+    made["deep"] = [{"_target_": "raft.made"}]
+    with trusting(["raft"]):
+        assert instantiate("x", made) == (("${x}", 2), {"deep": [((), {})]})
+        assert instantiate("x", made | {"_recursive_": False})[1] == {"deep": made["deep"]}
+        assert instantiate("x", {"y": made | {"_partial_": True}})["y"](3)[0] == ("${x}", 2, 3)
+        with pytest.raises(ConfigurationError, match=r"^x.y.0: .* must be an iterable, not int"):
+            instantiate("x", {"y": [made | {"_args_": 3}]})
+    assert find_code("x", "os.getcwd")() == str(Path.cwd())  # a program may call what it likes

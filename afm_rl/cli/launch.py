@@ -42,6 +42,7 @@ from afm_rl.report import (
 from afm_rl.report.diagnosis import write_diagnosis
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import JOBS, extend_manifest, read_manifest, write_manifest
+from afm_rl.targets import check_targets
 
 ENDS = (signal.SIGINT, signal.SIGTERM)
 """Batch systems send the latter before they kill; a shell ignores the former for what it runs
@@ -88,7 +89,7 @@ def sweep(
         try:
             found = jobs_of(one, one.hydra, swept)
             for job in found.values():
-                OmegaConf.to_container(job, resolve=True)
+                check_targets(OmegaConf.to_container(job, resolve=True))
             jobs |= found
         except (AFMError, HydraException, OmegaConfBaseException) as error:
             failures[" ".join(swept or given)] = explain(error) or str(error)

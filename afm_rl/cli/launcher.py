@@ -10,7 +10,7 @@ from typing import Any
 
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.plugins import Plugins
-from hydra.core.utils import JobReturn, JobStatus, setup_globals
+from hydra.core.utils import JobReturn, JobStatus, env_override, setup_globals
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
@@ -56,7 +56,8 @@ class JobLauncher(Launcher):
         setup_globals()
         overrides = [list(each) for each in job_overrides]
         configs = [self.loader.load_sweep_config(self.config, each) for each in overrides]
-        sweep(self.config, configs, overrides, self.executor)
+        with env_override(self.config.hydra.job.env_set):
+            sweep(self.config, configs, overrides, self.executor)
         return [
             JobReturn(overrides=each, cfg=cfg, status=JobStatus.COMPLETED)
             for each, cfg in zip(overrides, configs, strict=True)

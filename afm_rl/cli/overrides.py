@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,10 +15,10 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from afm_rl.targets import check_composed
-from afm_rl.trust import check_trust, conf_folders, trusted, trusting
+from afm_rl.cli.composed import check_composed, check_sources, given_by
+from afm_rl.trust import check_trust, conf_folders, trusting
 
 PARTS = ("dynamics", "updater", "corrector")
 OPTIONAL = "++"  # how Hydra is told to take a setting whether it is there or not
@@ -73,7 +74,11 @@ def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
     bare = [(key, re.sub(r"\[.*]|\{.*}", "", value)) for key, _, value in own]  # lists do not sweep
     swept = [key.strip("+~") for key, value in bare if re.search(r"[,(]", value)]
     name = "-".join([*swept, hashlib.sha256("\0".join(sorted(asked)).encode()).hexdigest()[:6]])
-    return [*arguments, f"hydra.sweep.dir=multirun/{re.sub(r'[^-.0-9A-Z_a-z]', '_', name[-60:])}"]
+    folder = f"hydra.sweep.dir=multirun/{re.sub(r'[^-.0-9A-Z_a-z]', '_', name[-60:])}"
+    beside = max(
+        (n for n, text in enumerate(arguments) if text[:1] != "-" and "=" in text), default=-1
+    )
+    return [*arguments[: beside + 1], folder, *arguments[beside + 1 :]]  # Hydra wants them together
 
 
 def optional(overrides: Sequence[str]) -> dict[str, str]:
@@ -125,19 +130,31 @@ def trusted_packages(arguments: Sequence[str]) -> list[str]:
 def checked(arguments: Sequence[str]) -> Iterator[list[str]]:
     """Let Hydra compose what a command asks for, and check it before anything in it is called.
 
+    Trusted is what the command line names, and ``AFM_RL_TRUST`` as it is now.
+
     Yields:
-        The packages that the command trusts.
+        The packages that are trusted.
     """
     load = ConfigLoaderImpl.load_configuration
 
     @functools.wraps(load)
-    def checking(*args: Any, **kwargs: Any) -> DictConfig:
-        cfg = load(*args, **kwargs)
-        settings: Any = OmegaConf.to_container(cfg, resolve=False)
-        check_composed(settings, trusted())
+    def checking(
+        self: ConfigLoaderImpl,
+        config_name: str | None,
+        overrides: list[str],
+        *args: Any,
+        **how: Any,
+    ) -> DictConfig:
+        primary = config_name and self.repository.load_config(config_path=config_name)
+        if primary:
+            check_sources(primary.config)
+        cfg = load(self, config_name, overrides, *args, **how)
+        check_composed(cfg, overrides, given)
         return cfg
 
-    names = trusted_packages(arguments)
+    named = os.environ.get("AFM_RL_TRUST", "").split(",")
+    names = [*filter(None, named), *trusted_packages(arguments)]
+    given = given_by(arguments)
     with trusting(names):
         conf_folders()  # an error of a package is told here, not as one of Hydra's
         Plugins.instance().register(TrustedFolders)

@@ -15,7 +15,7 @@ A page in the browser to play with: the same policy on two robots, alone and wit
 
   afm-rl-play                          a half cheetah
   afm-rl-play --robot hopper --open    another robot; the browser opens
-  afm-rl-play --policy mine.safetensors   a policy of your own, written by save_policy
+  afm-rl-play --policy mine.safetensors   a policy of your own, in its own task
 """
 
 
@@ -23,8 +23,8 @@ def main() -> None:
     """Run ``afm-rl-play``; a mistake ends in one line and exit status 2."""
     parser = OneLineParser(NAME, ABOUT)
     add = parser.add_argument
-    add("--robot", default="half_cheetah", help="half_cheetah, hopper, ant, ugv, ...")
-    add("--policy", metavar="FILE", type=Path, help="a stored policy of a task of gymnasium")
+    add("--robot", help="half_cheetah (without anything said), hopper, ant, ugv, ...")
+    add("--policy", metavar="FILE", type=Path, help="written by save_policy, with its task as id")
     add("--port", type=int, default=0, help="of 127.0.0.1; a free one")
     add("--open", action="store_true", help="open the browser")
     options = parser.parse_args()
@@ -45,9 +45,9 @@ def _run(options: argparse.Namespace) -> None:
     import torch
 
     torch.set_num_threads(1)
-    world = World(make_robot(options.robot, options.policy))
-    page = Page(world, f"{options.robot}: alone and with AFM", port)
-    print(f"{NAME}: {options.robot} at {page.url}; Ctrl-C ends it", flush=True)
+    robot = make_robot(options.robot, options.policy)
+    page = Page(World(robot), f"{robot.name}: alone and with AFM", port)
+    print(f"{NAME}: {robot.name} at {page.url}; Ctrl-C ends it", flush=True)
     if options.open:
         webbrowser.open(page.url)
     try:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import hmac
 import io
 import json
 import os
+import secrets
 import shutil
 import stat
 import tempfile
@@ -13,6 +15,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,8 +42,31 @@ def loaded(code: bytes) -> Any:
 
 
 def folder_in(cache: str | Path) -> Path:
-    """Return where programs are in a cache."""
-    return Path(cache).expanduser() / "compiled"
+    """Return where programs are in a cache: its name is a secret of this user and this place.
+
+    Thus a cache that somebody gives away holds no program that is run.
+    """
+    place = Path(cache).expanduser().resolve()
+    return place / f"compiled-{hmac.digest(_secret(), str(place).encode(), 'sha256').hex()[:16]}"
+
+
+@lru_cache
+def _secret() -> bytes:
+    """Return the key of this user, made when it is first needed; one of this process if it cannot.
+
+    It is where the user keeps things, wherever settings let them be kept.
+    """
+    path = Path(os.environ.get("AFM_RL_CACHE", "~/.cache/afm_rl")).expanduser() / "key"
+    try:
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            number, part = tempfile.mkstemp(dir=path.parent)  # for this user's eyes only
+            with open(number, "wb") as file:
+                file.write(secrets.token_bytes(32))
+            os.replace(part, path)
+        return path.read_bytes()
+    except OSError:
+        return secrets.token_bytes(32)
 
 
 def recall(path: Path) -> tuple[bytes | None, str]:

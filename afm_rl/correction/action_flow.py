@@ -99,6 +99,7 @@ class ActionFlow(PairCorrector):
     told: Tensor
     first: Tensor
     cause: Tensor
+    episodic = (*PairCorrector.episodic, "under_way")
 
     def __init__(
         self,
@@ -209,6 +210,14 @@ class ActionFlow(PairCorrector):
         found = self.believed(memory)
         none = found.new_zeros(*found.shape[:-2], len(self.causes), self.action_size)
         return none.scatter_add(-2, cause.unsqueeze(-1).expand_as(found), found)
+
+    def cause_in(self, memory: Tensor) -> str:
+        """Return the likeliest change that memories ``(*B, P)`` show, in words."""
+        belief = self.belief_in(memory).movedim(-2, -1).flatten(0, -2).mean(0)
+        cause = self.causes[1 + int(belief[1:].argmax())]
+        if cause == "a recent change":
+            return super().cause_in(memory)
+        return cause + (": a delay that the model lacks?" if "late" in cause else "")
 
     def place_of(self, state: Tensor) -> Tensor:
         """Return where a state is, in the unit in which ground differs."""

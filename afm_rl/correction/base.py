@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from afm_rl.correction.first_steps import FirstSteps
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.faults import count_repeats, trusted
@@ -64,6 +65,8 @@ class Corrector(nn.Module, ABC):
     lowest: Tensor
     highest: Tensor
     hold: Tensor
+    episodic: tuple[str, ...] = ("state", "planned", "executed", "repeats", "sent")
+    """Parts of a memory that belong to one episode; the others are what was learnt."""
 
     def __init__(
         self,
@@ -81,6 +84,7 @@ class Corrector(nn.Module, ABC):
                 "one size, finite, low < high"
             )
         self.layouts: dict[int, tuple[list, list, list]] = {}  # by the size of a state
+        self.first_steps = FirstSteps()
         self.recent = check_count("corrector.recent", recent)
         scale = torch.maximum(low.abs(), high.abs())
         self.action_size = len(scale)
@@ -105,6 +109,7 @@ class Corrector(nn.Module, ABC):
             "executed": (size,),
             "misaligned": (1,),
             "repeats": (1,),
+            "carryover": (1,),
             "transitions": (self.recent, 2 * state_size + 2 * size + 1),
             "sent": (self.delay, size),
         }
@@ -126,6 +131,18 @@ class Corrector(nn.Module, ABC):
         rest = self.denormalise(torch.zeros_like(self.lowest).clamp(self.lowest, self.highest))
         return self.pack({**parts, "sent": rest.to(memory).expand_as(parts["sent"])})
 
+    def resume(self, memory: Tensor, state: Tensor) -> Tensor:
+        """Return the memory ``(*B, P)`` of missions that begin again in ``state`` ``(*B, S)``.
+
+        What was learnt is kept. The state, the actions of the last step and commands under way are
+        those of a beginning, so that no transition leads from one episode into the next, and while
+        commands of the last one may still act, transitions do not count.
+        """
+        parts, late = self.unpack(memory, state.shape[-1]), self.under_way(memory)[2]
+        begun = self.unpack(self.begin(state.to(memory)), state.shape[-1])
+        parts |= {name: begun[name] for name in self.episodic}
+        return self.pack({**parts, "carryover": late.unsqueeze(-1).to(memory)})
+
     def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
         """Return the memory with the transition to ``next_state`` ``(*B, S)``.
 
@@ -135,6 +152,8 @@ class Corrector(nn.Module, ABC):
         state, count = parts["state"], parts["repeats"].squeeze(-1)
         after = count_repeats(next_state, state, count)
         valid = trusted(state, count) & trusted(next_state, after)
+        valid &= parts["carryover"].squeeze(-1) == 0
+        parts["carryover"] = (parts["carryover"] - 1).clamp_min(0)
         sent = torch.cat([parts["sent"], parts["executed"].unsqueeze(-2)], -2)
         acted, parts["sent"] = sent[..., 0, :], sent[..., 1:, :]
         ends = [state, parts["planned"], acted, next_state, valid.unsqueeze(-1)]
@@ -167,6 +186,10 @@ class Corrector(nn.Module, ABC):
         action itself, and no deviation.
         """
         return action, torch.zeros_like(action)
+
+    def cause_in(self, memory: Tensor) -> str:
+        """Return in words what memories ``(*B, P)`` show of the actuators; empty by default."""
+        return ""
 
     def latest(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the present state, and the actions planned and executed last."""

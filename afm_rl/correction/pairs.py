@@ -98,6 +98,21 @@ class PairCorrector(Corrector):
         rows = torch.where(before, 0.5 * rows, rows)
         return parts | {"pairs": torch.cat([older, rows], -2)}
 
+    def cause_in(self, memory: Tensor) -> str:
+        """Return the gains that explain the pairs of memories ``(*B, P)``, in words, if any do."""
+        pairs = self.unpack(memory, self.states_in(memory))["pairs"].double().flatten(0, -2)
+        sent, came, std, valid, _ = pairs.split([*[self.action_size] * 3, 1, self.tail], -1)
+        weight = valid / (std.square() + 0.05**2)
+        gains = (weight * sent * came).sum(0) / (weight * sent.square()).sum(0)
+        left = (weight * (came - gains * sent).square()).sum() / (weight * came.square()).sum()
+        if not bool(left < 0.5):  # nor where nothing moved
+            return ""
+        alike = bool((gains - gains.mean()).abs().amax() < 0.1 * gains.mean().abs())
+        told = [f"{gain:.2g}" for gain in (gains[:1] if alike else gains[:8]).tolist()]
+        more = " on all" if alike else ", ..." if len(gains) > 8 else ""
+        reason = "a sign" if bool((gains < 0).any()) else "dt or a unit"
+        return f"gain {', '.join(told)}{more}: {reason} of the model?"
+
     def aged(self, pairs: Tensor, begins: Tensor) -> Tensor:
         """Return pairs ``(*B, M, D)`` with all but the newest marked as old.
 

@@ -10,6 +10,7 @@ import numpy as np
 from afm_rl.errors import ConfigurationError
 
 FEWEST = 20  # rows
+MOST = 256  # actuators
 GAP = 1.5  # steps: where the time between two rows is longer, commands between them are not known
 
 
@@ -33,7 +34,7 @@ class Log:
 
     Raises:
         ConfigurationError: for shapes that do not fit, numbers that are not finite, time that does
-            not go on, or fewer than 20 rows.
+            not go on, fewer than 20 rows, or more than 256 actuators.
     """
 
     names: tuple[str, ...]
@@ -55,6 +56,10 @@ class Log:
             raise ConfigurationError(
                 f"log: commands {self.command.shape}, responses {self.response.shape}: expected "
                 f"{size} columns each, one per actuator"
+            )
+        if size > MOST:  # each is looked at beside each other
+            raise ConfigurationError(
+                f"log: {size} actuators: expected at most {MOST}; choose some of them"
             )
         if rows < FEWEST:
             raise ConfigurationError(

@@ -56,7 +56,7 @@ def run_batch(
         raise ConfigurationError(
             f"hydra.run.dir={folder}: holds the results of a run; choose another folder"
         )
-    own = (Path.cwd(), tuple(trusted()))
+    own = (Path.cwd(), trusted())
     jobs = [Job(name, folder / JOBS / file_name(name), *own) for name in configs]
     with locked(folder):
         waiting = [job for job in jobs if needs_run(job.folder, configs[job.name], overwrite)]

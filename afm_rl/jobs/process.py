@@ -102,6 +102,7 @@ def last_words(status: int) -> str:
 def work(job: Job) -> None:
     """Finish a job: the main function of its process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
+    (job.folder / LOG).unlink(missing_ok=True)  # it may be a link
     log = open(job.folder / LOG, "w", buffering=1)  # open as long as the process lives
     for number in (1, 2):
         os.dup2(log.fileno(), number)

@@ -58,11 +58,13 @@ def needs_run(folder: Path, cfg: DictConfig, overwrite: bool = False) -> bool:
         check_manifest(folder)
         _check_same(folder / CONFIG, cfg, read_manifest(folder)["version"])
         return False
-    elif any((folder / name).exists() for name in FILES):
-        raise ConfigurationError(
-            f"hydra.run.dir={folder}: holds results without {MANIFEST}; choose another folder, or "
-            "overwrite=true"
-        )
+    else:  # a run replaces all of these, so they must be those of a run
+        held = [name for name in (*FILES, *SHOWN) if (folder / name).exists()]
+        if held:
+            raise ConfigurationError(
+                f"hydra.run.dir={folder}: holds {', '.join(held)} without {MANIFEST}; choose "
+                "another folder, or overwrite=true"
+            )
     return True
 
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -29,6 +28,7 @@ from afm_rl.missions.robot import SHAPE_TRAINING, Robot
 from afm_rl.missions.selection import (
     build_missions,
     fit_schedule,
+    name_method,
     name_regimes,
     select_regimes,
     select_seeds,
@@ -36,8 +36,9 @@ from afm_rl.missions.selection import (
 )
 from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.storage.artefacts import cached
-from afm_rl.targets import check_targets
+from afm_rl.targets import check_targets, instantiate
 from afm_rl.transforms import ActionFlowTransform, Guard
+from afm_rl.trust import check_trust, trusting
 
 TRANSFORM = ("enabled", "extend_action_box")
 """Settings of whatever corrector is chosen."""
@@ -116,16 +117,20 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     Raises:
         ConfigurationError: for settings that cannot be used, naming the key.
     """
-    given: Any = OmegaConf.to_container(cfg, resolve=True)
-    settings = {**DEFAULTS, **given}
+    with trusting(check_trust(list(trust))):
+        return _build(cast(dict, OmegaConf.to_container(cfg, resolve=True)))
+
+
+def _build(settings: dict[str, Any]) -> Agent:
+    settings = {**DEFAULTS, **settings}
     for name in (*GROUPS, "tracks", "regimes"):
         if settings.get(name) is None:
             raise ConfigurationError(f"{name}: expected a setting; build needs {', '.join(GROUPS)}")
-    check_targets(settings, trust)
+    check_targets(settings)
     label = check_label(settings["label"])
     device = check_device("device", settings["device"])
     with blaming("robot"):
-        robot: Robot = instantiate(settings["robot"], _convert_="all")
+        robot: Robot = instantiate("robot", settings["robot"])
         tracks = select_tracks(settings["tracks"], robot)
         regimes = select_regimes(settings["regimes"], robot)
     seeds = select_seeds(settings["seeds"])
@@ -149,7 +154,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
 
     def make(group: str, *args: Any, **changed: Any) -> Any:
         with blaming(group):
-            return instantiate({**settings[group], **changed}, _convert_="all")(*args)
+            return instantiate(group, {**settings[group], **changed})(*args)
 
     dynamics = as_part("dynamics", make("dynamics", robot), DynamicsModel)
     model = dynamics.module
@@ -161,13 +166,14 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
     own = {key: value for key, value in settings["corrector"].items() if key not in TRANSFORM}
     around = {key: value for key, value in settings["corrector"].items() if key in TRANSFORM}
     with blaming("corrector"):
-        found = instantiate(own, _convert_="all")(robot, dynamics)
+        found = instantiate("corrector", own)(robot, dynamics)
         corrector = as_part("corrector", found, Corrector)
         transform = None
         if corrector.module is not None:
             around["reported_key"] = robot.reported
             # Scores and updaters read what was measured; planners the state in which they will act.
-            transform = ActionFlowTransform(model, corrector.module, late="leave", **around)
+            around |= {"late": "leave", "carry_memory": True}  # missions leave, and are resumed
+            transform = ActionFlowTransform(model, corrector.module, **around)
     shape = {name: value for name, value in settings["robot"].items() if name in SHAPE_TRAINING}
     trainings = [
         part.training._replace(settings=[shape, *part.training.settings])
@@ -175,7 +181,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
         if part.training is not None
     ]
     with blaming("cost"):
-        cost = instantiate(settings["cost"], _convert_="all")
+        cost = instantiate("cost", settings["cost"])
         cost = cost if isinstance(cost, Cost) else cost(robot)
     # Without a transform the planner does not know which effects are achievable.
     no_box = transform is None and "box_key" in settings["planner"]
@@ -205,7 +211,7 @@ def build(cfg: DictConfig, trust: Sequence[str] = ()) -> Agent:
         check_keys("planner", planner, whole, ["box_key"])
     check_keys("updater", updater, whole)
     agent = Agent(
-        label=label or "unnamed",
+        label=label or name_method(settings),
         robot=robot,
         env=whole,
         missions=missions,

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from inspect import signature
 from typing import Any
 
-from hydra.errors import InstantiationException
 from tensordict import unravel_key
 from torchrl.envs import EnvBase
 
@@ -33,7 +32,7 @@ KEYS = ("seed_key", "mask_key", "regime_key")  # settings that name an entry of 
 
 @contextmanager
 def blaming(group: str) -> Iterator[None]:
-    """Turn what a maker of parts raises into an error that names the group, or Hydra's key.
+    """Turn what a maker of parts raises into an error that names the group.
 
     >>> with blaming("planner"):
     ...     dict(horizon=5, horizn=3)["population"]
@@ -45,17 +44,6 @@ def blaming(group: str) -> Iterator[None]:
         yield
     except AFMError:
         raise
-    except InstantiationException as error:
-        last: BaseException = error
-        while last.__cause__ is not None and not isinstance(last, AFMError):
-            last = last.__cause__
-        if isinstance(last, AFMError):
-            raise ConfigurationError(str(last)) from error
-        found = re.search(r"full_key: (\S+)", str(error))
-        text = str(last).partition("\nfull_key:")[0] or type(last).__name__
-        place = found[1] if found else group
-        place = place if place.startswith(group) else f"{group}.{place}"
-        raise ConfigurationError(f"{place}: {text}") from error
     except MISTAKES as error:
         raise ConfigurationError(f"{group}: {str(error) or type(error).__name__}") from error
 

@@ -46,6 +46,11 @@ def effective_log(
     scale = action.abs().amax(0).clamp_min(1e-9)
     seen = effective_action(model, state, action, after, scale)
     known = (seen.std < unseen * scale).all(-1).numpy()
+    if known.sum() < FEWEST:
+        raise ConfigurationError(
+            f"{known.sum()} of {len(rows)} steps show what an action did: expected at least "
+            f"{FEWEST}; is the model right?"
+        )
     kept = rows[known]
     return Log(
         names=names,

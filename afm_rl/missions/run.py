@@ -75,7 +75,7 @@ def run(
         NonFiniteError: at a fault, with ``faults=raise``.
         Stopped: if ``stopped`` said so; a checkpoint was written.
     """
-    with torch.random.fork_rng(devices=[]):  # TorchRL's own planners draw from the global one
+    with torch.random.fork_rng(devices=[]):  # policies that explore draw from the global one
         torch.manual_seed(0)
         kept = None if checkpoint is None else Checkpoints(checkpoint, owner(agent), every, keep)
         return _run(agent, progress, kept, stopped)

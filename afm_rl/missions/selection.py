@@ -9,6 +9,7 @@ from itertools import product
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
 from tensordict import TensorDictBase
 
 from afm_rl.errors import ConfigurationError, check_choice, check_count
@@ -16,6 +17,8 @@ from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Compose, Schedule
 
 KEYS = ("draw", "set", "ramp", "changes")
+IDLE = ("afm_rl.learning.Updater", "afm_rl.missions.factories.no_correction")
+"""Parts that do nothing, and are not named."""
 
 
 @dataclass(frozen=True)
@@ -249,3 +252,17 @@ def name_regimes(
 ) -> list[str]:
     """Return the regime of every combination in words, in the order of :func:`build_missions`."""
     return [entry.name for _, entry, _ in product(tracks, regimes, seeds)]
+
+
+def name_method(settings: Mapping[str, Any]) -> str:
+    """Name a method that has no label: the preset of a Hydra application, or else its parts.
+
+    >>> parts = {"dynamics": "factories.physics", "updater": "RLSUpdater", "corrector": "AFM"}
+    >>> name_method({group: {"_target_": f"afm_rl.{name}"} for group, name in parts.items()})
+    'physics+RLSUpdater+AFM'
+    """
+    chosen = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
+    if chosen.get("method"):
+        return str(chosen["method"])
+    made = [settings[group]["_target_"] for group in ("dynamics", "updater", "corrector")]
+    return "+".join(name.rpartition(".")[2] for name in made if name not in IDLE)

@@ -101,10 +101,10 @@ class Handover(RecedingHorizonPlanner):
         error = self.env.dynamics.manifold.difference(state, goal.expand_as(state))
         action = -(gain @ error.unsqueeze(-1)).squeeze(-1)
 
-        def togo(states: Tensor) -> Tensor:  # (*B, N, S)
+        def togo(states: Tensor) -> Tensor:  # (*B, N, S); infinite where there is no feedback
             origin = goal.unsqueeze(-2).expand_as(states)
             off = self.env.dynamics.manifold.difference(states, origin)
-            return ((off @ value) * off).sum(-1)
+            return ((off @ value) * off).sum(-1).nan_to_num(torch.inf, torch.inf, torch.inf)
 
         inside = ((action >= space.low) & (action <= space.high)).all(-1)
         near = inside & (togo(state.unsqueeze(-2)).squeeze(-1) <= self.level)

@@ -10,9 +10,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from afm_rl.compiling.tracing import all_hold
 from afm_rl.errors import ConfigurationError, check_count, check_number
-from afm_rl.planning.receding import SamplingPlanner, action_spec_of
+from afm_rl.planning.receding import SamplingPlanner, action_spec_of, moments
 from afm_rl.spaces.keys import as_key
 
 WITHOUT_NOISE = (
@@ -180,26 +179,16 @@ class ICEM(SamplingPlanner):
             if i == self.iterations - 1:
                 plans[..., self.kept, :, :] = mean
             plans = torch.minimum(torch.maximum(plans, low.unsqueeze(-2)), high.unsqueeze(-2))
-            returns = self._returns(td, plans)
+            chosen, returns = self._best(td, plans, self.elites)
             finite = returns.isfinite()
-            if not all_hold(finite):
-                self._discard(finite)
-            top = torch.where(finite, returns, -torch.inf).topk(self.elites, -1)
-            index = top.indices[..., None, None].expand(*top.indices.shape, *plans.shape[-2:])
-            chosen, sound = plans.gather(-3, index), finite.any(-1)
+            sound = finite.any(-1)
             here = sound[..., None, None]
-            weight = top.values.isfinite()[..., None, None].to(plans)
-            centre, spread = self._fit(chosen, weight)
+            centre, spread = moments(chosen, finite.to(plans))
             best = torch.where(here, chosen[..., 0, :, :], best)
             mean = torch.where(here, torch.lerp(centre, mean, self.momentum), mean)
             std = torch.where(here, torch.lerp(spread, std, self.momentum), std)
-            few = torch.where(weight > 0, chosen, best.unsqueeze(-3))[..., : self.kept, :, :]
+            few = torch.where(finite[..., None, None], chosen, best.unsqueeze(-3))
+            few = few[..., : self.kept, :, :]
             elites, found = torch.where(here.unsqueeze(-3), few, elites), found | sound
         plan = mean if exploration_type() in WITHOUT_NOISE else best
         return plan[..., 0, :], [mean, elites]
-
-    def _fit(self, plans: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation ``(*B, H, A)`` of plans ``(*B, K, H, A)``."""
-        share = weight / weight.sum(-3, keepdim=True).clamp_min(1.0)
-        mean = (share * plans).sum(-3)
-        return mean, (share * (plans - mean.unsqueeze(-3)).square()).sum(-3).sqrt()

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import pickletools
 import re
-import zipfile
 from collections.abc import Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,9 @@ from torch import Tensor
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.planning.policies import StoredPolicy
+from afm_rl.storage.torch_files import LARGEST, OPERATIONS, BoundedZip, read_saved
+
+SETTINGS = 2**21  # bytes of a model's JSON
 
 # How the weights of an actor are called, hidden layers and last one; its usual activation; and
 # whether a tanh ends it.
@@ -44,27 +46,29 @@ def policy_from_sb3(file: str | Path, normaliser: str | Path | None = None) -> S
         ConfigurationError: if there is no such file.
         ArtefactError: if it holds no such policy.
     """
-    _existing(file)
+    content = _content(file)
     try:
-        with zipfile.ZipFile(file) as archive:
-            data, weights = json.loads(archive.read("data")), archive.read("policy.pth")
-        space = data["action_space"]
-        low, high = (_numbers(space[end]) for end in ("low", "high"))
-    except (zipfile.BadZipFile, KeyError, ValueError, TypeError, AttributeError) as error:
+        archive = BoundedZip(content)
+        data, weights = json.loads(archive.take("data", SETTINGS)), archive.take("policy.pth")
+        low, high = (_numbers(data["action_space"][end]) for end in ("low", "high"))
+        chosen = dict(data.get("policy_kwargs") or {})
+        limit = float(chosen.get("clip_mean", 2.0))
+        activation = re.search(r"activation\.(\w+)", str(chosen.get("activation_fn")))
+        searched_at_random = "ARSPolicy." in str(data.get("policy_class"))
+    except Exception as error:  # whatever the readers stumble upon
         raise ArtefactError(
-            f"{file}: no model of Stable-Baselines3 with a vector of actions ({error!r})"
+            f"{file}: no model of Stable-Baselines3 with a vector of actions ({error!r:.200})"
         ) from error
-    chosen = data.get("policy_kwargs") or {}
     about: dict[str, Any] = {}
-    if named := re.search(r"activation\.(\w+)", str(chosen.get("activation_fn"))):
-        about["activation"] = named[1].lower()
+    if activation:
+        about["activation"] = activation[1].lower()
     if "squash_output" in chosen:
         about["squash"] = bool(chosen["squash_output"])
-    if "ARSPolicy." in str(data.get("policy_class")):
+    if searched_at_random:
         about = {"activation": "relu", "squash": True, **about}
     state = _read_weights(weights, file)
     if "actor.mu.0.weight" in state and "actor.log_std" in state:  # state-dependent exploration
-        about["limit"] = float(chosen.get("clip_mean", 2.0))
+        about["limit"] = limit
     if normaliser is not None:
         about["normaliser"], about["clip"] = read_normaliser(normaliser)
     return _policy(state, low, high, about, file)
@@ -88,7 +92,7 @@ def policy_from_cleanrl(
         ArtefactError: if it holds no such policy.
     """
     about = {} if normaliser is None else {"normaliser": normaliser[0], "clip": normaliser[1]}
-    state = _read_weights(_existing(file).read_bytes(), file)
+    state = _read_weights(_content(file), file)
     low, high = torch.from_numpy(space.low), torch.from_numpy(space.high)
     return _policy(state, low, high, about, file)
 
@@ -99,11 +103,11 @@ def read_normaliser(file: str | Path) -> tuple[Tensor, float]:
     The file is a pickle. It is not unpickled: its stream of operations is read for the numbers that
     follow these names, which can do no harm.
     """
-    content, wanted, word, began = _existing(file).read_bytes(), "", None, False
+    content, wanted, word, began = _content(file), "", None, False
     found: dict[str, Any] = {}
     known: dict[Any, str | None] = {}
     try:
-        for code, value, _ in pickletools.genops(content):
+        for code, value, _ in islice(pickletools.genops(content), OPERATIONS):
             if "PUT" in code.name or code.name == "MEMOIZE":  # words that come again have a number
                 known[len(known) if value is None else value] = word
                 continue
@@ -118,17 +122,19 @@ def read_normaliser(file: str | Path) -> tuple[Tensor, float]:
                 found.setdefault(wanted, float(value))
         std = (found["var"] + found.get("epsilon", 1e-8)).sqrt()
         return torch.stack([found["mean"], std]), found.get("clip_obs", math.inf)
-    except (KeyError, ValueError, RuntimeError) as error:
+    except Exception as error:  # whatever the reader stumbles upon
         raise ArtefactError(
-            f"{file}: no mean and variance of a vector of observations in it ({error!r}); expected "
+            f"{file}: no mean and variance of observations in it ({error!r:.200}); expected "
             "what VecNormalize.save wrote"
         ) from error
 
 
-def _existing(file: str | Path) -> Path:
+def _content(file: str | Path) -> bytes:
     if not Path(file).is_file():
         raise ConfigurationError(f"{file}: no such file")
-    return Path(file)
+    if Path(file).stat().st_size > LARGEST:
+        raise ArtefactError(f"{file}: larger than {LARGEST} bytes, which no such policy is")
+    return Path(file).read_bytes()
 
 
 def _numbers(text: str) -> Tensor:
@@ -139,12 +145,11 @@ def _numbers(text: str) -> Tensor:
 def _read_weights(content: bytes, file: str | Path) -> Mapping[str, Tensor]:
     """Read named tensors, and nothing but tensors."""
     try:
-        # The one place: formats of others. weights_only refuses whatever is not a tensor.
-        found = torch.load(io.BytesIO(content), "cpu", weights_only=True)  # noqa: TID251
-    except Exception as error:  # torch raises whatever its reader stumbles upon
-        raise ArtefactError(f"{file}: no weights in it that can be read ({error})") from error
-    found = found[0] if isinstance(found, list | tuple) and found else found  # CleanRL: the actor
-    return found if isinstance(found, Mapping) else {}
+        return read_saved(content)
+    except Exception as error:  # whatever the readers stumble upon
+        raise ArtefactError(
+            f"{file}: no weights in it that can be read ({error!r:.200})"
+        ) from error
 
 
 def _policy(
@@ -161,6 +166,11 @@ def _policy(
             f"{file}: no actor of a known kind among {sorted(names)[:8]}; expected feed-forward "
             "PPO, A2C, TRPO, SAC, TQC, TD3, DDPG or ARS over a vector of numbers"
         )
-    nothing = {name: state[name].new_zeros(len(state[name])) for name in own}  # without biases
-    layers = [(state[x], state.get(x.replace(".weight", ".bias"), nothing[x])) for x in own]
-    return StoredPolicy(layers, low, high, **about)
+    layers = [
+        (state[x], state.get(x.replace(".weight", ".bias"), torch.zeros(state[x].shape[:1])))
+        for x in own
+    ]
+    try:
+        return StoredPolicy(layers, low, high, **about)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{file}: {error}") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import cast
 
@@ -140,7 +139,7 @@ class MPC(RecedingHorizonPlanner):
         self.register_buffer("high", space.high.masked_fill(free, torch.inf), persistent=False)
         self.register_buffer("middle", (space.low + space.high) / 2, persistent=False)
         self.in_keys = [env.observation_key, *env.cost.in_keys, *self.memory]
-        self.discarded = self.inexact = 0
+        self.inexact = 0
         states, actions = (torch.zeros(shape) for shape in self.memory.values())
         task = [torch.zeros(1, size) for size in env.cost.in_sizes]
         env.cost.quadratic(states, actions, *task)  # it says what does not fit
@@ -172,14 +171,7 @@ class MPC(RecedingHorizonPlanner):
             guess = _choose(use, better, guess)
             solved = solved | use
             self.inexact += int((use & ~exact).sum())
-        if not bool(solved.all()):
-            lost = int((~solved).sum())
-            self.discarded += lost
-            warnings.warn(
-                f"planner: no finite solution for {lost} of {solved.numel()} flights; the "
-                "previous plan stands",
-                stacklevel=4,
-            )
+        self._discard(solved.unsqueeze(-1), "solution")
         dtype = self.action_spec.dtype
         solution = _choose(solved, [found.to(dtype) for found in guess], shifted)
         return solution[1][..., 0, :], solution

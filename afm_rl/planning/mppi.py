@@ -11,7 +11,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.compiling.machine_code import MachineCode
-from afm_rl.compiling.tracing import all_hold
 from afm_rl.errors import check_choice, check_flag, check_number
 from afm_rl.planning.receding import SamplingPlanner, action_spec_of
 from afm_rl.spaces.keys import as_key
@@ -160,9 +159,11 @@ class MPPI(SamplingPlanner):
                 state, *task = self.env.entries(td)
                 given = state, plans, *task
                 found, finite = self._machine_code(MPPI.improved, *given, model=self.env.dynamics)
-                best = self._sound(finite, found, best)
+                self._discard(finite)
             else:
-                best = self._blend(self._returns(td, plans), plans, best)
+                returns = self._returns(td, plans)
+                found, finite = self._mean(returns, plans), returns.isfinite()
+            best = torch.where(finite.any(-1)[..., None, None], found, best)
         return best[..., 0, :], [best]
 
     @property
@@ -191,14 +192,3 @@ class MPPI(SamplingPlanner):
     def _mean(self, returns: Tensor, plans: Tensor) -> Tensor:
         weights = path_weights(returns, self.temperature).unsqueeze(-1)
         return (plans.flatten(-2).mT @ weights).squeeze(-1).unflatten(-1, plans.shape[-2:])
-
-    def _blend(self, returns: Tensor, plans: Tensor, fallback: Tensor) -> Tensor:
-        """Return the weighted mean plan, or ``fallback`` where no return is finite."""
-        return self._sound(returns.isfinite(), self._mean(returns, plans), fallback)
-
-    def _sound(self, finite: Tensor, mean: Tensor, fallback: Tensor) -> Tensor:
-        """Return the mean, or ``fallback`` where no return is finite; count those."""
-        if all_hold(finite):
-            return mean
-        self._discard(finite)
-        return torch.where(finite.any(-1)[..., None, None], mean, fallback)

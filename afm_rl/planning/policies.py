@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from afm_rl.dynamics import Oracle
-from afm_rl.errors import ArtefactError, ConfigurationError, check_choice, check_number
+from afm_rl.errors import AFMError, ArtefactError, ConfigurationError, check_choice, check_number
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.storage.artefacts import digest_of, read_tensors, save_tensors
 
@@ -23,7 +24,9 @@ class LawPlanner(TensorDictModuleBase):
     """A function of the state in the place of a planner: a controller, or a policy.
 
     In an :class:`~afm_rl.dynamics.Oracle` it sends the actions whose effects, under the regime
-    that the oracle is told, are nearest to the law's: the yardstick for corrections.
+    that the oracle is told, are nearest to the law's: the yardstick for corrections. Nothing is
+    planned that could stand where the law's action is not finite: it is passed on, and
+    :class:`~afm_rl.transforms.Guard` holds the last one.
 
     Args:
         env: the planning environment: where state and action are, the action's box, and what the
@@ -119,17 +122,35 @@ class StoredPolicy(nn.Module):
         clip: float = math.inf,
     ) -> None:
         super().__init__()
-        inputs = [weight.shape[1] for weight, _ in layers] + [len(low)]
-        if [len(weight) for weight, _ in layers] != inputs[1:] or len(low) != len(high):
-            shapes = [tuple(weight.shape) for weight, _ in layers]
+        shapes = [tuple(weight.shape) for weight, _ in layers]
+        outputs = [shape[:1] for shape in shapes]
+        inputs = [*(shape[1:] for shape in shapes[1:]), tuple(low.shape)]
+        if (
+            {len(shape) for shape in shapes} != {2}
+            or not outputs == inputs == [tuple(bias.shape) for _, bias in layers]
+            or low.shape != high.shape
+            or (normaliser is not None and normaliser.shape != (2, shapes[0][1]))
+        ):
             raise ConfigurationError(
-                f"policy: layers of the shapes {shapes} and an action box of {len(low)} and "
-                f"{len(high)} numbers: expected that each feeds the next"
+                f"policy: layers of the shapes {shapes!s:.200} and an action box of "
+                f"{tuple(low.shape)} and {tuple(high.shape)} numbers: expected that each feeds the "
+                "next, with as many biases and numbers of the normaliser"
+            )
+        parts = [*chain.from_iterable(layers), *([] if normaliser is None else [normaliser])]
+        if not all(part.is_floating_point() and part.float().isfinite().all() for part in parts):
+            raise ConfigurationError("policy: expected finite real numbers as its weights")
+        low, high = low.float(), high.float()
+        if not (low <= high).all() or (squash and not (high - low).isfinite().all()):
+            ends = f"{low.tolist()!s:.80} to {high.tolist()!s:.80}"
+            raise ConfigurationError(f"policy: expected an action box, got {ends}")
+        if not (limit > 0 and clip > 0 and (normaliser is None or (normaliser[1] > 0).all())):
+            raise ConfigurationError(
+                f"policy: limit={limit}, clip={clip}, or a deviation: expected positive numbers"
             )
         self.weights = nn.ParameterList([weight.detach().float() for weight, _ in layers])
         self.biases = nn.ParameterList([bias.detach().float() for _, bias in layers])
-        self.register_buffer("low", low.float())
-        self.register_buffer("high", high.float())
+        self.register_buffer("low", low)
+        self.register_buffer("high", high)
         self.register_buffer("normaliser", None if normaliser is None else normaliser.float())
         self.form: dict[str, Any] = {
             "activation": check_choice("policy.activation", activation, tuple(ACTIVATIONS)),
@@ -174,13 +195,21 @@ def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
         ConfigurationError: if there is no such file.
         ArtefactError: if it is damaged, or holds something else.
     """
-    tensors, description = read_tensors(Path(file))
-    if description.get("kind") != "policy" or "form" not in description:
-        raise ArtefactError(f"{file}: holds no policy; make one with save_policy")
-    count = range(sum(name.startswith("weights") for name in tensors))
-    layers = [(tensors[f"weights.{index}"], tensors[f"biases.{index}"]) for index in count]
-    box, normaliser = (tensors["low"], tensors["high"]), tensors.get("normaliser")
-    return StoredPolicy(layers, *box, normaliser=normaliser, **description["form"]), description
+    try:
+        tensors, description = read_tensors(Path(file))
+        if description["kind"] != "policy":
+            raise KeyError("kind")
+        count = range(sum(name.startswith("weights") for name in tensors))
+        layers = [(tensors[f"weights.{index}"], tensors[f"biases.{index}"]) for index in count]
+        box, normaliser = (tensors["low"], tensors["high"]), tensors.get("normaliser")
+        policy = StoredPolicy(layers, *box, normaliser=normaliser, **description["form"])
+    except AFMError:
+        raise
+    except Exception as error:  # files of others hold anything
+        raise ArtefactError(
+            f"{file}: holds no policy ({error!r:.80}); make one with save_policy"
+        ) from error
+    return policy, description
 
 
 class PolicyPlanner(LawPlanner):

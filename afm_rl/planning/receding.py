@@ -18,10 +18,25 @@ from torchrl.modules.planners.common import (
 )
 
 from afm_rl.compiling.devices import moved
-from afm_rl.compiling.tracing import may_look
+from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.errors import ConfigurationError, check_choice, check_count, check_instance
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
+
+
+def moments(plans: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean and standard deviation ``(*B, H, A)`` of plans ``(*B, K, H, A)``.
+
+    Weights ``(*B, K)`` are not negative; where all are zero, so are both.
+
+    >>> plans = torch.tensor([1.0, 3.0, 9.0]).view(3, 1, 1)
+    >>> [float(x) for x in moments(plans, torch.tensor([2.0, 2.0, 0.0]))]
+    [2.0, 1.0]
+    """
+    share = weights / weights.sum(-1, keepdim=True).clamp_min(torch.finfo(weights.dtype).tiny)
+    share = share[..., None, None]
+    mean = (share * plans).sum(-3)
+    return mean, (share * (plans - mean.unsqueeze(-3)).square()).sum(-3).sqrt()
 
 
 class ZeroPrimer(TensorDictPrimer):
@@ -67,12 +82,14 @@ class RecedingHorizonPlanner(MPCPlannerBase):
         memory: Mapping[NestedKey, Sequence[int]],
         action_key: NestedKey = "action",
     ) -> None:
+        spec = action_spec_of(env)
         super().__init__(env, action_key=as_key(action_key))
-        self.action_spec = action_spec_of(env)
+        self.action_spec = spec
         self.action_key = as_key(action_key)
         self.memory = {as_key(key): tuple(shape) for key, shape in memory.items()}
         self.next_memory = [unravel_key(("next", key)) for key in self.memory]
         self.out_keys = [self.action_key, *self.next_memory]
+        self.discarded = 0
         self._told = False
 
     def _apply(
@@ -113,7 +130,20 @@ class RecedingHorizonPlanner(MPCPlannerBase):
 
     def planning(self, td: TensorDictBase) -> Tensor:
         """Return the action ``(*B, A)`` without writing anything."""
-        return self._plan(td)[0]
+        return self._allowed(self._plan(td)[0], td)
+
+    def _discard(self, finite: Tensor, found: str = "return") -> None:
+        """Count what is not finite ``(*B, N)``; warn where nothing is."""
+        if all_hold(finite) or not may_look(finite):
+            return  # an exported planner does not count, nor does one on a GPU
+        self.discarded += int((~finite).sum())
+        lost = ~finite.any(-1)
+        if bool(lost.any()):
+            warnings.warn(
+                f"planner: no finite {found} for {int(lost.sum())} of {lost.numel()} plans; "
+                "the previous plan stands",
+                stacklevel=5,
+            )
 
     def _recall(self, td: TensorDictBase) -> list[Tensor]:
         """Return the memory, zeros where there is none."""
@@ -151,8 +181,8 @@ class SamplingPlanner(RecedingHorizonPlanner):
         seed: seed of the noise without ``seed_key``.
         hold: steps that each action of a plan lasts.
 
-    Returns that are not finite are ignored and counted in :attr:`discarded`; where all are,
-    the shifted plan stands and a warning is given.
+    Returns that are not finite are ignored and counted in :attr:`discarded`; where none is finite,
+    the plan from before, shifted, stands and a warning is given.
     """
 
     scale: Tensor  # standard deviation of the first noise, per action
@@ -227,7 +257,22 @@ class SamplingPlanner(RecedingHorizonPlanner):
         return torch.minimum(torch.maximum(wide, low), high).squeeze(-2)
 
     def _returns(self, td: TensorDictBase, plans: Tensor) -> Tensor:
-        """Return the return ``(*B, N)`` of each plan ``(*B, N, H, A)``, whose actions are held."""
+        """Return the return ``(*B, N)`` of each plan ``(*B, N, H, A)``, whose actions are held.
+
+        One that is not finite is counted, and becomes minus infinity.
+        """
+        returns = self._rolled_out(td, plans)
+        finite = returns.isfinite()
+        self._discard(finite)
+        return torch.where(finite, returns, -torch.inf)
+
+    def _best(self, td: TensorDictBase, plans: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Return the best plans ``(*B, count, H, A)`` and their returns, see :meth:`_returns`."""
+        top = self._returns(td, plans).topk(count, -1)
+        index = top.indices[..., None, None].expand(*top.indices.shape, *plans.shape[-2:])
+        return plans.gather(-3, index), top.values
+
+    def _rolled_out(self, td: TensorDictBase, plans: Tensor) -> Tensor:
         if self.hold > 1:
             plans = plans.repeat_interleave(self.hold, -2)
         if self.backend == "fast":
@@ -252,16 +297,3 @@ class SamplingPlanner(RecedingHorizonPlanner):
             done_key=_planning_done_keys(self.env),
         )
         return rewards.sum((-2, -1)).to(plans)
-
-    def _discard(self, finite: Tensor) -> None:
-        """Count the returns ``(*B, N)`` that are not finite; warn where none is."""
-        if not may_look(finite):
-            return  # an exported planner does not count, nor does one on a GPU
-        self.discarded += int((~finite).sum())
-        lost = ~finite.any(-1)
-        if bool(lost.any()):
-            warnings.warn(
-                f"planner: no finite return for {int(lost.sum())} of {lost.numel()} plans; "
-                "the previous plan stands",
-                stacklevel=5,
-            )

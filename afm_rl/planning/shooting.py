@@ -1,47 +1,46 @@
-"""TorchRL's own planners, under the names this library's configuration uses."""
+"""The rules of TorchRL's own planners, which start cold at every step."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.modules import CEMPlanner, MPPIPlanner
-from torchrl.objectives.value import TDLambdaEstimator
 
-from afm_rl.errors import ConfigurationError, check_count, check_instance, check_number
-from afm_rl.planning.planning_env import raise_missing
-
-
-def _check(env: EnvBase, horizon: int, population: int, iterations: int, elites: int) -> None:
-    """Check what both planners share."""
-    if check_instance("planner.env", env, EnvBase).action_keys != ["action"]:
-        raise ConfigurationError(
-            f"planner: TorchRL's planners write 'action', but {type(env).__name__} reads "
-            f"{env.action_keys}; rename it, or choose MPPI or ICEM"
-        )
-    check_count("planner.horizon", horizon, high=10_000)
-    check_count("planner.population", population, high=1_000_000)
-    check_count("planner.iterations", iterations, high=10_000)
-    if check_count("planner.elites", elites) > population:
-        raise ConfigurationError(
-            f"planner.elites={elites}: expected at most planner.population={population}"
-        )
+from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.planning.mppi import path_weights
+from afm_rl.planning.receding import SamplingPlanner, moments
 
 
-class CEM(CEMPlanner):
-    """TorchRL's cross-entropy planner. It starts cold at every step.
+class CEM(SamplingPlanner):
+    r"""Cross-entropy method, by the rule of ``torchrl.modules.CEMPlanner``. It keeps no plan.
+
+    Each iteration draws plans :math:`u = \mathrm{clamp}(\mu + \sigma \odot \epsilon)`, at first
+    around :math:`\mu = 0` with :math:`\sigma = 1`, whatever the action's bounds, and takes mean and
+    standard deviation of the best K. The action is the mean's. As long as no return is finite
+    :math:`\mu` and :math:`\sigma` stay.
 
     Args:
-        env: batch-unlocked environment to plan in.
-        horizon: steps of a plan.
-        population: candidates per iteration.
+        env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
+        horizon: steps of a plan, H.
+        population: candidates per iteration, N.
         iterations: refinements per step.
-        elites: candidates that the next iteration is fitted to.
+        elites: candidates that the next iteration is fitted to, K.
+        settings: further arguments of :class:`~afm_rl.planning.receding.SamplingPlanner`:
+            ``backend``, ``seed_key``, ``box_key``, ``action_key`` and ``seed``.
 
     Raises:
         ConfigurationError: for a setting or environment that cannot be used.
+
+    >>> from tensordict import TensorDict
+    >>> from afm_rl.dynamics import Dubins
+    >>> from afm_rl.planning import GoalDistance, PlanningEnv
+    >>> world = PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5])
+    >>> td = TensorDict({"observation": torch.zeros(4, 3), "goal": torch.ones(4, 2)}, [4])
+    >>> CEM(world, horizon=5)(td)["action"].shape
+    torch.Size([4, 2])
     """
 
     def __init__(
@@ -51,28 +50,53 @@ class CEM(CEMPlanner):
         population: int = 300,
         iterations: int = 3,
         elites: int = 30,
+        **settings: Any,
     ) -> None:
-        _check(env, horizon, population, iterations, elites)
-        super().__init__(env, horizon, iterations, population, elites)
+        super().__init__(env, {}, horizon, population, iterations, **settings)
+        self.elites = check_count("planner.elites", elites)
+        if elites > population:
+            raise ConfigurationError(
+                f"planner.elites={elites}: expected at most planner.population={population}"
+            )
+        self.register_buffer("scale", torch.ones_like(self.action_spec.space.low))
 
-    def planning(self, tensordict: TensorDictBase) -> Tensor:
-        """Plan on the entries needed: the base class copies all of them per candidate."""
-        raise_missing(self.env, tensordict)
-        return super().planning(tensordict.select(*self.in_keys))
+    @torch.no_grad()
+    def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
+        """Return the first action of the last mean plan, and nothing to remember."""
+        low, high, scale = self._box(td)
+        mean = scale.new_zeros(*td.batch_size, self.horizon, scale.shape[-1])
+        std = scale.expand_as(mean)
+        for _ in range(self.iterations):
+            plans = mean.unsqueeze(-3) + std.unsqueeze(-3) * self._noise(td, mean, self.population)
+            plans = torch.minimum(torch.maximum(plans, low.unsqueeze(-2)), high.unsqueeze(-2))
+            chosen, returns = self._best(td, plans, self.elites)
+            finite = returns.isfinite().any(-1)[..., None, None]
+            mean, std = (
+                torch.where(finite, new, old)
+                for new, old in zip(self._fit(chosen, returns), (mean, std), strict=True)
+            )
+        return mean[..., 0, :], []
+
+    def _fit(self, plans: Tensor, returns: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and unbiased standard deviation of the plans whose return is finite."""
+        count = returns.isfinite().sum(-1)[..., None, None].to(plans)
+        mean, std = moments(plans, returns.isfinite().to(plans))
+        return mean, std * (count / (count - 1.0).clamp_min(1.0)).sqrt()
 
 
-class TorchRLMPPI(MPPIPlanner):
-    """TorchRL's MPPI: cross-entropy with exponential weights on the elites, starting cold.
+class TorchRLMPPI(CEM):
+    r"""MPPI by the rule of ``torchrl.modules.MPPIPlanner``: :class:`CEM` with weighted elites.
 
-    The value beyond the horizon is taken to be zero.
+    The best K weigh :math:`w_i \propto \exp(\lambda R_i)`. Beyond the horizon nothing is expected.
 
     Args:
-        env: batch-unlocked environment to plan in.
-        horizon: steps of a plan.
-        population: candidates per iteration.
+        env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
+        horizon: steps of a plan, H.
+        population: candidates per iteration, N.
         iterations: refinements per step.
-        elites: candidates that the next iteration is fitted to.
-        temperature: multiplies the returns (an inverse temperature).
+        elites: candidates that the next iteration is fitted to, K.
+        temperature: :math:`\lambda`, an inverse temperature.
+        settings: as of :class:`CEM`.
     """
 
     def __init__(
@@ -83,17 +107,10 @@ class TorchRLMPPI(MPPIPlanner):
         iterations: int = 3,
         elites: int = 30,
         temperature: float = 1.0,
+        **settings: Any,
     ) -> None:
-        _check(env, horizon, population, iterations, elites)
-        check_number("planner.temperature", temperature, low=0.0, open_low=True)
-        keys = list(env.observation_spec.keys(True, True))
-        value = TensorDictModule(
-            lambda observation: torch.zeros_like(observation[..., :1]), keys[:1], ["state_value"]
-        )
-        returns = TDLambdaEstimator(gamma=1.0, lmbda=1.0, value_network=value)
-        super().__init__(env, returns, temperature, horizon, iterations, population, elites)
+        super().__init__(env, horizon, population, iterations, elites, **settings)
+        self.temperature = check_number("planner.temperature", temperature, low=0.0, open_low=True)
 
-    def planning(self, tensordict: TensorDictBase) -> Tensor:
-        """Plan on the entries needed: the base class copies all of them per candidate."""
-        raise_missing(self.env, tensordict)
-        return super().planning(tensordict.select(*self.env.observation_spec.keys(True, True)))
+    def _fit(self, plans: Tensor, returns: Tensor) -> tuple[Tensor, Tensor]:
+        return moments(plans, path_weights(returns, 1.0 / self.temperature))

@@ -9,10 +9,10 @@ from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
-import viser
 from viser import uplot
 
 from afm_rl.play.scene import COLOURS, figure_of
+from afm_rl.play.server import LocalServer
 from afm_rl.play.world import SIDES, World, presets
 
 FRAME, WORDS = 0.04, 0.25  # seconds between two pictures, and between two texts
@@ -74,7 +74,7 @@ class Page:
     def __init__(self, world: World, title: str, port: int) -> None:
         self.world, self.ended = world, False
         with redirect_stdout(io.StringIO()):  # the command says where the page is
-            self.server = viser.ViserServer("127.0.0.1", port, label=title, verbose=False)
+            self.server = LocalServer(port, title)
         self.url = f"http://127.0.0.1:{self.server.get_port()}"
         look: Any = {"control_width": "large", "show_logo": False, "show_share_button": False}
         self.server.gui.configure_theme(**look)
@@ -88,20 +88,23 @@ class Page:
             for name in self.figures
         }
         self.sliders: dict[str, Any] = {}
-        self.setting = False  # several sliders at once
+        self.buttons: list[tuple[Any, Callable[[], None]]] = []
         self._controls()
         self._live()
+        inputs: list[Any] = [self.choice, self.speed, self.pause, self.shown]
+        inputs += [handle for handle, _ in (*self.buttons, *self.sliders.values())]
+        self.server.inputs.update({handle._impl.uuid: handle for handle in inputs})
 
     def _controls(self) -> None:
         gui, names = self.server.gui, self.world.robot.names
         self.presets = presets(len(names))
-        choice = gui.add_dropdown("What fails", list(self.presets), order=-2.0)
-        choice.on_update(lambda _: self.choose(choice.value))
+        self.choice = gui.add_dropdown("What fails", list(self.presets), order=-2.0)
+        self.chosen = self.choice.value
         with gui.add_folder("Run"):
             self.speed = gui.add_slider("Speed", 0.1, 2.0, 0.1, 1.0)
             self.pause = gui.add_checkbox("Pause", False)
-            self._button("Push", self.world.push)
-            self._button("Reset", self.world.reset)
+            self.buttons.append((gui.add_button("Push"), self.world.push))
+            self.buttons.append((gui.add_button("Reset"), self.world.reset))
         with gui.add_folder("All actuators"):
             self._slider("delay", "Late by (steps)", 0.0, 10.0, 1.0, 0.0)
             self._slider("lag", "Slow (steps)", 0.0, 6.0, 0.5, 0.0)
@@ -112,34 +115,27 @@ class Page:
                 self._slider(f"bias_{k}", "Bias", -0.5, 0.5, 0.05, 0.0)
                 self._slider(f"loss_{k}", "Lost share", 0.0, 1.0, 0.1, 0.0)
 
-    def _button(self, label: str, action: Callable[[], None]) -> None:
-        self.server.gui.add_button(label).on_click(lambda _: action())
-
     def _slider(
         self, name: str, label: str, low: float, high: float, step: float, usual: float
     ) -> None:
-        slider = self.server.gui.add_slider(label, low, high, step, usual)
-        slider.on_update(lambda _: self._read())
-        self.sliders[name] = slider, usual
+        self.sliders[name] = self.server.gui.add_slider(label, low, high, step, usual), usual
 
-    def choose(self, preset: str) -> None:
-        """Set all sliders as a preset says."""
-        values = self.presets[preset]
-        self.setting = True
-        for name, (slider, usual) in self.sliders.items():
-            slider.value = values.get(name, usual)
-        self.setting = False
-        self.swapped = {name: x for name, x in values.items() if name.startswith("from_")}
-        self._read()
-
-    def _read(self) -> None:
-        """Take the faults from the sliders."""
-        if self.setting:
-            return
+    def read(self) -> None:
+        """Take the faults from the preset and the sliders, and do what was clicked."""
+        if self.choice.value != self.chosen:
+            self.chosen = self.choice.value
+            values = self.presets[self.chosen]
+            for name, (slider, usual) in self.sliders.items():
+                slider.value = values.get(name, usual)
+            self.swapped = {name: x for name, x in values.items() if name.startswith("from_")}
         found = {name: slider.value for name, (slider, _) in self.sliders.items()}
         with self.world.lock:
             self.world.faults.noise = found.pop("noise")
             self.world.faults.values = {**found, **self.swapped}
+        for button, action in self.buttons:
+            if button._impl.uuid in self.server.clicked:
+                self.server.clicked.discard(button._impl.uuid)
+                action()
 
     swapped: dict[str, float] = {}
 
@@ -170,6 +166,7 @@ class Page:
         """Let the world go on and draw it, until :meth:`end` or an interrupt."""
         worded = done = time.monotonic()  # up to when the world has been simulated
         while not self.ended:
+            self.read()
             now = time.monotonic()
             step = self.world.robot.dt / self.speed.value
             done = now if self.pause.value else max(done, now - FRAME - step)

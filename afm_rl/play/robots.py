@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,9 @@ from afm_rl.planning.riccati import stationary_value
 
 Acting = Callable[[np.ndarray], np.ndarray]
 LONG, NEAR = 3600.0, 3.0  # s, of a flight; m, from its reference, beyond which it is lost
-POLICIES = Path(__file__).parents[2] / "examples" / "policies" / "zoo"
+# Where a wheel has the policies of others, and where they are in the repository.
+INSTALLED = Path(__file__).parent / "policies"
+IN_TREE = Path(__file__).parents[2] / "examples" / "policies" / "zoo"
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,7 @@ class Robot:
     """What the page needs to know of a robot.
 
     Attributes:
+        name: what it is called.
         make: makes an environment without a time limit.
         policy: makes a policy; each robot has its own, as planners remember.
         model: keyword arguments of :class:`~afm_rl.ActionFlowWrapper`.
@@ -40,8 +44,10 @@ class Robot:
         names: of the actuators.
         score: what is counted of an episode: the name of an info, or ``reward``.
         corrector: makes the correction; the universal one in units of the box, if None comes of it.
+        task: of gymnasium, without its version, if it has a stored policy.
     """
 
+    name: str
     make: Callable[[], gymnasium.Env]
     policy: Callable[[], Acting]
     model: dict[str, Any]
@@ -50,50 +56,84 @@ class Robot:
     names: list[str]
     score: str = "reward"
     corrector: Callable[[], Any] = lambda: None
+    task: str | None = None
 
 
-def make_robot(name: str, file: Path | None = None) -> Robot:
-    """Return a robot of :data:`ROBOTS`, with the policy in a file, if one is given.
+def make_robot(name: str | None = None, file: str | Path | None = None) -> Robot:
+    """Return a robot of :data:`ROBOTS`, or the one that the policy in a file was trained for.
+
+    Args:
+        name: of the robot; ``half_cheetah`` without name and file.
+        file: what :func:`~afm_rl.planning.save_policy` wrote, with a task of gymnasium as ``id``
+            and, if it has any, numbers as its ``settings``.
 
     Raises:
-        ConfigurationError: for an unknown name, or if there is no policy at hand.
+        ConfigurationError: for an unknown name, or a file that does not fit it.
+        ArtefactError: if the file is damaged, or holds something else.
     """
-    return ROBOTS[check_choice("--robot", name, ROBOTS)](file)
+    if file is None:
+        return ROBOTS[check_choice("--robot", name or "half_cheetah", ROBOTS)]()
+    if name is None:
+        return _stored(Path(file))
+    own, robot = ROBOTS[check_choice("--robot", name, ROBOTS)](), _stored(Path(file))
+    if own.task is None:
+        raise ConfigurationError(f"--policy={file}: {name} has a controller; leave --policy out")
+    if own.task != robot.task:
+        raise ConfigurationError(
+            f"--robot={name}: the policy in {file} acts in {robot.name}; leave --robot out"
+        )
+    return robot
 
 
-def _from_file(default: str) -> Callable[[Path | None], Robot]:
-    """Return what makes a robot of gymnasium with a stored policy."""
+def _stored(file: Path, name: str | None = None) -> Robot:
+    """Return the robot of gymnasium that a stored policy acts in."""
+    policy, about = load_policy(file)
+    task, settings = about.get("id"), about.get("settings", {})
+    if not isinstance(task, str) or task not in gymnasium.registry:
+        raise ConfigurationError(f"{file}: id={task!r:.80}: expected a task of gymnasium")
+    if not isinstance(settings, dict) or not all(map(_numeric, settings.values())):
+        raise ConfigurationError(f"{file}: settings={settings!r:.80}: expected numbers, by name")
 
-    def build(file: Path | None) -> Robot:
-        file = POLICIES / f"{default}.safetensors" if file is None else Path(file)
-        if not file.is_file():
-            raise ConfigurationError(
-                f"--policy={file}: no such file; it is in the repository, or written by "
-                "afm_rl.planning.save_policy"
-            )
-        policy, about = load_policy(file)
+    def act(seen: np.ndarray) -> np.ndarray:
+        return policy(torch.as_tensor(seen, dtype=torch.float32)).numpy()
 
-        def act(seen: np.ndarray) -> np.ndarray:
-            return policy(torch.as_tensor(seen, dtype=torch.float32)).numpy()
+    try:
+        robot = _gymnasium(name or task, task, lambda: act, settings)
+        env = robot.make()
+        shapes = env.observation_space.shape, env.action_space.shape
+    except Exception as error:  # gymnasium and its tasks raise anything
+        raise ConfigurationError(f"{file}: {task} cannot be played: {error}") from error
+    if shapes != ((policy.observation_size,), tuple(policy.low.shape)):
+        raise ConfigurationError(
+            f"{file}: a policy of {policy.observation_size} observations and {len(policy.low)} "
+            f"actions; {task} has {shapes[0]} and {shapes[1]}"
+        )
+    return robot
 
-        return _gymnasium(about["id"], lambda: act, about.get("settings", {}))
 
-    return build
+def _numeric(value: Any) -> bool:
+    return all(map(_numeric, value)) if isinstance(value, list) else isinstance(value, int | float)
 
 
-def _gymnasium(task: str, policy: Callable[[], Acting], settings: dict[str, Any]) -> Robot:
+def _gymnasium(
+    name: str, task: str, policy: Callable[[], Acting], settings: dict[str, Any]
+) -> Robot:
     def make() -> gymnasium.Env:
         return gymnasium.make(task, max_episode_steps=-1, **settings)
 
     inner: Any = make().unwrapped
+    kind = gymnasium.spec(task).name
     if hasattr(inner, "model"):
         found = inner.model
         joints = [found.joint(joint).name for joint in found.actuator_trnid[:, 0]]
-        return Robot(make, policy, {"model": "mujoco"}, _push_root, inner.dt, joints)
-    model: dict[str, Any] = {"model": pendulum_step}
+        model: dict[str, Any] = {"model": "mujoco"}
+        return Robot(name, make, policy, model, _push_root, inner.dt, joints, task=kind)
+    if kind != "Pendulum":
+        raise ConfigurationError("it is neither a task of MuJoCo nor the pendulum")
+    model = {"model": pendulum_step}
     model["state"] = lambda env, seen: env.unwrapped.state
     model["observe"] = lambda s: np.c_[np.cos(s[:, 0]), np.sin(s[:, 0]), s[:, 1]]
-    return Robot(make, policy, model, _push_pendulum, inner.dt, ["joint"])
+    return Robot(name, make, policy, model, _push_pendulum, inner.dt, ["joint"], task=kind)
 
 
 def _push_root(inner: Any, direction: float) -> None:
@@ -105,7 +145,7 @@ def _push_pendulum(inner: Any, direction: float) -> None:
     inner.state = np.array(inner.state) + [0.0, 3.0 * direction]
 
 
-def _cart_pole(file: Path | None) -> Robot:
+def _cart_pole() -> Robot:
     """A cart with a pole, by the linear quadratic regulator."""
     env: Any = gymnasium.make("InvertedPendulum-v5")
     upright = torch.zeros(4, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
@@ -117,7 +157,7 @@ def _cart_pole(file: Path | None) -> Robot:
     def act(seen: np.ndarray) -> np.ndarray:
         return np.clip(-gain @ seen, space.low, space.high).astype(np.float32)
 
-    return _gymnasium("InvertedPendulum-v5", lambda: act, {})
+    return replace(_gymnasium("cart_pole", "InvertedPendulum-v5", lambda: act, {}), task=None)
 
 
 def _planned(planner: Any, parts: dict[str, tuple[int, ...]]) -> Acting:
@@ -152,7 +192,7 @@ def _first(size: int) -> dict[str, Any]:
     return {"state": state, "observe": observe}
 
 
-def _ugv(file: Path | None) -> Robot:
+def _ugv() -> Robot:
     """The ground robot on its track, by MPPI."""
     low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
     dynamics = Dubins()
@@ -168,10 +208,10 @@ def _ugv(file: Path | None) -> Robot:
         inner._data["pose"] += torch.tensor([0.0, 0.0, 0.5 * direction])
 
     model = {"model": dynamics, **_first(3)}
-    return Robot(make, policy, model, push, 0.2, ["speed", "turn"], score="reached")
+    return Robot("ugv", make, policy, model, push, 0.2, ["speed", "turn"], score="reached")
 
 
-def _quadrotor(file: Path | None) -> Robot:
+def _quadrotor() -> Robot:
     """A small quadrotor that flies in a circle, by model predictive control."""
     name, ahead = "afm_rl/CrazyflieTrack-v0", 20
     dynamics, level = Quadrotor(dt=0.05), [0.0] * 9 + [1.0] + [0.0] * 3
@@ -200,16 +240,22 @@ def _quadrotor(file: Path | None) -> Robot:
 
     model = {"model": dynamics, **_first(13)}
     names = ["thrust", "roll", "pitch", "yaw"]
-    return Robot(make, policy, model, push, 0.05, names, corrector=lambda: ActionFlow(-unit, unit))
+    corrector = partial(ActionFlow, -unit, unit)
+    return Robot("quadrotor", make, policy, model, push, 0.05, names, corrector=corrector)
 
 
-ROBOTS: dict[str, Callable[[Path | None], Robot]] = {
-    "half_cheetah": _from_file("half_cheetah_tqc"),
-    "hopper": _from_file("hopper_trpo"),
-    "walker2d": _from_file("walker2d_tqc"),
-    "ant": _from_file("ant_trpo"),
-    "swimmer": _from_file("swimmer_trpo"),
-    "pendulum": _from_file("pendulum_sac"),
+def _usual(name: str, file: str) -> Callable[[], Robot]:
+    folder = INSTALLED if INSTALLED.is_dir() else IN_TREE
+    return lambda: _stored(folder / f"{file}.safetensors", name)
+
+
+ROBOTS: dict[str, Callable[[], Robot]] = {
+    "half_cheetah": _usual("half_cheetah", "half_cheetah_tqc"),
+    "hopper": _usual("hopper", "hopper_trpo"),
+    "walker2d": _usual("walker2d", "walker2d_tqc"),
+    "ant": _usual("ant", "ant_trpo"),
+    "swimmer": _usual("swimmer", "swimmer_trpo"),
+    "pendulum": _usual("pendulum", "pendulum_sac"),
     "cart_pole": _cart_pole,
     "ugv": _ugv,
     "quadrotor": _quadrotor,

@@ -5,6 +5,7 @@ files         files that are written whole or not at all; tables as CSV; locks o
 artefacts     trained parts and checkpoints: safetensors, with their SHA-256 inside
 manifest      the SHA-256 of every file of a folder of results, and which settings it must share
 measures      by what stored results are compared
+torch_files   what others wrote: members of a zip, and the tensors of ``torch.save``, in bounds
 ============= ===================================================================================
 
 Nothing here is pickled.

@@ -28,6 +28,7 @@ from afm_rl.transforms.memory import (
     corrector_for,
     entries_spec,
     observe,
+    precise,
     warn_of_old,
 )
 from afm_rl.transforms.simulation import SIMULATOR_STATE, Simulation, simulation_in
@@ -44,8 +45,8 @@ class ActionFlowTransform(CarriedTransform):
     (paper, section IV-D). On the way back it adds the transition to its memory. It never learns
     and never changes the model, which it shares with planner and updater.
 
-    All that it keeps lives in the tensordict, under ``prefix``: every mission of a batch has its
-    own, and resets, branches and resumed rollouts are exact. Of use to others are
+    Every mission of a batch has a memory of its own, which a reset empties. Of use to others are,
+    under ``prefix``,
 
     * ``(prefix, "planned_action")`` and ``(prefix, "executed_action")`` ``(*B, A)``: the root
       action stays the planned one, which losses of policies need; models learn from the executed
@@ -64,8 +65,8 @@ class ActionFlowTransform(CarriedTransform):
     * ``(prefix, "effect_bounds")`` ``(*B, 2, A)``: lowest and highest effect that an action can
       have, at least the action box: for planners that can plan beyond it.
 
-    ``(prefix, "memory")`` ``(*B, P)`` is the corrector's own; logs can drop it:
-    ``data.exclude(("afm", "memory"), ("next", "afm", "memory"))``.
+    The memory is large, and no part of rollouts and of what collectors yield: of the newest step it
+    is held here. A tensordict of another step goes on with an empty one, and a warning.
 
     Put it first in a ``Compose``: what follows may rescale the observation under another key
     and the action. It needs the state as the model knows it.
@@ -95,6 +96,11 @@ class ActionFlowTransform(CarriedTransform):
         delay: steps from an action to its effect that are known, one number or one per axis.
         belief: keep ``(prefix, "belief")`` ``(*B, C, A)``, too: how probable the ``causes`` of the
             :class:`~afm_rl.correction.ActionFlow` are, by axis.
+        carry_memory: carry the memory in the tensordict instead, as ``(prefix, "memory")``
+            ``(*B, P)``: branches and resumed rollouts are exact, in another environment, too.
+        keep_memory_on_reset: go on with what was learnt in the episodes before, as where a fault
+            outlasts them: the pairs, the noise and the belief of the newest step. So rollouts
+            depend on those before them, and branches of rollouts are not exact.
 
     Raises:
         ConfigurationError: for parts that do not fit each other, also when it is put around an
@@ -111,8 +117,6 @@ class ActionFlowTransform(CarriedTransform):
     torch.Size([5, 2])
     """
 
-    essential = ("memory",)
-
     def __init__(
         self,
         model: DynamicsModel | str,
@@ -126,6 +130,8 @@ class ActionFlowTransform(CarriedTransform):
         late: str = "predict",
         delay: int | Sequence[int] | None = None,
         belief: bool = False,
+        carry_memory: bool = False,
+        keep_memory_on_reset: bool = False,
     ) -> None:
         self.delay, self.belief = delay, check_flag("transform.belief", belief)
         self.late = check_choice("transform.late", late, LATE)
@@ -145,6 +151,10 @@ class ActionFlowTransform(CarriedTransform):
         self.enabled = check_flag("transform.enabled", enabled)
         self.extend_action_box = check_flag("transform.extend_action_box", extend_action_box)
         self.reported_key = None if reported_key is None else as_key(reported_key)
+        self.carry_memory = check_flag("transform.carry_memory", carry_memory)
+        keep = check_flag("transform.keep_memory_on_reset", keep_memory_on_reset)
+        self.keep_memory_on_reset = keep
+        self._newest: Any = None  # the entries of the newest step, and its memory
 
     @property
     def corrector(self) -> Corrector:
@@ -159,6 +169,20 @@ class ActionFlowTransform(CarriedTransform):
                 "transform", self.model, None, self._action_spec, self.delay
             )
         return self._corrector
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> Any:
+        """Return the state of the corrector, the universal one's too, from the beginning on."""
+        self._complete()
+        return super().state_dict(*args, **kwargs)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        self._complete()
+        super()._load_from_state_dict(*args, **kwargs)
+
+    def _complete(self) -> None:
+        """Make the corrector now, if there is an environment to make it for."""
+        if self.parent is not None:
+            self.corrector  # noqa: B018
 
     @property
     def model(self) -> DynamicsModel:
@@ -213,6 +237,31 @@ class ActionFlowTransform(CarriedTransform):
         way = "the whole state of its simulation is in_keys=['simulator_state'], or model='mujoco'"
         return f"; {way}"
 
+    def recall(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Return the memory up to a tensordict: its own, or the newest, if it belongs to that."""
+        entries = tensordict.get(self.prefix, None)
+        if entries is None or self.carry_memory:
+            return None if entries is None else entries.get("memory", None)
+        state, newest = entries.get("arrival"), self._newest
+        fits = newest is not None and newest.shape == state.shape[:-1]
+        known = _same(entries, newest) if fits else torch.zeros(state.shape[:-1], dtype=torch.bool)
+        if known.all():
+            return newest.get("memory")
+        warnings.warn(
+            "ActionFlowTransform: a tensordict that is not that of the newest step, of which alone "
+            "the memory is held, goes on with an empty one; go on with step_mdp(tensordict), or "
+            "give carry_memory=True",
+            stacklevel=2,
+        )
+        begun = begin(self.corrector, state, self._action_spec, self._learnt).get("memory")
+        return torch.where(known.unsqueeze(-1), newest.get("memory"), begun) if fits else begun
+
+    @property
+    def _learnt(self) -> Tensor | None:
+        """The memory of the newest step, if a reset keeps it."""
+        keeps = self.keep_memory_on_reset and self._newest is not None
+        return self._newest.get("memory") if keeps else None
+
     def act(self, tensordict: TensorDictBase, memory: Tensor) -> TensorDictBase:
         """Replace the planned action by the corrected one."""
         warn_of_old(tensordict, self.prefix)
@@ -227,7 +276,7 @@ class ActionFlowTransform(CarriedTransform):
             self.extend_action_box,
             self.action_key,
         )
-        tensordict.set(self.action_key, entries.get("executed_action").to(planned.dtype))
+        tensordict.set(self.action_key, entries.get("executed_action"))
         kept = tensordict.get(self.prefix).select("observation", "arrival", "delay")
         if self.simulation is None:
             # Environments without a state of their own go on from what is under this key.
@@ -255,8 +304,8 @@ class ActionFlowTransform(CarriedTransform):
         memory = observe(memory, state, self.model, self.corrector, self.observation_key)
         entries |= {"memory": memory, **self._seen(memory, state, next_tensordict)}
         # Of the device that the next tensordict names: else every entry is moved to where it is.
-        device, batch = next_tensordict.device, next_tensordict.batch_size
-        return next_tensordict.set(self.prefix, TensorDict(entries, batch, device=device))
+        found = TensorDict(entries, memory.shape[:-1], device=next_tensordict.device)
+        return next_tensordict.set(self.prefix, self._hold(found))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -265,9 +314,39 @@ class ActionFlowTransform(CarriedTransform):
         state = self._state(tensordict_reset)
         if state is None:
             self._entry("in_keys", self.parent.full_observation_spec)
-        entries = begin(self.corrector, state, self._action_spec)
+        before = self._learnt
+        if before is not None:  # a tensordict's own goes before, if the reset is told of it
+            before = tensordict.get(self.key("memory"), before)
+        entries = begin(self.corrector, state, self._action_spec, before)
         entries.update(self._seen(entries.get("memory"), state, tensordict_reset))
-        return tensordict_reset.set(self.prefix, self._believed(entries))
+        found = self._hold(self._believed(entries), self._rows(tensordict))
+        return tensordict_reset.set(self.prefix, found)
+
+    def _hold(self, entries: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
+        """Hold the entries of a step, or of the ``rows`` that begin; return what is carried."""
+        if self.carry_memory and not self.keep_memory_on_reset:
+            return entries
+        newest, self._newest = self._newest, entries.copy()
+        if rows is not None and newest is not None and newest.shape == entries.shape:
+            rows = rows[(..., *[None] * (entries.dim() - rows.dim()))]  # for all agents
+            self._newest = torch.where(rows.expand(entries.shape), entries, newest)
+        return entries if self.carry_memory else entries.exclude("memory")
+
+    def _rows(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Return which missions begin, or which of their agents; None: all."""
+        keys, own = self.parent.reset_keys, self.key("memory")
+        for key in keys:
+            node = key[:-1] if isinstance(key, tuple) else ()
+            if own[: len(node)] == node:
+                rows = tensordict.get(key, None)
+                if rows is not None:
+                    batch = tensordict.get(node) if node else tensordict
+                    rows = rows.flatten(batch.batch_dims).any(-1)
+                return rows
+        raise ConfigurationError(
+            f"ActionFlowTransform: prefix={self.prefix!r}: episodes end by {keys}, so that nothing "
+            f"else is reset; give a prefix there, such as {(*keys[0][:-1], 'afm')!r}"
+        )
 
     def _state(self, tensordict: TensorDictBase) -> Any:
         """Return the measured state; None if there is none."""
@@ -344,16 +423,20 @@ class ActionFlowTransform(CarriedTransform):
                 f"{tuple(found.shape)}, but the dynamics model's state has "
                 f"{self.model.state_size} numbers{self._way}"
             )
-        entries = entries_spec(self.corrector, self.model.state_size, spec.shape, found.dtype)
-        size = (*spec.shape, self.model.state_size)
+        batch, corrector = found.shape[:-1], self.corrector  # agents have a dimension of their own
+        entries = entries_spec(corrector, batch, self._action_spec.dtype)
         seen = Composite({key: specs[key] for key in self._seen_keys}, shape=spec.shape)
         first = next(iter(seen.values()), found)  # of one or none
         entries["observation"] = (seen if len(self._seen_keys) > 1 else first).clone()
-        entries["arrival"] = Unbounded(size, dtype=found.dtype)
-        entries["delay"] = Unbounded(spec.shape, dtype=torch.long)
+        entries["arrival"] = Unbounded(found.shape, dtype=found.dtype)
+        entries["delay"] = Unbounded(batch, dtype=torch.long)
+        kind = precise(found.dtype)
+        if self.carry_memory:
+            size = (*batch, corrector.memory_size(self.model.state_size))
+            entries["memory"] = Unbounded(size, dtype=kind)
         if self.belief:
-            size = (*spec.shape, len(self._believer.causes), self.corrector.action_size)
-            entries["belief"] = Unbounded(size, dtype=found.dtype)
+            size = (*batch, len(self._believer.causes), corrector.action_size)
+            entries["belief"] = Unbounded(size, dtype=kind)
         return entries
 
 
@@ -362,3 +445,13 @@ def _one_key(name: str, keys: Sequence[NestedKey]) -> NestedKey:
     if len(found) != 1:
         raise ConfigurationError(f"ActionFlowTransform: {name}={keys!r}: expected one key")
     return found[0]
+
+
+def _same(entries: TensorDictBase, newest: TensorDictBase) -> Tensor:
+    """Return which missions' entries are those of the newest step ``(*B)``, up to rounding."""
+    same = []
+    for name in ("arrival", "executed_action"):
+        found = entries.get(name)
+        held = newest.get(name).to(found).float().nan_to_num()
+        same.append((held == found.float().nan_to_num()).all(-1))
+    return same[0] & same[1]

@@ -9,6 +9,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from torchrl.data import Composite
 from torchrl.envs import Transform
 
+from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.keys import as_key
 
 
@@ -24,8 +25,6 @@ class CarriedTransform(Transform, ABC):
         action_key: the action.
         prefix: where the memory is kept.
     """
-
-    essential: tuple[str, ...] = ()  # the entry without which there is no next step; (): all
 
     def __init__(
         self, observation_key: NestedKey, action_key: NestedKey, prefix: NestedKey
@@ -54,10 +53,14 @@ class CarriedTransform(Transform, ABC):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict
 
+    def recall(self, tensordict: TensorDictBase) -> Any:
+        """Return what is remembered up to a tensordict; None if it holds nothing of it."""
+        return tensordict.get(self.prefix, None)
+
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         if self.parent is None:
             return tensordict
-        memory = tensordict.get(self.key(*self.essential), None)
+        memory = self.recall(tensordict)
         if memory is None:
             raise KeyError(
                 f"{type(self).__name__}: no {self.prefix!r} in the tensordict; start from "
@@ -72,5 +75,19 @@ class CarriedTransform(Transform, ABC):
         return self._with_memory(state_spec, executed=False)
 
     def _with_memory(self, spec: Composite, executed: bool) -> Composite:
+        check_free(type(self).__name__, self.prefix, spec)
+        seen, path = self.parent.full_observation_spec, self.key("memory")[:-2]
+        for node in (path[: k + 1] for k in range(len(path))):
+            if spec.get(node, None) is None:  # of as many agents as are observed there
+                spec[node] = Composite(shape=seen.get(node, spec).shape, device=spec.device)
         spec[self.prefix] = self.memory_spec(spec, executed).to(spec.device)
         return spec
+
+
+def check_free(owner: str, prefix: NestedKey, spec: Composite) -> None:
+    """Refuse a prefix that stands in a spec already: two would write each other's memory."""
+    if spec.get(prefix, None) is not None:
+        raise ConfigurationError(
+            f"{owner}: prefix={prefix!r}: taken, by the environment or another transform; give "
+            "each a prefix of its own"
+        )

@@ -29,9 +29,10 @@ class Controller(nn.Module):
 
     .. math:: (m, s, g, \epsilon) \mapsto (m', a)
 
-    All that is remembered is in m; a memory of zeros begins a mission. A planner that samples takes
-    standard normal numbers :math:`\epsilon`, fresh ones at each tick, none beyond
-    :attr:`noise_bound`. Actions are those of planner and policy, up to rounding.
+    All that is remembered is in m; a memory of zeros begins a mission, and, with the policy's
+    ``keep_memory_on_reset``, one whose first number was set to -1 goes on with what was learnt. A
+    planner that samples takes standard normal numbers :math:`\epsilon`, fresh ones at each tick,
+    none beyond :attr:`noise_bound`. Actions are those of planner and policy, up to rounding.
 
     Args:
         planner: writes the planned action and, under ``next``, what it remembers. None: the
@@ -68,7 +69,7 @@ class Controller(nn.Module):
         if isinstance(planner, SamplingPlanner):
             self.streams = planner.streams
         kept = [*getattr(planner, "memory", ())]
-        kept += [unravel_key((policy.prefix, name)) for name in ("effect_bounds", "memory")]
+        kept += [unravel_key((policy.prefix, "effect_bounds")), policy.memory_key]
         self.shapes = {key: first.get(key).shape for key in kept}
         begun = torch.cat([first.get(key).flatten() for key in kept])
         self.register_buffer("start", begun, persistent=False)
@@ -128,9 +129,18 @@ class Controller(nn.Module):
         """
         task = given[: len(self.task)]
         before = torch.where(memory[:1] == 0.0, self.start, memory[1:])
+        if self.policy.keep_memory_on_reset:
+            before = torch.where(memory[:1] < 0.0, self._resumed(memory), before)
         noise = _Given(given[-1] if self.draws else None)
         found, action = self._tick(before, observation, task, noise)
         return torch.cat([torch.ones_like(memory[:1]), found]), action
+
+    def _resumed(self, memory: Tensor) -> Tensor:
+        """Return what a mission begins with that keeps what was learnt."""
+        size = math.prod(self.shapes[self.policy.memory_key])  # the last part
+        nowhere = memory.new_full((self._states,), torch.nan)
+        learnt = self.policy.corrector.resume(memory[-size:], nowhere)
+        return torch.cat([self.start[:-size], learnt])
 
     def _tick(
         self, memory: Tensor, observation: Tensor, task: Sequence[Tensor], noise: _Given
@@ -186,7 +196,7 @@ def export_controller(
 ) -> str:
     """Write a controller as machine code (``.pt2``), which torch runs without this library.
 
-    Its metadata names the arguments and their sizes (``memory:526 observation:3 ...``) and the
+    Its metadata names the arguments and their sizes (``memory:982 observation:3 ...``) and the
     bound of the noise. It takes a minute or two of one core, and a C++ compiler. The file is a
     program: who loads it should ask for the checksum that is returned.
 

@@ -34,6 +34,7 @@ from afm_rl.transforms.memory import (
     correct,
     corrector_for,
     observe,
+    precise,
 )
 from afm_rl.transforms.simulation import Simulation
 
@@ -68,6 +69,7 @@ class CorrectionLoop:
         observe: what is observed in states.
         delay: steps that are known.
         belief: tell it, too.
+        keep_memory_on_reset: go on with what was learnt.
     """
 
     def __init__(
@@ -83,7 +85,10 @@ class CorrectionLoop:
         observe: Observe | None = None,
         delay: int | Sequence[int] | None = None,
         belief: bool = False,
+        keep_memory_on_reset: bool = False,
     ) -> None:
+        keep = check_flag("wrapper.keep_memory_on_reset", keep_memory_on_reset)
+        self.keep_memory_on_reset = keep
         self.delay, self.belief = delay, check_flag("wrapper.belief", belief)
         self.late = check_choice("wrapper.late", late, LATE)
         if not isinstance(actions, Box) or len(actions.shape) != 1 or actions.dtype.kind != "f":
@@ -121,6 +126,10 @@ class CorrectionLoop:
         self.entries: Any = None  # a tensordict, from the first reset on
 
     @property
+    def _keeps(self) -> bool:
+        return self.keep_memory_on_reset and self.entries is not None
+
+    @property
     def learning(self) -> bool:
         """Is there no model yet?"""
         return self.watching is not None and self.watching.fitted is None
@@ -151,14 +160,16 @@ class CorrectionLoop:
             seed: of the noise of watching.
             observations: what was measured ``(N, ...)``; the states themselves if None.
         """
+        states = states.to(precise(states.dtype))
         if self.watching and seed is not None:
             self.watching.restart(seed)
         if self.entries is None:
             self._complete(states, states if observations is None else observations)
+        before = self.entries.get("memory") if self._keeps else None
         if self.watching and self.learning and self.watching.due:
             self.watching.learn()
-            self.model, rows = self.watching.fitted or self.model, None
-        fresh = begin(self.corrector, states, self.spec)
+            self.model, rows, before = self.watching.fitted or self.model, None, None
+        fresh = begin(self.corrector, states, self.spec, before)
         if rows is None or self.entries is None:
             self.entries, self.states = fresh, states
         else:
@@ -223,12 +234,15 @@ class CorrectionLoop:
     @torch.no_grad()
     def observe(self, states: Tensor, fresh: np.ndarray | None = None) -> None:
         """Add what the actions led to, ``(N, S)``; where ``fresh`` ``(N,)``, an episode began."""
-        fresh, entries = np.zeros(len(states), dtype=bool) if fresh is None else fresh, self.entries
+        states, entries = states.to(precise(states.dtype)), self.entries
+        fresh = np.zeros(len(states), dtype=bool) if fresh is None else fresh
         if self.watching and self.learning:
             executed, valid = entries.get("executed_action"), torch.from_numpy(~fresh)
             self.watching.add(self.states, executed, states, valid)
         else:
-            memory = observe(entries.get("memory"), states, self.model, self.corrector)
+            # What led into a new episode is no transition.
+            reached = states.masked_fill(torch.from_numpy(fresh).unsqueeze(-1), torch.nan)
+            memory = observe(entries.get("memory"), reached, self.model, self.corrector)
             entries.set("memory", memory)
         self.states, told = states, self.told
         if fresh.any():
@@ -303,8 +317,10 @@ def as_numbers(name: str, given: Any, shape: Sequence[int] | None) -> Tensor:
     >>> as_numbers("action", [1, 0.5], (2,))
     tensor([1.0000, 0.5000], dtype=torch.float64)
     """
+    if isinstance(given, Tensor) and given.dtype is torch.bfloat16:  # which numpy does not know
+        given = given.float()
     try:
-        numbers = np.asarray(given)
+        numbers = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given)
     except ValueError:  # lists of several lengths
         numbers = np.asarray(None)
     found: Any = torch.tensor(numbers) if numbers.dtype.kind in "iufcb" else given

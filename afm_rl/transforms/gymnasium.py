@@ -59,6 +59,8 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
             used from the first step on. What comes on top of it is found out.
         belief: have ``info["afm"]["belief"]``, too: how probable ``(A,)`` each cause is, by name,
             such as ``"nothing has changed"`` or ``"2 steps late"``.
+        keep_memory_on_reset: go on with what was learnt in the episodes before, as where a fault
+            outlasts them; else each episode begins with an empty memory.
 
     Raises:
         ConfigurationError: for spaces or a model that cannot be used, or do not fit each other;
@@ -83,16 +85,16 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         observe: Observe | None = None,
         delay: int | Sequence[int] | None = None,
         belief: bool = False,
+        keep_memory_on_reset: bool = False,
     ) -> None:
         given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
         given |= {"late": late, "observe": observe, "delay": delay, "belief": belief}
+        given |= {"keep_memory_on_reset": keep_memory_on_reset}
         RecordConstructorArgs.__init__(self, **given)
         gymnasium.Wrapper.__init__(self, env)
         inner: Any = env.unwrapped
         spaces = env.observation_space, env.action_space
-        self._loop = CorrectionLoop(
-            *spaces, model, state, corrector, enabled, env, late, observe, delay, belief
-        )
+        self._loop = CorrectionLoop(*spaces, source=env, **given)
         simulated = isinstance(self._loop.model, MuJoCoDynamics)
         if simulated and hasattr(inner, "data") and env.action_space != inner.action_space:
             raise ConfigurationError(
@@ -101,7 +103,7 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
             )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Begin an episode with an empty memory."""
+        """Begin an episode, with an empty memory or what was learnt."""
         observation, info = self.env.reset(seed=seed, options=options)
         measured = np.asarray(observation)[None]
         self._loop.begin(self._state(observation), seed=seed, observations=measured)
@@ -165,20 +167,20 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
         observe: Observe | None = None,
         delay: int | Sequence[int] | None = None,
         belief: bool = False,
+        keep_memory_on_reset: bool = False,
     ) -> None:
         given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
         given |= {"late": late, "observe": observe, "delay": delay, "belief": belief}
+        given |= {"keep_memory_on_reset": keep_memory_on_reset}
         RecordConstructorArgs.__init__(self, **given)
         VectorWrapper.__init__(self, env)
         spaces = env.single_observation_space, env.single_action_space
-        self._loop = CorrectionLoop(
-            *spaces, model, state, corrector, enabled, env, late, observe, delay, belief
-        )
+        self._loop = CorrectionLoop(*spaces, source=env, **given)
         self._mode = autoreset_mode_of(env)
         self._over = np.zeros(env.num_envs, dtype=bool)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None):
-        """Begin episodes with empty memories; of those in ``options["reset_mask"]``, if given."""
+        """Begin episodes, only those in ``options["reset_mask"]`` if it is given."""
         rows = (options or {}).get("reset_mask")
         rows = np.ones(self.env.num_envs, dtype=bool) if rows is None else rows.copy()
         observations, infos = self.env.reset(seed=seed, options=options)

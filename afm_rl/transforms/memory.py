@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -35,6 +36,7 @@ def corrector_for(
     Raises:
         ConfigurationError: if a part is not what it should be, or they are of different actions.
     """
+    check_precision()
     check_instance(f"{owner}.model", model, DynamicsModel)
     if corrector is None:
         low, high = bounds_of(action_spec)
@@ -61,10 +63,23 @@ def corrector_for(
     return corrector
 
 
-def entries_spec(
-    corrector: Corrector, states: int, batch: torch.Size, dtype: torch.dtype
-) -> Composite:
-    """Return the specs of the entries for a state size and a batch shape."""
+def precise(dtype: torch.dtype) -> torch.dtype:
+    """Return the type in which numbers are remembered: theirs, or single precision for 16 bits."""
+    return dtype if dtype in (torch.float32, torch.float64) else torch.float32
+
+
+def check_precision() -> None:
+    """Refuse a default type of 16 bits, in which the belief would be computed."""
+    if torch.get_default_dtype().itemsize < 4:
+        raise ConfigurationError(
+            f"torch.get_default_dtype() is {torch.get_default_dtype()}: expected float32 or "
+            "float64 while actions are corrected; set_default_dtype(torch.float32), and give "
+            "16 bits to the policy alone"
+        )
+
+
+def entries_spec(corrector: Corrector, batch: torch.Size, dtype: torch.dtype) -> Composite:
+    """Return the specs of the entries but the memory, for a batch shape and a type of actions."""
     actions = corrector.action_size
 
     def real(*shape: int) -> Unbounded:
@@ -79,19 +94,28 @@ def entries_spec(
         noise=real(actions),
         innovation=real(),
         misaligned=Binary(shape=batch, dtype=torch.bool),
-        memory=real(corrector.memory_size(states)),
         shape=batch,
     )
 
 
-def begin(corrector: Corrector, state: Tensor, action_spec: TensorSpec) -> TensorDictBase:
-    """Return the entries of missions that begin in ``state`` ``(*B, S)``."""
-    spec = entries_spec(corrector, state.shape[-1], state.shape[:-1], state.dtype)
-    entries = spec.to(state.device).zero()
+@torch.no_grad()
+def begin(
+    corrector: Corrector, state: Tensor, action_spec: TensorSpec, before: Tensor | None = None
+) -> TensorDictBase:
+    """Return the entries of missions that begin in ``state`` ``(*B, S)``.
+
+    With what was learnt in a memory ``(*B, P)`` ``before``, if one is given.
+    """
+    check_precision()
+    entries = entries_spec(corrector, state.shape[:-1], action_spec.dtype).to(state.device).zero()
     entries.set("effect_bounds", box_of(action_spec, entries.get("planned_action")))
-    return entries.set("memory", corrector.begin(state))
+    state = state.to(precise(state.dtype))
+    if before is None or before.shape[:-1] != state.shape[:-1]:
+        return entries.set("memory", corrector.begin(state))
+    return entries.set("memory", corrector.resume(before.to(state), state))
 
 
+@torch.no_grad()
 def observe(
     memory: Tensor,
     state: Any,
@@ -133,6 +157,7 @@ def warn_of_old(tensordict: TensorDictBase, prefix: NestedKey) -> None:
         )
 
 
+@torch.no_grad()
 def correct(
     memory: Tensor,
     planned: Tensor,
@@ -158,6 +183,7 @@ def correct(
     Raises:
         ConfigurationError: for a plan that is not real numbers ``(*B, A)``.
     """
+    check_precision()
     low, high = bounds_of(action_spec)
     check_numbers(key, planned, (*memory.shape[:-1], corrector.action_size))
     planned = computable(planned, low, high, memory.dtype)
@@ -165,6 +191,8 @@ def correct(
     _, last, sent = corrector.latest(memory)
     plan = torch.where(planned.isfinite().all(-1, keepdim=True), planned, last)
     memory, found = corrector.correct(memory, plan, model, box)
+    if enabled:
+        corrector.first_steps(found.misaligned, partial(corrector.cause_in, memory))
     # The last clamp depends on nothing but the spec, whatever the corrector answers.
     executed, _ = safe_action(found.executed if enabled else plan, low, high, sent)
     executed, predicted = executed.to(memory.dtype), found.predicted
@@ -185,9 +213,9 @@ def correct(
         "spread": found.spread if enabled else torch.zeros_like(found.spread),
         "noise": found.noise,
         "innovation": found.innovation,
-        "misaligned": found.misaligned,
-        "memory": memory,
     }
+    entries = {name: value.to(action_spec.dtype) for name, value in entries.items()}
+    entries |= {"misaligned": found.misaligned, "memory": memory}
     return TensorDict(entries, planned.shape[:-1], device=planned.device)
 
 

@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from afm_rl.compiling.devices import moved
 from afm_rl.correction import Corrector
@@ -17,12 +17,14 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.planning.receding import ZeroPrimer
 from afm_rl.spaces.keys import as_key
+from afm_rl.transforms.carried import check_free
 from afm_rl.transforms.memory import (
     begin,
     correct,
     corrector_for,
     entries_spec,
     observe,
+    precise,
     warn_of_old,
 )
 
@@ -31,9 +33,9 @@ class ActionFlowPolicy(TensorDictModuleBase):
     """The correction of :class:`~afm_rl.transforms.ActionFlowTransform` as the end of a policy.
 
     Put it after a planner in a ``TensorDictSequential``: a state goes in, the action to execute
-    comes out under ``action_key``, as a robot wants it that is no environment. Planned action and
-    memory are under ``prefix``, with the entries that the transform has; the next memory goes to
-    ``("next", prefix)``, as planners have it. Prime the first tensordict with
+    comes out under ``action_key``, as a robot wants it that is no environment. Under ``prefix`` are
+    the entries that the transform has, and ``"_memory"`` ``(*B, P)``, which collectors leave out;
+    the next ones go to ``("next", prefix)``, as planners have it. Prime the first tensordict with
     :meth:`make_tensordict_primer` (or append that to an environment), and carry ``"next"`` on
     (``step_mdp`` does). Actions are the same as the transform's.
 
@@ -50,6 +52,9 @@ class ActionFlowPolicy(TensorDictModuleBase):
         extend_action_box: let planners know of effects beyond the action box, if the model can
             predict them.
         delay: steps from an action to its effect that are known, one number or one per axis.
+        keep_memory_on_reset: go on with what was learnt in the episodes before, see
+            :class:`~afm_rl.transforms.ActionFlowTransform`: the primer keeps it of the last step,
+            or of the tensordict that it is given.
 
     Raises:
         ConfigurationError: for parts that do not fit each other.
@@ -80,6 +85,7 @@ class ActionFlowPolicy(TensorDictModuleBase):
         enabled: bool = True,
         extend_action_box: bool = True,
         delay: int | Sequence[int] | None = None,
+        keep_memory_on_reset: bool = False,
     ) -> None:
         super().__init__()
         self.action_spec = check_instance("policy.action_spec", action_spec, Bounded)
@@ -94,8 +100,10 @@ class ActionFlowPolicy(TensorDictModuleBase):
         self.prefix = as_key(prefix)
         self.enabled = check_flag("policy.enabled", enabled)
         self.extend_action_box = check_flag("policy.extend_action_box", extend_action_box)
+        keep = check_flag("policy.keep_memory_on_reset", keep_memory_on_reset)
+        self.keep_memory_on_reset = keep
         kept = [unravel_key((self.prefix, name)) for name in self._spec.keys(True, True)]
-        self.in_keys = [self.observation_key, self.action_key, unravel_key((self.prefix, "memory"))]
+        self.in_keys = [self.observation_key, self.action_key, self.memory_key]
         self.out_keys = [self.action_key, *(unravel_key(("next", key)) for key in kept)]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> ActionFlowPolicy:
@@ -104,9 +112,17 @@ class ActionFlowPolicy(TensorDictModuleBase):
         return super()._apply(fn, recurse)
 
     @property
+    def memory_key(self) -> NestedKey:
+        """Where the memory is: collectors leave out what begins with an underscore."""
+        return unravel_key((self.prefix, "_memory"))
+
+    @property
     def _spec(self) -> Composite:
-        states = self.model.state_size
-        return entries_spec(self.corrector, states, torch.Size(), self.action_spec.dtype)
+        dtype = self.action_spec.dtype
+        spec = entries_spec(self.corrector, torch.Size(), dtype)
+        size = self.corrector.memory_size(self.model.state_size)
+        spec["_memory"] = Unbounded((size,), dtype=precise(dtype))
+        return spec
 
     def arrival(self) -> Arrival:
         """Return the module that tells a planner in which state its action will act."""
@@ -116,15 +132,19 @@ class ActionFlowPolicy(TensorDictModuleBase):
         """Return the transform that puts an empty memory into a tensordict, or every reset."""
         return MemoryPrimer(self)
 
-    def empty(self, batch: torch.Size) -> TensorDictBase:
-        """Return the entries of missions whose state has not been seen: it is NaN."""
+    def empty(self, batch: torch.Size, before: Tensor | None = None) -> TensorDictBase:
+        """Return the entries of missions whose state has not been seen: it is NaN.
+
+        With what was learnt in a memory ``(*B, P)`` ``before``, if one is given.
+        """
         size, space = (*batch, self.model.state_size), self.action_spec.space
         nowhere = torch.full(size, torch.nan, dtype=space.low.dtype, device=space.low.device)
-        return begin(self.corrector, nowhere, self.action_spec)
+        entries = begin(self.corrector, nowhere, self.action_spec, before)
+        return entries.rename_key_("memory", "_memory")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Look at the state, and put the action to execute in the place of the planned one."""
-        memory = tensordict.get(unravel_key((self.prefix, "memory")), None)
+        memory = tensordict.get(self.memory_key, None)
         if memory is None:
             raise KeyError(
                 f"ActionFlowPolicy: no {self.prefix!r} in the tensordict; apply "
@@ -143,8 +163,9 @@ class ActionFlowPolicy(TensorDictModuleBase):
             self.extend_action_box,
             self.action_key,
         )
+        entries.rename_key_("memory", "_memory")
         tensordict.set(unravel_key(("next", self.prefix)), entries)
-        return tensordict.set(self.action_key, entries.get("executed_action").to(planned.dtype))
+        return tensordict.set(self.action_key, entries.get("executed_action"))
 
 
 class Arrival(TensorDictModuleBase):
@@ -162,7 +183,7 @@ class Arrival(TensorDictModuleBase):
     def __init__(self, policy: ActionFlowPolicy) -> None:
         super().__init__()
         self.__dict__["policy"] = policy  # shared, so not registered
-        self.in_keys = [policy.observation_key, unravel_key((policy.prefix, "memory"))]
+        self.in_keys = [policy.observation_key, policy.memory_key]
         self.out_keys = [unravel_key((policy.prefix, name)) for name in ("arrival", "delay")]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -186,9 +207,21 @@ class MemoryPrimer(ZeroPrimer):
         spec = policy._spec.to(policy.action_spec.device)
         super().__init__(Composite({policy.prefix: spec}))
         self.__dict__["policy"] = policy  # shared, so not registered
+        self._last: Tensor | None = None  # the memory of the last step, which a reset is not told
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        check_free("ActionFlowPolicy", self.policy.prefix, observation_spec)
+        return super().transform_observation_spec(observation_spec)
 
     def _reset_func(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        entries = self.policy.empty(tensordict_reset.batch_size)
+        before = None
+        if self.policy.keep_memory_on_reset:
+            before = tensordict.get(self.policy.memory_key, self._last)
+        entries = self.policy.empty(tensordict_reset.batch_size, before)
         return tensordict_reset.set(self.policy.prefix, entries)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self._last = next_tensordict.get(self.policy.memory_key, None)
+        return super()._step(tensordict, next_tensordict)

@@ -55,7 +55,7 @@ class Simulation:
     """
 
     def __init__(self, env: Any) -> None:
-        self.layers = _layers(env)
+        self.layers = layers_of(env)
         self.inner = self.layers[-1]
         self.host = getattr(self.inner, "physics", self.inner)  # dm_control's
         if not all(hasattr(self.host, name) for name in ("data", "model")):
@@ -181,7 +181,7 @@ def simulation_in(env: Any) -> Simulation | None:
         return None
 
 
-def _layers(env: Any) -> list[Any]:
+def layers_of(env: Any) -> list[Any]:
     """Return the wrappers of an environment, the outermost first, and itself."""
     found = [env]
     while True:

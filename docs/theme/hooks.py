@@ -23,6 +23,11 @@ API = {
     "Learning": "learning",
     "Regimes": "regimes",
     "Diagnosis": "diagnosis",
+    "Check of a model": [
+        "transforms.check_model.check_model",
+        "diagnosis.model_check.ModelCheck",
+        "diagnosis.model_check.check_transitions",
+    ],
     "Environments": "envs",
     "Missions": "missions",
     "Reports": "report",

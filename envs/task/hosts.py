@@ -132,18 +132,20 @@ def environment_task(
         raise ConfigurationError(
             f"robot.env={env!r}: makes {host!r:.80}, expected a TorchRL EnvBase"
         )
-    if reward is None:
-        raise ConfigurationError("robot.reward: expected a function, to plan with")
     specs = {
         "observation": host.observation_spec.get(observation_key, None),
         "action": host.full_action_spec.get("action", None),
     }
     for kind, spec in specs.items():
         if spec is None or spec.ndim != 1 or not spec.dtype.is_floating_point:
+            whose = f"robot.id={name}" if name else f"robot.env: {type(host).__name__}"
+            real = spec is None or spec.dtype.is_floating_point
             raise ConfigurationError(
-                f"robot.env: {type(host).__name__}: its {kind} is {spec}; expected one vector of "
+                f"{whose}: its {kind} is {spec if real else 'discrete'}; expected one vector of "
                 "real numbers, without a batch dimension"
             )
+    if reward is None:
+        raise ConfigurationError("robot.reward: expected a function, to plan with")
     size, box = specs["observation"].shape[-1], specs["action"].space
     own = [
         getattr(box, end, torch.full(specs["action"].shape, torch.inf)) for end in ("low", "high")

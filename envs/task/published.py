@@ -29,6 +29,8 @@ from afm_rl.envs.task.rewards import (
 from afm_rl.envs.task.task import NOWHERE, Reward, Task, trust
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
+from afm_rl.targets import check_name
+from afm_rl.trust import restricted
 
 
 @contextmanager
@@ -85,13 +87,17 @@ def gymnasium_task(
         action_high: highest action.
 
     Raises:
-        ConfigurationError: if there is no such task, or nothing is known of it.
+        ConfigurationError: if there is no such task, its actions are discrete, nothing is known of
+            it, or settings name a module (``MODULE:NAME``) that is not trusted.
 
     >>> gymnasium_task("Pendulum-v1").state_names
     ['angle', 'speed']
     """
     import gymnasium
 
+    module, colon, _ = str(id).partition(":")
+    if colon and restricted():  # gymnasium imports it
+        check_name("robot.id", module)
     try:
         with quiet():
             env = gymnasium.make(id)

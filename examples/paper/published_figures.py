@@ -23,7 +23,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from published_tables import MEASURES, published
+from published_tables import LABELS, MEASURES, published
 
 from afm_rl.envs import load_track
 from afm_rl.report import read_runs, style
@@ -142,10 +142,11 @@ def draw_bars(runs: Runs) -> Figure:
     for row, track in zip(grid, tracks, strict=True):
         printed = published()[lambda rows, track=track: rows["track"] == track]
         own = runs.missions[runs.missions["track"] == track]
-        for panel, (measure, (column, _, _)) in zip(row, MEASURES.items(), strict=True):
+        for panel, (measure, column) in zip(row, MEASURES.items(), strict=True):
             seeds = own.groupby(["method", "seed"])[column].mean().groupby("method")
             means, stds = seeds.mean().reindex(methods), seeds.std(ddof=0).reindex(methods)
-            theirs = printed.groupby("method")[f"{measure}_mean"].mean().reindex(methods)
+            theirs = printed.groupby("method")[f"{measure}_mean"].mean()
+            theirs = theirs.reindex([LABELS.get(name) for name in methods])
             colours = [looks[name].color for name in methods]
             panel.bar(place - 0.2, means, 0.38, yerr=stds, color=colours, error_kw={"lw": 1})
             panel.bar(place + 0.2, theirs, 0.38, facecolor="white", edgecolor=colours, hatch="///")

@@ -1,6 +1,7 @@
 """The command ``afm-rl-diagnose``."""
 
 import json
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,8 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from afm_rl.cli import diagnose
+from afm_rl.dynamics import MuJoCoDynamics
 
 
 @pytest.fixture
@@ -30,7 +33,9 @@ def call(monkeypatch, capsys):
 
 
 @pytest.fixture
-def log(tmp_path):
+def log(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
     rng = np.random.default_rng(0)
     u = rng.uniform(-1, 1, (400, 2))
     y = np.column_stack([u[:, 0], -0.62 * np.roll(u[:, 1], 2)])
@@ -47,7 +52,8 @@ def test_a_log_becomes_a_table_a_file_and_a_page(call, log):
     assert (done.status, done.err) == (0, "")
     assert "pan: healthy" in done.out.splitlines()
     assert "<b>elbow: reversed, 62 % of the command, 2 steps (0.04 s) late" in done.out.splitlines()
-    out = log.parent / "log_diagnosis"
+    out = Path("outputs", "log_diagnosis")
+    assert {path.name for path in log.parent.iterdir()} == {"here", "log.csv"}  # as it was
     pan, elbow = json.loads((out / "diagnosis.json").read_text())["actuators"]
     assert pan["status"] == "healthy" and pan["saturation"] is None
     assert elbow["gain_interval"][0] < elbow["gain"] < elbow["gain_interval"][1] < 0
@@ -63,10 +69,17 @@ def test_where_to_and_what_is_healthy(call, log, tmp_path):
     assert [path.name for path in (tmp_path / "there").iterdir()] == ["diagnosis.json"]
 
 
-def test_effective_actions_of_a_model(call, tmp_path, monkeypatch):
+@pytest.fixture
+def own_model(tmp_path, monkeypatch):
+    """A package of the user's, in the present folder."""
     monkeypatch.chdir(tmp_path)
     text = "def step(state, action):\n    return 0.9 * state + 0.1 * action\n"
     (tmp_path / "own_model.py").write_text(text)
+    yield "own_model.step"
+    sys.modules.pop("own_model", None)
+
+
+def test_effective_actions_of_a_model(call, own_model):
     rng = np.random.default_rng(0)
     actions, states = rng.uniform(-1, 1, (300, 2)), np.zeros((300, 2))
     for k in range(299):
@@ -74,10 +87,87 @@ def test_effective_actions_of_a_model(call, tmp_path, monkeypatch):
     columns = {f"action.{j}": actions[:, j] for j in range(2)}
     columns |= {f"state.{j}": states[:, j] for j in range(2)}
     pd.DataFrame(columns).to_csv("log.csv", index=False)
-    done = call("log.csv", "--model", "own_model.step")
+    refused = call("log.csv", "--model", own_model)
+    assert refused.status == 2 and refused.err.count("\n") == 1 and "own_model" not in sys.modules
+    assert "function of a package that you trust: --trust own_model" in refused.err
+    done = call("log.csv", "--model", own_model, "--trust", "own_model")
     assert done.err == ""
     assert done.out.splitlines()[-4:-2] == ["0: healthy", "1: reversed, 50 % of the command"]
-    sys.modules.pop("own_model")
+    told = done.out.splitlines()[:2]
+    assert told[0].startswith("The model predicts only 5")
+    assert told[1].startswith(
+        "Likely cause: the robot acts on -0.5 times 1 (signs, gains or units)"
+    )
+    assert json.loads(Path("outputs/log_diagnosis/diagnosis.json").read_text())["notes"][:2] == told
+
+
+CART = """<mujoco><option timestep="0.01"/><worldbody><body><joint name="rail" type="slide"
+axis="1 0 0" damping="1"/><geom size=".1"/><body><joint name="pole" axis="0 1 0" damping=".1"/><geom
+size=".05" pos="0 0 .5"/></body></body></worldbody><actuator><motor name="push" joint="rail"
+gear="20"/></actuator></mujoco>"""
+
+
+@pytest.fixture
+def cart(tmp_path, monkeypatch):
+    """A simulated robot's log of 150 rows, five steps of the simulation each; and its model."""
+    pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cart.xml").write_text(CART)
+    robot, rng = MuJoCoDynamics(CART, frame_skip=5), np.random.default_rng(0)
+    states, actions = (
+        [torch.tensor([0.0, 0.3, 0.0, 0.0])],
+        torch.tensor(rng.uniform(-1, 1, (150, 1))),
+    )
+    for action in actions[:-1]:
+        states.append(robot(states[-1], action))
+    names = {f"state.{name}": k for k, name in enumerate(robot.names[0])}
+    table = {name: torch.stack(states).numpy()[:, k] for name, k in reversed(names.items())}
+    table |= {"t": 0.05 * np.arange(150), "action.push": actions[:, 0].numpy()}
+    pd.DataFrame(table | {"state.more": 0.0}).to_csv("cart.csv", index=False)
+    return table
+
+
+def test_columns_are_those_that_a_simulator_names(call, cart):
+    done = call("cart.csv", "--model", "cart.xml")
+    assert (done.status, done.err) == (0, "")
+    first = done.out.splitlines()[0]
+    assert first.startswith("The model is right: it predicts 100 % of the motion (")
+    assert {f"{name} 100 %" for name in ("q_pole", "v_rail")} < set(re.split(r"[(,;] ?", first))
+    assert "push: healthy" in done.out.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("factors", "cause"),
+    [
+        ({"t": None}, "makes 5 steps of the model in one (dt, frame_skip)"),
+        ({"action.push": -1.0}, "acts on -1 times the action (a sign)"),
+        (
+            dict.fromkeys(("state.", "action."), 180 / np.pi),
+            "has states and actions in degrees, the model in radians",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_model_is_said_first(call, cart, factors, cause):
+    for part, factor in factors.items():
+        for name in [name for name in cart if name.startswith(part)]:
+            cart[name] = None if factor is None else factor * cart[name]
+    table = {name: column for name, column in cart.items() if column is not None}
+    pd.DataFrame(table).to_csv("log.csv", index=False)
+    done = call("log.csv", "--model", "cart.xml")
+    assert cause in done.out.splitlines()[1] and "push: healthy" not in done.out.splitlines()
+
+
+def test_missing_columns_are_named(call, cart):
+    pd.DataFrame(cart).rename(columns={"state.q_pole": "state.angle"}).to_csv(
+        "log.csv", index=False
+    )
+    refused = call("log.csv", "--model", "cart.xml")
+    assert refused.status == 2 and refused.out == "" and refused.err.count("\n") == 1
+    assert "no column state.q_pole for the model, but state.v_pole, " in refused.err
+    assert "--response q_pole=COLUMN" in refused.err
+    names = "q_pole=state.angle,q_rail=state.q_rail,v_rail=state.v_rail,v_pole=state.v_pole"
+    fields = ["--response", names, "--command", "push=action.push"]
+    assert "The model is right" in call("log.csv", "--model", "cart.xml", *fields).out
 
 
 def test_a_log_is_replayed(call, log, tmp_path):
@@ -86,8 +176,10 @@ def test_a_log_is_replayed(call, log, tmp_path):
     sentence = next(line for line in done.out.splitlines() if line.startswith("A correction"))
     assert sentence.endswith("% of the error of <b>elbow, and none of pan.")
     rows = pd.read_csv(tmp_path / "out.csv")
-    assert len(rows) == 398 and np.isfinite(rows["<b>elbow.afm"]).all()
-    page = (log.parent / "log_diagnosis" / "index.html").read_text()
+    assert len(rows) == 398 and np.isfinite(rows["afm.<b>elbow"]).all()
+    again = call(tmp_path / "out.csv", "--no-page")  # a log like any other
+    assert "pan: healthy" in again.out.splitlines() and again.err == ""
+    page = Path("outputs/log_diagnosis/index.html").read_text()
     assert page.count("data:image/png;base64,") == 3 and "affine least squares" in page
 
 
@@ -96,6 +188,12 @@ def test_what_is_in_a_log_of_messages_is_listed(call):
     done = call(ulog)
     assert done.status == 2 and done.err.count("\n") == 1 and "--command" in done.err
     assert "vehicle_rates_setpoint (184 messages): roll, pitch, yaw, thrust" in done.out
+
+
+def test_columns_that_no_model_can_take_are_listed(call, log):
+    done = call(log, "--model", "cart.xml")
+    assert done.status == 2 and "log.csv: columns t, command.pan" in done.err
+    assert done.out.splitlines()[:2] == ["t", "command.pan"]
 
 
 def test_fields_are_named(call, log, tmp_path):
@@ -114,10 +212,13 @@ def test_fields_are_named(call, log, tmp_path):
         ([], "the following arguments are required: FILE"),
         (["nowhere.csv"], "nowhere.csv: no such file"),
         (["log.csv", "--delay", "-1"], "--delay=-1.0: expected a finite number"),
-        (["log.csv", "--model", "no.step"], "log.csv: columns t, command.pan"),
+        (["cart.csv", "--model", "no.xml"], "dynamics.model=no.xml: no such file"),
+        (["cart.csv", "--model", "os.system"], "--model os.system: expected a file .xml, or a"),
+        (["cart.csv", "--model", "step", "--trust", "step"], "--model step: expected a file .xml"),
+        (["cart.csv", "--model", "no.step", "--trust", "no"], "--model='no.step': cannot be found"),
     ],
 )
-def test_mistakes_end_in_one_line(call, log, monkeypatch, arguments, message):
+def test_mistakes_end_in_one_line(call, log, cart, monkeypatch, arguments, message):
     monkeypatch.chdir(log.parent)
     done = call(*arguments)
     assert (done.status, done.out) == (2, "")

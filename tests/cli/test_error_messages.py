@@ -1,6 +1,5 @@
 """Settings that cannot be used: one line that names them, before anything is trained."""
 
-import os
 import re
 
 import pytest
@@ -97,28 +96,6 @@ def test_a_cache_that_cannot_be_written(afm_rl, tmp_path, quick, monkeypatch):
     assert done.err.startswith(f"afm-rl: cannot write {tmp_path}/file/parts: Not a ")
 
 
-def test_a_configuration_from_a_file_runs_no_command(refuse, tmp_path):
-    canary = tmp_path / "canary"
-    evil = f"{{_target_: os.system, command: touch {canary}}}"
-    wishes = {
-        "planner": evil,
-        "label": evil,
-        "updater": f"{{optimizer: {evil}}}",
-        "hydra": f"{{callbacks: {{x: {evil}}}}}",
-        "hydra ": f"{{launcher: {{x: {evil}}}}}",
-        "hydra  ": "{job_logging: {handlers: {x: {class: subprocess.Popen, args: touch}}}}",
-        "hydra   ": "{job_logging: {formatters: {x: {(): os.system}}}}",
-        "trust": "[os]\nplanner: " + evil,
-    }
-    for number, (key, wish) in enumerate(wishes.items()):
-        (tmp_path / "conf").mkdir(exist_ok=True)
-        text = f"defaults: [config, _self_]\n{key.strip()}: {wish}\n"
-        (tmp_path / "conf" / f"evil{number}.yaml").write_text(text)
-        line = refuse(f"--config-dir={tmp_path}/conf", f"--config-name=evil{number}")
-        assert "trust=[PACKAGE]" in line or "expected one of logging.StreamHandler" in line
-        assert not canary.exists()
-
-
 def test_a_package_is_trusted_on_the_command_line_alone(refuse, monkeypatch, tmp_path):
     (tmp_path / "mine.py").write_text("from os import system\ndef made(): ...\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -128,7 +105,6 @@ def test_a_package_is_trusted_on_the_command_line_alone(refuse, monkeypatch, tmp
     line = refuse("trust=[mine]", "planner._target_=mine.system")
     assert "is code of posix" in line  # trusted is what the package defines
     assert refuse("trust=mine").startswith("afm-rl: trust='mine': expected a list of names")
-    assert "AFM_RL_TRUST" not in os.environ
 
 
 def test_a_misspelt_setting_suggests_the_nearest_one(refuse):

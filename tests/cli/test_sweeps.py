@@ -200,6 +200,7 @@ def test_folders_of_sweeps_are_named_after_what_is_swept():
     named = with_sweep_folder(["-m", "+a/b=1,2", "tracks=[x,y]", "seeds=range(3)"])[-1]
     assert named.startswith("hydra.sweep.dir=multirun/a_b-seeds-")
     assert len(with_sweep_folder(["-m", "x" * 200 + "=1,2"])[-1]) < 90
+    assert with_sweep_folder(["a=1,2", "-m"])[::2] == ["a=1,2", "-m"]  # Hydra wants them together
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,26 @@
 
 import os
 import stat
+from pathlib import Path
 
 import pytest
 import torch
 from torch import nn
 
 from afm_rl.compiling import machine_code
-from afm_rl.compiling.machine_code import checksum_of, claim, keep, recall
+from afm_rl.compiling.machine_code import checksum_of, claim, folder_in, keep, recall
 
 CODE = os.urandom(1000)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def own_key(tmp_path_factory):
+    """Keep the key of this user out of the tests."""
+    machine_code._secret.cache_clear()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AFM_RL_CACHE", str(tmp_path_factory.mktemp("own")))
+        yield
+    machine_code._secret.cache_clear()
 
 
 @pytest.fixture
@@ -89,6 +100,19 @@ def test_a_link_to_a_folder_is_not_followed(path, tmp_path):
     assert "belongs to another user" in recall(link / "a.pt2")[1] and not claim(link)
 
 
+def test_a_cache_from_elsewhere_holds_no_program_that_is_run(tmp_path, monkeypatch):
+    mine = folder_in(tmp_path / "a")
+    key = Path(os.environ["AFM_RL_CACHE"], "key")
+    assert mine.parent == tmp_path / "a" and stat.S_IMODE(key.stat().st_mode) == 0o600
+    assert folder_in(tmp_path / "b").name != mine.name  # a copy elsewhere
+    machine_code._secret.cache_clear()  # as in the next process
+    assert folder_in(tmp_path / "b" / ".." / "a") == mine
+    for place in (tmp_path / "another user", key):  # the latter cannot hold a key
+        monkeypatch.setenv("AFM_RL_CACHE", str(place))
+        machine_code._secret.cache_clear()
+        assert folder_in(tmp_path / "a").name != mine.name
+
+
 class Doubled(nn.Module):
     def forward(self, *given):
         return (2.0 * given[0],)
@@ -114,9 +138,9 @@ def compiled(tmp_path_factory):
 def real(compiled, tmp_path, monkeypatch):
     """Where that program belongs in another cache, and its code; nothing else can be compiled."""
     monkeypatch.setattr(machine_code, "has_compiler", lambda: False)
-    (path,) = (compiled / "compiled").glob("*.pt2")
-    claim(tmp_path / "compiled")
-    return tmp_path / "compiled" / path.name, path.read_bytes()
+    (path,) = folder_in(compiled).glob("*.pt2")
+    claim(folder_in(tmp_path))
+    return folder_in(tmp_path) / path.name, path.read_bytes()
 
 
 @pytest.mark.slow

@@ -190,11 +190,10 @@ MODULES = {
         partial(updater, UnmatchedUpdater, partial(OnlineUpdater, optimizer=ADAM), BOX[1]), learn
     ),
 }
-THEIRS = ("CEM", "TorchRLMPPI")  # they draw from the generator of the device
 BUILT_IN_PRECISION = ("ActionFlowPolicy", "MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI")
 
 
-SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "ActionFlowPolicy", "CFMLoss")
+SLOW_TO_COMPILE = ("MPPI", "ICEM", "MPC", "CEM", "TorchRLMPPI", "ActionFlowPolicy", "CFMLoss")
 SLOW_TO_COMPILE += ("OnlineUpdater", "RLSUpdater", "StreamXUpdater", "UnmatchedUpdater")
 COMPILED_SMALLER = {  # what is compiled is the updater: a model in closed form has fewer operations
     "RLSUpdater": Case(
@@ -204,7 +203,6 @@ COMPILED_SMALLER = {  # what is compiled is the updater: a model in closed form 
 COMPILED = [
     pytest.param(name, marks=[pytest.mark.slow] if name in SLOW_TO_COMPILE else [])
     for name in MODULES
-    if name not in THEIRS  # that is TorchRL's affair, and takes a minute
 ]
 
 
@@ -232,7 +230,7 @@ def compiled_case(request):
     return case_of(request.param, MODULES | COMPILED_SMALLER)
 
 
-@pytest.fixture(params=[name for name in MODULES if name not in THEIRS])
+@pytest.fixture(params=MODULES)
 def movable_case(request):
     """The name of each module whose results do not depend on the device, and the module."""
     return request.param, case_of(request.param)

@@ -7,40 +7,49 @@ import pickle
 import gymnasium
 import pytest
 import torch
-from tensordict.nn import NormalParamExtractor, TensorDictModule
+from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, GymWrapper, ParallelEnv, TransformedEnv, VecGymEnvTransform
+from torchrl.envs import (
+    Compose,
+    GymEnv,
+    GymWrapper,
+    ParallelEnv,
+    TransformedEnv,
+    VecGymEnvTransform,
+)
 from torchrl.envs.utils import step_mdp
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss, SACLoss
 from torchrl.objectives.value import GAE
 
 from afm_rl.correction import LeastSquares
-from afm_rl.dynamics import Dubins
+from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam, Updater
 from afm_rl.planning import ICEM, MPPI, GoalDistance, PlanningEnv
 from afm_rl.regimes import Schedule
-from afm_rl.transforms import ActionFlowTransform
+from afm_rl.spaces.manifold import Manifold
+from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
 
 REVERSED = {"schedule": Schedule([]), "missions": {"regime": {"v_gain": -1.0}}}
 
 
-def afm(box, model=None):
-    return ActionFlowTransform(model or Dubins(), LeastSquares(*box))
+def afm(box, model=None, carry_memory=False):
+    return ActionFlowTransform(model or Dubins(), LeastSquares(*box), carry_memory=carry_memory)
 
 
-def car(box, *more, batch=(), model=None, **settings):
+def car(box, *more, batch=(), model=None, carry_memory=False, **settings):
     base = UGVTrack(batch_size=batch, process_noise=0.0, **{**REVERSED, **settings})
-    return TransformedEnv(base, Compose(afm(box, model), *more))
+    return TransformedEnv(base, Compose(afm(box, model, carry_memory), *more))
 
 
 @pytest.mark.parametrize("kind", [MPPI, ICEM])
 def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind, remembered):
     planner = kind(PlanningEnv(Dubins(), GoalDistance(), *box), horizon=3, population=20)
-    env = car(box, planner.make_tensordict_primer(), batch=(2,), max_steps=5)
+    primer = planner.make_tensordict_primer()
+    env = car(box, primer, batch=(2,), max_steps=5, carry_memory=True)
     collector = Collector(env, planner, frames_per_batch=12, total_frames=12)
     (data,) = list(collector)
     collector.shutdown()
@@ -55,8 +64,48 @@ def test_a_collector_fills_a_buffer_with_plans_and_what_was_executed(box, kind, 
     assert not past["valid"][:, 5].any()  # a new episode, a new memory
 
 
+CHEETAH = KnownDynamics(lambda s, a: s + 0.05 * torch.cat([s[..., :11], a], -1), Manifold(17), 6)
+
+
+def collected(env, policy=None):
+    collector = Collector(env, policy, frames_per_batch=20, total_frames=20)
+    (data,) = list(collector)
+    collector.shutdown()
+    return data
+
+
+def corrected(env):
+    """Collect from a policy that corrects itself."""
+    policy = ActionFlowPolicy(CHEETAH, env.action_spec)
+    whole = TransformedEnv(env.base_env, policy.make_tensordict_primer())
+    planner = TensorDictModule(lambda s: s[..., :6].float(), ["observation"], ["action"])
+    return collected(whole, TensorDictSequential(planner, policy))
+
+
+SOURCES = {
+    "collector": (collected, False),
+    "rollout": (lambda env: env.rollout(20), False),
+    "rollout that goes on": (lambda env: env.rollout(20, break_when_any_done=False), False),
+    "policy": (corrected, False),
+    "carried": (collected, True),
+}
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_memories_are_no_part_of_replay_data_unless_they_are_carried(source):
+    """On HalfCheetah, whose states are in double precision."""
+    pytest.importorskip("mujoco")
+    collect, carry = SOURCES[source]
+    transform = ActionFlowTransform(CHEETAH, carry_memory=carry)
+    data = collect(TransformedEnv(GymEnv("HalfCheetah-v5"), transform))
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20))
+    buffer.extend(data)
+    size = sum(value.nbytes for value in buffer[:].values(True, True)) / 20  # bytes
+    assert size > 40_000 if carry else size <= 1500
+
+
 def test_terminal_states_reach_the_memory_and_resets_do_not(box, remembered):
-    env = car(box, batch=(2,), max_steps=3)
+    env = car(box, batch=(2,), max_steps=3, carry_memory=True)
     td, corrector = env.reset(), env.transform[0].corrector
     for step in range(7):
         td = env.rand_action(td)
@@ -102,7 +151,7 @@ def test_a_compiled_environment_steps_alike(box):
     env = TransformedEnv(base, Compose(afm(box)))
     start = env.rollout(3)[:, -1]
     td = step_mdp(start).set("action", torch.full((3, 2), 0.4))
-    expected = env.step(td.clone())
+    expected = copy.deepcopy(env).step(td.clone())
     torch._dynamo.reset()
     transform = env.transform[0]
     compiled = torch.compile(transform._inv_call, backend="eager")

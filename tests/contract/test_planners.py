@@ -1,18 +1,34 @@
 """Planners are policies for any batch-unlocked environment."""
 
+import math
+import warnings
+
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
+from torchrl.modules import CEMPlanner, MPPIPlanner
+from torchrl.objectives.value import TDLambdaEstimator
 
-from afm_rl.dynamics import Dubins
+from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import CEM, ICEM, MPC, MPPI, GoalDistance, PlanningEnv, TorchRLMPPI
+from afm_rl.planning import (
+    CEM,
+    ICEM,
+    MPC,
+    MPPI,
+    GoalDistance,
+    KnownReward,
+    PlanningEnv,
+    TorchRLMPPI,
+)
+from afm_rl.spaces.manifold import Manifold
 
-OURS = [MPPI, ICEM]
-ALL = [*OURS, CEM, TorchRLMPPI]
+MEMORIES = {MPPI: ("mppi", "mean"), ICEM: ("icem", "mean")}
+ALL = [*MEMORIES, CEM, TorchRLMPPI]
 SETTINGS = {"horizon": 6, "population": 200, "iterations": 3}
 
 
@@ -44,12 +60,13 @@ class Slider(EnvBase):
         pass
 
 
-@pytest.mark.parametrize("kind", OURS)
+@pytest.mark.parametrize("kind", ALL)
 @pytest.mark.parametrize("batch", [(), (3,)])
 def test_an_environment_with_keys_of_its_own(kind, batch):
     env = Slider()
     check_env_specs(env)
-    more = {"memory_key": ["my", "plan"]} if kind is ICEM else {"mean_key": ["my", "plan"]}
+    more = {MPPI: "mean_key", ICEM: "memory_key"}
+    more = {more[kind]: ["my", "plan"]} if kind in more else {}
     planner = kind(env, **SETTINGS, action_key=["robot", "push"], **more)
     assert planner.backend == "env" and planner.out_keys[0] == ("robot", "push")
     whole = TransformedEnv(env, planner.make_tensordict_primer())
@@ -59,10 +76,103 @@ def test_an_environment_with_keys_of_its_own(kind, batch):
     torch.testing.assert_close(td["robot", "place"], torch.ones(*batch, 1), rtol=0, atol=0.1)
 
 
+class Cliff(PlanningEnv):
+    """A point on a line that shall go far to the right: beyond 0.5 nothing is finite."""
+
+    def __init__(self, beyond=math.nan):
+        def reward(state, action, after):
+            return torch.where(after[..., 0] > 0.5, beyond, after[..., 0])
+
+        push = KnownDynamics(lambda state, action: state + action, Manifold(1), 1)
+        super().__init__(push, KnownReward(reward), [-1.0], [1.0])
+
+    def start(self, planner, count):
+        td = TensorDict({"observation": torch.zeros(count, 1)}, [count])
+        return planner.make_tensordict_primer()(td)
+
+
+@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize("backend", ["fast", "env"])
+@pytest.mark.parametrize("beyond", [math.nan, math.inf, -math.inf])
+def test_nobody_steps_to_where_returns_are_not_finite(kind, backend, beyond):
+    world = Cliff(beyond)
+    elites = {} if kind is MPPI else {"elites": 8}
+    planner = kind(world, horizon=3, population=200, backend=backend, **elites)
+    action = planner(world.start(planner, 30))["action"]
+    assert action.isfinite().all() and (action <= 0.5).all()
+    assert action.mean() > 0.1 and planner.discarded > 0
+
+
+@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize(
+    ("lost", "fault"), [(0, 0.0), (1, math.inf), (16, math.nan), (31, -math.inf), (32, math.nan)]
+)
+def test_returns_that_are_not_finite_are_ignored(box, kind, lost, fault):
+    def plan(lost):
+        world = PlanningEnv(Dubins(), GoalDistance(), *box)
+        planner, real = kind(world, horizon=5, population=32, iterations=1), world.returns
+
+        def faulty(*given):
+            returns = real(*given)
+            returns[1, :lost] = fault
+            return returns
+
+        world.returns = faulty
+        return planner, planner(td.clone())
+
+    td = TensorDict({"observation": torch.zeros(2, 3), "goal": torch.ones(2, 2)}, [2])
+    if kind in MEMORIES:
+        td[MEMORIES[kind]] = 0.1 * torch.randn(2, 5, 2)
+    td["icem", "elites"] = 0.1 * torch.randn(2, 3, 5, 2)
+    _, sound = plan(0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        planner, out = plan(lost)
+    assert planner.discarded == lost
+    assert all(entry.isfinite().all() for entry in out.values(True, True))
+    torch.testing.assert_close(out["action"][0], sound["action"][0])  # it notices nothing
+    if lost == 0:
+        assert torch.equal(out["action"], sound["action"])
+    told = [str(warning.message) for warning in caught]
+    if lost < 32:
+        assert told == []
+        return
+    assert told == ["planner: no finite return for 1 of 2 plans; the previous plan stands"]
+    for key in planner.memory:
+        before, after = td[key][1], out["next", key][1]
+        assert torch.equal(torch.cat([before[..., 1:, :], before[..., -1:, :]], -2), after)
+    if kind not in MEMORIES:
+        assert (out["action"][1] == 0).all()
+
+
+@pytest.mark.parametrize("kind", ALL)
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+@pytest.mark.parametrize("shift", [0.0, 1e6])
+def test_any_scale_of_the_cost_gives_an_action_in_the_box(kind, scale, shift):
+    world = Cliff()
+    real, world.returns = world.returns, lambda *given: scale * real(*given) - shift
+    planner = kind(world, horizon=3, population=40)
+    action = planner(world.start(planner, 8))["action"]
+    assert (action.abs() <= 1).all()
+
+
 @pytest.mark.parametrize("kind", [CEM, TorchRLMPPI])
-def test_torchrls_own_refuse_other_keys(kind):
-    with pytest.raises(ConfigurationError, match=r"write 'action', but Slider reads .*'push'"):
-        kind(Slider())
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_torchrls_rules_give_the_plans_of_torchrls_planners(box, kind, batch):
+    world = PlanningEnv(Dubins(), GoalDistance(), *box)
+    td = TensorDict({"observation": torch.randn(*batch, 3), "goal": torch.ones(*batch, 2)}, batch)
+    if kind is CEM:
+        theirs = CEMPlanner(world, 4, 3, 60, 8)
+    else:
+        none = TensorDictModule(lambda x: torch.zeros_like(x[..., :1]), ["goal"], ["state_value"])
+        value = TDLambdaEstimator(gamma=1.0, lmbda=1.0, value_network=none)
+        theirs = MPPIPlanner(world, value, 2.0, 4, 3, 60, 8)
+    ours = kind(world, 4, 60, 3, 8, **({"temperature": 2.0} if kind is TorchRLMPPI else {}))
+    ours._noise = lambda td, like, count: torch.randn(*batch, count, *like.shape[-2:])
+    torch.manual_seed(0)
+    expected = theirs(td.clone())["action"]
+    torch.manual_seed(0)
+    torch.testing.assert_close(ours(td)["action"], expected)
 
 
 @pytest.mark.parametrize("kind", ALL)
@@ -79,17 +189,12 @@ def test_any_exploration_type_gives_an_action_in_the_box(box, kind, explore):
     world = PlanningEnv(Dubins(), GoalDistance(), *box)
     planner = kind(world, horizon=3, population=60)
     with set_exploration_type(explore):
-        data = (
-            world.rollout(2, planner)
-            if kind in ALL[2:]
-            else _primed(world, planner).rollout(2, planner)
-        )
+        data = _primed(world, planner).rollout(2, planner)
     assert ((data["action"] >= box[0]) & (data["action"] <= box[1])).all()
 
 
 def _primed(world, planner):
-    keeps = hasattr(planner, "make_tensordict_primer")
-    return TransformedEnv(world, planner.make_tensordict_primer()) if keeps else world
+    return TransformedEnv(world, planner.make_tensordict_primer())
 
 
 def test_mppi_gives_its_mean_whatever_the_exploration_type(box):

@@ -5,7 +5,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afm_rl.correction.achievable import MODES, ROUNDS, TOLERANCE, attainable, intend, saturate
+from afm_rl.correction.achievable import (
+    MODES,
+    ROUNDS,
+    TOLERANCE,
+    attainable,
+    extend,
+    intend,
+    saturate,
+)
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 
@@ -43,6 +51,22 @@ def test_of_a_plan_the_part_is_asked_for_that_can_be_had(mode, share):
     high = torch.tensor([[2.0, 2.0], [0.9, 2.0], [0.9, 2.0], [-0.1, 2.0]])  # it cannot go there
     expected = torch.tensor(share).unsqueeze(-1) * unit
     torch.testing.assert_close(attainable(unit, low, high, mode), expected)
+
+
+def test_where_nothing_can_be_had_the_others_are_no_slower():
+    unit, high = torch.tensor([0.8, 0.5]), torch.tensor([0.4, 0.01])
+    torch.testing.assert_close(attainable(unit, -high, high, "direction"), 0.5 * unit)
+
+
+@pytest.mark.parametrize(
+    ("share", "tried", "bound"),
+    [(0.25, 2.0, 1.0), (0.25, 0.1, 0.25), (0.02, 2.0, 0.02), (0.35, 2.0, 0.35)],
+    ids=["little", "hardly tried", "nothing", "enough"],
+)
+def test_plans_get_all_of_the_box_where_little_of_it_is_known_to_be_had(share, tried, bound):
+    box = torch.tensor([[-1.0], [1.0]])
+    found = extend(share * box, box, torch.tensor([tried]))
+    torch.testing.assert_close(found, bound * box)
 
 
 @pytest.fixture

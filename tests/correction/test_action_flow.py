@@ -1,5 +1,6 @@
 """The action flow, whatever its weights."""
 
+import math
 import os
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
 from afm_rl.correction.achievable import MODES
+from afm_rl.correction.belief import Belief
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.tick import points_of, probes_of
 from afm_rl.correction.training import train_flow
@@ -38,6 +40,93 @@ def test_an_aligned_robot_is_left_alone_to_the_bit(line, drive, plans, size, bat
     executed, predicted, spread, _, innovation, misaligned, _ = found
     assert torch.equal(executed, planned) and torch.equal(predicted, planned)
     assert not misaligned.any() and not spread.any() and (innovation < 5).all()
+
+
+@pytest.mark.parametrize(
+    ("reached", "corrected", "pair"),
+    [
+        (0.3005, 0.0, (0.3, 0.3, 1.0)),  # half a standard deviation needs no explanation
+        (0.3005, 1.0, (0.3, 0.3005, 1.0)),  # but where actions are corrected all is looked at
+        (50.0, 0.0, (0.3, 4.0, 1.0)),  # as far as effects carry news
+        (math.nan, 0.0, (0.3, 0.0, 0.0)),  # what was sent is known
+    ],
+)
+def test_a_transition_becomes_a_pair(line, reached, corrected, pair):
+    flow, model = flow_of(1), line(1, noise_std=1e-3)
+    sent = torch.tensor([0.3])
+    memory = flow.executing(flow.begin(torch.zeros(1)), sent, sent)
+    memory = flow.observe(memory, torch.tensor([reached]))
+    memory = flow.pack({**flow.unpack(memory, 1), "misaligned": torch.tensor([corrected])})
+    newest = flow.look(memory, model)["pairs"][-1]
+    torch.testing.assert_close(newest[[0, 1, 3]], torch.tensor(pair), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [
+        (0.5, [5.0, 0.1, 9.0], [5.0, 4.0, 9.0]),  # one that foresaw a surprise leads by the odds
+        (2.0, [5.0, 0.1, 9.0], [5.0, 0.1, 9.0]),  # it was one before
+        (0.5, [0.9, 0.1, 40.0], [0.9, 0.1, 16.9]),  # a change may come: none falls far behind
+    ],
+)
+def test_until_a_change_is_known_models_are_held_together(before, after, expected):
+    flow = flow_of(1, odds=1.0, most_odds=16.0)
+    losses = torch.tensor([before, 0.0, 0.0]).unsqueeze(-1), torch.tensor(after).unsqueeze(-1)
+    torch.testing.assert_close(flow.surprised(*losses).squeeze(-1), torch.tensor(expected))
+
+
+def test_a_model_falls_behind_only_while_an_axis_is_in_doubt():
+    losses = torch.tensor([[0.5, 5.0], [40.0, 0.1]])
+    assert torch.equal(flow_of(2).surprised(losses, losses), losses)
+
+
+@pytest.mark.parametrize(("largest", "floor"), [(0.1, 0.005), (0.5, 0.01), (3.0, 0.02)])
+def test_the_least_noise_is_a_share_of_the_largest_command(largest, floor):
+    flow = flow_of(1, least_noise=0.02, least_command=0.25)
+    parts = flow.unpack(flow.begin(torch.zeros(1)), 1)
+    parts["pairs"][3, 0] = -largest
+    torch.testing.assert_close(flow.floor(parts), torch.tensor([floor]))
+
+
+def test_while_nothing_has_changed_only_a_delay_that_is_believed_keeps_its_losses():
+    flow = flow_of(1)
+    parts = flow.unpack(flow.begin(torch.zeros(1)), 1)
+    parts["losses"] = torch.linspace(0.5, 2.0, len(flow.models)).flip(0).unsqueeze(-1)
+    parts["losses"][0] = 1.0
+    for late, keeps in ((0, flow.delays < -1), (2, (flow.delays == 2) | (flow.delays < 0))):
+        parts["late"] = torch.tensor([float(late)])
+        losses = flow.asleep(parts, torch.zeros(1))["losses"]
+        kept = torch.where(keeps.unsqueeze(-1), parts["losses"], parts["losses"].clamp_max(1.0))
+        assert torch.equal(losses, kept)
+
+
+@pytest.mark.parametrize("delay", [0, 2])
+def test_what_actuators_gave_of_what_acts_now_is_foreseen(delay):
+    low, high = torch.tensor([-2.0, -1.0]), torch.tensor([2.0, 4.0])
+    flow = ActionFlow(low, high, network=AxisNetwork(width=16, latent=8), delay=delay)
+    memory, sent = flow.begin(torch.zeros(3)), torch.tensor([1.0, 2.0])
+    for _ in range(delay + 1):
+        memory = flow.observe(flow.executing(memory, sent, sent), torch.randn(3))
+    memory = flow.executing(memory, sent, sent)
+    before, after = (
+        flow.unpack(m, 3) for m in (memory, flow.reported(memory, torch.tensor([0.5, 4.0])))
+    )
+    moved = after["forecasts"] - before["forecasts"]
+    torch.testing.assert_close(moved, torch.tensor([-0.25, 0.5]).expand_as(moved))
+
+
+def test_models_that_take_a_new_delay_begin_as_good_as_the_best_that_had_it():
+    flow = flow_of(1)
+    losses = torch.arange(float(len(flow.models))).unsqueeze(-1)
+    weights = torch.full_like(losses, 1e-6)
+    weights[flow.models.index("delay_3")] = 1.0
+    belief = Belief(losses, losses, torch.ones(1))
+    late, found = flow.delayed(belief, weights, torch.tensor(0))
+    best = losses[flow.delays == 3].min()
+    assert late == 3 and (found[flow.delays < 0] == best).all()
+    assert torch.equal(found[flow.delays >= 0], losses[flow.delays >= 0])
+    late, found = flow.delayed(belief, weights, torch.tensor(3))
+    assert late == 3 and torch.equal(found, losses)
 
 
 @pytest.mark.parametrize("size", SIZES)

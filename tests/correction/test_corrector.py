@@ -7,10 +7,12 @@ import torch
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
 from afm_rl.correction.base import Correction, Corrector
+from afm_rl.correction.late import arrival
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.dynamics import Dubins
+from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.faults import PATIENCE
+from afm_rl.spaces.manifold import Manifold
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 
@@ -18,8 +20,8 @@ LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 class Watching(Corrector):
     """Keeps three transitions, and corrects nothing."""
 
-    def __init__(self, low=LOW, high=HIGH):
-        super().__init__(low, high, recent=3)
+    def __init__(self, low=LOW, high=HIGH, delay=0):
+        super().__init__(low, high, recent=3, delay=delay)
 
     def correct(self, memory, planned, model, box):
         return self.executing(memory, planned, planned), self.unchanged(
@@ -100,6 +102,23 @@ def test_a_mission_begins_with_its_state_and_nothing_else(corrector, batch):
     noise = parts.pop("noise", None)
     assert noise is None or (noise == corrector.noise).all()
     assert not any(part.any() for name, part in parts.items() if name != "state")
+
+
+def test_before_the_first_action_the_one_nearest_to_zero_was_sent():
+    low, high = torch.tensor([0.5, -3.0, -1.0, 0.0]), torch.tensor([2.0, -1.5, 1.0, 4.0])
+    corrector = Watching(low, high, delay=2)
+    sent = corrector.unpack(corrector.begin(torch.zeros(3, 1)), 1)["sent"]
+    assert torch.equal(sent, torch.tensor([0.5, -1.5, 0.0, 0.0]).expand(3, 2, 4))
+
+
+def test_arrival_is_the_state_after_the_commands_under_way_or_the_present_one():
+    model = KnownDynamics(lambda state, action: state + 1 / action, Manifold(1), 1)
+    corrector = Watching(-torch.ones(1), torch.ones(1), delay=2)
+    memory = corrector.begin(torch.tensor([[5.0], [6.0]]))
+    sent = torch.tensor([[[0.5], [0.25]], [[1.0], [0.0]]])  # the second leads to no number
+    memory = corrector.pack({**corrector.unpack(memory, 1), "sent": sent})
+    state, steps = arrival(corrector, memory, model)
+    assert state.tolist() == [[11.0], [6.0]] and steps.tolist() == [2, 0]
 
 
 def test_another_action_can_be_noted(corrector):

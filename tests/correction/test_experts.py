@@ -71,6 +71,14 @@ def test_actions_are_exact_where_a_fit_can_express_them(example):
         torch.testing.assert_close(regime(found[:, k]), planned, rtol=0.03, atol=0.05)
 
 
+def test_nearness_counts_no_more_than_one_pair():
+    executed = torch.tensor([[0.5], [0.5], [0.5], [-0.5]])
+    experts = fit_experts(rows_of(executed, executed))
+    found = answers(experts.effect(torch.tensor([[[0.5], [0.5 + NEAR], [3.0]]])))[:, NEAREST + 1, 0]
+    at, beside = found[:2].tolist()
+    assert at == 1.0 and 0.5 < beside < 1.0 and found[2] < 1e-6
+
+
 def test_each_explains_what_it_can_express(example):
     _, experts, exact = example
     misses = experts.misses[0, :, 0].mean(0)

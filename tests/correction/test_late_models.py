@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from afm_rl.correction.late import aligned, delay_tables, steps_late
+from afm_rl.correction.late import ago, aligned, delay_tables, steps_late
 from afm_rl.correction.least_squares import fit_gain
 
 
@@ -16,6 +16,13 @@ def test_a_command_joins_the_effect_that_came_later(late):
     assert torch.equal(still, pairs[0])
     assert found[late:, 0].tolist() == list(range(6 - late)) and found[:, 3].sum() == 6 - late
     assert torch.equal(found[:, 1], pairs[1, :, 1])
+
+
+def test_the_command_that_acts_is_so_many_steps_older_than_the_newest():
+    commands = torch.arange(24.0).view(3, 4, 2)  # of four steps, the newest last
+    found = ago(commands, torch.tensor([0, 1, 3]))
+    assert torch.equal(found, torch.stack([commands[0, 3], commands[1, 2], commands[2, 0]]))
+    assert torch.equal(ago(commands[0], torch.tensor(2)), commands[0, 1])
 
 
 def test_gains_of_late_commands_are_found():
@@ -52,6 +59,25 @@ def test_the_delay_is_that_of_the_models_that_are_believed(believed, before, lat
     assert steps_late(weights, torch.tensor(before), *TABLES) == late
     batch = steps_late(weights.expand(3, 5, 2), torch.full((3,), before), *TABLES)
     assert batch.tolist() == [late] * 3
+
+
+@pytest.mark.parametrize("share", [0.2, 0.6])
+def test_nothing_has_changed_counts_what_it_is_worth_and_no_more_than_the_others(share):
+    other = (1 - share) / 2
+    told, first = delay_tables(torch.tensor([0, -1, 1]), torch.tensor([share, other, other]).log())
+    counts = min(share, other)
+    now, late = counts + other, other  # the second model takes any delay, at first none
+    expected = torch.tensor([[counts / share / now, 1 / now, 0.0], [0.0, 0.0, 1 / late]])
+    torch.testing.assert_close(told[0], expected)
+    torch.testing.assert_close(first[0].exp(), torch.tensor([now, late]) / (now + late))
+
+
+def test_no_axis_decides_alone_however_sure_it_is():
+    sure = torch.tensor([1e-12, 1e-12, 1.0, 1e-12, 1e-12])
+    others = torch.tensor([0.005, 0.005, 0.005, 0.98, 0.005])
+    weights = torch.stack([sure, others, others], -1)
+    assert steps_late(weights[:, :2], torch.tensor(0), *TABLES) == 1
+    assert steps_late(weights, torch.tensor(0), *TABLES) == 2
 
 
 def test_one_delay_is_found_from_the_evidence_of_all_axes():

@@ -1,10 +1,13 @@
-"""Linear models that mix axes."""
+"""Linear models, against the solutions of least squares."""
 
+import math
+
+import numpy as np
 import pytest
 import torch
 
 from afm_rl.correction.hypotheses import HYPOTHESES
-from afm_rl.correction.linear import fit_lines
+from afm_rl.correction.linear import fit_lines, invert_affine, sensor_noise, within_rate
 
 LINEAR = [row.name for row in HYPOTHESES if row.kind == "linear"]
 DRIVEN, AFFINE = LINEAR.index("driven"), LINEAR.index("affine")
@@ -44,3 +47,78 @@ def test_what_no_single_command_explains_is_left_to_the_affine_map():
 def test_of_three_rows_nothing_is_said_to_be_swapped():
     matrix = fitted(swapped, rows=3)
     assert torch.equal(matrix[DRIVEN], matrix[AFFINE])
+
+
+def test_an_axis_is_driven_by_its_own_command_if_that_explains_it():
+    sent = 2 * torch.rand(1, 9, 1, generator=torch.Generator().manual_seed(0)) - 1
+    lines = fit_lines(*[sent.expand(1, 9, 2)] * 3, torch.ones(1, 9, 2))  # both commands are alike
+    assert torch.equal(lines.matrix[0, DRIVEN], lines.matrix[0, AFFINE])
+
+
+def solved(columns, effects):
+    return np.linalg.lstsq(np.stack(columns, -1), effects, rcond=None)[0]
+
+
+def test_every_line_is_the_least_squares_solution_of_its_rows():
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, 20)
+    v = 0.3 - 0.8 * u + 0.05 * rng.normal(size=20)
+    sent, came = (torch.tensor(x, dtype=torch.float32).view(1, 20, 1) for x in (u, v))
+    matrix, bias = fit_lines(sent, sent, came, torch.ones(1, 20, 1))
+    found = {row: (matrix[0, k, 0, 0], bias[0, k, 0]) for k, row in enumerate(LINEAR)}
+    one = np.ones(20)
+    gain_12 = solved([u[-12:]], v[-12:])[0]
+    b, c, a, d = solved([u[1:], u[:-1], v[:-1], one[1:]], v[1:])
+    wanted = {
+        "reversed": (-1.0, 0.0),
+        "offset_1": (1.0, (v - u)[-1]),
+        "offset_3": (1.0, (v - u)[-3:].mean()),
+        "gain_3": (solved([u[-3:]], v[-3:])[0], 0.0),
+        "gain": (solved([u], v)[0], 0.0),
+        "line_12": solved([u[-12:], one[-12:]], v[-12:]),
+        "line": solved([u, one], v),
+        "drift": (gain_12, v[-1] - gain_12 * u[-1]),
+        "arx": (b, c * u[-1] + a * v[-1] + d),
+        "affine": solved([u, one], v),
+    }
+    assert {*wanted, "driven"} == set(LINEAR)
+    for name, (gain, offset) in wanted.items():
+        assert float(found[name][0]) == pytest.approx(gain, abs=0.03), name
+        assert float(found[name][1]) == pytest.approx(offset, abs=0.03), name
+
+
+def test_what_goes_on_is_learned_from_rows_that_follow_each_other():
+    """The robot is pushed at row 7, which is not to be believed; nor is what came after it."""
+    u = 2 * torch.rand(1, 15, 1, generator=torch.Generator().manual_seed(0)) - 1
+    v = u.clone()
+    for k in range(1, 15):
+        v[:, k] = u[:, k] + 0.5 * v[:, k - 1]
+    v[:, 7] = 30.0
+    weight = torch.ones(1, 15, 1)
+    weight[:, 7] = 0.0
+    matrix, bias = fit_lines(u, u, v, weight)
+    arx = LINEAR.index("arx")
+    assert float(matrix[0, arx]) == pytest.approx(1.0, abs=0.01)
+    assert float(bias[0, arx]) == pytest.approx(0.5 * float(v[0, -1]), abs=0.02)
+
+
+def test_a_rate_is_known_from_two_effects_in_a_row():
+    came = torch.tensor([[[0.0], [0.2], [0.3]]])
+    limited = within_rate(came, torch.ones(1, 3, 1)).flatten()
+    torch.testing.assert_close(limited, torch.tensor([0.1, 0.5]))
+    for valid in ([1.0, 0.0, 1.0], [1.0, 1.0, 0.0]):
+        free = within_rate(came, torch.tensor(valid).view(1, 3, 1))
+        assert free.flatten().tolist() == [-math.inf, math.inf]
+
+
+def test_errors_of_readings_are_smoothed_exponentially():
+    missed = torch.tensor([0.3, -0.1, 0.2])
+    valid = torch.tensor([1.0, 0.0, 1.0]).view(1, 3, 1)
+    found = sensor_noise(torch.zeros(1, 3, 1), missed.view(1, 3, 1), valid, keep=0.7)
+    assert float(found) == pytest.approx(-(0.7**3 * 0.3 + 0.7 * 0.2))
+
+
+def test_singular_maps_have_answers_of_moderate_size():
+    almost = torch.tensor([[1.0, 1.0], [1.0, 1.0 + 1e-6]])
+    action = invert_affine(almost, torch.zeros(2, 1), torch.tensor([[1.0], [-1.0]]))
+    assert action.abs().max() < 1

@@ -5,12 +5,19 @@ import os
 import random
 import shutil
 import sqlite3
+import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as arrow
 import pytest
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
+from pyarrow import parquet
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.typesys import Stores, get_typestore
 
 from afm_rl.diagnosis.readers import read_log
 from afm_rl.errors import ConfigurationError
@@ -166,3 +173,134 @@ def test_two_columns_of_one_name_are_refused(tmp_path):
     (tmp_path / "log.csv").write_text(text)
     with pytest.raises(ConfigurationError, match=r"command\.a: two columns of this name"):
         read_log(tmp_path / "log.csv")
+
+
+def lists_of(**lengths):
+    """Write a table whose columns are lists of zeros, of given lengths."""
+
+    def write(path):
+        ends = {name: np.cumsum([0, *sizes]) for name, sizes in lengths.items()}
+        make = arrow.LargeListArray.from_arrays
+        columns = {name: make(end, np.zeros(end[-1])) for name, end in ends.items()}
+        parquet.write_table(arrow.table(columns), path, compression="zstd")
+
+    return write
+
+
+def chunk_of(compression, size=1 << 25):
+    def write(path):
+        with path.open("wb") as file:
+            writer = Writer(file, compression=compression)
+            writer.start()
+            channel = writer.register_channel("/arm", "json", 0)
+            writer.add_message(channel, 0, b'{"u": "' + b"x" * size + b'"}', 0)
+            writer.finish()
+
+    return write
+
+
+def ulog_of(formats, topics=1):
+    """Write a ULog of formats and subscriptions of the first, without data."""
+
+    def write(path):
+        head = b"\x55\x4c\x6f\x67\x01\x12\x35\x01" + bytes(8)
+        parts = [struct.pack("<HB", len(each), ord("F")) + each for each in formats]
+        name = formats[0].partition(b":")[0]
+        for k in range(topics):
+            parts.append(struct.pack("<HBBH", 3 + len(name), ord("A"), 0, k) + name)
+        path.write_bytes(head + b"".join(parts))
+
+    return write
+
+
+def sparse(path):
+    """Write 4 GiB of which most are no bytes on the disk, and no lines."""
+    path.write_text("command.a,response.a\n" + "1,2\n" * 30)
+    os.truncate(path, 1 << 32)
+
+
+def view(path):
+    with sqlite3.connect(path) as file:
+        file.executescript(
+            "create table topics (id); create table messages (id);"
+            "create view schema (schema_version) as with recursive c (x) as "
+            "(select 1 union all select x + 1 from c) select max(x) from c"
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "message"),
+    [
+        ("cell.parquet", lists_of(action=[5_000_000, *[1] * 29]), "action: 166,667 numbers a row"),
+        ("all.parquet", lists_of(action=[400_000] * 30), "action: 400,000 numbers a row: expected"),
+        (
+            "named.parquet",
+            lists_of(**{"command.a": [2000] * 30, "response.a": [2000] * 30}),
+            "command.a: 2,000 numbers a row: expected lists of at most 1,000",
+        ),
+        (
+            "rows.parquet",
+            lists_of(action=[900] * 300, state=[900] * 300),
+            "900 actuators: expected at most 256",
+        ),
+        ("line.csv", sparse, "a line of more than 1,048,576 bytes: expected rows"),
+        ("head.csv", lambda path: path.write_text("c," * 2**19), "a line of more than 1,048,576"),
+        ("names.csv", lambda path: path.write_text("c," * 200_000), "more than 100,000 columns"),
+        ("zstd.mcap", chunk_of(CompressionType.ZSTD), "a chunk unpacks to more than"),
+        ("lz4.mcap", chunk_of(CompressionType.LZ4), "a chunk unpacks to more than"),
+        (
+            "nested.ulg",
+            ulog_of([b"a:b[65535] x;", b"b:c[65535] x;", b"c:float[65535] x;"]),
+            "topics of more than 100,000 fields",
+        ),
+        ("many.ulg", ulog_of([b"a:float[999] x;"], 60_000), "topics of more than 100,000 fields"),
+        ("view.db3", view, "view schema: expected tables alone"),
+    ],
+)
+def test_small_files_that_hold_much(tmp_path, name, write, message):
+    """What a file unpacks to is known, or bounded, before it is unpacked."""
+    write(tmp_path / name)
+    fields = (["a"], ["b"]) if name.endswith(("mcap", "ulg", "db3")) else ()
+    with pytest.raises(ConfigurationError, match=message) as error:
+        read_log(tmp_path / name, *fields)
+    assert str(error.value).isprintable() and str(error.value).startswith(str(tmp_path / name))
+
+
+def test_messages_may_have_many_numbers_of_which_some_are_named(tmp_path):
+    with (tmp_path / "log.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/arm", "json", 0)
+        data = json.dumps({f"k{k}": k for k in range(3000)}).encode()
+        for k in range(30):
+            writer.add_message(channel, 10**7 * k, data, 10**7 * k)
+        writer.finish()
+    log = read_log(tmp_path / "log.mcap", ["/arm.k999"], ["/arm.k998"])
+    assert log.command.tolist() == [[999.0]] * 30
+    with pytest.raises(ConfigurationError, match="/arm.k1000: there is no such name"):
+        read_log(tmp_path / "log.mcap", ["/arm.k1000"], ["/arm.k998"])
+
+
+def test_memory_is_bounded_where_nothing_else_is(tmp_path):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    text = store.types["std_msgs/msg/String"]("x" * (1 << 27))
+    writer = BagWriter(tmp_path / "log.bag")
+    writer.set_compression(BagWriter.CompressionFormat.BZ2)
+    with writer:
+        connection = writer.add_connection("/a", "std_msgs/msg/String", typestore=store)
+        writer.write(connection, 0, store.serialize_ros1(text, "std_msgs/msg/String"))
+    code = """
+import resource, sys
+from pathlib import Path
+from afm_rl.diagnosis.readers import bounded_memory, read_log
+before = resource.getrlimit(resource.RLIMIT_DATA)
+try:
+    with bounded_memory(Path(sys.argv[1]), least=1 << 26):
+        read_log(sys.argv[1], ["a"], ["b"])
+except ValueError as error:
+    print(error)
+assert resource.getrlimit(resource.RLIMIT_DATA) == before
+"""
+    done = subprocess.run([sys.executable, "-c", code, tmp_path / "log.bag"], capture_output=True)
+    said = f"{tmp_path}/log.bag: not enough memory; log less at a time\n"
+    assert (done.stdout.decode(), done.returncode) == (said, 0), done.stderr

@@ -108,13 +108,12 @@ def test_a_response_that_is_held_between_messages_counts():
 
 def test_each_row_of_the_file_has_a_row(tmp_path):
     table = replay(make(rows=40)).rows()
-    assert list(table) == ["t", *(f"{n}.{k}" for n in ("arm", "hand") for k in COLUMNS)]
-    table = table.rename(columns=lambda name: ".".join(reversed(name.split("."))))
+    assert list(table) == ["t", *(f"{k}.{n}" for n in ("arm", "hand") for k in COLUMNS)]
     kept = table[["t", "command.arm", "response.arm"]].copy()
     kept.loc[[5, 38, 39], "response.arm"] = np.nan
     kept.to_csv(tmp_path / "log.csv", index=False)
     rows = replay(read_log(tmp_path / "log.csv")).rows()
-    assert len(rows) == 40 and rows["arm.afm"].isna().to_numpy().nonzero()[0].tolist() == [
+    assert len(rows) == 40 and rows["afm.arm"].isna().to_numpy().nonzero()[0].tolist() == [
         5,
         38,
         39,
@@ -122,6 +121,16 @@ def test_each_row_of_the_file_has_a_row(tmp_path):
 
 
 COLUMNS = ("command", "response", "afm", "std")
+
+
+def test_what_is_written_is_a_log_again(tmp_path):
+    episode = np.arange(90) // 30
+    log = make(rows=90, t=0.1 * (np.arange(90) % 30), episode=episode)
+    replay(log).rows().to_csv(tmp_path / "out.csv", index=False)
+    again = read_log(tmp_path / "out.csv")
+    assert again.names == log.names and again.begins.tolist() == log.begins.tolist()
+    np.testing.assert_allclose(again.command, log.command)
+    np.testing.assert_allclose(again.response, log.response)
 
 
 def test_errors_are_those_of_the_rows(replayed):

@@ -204,3 +204,23 @@ def test_a_row_alone_is_found_as_among_others():
         alone = seen(model, *(part[row] for part in (state, action, reached)))
         for one, many in zip(alone, together, strict=True):
             torch.testing.assert_close(one, many[row], rtol=1e-12, atol=1e-12)
+
+
+def test_a_step_that_makes_it_worse_is_tried_shorter():
+    """From 0.18 the slope of the sine leads too far; a quarter of the step gets over the hill."""
+    model = KnownDynamics(lambda s, a: s + (8 * a).sin(), Manifold(1), 1, noise_std=0.01)
+    sent, wanted = torch.tensor([0.18]), torch.tensor([0.2])
+    found = effective_action(model, torch.zeros(1), sent, wanted, torch.ones(1), rounds=3)
+    assert ((8 * found.action).sin() - wanted).abs() < 0.25
+    assert ((8 * sent).sin() - wanted).abs() > 0.75
+
+
+@pytest.mark.parametrize(("left", "grown"), [(0.5, 1.0), (3.0, 3.0 / math.sqrt(2)), (90.0, None)])
+def test_what_no_action_explains_makes_it_less_sure(left, grown):
+    """The second coordinate is beyond the action's reach."""
+    model = KnownDynamics(lambda s, a: s + torch.cat([a, 0 * a], -1), Manifold(2), 1, noise_std=1.0)
+    seen = torch.tensor([0.5, left])
+    found = effective_action(model, torch.zeros(2), torch.zeros(1), seen, torch.ones(1))
+    exact = (1 + 1 / 16) ** -0.5
+    wanted = 4.0 if grown is None else exact * max(1.0, grown)
+    torch.testing.assert_close(found.std, torch.tensor([wanted]), rtol=0.01, atol=0)

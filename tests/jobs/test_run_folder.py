@@ -74,9 +74,10 @@ def test_results_of_another_version_are_refused(configure, tmp_path, monkeypatch
         needs_run(tmp_path, configure())
 
 
-def test_results_without_a_manifest_are_refused(configure, tmp_path):
-    (tmp_path / "missions.csv").write_text("mine\n")
-    with pytest.raises(ConfigurationError, match="without manifest.json"):
+@pytest.mark.parametrize("name", ["missions.csv", "figures", "video"])
+def test_what_is_not_of_a_run_is_not_replaced(configure, tmp_path, name):
+    (tmp_path / name).mkdir()
+    with pytest.raises(ConfigurationError, match=f"holds {name} without manifest.json"):
         needs_run(tmp_path, configure())
     assert needs_run(tmp_path, configure(), overwrite=True)
 

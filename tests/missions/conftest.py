@@ -7,11 +7,11 @@ from types import SimpleNamespace
 
 import pytest
 from hydra import compose, initialize_config_module
-from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from small import shrink
 
 from afm_rl.missions import build, prepare, run
+from afm_rl.targets import instantiate
 
 SMALL = {"budget": 12, "planner.population": 16, "planner.elites": 4}
 TARGETS = 20  # of the ring
@@ -77,7 +77,7 @@ def drive(make_agent):
 @pytest.fixture
 def robot(configure):
     """The ground robot."""
-    return instantiate(configure().robot, _convert_="all")
+    return instantiate("robot", OmegaConf.to_container(configure().robot, resolve=True))
 
 
 @pytest.fixture

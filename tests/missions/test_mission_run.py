@@ -61,7 +61,7 @@ def test_missions_stand_in_order_tracks_then_regimes_then_seeds(drive, ring):
     assert missions["v_gain"].tolist() == [-1, -1, 0.5, 0.5, 2, 2] * 2
     assert missions["omega_gain"].eq(1).all()
     assert missions["seed"].tolist() == [4, 2] * 6
-    assert missions["method"].eq("unnamed").all()
+    assert missions["method"].eq("physics").all()
     assert run.steps["mission"].tolist() == [mission for mission in range(12) for _ in range(2)]
 
 
@@ -197,4 +197,4 @@ def test_progress_is_shown_if_asked_for(make_agent, spot, capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True)
     run_missions(make_agent(budget=51), progress=True)
     err = capsys.readouterr().err
-    assert "unnamed:" in err and "1 missions ended" in err
+    assert "physics:" in err and "1 missions ended" in err

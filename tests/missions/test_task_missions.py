@@ -92,6 +92,8 @@ def test_the_change_comes_when_the_schedule_says(tmp_path):
     ("overrides", "message"),
     [
         (["robot=gymnasium", "robot.id=Nothing-v0"], "robot.id='Nothing-v0': .*doesn't exist"),
+        (["robot=gymnasium", "robot.id=CartPole-v1"], "CartPole-v1: its action is discrete"),
+        (["robot=gymnasium", "robot.id='this:Pendulum-v1'"], "robot.id='this': only"),
         (["robot=gymnasium", "robot.id=Swimmer-v5"], "robot.id=Swimmer-v5: its reward is not"),
         (["robot=dm_control", "robot.domain=nothing"], "robot.domain=nothing robot.task=hard: "),
         (["robot=dm_control", "robot.task=nothing"], "robot.domain=reacher robot.task=nothing: "),

@@ -1,6 +1,7 @@
 """A planner that searches, and LQR near the goal."""
 
 import math
+import warnings
 from functools import partial
 
 import pytest
@@ -75,6 +76,18 @@ def heavy_as(mass):
 def push_of(planner, batch):
     td = TensorDict({"observation": torch.tensor([0.02, 0.0]).expand(*batch, 2)}, batch)
     return planner(planner.make_tensordict_primer()(td))["action"]
+
+
+def test_where_there_is_no_feedback_the_other_planner_searches_all_the_same():
+    model = heavy_as(1.0)  # with an endless mass nothing lifts it: the equation has no solution
+    planner = planner_of(model, level=5.0)
+    model.expand_(2).set_physics(torch.tensor([[math.inf], [1.0]]))
+    td = TensorDict({"observation": torch.tensor([0.5, 0.0]).expand(2, 2)}, [2])
+    assert not planner.regulator(td["observation"])[1][0].isfinite().all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        action = planner(planner.make_tensordict_primer()(td))["action"]
+    assert action.isfinite().all() and planner.far.discarded == 0
 
 
 def swing_with(state, torque, physics):

@@ -1,8 +1,5 @@
 """The improved cross-entropy method: its noise, its elites, its actions."""
 
-import math
-import warnings
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -164,28 +161,6 @@ def test_an_action_is_held_as_long_as_plans_say(world):
     assert torch.equal(plans[..., ::3, :], plans[..., 2::3, :])
     best = seen[1][1].argmax(-1)
     assert torch.equal(actions[:, 0], seen[1][0][torch.arange(2), best, 0])
-
-
-@pytest.mark.parametrize("lost", [1, 30, 32])
-def test_returns_that_are_not_finite_are_ignored(world, lost):
-    planner, td, real = ICEM(world, **{**SMALL, "iterations": 1}), situation(2), world.returns
-    world.returns = lambda *args: _broken(real(*args), lost)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        out = planner(td.clone())
-    assert planner.discarded == lost and all(v.isfinite().all() for v in out.values(True, True))
-    assert len([w for w in caught if "no finite return for 1 of 2" in str(w.message)]) == (
-        lost == 32
-    )
-    mean, elites = (out["next", "icem", name][1] for name in ("mean", "elites"))
-    for before, after in ((td["icem", "mean"][1], mean), (td["icem", "elites"][1], elites)):
-        shifted = torch.cat([before[..., 1:, :], before[..., -1:, :]], -2)
-        assert torch.equal(shifted, after) == (lost == 32)
-
-
-def _broken(returns, lost):
-    returns[1, :lost] = math.nan
-    return returns
 
 
 def test_it_drives_to_the_goal(world, box):

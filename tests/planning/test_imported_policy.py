@@ -1,8 +1,12 @@
 """Models of Stable-Baselines3 and CleanRL act as in their own libraries; nothing in them runs."""
 
 import io
+import json
 import os
 import pickle
+import re
+import struct
+import tracemalloc
 import zipfile
 
 import gymnasium
@@ -13,6 +17,7 @@ from torch import nn
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.planning import load_policy, policy_from_cleanrl, policy_from_sb3, save_policy
+from afm_rl.storage.torch_files import LARGEST
 
 SEEN = np.random.default_rng(0).uniform(-1, 1, (16, 3)).astype(np.float32) * [1, 1, 8]
 SMALL = {"net_arch": [8, 8]}
@@ -97,21 +102,169 @@ class Bomb:
         return os.mkdir, (self.folder,)
 
 
+WEIGHTS = {
+    "mlp_extractor.policy_net.0.weight": torch.ones(8, 3),
+    "action_net.weight": torch.ones(1, 8),
+}
+BOX = {"low": "[-1.]", "high": "[1.]"}
+
+
+def saved(value, **how):
+    content = io.BytesIO()
+    torch.save(value, content, **how)
+    return content.getvalue()
+
+
+def zipped(members, **how):
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", **how) as archive:
+        for name, member in members.items():
+            archive.writestr(name, member)
+    return content.getvalue()
+
+
+def model(weights=None, **settings):
+    """What Stable-Baselines3 writes, as far as it is read; settings may be text instead."""
+    text = settings.pop("text", json.dumps({"action_space": BOX, **settings}))
+    weights = weights if isinstance(weights, bytes) else saved({**WEIGHTS, **(weights or {})})
+    return {"data": text, "policy.pth": weights}
+
+
+def described(operations):
+    """Weights that the operations of a pickle describe."""
+    return zipped({"archive/data.pkl": b"\x80\x02" + operations, "archive/data/0": bytes(8)})
+
+
+def encrypted(content):
+    """Set the flag of each header of a zip that says so."""
+    content = bytearray(content)
+    for header, flag in ((b"PK\3\4", 6), (b"PK\1\2", 8)):
+        for part in re.finditer(header, content):
+            content[part.start() + flag] |= 1
+    return bytes(content)
+
+
+def contents(megabytes):
+    """A zip that is nothing but its table of contents."""
+    entry = b"PK\1\2" + struct.pack("<6H3I5H2I", *[20, 20, *[0] * 7, 1, *[0] * 6]) + b"a"
+    listed = entry * (megabytes * 2**20 // len(entry))
+    counts = 0, 0, 0xFFFF, 0xFFFF, len(listed), 0, 0
+    return listed + b"PK\5\6" + struct.pack("<4H2IH", *counts)
+
+
+def shrunk(name, members):
+    """A zip in which one member is as many zeros as no model has, in little room."""
+    return zipped({**members, name: bytes(LARGEST + 1)}, compression=8, compresslevel=1)
+
+
+LAST, NAN = "action_net.weight", float("nan")
+NOISY = {"actor.mu.0.weight": torch.ones(1, 3), "actor.log_std": torch.ones(1)}
+PAIRS = b")" + b"q\1h\1\x86" * 100  # a pair of pairs of pairs ...: 2^100 leaves
+STORAGE = b"(X\7\0\0\0storagectorch\nFloatStorage\nX\1\0\0\0%btQ"
+TENSOR = b"}X\1\0\0\0a" + b"ctorch._utils\n_rebuild_tensor_v2\n(" + STORAGE % b"0" + b"K\0%b%btRs."
+HOSTILE = {
+    "deep": lambda: zipped(model(text="[" * 10**6)),
+    "deep and whole": lambda: zipped(model(text="[" * 10**5 + "]" * 10**5)),
+    "a list": lambda: zipped(model(text="[1]")),
+    "a number": lambda: zipped(model(text="1e999")),
+    "settings in a list": lambda: zipped(model(policy_kwargs=[1])),
+    "settings as a number": lambda: zipped(model(policy_kwargs=3)),
+    "actions in a list": lambda: zipped(model(action_space=[1])),
+    "a box of NaN": lambda: zipped(model(action_space={**BOX, "low": "[nan]"})),
+    "a box without end": lambda: zipped(model(NOISY, action_space={**BOX, "low": "[-inf]"})),
+    "a box upside down": lambda: zipped(model(action_space={**BOX, "low": "[2.]"})),
+    "a limit of NaN": lambda: zipped(model(NOISY, policy_kwargs={"clip_mean": NAN})),
+    "a limit in words": lambda: zipped(model(NOISY, policy_kwargs={"clip_mean": "x"})),
+    "an activation": lambda: zipped(model(policy_kwargs={"activation_fn": "activation.Sin"})),
+    "integers": lambda: zipped(model({LAST: torch.ones(1, 8, dtype=torch.int64)})),
+    "one number": lambda: zipped(model({LAST: torch.ones(())})),
+    "a vector": lambda: zipped(model({LAST: torch.ones(8)})),
+    "NaN": lambda: zipped(model({LAST: torch.full((1, 8), NAN)})),
+    "too large": lambda: zipped(model({LAST: torch.full((1, 8), 1e300, dtype=torch.float64)})),
+    "complex": lambda: zipped(model({LAST: torch.ones(1, 8, dtype=torch.complex64)})),
+    "sparse": lambda: zipped(model({LAST: torch.ones(1, 8).to_sparse()})),
+    "a long bias": lambda: zipped(model({"action_net.bias": torch.ones(2)})),
+    "one number repeated": lambda: zipped(model({LAST: torch.ones(1, 1).expand(1, 10**12)})),
+    "no names": lambda: zipped(model(saved([1, 2]))),
+    "no tensors": lambda: zipped(model(saved({LAST: 3}))),
+    "numbers as names": lambda: zipped(model(saved({1: torch.ones(1)}))),
+    "pairs as a name": lambda: zipped(model(described(b"}" + PAIRS + b"K\1s."))),
+    "pairs as a function": lambda: zipped(model(described(PAIRS + b")R."))),
+    "pairs as a storage": lambda: zipped(model(described(PAIRS + b"Q."))),
+    "pairs as a size": lambda: zipped(model(described(TENSOR % (PAIRS, b")")))),
+    "a long text as a size": lambda: zipped(
+        model(described(TENSOR % (b"(J\xff\xff\xff\x7fX\1\0\0\0at", b")")))
+    ),
+    "a size below zero": lambda: zipped(
+        model(described(TENSOR % (b"J\xff\xff\xff\xff\x85", b"K\1\x85")))
+    ),
+    "a stride too long": lambda: zipped(model(described(TENSOR % (b"K\2\x85", b"K\x09\x85")))),
+    "no end": lambda: zipped(model(described(b"}" * 10**6))),
+    "zeros": lambda: shrunk("policy.pth", model()),
+    "zeros in the settings": lambda: shrunk("data", model()),
+    "zeros in a tensor": lambda: zipped(
+        model(shrunk("archive/data/0", {"archive/data.pkl": b"\x80\2" + TENSOR % (b")", b")")}))
+    ),
+    "contents": lambda: contents(64),
+    "encrypted": lambda: encrypted(zipped(model())),
+    "an unusual zip": lambda: zipped(model(), compression=zipfile.ZIP_LZMA),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_whatever_a_file_holds_ends_in_one_line_and_little_memory(name, tmp_path):
+    file = tmp_path / "model.zip"
+    file.write_bytes(HOSTILE[name]())
+    size = file.stat().st_size
+    tracemalloc.start()
+    with pytest.raises((ArtefactError, ConfigurationError)) as refused:
+        policy_from_sb3(file)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    message = str(refused.value)
+    assert message.startswith(f"{file}: ") and "\n" not in message and len(message) < 1000
+    assert most < 2 * size + 10**8
+
+
+@pytest.mark.parametrize("damaged", ["model", "normaliser"])
+def test_600_damaged_files_are_read_or_refused(damaged, tmp_path):
+    moments = {"mean": np.zeros(3), "var": np.ones(3)}
+    contents = {
+        "model": zipped(model()),
+        "normaliser": pickle.dumps({"obs_rms": moments, "epsilon": 1e-8, "clip_obs": 10.0}),
+    }
+    random, sound, read = np.random.default_rng(0), contents[damaged], 0
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+    for number in range(600):
+        content = bytearray(sound)
+        place, length = (int(x) for x in random.integers(0, (len(sound), 9)))
+        if number % 3 == 0:
+            del content[place:]
+        elif number % 3 == 1:
+            content[place : place + length] = random.bytes(length + 1)
+        else:
+            for place in random.integers(0, len(sound), length + 1):
+                content[place] = random.integers(256)
+        (tmp_path / damaged).write_bytes(content)
+        try:
+            policy = policy_from_sb3(*(tmp_path / name for name in contents))
+        except (ArtefactError, ConfigurationError) as error:
+            assert "\n" not in str(error)
+        else:
+            read += policy(torch.ones(3)).isfinite().all()
+    assert 0 < read < 300
+
+
 def test_nothing_in_a_file_runs(tmp_path):
-    bomb, content = Bomb(), io.BytesIO()
+    bomb = Bomb()
     bomb.folder = str(tmp_path / "harm")
-    torch.save({"action_net.weight": bomb}, content)
-    box = {"low": "[-1.]", "high": "[1.]"}
-    with zipfile.ZipFile(tmp_path / "model.zip", "w") as archive:
-        archive.writestr("data", f'{{"action_space": {box}}}'.replace("'", '"'))
-        archive.writestr("policy.pth", content.getvalue())
+    weights = saved({LAST: bomb})
+    (tmp_path / "model.zip").write_bytes(zipped(model(weights)))
     (tmp_path / "seen.pkl").write_bytes(pickle.dumps({"obs_rms": bomb}))
     with pytest.raises(ArtefactError, match="no weights"):
         policy_from_sb3(tmp_path / "model.zip")
-    torch.save({"action_net.weight": torch.ones(1, 3)}, tmp_path / "weights.pth")
-    with zipfile.ZipFile(tmp_path / "sound.zip", "w") as archive:
-        archive.writestr("data", f'{{"action_space": {box}}}'.replace("'", '"'))
-        archive.write(tmp_path / "weights.pth", "policy.pth")
+    (tmp_path / "sound.zip").write_bytes(zipped(model()))
     with pytest.raises(ArtefactError, match="no mean and variance"):
         policy_from_sb3(tmp_path / "sound.zip", tmp_path / "seen.pkl")
     assert policy_from_sb3(tmp_path / "sound.zip").observation_size == 3

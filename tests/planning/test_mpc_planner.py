@@ -199,14 +199,15 @@ def test_missions_with_models_of_their_own_plan_with_them(box, make_ensemble):
 
 @pytest.mark.parametrize("fault", [math.nan, math.inf])
 @pytest.mark.parametrize("cold", [False, True])
-def test_without_a_finite_solution_the_previous_plan_stands(box, fault, cold):
+@pytest.mark.parametrize("where", ["observation", "reference"])
+def test_without_a_finite_solution_the_previous_plan_stands(box, fault, cold, where):
     planner = car(box)
     td = situation(planner, 3)
     if cold:
         td["mpc"].zero_()
     expected = plan(planner, td)
-    td["observation"][1] = fault
-    with pytest.warns(UserWarning, match="no finite solution for 1 of 3 flights"):
+    td[where][1] = fault
+    with pytest.warns(UserWarning, match="no finite solution for 1 of 3 plans"):
         states, actions = plan(planner, td)
     assert planner.discarded == 1
     for found, name, good in zip((states, actions), ("states", "actions"), expected, strict=True):

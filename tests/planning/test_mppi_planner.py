@@ -1,6 +1,5 @@
 """MPPI as a module: what it plans."""
 
-import math
 import warnings
 
 import pytest
@@ -127,44 +126,6 @@ def test_a_cold_planner_takes_the_best_of_its_candidates(world):
     found = plan(planner, situation())
     best = candidates["plans"][candidates["returns"].argmax()]
     torch.testing.assert_close(found, best)
-
-
-@pytest.mark.parametrize(
-    ("lost", "value"), [(0, math.nan), (1, math.inf), (31, -math.inf), (32, math.nan)]
-)
-def test_returns_that_are_not_finite_are_ignored(world, lost, value):
-    planner, td = MPPI(world, **SMALL), situation(2)
-    real, seen = world.returns, {}
-
-    def faulty(state, plans, *task):
-        returns = real(state, plans, *task)
-        returns[1, :lost] = value
-        seen["plans"], seen["returns"] = plans, returns
-        return returns
-
-    world.returns = faulty
-    expected = plan(MPPI(PlanningEnv(world.dynamics, world.cost, *_bounds(world)), **SMALL), td)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        found = plan(planner, td)
-    assert planner.discarded == lost
-    assert found.isfinite().all()
-    torch.testing.assert_close(found[0], expected[0])  # the other mission notices nothing
-    told = [str(warning.message) for warning in caught if "no finite" in str(warning.message)]
-    if lost == 32:
-        assert told == ["planner: no finite return for 1 of 2 plans; the previous plan stands"]
-        mean = td["mppi", "mean"][1]
-        torch.testing.assert_close(found[1], torch.cat([mean[1:], mean[-1:]]))
-    else:
-        assert told == []
-        kept = seen["returns"][1, lost:]
-        weights = ((kept - kept.max()) / planner.temperature).exp()
-        blend = (weights / weights.sum()).view(-1, 1, 1) * seen["plans"][1, lost:]
-        torch.testing.assert_close(found[1], blend.sum(0))
-
-
-def _bounds(world):
-    return world.action_spec.space.low, world.action_spec.space.high
 
 
 def test_a_missing_plan_is_told_once_and_taken_as_zero(world):

@@ -45,3 +45,35 @@ def test_files_that_hold_no_policy_are_refused(tmp_path):
     save_tensors(tmp_path / "other.safetensors", {"a": torch.zeros(1)}, {})
     with pytest.raises(ArtefactError, match="holds no policy"):
         load_policy(tmp_path / "other.safetensors")
+
+
+BOX = {"low": -torch.ones(1), "high": torch.ones(1)}
+SOUND = {"weights.0": torch.ones(1, 3), "biases.0": torch.zeros(1), **BOX}
+
+
+@pytest.mark.parametrize(
+    ("tensors", "form"),
+    [
+        ({}, [1]),
+        ({}, {"colour": "red"}),
+        ({}, {"limit": "far"}),
+        ({}, {"clip": float("nan")}),
+        ({}, {"activation": ["relu"]}),
+        ({"low": None}, {}),
+        ({"biases.0": None}, {}),
+        ({"biases.0": torch.zeros(2)}, {}),
+        ({"weights.0": torch.ones(())}, {}),
+        ({"weights.0": torch.ones(1, 3, dtype=torch.int64)}, {}),
+        ({"weights.0": torch.full((1, 3), 1e300, dtype=torch.float64)}, {}),
+        ({"high": -2 * torch.ones(1)}, {}),
+        ({"normaliser": torch.ones(2, 4)}, {}),
+        ({"normaliser": torch.zeros(2, 3)}, {}),
+    ],
+)
+def test_files_of_others_are_refused_in_one_line(tensors, form, tmp_path):
+    file = tmp_path / "mine.safetensors"
+    held = {name: value for name, value in {**SOUND, **tensors}.items() if value is not None}
+    save_tensors(file, held, {"kind": "policy", "form": form})
+    with pytest.raises((ArtefactError, ConfigurationError)) as refused:
+        load_policy(file)
+    assert "\n" not in str(refused.value)

@@ -1,6 +1,7 @@
 """The page in a real browser: a slider reverses a motor, and one robot of two falls."""
 
 import shutil
+import socket
 import threading
 import time
 import warnings
@@ -66,6 +67,11 @@ def until(holds):
         time.sleep(0.1)
 
 
+def choose(page, preset):
+    page.choice.value = preset
+    page.read()
+
+
 def opened(browser, served, errors):
     """Open the page, and wait until its controls are there."""
     page = browser.new_page(viewport={"width": 900, "height": 600})
@@ -81,7 +87,7 @@ def opened(browser, served, errors):
 @pytest.mark.parametrize("name", ["hopper", "pendulum", "ugv", "quadrotor"])
 def test_robots_are_drawn_and_described(name, page_of):
     page = page_of(name)
-    page.choose("reverse one")
+    choose(page, "reverse one")
     for _ in range(20):
         page.world.step()
     page.draw()
@@ -93,7 +99,7 @@ def test_robots_are_drawn_and_described(name, page_of):
     assert "| alone | AFM |" in page.words.content and "| a recent change |" in page.words.content
     for figure in page.figures.values():
         assert all(abs(number) < 1e3 for number in figure.root.position)
-    page.choose("late by 4")
+    choose(page, "late by 4")
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # what is observed at arrival is known of every robot
         for _ in range(20):
@@ -101,7 +107,7 @@ def test_robots_are_drawn_and_described(name, page_of):
     assert "cannot find" not in text_of(page.world)
     page.world.faults.values["delay"] = 10.0
     assert "cannot find" in text_of(page.world)
-    page.choose("healthy")
+    choose(page, "healthy")
     assert page.world.faults.values["gain_0"] == 1.0
 
 
@@ -122,3 +128,25 @@ def test_a_slider_reverses_a_motor(served, browser):
     page = opened(browser, served, errors)  # another page of the same world
     until(lambda: page.locator(gain).input_value() == "-1" and corrected.steps > steps)
     assert not errors
+
+
+def test_a_link_cannot_let_another_server_into_the_page(served, browser):
+    said = []
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        address = f"ws://127.0.0.1:{other.getsockname()[1]}"
+        page = browser.new_page()
+        page.on("console", lambda message: said.append(message.text))
+        page.goto(f"{served.url}/?websocket={address}")  # which viser would obey
+        end = time.monotonic() + LONG / 1000
+        while not any(address in text for text in said):
+            assert time.monotonic() < end
+            page.wait_for_timeout(100)
+        other.settimeout(2)
+        with pytest.raises(TimeoutError):
+            other.accept()
+    framed = browser.new_page()
+    framed.on("console", lambda message: said.append(message.text))
+    framed.set_content(f"<iframe src='{served.url}'></iframe>")
+    while not any("frame-ancestors" in text for text in said):
+        assert time.monotonic() < end
+        framed.wait_for_timeout(100)

@@ -3,8 +3,10 @@
 import gymnasium
 import numpy as np
 import pytest
+import torch
 
 from afm_rl.cli.play import main
+from afm_rl.planning import StoredPolicy, save_policy
 from afm_rl.play import Actuators, World, make_robot
 from afm_rl.play.world import Faults, presets
 
@@ -74,6 +76,49 @@ def test_presets_are_faults_of_any_robot():
     ],
 )
 def test_mistakes_end_in_one_line(arguments, words, monkeypatch, capsys):
+    ends_in_one_line(arguments, words, monkeypatch, capsys)
+
+
+@pytest.mark.parametrize(
+    ("about", "arguments", "words"),
+    [
+        ({"id": "Pendulum-v1"}, ["--robot", "hopper"], "acts in Pendulum-v1; leave --robot out"),
+        ({"id": "Pendulum-v1"}, ["--robot", "ugv"], "ugv has a controller; leave --policy out"),
+        ({"id": "Pendulum-v1"}, ["--robot", "cart_pole"], "cart_pole has a controller"),
+        ({"id": "Pendulum-v1"}, ["--robot", "dog"], "--robot='dog'"),
+        ({}, [], "id=None: expected a task of gymnasium"),
+        ({"id": "this:Pendulum-v1"}, [], "expected a task"),  # gymnasium would import a module
+        ({"id": ["Pendulum-v1"]}, [], "expected a task"),
+        ({"id": "CartPole-v1"}, [], "neither a task of MuJoCo nor the pendulum"),
+        ({"id": "Hopper-v5"}, [], "a policy of 3 observations and 1 actions; Hopper-v5 has (11,)"),
+        ({"id": "Hopper-v5", "settings": {"xml_file": "x.xml"}}, [], "expected numbers, by name"),
+        ({"id": "Pendulum-v1", "settings": [1]}, [], "expected numbers, by name"),
+        ({"id": "Pendulum-v1", "settings": {"speed": 1}}, [], "Pendulum-v1 cannot be played"),
+    ],
+)
+def test_a_policy_that_does_not_fit_ends_in_one_line(
+    about, arguments, words, tmp_path, monkeypatch, capsys
+):
+    file = stored(tmp_path, about)
+    ends_in_one_line(["--policy", file, *arguments], words, monkeypatch, capsys)
+
+
+def test_a_policy_names_its_robot(tmp_path):
+    file = stored(tmp_path, {"id": "Pendulum-v1", "settings": {"g": 5.0}})
+    for robot in (make_robot(file=file), make_robot("pendulum", file)):
+        assert robot.name == "Pendulum-v1" and robot.make().unwrapped.g == 5.0
+    assert make_robot().name == "half_cheetah" and make_robot("ugv").name == "ugv"
+
+
+def stored(folder, about):
+    """A policy of three observations and one action."""
+    box = torch.ones(1)
+    policy = StoredPolicy([(torch.ones(1, 3), torch.zeros(1))], -box, box)
+    save_policy(folder / "mine.safetensors", policy, about)
+    return str(folder / "mine.safetensors")
+
+
+def ends_in_one_line(arguments, words, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["afm-rl-play", *arguments])
     with pytest.raises(SystemExit) as end:
         main()

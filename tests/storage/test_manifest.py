@@ -1,5 +1,6 @@
 """Damaged results are found, and the damaged file is named."""
 
+import hashlib
 import json
 import os
 import random
@@ -104,9 +105,15 @@ def test_what_is_no_manifest_is_refused(folder, text):
         check_manifest(folder)
 
 
-def test_a_manifest_cannot_name_files_elsewhere(folder):
-    write_manifest(folder / "figures", [folder / "figures" / ".." / "config.yaml"])
-    with pytest.raises(ArtefactError, match="damaged"):
+@pytest.mark.parametrize("where", ["../config.yaml", "absolute"])
+def test_a_manifest_cannot_name_files_elsewhere(folder, where):
+    """Not even one with a right checksum of its own."""
+    name = str(folder / "config.yaml") if where == "absolute" else where
+    content = {"version": "1", "files": {name: "0" * 64}}
+    own = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    text = json.dumps({**content, "sha256": own}, indent=1, sort_keys=True) + "\n"
+    (folder / "figures" / MANIFEST).write_text(text)
+    with pytest.raises(ArtefactError, match="manifest.json: damaged"):
         check_manifest(folder / "figures")
 
 

@@ -6,11 +6,22 @@ import pickle
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, Unbounded
+from torch.utils._pytree import tree_leaves, tree_map
+from torchrl.checkpoint import Checkpoint
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Composite,
+    LazyTensorStorage,
+    TensorDictReplayBuffer,
+    Unbounded,
+)
 from torchrl.envs import (
     Compose,
+    EnvBase,
     ParallelEnv,
     SerialEnv,
+    StepCounter,
     TransformedEnv,
 )
 from torchrl.envs.utils import check_env_specs
@@ -21,7 +32,7 @@ from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning import GoalDistance, PlanningEnv
-from afm_rl.transforms import ActionFlowTransform
+from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform, Guard
 
 
 def transform(**settings):
@@ -49,7 +60,7 @@ def test_either_precision(dtype):
     whole.transform.to(dtype)  # the flow computes in the precision of its weights
     check_env_specs(whole)
     data = whole.rollout(2)["next", "afm"]
-    assert data["memory"].dtype is data["planned_action"].dtype is dtype
+    assert data["observation"].dtype is data["planned_action"].dtype is dtype
 
 
 def test_planning_environment(box):
@@ -90,6 +101,26 @@ def test_without_an_environment():
     assert (transform()(td.clone()) == td).all()
     assert (transform().inv(td.clone()) == td).all()
     assert (Compose(transform(), transform(prefix="b"))(td.clone()) == td).all()
+
+
+def primed():
+    return ActionFlowPolicy(Dubins(), track().action_spec).make_tensordict_primer()
+
+
+TAKEN = {
+    "in a chain": lambda: env(transform()),
+    "unwrapped": lambda: TransformedEnv(env(), transform(), auto_unwrap=True),
+    "nested": lambda: TransformedEnv(env(), transform(), auto_unwrap=False),
+    "around a series": lambda: TransformedEnv(SerialEnv(2, env), transform()),
+    "policy": lambda: env(primed()),
+    "guard": lambda: TransformedEnv(track(), Compose(Guard(), transform(prefix="guard"))),
+}
+
+
+@pytest.mark.parametrize("make", TAKEN.values(), ids=TAKEN)
+def test_two_under_one_prefix_are_refused(make):
+    with pytest.raises(ConfigurationError, match="prefix='(afm|guard)': taken, by"):
+        make().rollout(2)
 
 
 def test_in_a_replay_buffer():
@@ -144,6 +175,104 @@ def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble, small_flo
     assert len(stored) == len(flow.state_dict()) > 0
     assert all("corrector." in name for name in stored)
     assert {id(p) for p in chain.parameters()} == {id(p) for p in flow.parameters()}
+
+
+STORED = {
+    "alone": lambda make: make(),
+    "in a chain": lambda make: TransformedEnv(track(), Compose(make().transform, StepCounter())),
+    "in a series": lambda make: SerialEnv(2, make),
+    "around a series": lambda make: TransformedEnv(SerialEnv(2, track), make().transform),
+}
+
+
+def load(new, old, path):
+    new.load_state_dict(old.state_dict())
+
+
+def directory(new, old, path):
+    Checkpoint(env=old).save(path / "stored")
+    Checkpoint(env=new).load(path / "stored")
+
+
+def archive(new, old, path):
+    Checkpoint(env=old).save(path / "stored.zip", format="archive")
+    Checkpoint(env=new).load(path / "stored.zip")
+
+
+# TorchRL's checkpoint does not take a series that was never reset, whatever is in it.
+CASES = [(load, case) for case in STORED] + [(directory, "alone"), (archive, "in a chain")]
+
+
+@pytest.mark.parametrize(("move", "case"), CASES)
+def test_the_state_of_an_environment_loads_into_one_that_is_new(move, case, tmp_path):
+    def make():
+        box = {"action_low": [-1.0, -1.5], "action_high": [1.0, 1.5]}
+        return TransformedEnv(track(**box), ActionFlowTransform(Dubins()))
+
+    old, new = (STORED[case](make) for _ in range(2))
+    old.rollout(2)
+    changed = tree_map(lambda x: x + 1.0 if x.is_floating_point() else x, old.state_dict())
+    old.load_state_dict(changed)
+    move(new, old, tmp_path)
+    found, expected = tree_leaves(new.state_dict()), tree_leaves(changed)
+    assert len(found) == len(expected) > 0
+    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
+    new.rollout(2)
+
+
+class Team(EnvBase):
+    """Three cars under one action key, driven backwards; episodes end together or one by one."""
+
+    def __init__(self, batch=(), ends="root", size=3):
+        super().__init__(batch_size=batch)
+        group, batch = (*batch, size), torch.Size(batch)
+
+        def agents(**entries):
+            return Composite(agents=Composite(**entries, shape=group), shape=batch)
+
+        self.observation_spec = agents(observation=Unbounded((*group, 3)))
+        self.action_spec = agents(action=Bounded(-1.0, 1.0, (*group, 2)))
+        self.reward_spec = agents(reward=Unbounded((*group, 1)))
+        own = agents(done=Binary(1, (*group, 1), dtype=torch.bool))
+        of_all = Composite(done=Binary(1, (*batch, 1), dtype=torch.bool), shape=batch)
+        self.done_spec = own if ends == "agents" else of_all
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.steps = torch.zeros(self.full_done_spec[self.done_keys[0]].shape)
+        return self.full_done_spec.zero().update(self.observation_spec.zero())
+
+    def _step(self, tensordict):
+        seen, action = (tensordict["agents", name] for name in ("observation", "action"))
+        self.steps = self.steps + 1
+        out = self.full_done_spec.zero().update(self.observation_spec.zero())
+        out["agents", "observation"] = Dubins()(seen, -action)
+        return out.set(self.done_keys[0], self.steps >= 5).update(self.reward_spec.zero())
+
+    def _set_seed(self, seed):
+        pass
+
+
+AGENTS = {"in_keys": [("agents", "observation")], "in_keys_inv": [("agents", "action")]}
+
+
+OWN = ("agents", "afm")
+
+
+@pytest.mark.parametrize("batch", [(), (4,)])
+@pytest.mark.parametrize(("ends", "prefix"), [("root", "afm"), ("root", OWN), ("agents", OWN)])
+def test_agents_under_one_key_have_a_memory_each(batch, ends, prefix):
+    env = TransformedEnv(Team(batch, ends), ActionFlowTransform(Dubins(), prefix=prefix, **AGENTS))
+    check_env_specs(env, break_when_any_done="both")
+    found = env.rollout(9, break_when_any_done=False)["next", prefix]
+    assert found["executed_action"].shape == (*batch, 9, 3, 2)
+    corrects = found["misaligned"].movedim(len(batch), 0)
+    assert corrects[4].all() and not corrects[5].any() and corrects[-1].all()
+
+
+def test_a_prefix_that_is_not_reset_with_the_agents_is_refused():
+    env = TransformedEnv(Team((), "agents"), ActionFlowTransform(Dubins(), **AGENTS))
+    with pytest.raises(ConfigurationError, match=r"prefix='afm': .* such as \('agents', 'afm'\)"):
+        env.reset()
 
 
 def test_nothing_but_a_model_is_needed(box):

@@ -239,7 +239,7 @@ def test_with_two_the_last_hears_the_planner_first():
 @pytest.mark.parametrize("fault", [math.nan, math.inf, -math.inf, 1e30])
 def test_a_faulty_sensor_does_not_reach_the_motors(fault, small_flow, remembered):
     flow = small_flow()
-    data = env(flow, Blind([4, 5], fault)).rollout(12)
+    data = env(flow, Blind([4, 5], fault), carry_memory=True).rollout(12)
     entries = data["next", "afm"]
     assert entries["executed_action"].isfinite().all() and entries["innovation"].isfinite().all()
     assert (entries["innovation"] < 0.1).all() and not entries["misaligned"].any()
@@ -250,7 +250,7 @@ def test_a_faulty_sensor_does_not_reach_the_motors(fault, small_flow, remembered
 
 def test_the_present_model_is_asked(make_ensemble, small_flow):
     model, flow = make_ensemble(), small_flow()
-    whole = env(flow, model=model)
+    whole = env(flow, model=model, carry_memory=True)
     td = step_mdp(whole.rollout(4)[:, -1])
     td["action"] = torch.zeros(4, 2)
     pairs = flow.unpack(td["afm", "memory"], 3)["pairs"]

@@ -1,17 +1,28 @@
-"""The memory of the action flow transform lives in the tensordict."""
+"""The memory of the action flow transform: held for the newest step, or carried along."""
 
+import functools
 import warnings
 
 import pytest
 import torch
+from puck import Puck, push
 from tensordict import TensorDict
 from torchrl.data import Unbounded
-from torchrl.envs import Compose, SerialEnv, StepCounter, Transform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    GymWrapper,
+    ParallelEnv,
+    SerialEnv,
+    StepCounter,
+    Transform,
+    TransformedEnv,
+)
 from torchrl.envs.utils import step_mdp
 
-from afm_rl.dynamics import Dubins
+from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.envs import UGVTrack
 from afm_rl.regimes import Schedule
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
 
 READINGS = ["recent", "newest", "delay_1"]
@@ -21,7 +32,7 @@ READINGS = ["recent", "newest", "delay_1"]
 def make(small_flow):
     """Make an environment with a reversed drive, which the flow does correct somehow."""
 
-    def build(batch=(4,), max_steps=100):
+    def build(batch=(4,), max_steps=100, carry_memory=True, **settings):
         # From one point: among samples that are as good, rounding would decide.
         flow = small_flow(readings=READINGS, source_std=0.0)
         base = UGVTrack(
@@ -31,7 +42,8 @@ def make(small_flow):
             schedule=Schedule([]),
             missions={"regime": {"v_gain": -1.0}},
         )
-        return TransformedEnv(base, ActionFlowTransform(Dubins(), flow))
+        settings["carry_memory"] = carry_memory
+        return TransformedEnv(base, ActionFlowTransform(Dubins(), flow, **settings))
 
     return build
 
@@ -99,7 +111,7 @@ class Reports(Transform):
 def test_it_remembers_what_actuators_report(small_flow, remembered):
     """And forecasts of what was sent count as forecasts of what was given."""
     flow, base = small_flow(readings=READINGS), UGVTrack(batch_size=[4])
-    transform = ActionFlowTransform(Dubins(), flow, reported_key="given")
+    transform = ActionFlowTransform(Dubins(), flow, reported_key="given", carry_memory=True)
     env = TransformedEnv(base, Compose(Reports(), transform))
     td = env.reset()
     td["action"] = torch.full((4, 2), 0.5)
@@ -173,6 +185,97 @@ def test_a_tensordict_without_memory_is_refused_clearly(small_flow, more):
     td = env.reset().exclude("my")
     with pytest.raises(KeyError, match=r"no \('my', 'afm'\) in the tensordict; start from env.r"):
         env.step(td.set("action", torch.zeros(2)))
+
+
+def parallel(count, makers):
+    return ParallelEnv(count, makers, mp_start_method="fork")
+
+
+KINDS = {
+    "around a series": (SerialEnv, False),
+    "in a series": (SerialEnv, True),
+    "around processes": (parallel, False),
+    "in processes": (parallel, True),
+}
+ENDS, STEPS = (5, 7), 24
+
+
+def reversed_pucks(kind="around a series", **settings):
+    """Two environments with reversed actuators, whose episodes have 5 and 7 steps."""
+    whole, inside = KINDS[kind]
+
+    def corrected(env):
+        model = KnownDynamics(push, Manifold(4), 2)
+        return TransformedEnv(env, ActionFlowTransform(model, **settings))
+
+    def make(ends):
+        env = GymWrapper(Puck(gain=-1.0, ends=ends))
+        return corrected(env) if inside else env
+
+    env = whole(2, [lambda ends=ends: make(ends) for ends in ENDS])
+    env = env if inside else corrected(env)
+    env.set_seed(0)
+    return env
+
+
+def act(env, resets=()):
+    """Return what is executed for random plans; the environment begins anew before ``resets``."""
+    plans = torch.rand(STEPS, 2, 2, generator=torch.Generator().manual_seed(0)).double() * 2 - 1
+    td, steps = env.reset(), []
+    for k, plan in enumerate(plans):
+        td = env.reset() if k in resets else td
+        whole, td = env.step_and_maybe_reset(td.set("action", plan))
+        steps.append(whole["next", "afm"].exclude("memory"))
+    return torch.stack(steps)
+
+
+@functools.cache
+def carried(keep):
+    return act(reversed_pucks(carry_memory=True, keep_memory_on_reset=keep), [17])
+
+
+@pytest.mark.parametrize("keep", [False, True])
+@pytest.mark.parametrize("kind", KINDS)
+def test_held_and_carried_memories_are_the_same_also_where_resets_keep_them(kind, keep):
+    """In each mission by itself, and a bare reset is one of all."""
+    expected, env = carried(keep), reversed_pucks(kind, keep_memory_on_reset=keep)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            found = act(env, [17])
+    finally:
+        env.close(raise_if_closed=False)
+    rounding = {"rtol": 0, "atol": 1e-5}  # of missions in one batch or alone
+    torch.testing.assert_close(found["executed_action"], expected["executed_action"], **rounding)
+    assert found["misaligned"][4:].all() if keep else found["misaligned"].double().mean() < 0.7
+
+
+def test_after_a_rollout_the_next_goes_on_from_its_end():
+    executed = []
+    for carry in (False, True):
+        env = reversed_pucks(carry_memory=carry)
+        torch.manual_seed(0)
+        td = step_mdp(env.rollout(4)[:, -1])
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            data = env.rollout(6, tensordict=td, auto_reset=False, break_when_any_done=False)
+        executed.append(data["next", "afm", "executed_action"])
+    torch.testing.assert_close(*executed)
+
+
+def test_of_another_step_nothing_is_held_which_is_said(make):
+    env, action = make(carry_memory=False), torch.full((4, 2), 0.5)
+    td, executed = follow(env, env.reset(), action.expand(8, 4, 2))
+    fork, rows = td.clone(), torch.tensor([True, False, True, False])
+    assert td["afm", "misaligned"].all()
+    td, _ = follow(env, td, action[None])
+    mixed = torch.where(rows, td, fork)  # of the second and the last the step before
+    with pytest.warns(UserWarning, match="goes on with an empty one.* carry_memory=True"):
+        found = env.step(mixed.set("action", action))["next", "afm"]
+    assert torch.equal(found["misaligned"], rows)
+    assert torch.equal(found["executed_action"][~rows], action[~rows])
+    with pytest.warns(UserWarning, match="goes on with an empty one"):
+        make(carry_memory=False).step(fork.set("action", action))  # another environment
 
 
 @pytest.mark.parametrize("end", ["transform", "policy"])

@@ -17,6 +17,7 @@ from afm_rl.regimes import Schedule
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
 
 STEPS = 8
+BACKWARDS = {"schedule": Schedule([]), "missions": {"regime": {"v_gain": -2.5}}}
 
 
 @pytest.fixture
@@ -25,9 +26,8 @@ def track(box):
     low, high = (bound.tolist() for bound in box)
 
     def make(batch=(3,)):
-        regime = {"schedule": Schedule([]), "missions": {"regime": {"v_gain": -2.5}}}
         return UGVTrack(
-            batch_size=batch, process_noise=0.0, action_low=low, action_high=high, **regime
+            batch_size=batch, process_noise=0.0, action_low=low, action_high=high, **BACKWARDS
         )
 
     return make
@@ -83,7 +83,7 @@ def test_a_loop_without_an_environment_takes_the_same_actions(track, agent):
 
 def test_the_first_state_is_no_transition(track, agent):
     data = TransformedEnv(track(), primers(agent)).rollout(3)
-    memory = data["afm", "memory"][:, 0]
+    memory = data["afm", "_memory"][:, 0]
     assert memory[:, :3].isnan().all() and not memory[:, 3:-2].any()  # the last is the noise
 
 
@@ -128,3 +128,16 @@ def test_nothing_but_a_model_and_a_spec_is_needed(planner):
     td = policy.make_tensordict_primer()(TensorDict())
     td.update({"observation": torch.zeros(3), "action": torch.tensor([0.3, 0.4])})
     assert torch.equal(policy(td)["action"], torch.tensor([0.3, 0.4]))
+
+
+def test_a_primer_keeps_what_was_learnt_through_automatic_resets(planner, box):
+    low, high = (bound.tolist() for bound in box)
+    base = UGVTrack(action_low=low, action_high=high, max_steps=5, **BACKWARDS)
+    shares = []
+    for keep in (False, True):
+        policy = ActionFlowPolicy(Dubins(), planner.action_spec, keep_memory_on_reset=keep)
+        agent = TensorDictSequential(planner, policy)
+        env = TransformedEnv(base, primers(agent))
+        data = env.rollout(40, agent, break_when_any_done=False)
+        shares.append(data["next", "afm", "misaligned"].double().mean())
+    assert shares[0] < 0.7 and shares[1] >= 0.9

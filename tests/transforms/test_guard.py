@@ -11,8 +11,11 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, GymEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
+from afm_rl.dynamics import KnownDynamics
 from afm_rl.envs import CrazyflieTrack, UGVTrack
 from afm_rl.errors import ConfigurationError
+from afm_rl.planning import KnownReward, PlanningEnv
+from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import Guard
 
 BAD = [math.nan, math.inf, -math.inf, 1e30, -1e30, 3.0, -3.0, 0.5]
@@ -96,6 +99,14 @@ def test_any_answer_becomes_a_safe_action(make, data):
         last = passed
 
 
+@pytest.mark.parametrize("box", [(0.5, 2.0), (-2.0, -0.5)])
+def test_what_cannot_be_executed_at_first_becomes_the_action_nearest_to_zero(box):
+    push = KnownDynamics(lambda state, action: state + action, Manifold(1), 1)
+    base = PlanningEnv(push, KnownReward(lambda state, action, after: after[..., 0]), *zip(box))
+    (row,) = drive(base, [Guard()], 1, action=math.nan)
+    assert row["guard", "executed_action"] == min(box, key=abs) and row["guard", "held"]
+
+
 def test_one_frozen_sensor_among_others():
     def freeze(step, seen):
         if step == 4:
@@ -130,8 +141,8 @@ def test_a_time_stamp_that_stands_still():
     guard, base = Guard(stamp_key="step"), CrazyflieTrack(batch_size=(2,))
     rows = drive(base, [guard], 5, action=0.1)
     assert all(row["guard", "sound"].all() for row in rows)
-    stopped = Guard(stamp_key="since")  # stands still until the phase changes
-    assert not drive(base, [stopped], 1)[0]["guard", "sound"].any()
+    stopped = Guard(stamp_key="since", patience=1)  # stands still until the phase changes
+    assert not any(row["guard", "sound"].any() for row in drive(base, [stopped], 3))
 
 
 def test_an_action_of_another_shape_is_refused():

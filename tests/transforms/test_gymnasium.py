@@ -105,6 +105,45 @@ def test_states_of_ones_own():
     assert steps[-1][-1]["afm"]["corrects"] and "puck" in steps[-1][0]
 
 
+class Faulty(gymnasium.ActionWrapper):
+    """Reversed actuators, late by some steps."""
+
+    def __init__(self, env, late):
+        super().__init__(env)
+        self.late = late
+
+    def reset(self, **given):
+        self.queue = [np.zeros(self.action_space.shape)] * self.late
+        return super().reset(**given)
+
+    def action(self, command):
+        self.queue.append(command)
+        return -self.queue.pop(0)
+
+
+@pytest.mark.parametrize("late", [0, 4])
+def test_a_fault_outlasts_episodes_that_are_too_short_to_find_it_in_each(late):
+    """And commands of the episode before are not taken for late ones of this."""
+    pytest.importorskip("mujoco")
+    env = Faulty(gymnasium.make("InvertedPendulum-v5"), late)
+    shares = []
+    for keep in (False, True):
+        wrapped = ActionFlowWrapper(env, "mujoco", keep_memory_on_reset=keep)
+        wrapped.reset(seed=0)
+        wrapped.action_space.seed(0)
+        told, planned = [], []
+        for _ in range(140):
+            planned.append(wrapped.action_space.sample())
+            *_, over, _, info = wrapped.step(planned[-1])
+            told.append(info["afm"])
+            if over:
+                wrapped.reset()
+        shares.append(np.mean([not each["corrects"] for each in told]))
+    executed = np.stack([each["executed"] for each in told])
+    wrong = np.abs(executed + np.stack(planned)) > 0.05 * env.action_space.high
+    assert shares[0] > 0.2 and shares[1] <= 0.05 and wrong[40:].mean() <= 0.05
+
+
 def test_an_episode_begins_with_an_empty_memory():
     env = ActionFlowWrapper(Puck(gain=-1.0), push)
     assert play(env, 10)[-1][-1]["afm"]["corrects"]

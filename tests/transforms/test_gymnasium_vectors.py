@@ -1,15 +1,18 @@
 """Vectors of environments, in one process, in several, and wrappers in several threads."""
 
 import threading
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from puck import Puck, play, push
 
 from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
 from afm_rl.errors import ConfigurationError
+from afm_rl.learning import watching
 
 GAINS, ENDS = (1.0, -1.0, 0.5), (6, 9, 7)
 
@@ -60,6 +63,32 @@ def test_each_environment_gets_the_actions_of_a_wrapper_of_its_own(kind, mode):
             envs.reset(options={"reset_mask": over.copy()})
     assert (np.abs(expected[:, 1] + plans[:, 1]).max(-1) < 0.1).sum() > 10  # it was corrected
     envs.close()
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_what_is_learned_from_are_steps_within_episodes(mode, monkeypatch):
+    learned_from, count = [], 0
+
+    def fit(model, data, **settings):
+        learned_from.append(data)
+        return SimpleNamespace(error=1.0)
+
+    monkeypatch.setattr(watching, "fit_ensemble", fit)
+    vector = SyncVectorEnv([lambda: Puck(ends=6), lambda: Puck(ends=9)], autoreset_mode=mode)
+    envs = ActionFlowVectorWrapper(vector, "learn")
+    envs.reset(seed=0)
+    for _ in range(20):
+        *_, over, _, infos = envs.step(np.zeros((2, 2)))
+        lost = over if mode is AutoresetMode.SAME_STEP else False  # nobody sees what they led to
+        count += (infos["_afm"] & ~np.asarray(lost)).sum()
+        if mode is AutoresetMode.DISABLED and over.any():
+            envs.reset(options={"reset_mask": over.copy()})
+    envs.watching.learn()
+    (data,) = learned_from
+    torch.testing.assert_close(
+        data["next", "observation"], push(data["observation"], data["action"])
+    )
+    assert len(data) == envs.watching.count == count
 
 
 def test_mujoco_in_a_vector_of_one_process_or_of_several():

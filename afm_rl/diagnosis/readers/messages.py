@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import io
 import json
+import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import closing, contextmanager, redirect_stdout
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from afm_rl.diagnosis.readers.source import Series, Source, check_regular
+from afm_rl.diagnosis.readers.source import (
+    NAMES,
+    WIDEST,
+    Series,
+    Source,
+    check_names,
+    check_regular,
+)
 from afm_rl.errors import ConfigurationError, printable
 
 Field = tuple[str | int, ...]
@@ -20,6 +30,10 @@ MISSING = "needs {}: pip install 'afm-rl[logs]'"
 Messages = Iterator[tuple[str, float, Any]]
 """Topic, time (s) and content."""
 TIME = "timestamp"  # in microseconds
+CHUNK = 1 << 26
+"""Most bytes that a chunk of an MCAP file unpacks to."""
+UNPACKED = 1 << 24, 100
+"""Most bytes that all of them do: so many, and so many for each byte of the file."""
 
 
 def fields_of(message: Any, depth: int = 8, most: int = 64) -> Iterator[tuple[str, Field]]:
@@ -94,7 +108,7 @@ def sorted_series(values: np.ndarray, t: np.ndarray) -> Series:
     """Return values in the order of their times, the last one of each time.
 
     >>> sorted_series(np.array([1.0, 2.0, 3.0]), np.array([0.0, 0.2, 0.0]))
-    Series(values=array([3., 2.]), t=array([0. , 0.2]), row=None)
+    Series(values=array([3., 2.]), t=array([0. , 0.2]), row=None, rows=0)
     """
     order = np.argsort(t, kind="stable")
     t = t[order]
@@ -116,22 +130,59 @@ def _get(message: Any, key: Any) -> Any:
 def open_mcap(path: Path) -> Source:
     """Return the fields of an MCAP file whose messages are those of ROS 2, or JSON."""
     try:
-        from mcap.reader import make_reader
+        from mcap.records import Channel, Message, Schema
     except ImportError as error:
         raise ConfigurationError(f"an MCAP file {MISSING.format('mcap')}") from error
 
     def messages(topics: Collection[str] | None) -> Messages:
-        decoders: dict[int, Any] = {}
+        schemas: dict[int, Any] = {}
+        channels: dict[int, tuple[str, Any]] = {}  # topic, and what decodes its messages
         with _reading("MCAP file"), path.open("rb") as file:
-            reader = make_reader(file)
-            for schema, channel, message in reader.iter_messages(topics):
-                if channel.id not in decoders:
-                    decoders[channel.id] = _decoder(schema, channel.message_encoding)
-                decode = decoders[channel.id]
-                if decode is not None:
-                    yield channel.topic, message.log_time / 1e9, decode(message.data)
+            for record in _records(file, path.stat().st_size):
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel) and record.id not in channels:
+                    decode = _decoder(schemas.get(record.schema_id), record.message_encoding)
+                    channels[record.id] = record.topic, decode
+                elif isinstance(record, Message):
+                    topic, decode = channels[record.channel_id]
+                    if decode is not None and (topics is None or topic in topics):
+                        yield topic, record.log_time / 1e9, decode(record.data)
 
     return _source(path, messages)
+
+
+def _records(file: BinaryIO, size: int) -> Iterator[Any]:
+    """Yield the records of an MCAP file, those of its chunks among them, in the file's order."""
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    least, ratio = UNPACKED
+    left = least + ratio * size
+    for record in StreamReader(file, emit_chunks=True).records:
+        if isinstance(record, Chunk):
+            most = min(left, CHUNK)
+            data = _unpacked(record.data, record.compression, most + 1)
+            if len(data) > most:
+                raise ConfigurationError(
+                    f"a chunk unpacks to more than {most:,} bytes: expected at most {CHUNK:,}, and "
+                    f"{ratio} times the file's size in all"
+                )
+            left -= len(data)
+            yield from breakup_chunk(replace(record, data=data, compression=""))
+        else:
+            yield record
+
+
+def _unpacked(data: bytes, compression: str, most: int) -> bytes:
+    """Return the first bytes that packed ones stand for, at most so many."""
+    import lz4.frame
+    import zstandard
+
+    if not compression:
+        return data
+    with {"lz4": lz4.frame.open, "zstd": zstandard.open}[compression](io.BytesIO(data)) as file:
+        return file.read(most)
 
 
 def open_bag(path: Path) -> Source:
@@ -141,9 +192,9 @@ def open_bag(path: Path) -> Source:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise ConfigurationError(f"a bag of ROS {MISSING.format('rosbags')}") from error
-    if path.is_dir():
-        for part in path.iterdir():
-            check_regular(part)
+    for part in path.iterdir() if path.is_dir() else (path,):
+        if check_regular(part).suffix == ".db3":
+            _check_tables(part)
 
     def messages(topics: Collection[str] | None) -> Messages:
         with _reading("bag of ROS"):
@@ -156,6 +207,15 @@ def open_bag(path: Path) -> Source:
     return _source(path, messages)
 
 
+def _check_tables(file: Path) -> None:
+    """Refuse views in a database: what they hold is computed, and need not end."""
+    address = f"{file.resolve().as_uri()}?immutable=1"
+    with _reading("bag of ROS"), closing(sqlite3.connect(address, uri=True)) as base:
+        view = base.execute("SELECT name FROM sqlite_master WHERE type = 'view'").fetchone()
+    if view:
+        raise ConfigurationError(f"view {printable(str(view[0]))}: expected tables alone")
+
+
 def _source(path: Path, messages: Any, looked_at: int = 20) -> Source:
     """Return a source of messages: a first pass finds the fields, in some of each topic."""
     fields: dict[str, tuple[str, Field]] = {}
@@ -163,7 +223,11 @@ def _source(path: Path, messages: Any, looked_at: int = 20) -> Source:
     for topic, _, content in messages(None):
         counts[topic] = counts.get(topic, 0) + 1
         if counts[topic] <= looked_at:
-            fields |= {f"{topic}{name}": (topic, way) for name, way in fields_of(content)}
+            named = islice(fields_of(content), WIDEST)
+            fields |= {f"{topic}{name}": (topic, way) for name, way in named}
+        if len(fields) > NAMES:
+            break
+    check_names(list(fields))
 
     def read(wanted: Sequence[str]) -> dict[str, Series]:
         chosen = {name: fields[name] for name in wanted}
@@ -207,10 +271,26 @@ def open_ulog(path: Path) -> Source:
         from pyulog import ULog
     except ImportError as error:
         raise ConfigurationError("ULog needs pyulog: pip install 'afm-rl[logs]'") from error
+
+    class Subscription(ULog._MessageAddLogged):
+        """The fields of a topic, whose formats may hold each other in any number."""
+
+        left = NAMES
+
+        def _parse_nested_type(self, prefix: str, name: str, formats: Any) -> None:
+            width = sum(max(size, 1) for _, size, _ in formats[name].fields)
+            Subscription.left -= width
+            if Subscription.left < 0:  # no ValueError, which pyulog passes over
+                raise RuntimeError(f"topics of more than {NAMES:,} fields; expected fewer")
+            super()._parse_nested_type(prefix, name, formats)
+
+    class Bounded(ULog):
+        _MessageAddLogged = Subscription
+
     with _reading("ULog"), path.open("rb") as file, redirect_stdout(io.StringIO()):
         topics = {
             f"{data.name}[{data.multi_id}]" if data.multi_id else data.name: data.data
-            for data in ULog(file).data_list
+            for data in Bounded(file).data_list
         }
     fields = {
         f"{topic}.{field}": (topic, field)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -18,11 +19,12 @@ import pyarrow.parquet as parquet
 from afm_rl.diagnosis.readers.source import (
     ACTIONS,
     STATES,
+    WIDEST,
     Series,
     Source,
     blocks_of,
+    check_names,
     check_regular,
-    thinned_note,
 )
 from afm_rl.diagnosis.readers.tables import EPISODE, TIME
 from afm_rl.errors import ConfigurationError, printable
@@ -31,17 +33,25 @@ STAMP = "timestamp"
 LISTS = (arrow.types.is_list, arrow.types.is_large_list, arrow.types.is_fixed_size_list)
 INFO = "meta/info.json"
 FASTEST, SLOWEST = 1e6, 1e-3  # rates (1/s) that a robot may have
+DECODED = 10**9
+"""Most numbers that are unpacked to read a log."""
 
 
 def open_parquet(path: Path) -> Source:
-    """Return the columns of a parquet file; a list's numbers are called ``COLUMN.0`` and so on."""
+    """Return the columns of a parquet file; a list's numbers are called ``COLUMN.0`` and so on.
+
+    The numbers of a list of more than ``WIDEST``, as of an image, have no names.
+    """
     names: dict[str, tuple[str, int | None]] = {}
     columns = columns_of(path)
-    for column in columns:
-        width = width_of(path, column)
-        if width is None:
+    for column, width in widths_of(path, columns).items():
+        if column in (*ACTIONS, *STATES):
+            check_width(column, width)
+        if width is None or width > WIDEST:
             names[column] = (column, None)
-        names |= {f"{column}.{k}": (column, k) for k in range(width or 0)}
+        else:
+            names |= {f"{column}.{k}": (column, k) for k in range(width)}
+    check_names(list(names))
     # An episode of LeRobot's has the time (s) under another name.
     time = STAMP if TIME not in columns and str(columns.get(STAMP)) in ("float", "double") else TIME
     return source_of(path, [path], names, time)
@@ -58,11 +68,12 @@ def source_of(
 ) -> Source:
     """Return the rows of parquet files, one after the other, as a source."""
     sizes = [_rows(file) for file in files]
-    blocks = blocks_of(sum(sizes))
+    total, widths = sum(sizes), Counter(column for column, _ in names.values())
 
     def read(wanted: Sequence[str]) -> dict[str, Series]:
         columns = list(dict.fromkeys(names[name][0] for name in wanted))
-        number, arrays = _read(files, sizes, columns, blocks)
+        width = sum(widths[column] for column in columns)
+        number, arrays = _read(files, sizes, columns, width, blocks_of(total, width))
         found = {}
         for name in wanted:
             column, place = names[name]
@@ -70,11 +81,11 @@ def source_of(
             if (values.ndim == 1) != (place is None) or (place or 0) >= values.shape[-1]:
                 expected = "one number a row" if place is None else f"lists of more than {place}"
                 raise ConfigurationError(f"{printable(column)}: expected {expected}")
-            found[name] = Series(values if place is None else values[:, place], row=number)
+            values = values if place is None else values[:, place]
+            found[name] = Series(values, None, number, total)
         return found
 
     at, number = (name if name in names else None for name in (time, episode))
-    notes = (*notes, *thinned_note(sum(sizes), blocks))
     return Source(path, list(names), read, frame, at, number, notes=notes)
 
 
@@ -82,21 +93,62 @@ def columns_of(file: Path) -> dict[str, arrow.DataType]:
     """Return names and types of the columns of a file."""
     with _reading(file):
         schema = parquet.read_schema(file)
-    if len(set(schema.names)) < len(schema.names):
-        raise ConfigurationError(
-            f"{printable(str(file), 200)}: two columns of one name; rename one"
-        )
-    return dict(zip(schema.names, schema.types, strict=True))
+    return dict(zip(check_names(schema.names), schema.types, strict=True))
 
 
-def width_of(file: Path, column: str) -> int | None:
-    """Return how many numbers the first list of a column has; None: they are single numbers."""
+def widths_of(file: Path, columns: Iterable[str]) -> dict[str, int | None]:
+    """Return how many numbers the first list of each column has; None: it has no lists of numbers.
+
+    Of lists of more than ``WIDEST`` numbers it is the mean, which is known without reading them.
+    """
     with _reading(file):
-        opened = parquet.ParquetFile(file)
-        if not any(is_list(opened.schema_arrow.field(column).type) for is_list in LISTS):
-            return None
-        first = next(opened.iter_batches(1, columns=[column]), None)
-        return 0 if first is None or not len(first) else len(first.column(0)[0].as_py() or ())
+        opened, first = parquet.ParquetFile(file), 0
+        stored, schema = opened.metadata, opened.schema_arrow
+        groups = [stored.row_group(k) for k in range(stored.num_row_groups)]
+        leaves: dict[str, int] = {}  # numbers of the first of the columns that parquet knows
+        for field in schema:
+            leaves[field.name], first = first, first + _leaves(field.type)
+        means: dict[str, int] = {}
+        for name in columns:
+            kind = schema.field(name).type
+            if kind != _innermost(kind) and _is_number(_innermost(kind)):
+                count = sum(group.column(leaves[name]).num_values for group in groups)
+                means[name] = count // max(stored.num_rows, 1)
+        short = [name for name, mean in means.items() if mean <= WIDEST]
+        row = next(opened.iter_batches(1, columns=short), None) if short else None
+        lengths = {} if row is None or not len(row) else {n: row.column(n)[0] for n in short}
+    found = {n: len(cell.values) if cell.is_valid else 0 for n, cell in lengths.items()}
+    return {name: found.get(name, means.get(name)) for name in columns}
+
+
+def check_kind(column: str, kind: arrow.DataType) -> None:
+    """Refuse a column of something else than numbers, and lists of them."""
+    if not _is_number(_innermost(kind)):
+        raise ConfigurationError(f"{printable(column)}: {kind}: expected numbers, or lists of them")
+
+
+def _is_number(kind: arrow.DataType) -> bool:
+    types = arrow.types
+    return types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)
+
+
+def _innermost(kind: arrow.DataType) -> arrow.DataType:
+    while any(is_list(kind) for is_list in LISTS):
+        kind = kind.value_type
+    return kind
+
+
+def _leaves(kind: arrow.DataType) -> int:
+    inner = (kind.field(k).type for k in range(kind.num_fields))
+    return sum(_leaves(each) for each in inner) or 1
+
+
+def check_width(column: str, width: int | None) -> None:
+    """Refuse lists that are too long for each of their numbers to have a name."""
+    if width is not None and width > WIDEST:
+        raise ConfigurationError(
+            f"{printable(column)}: {width:,} numbers a row: expected lists of at most {WIDEST:,}"
+        )
 
 
 def _rows(file: Path) -> int:
@@ -108,16 +160,23 @@ def _read(
     files: Sequence[Path],
     sizes: Sequence[int],
     columns: Sequence[str],
+    width: int,
     blocks: Sequence[tuple[int, int]],
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the numbers of the rows of blocks, and columns ``(N,)`` or ``(N, K)``."""
+    """Return the numbers of the rows of blocks, and columns ``(N,)`` or ``(N, K)``.
+
+    The columns of a row have ``width`` numbers.
+    """
     parts: dict[str, list[np.ndarray]] = {column: [] for column in columns}
     numbers, begin = [np.empty(0, dtype=int)], 0
     for file, size in zip(files, sizes, strict=True):
         wanted = [(max(a - begin, 0), min(b - begin, size)) for a, b in blocks]
         wanted = [(a, b) for a, b in wanted if a < b]
+        for column, longest in widths_of(file, columns).items():
+            check_width(column, longest)
+            check_kind(column, columns_of(file)[column])
         with _reading(file):
-            for first, batch in _batches(file, columns, wanted):
+            for first, batch in _batches(file, columns, width, wanted):
                 numbers.append(begin + first + np.arange(len(batch)))
                 for column in columns:
                     parts[column].append(_values(column, batch.column(column)))
@@ -126,28 +185,41 @@ def _read(
         kinds = {str(part.shape[1]) if part.ndim > 1 else "single" for part in found}
         if len(kinds) > 1:
             raise ConfigurationError(
-                f"{printable(column)}: lists of {' and '.join(sorted(kinds))} numbers: expected "
-                "one length"
+                f"{printable(column)}: lists of {' and '.join(sorted(kinds)[:8])} numbers: "
+                "expected one length"
             )
     joined = {name: np.concatenate(found or [np.empty(0)]) for name, found in parts.items()}
     return np.concatenate(numbers), joined
 
 
 def _batches(
-    file: Path, columns: Sequence[str], wanted: Sequence[tuple[int, int]]
+    file: Path, columns: Sequence[str], width: int, wanted: Sequence[tuple[int, int]]
 ) -> Iterator[tuple[int, arrow.RecordBatch]]:
     """Yield rows of a file in batches, with the number of the first; only wanted rows."""
-    if not wanted:
-        return
     opened, first = parquet.ParquetFile(file), 0
-    for batch in opened.iter_batches(1 << 16, columns=list(columns)):
-        for low, high in wanted:
-            a, b = max(low - first, 0), min(high - first, len(batch))
-            if a < b:
-                yield first + a, batch.slice(a, b - a)
-        first += len(batch)
-        if first >= wanted[-1][1]:
-            return
+    groups: list[tuple[int, int]] = []  # those that hold wanted rows, with their first row
+    rows = 0
+    for k in range(opened.num_row_groups):
+        count = opened.metadata.row_group(k).num_rows
+        if any(low < first + count and first < high for low, high in wanted):
+            groups.append((k, first))
+            rows += count
+        first += count
+    if rows * width > DECODED:
+        raise ConfigurationError(
+            f"{rows:,} rows of {width:,} numbers: expected at most {DECODED:,} numbers in all; "
+            "name fewer columns, or split the file"
+        )
+    size = min(1 << 16, (1 << 22) // width + 1)
+    for k, first in groups:
+        for batch in opened.iter_batches(size, row_groups=[k], columns=list(columns)):
+            for low, high in wanted:
+                a, b = max(low - first, 0), min(high - first, len(batch))
+                if a < b:
+                    yield first + a, batch.slice(a, b - a)
+            first += len(batch)
+            if first >= wanted[-1][1]:
+                return
 
 
 def _values(name: str, column: arrow.Array) -> np.ndarray:
@@ -156,14 +228,10 @@ def _values(name: str, column: arrow.Array) -> np.ndarray:
         widths = compute.unique(compute.list_value_length(column)).to_pylist()
         if len(widths) != 1 or widths[0] is None:
             raise ConfigurationError(
-                f"{printable(name)}: lists of {' and '.join(str(w or 'no') for w in widths)} "
+                f"{printable(name)}: lists of {' and '.join(str(w or 'no') for w in widths[:8])} "
                 "numbers: expected lists of numbers of one length"
             )
         return _values(name, column.flatten()).reshape(len(column), widths[0])
-    kind = column.type
-    is_number = arrow.types.is_integer(kind) or arrow.types.is_floating(kind)
-    if not (is_number or arrow.types.is_boolean(kind)):
-        raise ConfigurationError(f"{printable(name)}: {kind}: expected numbers, or lists of them")
     with np.errstate(invalid="ignore"):  # a signalling NaN
         return column.to_numpy(zero_copy_only=False).astype(float)
 
@@ -173,7 +241,7 @@ def _reading(file: Path) -> Iterator[None]:
     """Turn an error of the reader into one line."""
     try:
         yield
-    except ConfigurationError:
+    except (ConfigurationError, MemoryError):
         raise
     except OSError as error:
         reason = error.strerror or printable(str(error))
@@ -224,7 +292,8 @@ def open_lerobot(folder: Path) -> Source:
 def _info(file: Path) -> tuple[dict[str, Any], float]:
     """Return the features of a data set, and its rate (1/s)."""
     try:
-        info = json.loads(file.read_text(encoding="utf-8"))
+        with file.open(encoding="utf-8") as text:
+            info = json.loads(text.read(1 << 24))
         features, fps = info["features"], float(info["fps"])
         if not isinstance(features, dict):
             raise TypeError("features")
@@ -261,7 +330,8 @@ def _is_regular(file: Path) -> bool:
 
 def _named(file: Path, head: str, feature: Any) -> dict[str, tuple[str, int | None]]:
     """Return the names of a feature's numbers: as given, or their places."""
-    width = width_of(file, head)  # one number is no list
+    width = widths_of(file, [head])[head]  # one number is no list
+    check_width(head, width)
     places: list[int | None] = [None] if width is None else list(range(width))
     given = feature.get("names") if isinstance(feature, dict) else None
     if isinstance(given, dict) and all(type(place) is int for place in given.values()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -12,7 +13,14 @@ import numpy as np
 
 from afm_rl.diagnosis.log import FEWEST, Log
 from afm_rl.diagnosis.readers import messages, parquet, tables
-from afm_rl.diagnosis.readers.source import Columns, Series, Source, check_regular, choose
+from afm_rl.diagnosis.readers.source import (
+    Columns,
+    Series,
+    Source,
+    check_regular,
+    choose,
+    thinned_note,
+)
 from afm_rl.errors import ConfigurationError, printable
 
 PAIRS = ("command", "response")
@@ -31,6 +39,7 @@ READERS: dict[str, Callable[[Path], Source]] = {
     ".bag": messages.open_bag,
     ".db3": messages.open_bag,
 }
+BAG = "metadata.yaml"
 EXPECTED = (
     "expected a file .csv, .parquet, .ulg, .mcap, .db3 or .bag, or a folder of LeRobot or ROS"
 )
@@ -41,10 +50,10 @@ def open_source(path: Path) -> Source:
     if path.is_dir():
         if (path / parquet.INFO).parent.exists():
             return parquet.open_lerobot(path)
-        if (path / "metadata.yaml").exists():
+        if (path / BAG).exists():
             return messages.open_bag(path)
         raise ConfigurationError(
-            f"{path}: a folder without {parquet.INFO} (LeRobot) or metadata.yaml (ROS); {EXPECTED}"
+            f"{path}: a folder without {parquet.INFO} (LeRobot) or {BAG} (ROS); {EXPECTED}"
         )
     if not path.is_symlink() and not path.exists():
         raise ConfigurationError(f"{path}: no such file; {EXPECTED}")
@@ -52,6 +61,39 @@ def open_source(path: Path) -> Source:
     if reader is None:
         raise ConfigurationError(f"{path}: {EXPECTED}; export the log as one of these")
     return reader(path)
+
+
+@contextmanager
+def bounded_memory(path: Path, least: int = 1 << 30, ratio: int = 8) -> Iterator[None]:
+    """Let messages take no more than 1 GiB and eight times their file, of memory and of the disk.
+
+    What they unpack to is not known before, as it is of tables; where it is more, reading ends in
+    an error. The limits are those of the whole process, so this is for commands. Some systems have
+    none.
+    """
+    reader = messages.open_bag if (path / BAG).exists() else READERS.get(path.suffix.lower())
+    if reader not in (messages.open_bag, messages.open_mcap, messages.open_ulog):
+        yield
+        return
+    try:
+        import resource
+
+        used = int(Path("/proc/self/statm").read_text().split()[5]) * resource.getpagesize()
+    except (ImportError, OSError):
+        yield
+        return
+    parts = (path, *path.glob("*"))
+    spare = least + ratio * sum(os.path.getsize(part) for part in parts if os.path.isfile(part))
+    limits = {resource.RLIMIT_DATA: used + spare, resource.RLIMIT_FSIZE: spare}
+    before = {kind: resource.getrlimit(kind) for kind in limits}
+    try:
+        for kind, (soft, hard) in before.items():
+            bounds = [limits[kind], *(x for x in (soft, hard) if x != resource.RLIM_INFINITY)]
+            resource.setrlimit(kind, (min(bounds), hard))
+        yield
+    finally:
+        for kind, both in before.items():
+            resource.setrlimit(kind, both)
 
 
 def read_log(
@@ -129,8 +171,9 @@ def read_columns(
         first, second = (np.column_stack([found[n].values for n in group]) for group in wanted)
         time = found[source.time].values if source.time else clock
         border = found[source.episode].values if source.episode else None
-        number = found[wanted[0][0]].row
-        number = np.arange(len(first)) if number is None else number
+        leading = found[wanted[0][0]]
+        number = np.arange(len(first)) if leading.row is None else leading.row
+        notes = (*source.notes, *thinned_note(number, leading.rows), *notes)
         done = _complete(source, names, first, second, number, time, border, notes)
         return replace(done, effort=_effort(source))
 
@@ -201,7 +244,6 @@ def _complete(
             f"{len(sound)} rows{missing}: expected at least {FEWEST} complete ones, and half of "
             "all; log for a longer time"
         )
-    notes = (*source.notes, *notes)
     if lost:
         notes += (f"{lost} of {len(sound)} rows were dropped: numbers are missing or infinite",)
     rows = np.flatnonzero(sound)

@@ -19,6 +19,10 @@ Pairs = tuple[list[str], list[str]]
 
 ACTIONS = ("action", "actions")  # LeRobot's words, and older ones
 STATES = ("observation.state", "state", "states", "observation.states")
+WIDEST = 1_000
+"""Most numbers of a list in a table, or of a message, that have names."""
+NAMES = 100_000
+"""Most names in a log."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +70,15 @@ class Source:
 
 @dataclass(frozen=True)
 class Series:
-    """Values ``(N,)``; of messages also their times (s), of a table the number of each row."""
+    """Values ``(N,)``; of messages also their times (s).
+
+    Of a table, the number of each row, and how many rows it has.
+    """
 
     values: np.ndarray
     t: np.ndarray | None = None
     row: np.ndarray | None = None
+    rows: int = 0
 
 
 @dataclass(frozen=True)
@@ -127,31 +135,53 @@ def check_regular(path: Path) -> Path:
     return path
 
 
-def blocks_of(rows: int, most: int = 400_000, count: int = 8) -> list[tuple[int, int]]:
+def check_names(names: Sequence[str]) -> Sequence[str]:
+    """Return names if they are not too many, and no two are the same.
+
+    >>> check_names(["t", "pan", "t"])
+    Traceback (most recent call last):
+        ...
+    afm_rl.errors.ConfigurationError: t: two columns of this name; rename one
+    """
+    if len(names) > NAMES:
+        raise ConfigurationError(
+            f"more than {NAMES:,} columns or fields: expected fewer; log, or keep, less"
+        )
+    name, count = next(iter(Counter(names).most_common(1)), ("", 0))
+    if count > 1:
+        raise ConfigurationError(f"{printable(name)}: two columns of this name; rename one")
+    return names
+
+
+def blocks_of(
+    rows: int, width: int = 1, most: int = 400_000, count: int = 8
+) -> list[tuple[int, int]]:
     """Return first and last row (exclusive) of what is read of a log.
 
     All rows, or blocks that are evenly spread: a block is long enough for every delay, and changes
-    on the way are seen. 400,000 rows of twenty numbers take 64 MB.
+    on the way are seen. 400,000 rows of forty numbers take 128 MB; of rows with a larger ``width``
+    fewer are read.
 
-    >>> blocks_of(100), blocks_of(1000, most=100, count=2)
-    ([(0, 100)], [(0, 50), (950, 1000)])
+    >>> blocks_of(100), blocks_of(1000, most=100, count=2), blocks_of(1000, 40, 100, 2)[0]
+    ([(0, 100)], [(0, 50), (950, 1000)], (0, 50))
     """
+    most = min(most, 40 * 400_000 // max(width, 1))
     if rows <= most:
         return [(0, rows)]
     length = most // count
     return [(int(a), int(a) + length) for a in np.linspace(0, rows - length, count)]
 
 
-def thinned_note(rows: int, blocks: list[tuple[int, int]]) -> tuple[str, ...]:
-    """Return what must be said where rows were left out.
+def thinned_note(row: np.ndarray, rows: int) -> tuple[str, ...]:
+    """Return what must be said where not all ``rows`` were read, but those of numbers ``(N,)``.
 
-    >>> thinned_note(1000, [(0, 50), (950, 1000)])
+    >>> thinned_note(np.r_[0:50, 900:950], 1000)
     ('1,000 rows are many: 2 blocks of 50 were read',)
     """
-    if len(blocks) == 1:
+    if len(row) >= rows:
         return ()
-    length = blocks[0][1] - blocks[0][0]
-    return (f"{rows:,} rows are many: {len(blocks)} blocks of {length:,} were read",)
+    blocks = 1 + int((np.diff(row) != 1).sum())
+    return (f"{rows:,} rows are many: {blocks} blocks of {len(row) // blocks:,} were read",)
 
 
 def choose(
@@ -235,7 +265,8 @@ def _expanded(source: Source, option: str, given: Sequence[str]) -> Pairs:
         found = [field] if field in source.names else []
         found = found or [n for n in source.names if n.startswith((f"{field}.", f"{field}["))]
         if not found:
-            near = difflib.get_close_matches(field, source.names, n=1)
+            some = [name for name in source.names[: NAMES // 10] if len(name) < 200]
+            near = difflib.get_close_matches(field, some, n=1)
             advice = f"did you mean {printable(near[0])}?" if near else "leave it out for a listing"
             raise ConfigurationError(
                 f"{option} {printable(field)}: there is no such name; {advice}"
@@ -243,12 +274,12 @@ def _expanded(source: Source, option: str, given: Sequence[str]) -> Pairs:
         fields += found
         called += [own or None] if len(found) == 1 else [None] * len(found)
     short = [name.rpartition("/")[2].partition(".")[2] or name for name in fields]
+    counts = Counter(short)
     names = [
-        own or (s if short.count(s) == 1 else n)
-        for own, s, n in zip(called, short, fields, strict=True)
+        own or (s if counts[s] == 1 else n) for own, s, n in zip(called, short, fields, strict=True)
     ]
-    if len(set(names)) < len(names):
-        double = next(name for name in names if names.count(name) > 1)
+    double, count = Counter(names).most_common(1)[0]
+    if count > 1:
         raise ConfigurationError(f"{option} {printable(double)}: given twice; expected it once")
     return fields, names
 

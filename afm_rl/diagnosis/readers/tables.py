@@ -5,68 +5,77 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from itertools import islice
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pandas as pd
 
-from afm_rl.diagnosis.readers.source import Series, Source, blocks_of, thinned_note
+from afm_rl.diagnosis.readers.source import Series, Source, blocks_of, check_names
 from afm_rl.errors import ConfigurationError, printable
 
 TIME, EPISODE = "t", "episode_index"
+LINE = 1 << 20
+"""Longest line (bytes)."""
 
 
 def open_csv(path: Path) -> Source:
     """Return the columns of a CSV file with a head line."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            head = file.readline(1 << 20)
+            head = file.readline(LINE)
             names = [name.strip() for name in next(csv.reader([head], skipinitialspace=True), [])]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ConfigurationError(f"no CSV file: {printable(str(error))}") from error
     if not names:
         raise ConfigurationError("empty; expected a head line and rows")
-    double = next((name for name in names if names.count(name) > 1 and name), None)
-    if double is not None:
-        raise ConfigurationError(f"{printable(double)}: two columns of this name; rename one")
+    if len(head) == LINE:
+        raise ConfigurationError(f"a line of more than {LINE:,} bytes: expected a head line")
+    check_names([name for name in names if name])
     return Source(
         path,
         names,
         lambda wanted: _read(path, names, wanted),
         time=TIME if TIME in names else None,
         episode=EPISODE if EPISODE in names else None,
-        notes=_large(path)[1],
     )
 
 
-def _large(path: Path, large: int = 1 << 25) -> tuple[list[tuple[int, int, int]], tuple[str, ...]]:
-    """Return the blocks of a large file: byte, row, and number of rows; and a note.
+def _line(file: BinaryIO) -> bytes:
+    line = file.readline(LINE)
+    if len(line) == LINE:
+        raise ConfigurationError(f"a line of more than {LINE:,} bytes: expected rows of numbers")
+    return line
+
+
+def _large(path: Path, width: int, large: int = 1 << 25) -> tuple[list[tuple[int, int, int]], int]:
+    """Return the blocks of a large file, byte, row, and number of rows; and the rows of the file.
 
     A file of less than ``large`` bytes is read as a whole, and has none.
     """
     size, count = path.stat().st_size, len(blocks_of(1 << 60))
     if size < large:
-        return [], ()
+        return [], 0
     starts, lines, before = [size * k // count for k in range(count)], [], 0
     with path.open("rb") as file:
+        for start in starts:  # before all is read: are there lines at all?
+            file.seek(start)
+            _line(file), _line(file)
         for start, end in zip(starts, [*starts[1:], size], strict=True):
             lines.append(before)
             file.seek(start)
             while start < end:
                 piece = file.read(min(1 << 24, end - start))
                 before, start = before + piece.count(b"\n"), start + len(piece)
-    before -= 1  # the head line
-    blocks = blocks_of(before)
+    blocks = blocks_of(before - 1, width)  # without the head line
     if len(blocks) == 1:
-        return [], ()
-    length = blocks[0][1]
-    found = [(at, max(line, 0), length) for at, line in zip(starts, lines, strict=True)]
-    return found, thinned_note(before, blocks)
+        return [], 0
+    found = [(at, max(line, 0), blocks[0][1]) for at, line in zip(starts, lines, strict=True)]
+    return found, before - 1
 
 
 def _read(path: Path, names: list[str], wanted: Sequence[str]) -> Mapping[str, Series]:
-    blocks, _ = _large(path)
+    blocks, total = _large(path, len(wanted))
     if not blocks:
         table = _parse(path, names, wanted, skip=1)
         row = np.arange(len(table))
@@ -75,25 +84,25 @@ def _read(path: Path, names: list[str], wanted: Sequence[str]) -> Mapping[str, S
         with path.open("rb") as file:
             for at, first, length in blocks:
                 file.seek(at)
-                file.readline()  # the head, or the rest of a row
-                text = b"".join(islice(file, length))
+                _line(file)  # the head, or the rest of a row
+                text = b"".join(_line(file) for _ in range(length))
                 parts.append(_parse(io.BytesIO(text), names, wanted))
                 rows.append(first + np.arange(len(parts[-1])))
         table, row = pd.concat(parts, ignore_index=True), np.concatenate(rows)
-    return {name: Series(_numbers(name, table[name]), row=row) for name in wanted}
+    return {name: Series(_numbers(name, table[name]), None, row, total) for name in wanted}
 
 
 def _parse(
     file: Path | io.BytesIO, names: list[str], wanted: Sequence[str], skip: int = 0
 ) -> pd.DataFrame:
     """Return some columns of rows without a head line."""
-    places = sorted(names.index(name) for name in wanted)
+    place = {name: k for k, name in enumerate(names)}
     try:
         return pd.read_csv(
             file,
             header=None,
             names=range(len(names)),
-            usecols=places,
+            usecols=sorted(place[name] for name in wanted),
             skiprows=skip,
             skipinitialspace=True,
             low_memory=False,

@@ -162,16 +162,19 @@ class Table:
     def rows(self) -> pd.DataFrame:
         """Return a row for each row of the log: ``t``, and of each actuator four columns.
 
-        ``NAME.command``, ``NAME.response``, ``NAME.afm`` (what the command was predicted to do) and
-        ``NAME.std``. They are NaN in rows of the file that could not be used.
+        ``command.NAME``, ``response.NAME``, ``afm.NAME`` (what the command was predicted to do) and
+        ``std.NAME``; of a log of several episodes also ``episode_index``. They are NaN in rows of
+        the file that could not be used. Readers of logs know these names.
         """
         log, columns = self.log, {"t": self.log.seconds}
+        if log.begins.sum() > 1:
+            columns["episode_index"] = log.begins.cumsum() - 1
         for j, name in enumerate(log.names):
             columns |= {
-                f"{name}.command": log.command[:, j],
-                f"{name}.response": log.response[:, j],
-                f"{name}.afm": self.predictions[AFM][:, j],
-                f"{name}.std": self.std[:, j],
+                f"command.{name}": log.command[:, j],
+                f"response.{name}": log.response[:, j],
+                f"afm.{name}": self.predictions[AFM][:, j],
+                f"std.{name}": self.std[:, j],
             }
         found = pd.DataFrame(columns)
         if log.row is None:

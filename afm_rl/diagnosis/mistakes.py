@@ -1,0 +1,260 @@
+"""The usual mistakes in a dynamics model, and what it would predict without them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+from torch import Tensor
+
+from afm_rl.diagnosis.words import UNITS
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.spaces.manifold import wrap_angle
+
+NEAR = 0.1  # a factor this near to 1 is none
+LATEST, LONGEST = 8, 20  # steps late; steps of the model in one of the robot
+GAINS = (1.0, -1.0, 0.01, 0.1, 10.0, 100.0, *UNITS.values())
+SCALES = (1.0, 0.3, 0.1, 0.02, 10.0)
+ANGLES = {math.pi / 180: "degrees, the model in radians", 180 / math.pi: "radians, not in degrees"}
+SMALL = 6  # entries of a state of which all combinations are tried
+
+
+class Transitions(NamedTuple):
+    """N transitions of a model's robot; rows that are not known are NaN."""
+
+    model: DynamicsModel
+    state: Tensor
+    action: Tensor
+    after: Tensor
+    before: Tensor
+    """The states a step earlier."""
+    sent: Mapping[int, Tensor]
+    """The actions so many steps earlier, or later."""
+
+    @classmethod
+    def of(cls, model: DynamicsModel, state: Tensor, action: Tensor, after: Tensor) -> Transitions:
+        """Return transitions in the order of time, of which some follow each other."""
+        follows = (state[1:] == after[:-1]).all(-1)
+        sent = {k: _earlier(action, follows, k) for k in (-1, *range(1, LATEST + 1))}
+        return cls(model, state, action, after, _earlier(state, follows, 1), sent)
+
+    def part(self, most: int) -> Transitions:
+        """Return at most so many rows, evenly spread."""
+        at = torch.linspace(0, len(self.state) - 1, min(most, len(self.state))).long()
+        state, action, after, before = (x[at] for x in self[1:5])
+        sent = {k: x[at] for k, x in self.sent.items()}
+        return Transitions(self.model, state, action, after, before, sent)
+
+    def motion(self, scale: Any = 1.0, offset: Any = 0.0) -> Tensor:
+        """Return how the states change, ``(N, D)``; of other units and zeros, in the own unit."""
+        here, there = (scale * x + offset for x in (self.state, self.after))
+        return self.model.manifold.difference(there, here) / scale
+
+    def step(self, gain: Any = 1.0, scale: Any = 1.0, offset: Any = 0.0) -> Tensor:
+        """Return what the model predicts of that, of actions in another unit, too."""
+        here = scale * self.state + offset
+        return self.model.manifold.difference(self.model(here, gain * self.action), here) / scale
+
+    def miss(self) -> Tensor:
+        """Return what the model misses, all of it where it predicts no numbers, ``(N, D)``."""
+        motion = self.motion()
+        return torch.where((step := self.step()).isfinite(), motion - step, motion)
+
+
+class Mistake(NamedTuple):
+    """What the robot does instead, and what the model misses once that is put right."""
+
+    cause: str
+    miss: Tensor
+    factor: Sequence[float] = ()
+    fitted: int = 0
+    """Numbers that were fitted for it."""
+
+
+def usual_mistakes(
+    seen: Transitions, miss: Tensor, size: Tensor, names: Sequence[str], actuators: Sequence[str]
+) -> Iterator[Mistake]:
+    """Yield the usual mistakes, the simplest first.
+
+    Args:
+        seen: N transitions.
+        miss: what the model misses of them, ``(N, D)``.
+        size: of the motion, ``(D,)``.
+        names: of the D entries of the state's tangent.
+        actuators: names of the A actions.
+    """
+    model, state, action, after, _, sent = seen
+    between, states, axes = model.manifold.difference, model.state_size, model.action_size
+    motion, step = seen.motion(), seen.step()
+    flat = states == len(size)  # no rotations
+    jumps = (miss.abs().amax(0) > math.pi) & (miss.abs().median(0).values < 1)
+    if flat and bool(jumps.any()):
+        which = jumps.nonzero().flatten().tolist()
+        told = f"turns through pi in {_where(names, jumps)} (Manifold({states}, angles={which}))"
+        yield Mistake(told, torch.where(jumps, wrap_angle(miss), miss))
+    for k, earlier in sent.items():
+        told = f"acts {k} step{'s' * (k > 1)} late" if k > 0 else "acts on the next row's action"
+        yield Mistake(told, between(after, model(state, earlier)), (k,))
+    begin = [1.0] if model.stiff else GAINS  # what is far off may be more than a simulator bears
+    (gain,), left = _fit(seen, size, [[k] for k in begin], lambda x: {"gain": x})
+    if abs(gain - 1) > NEAR:
+        yield Mistake(f"acts on {gain:.3g} times the action ({_unit(gain)})", left, (gain,), 1)
+    pace = _ratio(motion, step)
+    if abs(pace - 1) > NEAR:
+        told = f"moves {pace:.3g} times as far in a step (dt)"
+        yield Mistake(told, motion - pace * step, (pace,), 1)
+    there = model(state, action)
+    for n in range(2, LONGEST + 1):
+        there = model(there, action)
+        told = f"makes {n} steps of the model in one (dt, frame_skip)"
+        yield Mistake(told, between(after, there), (n,), 1)
+    told = "feels other forces that depend on its state (gravity, damping, stiffness)"
+    left, fitted = _without_forces(seen, miss)
+    yield Mistake(told, left, (), fitted)
+    if axes > 1:
+        gains, left = _fit(seen, size, [[1.0] * axes, [gain] * axes], lambda x: {"gain": x}, 1)
+        pairs = zip(gains, actuators, strict=True)
+        each = some_of([f"{k:.3g} times {name}" for k, name in pairs if abs(k - 1) > NEAR])
+        yield Mistake(f"acts on {each or 'all'} (signs, gains or units)", left, gains, axes)
+    if flat:
+        yield from _other_units(seen, size, names)
+
+
+def _other_units(seen: Transitions, size: Tensor, names: Sequence[str]) -> Iterator[Mistake]:
+    """Yield mistakes in the units of the state's entries, in the motion and in forces only."""
+    count, motion, stiff = len(size), seen.motion(), seen.model.stiff
+    lengths = [count] if stiff else [1, count] if count > SMALL else range(1, count + 1)
+    for unit, words in list(ANGLES.items())[: 1 if stiff else 2]:  # simulators have radians
+        step = seen.step(unit, unit)
+        yield Mistake(f"has states and actions in {words}", motion - step, [unit], 1)
+        for chosen in (c for length in lengths for c in combinations(range(count), length)):
+            which = torch.zeros(count, dtype=torch.bool)
+            which[list(chosen)] = True
+            scale = torch.where(which, unit, 1.0).to(size)
+            step, told = seen.step(scale=scale), f"has {_where(names, which)} in {words}"
+            yield Mistake(told, motion - step, scale.tolist(), 1)
+            yield Mistake(told, motion - scale * step, scale.tolist(), 1)
+    if stiff:
+        return
+    starts = [[math.log(k)] * count + [0.01] * count for k in SCALES]
+    found, left = _fit(
+        seen, size, starts, lambda x: {"scale": x[:count].exp(), "offset": x[count:]}, len(SCALES)
+    )
+    factor = [math.exp(x) for x in found[:count]]
+    pairs = zip(factor, names, found[count:], strict=True)
+    each = some_of([f"{k:.3g} {name} {round(b, 4) + 0.0:+.3g}" for k, name, b in pairs])
+    near = all(abs(k - 1) < NEAR for k in factor)
+    reason = "another zero, the sign of gravity" if near else "normalised observations, units"
+    told = f"has states that the model knows as {each} ({reason})"
+    yield Mistake(told, left, factor, 2 * count)
+
+
+def _fit(
+    seen: Transitions,
+    size: Tensor,
+    starts: Sequence[Sequence[float]],
+    units: Callable[[Tensor], Mapping[str, Tensor]],
+    tries: int = 2,
+) -> tuple[list[float], Tensor]:
+    """Return the numbers with which the model misses least, and what it misses then.
+
+    Args:
+        seen: N transitions.
+        size: of the motion, ``(D,)``.
+        starts: of the search; it begins at the best of them.
+        units: makes arguments of :meth:`Transitions.step` of the numbers.
+        tries: how many of the starts are searched from.
+    """
+
+    def left(x: Any) -> Tensor:
+        given = units(torch.as_tensor(x).to(size))
+        seen_from = {name: value for name, value in given.items() if name != "gain"}
+        return seen.motion(**seen_from) - seen.step(**given)
+
+    def residual(x: Any) -> np.ndarray:
+        return (left(x) / size).nan_to_num(1e3, 1e3, -1e3).double().cpu().numpy().ravel()
+
+    def slope(x: np.ndarray) -> np.ndarray:  # in single precision, SciPy's steps are too small
+        steps = np.diag(np.maximum(3e-3 * np.abs(x), 1e-4))
+        return np.stack([(residual(x + h) - residual(x - h)) / (2 * h.sum()) for h in steps], -1)
+
+    first = starts
+    if len(first) > tries:
+        first = sorted(starts, key=lambda x: np.abs(residual(x)).mean())[:tries]
+    rule = {"loss": "soft_l1", "max_nfev": 30, "ftol": 1e-4, "xtol": 1e-4}
+    fits = [least_squares(residual, x, slope, **rule) for x in first]
+    best = min(fits, key=lambda fit: fit.cost).x.tolist()
+    return best, left(best)
+
+
+def _ratio(of: Tensor, to: Tensor) -> float:
+    """Return k of ``of = k to`` ``(N, D)``, the median of all, each D being worth the same.
+
+    >>> _ratio(torch.tensor([[2.0], [4.0], [9.0]]), torch.tensor([[1.0], [2.0], [-0.1]]))
+    2.0
+    """
+    ratio, order = (of / to).flatten().sort()
+    weight = (to.abs() / to.abs().mean(0)).nan_to_num(0.0).flatten()[order]
+    half = weight.cumsum(0) >= 0.5 * weight[ratio.isfinite()].sum()
+    return float(ratio[half.int().argmax()])
+
+
+def _without_forces(seen: Transitions, miss: Tensor) -> tuple[Tensor, int]:
+    """Return what is missed beyond lines through the state and its motion by itself.
+
+    And how many numbers these lines have, of entries of which they explain more than half. The
+    state is that of a step earlier: else what is missed of a noisy one would seem to depend on it.
+    """
+    model, before = seen.model, seen.before
+    free = model.manifold.difference(model(before, torch.zeros_like(seen.action)), before)
+    known, left, fitted = free.isfinite().all(-1), torch.full_like(miss, torch.nan), 0
+    for j, own in enumerate(miss[known].double().cpu().T):
+        rows = torch.cat([torch.ones_like(free[:, :1]), before, free[:, j : j + 1]], -1)[known]
+        rows = rows.double().cpu()
+        rows = rows / rows.square().mean(0).sqrt().clamp_min(1e-9)
+        line = torch.linalg.lstsq(rows, own.unsqueeze(-1), driver="gelsd").solution
+        rest = own - (rows @ line).squeeze(-1)
+        explains = bool(rest.abs().mean() < 0.5 * own.abs().mean())
+        left[known, j] = (rest if explains else own).to(left)
+        fitted += rows.shape[-1] * explains
+    return left, fitted
+
+
+def _earlier(values: Tensor, follows: Tensor, steps: int) -> Tensor:
+    """Return the values ``(N, A)`` some steps earlier, NaN where an episode begins."""
+    found, count = torch.full_like(values, torch.nan), len(values) - abs(steps)
+    if count > 0:
+        whole = follows.unfold(0, abs(steps), 1).all(-1, keepdim=True)
+        there, here = (
+            (values[:count], found[-count:]) if steps > 0 else (values[-count:], found[:count])
+        )
+        here.copy_(torch.where(whole, there, torch.nan))
+    return found
+
+
+def _unit(gain: float) -> str:
+    """Return what a gain may come from.
+
+    >>> _unit(-1.0), _unit(57.3), _unit(0.5)
+    ('a sign', 'degrees for radians', 'a gain or a unit')
+    """
+    units = [name for name, k in UNITS.items() if abs(abs(gain) / k - 1) < NEAR]
+    return "a sign" if 0.7 < -gain < 1.4 else units[0] if units else "a gain or a unit"
+
+
+def _where(names: Sequence[str], which: Tensor) -> str:
+    return some_of([name for name, here in zip(names, which, strict=True) if here])
+
+
+def some_of(texts: Sequence[str], most: int = 4) -> str:
+    """Return the first of some texts.
+
+    >>> some_of(["a", "b", "c"], 2)
+    'a, b, ...'
+    """
+    return ", ".join([*texts[:most], *["..."][: len(texts) > most]])

@@ -1,0 +1,51 @@
+"""A correction that begins with the first steps and lasts is said, once."""
+
+import warnings
+
+import pytest
+import torch
+
+from afm_rl.correction.first_steps import STEPS, FirstSteps
+
+
+def said(steps):
+    """Return what is said of steps (bool)."""
+    first = FirstSteps()
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        for corrected in steps:
+            first(torch.tensor([corrected]), lambda: "gain 0.5 on all")
+    return [str(warning.message) for warning in found]
+
+
+@pytest.mark.parametrize(
+    ("steps", "count"),
+    [
+        ([True] * 300, 1),
+        ([True, True, False] * 100, 1),  # episodes of three steps
+        ([False] * 19 + [True] * 281, 1),
+        ([False] * 40 + [True] * 260, 0),  # a fault that came later
+        ([True] * 40 + [False] * 260, 0),
+        ([False] * 300, 0),
+        ([True] * (STEPS - 1), 0),
+    ],
+)
+def test_it_is_said_once_where_corrections_began_with_the_first_steps(steps, count):
+    messages = said(steps)
+    assert len(messages) == count
+    assert all("first 60 steps were corrected (gain 0.5 on all)" in text for text in messages)
+
+
+def test_numbers_are_not_looked_at_on_the_way_nor_in_a_compiled_tick():
+    first = FirstSteps()
+    for _ in range(STEPS - 1):
+        first(torch.ones(2, dtype=torch.bool, device="meta"), str)
+    assert len(first.corrected) == STEPS - 1
+    first = FirstSteps()
+
+    @torch.compile(backend="eager", fullgraph=True)
+    def tick(values):
+        first(values > 0, str)
+        return values + 1
+
+    assert tick(torch.ones(2)).tolist() == [2, 2] and not first.corrected

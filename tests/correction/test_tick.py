@@ -1,0 +1,101 @@
+"""The steps of a tick, each against a closed form."""
+
+import math
+
+import pytest
+import torch
+
+from afm_rl.correction import ActionFlow
+from afm_rl.correction.linear import Lines
+from afm_rl.correction.network import AxisNetwork
+from afm_rl.correction.tick import Models
+
+
+def flow_of(size=1, **settings):
+    network = AxisNetwork(width=16, latent=8)
+    return ActionFlow(-torch.ones(size), torch.ones(size), network=network, **settings)
+
+
+def models_of(flow, matrix):
+    """Return what is believed where a linear model is certain."""
+    size = flow.action_size
+    pairs, place = torch.zeros(1, flow.memory, 3 * size + 2), torch.zeros(1, 0)
+    read = flow.tick.read(pairs, torch.ones(1, size), place, torch.zeros(1, dtype=torch.long))
+    certain = torch.zeros(1, len(flow.models), size)
+    certain[:, flow.models.index("affine")] = 1.0
+    found = flow.tick.most_likely(read, certain)
+    matrix = torch.tensor(matrix).expand_as(found.lines.matrix)
+    return found._replace(lines=Lines(matrix, torch.zeros_like(found.lines.bias)))
+
+
+@pytest.mark.parametrize(("miss", "action"), [(0.1, 0.5), (0.2, 0.3)])
+def test_an_action_must_promise_more_than_the_plan(miss, action):
+    """The loss that it saves is log(1 + miss^2): of 0.01 too little, of 0.04 enough."""
+    models = Models(None, None, torch.ones(1, 1, 1))
+    proposals, expected = torch.tensor([[[0.5], [0.3]]]), torch.tensor([[[[miss], [0.0]]]])
+    nothing = torch.zeros(1, 1)
+    found, effect = flow_of().tick.decide(models, proposals, expected, nothing, 1 + nothing)
+    assert found == action and effect == expected[0, 0, [0.5, 0.3].index(action)]
+
+
+def test_axes_choose_apart_only_if_that_is_no_worse_together():
+    flow = flow_of(2)
+    proposals = torch.tensor([[[0.0, 0.0], [1.0, 0.0], [0.2, 0.2]]])
+    noise = torch.full((1, 2), 0.1)
+    # One effect is the sum, the other the difference: what suits one axis spoils the other.
+    coupled = models_of(flow, [[1.0, 1.0], [1.0, -1.0]])
+    expected = flow.tick.expect(coupled, proposals)
+    found, _ = flow.tick.decide(coupled, proposals, expected, torch.tensor([[1.0, 0.0]]), noise)
+    assert torch.equal(found, proposals[:, 2])
+    apart = models_of(flow, [[1.0, 0.0], [0.0, 1.0]])
+    expected = flow.tick.expect(apart, proposals)
+    wanted = torch.tensor([[1.0, 0.2]])
+    found, effect = flow.tick.decide(apart, proposals, expected, wanted, noise)
+    assert torch.equal(found, wanted)
+    torch.testing.assert_close(
+        (apart.weights.unsqueeze(2) * effect.unsqueeze(2)).sum(1)[:, 0], wanted
+    )
+
+
+def test_as_far_as_models_differ_the_best_is_hoped_for():
+    foreseen = torch.tensor([[[[1.0], [0.5]], [[-1.0], [0.5]]]])  # of two models, for two actions
+    reach = flow_of().tick.reach(Models(None, None, torch.full((1, 2, 1), 0.5)), foreseen)
+    assert reach.flatten().tolist() == [-1.0, 1.0]
+
+
+@pytest.mark.parametrize(("acts", "command"), [(0.3, None), (0.9, 1.0), (-0.9, -1.0)])
+def test_a_slow_actuator_is_led_as_far_as_the_box_allows(acts, command):
+    flow = flow_of()
+    weights = torch.tensor([name == "lag_2" for name in flow.models]).to(flow.tick.filtered)
+    lag = (flow.tick.filtered @ weights).argmax().view(1, 1)
+    sent, box = torch.full((1, 20, 1), 0.1), torch.tensor([[[-1.0], [1.0]]])
+    share = 1 - math.exp(-1 / 2)
+    found, led_to = flow.tick.lead(torch.tensor([[acts]]), lag, sent, box)
+    expected = (acts - (1 - share) * 0.1) / share if command is None else command
+    torch.testing.assert_close(found, torch.tensor([[expected]]))
+    torch.testing.assert_close(led_to, torch.tensor([[share * expected + (1 - share) * 0.1]]))
+
+
+@pytest.mark.parametrize(("healthy", "executed"), [(0.6, 0.5), (0.4, -0.5)])
+def test_models_by_which_nothing_is_wrong_keep_the_plan(healthy, executed):
+    flow, plan = flow_of(), torch.tensor([[0.5]])
+    weights = torch.zeros(1, len(flow.models), 1)
+    weights[:, flow.models.index("noisy readings")] = healthy
+    weights[:, flow.models.index("reversed")] = 1 - healthy
+    flow.weights = lambda parts: weights
+    box = torch.tensor([[[-1.0], [1.0]]])
+    _, action, *_, corrects = flow.decide(flow.begin(torch.zeros(1, 1)), plan, box)
+    torch.testing.assert_close(action, torch.tensor([[executed]]), rtol=0, atol=1e-3)
+    assert corrects == (healthy < 0.5)
+
+
+def test_maps_that_mix_axes_are_of_the_present_command_whatever_delay_is_believed():
+    flow = flow_of(2)
+    parts = flow.unpack(flow.begin(torch.zeros(3)), 3)
+    parts["pairs"][-2:, :2] = torch.tensor([[0.1, 0.2], [0.3, 0.4]])
+    parts["late"] = torch.tensor([2.0])
+    now = torch.tensor([0.7, 0.8])
+    forecasts, _ = flow.foresee(parts, now)
+    of = dict(zip(flow.models, forecasts, strict=True))  # nothing is known: every fit is nominal
+    for name, command in (("affine", now), ("driven", now), ("gain", torch.tensor([0.1, 0.2]))):
+        torch.testing.assert_close(of[name], command)

@@ -1,0 +1,212 @@
+"""A wrong model is told from a right one, and what is wrong with it is named."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from afm_rl.diagnosis.model_check import check_transitions
+from afm_rl.dynamics import KnownDynamics
+from afm_rl.errors import ConfigurationError
+from afm_rl.spaces.manifold import Manifold
+
+DEGREE = math.pi / 180
+
+
+def upright(state, torque, dt=0.05, gravity=10.0, angle=1.0):
+    """A pendulum that stands on its head: angle (rad), speed (rad/s); torque (N m)."""
+    speed = state[..., 1:] + dt * (1.5 * gravity * (angle * state[..., :1]).sin() + 3 * torque)
+    return torch.cat([state[..., :1] + dt * speed, speed], -1)
+
+
+def law(state, rng):
+    """Keep it upright."""
+    return np.clip(-12 * state[:1] - 3 * state[1:], -2, 2)
+
+
+def shaken(state, rng):
+    """Keep it upright, and let its torque show."""
+    return np.clip(law(state, rng) + 0.4 * rng.standard_normal(1), -2, 2)
+
+
+def random(state, rng):
+    return rng.uniform(-2, 2, 1)
+
+
+def drive(policy=random, noise=0.0, late=0, rows=300, robot=upright):
+    """Return states, actions and next states of a healthy robot."""
+    rng, state, sent = (
+        np.random.default_rng(0),
+        torch.tensor([0.3, 0.0]).double(),
+        [np.zeros(1)] * late,
+    )
+    seen, told = state.numpy(), []
+    for _ in range(rows):
+        sent.append(policy(seen, rng))
+        state = robot(state, torch.from_numpy(sent[-1 - late]))
+        after = state.numpy() + noise * rng.standard_normal(2)
+        told.append((seen, sent[-1], after))
+        seen = after
+    return [np.stack(column) for column in zip(*told, strict=True)]
+
+
+def check(model, rows, manifold=None, names=("angle", "speed")):
+    size = rows[0].shape[1], rows[1].shape[1]
+    known = KnownDynamics(model, manifold or Manifold(size[0]), size[1])
+    return check_transitions(known, *rows, names)
+
+
+WRONG = {
+    "sign": (lambda s, a: upright(s, -a), "acts on -1 times the action (a sign)", -1),
+    "degrees": (lambda s, a: upright(s, DEGREE * a), "57.3 times the action (degrees for", 57.3),
+    "hundredth": (lambda s, a: upright(s, 0.01 * a), "acts on 100 times the action", 100),
+    "half": (lambda s, a: upright(s, 0.5 * a), "acts on 2 times the action (a gain or", 2),
+    "dt / 10": (lambda s, a: upright(s, a, dt=0.005), r"dt", 10),
+    "dt / 2": (lambda s, a: upright(s, a, dt=0.025), r"dt", 2),
+    "dt * 2": (lambda s, a: upright(s, a, dt=0.1), r"dt", 0.5),
+    "angle": (
+        lambda s, a: upright(s, a, angle=DEGREE),
+        "has angle in radians, not in degrees",
+        57.3,
+    ),
+    "gravity": (lambda s, a: upright(s, a, gravity=-10.0), "gravity", None),
+}
+
+
+@pytest.mark.parametrize("policy", [random, law, shaken])
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_is_wrong_is_named(wrong, policy):
+    model, cause, factor = WRONG[wrong]
+    found = check(model, drive(policy))
+    assert not found.right and found.share < 0.95
+    assert cause in found.cause and found.corrected > max(0.55, found.share)
+    if factor is not None:
+        assert found.factor[0] == pytest.approx(factor, rel=0.25)
+    assert found.cause in str(found) and f"{100 * found.corrected:.0f} %" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("policy", "noise", "right"),
+    [(random, 0.0, True), (law, 0.0, True), (random, 0.02, True), (law, 0.02, False)],
+)
+def test_a_right_model_is_not_accused(policy, noise, right):
+    """Noise that hides the motion leaves open whether it is right."""
+    found = check(upright, drive(policy, noise))
+    assert found.right is right and not found.cause
+    assert ("it is right" in str(found) or "model is right" in str(found)) is right
+    if not noise:
+        assert found.predicted == pytest.approx((1.0, 1.0), abs=1e-4)
+
+
+def finer(state, torque):
+    """Two steps of half the length."""
+    return upright(upright(state, torque, dt=0.025), torque, dt=0.025)
+
+
+def walled(state, torque):
+    """A wall that it falls against."""
+    after = upright(state, torque)
+    return torch.where(after[..., :1] > 0.2, torch.tensor([0.2, 0.0]).double(), after)
+
+
+@pytest.mark.parametrize(("robot", "right"), [(finer, True), (walled, False)])
+def test_what_is_no_usual_mistake_is_none(robot, right):
+    found = check(upright, drive(robot=robot))
+    assert found.right is right and not found.cause
+
+
+@pytest.mark.parametrize("policy", [random, shaken])
+@pytest.mark.parametrize("wrong", ["sign", "degrees", "dt / 2"])
+def test_noise_does_not_hide_what_is_wrong(wrong, policy):
+    model, cause, _ = WRONG[wrong]
+    found = check(model, drive(policy, noise=0.01))
+    assert cause.split(" times")[-1].split(" (")[0] in found.cause and not found.right
+
+
+def puck(state, action):
+    """Two places and speeds."""
+    speed = state[..., 2:] + 0.1 * action
+    return torch.cat([state[..., :2] + 0.1 * speed, speed], -1)
+
+
+def cart(count=2):
+    """Return steps of a cart on a plane under random forces."""
+    rng, state, rows = np.random.default_rng(0), np.zeros(2 * count), []
+    for _ in range(300):
+        action = rng.uniform(-1, 1, count)
+        after = puck(torch.from_numpy(state), torch.from_numpy(action)).numpy()
+        rows.append((state, action, after))
+        state = 0.95 * after if abs(after).max() > 1 else after
+    return [np.stack(column) for column in zip(*rows, strict=True)]
+
+
+def scaled(rows, scale, offset):
+    return [(rows[0] - offset) / scale, rows[1], (rows[2] - offset) / scale]
+
+
+def turning(state, action):
+    return state + action
+
+
+def wrapped():
+    """Return an angle that a sensor wraps at pi."""
+    rng = np.random.default_rng(0)
+    state, action = rng.uniform(-3, 3, (300, 1)), rng.uniform(0, 0.5, (300, 1))
+    return state, action, (state + action + np.pi) % (2 * np.pi) - np.pi
+
+
+@pytest.mark.parametrize(
+    ("model", "rows", "cause"),
+    [
+        (upright, lambda: drive(late=1), "acts 1 step late"),
+        (upright, lambda: drive(law, late=3), "acts 3 steps late"),
+        (puck, lambda: [x[1:] if k != 1 else x[:-1] for k, x in enumerate(cart())], "next row"),
+        (upright, lambda: scaled(drive(), DEGREE, 0.0), "has angle, speed in degrees"),
+        (upright, lambda: scaled(drive(law), [0.045, 0.08], [0.01, -0.02]), "normalised"),
+        (
+            upright,
+            lambda: scaled(drive(shaken), [0.05, 0.1], [0.01, -0.02]),
+            "0.05 angle +0.01, 0.1 speed -0.02",
+        ),
+        (
+            lambda s, a: puck(s, a * torch.tensor([1.0, -2.0])),
+            cart,
+            "acts on -0.5 times action[1] (",
+        ),
+        (turning, wrapped, "turns through pi in angle (Manifold(1, angles=[0]))"),
+    ],
+)
+def test_other_mistakes(model, rows, cause):
+    rows = rows()
+    names = ("angle", "speed") if model is upright else ("angle",) if model is turning else ()
+    found = check(model, rows, names=names)
+    assert cause in found.cause and found.corrected > 0.99
+
+
+def test_a_manifold_that_turns_is_right():
+    assert check(turning, wrapped(), Manifold(1, angles=[0]), ("angle",)).right
+
+
+def test_a_model_that_predicts_no_numbers_predicts_nothing():
+    found = check(lambda s, a: s * torch.nan, drive())
+    assert found.share == 0.0 and not found.right and not found.cause
+
+
+def test_rows_that_are_no_numbers_do_not_count():
+    rows = drive()
+    rows[2][7] = np.nan
+    assert check(upright, rows).steps == 299
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s, a, n: (s[:9], a[:9], n[:9]), "expected 20 rows or more, of"),
+        (lambda s, a, n: (s, a[:, [0, 0]], n[:, :1]), r"next states \[\(300, 2\), \(300, 2\), "),
+        (lambda s, a, n: (s, a, s), "the robot rests in all 300 steps"),
+    ],
+)
+def test_what_shows_nothing_is_refused(change, message):
+    with pytest.raises(ConfigurationError, match=message):
+        check_transitions(KnownDynamics(lambda s, a: s, Manifold(2), 1), *change(*drive()))

@@ -1,0 +1,148 @@
+"""What holds in whichever shell the correction is: transform, policy, controller or wrapper."""
+
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from puck import Puck, push
+from tensordict import TensorDict
+from torchrl.data import Bounded
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import step_mdp
+
+from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
+from afm_rl.dynamics import KnownDynamics
+from afm_rl.errors import ConfigurationError
+from afm_rl.planning import KnownReward, PlanningEnv
+from afm_rl.spaces.manifold import Manifold
+from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
+from afm_rl.transforms.controller import Controller
+
+EPISODE = 6
+BOX = -torch.ones(2), torch.ones(2)
+
+
+def starts(dtype):
+    generator = torch.Generator().manual_seed(0)
+    while True:
+        yield torch.randn(4, generator=generator).to(dtype)
+
+
+def transform(plans, dtype, **settings):
+    actual = KnownDynamics(lambda s, a: push(s, -a), Manifold(4), 2)
+    world = PlanningEnv(actual, KnownReward(lambda s, a, n: -n.square().sum(-1)), *BOX)
+    model = KnownDynamics(push, Manifold(4), 2)
+    env, start = TransformedEnv(world, ActionFlowTransform(model, **settings)), starts(dtype)
+    for k, plan in enumerate(plans):
+        if k % EPISODE == 0:
+            td = env.reset(TensorDict({"observation": next(start)}))
+        td = step_mdp(env.step(td.set("action", plan)))
+        yield td["afm", "executed_action"]
+
+
+def policy(plans, dtype, **settings):
+    model = KnownDynamics(push, Manifold(4), 2)
+    corrected, start = ActionFlowPolicy(model, Bounded(*BOX), **settings), starts(dtype)
+    primer, td = corrected.make_tensordict_primer(), TensorDict()
+    for k, plan in enumerate(plans):
+        if k % EPISODE == 0:
+            td, state = primer(td), next(start)
+        td = corrected(td.update({"observation": state, "action": plan}))
+        executed, td = td["action"], step_mdp(td)
+        state = push(state.float(), -executed.float()).to(dtype)
+        yield executed
+
+
+def controller(plans, dtype, keep_memory_on_reset=False):
+    model = KnownDynamics(push, Manifold(4), 2)
+    corrected = ActionFlowPolicy(model, Bounded(*BOX), keep_memory_on_reset=keep_memory_on_reset)
+    pure, start = Controller(None, corrected), starts(dtype)
+    memory = torch.zeros(pure.sizes["memory"])
+    for k, plan in enumerate(plans):
+        if k % EPISODE == 0:
+            state = next(start)
+            memory = memory.clone() if keep_memory_on_reset else torch.zeros_like(memory)
+            memory[0] *= -1
+        memory, executed = pure(memory, state, plan)
+        state = push(state.float(), -executed.float()).to(dtype)
+        yield executed
+
+
+def numpy_of(dtype):
+    return torch.zeros((), dtype=dtype).numpy().dtype
+
+
+def wrapper(plans, dtype, **settings):
+    env = ActionFlowWrapper(Puck(numpy_of(dtype), -1.0, EPISODE), push, **settings)
+    env.reset(seed=0)
+    for plan in plans:
+        *_, over, _, info = env.step(plan)
+        if over:
+            env.reset()
+        yield torch.as_tensor(info["afm"]["executed"])
+
+
+def vector(mode):
+    def run(plans, dtype, **settings):
+        makers = [lambda: Puck(numpy_of(dtype), -1.0, EPISODE)] * 2
+        env = SyncVectorEnv(makers, autoreset_mode=mode)
+        env = ActionFlowVectorWrapper(env, push, **settings)
+        env.reset(seed=0)
+        for plan in plans:
+            _, _, over, _, info = env.step(torch.stack([plan, plan]))
+            if mode is AutoresetMode.DISABLED and over.any():
+                env.reset(options={"reset_mask": over})
+            executed = torch.as_tensor(info["afm"]["executed"][0])
+            yield executed if info["_afm"][0] else -plan.detach()  # of a step that only resets
+
+    return run
+
+
+SHELLS = {f.__name__: f for f in (transform, policy, controller, wrapper)}
+SHELLS |= {mode.value: vector(mode) for mode in AutoresetMode}
+
+
+def plans_of(count):
+    return torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
+
+
+def missed(shell, plans, dtype=torch.float32, **settings):
+    """Return how far each action is from the one that is right, the plan's opposite."""
+    executed = torch.stack([each.double() for each in shell(plans, dtype, **settings)])
+    assert not executed.requires_grad and executed.isfinite().all()
+    return (executed + torch.stack(list(plans)).detach().double()).abs().amax(-1)
+
+
+@pytest.mark.parametrize("shell", SHELLS.values(), ids=SHELLS)
+def test_what_was_learnt_outlasts_resets_if_it_shall(shell):
+    plans = plans_of(80)
+    assert (missed(shell, plans) > 0.1).double().mean() > 0.3
+    assert (missed(shell, plans, keep_memory_on_reset=True) > 0.1).double().mean() <= 0.05
+
+
+SIXTEEN = {
+    "gradients": (lambda plan: plan.clone().requires_grad_(), torch.float32),
+    "bfloat16 actions": (lambda plan: plan.bfloat16(), torch.float32),
+    "float16 actions": (lambda plan: plan.half(), torch.float32),
+    "float16 observations": (lambda plan: plan, torch.float16),
+}
+
+
+@pytest.mark.parametrize("case", SIXTEEN)
+@pytest.mark.parametrize("shell", SHELLS.values(), ids=SHELLS)
+def test_gradients_and_16_bits_are_served(shell, case):
+    change, dtype = SIXTEEN[case]
+    assert (missed(shell, [change(plan) for plan in plans_of(EPISODE)], dtype)[4:] < 0.15).all()
+
+
+@pytest.mark.parametrize("when", ["reset", "step"])
+@pytest.mark.parametrize("shell", SHELLS.values(), ids=SHELLS)
+def test_a_default_type_of_16_bits_is_refused(shell, when):
+    running = shell(plans_of(EPISODE), torch.float32)
+    if when == "step":
+        next(running)
+    torch.set_default_dtype(torch.bfloat16)
+    try:
+        with pytest.raises(ConfigurationError, match="default_dtype.. is torch.bfloat16: expected"):
+            next(running)
+    finally:
+        torch.set_default_dtype(torch.float32)
