@@ -239,10 +239,12 @@ class ActionFlowTransform(CarriedTransform):
 
     def recall(self, tensordict: TensorDictBase) -> Tensor | None:
         """Return the memory up to a tensordict: its own, or the newest, if it belongs to that."""
-        entries = tensordict.get(self.prefix, None)
-        if entries is None or self.carry_memory:
-            return None if entries is None else entries.get("memory", None)
-        state, newest = entries.get("arrival"), self._newest
+        if self.carry_memory:
+            return tensordict.get(self.key("memory"), None)
+        entries, newest = tensordict.get(self.prefix, None), self._newest
+        state = None if entries is None else entries.get("arrival", None)
+        if state is None:
+            return None
         fits = newest is not None and newest.shape == state.shape[:-1]
         known = _same(entries, newest) if fits else torch.zeros(state.shape[:-1], dtype=torch.bool)
         if known.all():

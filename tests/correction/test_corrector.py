@@ -104,6 +104,25 @@ def test_a_mission_begins_with_its_state_and_nothing_else(corrector, batch):
     assert not any(part.any() for name, part in parts.items() if name != "state")
 
 
+def test_who_begins_again_keeps_what_was_learnt(corrector):
+    memory, state = torch.rand(4, corrector.memory_size(3)), torch.rand(4, 3)
+    again = corrector.unpack(corrector.resume(memory, state), 3)
+    begun, before = (corrector.unpack(m, 3) for m in (corrector.begin(state), memory))
+    again.pop("carryover")
+    assert {"state", "planned", "executed"} <= set(corrector.episodic) <= set(again)
+    for name, part in again.items():
+        assert torch.equal(part, (begun if name in corrector.episodic else before)[name])
+
+
+def test_transitions_count_when_commands_from_before_a_reset_act_no_more():
+    corrector = Watching(delay=2)
+    memory = corrector.resume(corrector.begin(torch.zeros(3)), torch.ones(3))
+    for _ in range(4):
+        memory = corrector.observe(memory, torch.rand(3))
+    rows = corrector.unpack(memory, 3)["transitions"]
+    assert rows[:, -1].tolist() == [0.0, 1.0, 1.0]  # the last three of four
+
+
 def test_before_the_first_action_the_one_nearest_to_zero_was_sent():
     low, high = torch.tensor([0.5, -3.0, -1.0, 0.0]), torch.tensor([2.0, -1.5, 1.0, 4.0])
     corrector = Watching(low, high, delay=2)
