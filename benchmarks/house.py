@@ -1,4 +1,4 @@
-"""Count the house: files, lines, classes, module constants, and words of docs.
+"""Count the house: files, lines, classes, module constants, words of docs, and what imports load.
 
     python benchmarks/house.py [ROOT]
 
@@ -10,9 +10,19 @@ from __future__ import annotations
 
 import argparse
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 HERE = Path(__file__).parents[1]
+IMPORTS = {
+    "ActionFlowTransform": "from afm_rl.transforms import ActionFlowTransform",
+    "ActionFlowWrapper": "from afm_rl import ActionFlowWrapper",
+}
+FILES = """
+import sys
+print(*(m.__file__ for name, m in sys.modules.items() if name[:6] == "afm_rl"), sep="\\n")
+"""
 
 
 def constants(tree: ast.Module) -> int:
@@ -43,11 +53,20 @@ def count(root: Path) -> dict[str, int]:
     }
 
 
+def loaded(statement: str) -> int:
+    """Return how many lines of the package that is installed an import loads."""
+    code = f"{statement}\n{FILES}"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return sum(Path(path).read_text(encoding="utf-8").count("\n") for path in ran.stdout.split())
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("root", type=Path, nargs="?", default=HERE)
     for name, number in count(parser.parse_args().root).items():
         print(f"{name}: {number:,}")
+    for name, statement in IMPORTS.items():
+        print(f"lines loaded by {name}: {loaded(statement):,}")
 
 
 if __name__ == "__main__":
