@@ -69,12 +69,14 @@ def _slow(kind: str, prefix: str = "") -> list[Hypothesis]:
     ]
 
 
-NOMINAL = Hypothesis("nothing has changed", "nominal", follows_delay=False)
+UNCHANGED = "nothing has changed"
+NOMINAL = Hypothesis(UNCHANGED, "nominal", follows_delay=False, cause=UNCHANGED)
+CAUSES = {"near": "another ground"}  # of readings by what they read
 HYPOTHESES = (
-    NOMINAL._replace(cause=NOMINAL.name),
+    NOMINAL,
     *(
-        Hypothesis(name, "network", cause="another ground" if by_place else "a recent change")
-        for name, by_place in ((name, row.kind == "near") for name, row in READINGS.items())
+        Hypothesis(name, "network", cause=CAUSES.get(reading.kind, "a recent change"))
+        for name, reading in READINGS.items()
     ),
     # The opposite of the command: it needs no fit, and says what every action does.
     Hypothesis("reversed", "linear"),

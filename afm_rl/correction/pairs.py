@@ -9,6 +9,7 @@ from torch import Tensor
 
 from afm_rl.correction.base import Corrector, Fields
 from afm_rl.correction.experts import LIMIT
+from afm_rl.correction.least_squares import fit_gain
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
 from afm_rl.errors import check_count, check_number
@@ -103,7 +104,7 @@ class PairCorrector(Corrector):
         pairs = self.unpack(memory, self.states_in(memory))["pairs"].double().flatten(0, -2)
         sent, came, std, valid, _ = pairs.split([*[self.action_size] * 3, 1, self.tail], -1)
         weight = valid / (std.square() + 0.05**2)
-        gains = (weight * sent * came).sum(0) / (weight * sent.square()).sum(0)
+        gains = fit_gain(sent, came, weight)
         left = (weight * (came - gains * sent).square()).sum() / (weight * came.square()).sum()
         if not bool(left < 0.5):  # nor where nothing moved
             return ""
