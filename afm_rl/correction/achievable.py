@@ -5,15 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from afm_rl.regimes import Regime
-
 LIMIT = 4.0  # half ranges: effects beyond carry no more news
 MODES = ("mixed", "direction", "clip")
 LEAST = 0.15  # share of an action that must be had for "mixed" to clip it
 LITTLE = 0.3  # share of the box that must be reached for plans to keep to it
 TRIED = 0.1  # share of the box that must have been tried to know that little can be reached
 DEAD = 0.025  # share of which nothing can be had
-ROUNDS, TOLERANCE = 8, 0.01  # bisection of the scale; miss in half ranges that still counts
 
 
 def saturate(unit: Tensor, mode: str, dim: int = -1) -> Tensor:
@@ -80,42 +77,3 @@ def extend(reach: Tensor, box: Tensor, tried: Tensor) -> Tensor:
     little = (share > DEAD) & (share < LITTLE) & (tried.unsqueeze(-2) > TRIED * width)
     (low, high), (least, most) = reach.unbind(-2), box.unbind(-2)
     return torch.where(little, torch.stack([low.fmin(least), high.fmax(most)], -2), reach)
-
-
-def intend(
-    regime: Regime,
-    planned: Tensor,
-    parameters: Tensor,
-    state: Tensor,
-    low: Tensor,
-    high: Tensor,
-    mode: str,
-) -> Tensor:
-    r"""Return the action whose effect under a regime T is the planned action, ``(*B, A)``.
-
-    .. math:: u = T^{-1}(s\,a),\qquad s = \max\{s \in [0, 1] : s\,a \in T(\text{box})\}
-
-    with ``mode="direction"``; with ``"clip"``, or ``"mixed"`` and s > 0.15, u has the nearest
-    effect there is.
-    """
-    intended = regime.inverse(planned, parameters, state, low, high)
-    if mode == "clip":
-        return intended
-
-    def possible(action: Tensor, effect: Tensor, now: Tensor, here: Tensor) -> Tensor:
-        miss = (regime.apply(action, now, here) - effect).abs() / (0.5 * (high - low))
-        return (miss < TOLERANCE).all(-1, keepdim=True)
-
-    short = ~possible(intended, planned, parameters, state).squeeze(-1)
-    wanted = planned[short]
-    now, here = (part.expand(*short.shape, -1)[short] for part in (parameters, state))
-    scale = torch.zeros_like(wanted[..., :1])
-    for k in range(1, ROUNDS + 1):
-        trial = scale + 0.5**k
-        action = regime.inverse(trial * wanted, now, here, low, high)
-        scale = torch.where(possible(action, trial * wanted, now, here), trial, scale)
-    slower = regime.inverse(scale * wanted, now, here, low, high)
-    intended = intended.clone()
-    nearest = scale == 0 if mode == "direction" else (scale == 0) | (scale > LEAST)
-    intended[short] = torch.where(nearest, intended[short], slower)
-    return intended

@@ -19,7 +19,6 @@ from afm_rl.errors import (
     check_flag,
     check_number,
 )
-from afm_rl.regimes import Regime
 from afm_rl.spaces.manifold import draw_states, uniform
 
 
@@ -118,7 +117,6 @@ class PaperFlow(Corrector):
     def training_loss(
         self,
         model: DynamicsModel,
-        regime: Regime,
         states: tuple[Tensor, Tensor] | Tensor,
         count: int,
         generator: torch.Generator,
@@ -133,7 +131,6 @@ class PaperFlow(Corrector):
     def held_out_error(
         self,
         model: DynamicsModel,
-        regime: Regime,
         states: tuple[Tensor, Tensor] | Tensor,
         count: int,
         generator: torch.Generator,

@@ -35,8 +35,6 @@ from afm_rl.missions.robot import Robot
 from afm_rl.planning.costs import KnownReward
 from afm_rl.storage.artefacts import load_artefact
 
-FLOW_UNIT = "shares of the largest action"
-
 
 class Training(NamedTuple):
     """How a part is trained, if it is not taken from the cache."""
@@ -166,17 +164,21 @@ def no_correction(robot: Robot, dynamics: Part) -> Part:
 def afm(
     robot: Robot,
     dynamics: Part,
-    train: Mapping[str, Any] | None = None,
     checkpoint: str | None = None,
+    train: None = None,
     **settings: Any,
 ) -> Part:
-    """Return the universal action flow; ``train`` refines it on the robot."""
+    """Return the universal action flow; ``train`` is null in settings that were stored earlier."""
+    if train is not None:
+        raise ConfigurationError(
+            f"corrector.train={train}: this flow is no longer refined on a robot; leave it out, or "
+            "give corrector.checkpoint"
+        )
     place, scale = list(robot.place), robot.place_scale
     flow = ActionFlow(*robot.action_box, place=place, place_scale=scale, **settings)
-    if train is None and checkpoint is None:
-        return Part(flow)
-    own: dict[str, Any] = {k: v for k, v in settings.items() if k in ("readings", "rows")}
-    return Part(flow, _training(flow, robot, dynamics, train or {}, checkpoint, own, FLOW_UNIT))
+    if checkpoint is not None:
+        _load(flow, checkpoint)
+    return Part(flow)
 
 
 def paper_flow(
@@ -194,8 +196,19 @@ def paper_flow(
         )
     size, features = model.state_size, list(robot.features)
     flow = PaperFlow(*robot.action_box, features=features, state_size=size, **settings)
+    check_training("corrector.train", train_flow, train, batch_size=2)
+    if checkpoint is not None:
+        _load(flow, checkpoint)
+        return Part(flow)
+    if dynamics.settings is None:
+        model = robot.model
+
+    def fit(progress: bool) -> float:
+        return train_flow(flow, model, robot.state_box, progress=progress, **train)
+
     own = _without(settings, "rule", "gate", "steps", "error_action", "latch")
-    return Part(flow, _training(flow, robot, dynamics, train, checkpoint, own, "action units"))
+    shape = [dynamics.settings or {}, {**own, "train": train}]
+    return Part(flow, Training("flow", flow, fit, "action units", shape))
 
 
 def least_squares(robot: Robot, dynamics: Part, **settings: Any) -> LeastSquares:
@@ -209,34 +222,16 @@ def l1(robot: Robot, dynamics: Part, dt: float | None = None, **settings: Any) -
     return L1Augmentation(*robot.action_box, dt=step, **settings)
 
 
-def _training(
-    flow: ActionFlow | PaperFlow,
-    robot: Robot,
-    dynamics: Part,
-    settings: Mapping[str, Any],
-    checkpoint: str | None,
-    own: Mapping[str, Any],
-    unit: str,
-) -> Training | None:
-    """Return how a flow is trained; None if it comes from a file."""
-    model = robot.model if dynamics.settings is None else dynamics.module
-    check_training("corrector.train", train_flow, settings, batch_size=2)
-    if checkpoint is not None:
-        if not isinstance(checkpoint, str):
-            raise ConfigurationError(
-                f"corrector.checkpoint={checkpoint!r}: expected the path of a file"
-            )
-        try:
-            load_artefact(Path(checkpoint), flow, flow.signature)
-        except AFMError as error:
-            raise ConfigurationError(f"corrector.checkpoint: {error}") from error
-        return None
-
-    def train(progress: bool) -> float:
-        return train_flow(flow, model, robot.regime, robot.state_box, progress=progress, **settings)
-
-    shape = {**own, "train": settings}
-    return Training("flow", flow, train, unit, [dynamics.settings or {}, shape])
+def _load(flow: ActionFlow | PaperFlow, checkpoint: str) -> None:
+    """Load the weights of a flow, in place."""
+    if not isinstance(checkpoint, str):
+        raise ConfigurationError(
+            f"corrector.checkpoint={checkpoint!r}: expected the path of a file"
+        )
+    try:
+        load_artefact(Path(checkpoint), flow, flow.signature)
+    except AFMError as error:
+        raise ConfigurationError(f"corrector.checkpoint: {error}") from error
 
 
 def _without(settings: Mapping[str, Any], *names: str) -> dict[str, Any]:

@@ -100,8 +100,9 @@ def assert_same_results(left, right):
 
 def test_the_stored_configuration_makes_the_same_run(afm_rl, tmp_path, quick, cache):
     first, again = tmp_path / "first", tmp_path / "again"
-    train = "corrector.train={iterations: 5, batch_size: 16}"
-    chosen = ["method=afm_physics", train, "budget=20", "seeds=[4]", "label=mine"]
+    train = ["corrector.train.iterations=5", "corrector.train.batch_size=16"]
+    parts = ["corrector=paper", *train]
+    chosen = [*parts, "budget=20", "seeds=[4]", "label=mine"]
     assert afm_rl(*chosen, *quick, f"hydra.run.dir={first}").status == 0
     replay = [f"--config-path={first}", "--config-name=config", f"hydra.run.dir={again}"]
     done = afm_rl(*replay)

@@ -11,9 +11,6 @@ from afm_rl.correction.achievable import MODES
 from afm_rl.correction.belief import Belief
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.tick import points_of, probes_of
-from afm_rl.correction.training import train_flow
-from afm_rl.correction.training.counterfactuals import Windows
-from afm_rl.dynamics import Dubins
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.storage.artefacts import load_artefact, save_artefact
 
@@ -209,15 +206,6 @@ def test_only_weights_are_stored_and_load_where_they_fit(tmp_path):
     paper = PaperFlow([-1.0], [1.0], [0], 1)
     with pytest.raises(ArtefactError, match="kind"):
         load_artefact(path, paper, paper.signature)
-
-
-def test_it_can_be_refined_on_a_robot(small_flow, gains, states):
-    flow, world = small_flow(), (Dubins(), gains, states)
-    windows = Windows(flow)
-    drawn = windows.draw(*world, 256, torch.Generator().manual_seed(3))
-    before = windows.error(drawn)
-    error = train_flow(flow, *world, iterations=40, batch_size=48, lr=5e-3)
-    assert windows.error(drawn) < 0.95 * before and 0 < error < 0.5
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """The published flow and its quirks."""
 
+import io
 import math
+import sys
 
 import pytest
 import torch
@@ -8,7 +10,7 @@ import torch
 from afm_rl.correction import PaperFlow
 from afm_rl.correction.network import midpoint
 from afm_rl.correction.training import train_flow
-from afm_rl.dynamics import Dubins
+from afm_rl.dynamics import Dubins, Quadrotor
 from afm_rl.errors import ConfigurationError
 
 
@@ -159,7 +161,7 @@ def test_training_leaves_the_noise_of_a_sampling_model_alone(make, states, make_
     model = make_ensemble(propagation="sample")
     before = model._generator.get_state()
     settings = {"iterations": 2, "batch_size": 8}
-    errors = {train_flow(make(), model, None, states, **settings) for _ in range(2)}
+    errors = {train_flow(make(), model, states, **settings) for _ in range(2)}
     assert len(errors) == 1 and torch.equal(model._generator.get_state(), before)
 
 
@@ -175,12 +177,12 @@ def test_the_correction_integrates_from_the_planned_action_in_raw_units(make, tr
     assert not found.spread.any() and torch.equal(found.predicted, planned)
 
 
-def test_it_learns_what_it_is_taught(make, states, gains):
+def test_it_learns_what_it_is_taught(make, states):
     flow = make(width=32, wrap=True)
     fresh = torch.Generator().manual_seed(5)
-    before = flow.held_out_error(Dubins(), gains, states, 1000, fresh)
+    before = flow.held_out_error(Dubins(), states, 1000, fresh)
     settings = {"iterations": 1000, "batch_size": 128, "lr": 1e-2}
-    assert train_flow(flow, Dubins(), gains, states, **settings) < 0.5 * before
+    assert train_flow(flow, Dubins(), states, **settings) < 0.5 * before
 
 
 @pytest.mark.parametrize(
@@ -203,3 +205,85 @@ def test_it_learns_what_it_is_taught(make, states, gains):
 def test_impossible_settings_are_refused(box, settings):
     with pytest.raises(ConfigurationError, match=f"corrector.{next(iter(settings))}"):
         PaperFlow(*box, **{"features": [2], "state_size": 3, **settings})
+
+
+@pytest.fixture
+def train(make, states):
+    def run(seed=0, **settings):
+        flow = make()
+        settings = {"iterations": 4, "batch_size": 8, "seed": seed, **settings}
+        return flow, train_flow(flow, Dubins(), states, **settings)
+
+    return run
+
+
+def same(left, right):
+    right = right.state_dict()
+    return all(torch.equal(value, right[name]) for name, value in left.state_dict().items())
+
+
+def test_the_seed_decides_everything_and_the_global_generator_nothing(train):
+    before = torch.get_rng_state()
+    first, error = train()
+    assert torch.equal(torch.get_rng_state(), before)
+    again, same_error = train()
+    other, _ = train(seed=1)
+    assert same(first, again) and error == same_error and not same(first, other)
+
+
+def test_the_model_is_not_changed_and_gradients_may_be_off(make_ensemble, make, states):
+    model, flow, start = make_ensemble(), make(), make()
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    with torch.no_grad():
+        train_flow(flow, model, states, iterations=2, batch_size=8)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert not same(flow, start)
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_progress_can_be_shown_on_a_terminal(train, monkeypatch):
+    written = {}
+    for progress in (False, True):
+        monkeypatch.setattr("sys.stderr", Terminal())
+        train(progress=progress)
+        written[progress] = sys.stderr.getvalue()
+    assert written[False] == "" and "training the flow" in written[True]
+
+
+@pytest.mark.parametrize(
+    "settings", [{"iterations": 0}, {"batch_size": 1}, {"lr": 0.0}, {"seed": 1.5}], ids=str
+)
+def test_impossible_settings_of_a_training_are_refused(train, settings):
+    with pytest.raises(ConfigurationError, match=f"corrector.train.{next(iter(settings))}"):
+        train(**settings)
+
+
+@pytest.mark.parametrize(
+    "region",
+    [(torch.zeros(2), torch.ones(2)), (torch.zeros(3), torch.full((3,), math.inf))],
+    ids=str,
+)
+def test_a_box_of_states_that_cannot_be_drawn_from_is_refused(make, region):
+    with pytest.raises(ConfigurationError, match="states=.*expected finite states of 3 numbers"):
+        train_flow(make(), Dubins(), region)
+
+
+def test_the_universal_flow_is_not_trained_on_a_robot(universal_flow, states):
+    with pytest.raises(ConfigurationError, match="flow: expected a PaperFlow, got ActionFlow"):
+        train_flow(universal_flow, Dubins(), states)
+
+
+def test_training_states_lie_on_the_manifold(monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        Quadrotor, "forward", lambda model, state, action: seen.append(state) or state
+    )
+    monkeypatch.setattr("afm_rl.spaces.manifold.Manifold.difference", lambda m, a, b: a - b)
+    states, generator = (torch.zeros(13), torch.ones(13)), torch.Generator().manual_seed(0)
+    flow = PaperFlow(torch.tensor([0.0, -1.0, -1.0, -1.0]), torch.ones(4), [3, 4], 13)
+    flow._examples(Quadrotor(), states, 8, generator)
+    torch.testing.assert_close(seen[-1][..., 6:10].norm(dim=-1), torch.ones(8))

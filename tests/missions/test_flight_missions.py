@@ -211,11 +211,10 @@ def test_robots_say_which_readings_make_sense(composed):
 
 
 def test_before_it_learns_a_model_shares_the_flow_of_the_physics(configure):
-    methods = ("afm_physics", "afm_online_knode", "afm_rls", "afm_offline_knode")
-    same = {"corrector.train": {"iterations": 5}, "corrector.readings": ["recent"]}
-    agents = [build(configure("robot=quadrotor", f"method={method}", **same)) for method in methods]
-    first, *others, offline = [agent.trainings[-1].settings for agent in agents]
-    assert others == [first, first] and offline != first
+    models = ["physics", "calibrated", "pe"]
+    agents = [build(configure("corrector=paper", f"dynamics={model}")) for model in models]
+    first, other, learned = [agent.trainings[-1].settings for agent in agents]
+    assert other == first != learned
 
 
 def test_correctors_learn_from_what_the_motors_gave(drive):

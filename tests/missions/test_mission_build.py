@@ -63,6 +63,7 @@ def test_a_planner_that_remembers_nothing_needs_no_primer(configure):
         (["robot=quadrotor", "dynamics=knode", "+dynamics.pretrain.lr=0"], "pretrain.lr=0"),
         (["robot=quadrotor", "dynamics=knode", "planner=mppi"], "choose planner=mpc"),
         (["updater=online"], "updater: the dynamics model has nothing to learn"),
+        (["corrector=afm", "+corrector.train={seed: 1}"], "corrector.train=.*no longer refined"),
         (["+planner.horizn=3"], "planner: .* unexpected keyword argument 'horizn'"),
         (["+robot.env.horizn=3"], "robot.env: .* unexpected keyword argument 'horizn'"),
         (["cost.coordinates=[0, 7]"], "cost: index 7 is out of bounds"),
@@ -125,7 +126,7 @@ NAN = float("nan")
         ("online_pe", "updater.optimizer.lr", "abc", "updater.lr='abc': expected a finite"),
         ("online_pe", "updater.optimizer._target_", "torch.Nope", "updater.optimizer._target_="),
         ("afm_physics", "corrector.readings", ["near"], "corrector.readings=.* by time"),
-        ("afm_physics", "corrector.train", {"batch_size": 1}, "corrector.train.batch_size=1: exp"),
+        ("afm_paper", "corrector.train.batch_size", 1, "corrector.train.batch_size=1: exp"),
         ("afm_paper", "corrector.error_action", "foo", "corrector.error_action='foo': expected"),
     ],
 )

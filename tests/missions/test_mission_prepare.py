@@ -6,8 +6,7 @@ import torch
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.missions import build, prepare
 
-METHOD = "method=afm_frozen_pe"  # trains an ensemble
-REFINED = {"iterations": 20, "batch_size": 16, "seed": 0}  # and refines the flow over it
+METHOD = "method=afm_paper"  # trains an ensemble, and a flow over it
 
 
 @pytest.fixture
@@ -15,7 +14,6 @@ def prepared(configure):
     """Build and prepare; return the agent and what was said."""
 
     def make(cache, *overrides, **settings):
-        settings = {"corrector.train": REFINED, **settings}
         agent, lines = build(configure(METHOD, *overrides, **settings)), []
         prepare(agent, cache, echo=lines.append)
         return agent, [line for line in lines if "held-out error" in line]
@@ -45,11 +43,11 @@ def test_only_what_the_result_depends_on_is_part_of_the_key(prepared, cache):
     prepared(cache)
     _, lines = prepared(cache, "planner=mppi_paper", "seeds=3", budget=3)
     assert all("from the cache" in line for line in lines)
-    after = {f"corrector.{name}": value for name, value in {"odds": 9.0, "samples": 2}.items()}
+    after = {f"corrector.{name}": value for name, value in {"gate": 9.0, "steps": 2}.items()}
     after["dynamics.propagation"] = "sample"
     _, lines = prepared(cache, **after)
     assert all("from the cache" in line for line in lines)
-    _, lines = prepared(cache, **{"corrector.train": {**REFINED, "iterations": 21}})
+    _, lines = prepared(cache, **{"corrector.train.iterations": 21})
     assert ["from the cache" in line for line in lines] == [True, False]
     _, lines = prepared(cache, **{"dynamics.seed": 1})
     assert not any("from the cache" in line for line in lines)
@@ -83,11 +81,10 @@ def test_nothing_to_train_needs_no_cache(configure, no_training):
 
 def test_progress_is_shown_if_asked_for(configure, tmp_path):
     seen = []
-    agent = build(configure("method=afm_physics", **{"corrector.train": REFINED}))
+    agent = build(configure("method=afm_paper", "dynamics=physics", "updater=frozen"))
     agent.trainings = [
         part._replace(train=lambda progress: seen.append(progress) or 0.5)
         for part in agent.trainings
     ]
     prepare(agent, tmp_path, progress=True, echo=seen.append)
-    unit = "shares of the largest action"
-    assert seen == [True, f"flow: held-out error 0.5000 {unit} (trained in 0 s)"]
+    assert seen == [True, "flow: held-out error 0.5000 action units (trained in 0 s)"]

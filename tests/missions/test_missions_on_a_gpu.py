@@ -29,8 +29,7 @@ METHODS = {
 def test_training_and_missions_stay_on_their_device(make_agent, monkeypatch, method):
     agent = make_agent(f"method={method}", "seeds=2", "budget=50")
     values = "envs.missions.format.MissionFormat._check_values"
-    for numbers in (values, "correction.training.refine.check_states"):
-        monkeypatch.setattr(f"afm_rl.{numbers}", lambda *_: None)
+    monkeypatch.setattr(f"afm_rl.{values}", lambda *_: None)
     with FakeGPU(answer=False) as gpu, torch.no_grad():
         gpu.move(agent)
         for part in agent.trainings:

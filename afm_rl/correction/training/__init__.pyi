@@ -1,2 +1,3 @@
+from .loss import CFMLoss as CFMLoss
+from .paper import train_flow as train_flow
 from .prior import draw_examples as draw_examples
-from .refine import CFMLoss as CFMLoss, train_flow as train_flow

@@ -20,8 +20,8 @@ from torch import Tensor
 from afm_rl.correction.achievable import MODES
 from afm_rl.correction.experts import Rows, fit_experts
 from afm_rl.correction.network import AxisNetwork, load_universal, midpoint
+from afm_rl.correction.training.loss import EFFECT_WEIGHT, flow_losses
 from afm_rl.correction.training.prior import KINDS, MIXES, Drawn, draw_examples
-from afm_rl.correction.training.refine import EFFECT_WEIGHT, flow_losses
 from afm_rl.storage.files import write_whole
 
 SIZES = {1: 0.12, 2: 0.45, 3: 0.15, 4: 0.08, 6: 0.15, 9: 0.05}  # share of numbers of actions

@@ -1,9 +1,7 @@
 """The loss of flow matching, training, and the weights of the package."""
 
 import hashlib
-import io
 import math
-import sys
 from importlib.resources import files
 
 import pytest
@@ -14,10 +12,9 @@ from tensordict import TensorDict
 import afm_rl.correction.network
 from afm_rl.correction.experts import fit_experts
 from afm_rl.correction.network import AxisNetwork, load_universal
-from afm_rl.correction.training import CFMLoss, draw_examples, train_flow
+from afm_rl.correction.training import CFMLoss, draw_examples
+from afm_rl.correction.training.loss import EFFECT_WEIGHT, PRECISION, flow_losses
 from afm_rl.correction.training.pretrain import pretrain
-from afm_rl.correction.training.refine import EFFECT_WEIGHT, PRECISION, flow_losses
-from afm_rl.dynamics import Dubins
 from afm_rl.errors import ArtefactError, ConfigurationError
 
 KEYS = ["executed", "effective", "std", "valid", "planned", "intended", "probe", "effect"]
@@ -125,63 +122,6 @@ def test_pretraining_helps_and_follows_the_seed():
         assert torch.equal(one, other)
 
 
-@pytest.fixture
-def train(small_flow, states, gains):
-    def run(seed=0, **settings):
-        flow = small_flow()
-        settings = {"iterations": 4, "batch_size": 8, "seed": seed, **settings}
-        return flow, train_flow(flow, Dubins(), gains, states, **settings)
-
-    return run
-
-
-def same(left, right):
-    right = right.state_dict()
-    return all(torch.equal(value, right[name]) for name, value in left.state_dict().items())
-
-
-def test_the_seed_decides_everything_and_the_global_generator_nothing(train):
-    before = torch.get_rng_state()
-    first, error = train()
-    assert torch.equal(torch.get_rng_state(), before)
-    again, same_error = train()
-    other, _ = train(seed=1)
-    assert same(first, again) and error == same_error and not same(first, other)
-
-
-def test_the_model_is_not_changed_and_gradients_may_be_off(
-    make_ensemble, small_flow, states, gains
-):
-    model, flow, start = make_ensemble(), small_flow(), small_flow()
-    before = {name: value.clone() for name, value in model.state_dict().items()}
-    with torch.no_grad():
-        train_flow(flow, model, gains, states, iterations=2, batch_size=8)
-    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
-    assert not same(flow, start)
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def test_progress_can_be_shown_on_a_terminal(train, monkeypatch):
-    written = {}
-    for progress in (False, True):
-        monkeypatch.setattr("sys.stderr", Terminal())
-        train(progress=progress)
-        written[progress] = sys.stderr.getvalue()
-    assert written[False] == "" and "training the flow" in written[True]
-
-
-@pytest.mark.parametrize(
-    "settings", [{"iterations": 0}, {"batch_size": 1}, {"lr": 0.0}, {"seed": 1.5}], ids=str
-)
-def test_impossible_settings_are_refused(train, settings):
-    with pytest.raises(ConfigurationError, match=f"corrector.train.{next(iter(settings))}"):
-        train(**settings)
-
-
 def test_the_weights_of_the_package_are_small_sound_and_frozen():
     data = files("afm_rl.correction").joinpath("universal.safetensors").read_bytes()
     assert len(data) < 2 * 2**20
@@ -213,11 +153,3 @@ def test_experts_fitted_while_driving_can_be_used_in_training(drawn):
     later = draw_examples(2, 5, 7, 4, "clip", torch.Generator().manual_seed(0))
     net = network()
     flow_losses(net, later, "clip", torch.Generator())[0].mean().backward()
-
-
-@pytest.mark.parametrize(
-    "box", [(torch.zeros(2), torch.ones(2)), (torch.zeros(3), torch.full((3,), math.inf))], ids=str
-)
-def test_a_box_of_states_that_cannot_be_drawn_from_is_refused(box):
-    with pytest.raises(ConfigurationError, match="states=.*expected finite states of 3 numbers"):
-        train_flow(None, Dubins(), None, box)

@@ -1,0 +1,74 @@
+"""Training of the published flow on one robot's model."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from afm_rl.compiling.devices import device_of
+from afm_rl.correction.paper_flow import PaperFlow
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import ConfigurationError, check_count, check_instance, check_number
+from afm_rl.progress import Bar
+
+
+def train_flow(
+    flow: PaperFlow,
+    model: DynamicsModel,
+    states: tuple[Tensor, Tensor] | Tensor,
+    *,
+    iterations: int = 1000,
+    batch_size: int = 160,
+    lr: float = 1e-3,
+    seed: int = 0,
+    progress: bool = False,
+) -> float:
+    """Train the published flow by Adam, on transitions of one action registered as another's.
+
+    The universal :class:`~afm_rl.correction.ActionFlow` knows no robot and needs none of this.
+
+    Args:
+        flow: trained in place.
+        model: base dynamics model, not changed.
+        states: lowest and highest state, ``(S,)`` each; or a pool of observed ones, ``(P, S)``,
+            where states keep to a small part of their box.
+        iterations: gradient steps.
+        batch_size: examples per step.
+        lr: step size.
+        seed: of everything drawn.
+        progress: show a progress bar.
+
+    Returns:
+        Root mean square error of the corrected action on new examples, in action units.
+
+    Raises:
+        ConfigurationError: for a setting that cannot be used.
+    """
+    check_instance("flow", flow, PaperFlow)
+    check_count("corrector.train.iterations", iterations)
+    check_count("corrector.train.batch_size", batch_size, low=2)
+    check_count("corrector.train.seed", seed, low=0)
+    check_number("corrector.train.lr", lr, low=0.0, open_low=True)
+    for rows in states if isinstance(states, tuple) else [states]:
+        if rows.shape[-1] != model.state_size or not bool(rows.isfinite().all()):
+            raise ConfigurationError(
+                f"states={rows.tolist() if rows.numel() < 20 else tuple(rows.shape)}: expected "
+                f"finite states of {model.state_size} numbers; give the box in which it moves"
+            )
+    generator, device = torch.Generator().manual_seed(seed), device_of(model)
+    if isinstance(states, tuple):
+        states = states[0].to(device), states[1].to(device)
+    else:
+        states = states.to(device)
+    parameters = [parameter.requires_grad_(True) for parameter in flow.parameters()]
+    optimizer = torch.optim.Adam(parameters, lr=lr, fused=True)
+    bar = Bar(range(iterations), desc="training the flow", shown=progress)
+    for step in bar:
+        with torch.enable_grad():
+            loss = flow.training_loss(model, states, batch_size, generator)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()
+        optimizer.step()
+        if progress and step % 100 == 0:
+            bar.set_postfix_str(f"loss {loss.item():.4f}", refresh=False)
+    return flow.held_out_error(model, states, 2048, generator)
