@@ -13,7 +13,8 @@ from viser import uplot
 
 from afm_rl.play.scene import COLOURS, figure_of
 from afm_rl.play.server import LocalServer
-from afm_rl.play.world import SIDES, World, presets
+from afm_rl.play.world import SIDES, World
+from afm_rl.regimes import presets
 
 FRAME, WORDS = 0.04, 0.25  # seconds between two pictures, and between two texts
 PLOT: Any = {"aspect": 2.0, "scales": {"x": uplot.Scale(time=False)}}
@@ -28,7 +29,7 @@ def text_of(world: World) -> str:
     if score != "reward":
         table[score] = [side.info.get(score, "") for side in sides]
     rows = ["| " + " | ".join(map(str, (name, *row))) + " |" for name, row in table.items()]
-    afm, late = sides[1].info["afm"], world.faults.values.get("delay", 0)
+    afm, late = sides[1].info["afm"], world.fault.get("delay", 0)
     state = "**corrects**" if afm["corrects"] else "does nothing"
     lines = [f"AFM {state}; innovation {afm['innovation']:.3g}"]
     if f"{late:.0f} steps late" not in afm["belief"] and late > 1:
@@ -127,17 +128,13 @@ class Page:
             values = self.presets[self.chosen]
             for name, (slider, usual) in self.sliders.items():
                 slider.value = values.get(name, usual)
-            self.swapped = {name: x for name, x in values.items() if name.startswith("from_")}
-        found = {name: slider.value for name, (slider, _) in self.sliders.items()}
-        with self.world.lock:
-            self.world.faults.noise = found.pop("noise")
-            self.world.faults.values = {**found, **self.swapped}
+        # A preset may have more than there are sliders for, such as which command goes where.
+        sliders = {name: slider.value for name, (slider, _) in self.sliders.items()}
+        self.world.fail({**self.presets[self.chosen], **sliders})
         for button, action in self.buttons:
             if button._impl.uuid in self.server.clicked:
                 self.server.clicked.discard(button._impl.uuid)
                 action()
-
-    swapped: dict[str, float] = {}
 
     def _live(self) -> None:
         gui, empty = self.server.gui, np.zeros(2)

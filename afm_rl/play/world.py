@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
 from threading import RLock
 from typing import Any
 
@@ -12,84 +11,47 @@ import numpy as np
 import torch
 
 from afm_rl.play.robots import Robot
-from afm_rl.regimes import Compose, actuator_regimes
+from afm_rl.regimes import Actuators
+from afm_rl.regimes.presets import Fault
 from afm_rl.transforms.gymnasium import ActionFlowWrapper
 
 SIDES = ("alone", "AFM")
-KEPT = 400  # steps that are drawn as curves
-LYING = 1.0  # seconds that a robot lies where it fell
 
 
-@dataclass
-class Faults:
-    """What the actuators of both robots have now; the numbers of a healthy robot are the default.
-
-    Args:
-        values: parameters of :func:`~afm_rl.regimes.actuator_regimes`, such as ``gain_0``.
-        noise: standard deviation of normal noise on the commands, in half ranges.
-    """
-
-    values: dict[str, float] = field(default_factory=dict)
-    noise: float = 0.0
-
-
-def presets(actuators: int) -> dict[str, dict[str, float]]:
-    """Return faults by name."""
-    every, other = range(actuators), actuators // 2
-    found: dict[str, dict[str, float]] = {
-        "healthy": {},
-        "reverse one": {"gain_0": -1.0},
-        "reverse all": {f"gain_{k}": -1.0 for k in every},
-        "swap": {"from_0": other, f"from_{other}": 0.0},
-        "half strength": {f"gain_{k}": 0.5 for k in every},
-        "one dead": {"loss_0": 1.0},
-        "bias": {f"bias_{k}": 0.3 for k in every},
-        "late by 1": {"delay": 1},
-        "late by 4": {"delay": 4},
-        "late by 8": {"delay": 8},
-        "slow": {"lag": 2.0},
-        "reversed and late": {**{f"gain_{k}": -1.0 for k in every}, "delay": 2},
-    }
-    if actuators == 1:
-        del found["swap"], found["reverse all"]
-    return found
-
-
-class Actuators(gymnasium.Wrapper):
-    """An environment whose actuators do what ``faults`` says with a command.
+class FaultyEnv(gymnasium.Wrapper):
+    """An environment whose actuators can :meth:`fail`.
 
     Args:
         env: with a vector of real numbers between finite bounds as action.
-        faults: shared with whoever changes them.
 
-    >>> env = Actuators(gymnasium.make("Pendulum-v1"), Faults({"gain_0": -1.0}))
+    >>> env = FaultyEnv(gymnasium.make("Pendulum-v1"))
+    >>> env.fail({"gain_0": -1.0})
     >>> _ = env.reset(seed=0), env.step(np.array([1.5]))
     >>> env.effect
     array([-1.5], dtype=float32)
     """
 
-    def __init__(self, env: gymnasium.Env, faults: Faults) -> None:
+    def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
         space: Any = env.action_space
-        families = actuator_regimes(space.low.tolist(), space.high.tolist())
-        chosen = ("delay", "lag", "permutation", "gain", "dead", "bias")
-        self.regime = Compose({name: families[name] for name in chosen})
-        self.faults, self.random = faults, np.random.default_rng(0)
-        self.half = (space.high - space.low) / 2
+        self.actuators = Actuators(space.low.tolist(), space.high.tolist())
+        self.half, self.noise = (space.high - space.low) / 2, 0.0
+        self.random = np.random.default_rng(0)
+
+    def fail(self, fault: Fault) -> None:
+        """Have a fault of :class:`~afm_rl.regimes.Actuators`, or ``noise``, in half ranges."""
+        self.noise = fault.get("noise", 0.0)
+        self.actuators.fail({name: x for name, x in fault.items() if name != "noise"})
 
     def reset(self, **options: Any):
         """Begin with actuators that were not used yet."""
-        shape = self.regime.history, len(self.half)
-        self.past = torch.zeros(shape, dtype=torch.float64)
+        self.actuators.reset()
         return self.env.reset(**options)
 
     def step(self, action: Any):
         """Send the actuators what they make of the command."""
-        command = torch.as_tensor(np.asarray(action)).double()
-        row, state = self.regime.encode(self.faults.values).double(), torch.zeros(1)
-        effect = self.regime.apply(command, row, state, self.past).numpy()
-        noise = self.random.standard_normal(len(effect)) * self.faults.noise
-        self.past = torch.cat([command[None], self.past[:-1]])
+        effect = self.actuators(torch.as_tensor(np.asarray(action))).numpy()
+        noise = self.random.standard_normal(len(effect)) * self.noise
         self.effect = (effect + noise * self.half).astype(self.action_space.dtype)
         return self.env.step(self.effect)
 
@@ -97,14 +59,15 @@ class Actuators(gymnasium.Wrapper):
 class Side:
     """One of the two robots."""
 
-    def __init__(self, robot: Robot, faults: Faults, corrected: bool) -> None:
+    def __init__(self, robot: Robot, corrected: bool) -> None:
         self.robot, self.act = robot, robot.policy()
-        self.env: Any = Actuators(robot.make(), faults)
+        self.env: Any = FaultyEnv(robot.make())
+        self.faulty: FaultyEnv = self.env
         if corrected:
             model, corrector = robot.model, robot.corrector()
             self.env = ActionFlowWrapper(self.env, **model, corrector=corrector, belief=True)
-        self.rewards: deque[float] = deque(maxlen=KEPT)
-        self.commands: deque[np.ndarray] = deque(maxlen=KEPT)
+        self.rewards: deque[float] = deque(maxlen=400)  # drawn as curves
+        self.commands: deque[np.ndarray] = deque(maxlen=400)
         self.falls = 0
         self.reset(0)
 
@@ -125,17 +88,9 @@ class Side:
         self.steps, self.total = self.steps + 1, self.total + float(reward)
         self.rewards.append(float(reward))
         executed = self.info.get("afm", {}).get("executed", planned)
-        self.commands.append(np.stack([planned, executed, self.effect]))
+        self.commands.append(np.stack([planned, executed, self.faulty.effect]))
         if over:
-            self.falls, self.lying = self.falls + 1, LYING
-
-    @property
-    def effect(self) -> np.ndarray:
-        """What the actuators gave in the newest step, ``(A,)``."""
-        env = self.env
-        while not isinstance(env, Actuators):
-            env = env.env
-        return env.effect
+            self.falls, self.lying = self.falls + 1, 1.0  # s
 
     @property
     def inner(self) -> Any:
@@ -148,16 +103,24 @@ class World:
 
     >>> from afm_rl.play.robots import make_robot
     >>> world = World(make_robot("pendulum"))
-    >>> world.faults.values = {"gain_0": -1.0}
+    >>> world.fail({"gain_0": -1.0})
     >>> world.step()
     >>> world.sides["AFM"].steps
     1
     """
 
     def __init__(self, robot: Robot) -> None:
-        self.robot, self.faults, self.lock = robot, Faults(), RLock()
-        self.sides = {name: Side(robot, self.faults, name == "AFM") for name in SIDES}
+        self.robot, self.lock = robot, RLock()
+        self.fault: Fault = {}
+        self.sides = {name: Side(robot, name == "AFM") for name in SIDES}
         self.seed, self.direction = 0, 1.0
+
+    def fail(self, fault: Fault) -> None:
+        """Give the actuators of both a fault, see :meth:`FaultyEnv.fail`."""
+        with self.lock:
+            self.fault = fault
+            for side in self.sides.values():
+                side.faulty.fail(fault)
 
     def step(self) -> None:
         """Let both act once."""

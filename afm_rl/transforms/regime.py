@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
 from afm_rl.errors import ConfigurationError, check_flag
-from afm_rl.regimes import Regime, Schedule, phase_parameters
+from afm_rl.regimes import Regime, Schedule, phase_parameters, shifted
 from afm_rl.streams import Streams
 from afm_rl.transforms.carried import CarriedTransform
 
@@ -100,8 +100,7 @@ class RegimeTransform(CarriedTransform):
         if self.clip:
             effect = self.parent.full_action_spec[self.action_key].project(effect)
         if past is not None:
-            kept = past.narrow(-2, 0, self.regime.history - 1)
-            memory.set("past", torch.cat([command.unsqueeze(-2), kept], -2))
+            memory.set("past", shifted(past, command))
         memory.set("effective_action", effect)
         return tensordict.set(self.prefix, memory).set(self.action_key, effect)
 

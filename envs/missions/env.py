@@ -22,7 +22,7 @@ from afm_rl.errors import (
     check_count,
     check_number,
 )
-from afm_rl.regimes import Regime, Schedule, blend_phases
+from afm_rl.regimes import Regime, Schedule, blend_phases, shifted
 
 
 class PhasedSimulation(ABC):
@@ -83,7 +83,7 @@ class PhasedSimulation(ABC):
         same = self.phase(mission, before) == self.phase(mission, after)
         after["since"] = torch.where(same, before["since"], after["step"])
         if self.regime.history:
-            after["past"] = torch.cat([action.unsqueeze(-2), before["past"][..., :-1, :]], -2)
+            after["past"] = shifted(before["past"], action)
         return after
 
     def described(

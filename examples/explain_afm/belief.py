@@ -15,7 +15,6 @@ import torch
 from matplotlib.axes import Axes
 
 from afm_rl.play import Side, make_robot
-from afm_rl.play.world import Faults
 from afm_rl.report import style
 from afm_rl.storage.files import write_whole
 
@@ -30,12 +29,12 @@ LOOKS = {
 
 def act(steps: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return commands and beliefs of the first motor, ``(2 steps,)`` each."""
-    faults = Faults()
-    side = Side(make_robot("half_cheetah"), faults, corrected=True)
+    side = Side(make_robot("half_cheetah"), corrected=True)
     for _ in range(BEFORE):
         side.step()
     commands, beliefs = [], []
-    for faults.values in NOW.values():
+    for fault in NOW.values():
+        side.faulty.fail(fault)
         for _ in range(steps):
             side.step()
             commands.append(side.commands[-1][:, 0])

@@ -87,28 +87,28 @@ def opened(browser, served, errors):
 @pytest.mark.parametrize("name", ["hopper", "pendulum", "ugv", "quadrotor"])
 def test_robots_are_drawn_and_described(name, page_of):
     page = page_of(name)
-    choose(page, "reverse one")
+    choose(page, "one reversed")
     for _ in range(20):
         page.world.step()
     page.draw()
     page.say()
-    effect = page.world.sides["AFM"].effect
-    assert page.world.faults.values["gain_0"] == -1.0
+    effect = page.world.sides["AFM"].faulty.effect
+    assert page.world.fault["gain_0"] == -1.0
     executed = page.world.sides["AFM"].info["afm"]["executed"]
     assert effect[0] == pytest.approx(-executed[0], rel=1e-5)
     assert "| alone | AFM |" in page.words.content and "| a recent change |" in page.words.content
     for figure in page.figures.values():
         assert all(abs(number) < 1e3 for number in figure.root.position)
-    choose(page, "late by 4")
+    choose(page, "late 4")
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # what is observed at arrival is known of every robot
         for _ in range(20):
             page.world.step()
     assert "cannot find" not in text_of(page.world)
-    page.world.faults.values["delay"] = 10.0
+    page.world.fail({"delay": 10.0})
     assert "cannot find" in text_of(page.world)
-    choose(page, "healthy")
-    assert page.world.faults.values["gain_0"] == 1.0
+    choose(page, "none")
+    assert page.world.fault["gain_0"] == 1.0
 
 
 def test_a_slider_reverses_a_motor(served, browser):
@@ -118,7 +118,7 @@ def test_a_slider_reverses_a_motor(served, browser):
     assert alone.falls == 0
     page.locator(gain).fill("-1")
     page.locator(gain).press("Enter")
-    until(lambda: served.world.faults.values.get("gain_0") == -1.0)
+    until(lambda: served.world.fault.get("gain_0") == -1.0)
     page.get_by_text("Push", exact=True).click()
     until(lambda: alone.falls > 3 and corrected.steps > 100)
     assert corrected.falls <= 2  # at most while the reversal is not yet believed

@@ -7,8 +7,8 @@ import torch
 
 from afm_rl.cli.play import main
 from afm_rl.planning import StoredPolicy, save_policy
-from afm_rl.play import Actuators, World, make_robot
-from afm_rl.play.world import Faults, presets
+from afm_rl.play import FaultyEnv, World, make_robot
+from afm_rl.regimes import Actuators, presets
 
 pytest.importorskip("mujoco")
 
@@ -19,7 +19,7 @@ def test_a_reversed_cart_falls_unless_it_is_corrected():
         world.step()
     alone, corrected = world.sides.values()
     assert alone.total == corrected.total > 0
-    world.faults.values = {"gain_0": -1.0}
+    world.fail({"gain_0": -1.0})
     for _ in range(160):
         world.step()
     assert alone.falls > 3 and corrected.falls <= 2  # before the reversal is believed
@@ -45,25 +45,24 @@ def test_healthy_robots_do_the_same(name):
 
 
 def test_actuators_do_what_is_set():
-    faults = Faults({"delay": 1, "gain_0": 0.5, "from_0": 1, "from_1": 0})
-    env = Actuators(gymnasium.make("Reacher-v5"), faults)
+    env = FaultyEnv(gymnasium.make("Reacher-v5"))
+    env.fail({"delay": 1, "gain_0": 0.5, "from_0": 1, "from_1": 0})
     env.reset(seed=0)
     env.step(np.array([0.2, 0.8]))
     assert env.effect.tolist() == [0.0, 0.0]
     env.step(np.array([0.0, 0.0]))
     np.testing.assert_allclose(env.effect, [0.4, 0.2], rtol=1e-6)
-    faults.values, faults.noise = {}, 0.1
+    env.fail({"noise": 0.1})
     env.step(np.array([0.3, 0.3]))
     assert 0 < np.abs(env.effect - 0.3).max() < 0.5
 
 
-def test_presets_are_faults_of_any_robot():
-    for count in (1, 2, 6):
-        env = Actuators(gymnasium.make("HalfCheetah-v5" if count == 6 else "Pendulum-v1"), Faults())
-        if count == 6:
-            for values in presets(6).values():
-                env.regime.encode(values)
-        assert "swap" in presets(count) or count == 1
+@pytest.mark.parametrize("count", [1, 2, 6])
+def test_presets_are_faults_of_any_robot(count):
+    actuators = Actuators([-1.0] * count, [1.0] * count)
+    for fault in presets(count).values():
+        actuators.fail(fault)
+    assert ("swapped pair" in presets(count)) == (count > 1)
 
 
 @pytest.mark.parametrize(

@@ -85,12 +85,12 @@ def test_every_policy_fits_its_task(zoo, file):
 def test_actuators_with_a_limited_rate_go_on_from_where_they_are(zoo):
     task = zoo("task").Task(SUITE.parents[2] / "examples/policies/zoo/pendulum_sac.safetensors")
     faults = [{"rate": 0.2}, {"rate": 0.2, "gain_0": -1.0}, {}]
-    envs = zoo("faults").FaultyVector(task.vector(3), task.regime, faults, at=1)
+    envs = zoo("faults").FaultyVector(task.vector(3), faults, at=1)
     envs.reset(seed=[0, 1, 2])
     reached = []
     for command in (2.0, 2.0, -2.0, -2.0):
         envs.step(np.full((3, 1), command))
-        reached.append(envs.reached[:, 0].tolist())
+        reached.append(envs.actuators.last[:, 0].tolist())
     expected = [[2.0, 2.0, 2.0], [2.0, 1.6, 2.0], [1.6, 2.0, -2.0], [1.2, 2.0, -2.0]]
     assert np.allclose(reached, expected)
     envs.close()

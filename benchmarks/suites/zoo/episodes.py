@@ -86,7 +86,7 @@ def rewards_of(
     """Return rewards ``(T, N)``, 0 after the end of an episode, and how long each one lasted."""
     torch.manual_seed(0)
     faults = [task.faults[fault] for fault, _ in pairs]
-    inner = FaultyVector(task.vector(len(pairs)), task.regime, faults, task.at)
+    inner = FaultyVector(task.vector(len(pairs)), faults, task.at)
     envs, act = METHODS[method](task, inner)
     observations, _ = envs.reset(seed=[episode for _, episode in pairs])
     rewards, alive = np.zeros((steps, len(pairs))), np.ones(len(pairs), dtype=bool)

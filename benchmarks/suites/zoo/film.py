@@ -31,7 +31,7 @@ GOES_ON = {"hopper_trpo": {"terminate_when_unhealthy": False}}
 
 def record(task: Task, fault: str, method: str, at: int, steps: int) -> list[np.ndarray]:
     """Return the ends of all capsules, x and z, ``(G, 2, 2)``, at every step."""
-    inner = FaultyVector(task.vector(1), task.regime, [task.faults[fault]], at)
+    inner = FaultyVector(task.vector(1), [task.faults[fault]], at)
     envs, act = METHODS[method](task, inner)
     world = inner.env.envs[0].unwrapped
     observations, _ = envs.reset(seed=[0])

@@ -69,37 +69,43 @@ class Truth:
 
     def __init__(self, task: Task, envs: FaultyVector) -> None:
         self.task, self.envs = task, envs
-        names = list(task.regime.names)
-        self.late = envs.rows[:, names.index("delay")].long().tolist()
-        lag = envs.rows[:, names.index("lag"), None]
+        self.regime = envs.actuators.regime
+        delay, lag = (
+            torch.tensor([[fault.get(name, 0.0)] for fault in envs.faults]).double()
+            for name in ("delay", "lag")
+        )
+        self.delay = delay.flatten().int().tolist()
         self.keep = torch.where(lag > 0, (-1 / lag).exp(), 0.0)
-        self.static = envs.rows.clone()
-        self.static[:, names.index("delay")] = self.static[:, names.index("lag")] = 0.0
+        others = [
+            {name: x for name, x in fault.items() if name not in ("delay", "lag", "rate")}
+            for fault in envs.faults
+        ]
+        self.static = torch.stack([self.regime.encode(fault) for fault in others]).double()
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         if not self.envs.failed:
             return self.task.act(observations)
-        regime, past = self.task.regime, self.envs.past
-        seen = observations.copy()
-        for row, steps in enumerate(self.late):
+        regime, past = self.regime, self.envs.actuators.past
+        expected = observations.copy()
+        for row, steps in enumerate(self.delay):
             if steps:
                 parameters = self.static[row].expand(steps, -1)
                 pending = past[row, :steps].flip(0)  # oldest first
                 effects = regime.apply(pending, parameters, pending[:, :1])
-                seen[row] = self.task.after(self.envs.env.envs[row], effects.numpy())
-        wanted = torch.as_tensor(self.task.act(seen)).double()
+                expected[row] = self.task.after(self.envs.env.envs[row], effects.numpy())
+        wanted = torch.as_tensor(self.task.act(expected)).double()
         reached = _lagged(past, self.keep)
         wanted = (wanted - self.keep * reached) / (1 - self.keep)
-        found = regime.inverse(wanted, self.static, wanted[:, :1], self.task.low, self.task.high)
-        return found.numpy()
+        box = self.task.low, self.task.high
+        return regime.inverse(wanted, self.static, wanted[:, :1], *box).numpy()
 
 
 def _lagged(past: Tensor, keep: Tensor) -> Tensor:
     """Return where actuators with a lag are after commands ``(N, D, A)``, newest first."""
-    found = past[:, 7]  # as far back as the regime remembers
+    reached = past[:, 7]  # as far back as the regime remembers
     for command in past[:, :7].flip(1).unbind(1):
-        found = command + keep * (found - command)
-    return found
+        reached = command + keep * (reached - command)
+    return reached
 
 
 def truth(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:

@@ -15,10 +15,12 @@ from pathlib import Path
 import pandas as pd
 import torch
 from episodes import complete
-from faults import SLOW, faults_of
+from faults import SLOW
 from methods import METHODS
 from show import draw, ordered, print_tables, shares
 from task import POLICIES, Task
+
+from afm_rl.regimes import presets
 
 
 def main() -> None:
@@ -45,7 +47,7 @@ def main() -> None:
         asked &= results[column].isin(chosen) if chosen else True
     results = results[asked]
     if {"alone", "none"} <= set(results["method"]) | set(results["fault"]):
-        results = shares(ordered(results, list(METHODS), list(faults_of(2))))
+        results = shares(ordered(results, list(METHODS), list(presets(2))))
         print_tables(results)
         draw(results, args.out / "zoo.png")
 

@@ -8,11 +8,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from faults import faults_of, regime_of
 from gymnasium.vector import SyncVectorEnv
 
 from afm_rl.envs.task.rewards import pendulum_step
 from afm_rl.planning import load_policy
+from afm_rl.regimes import presets
 
 POLICIES = Path(__file__).parents[3] / "examples" / "policies" / "zoo"
 HEALTHY = 0.2  # share of an episode before the actuators fail
@@ -34,8 +34,7 @@ class Task:
         self.at = round(HEALTHY * self.steps)
         space = self.twin.action_space
         self.low, self.high = (torch.from_numpy(end).double() for end in (space.low, space.high))
-        self.regime = regime_of(space.low, space.high)
-        self.faults = faults_of(len(space.low))
+        self.faults = presets(len(space.low))
         self.twin.reset(seed=0)
 
     def make(self) -> gymnasium.Env:

@@ -1,0 +1,107 @@
+"""Faults by name, and actuators that have them and remember what they were commanded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from afm_rl.regimes.compose import Compose, actuator_regimes
+
+Fault = Mapping[str, float]
+
+
+def presets(actuators: int) -> dict[str, Fault]:
+    """Return faults of so many actuators by name, as :meth:`Actuators.fail` takes them.
+
+    >>> presets(2)["swapped pair"]
+    {'from_0': 1, 'from_1': 0}
+    """
+    every, other = range(actuators), actuators // 2
+    faults: dict[str, Fault] = {
+        "none": {},
+        "one reversed": {"gain_0": -1.0},
+        "all reversed": {f"gain_{k}": -1.0 for k in every},
+        "swapped pair": {"from_0": other, f"from_{other}": 0},
+        "half": {f"gain_{k}": 0.5 for k in every},
+        "dead": {"loss_0": 1.0},
+        "bias .3": {f"bias_{k}": 0.3 for k in every},
+        **{f"late {steps}": {"delay": steps} for steps in (1, 2, 4, 8)},
+        **{f"lag {steps}": {"lag": float(steps)} for steps in (1, 2, 3)},
+        **{f"rate .{tenths}": {"rate": tenths / 10} for tenths in (3, 2)},
+        "reversed and late 2": {**{f"gain_{k}": -1.0 for k in every}, "delay": 2},
+    }
+    if actuators == 1:
+        del faults["swapped pair"]
+    return faults
+
+
+def shifted(past: Tensor, command: Tensor) -> Tensor:
+    """Return the newest D commands ``(*B, D, A)``, newest first, after one more ``(*B, A)``.
+
+    >>> shifted(torch.tensor([[1.0], [2.0]]), torch.tensor([3.0])).flatten()
+    tensor([3., 1.])
+    """
+    return torch.cat([command.unsqueeze(-2), past[..., :-1, :]], -2)
+
+
+class Actuators:
+    r"""Actuators under a fault, with a state: the commands before, and the last effect.
+
+    .. math:: y_t = \mathrm{clip}(g(u_t;\, u_{t-1}, \dots),\ y_{t-1} - r h,\ y_{t-1} + r h)
+
+    with the regime g of :func:`~afm_rl.regimes.actuator_regimes` (delay, lag, permutation, gain,
+    loss, bias) and a limited rate r, in half ranges h a step. No regime is that limit: it goes on
+    from the last effect, not from a command.
+
+    Args:
+        low: lowest command, ``(A,)``.
+        high: highest command, ``(A,)``.
+        batch: how many are side by side, B.
+
+    >>> motor = Actuators([-1.0], [1.0])
+    >>> before = motor(torch.tensor([0.5]))
+    >>> motor.fail({"gain_0": -1.0})
+    >>> before, motor(torch.tensor([0.5]))
+    (tensor([0.5000], dtype=torch.float64), tensor([-0.5000], dtype=torch.float64))
+    """
+
+    def __init__(
+        self, low: Sequence[float], high: Sequence[float], batch: Sequence[int] = ()
+    ) -> None:
+        families = actuator_regimes(low, high)
+        chosen = ("delay", "lag", "permutation", "gain", "dead", "bias")
+        self.regime = Compose({name: families[name] for name in chosen})
+        self.low, self.high = (torch.tensor(list(end)).double() for end in (low, high))
+        self.batch = tuple(batch)
+        self.reset()
+        self.fail({})
+
+    def reset(self) -> None:
+        """Begin with actuators that were not used yet."""
+        self.past = self.low.new_zeros(*self.batch, self.regime.history, len(self.low))
+        self.last: Tensor | None = None
+
+    def fail(self, *faults: Fault) -> None:
+        """Have a fault from now on, one for all or one each; none is ``{}``.
+
+        Raises:
+            ConfigurationError: for an unknown name, or a value that it cannot have.
+        """
+        rows = [self.regime.encode({k: v for k, v in x.items() if k != "rate"}) for x in faults]
+        rates = [[fault.get("rate", math.inf)] for fault in faults]
+        self.rows, rate = torch.stack(rows).double(), torch.tensor(rates).double()
+        if len(faults) == 1:
+            self.rows, rate = self.rows[0], rate[0]
+        self.most = rate * (self.high - self.low) / 2
+
+    def __call__(self, command: Tensor) -> Tensor:
+        """Return the effect ``(*B, A)`` of a command, in double precision."""
+        command = command.double()
+        effect = self.regime.apply(command, self.rows, command[..., :1], self.past)
+        if self.last is not None:
+            effect = effect.clamp(self.last - self.most, self.last + self.most)
+        self.past, self.last = shifted(self.past, command), effect
+        return effect
