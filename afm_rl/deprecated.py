@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import lazy_loader
 
-NAMES: dict[str, str] = {}
+NAMES = {"afm_rl.report.check_video": "afm_rl.film.check_video"}
 """New names of parts, both with their package."""
 ARGUMENTS: dict[str, dict[str, tuple[str, dict[Any, Any]]]] = {}
 """New names of arguments, by function or class, and new values for old ones."""

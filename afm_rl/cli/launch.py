@@ -22,6 +22,7 @@ from afm_rl.cli.error_messages import explain
 from afm_rl.cli.methods import check_had, jobs_of
 from afm_rl.envs import load_track
 from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag, check_number
+from afm_rl.film import check_video
 from afm_rl.jobs.batch import run_batch
 from afm_rl.jobs.executor import Executor, JobsFailed, LocalExecutor
 from afm_rl.jobs.layout import LOG
@@ -31,7 +32,6 @@ from afm_rl.missions import Agent, build
 from afm_rl.missions.explained import explain_mission, planned_for
 from afm_rl.missions.run import Stopped
 from afm_rl.report import (
-    check_video,
     load_tracks,
     print_summary,
     read_runs,

@@ -44,7 +44,8 @@ def main() -> None:
     options = parser.parse_args()
 
     from afm_rl.envs import load_track  # torch takes seconds: `--help` need not wait
-    from afm_rl.report import check_video, load_tracks, read_runs, write_films, write_report
+    from afm_rl.film import check_video
+    from afm_rl.report import load_tracks, read_runs, write_films, write_report
 
     out = options.out or options.folders[0] / "report"
     chosen = {"baselines": options.baselines, "oracle": options.oracle, "figures": options.figures}

@@ -1,5 +1,5 @@
 from .comparison import draw_comparison as draw_comparison
-from .film import check_video as check_video, write_films as write_films
+from .film import write_films as write_films
 from .learning import draw_learning as draw_learning
 from .runs import Runs as Runs, read_runs as read_runs
 from .space_plot import draw_space as draw_space

@@ -1,52 +1,33 @@
-"""Films of missions, drawn from the table of steps."""
+"""Films of missions, drawn from the table of steps: robots on a map, or in space."""
 
 from __future__ import annotations
 
-import importlib.util
-import io
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from PIL import Image
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import FancyArrowPatch, Polygon
 
 from afm_rl.errors import ConfigurationError
+from afm_rl.film import ENCODERS, Moves, Scene, frames, shown
+from afm_rl.report import style
 from afm_rl.report.learning import last_step
-from afm_rl.report.runs import Runs, steps_of
-from afm_rl.report.scenes import COLUMNS, Scene, map_scene, space_scene
-from afm_rl.report.style import FEW
-from afm_rl.report.trajectory import DrawableTrack
+from afm_rl.report.runs import Runs, action_names, steps_of
+from afm_rl.report.space_plot import GOAL, POSITION, dress_space, mark_regimes
+from afm_rl.report.style import BEFORE, CHANGED, EXECUTED, FEW, PLANNED, REFERENCE, START, TARGET
+from afm_rl.report.trajectory import DrawableTrack, changed_stretch, draw_road, positions, view
 from afm_rl.report.write import folder_names
 from afm_rl.storage.files import write_whole
 
-FRAMES, RATE = 150, 15  # at most; per second
-LAST = 1500  # ms, how long the last frame of a GIF stays
-Draw = Callable[[pd.DataFrame], Iterable[np.ndarray]]
-
-
-def check_video(video: bool | str) -> str | None:
-    """Return the kind of film that is asked for, ``gif`` where none is named, or None.
-
-    Raises:
-        ConfigurationError: if there is no such kind, or what writes it is not installed.
-
-    >>> check_video(True), check_video(False)
-    ('gif', None)
-    """
-    if isinstance(video, bool):
-        return "gif" if video else None
-    if video not in ENCODERS:
-        raise ConfigurationError(f"video={video!r}: expected false, true, gif or mp4")
-    needed = ("imageio", "imageio_ffmpeg") if video == "mp4" else ()
-    if not all(importlib.util.find_spec(name) for name in needed):
-        raise ConfigurationError(
-            "video=mp4: imageio and imageio-ffmpeg are not installed; install afm-rl[video], or "
-            "choose video=gif"
-        )
-    return video
+COLUMNS = ("x", "y", "goal_x", "goal_y", "error", "misaligned", "regime_active")  # at least
+BODY = np.array([[1.0, 0.0], [-0.8, 0.65], [-0.4, 0.0], [-0.8, -0.65]])  # seen from above
+GRID = 0.16  # inches: sides of pictures are multiples of 16 pixels, as video codecs want them
 
 
 def write_films(
@@ -55,7 +36,7 @@ def write_films(
     tracks: Sequence[DrawableTrack] = (),
     form: str = "gif",
     echo: Callable[[str], object] = print,
-    draw: Draw | None = None,
+    draw: Callable[[pd.DataFrame], Iterable[np.ndarray]] | None = None,
 ) -> list[Path]:
     """Write a film of each method's first mission, ``METHOD.gif`` or ``METHOD.mp4``.
 
@@ -66,7 +47,7 @@ def write_films(
 
     Args:
         folder: where to; made if it is not there.
-        runs: the results; see :data:`~.scenes.COLUMNS` for what their steps must have.
+        runs: the results; see :data:`COLUMNS` for what their steps must have.
         tracks: tracks to draw, found by name.
         form: ``"gif"`` or ``"mp4"``.
         echo: receives one line per film.
@@ -101,44 +82,17 @@ def write_films(
         parts = {m.method: _checked(rows, m.mission, steps) for m in beside.itertuples()}
         parts = {name: own[own["t"] <= end] for name, own in parts.items()}
         scene = map_scene(cell, parts, roads.get(beside["track"].iloc[0]))
-        write(together, frames(scene, max(map(len, parts.values()))))
+        write(together, frames(scene, shown(max(map(len, parts.values())))))
     for mission, name in zip(first.itertuples(), names, strict=True):
         if draw is not None:
             own = rows[mission.mission]
-            write(name, draw(own.iloc[_shown(len(own))]))
+            write(name, draw(own.iloc[shown(len(own))]))
             continue
         own, title = _checked(rows, mission.mission, steps), f"{mission.method}: {mission.cell}"
         road = roads.get(mission.track)
         scene = space_scene(title, own) if space else map_scene(title, {mission.method: own}, road)
-        write(name, frames(scene, len(own)))
+        write(name, frames(scene, shown(len(own))))
     return written
-
-
-def frames(scene: Scene, count: int, dpi: int = 100) -> Iterator[np.ndarray]:
-    """Yield the pictures ``(height, width, 3)`` of a mission of ``count`` steps.
-
-    What does not move is drawn once; the rest is drawn over it.
-    """
-    figure, canvas = scene.figure, cast(FigureCanvasAgg, scene.figure.canvas)
-    figure.set_dpi(dpi)
-    scene.show(0)  # texts take the room that they need
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")
-    for artist in scene.moving:
-        artist.set_animated(True)
-    canvas.draw()
-    background = canvas.copy_from_bbox(figure.bbox)
-    for row in _shown(count):
-        canvas.restore_region(background)
-        scene.show(int(row))
-        for artist in scene.moving:
-            figure.draw_artist(artist)
-        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
-
-
-def _shown(count: int) -> np.ndarray:
-    """Return which of so many steps are shown."""
-    return np.unique(np.linspace(0, count - 1, min(count, FRAMES)).round().astype(int))
 
 
 def _checked(rows: dict[int, pd.DataFrame], mission: int, steps: pd.DataFrame) -> pd.DataFrame:
@@ -152,35 +106,169 @@ def _checked(rows: dict[int, pd.DataFrame], mission: int, steps: pd.DataFrame) -
     return own
 
 
-def _gif(pictures: Iterable[np.ndarray]) -> bytes:
-    """Return an animated GIF that starts again, its last picture held for a while."""
-    whole = [Image.fromarray(picture) for picture in pictures]
-    palette = _palette(np.concatenate([whole[k] for k in (0, len(whole) // 2, -1)]))
-    few = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in whole]
-    durations = [1000 // RATE] * (len(few) - 1) + [LAST]
-    buffer = io.BytesIO()
-    rest = {"append_images": few[1:], "duration": durations, "loop": 0}
-    few[0].save(buffer, "GIF", save_all=True, optimize=True, **rest)
-    return buffer.getvalue()
+def map_scene(
+    title: str, runs: Mapping[str, pd.DataFrame], track: DrawableTrack | None = None
+) -> Scene:
+    """Return the scene of robots on a map, and their distance from the plan over time under it.
+
+    A robot alone has its target, and arrows for the planned action (wide) and the executed one
+    (slim), if its actions are called ``v`` and ``omega``: as long as the robot is to be fast, and
+    turned by how far it is to turn in half a second. Several robots move at the same time.
+    """
+    box = view(track, [positions(steps) for steps in runs.values()])
+    tall = 5.6 * np.clip(box.ratio, 0.4, 1.2)
+    figure = style.new_figure(6.4, GRID * round((tall + 2.3) / GRID), dpi=100)
+    upper, lower = figure.subplots(2, 1, height_ratios=[tall, 1.1])
+    upper.set(xlim=box[:2], ylim=box[2:], aspect="equal")
+    style.dress(upper, "x (m)", "y (m)", size=style.LARGE)
+    if track is not None:
+        draw_road(upper, track)
+    planned = all("miss" in steps and steps["miss"].notna().all() for steps in runs.values())
+    column, label = ("miss", "the plan") if planned else ("error", "the model")
+    styles, alone, longest = style.method_styles(runs), len(runs) == 1, max(runs.values(), key=len)
+    label = f"{'distance from' if planned else 'error of'}\n{label}"
+    moving = _cursors({label: lower}, longest, alone)
+    lower.set_yscale("log")
+    handles: dict[str, Artist] = {}
+    for method, steps in runs.items():
+        look = style.Style(style.NOMINAL, "-", "o") if alone else styles[method]
+        upper.plot(*positions(steps)[:1].T, **START, zorder=3)
+        width = 0.9 if alone else 2.2 - 0.25 * look.place
+        (line,) = lower.plot(steps["t"], steps[column].clip(lower=1e-6), linewidth=width)
+        line.set(color=look.color, linestyle=look.linestyle)
+        parts, named = _robot(upper, steps, look.color, max(box.span), alone)
+        moving |= parts
+        handles |= named if alone else {method: look.handle()}
+    style.legend_above(figure, [*handles.values()], [*handles], title)
+    return Scene(figure, moving | _words(upper, longest, alone))
 
 
-def _palette(picture: np.ndarray, colours: int = 128) -> Image.Image:
-    """Return the most common colours, no two almost alike, so that areas keep theirs exactly."""
-    packed = picture.astype(np.int64) @ [65536, 256, 1]  # far faster than unique rows
-    values, counts = np.unique(packed, return_counts=True)
-    common = values[np.argsort(-counts, kind="stable"), None] // [65536, 256, 1] % 256
-    _, first = np.unique(common // 8, axis=0, return_index=True)
-    palette = Image.new("P", (1, 1))
-    palette.putpalette([int(value) for value in common[np.sort(first)[:colours]].ravel()])
-    return palette
+def _robot(
+    axes: Axes, steps: pd.DataFrame, color: str, span: float, alone: bool
+) -> tuple[Moves, dict[str, Artist]]:
+    """Draw a robot on a map; return what moves, and what stands in the legend."""
+    path = positions(steps)
+    moved = np.diff(path, axis=0, prepend=path[:1])
+    heading = (
+        steps["theta"].to_numpy(dtype=float) if "theta" in steps else np.arctan2(*moved.T[::-1])
+    )
+    stretch = changed_stretch(steps["regime_active"].to_numpy())
+    changed = np.where(stretch[:, None], path, np.nan)
+    (before,) = axes.plot([], [], **BEFORE | {"color": color}, zorder=4)
+    (under,) = axes.plot(
+        [], [], **(CHANGED if alone else {"color": color, "linewidth": 2.4}), zorder=4
+    )
+    body = Polygon(BODY, facecolor=color, edgecolor="white", linewidth=0.8, zorder=7)
+    axes.add_patch(body)
+
+    def turn(row: int) -> None:
+        row = min(row, len(path) - 1)
+        cos, sin = np.cos(heading[row]), np.sin(heading[row])
+        body.set_xy(path[row] + 0.022 * span * BODY @ np.array([[cos, sin], [-sin, cos]]))
+
+    moving: Moves = {
+        before: lambda row: before.set_data(*path[: row + 1].T),
+        under: lambda row: under.set_data(*changed[: row + 1].T),
+        body: turn,
+    }
+    handles: dict[str, Artist] = {"nominal": before, "changed regime": under}
+    if alone:
+        goals = steps[["goal_x", "goal_y"]].to_numpy()
+        (target,) = axes.plot([], [], **TARGET, zorder=5)
+        moving[target] = lambda row: target.set_data(*goals[row : row + 1].T)
+        handles["target"] = target
+    if alone and {"v", "omega"} <= set(action_names(steps)):
+        looks = {"planned": PLANNED, "executed": EXECUTED}
+        for (kind, look), course in zip(looks.items(), _courses(steps, heading), strict=True):
+            head: style.Look = {"arrowstyle": "-|>", "mutation_scale": 9 + look["linewidth"]}
+            arrow = FancyArrowPatch((0, 0), (0, 0), shrinkA=0, shrinkB=0, zorder=6, **head, **look)
+            axes.add_patch(arrow)
+            moving[arrow] = partial(_point, arrow, path, path + 0.13 * span * course)
+            handles[f"{kind} action"] = Line2D([], [], **look)
+    return moving, handles
 
 
-def _mp4(pictures: Iterable[np.ndarray]) -> bytes:
-    """Return a film in H.264."""
-    from imageio.v3 import imwrite  # an extra
-
-    whole = np.stack(list(pictures))
-    return imwrite("<bytes>", whole, extension=".mp4", plugin="FFMPEG", fps=RATE)
+def _point(arrow: FancyArrowPatch, starts: np.ndarray, ends: np.ndarray, row: int) -> None:
+    arrow.set_positions(starts[row], ends[row])
 
 
-ENCODERS: dict[str, Callable[[Iterable[np.ndarray]], bytes]] = {"gif": _gif, "mp4": _mp4}
+def _courses(steps: pd.DataFrame, heading: np.ndarray, ahead: float = 0.5) -> np.ndarray:
+    """Return arrows ``(2, T, 2)`` of planned and executed actions, the longest of size 1."""
+    kinds = ("planned", "executed")
+    fast, turning = (
+        np.stack([steps[f"{kind}_{name}"].to_numpy(dtype=float) for kind in kinds])
+        for name in ("v", "omega")
+    )
+    angle = heading + ahead * turning
+    longest = max(float(np.nanmax(np.abs(fast))), 1e-6)
+    return np.stack([np.cos(angle), np.sin(angle)], -1) * (fast / longest)[..., None]
+
+
+def space_scene(title: str, steps: pd.DataFrame) -> Scene:
+    """Return the scene of a path in space, with the height and the first action over time."""
+    figure, action = style.new_figure(9.6, 28 * GRID, dpi=100), action_names(steps)[0]
+    grid = figure.add_gridspec(2, 2, width_ratios=[1.2, 1])
+    space: Any = figure.add_subplot(grid[:, 0], projection="3d")
+    height, effort = (figure.add_subplot(grid[row, 1]) for row in (0, 1))
+    path, wanted = (steps[names].to_numpy(dtype=float) for names in (POSITION, GOAL))
+    space.plot(*wanted.T, **REFERENCE)
+    space.plot(*path.T, alpha=0.0)  # so that the axes have room for all of it
+    dress_space(space)
+
+    height.plot(steps["t"], steps["goal_z"], **REFERENCE)
+    height.plot(steps["t"], steps["z"], color=style.NOMINAL, linewidth=1.2)
+    looks = {
+        f"planned {action}": PLANNED | {"linewidth": 3.0},
+        f"executed {action}": EXECUTED | {"linewidth": 1.2},
+    }
+    for name, look in looks.items():
+        effort.plot(steps["t"], steps[name.replace(" ", "_", 1)], **look)
+    cursors = _cursors({"height (m)": height, action: effort}, steps, True)
+
+    (line,) = space.plot([], [], [], color=style.NOMINAL, linewidth=1.4)
+    (robot,) = space.plot([], [], [], "o", color=style.REGIME, markersize=7)
+    (goal,) = space.plot([], [], [], **TARGET)
+    handles = {"reference": Line2D([], [], **REFERENCE), "path": line, "now": robot}
+    handles |= {"set-point": goal}
+    handles |= {name: Line2D([], [], **look) for name, look in looks.items()}
+    style.legend_above(figure, [*handles.values()], [*handles], title)
+    moving: Moves = {
+        line: lambda row: line.set_data_3d(*path[: row + 1].T),
+        goal: lambda row: goal.set_data_3d(*wanted[row : row + 1].T),
+        robot: lambda row: robot.set_data_3d(*path[row : row + 1].T),
+    }
+    return Scene(figure, moving | cursors | _words(space, steps, True))
+
+
+def _cursors(panels: Mapping[str, Axes], steps: pd.DataFrame, alone: bool) -> Moves:
+    """Dress axes over time, by their labels; return the lines that mark now."""
+    if alone:
+        mark_regimes([*panels.values()], steps)
+    moving: Moves = {}
+    t, lowest = steps["t"].to_numpy(), list(panels)[-1]
+    for label, axes in panels.items():
+        style.dress(axes, "step" if label == lowest else "", label, size=style.LARGE)
+        axes.set_xlim(0, max(int(t[-1]), 1))
+        line = axes.axvline(0, color=style.REGIME, linewidth=1.2)
+        moving[line] = partial(_mark, line, t)
+    return moving
+
+
+def _mark(line: Line2D, t: np.ndarray, row: int) -> None:
+    line.set_xdata([t[row]] * 2)
+
+
+def _words(axes: Any, steps: pd.DataFrame, alone: bool) -> Moves:
+    """Return a line above axes that says the step and what is known of it."""
+    speak = axes.text2D if hasattr(axes, "text2D") else axes.text
+    words = speak(0.0, 1.01, "", transform=axes.transAxes, fontsize=style.NORMAL)
+
+    def tell(row: int) -> None:
+        step = steps.iloc[row]
+        text = f"step {int(step['t'])}"
+        if alone:
+            text += ": changed regime" if step["regime_active"] else ": nominal"
+            text += ", misaligned" if step["misaligned"] else ""
+        words.set_text(text)
+
+    return {words: tell}

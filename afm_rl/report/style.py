@@ -124,9 +124,9 @@ def excerpt(missions: pd.DataFrame, cells: int) -> tuple[pd.DataFrame, dict[str,
     return first[chosen], method_styles(names), note
 
 
-def new_figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
     """Return an empty white figure of ``width`` by ``height`` inches."""
-    figure = Figure((width, height), dpi=DPI, layout="constrained", facecolor="white")
+    figure = Figure((width, height), dpi=dpi, layout="constrained", facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 

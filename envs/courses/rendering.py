@@ -13,6 +13,7 @@ from torch import Tensor
 
 from afm_rl.envs.courses.track import Track
 from afm_rl.errors import check_count
+from afm_rl.film import picture
 
 ROAD, LINE, ROBOT, GOAL, TRAIL = "#dddddd", "#999999", "#0072b2", "#d55e00", "#56b4e9"
 DPI = 64  # a power of two, so that sizes in inches are exact
@@ -57,7 +58,7 @@ class TrackCanvas:
         middle, half = (low + high) / 2, size / metre / 2
         (left, bottom), (right, top) = (middle - half).tolist(), (middle + half).tolist()
         self.figure = Figure(figsize=(float(size[0]) / DPI, float(size[1]) / DPI), dpi=DPI)
-        self.canvas = FigureCanvasAgg(self.figure)
+        FigureCanvasAgg(self.figure)
         axes = self.figure.add_axes((0, 0, 1, 1), xlim=(left, right), ylim=(bottom, top))
         axes.set_axis_off()
         x, y = torch.cat([track.centerline, track.centerline[:1]]).unbind(-1)
@@ -86,8 +87,7 @@ class TrackCanvas:
         self._goal.set(center=goal.detach().cpu().tolist(), radius=reach)
         where = torch.zeros(0, 2) if trail is None else trail.detach().cpu()
         self._trail.set_data(where[:, 0].numpy(), where[:, 1].numpy())
-        self.canvas.draw()
-        return np.asarray(self.canvas.buffer_rgba())[..., :3].copy()
+        return picture(self.figure)
 
 
 @lru_cache(maxsize=8)

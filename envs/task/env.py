@@ -15,9 +15,9 @@ from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.envs.missions.env import MissionEnv, PhasedSimulation
 from afm_rl.envs.missions.format import MissionNoise
 from afm_rl.envs.missions.settings import check_bounds, check_regime
-from afm_rl.envs.task.film import curves, film
 from afm_rl.envs.task.task import Task
 from afm_rl.errors import ConfigurationError, check_count, check_instance
+from afm_rl.film import body_pictures, curves
 from afm_rl.regimes import ActionGain, Regime, Schedule
 
 SALT = 0x5441534B  # of the noise of actuators
@@ -94,7 +94,7 @@ class TaskEnv(MissionEnv):
         """
         states = steps[list(self.task.state_names)].to_numpy()
         if isinstance(self.task.world, MuJoCoDynamics):
-            return film(self.task.world.mjcf, states)
+            return body_pictures(self.task.world.mjcf, states)
         return curves(steps["t"].to_numpy(), states, self.task.state_names)
 
     def _advance(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -15,12 +15,11 @@ import numpy as np
 import torch
 from faults import FaultyVector
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from methods import METHODS
 from task import POLICIES, Task
 
+from afm_rl.film import ENCODERS, picture, segments
 from afm_rl.report import style
-from afm_rl.report.film import ENCODERS
 from afm_rl.storage.files import write_whole
 
 SCENES = {"hopper_trpo": "all reversed", "half_cheetah_tqc": "late 4"}
@@ -29,20 +28,18 @@ VIEW = 4.0, 2.2  # width and height of a panel, m
 GOES_ON = {"hopper_trpo": {"terminate_when_unhealthy": False}}
 
 
-def record(task: Task, fault: str, method: str, at: int, steps: int) -> list[np.ndarray]:
-    """Return the ends of all capsules, x and z, ``(G, 2, 2)``, at every step."""
+def record(task: Task, fault: str, method: str, at: int, steps: int) -> np.ndarray:
+    """Return the ends of all capsules, x and z, ``(T, G, 2, 2)``, at every step."""
     inner = FaultyVector(task.vector(1), [task.faults[fault]], at)
     envs, act = METHODS[method](task, inner)
     world = inner.env.envs[0].unwrapped
     observations, _ = envs.reset(seed=[0])
-    frames = []
+    states = []
     for _ in range(steps):
-        axes = world.data.geom_xmat.reshape(-1, 3, 3)[..., 2] * world.model.geom_size[:, 1:2]
-        ends = np.stack([world.data.geom_xpos - axes, world.data.geom_xpos + axes], 1)
-        frames.append(ends[1:, :, ::2])  # all but the ground
+        states.append(world.data.qpos.copy())
         observations, *_ = envs.step(act(observations))
     envs.close()
-    return frames
+    return segments(world.model, np.array(states))[0][..., ::2]
 
 
 def draw(axes: Axes, ends: np.ndarray, sizes: np.ndarray, colour: str) -> None:
@@ -68,7 +65,6 @@ def main() -> None:
     torch.set_num_threads(1)
     figure = style.new_figure(6.4, 3.9)
     panels = figure.subplots(2, 2)
-    canvas = FigureCanvasAgg(figure)
     rows = []
     for name, fault in SCENES.items():
         task = Task(POLICIES / f"{name}.safetensors")
@@ -89,8 +85,7 @@ def main() -> None:
                     draw(axes, film[step], sizes, colour)
                     state = f", {said}" if broken else ", healthy"
                     axes.set_title(f"{name}, {who}{state}", fontsize=style.LARGE)
-            canvas.draw()
-            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+            yield picture(figure)
 
     write_whole(args.out, ENCODERS["gif"](pictures()))
     print(f"wrote {args.out}")

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from afm_rl.envs import TaskEnv, gymnasium_task
-from afm_rl.envs.task.film import SIZE, can_render, film, segments
+from afm_rl.film import SIZE, body_pictures, can_render, segments
 
 HEIGHT, WIDTH = SIZE
 
@@ -46,13 +46,15 @@ def test_bones_are_where_the_body_is(pole):
 
 
 def test_where_nothing_can_render_bones_are_drawn(pole, blind):
-    pictures = np.stack(list(film(pole, np.array([[0.0], [0.0], [0.5]]))))
+    pictures = np.stack(list(body_pictures(pole, np.array([[0.0], [0.0], [0.5]]))))
     assert pictures.shape == (3, HEIGHT, WIDTH, 3)
     assert (pictures[0] == pictures[1]).all()
     assert (pictures[0] != pictures[2]).any()
     inside = (pictures[0] == (0, 114, 178)).all(-1)
     assert 500 < inside.sum() < HEIGHT * WIDTH / 4
-    assert len(list(film(pole, np.zeros((1, 1))))) == len(blind) == 1  # a second failure may kill
+    assert (
+        len(list(body_pictures(pole, np.zeros((1, 1))))) == len(blind) == 1
+    )  # a second failure may kill
 
 
 def test_mujocos_renderer_is_used_where_there_is_one(pole, monkeypatch):
@@ -79,7 +81,7 @@ def test_mujocos_renderer_is_used_where_there_is_one(pole, monkeypatch):
 
     monkeypatch.setattr(mujoco, "Renderer", Renderer)
     can_render.cache_clear()
-    assert len(list(film(pole, np.array([[0.1], [0.2]])))) == 2
+    assert len(list(body_pictures(pole, np.array([[0.1], [0.2]])))) == 2
     assert shown == [(0.1, -1), (0.2, -1), "closed"]
     can_render.cache_clear()
 
@@ -102,5 +104,5 @@ def test_a_state_without_a_body_is_drawn_as_curves_that_grow():
 def test_a_ball_is_drawn(blind):
     ball = "<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body></worldbody>"
     model = mujoco.MjModel.from_xml_string(f"{ball}</mujoco>")
-    (picture,) = film(model, np.zeros((1, 1)))
+    (picture,) = body_pictures(model, np.zeros((1, 1)))
     assert (picture == (0, 114, 178)).all(-1).sum() > 500
