@@ -41,7 +41,7 @@ def lazy_package(package: str, file: str) -> tuple[Callable[[str], Any], Any, li
 
 
 def old_arguments(function: Function) -> Function:
-    """Let a function take the old names of its :data:`ARGUMENTS`, too.
+    r"""Let a function take the old names of its :data:`ARGUMENTS`, too.
 
     >>> ARGUMENTS["wait"] = {"late": ("delay_compensation", {"predict": True})}
     >>> @old_arguments
@@ -49,7 +49,7 @@ def old_arguments(function: Function) -> Function:
     ...     return delay_compensation
     >>> with warnings.catch_warnings(record=True) as issued:
     ...     warnings.simplefilter("always")
-    ...     print(wait(late="predict"), issued[0].message, sep="\\n")
+    ...     print(wait(late="predict"), issued[0].message, sep="\n")
     True
     wait: late is called delay_compensation now; the old name goes with the next version
     >>> del ARGUMENTS["wait"]
