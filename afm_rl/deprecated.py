@@ -12,7 +12,9 @@ import lazy_loader
 
 NAMES = {"afm_rl.report.check_video": "afm_rl.film.check_video"}
 """New names of parts, both with their package."""
-ARGUMENTS: dict[str, dict[str, tuple[str, dict[Any, Any]]]] = {}
+ARGUMENTS: dict[str, dict[str, tuple[str, dict[Any, Any]]]] = {
+    "ActionFlow": {"readings": ("hypotheses", {})},
+}
 """New names of arguments, by function or class, and new values for old ones."""
 
 Function = TypeVar("Function", bound=Callable[..., Any])

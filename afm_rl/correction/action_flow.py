@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,11 +12,12 @@ from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.compiling.tracing import all_hold, somewhere
 from afm_rl.correction.base import Correction, Fields
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
+from afm_rl.correction.delay import command_acting, delay_tables, likeliest_delay
 from afm_rl.correction.hypotheses import CHOICES, acting_of, choose, delayed
-from afm_rl.correction.late import ago, delay_tables, steps_late
 from afm_rl.correction.network import AxisNetwork, load_universal
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.correction.tick import Answer, Tick
+from afm_rl.correction.tick import Tick
+from afm_rl.deprecated import old_arguments
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_flag, check_number
 
@@ -44,10 +44,10 @@ class ActionFlow(PairCorrector):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        readings: names of :data:`~afm_rl.correction.hypotheses.CHOICES`; all if None.
-        rows: pairs of a reading, K; None: 12, or more for more than eight actions.
+        hypotheses: names of :data:`~afm_rl.correction.hypotheses.CHOICES`; all if None.
+        rows: pairs of a context window, K; None: 12, or more for more than eight actions.
         memory: pairs that are remembered.
-        place: coordinates of the state in which the ground may differ; readings by place are
+        place: coordinates of the state in which the ground may differ; context windows by place are
             left out if there are none.
         place_scale: distance at which ground counts as other ground, in their unit.
         plain: prior log-odds of a linear model that is fitted against a reading: a local fit does
@@ -85,27 +85,28 @@ class ActionFlow(PairCorrector):
     >>> memory, state = flow.begin(torch.zeros(3)), torch.zeros(3)
     >>> for _ in range(8):  # both motors are reversed
     ...     plan, box = torch.tensor([0.5, 0.2]), torch.tensor([[-1.0, -1.5], [1.0, 1.5]])
-    ...     memory, found = flow.correct(memory, plan, Dubins(), box)
-    ...     state = Dubins()(state, -found.executed)
+    ...     memory, correction = flow.correct(memory, plan, Dubins(), box)
+    ...     state = Dubins()(state, -correction.executed)
     ...     memory = flow.observe(memory, state)
-    >>> found.executed.round(decimals=1)
+    >>> correction.executed.round(decimals=1)
     tensor([-0.5000, -0.2000])
     """
 
     _machine_code: MachineCode
-    worth: Tensor
+    log_prior: Tensor
     delays: Tensor
     acting: Tensor
-    told: Tensor
-    first: Tensor
+    delay_likelihood: Tensor
+    delay_log_prior: Tensor
     cause: Tensor
     episodic = (*PairCorrector.episodic, "under_way")
 
+    @old_arguments
     def __init__(
         self,
         action_low: Tensor,
         action_high: Tensor,
-        readings: Sequence[str] | None = None,
+        hypotheses: Sequence[str] | None = None,
         rows: int | None = None,
         memory: int = 80,
         place: Sequence[int] = (),
@@ -132,7 +133,7 @@ class ActionFlow(PairCorrector):
         size, place = len(torch.as_tensor(action_low)), list(place)
         rows = max(12, size + 4) if rows is None else check_count("corrector.rows", rows)
         super().__init__(action_low, action_high, rows, memory, len(place), quiet, delay)
-        self.hypotheses = choose(readings, bool(place), plain)
+        self.hypotheses = choose(hypotheses, bool(place), plain)
         self.models = tuple(row.name for row in self.hypotheses)
         self.odds = check_number("corrector.odds", odds, low=0.0)
         self.most_odds = check_number("corrector.most_odds", most_odds, low=0.0)
@@ -151,23 +152,23 @@ class ActionFlow(PairCorrector):
             "corrector.place_scale", place_scale, low=0.0, open_low=True
         )
         nominal, *others = self.hypotheses
-        worth = torch.tensor([row.log_prior for row in others])
-        prior = torch.cat([torch.full((1,), self.odds), worth.log_softmax(0)])
+        log_prior = torch.tensor([row.log_prior for row in others])
+        prior = torch.cat([torch.full((1,), self.odds), log_prior.log_softmax(0)])
         # Of a model: its delay; -1: the one that is believed.
         delays = torch.tensor([-1 if row.follows_delay else row.delay for row in self.hypotheses])
-        told, first = delay_tables(delays, prior)
-        self.most_late = max(delays.tolist())
+        likelihood, delay_log_prior = delay_tables(delays, prior)
+        self.longest_delay = max(delays.tolist())
         causes = [
             delayed(row.delay + self.delay) if row.delay else row.cause for row in self.hypotheses
         ]
-        late = [delayed(k + self.delay) for k in range(1, self.most_late + 1)]
-        self.causes = tuple(dict.fromkeys([nominal.cause, *late, *causes]))
+        delays_in_words = [delayed(k + self.delay) for k in range(1, self.longest_delay + 1)]
+        self.causes = tuple(dict.fromkeys([nominal.cause, *delays_in_words, *causes]))
         fixed = {
-            "worth": worth,
+            "log_prior": log_prior,
             "acting": acting_of(self.hypotheses),
             "delays": delays,
-            "told": told,
-            "first": first,
+            "delay_likelihood": likelihood,
+            "delay_log_prior": delay_log_prior,
             "cause": torch.tensor([self.causes.index(cause) for cause in causes]),
         }
         for name, value in fixed.items():
@@ -176,7 +177,7 @@ class ActionFlow(PairCorrector):
         if self.memory < longest:
             raise ConfigurationError(
                 f"corrector.memory={memory!r}: expected at least {longest} for {rows} rows and the "
-                f"readings {', '.join(row.name for row in others if row.name in CHOICES)}"
+                f"hypotheses {', '.join(row.name for row in others if row.name in CHOICES)}"
             )
         self.compiles = check_flag("corrector.compile", compile)
         self.__dict__["_machine_code"] = MachineCode(self, cache)
@@ -205,11 +206,11 @@ class ActionFlow(PairCorrector):
         >>> flow.causes[0], belief[0].item() > 0.7, belief.sum(-2).round(decimals=4)
         ('nothing has changed', True, tensor([1.]))
         """
-        late = self.unpack(memory, self.states_in(memory))["late"].long()
-        cause = torch.where((self.delays < 0) & (late > 0), late, self.cause)
-        found = self.believed(memory)
-        none = found.new_zeros(*found.shape[:-2], len(self.causes), self.action_size)
-        return none.scatter_add(-2, cause.unsqueeze(-1).expand_as(found), found)
+        delay = self.unpack(memory, self.states_in(memory))["delay"].long()
+        cause = torch.where((self.delays < 0) & (delay > 0), delay, self.cause)
+        weights = self.weights_in(memory)
+        none = weights.new_zeros(*weights.shape[:-2], len(self.causes), self.action_size)
+        return none.scatter_add(-2, cause.unsqueeze(-1).expand_as(weights), weights)
 
     def cause_in(self, memory: Tensor) -> str:
         """Return the likeliest change that memories ``(*B, P)`` show, in words."""
@@ -227,8 +228,8 @@ class ActionFlow(PairCorrector):
         """Return names and shapes, with the belief; its noise is the last part."""
         size, count = self.action_size, len(self.models)
         belief = {"losses": (count, size), "forecasts": (count, size), "noise": (size,)}
-        late = {"late": (1,), "under_way": (self.most_late + self.delay, size)}
-        return {**super().shapes(state_size), **late, **belief}
+        delay = {"delay": (1,), "under_way": (self.longest_delay + self.delay, size)}
+        return {**super().shapes(state_size), **delay, **belief}
 
     def begin(self, state: Tensor) -> Tensor:
         """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
@@ -247,32 +248,32 @@ class ActionFlow(PairCorrector):
     def weights(self, parts: Fields) -> Tensor:
         """Return the probabilities of the models ``(*B, M, A)``."""
         noise = parts["noise"]
-        prior = prior_of(self.worth.to(noise), self.odds, noise, self.floor(parts))
+        prior = prior_of(self.log_prior.to(noise), self.odds, noise, self.floor(parts))
         return self.belief(parts).weights(prior)
 
-    def look(self, memory: Tensor, model: DynamicsModel) -> Fields:
+    def measure(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts of the memory with the newest pairs and the belief after them."""
-        parts = super().look(memory, model)
+        parts = super().measure(memory, model)
         newest, size = parts["pairs"][..., -1, :], self.action_size
         _, effect, std, valid, _ = newest.split([size, size, size, 1, self.tail], -1)
         floor = self.floor(parts)
-        rules = (self.discount, self.noise_rate, floor, self.tails)
-        prior = prior_of(self.worth.to(floor), self.odds, parts["noise"], floor)
-        belief = self.belief(parts).update(effect, std, valid, prior, *rules)
-        belief = belief._replace(losses=self.surprised(parts["losses"], belief.losses))
-        awake = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
-        before = parts["late"].squeeze(-1).long()
-        late, losses = somewhere(
-            awake.squeeze(-1) | (before > 0),
+        constants = (self.discount, self.noise_rate, floor, self.tails)
+        prior = prior_of(self.log_prior.to(floor), self.odds, parts["noise"], floor)
+        belief = self.belief(parts).update(effect, std, valid, prior, *constants)
+        belief = belief._replace(losses=self.share_losses(parts["losses"], belief.losses))
+        misaligned = belief.losses[..., 0, :].amax(-1, keepdim=True) > self.odds
+        before = parts["delay"].squeeze(-1).long()
+        delay, losses = somewhere(
+            misaligned.squeeze(-1) | (before > 0),
             lambda: self.delayed(belief, belief.weights(prior), before),
             [before, belief.losses],
         )
-        parts["late"], belief = late.unsqueeze(-1).to(newest), belief._replace(losses=losses)
-        begins = (parts["misaligned"] != 1.0) & awake
-        parts["pairs"] = self.aged(parts["pairs"], begins)
-        return parts | belief._asdict() | {"misaligned": awake.to(newest)}
+        parts["delay"], belief = delay.unsqueeze(-1).to(newest), belief._replace(losses=losses)
+        begins = (parts["misaligned"] != 1.0) & misaligned
+        parts["pairs"] = self.mark_old(parts["pairs"], begins)
+        return parts | belief._asdict() | {"misaligned": misaligned.to(newest)}
 
-    def surprised(self, before: Tensor, losses: Tensor) -> Tensor:
+    def share_losses(self, before: Tensor, losses: Tensor) -> Tensor:
         """Return the losses ``(*B, M, A)`` as models may have them until a change is known.
 
         What surprises *nothing has changed* surprises all models that have yet to learn of it. One
@@ -286,41 +287,46 @@ class ActionFlow(PairCorrector):
         healthy = (nothing <= losses.amin(-2, keepdim=True) + self.odds).all(-1, keepdim=True)
         return torch.where(healthy, torch.minimum(losses, nothing + self.most_odds), losses)
 
-    def delays_now(self, late: Tensor) -> Tensor:
-        """Return the delays of all models ``(*B, M)`` while ``late`` ``(*B)`` is believed."""
-        return torch.where(self.delays < 0, late.unsqueeze(-1), self.delays)
+    def delays_now(self, delay: Tensor) -> Tensor:
+        """Return the delays of all models ``(*B, M)`` while ``delay`` ``(*B)`` is believed."""
+        return torch.where(self.delays < 0, delay.unsqueeze(-1), self.delays)
 
     def delayed(self, belief: Belief, weights: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Return the delay ``(*B)`` that is believed now, and the losses ``(*B, M, A)``.
 
         Models that follow a new one begin as good as the best that had it already.
         """
-        late = steps_late(weights, before, self.told, self.first)
-        theirs = (self.delays == late.unsqueeze(-1)).unsqueeze(-1)
-        best = torch.where(theirs, belief.losses, torch.inf).amin(-2, keepdim=True)
-        begin = (self.delays < 0) & (late != before).unsqueeze(-1)
-        return late, torch.where(begin.unsqueeze(-1), best, belief.losses)
+        delay = likeliest_delay(weights, before, self.delay_likelihood, self.delay_log_prior)
+        has_it = (self.delays == delay.unsqueeze(-1)).unsqueeze(-1)
+        best = torch.where(has_it, belief.losses, torch.inf).amin(-2, keepdim=True)
+        begin = (self.delays < 0) & (delay != before).unsqueeze(-1)
+        return delay, torch.where(begin.unsqueeze(-1), best, belief.losses)
 
-    def asleep(self, parts: Fields, action: Tensor) -> Fields:
+    def forecast_unchanged(self, parts: Fields, action: Tensor) -> Fields:
         """Return the parts if ``action`` ``(*B, A)`` is executed, and nothing has changed.
 
-        All models predict effects as they are sent, now or late. They are believed alike, but
-        that late ones keep what they predict better, as in a cumulative sum: so they are found as
-        soon as there is a surprise. And a delay that is believed keeps what it predicts worse.
+        All models then predict that commands act as they are sent, at once or delayed, so none can
+        lose against *nothing has changed*; delayed ones keep what they predicted better, as in a
+        cumulative sum, and are found as soon as there is a surprise. A delay that is believed also
+        keeps what it predicted worse.
         """
-        losses, late = parts["losses"], parts["late"].squeeze(-1).long()
+        losses, delay = parts["losses"], parts["delay"].squeeze(-1).long()
         commands = self.commands(parts, action)
         acted = commands[..., : commands.shape[-2] - self.delay, :]
         acts = self.acting.to(acted) @ acted[..., acted.shape[-2] - self.acting.shape[-1] :, :]
         follows = (self.delays < 0).unsqueeze(-1)
-        acts = torch.where(follows, ago(acted, late).unsqueeze(-2), acts)
-        believed = (self.delays_now(late) == late.unsqueeze(-1)) & (late > 0).unsqueeze(-1)
+        acts = torch.where(follows, command_acting(acted, delay).unsqueeze(-2), acts)
+        believed = (self.delays_now(delay) == delay.unsqueeze(-1)) & (delay > 0).unsqueeze(-1)
         best = torch.minimum(losses, losses[..., :1, :])
-        alike = {"planned": action, "executed": action}
-        alike |= {"acting": self.denormalise(ago(acted, late)), "forecasts": acts}
-        alike |= {"losses": torch.where(believed.unsqueeze(-1), losses, best)}
         newest = commands.shape[-2] - parts["under_way"].shape[-2]
-        return {**parts, **alike, "under_way": commands[..., newest:, :]}
+        return parts | {
+            "planned": action,
+            "executed": action,
+            "acting": self.denormalise(command_acting(acted, delay)),
+            "forecasts": acts,
+            "losses": torch.where(believed.unsqueeze(-1), losses, best),
+            "under_way": commands[..., newest:, :],
+        }
 
     def commands(self, parts: Fields, executed: Tensor) -> Tensor:
         """Return all commands up to the present one, ``(*B, M + D + 1, A)``, in u.
@@ -331,18 +337,18 @@ class ActionFlow(PairCorrector):
         ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
         return torch.cat([acted, self.normalise(ahead)], -2)
 
-    def watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> tuple[Tensor, ...]:
+    def detect(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> tuple[Tensor, ...]:
         """Return the memory with the newest pair, and what it is if the plan is executed.
 
         Returns:
-            Both, is any other model to be asked? ``(*B)``, and the innovation ``(*B)``.
+            Both, is the model misaligned? ``(*B)``, and the innovation ``(*B)``.
         """
-        parts = self.look(memory, model)
+        parts = self.measure(memory, model)
         innovation = parts["pairs"][..., -1, -self.tail]
-        awake = parts["misaligned"].squeeze(-1) == 1.0
+        misaligned = parts["misaligned"].squeeze(-1) == 1.0
         memory = self.pack(parts)
-        idle = memory if all_hold(awake) else self.pack(self.asleep(parts, planned))
-        return memory, idle, awake, innovation
+        unchanged = parts if all_hold(misaligned) else self.forecast_unchanged(parts, planned)
+        return memory, self.pack(unchanged), misaligned, innovation
 
     def decide(self, memory: Tensor, planned: Tensor, box: Tensor) -> tuple[Tensor, ...]:
         """Return the next memories, and what to execute, of B missions with a surprise.
@@ -356,9 +362,9 @@ class ActionFlow(PairCorrector):
             The next memory, and the parts of an :class:`Answer` but the last two.
         """
         parts = self.unpack(memory, self.states_in(memory))
-        weights, late = self.weights(parts), parts["late"].squeeze(-1).long()
+        weights, delay = self.weights(parts), parts["delay"].squeeze(-1).long()
         rest = [x.to(self.tick.scale) for x in (self.normalise(parts["sent"]), planned, box)]
-        answer = self.tick(*self._read(parts, weights), late, *rest)
+        answer = self.tick(*self._evidence(parts, weights), delay, *rest)
         acting = self.denormalise((weights * answer.forecasts.to(memory)).sum(-2))
         parts |= {"planned": planned, "executed": answer.executed.to(memory), "acting": acting}
         parts["forecasts"] = answer.forecasts.to(memory)
@@ -369,29 +375,27 @@ class ActionFlow(PairCorrector):
         self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
     ) -> tuple[Tensor, Correction]:
         """Return the next memory, and what to execute for a planned action ``(*B, A)``."""
-        calm = planned.clamp(*box.unbind(-2))
+        inside = planned.clamp(*box.unbind(-2))
         with torch.no_grad():
-            memory, idle, awake, innovation = self._watch(memory, calm, model)
-            found = self.unchanged(calm, innovation, box)
-            found = found._replace(noise=self.noise_in(memory))
-            names = ["memory", *Answer._fields[:-2]]
-            still = [idle, *found[:4], found.misaligned]
-            changed = somewhere(awake, self._decide, still, memory, planned, box)
-            now = dict(zip(names, changed, strict=True))
-            now["misaligned"] = now.pop("corrects")
-            return now.pop("memory"), found._replace(**now)
+            memory, idle, misaligned, innovation = self._detect(memory, inside, model)
+            plan = self.unchanged(inside, innovation, box)._replace(noise=self.noise_in(memory))
+            as_planned = [idle, *plan[:4], plan.misaligned]
+            decided = somewhere(misaligned, self._decide, as_planned, memory, planned, box)
+            memory, executed, predicted, spread, bounds, corrects = decided
+            answer = {"executed": executed, "predicted": predicted, "spread": spread}
+            return memory, plan._replace(**answer, bounds=bounds, misaligned=corrects)
 
     def under_way(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the state, the newest commands' effects, and how many of them are to come."""
         parts = self.unpack(memory, self.states_in(memory))
-        steps = parts["late"].squeeze(-1).long() + self.delay
+        steps = parts["delay"].squeeze(-1).long() + self.delay
         return parts["state"], self.denormalise(parts["under_way"]), steps
 
     def noise_in(self, memory: Tensor) -> Tensor:
         """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
         return self.denormalise(memory[..., -self.action_size :])
 
-    def believed(self, memory: Tensor) -> Tensor:
+    def weights_in(self, memory: Tensor) -> Tensor:
         """Return how probable the :attr:`models` are, by axis, ``(*B, M, A)``."""
         parts = self.unpack(memory, self.states_in(memory))
         return self.weights(parts)
@@ -410,8 +414,8 @@ class ActionFlow(PairCorrector):
             model: the dynamics model as it is now.
         """
         with torch.no_grad():
-            seen = self._foresee(self.pack(self.look(memory, model)), action)
-            parts = self.unpack(seen, model.state_size)
+            memory = self._with_forecasts(self.pack(self.measure(memory, model)), action)
+            parts = self.unpack(memory, model.state_size)
             weights = self.weights(parts)
             mean, std = mean_and_std(parts["forecasts"], weights)
             return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))
@@ -420,7 +424,9 @@ class ActionFlow(PairCorrector):
         self, memory: Tensor, planned: Tensor, executed: Tensor, misaligned: Tensor | None = None
     ) -> Tensor:
         """Return the memory with the actions that are planned and executed now, ``(*B, A)``."""
-        return self._foresee(super().executing(memory, planned, executed, misaligned), executed)
+        return self._with_forecasts(
+            super().executing(memory, planned, executed, misaligned), executed
+        )
 
     def reported(self, memory: Tensor, given: Tensor) -> Tensor:
         """Return the memory with forecasts moved by what was given more than sent."""
@@ -428,40 +434,39 @@ class ActionFlow(PairCorrector):
         parts = self.unpack(super().reported(memory, given), self.states_in(memory))
         if self.delay:
             sent = self.unpack(memory, self.states_in(memory))["sent"][..., 0, :]
-        more = self.normalise(given - sent).unsqueeze(-2)
-        return self.pack({**parts, "forecasts": parts["forecasts"] + more})
+        difference = self.normalise(given - sent).unsqueeze(-2)
+        return self.pack({**parts, "forecasts": parts["forecasts"] + difference})
 
     @torch.no_grad()
-    def _foresee(self, memory: Tensor, executed: Tensor) -> Tensor:
-        """Return the memory with forecasts of what is executed, where models are to be asked."""
+    def _with_forecasts(self, memory: Tensor, executed: Tensor) -> Tensor:
+        """Return the memory with forecasts of what is executed, of all models if misaligned."""
         parts = self.unpack(memory, self.states_in(memory))
-        awake = parts["misaligned"].squeeze(-1) == 1.0
-        idle = self.asleep(parts, executed)
+        misaligned = parts["misaligned"].squeeze(-1) == 1.0
+        idle = self.forecast_unchanged(parts, executed)
 
-        def asked(memory: Tensor, executed: Tensor) -> Sequence[Tensor]:
-            return self.foresee(self.unpack(memory, self.states_in(memory)), executed)
+        def by_models(memory: Tensor, executed: Tensor) -> Sequence[Tensor]:
+            return self.forecast(self.unpack(memory, self.states_in(memory)), executed)
 
-        still = [idle["forecasts"], idle["under_way"]]
-        forecasts, under_way = somewhere(awake, asked, still, memory, executed)
+        unchanged = [idle["forecasts"], idle["under_way"]]
+        forecasts, under_way = somewhere(misaligned, by_models, unchanged, memory, executed)
         return self.pack({**parts, "forecasts": forecasts, "under_way": under_way})
 
-    def foresee(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
+    def forecast(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
         """Return the forecasts of all models, and what is under way."""
         ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
-        given = *self._read(parts, self.weights(parts)), self.normalise(ahead)
-        lead, late = executed.shape[:-1], parts["late"].reshape(-1).long()
-        count = math.prod(lead)
+        evidence = *self._evidence(parts, self.weights(parts)), self.normalise(ahead)
+        batch, delay = executed.shape[:-1], parts["delay"].reshape(-1).long()
         pairs, weights, noise, place, unit = (
-            x.reshape(count, *x.shape[len(lead) :]) for x in given
+            x.reshape(len(delay), *x.shape[len(batch) :]) for x in evidence
         )
-        read = self.tick.read(pairs, noise, place, late)
-        found = self.tick.forecast(read, weights, late, pairs, unit.to(pairs))
-        forecasts, under_way = (x.view(*lead, *x.shape[1:]).to(executed) for x in found)
+        fits = self.tick.fit(pairs, noise, place, delay)
+        effects = self.tick.forecast(fits, weights, delay, pairs, unit.to(pairs))
+        forecasts, under_way = (x.view(*batch, *x.shape[1:]).to(executed) for x in effects)
         return forecasts, under_way
 
-    def _read(self, parts: Fields, weights: Tensor) -> list[Tensor]:
-        given = parts["pairs"], weights, parts["noise"], self.place_of(parts["state"])
-        return [part.to(self.tick.scale) for part in given]
+    def _evidence(self, parts: Fields, weights: Tensor) -> list[Tensor]:
+        evidence = parts["pairs"], weights, parts["noise"], self.place_of(parts["state"])
+        return [part.to(self.tick.scale) for part in evidence]
 
     @property
     def _as_machine_code(self) -> bool:
@@ -473,16 +478,16 @@ class ActionFlow(PairCorrector):
             return super().observe(memory, next_state)
         return self._machine_code(PairCorrector.observe, memory, next_state)[0]
 
-    def _watch(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
+    def _detect(self, memory: Tensor, planned: Tensor, model: DynamicsModel) -> Sequence[Tensor]:
         # Machine code holds the model as it is now, one round of Gauss and Newton, and no
         # automatic derivative.
         derived = type(model).jacobian is DynamicsModel.jacobian
         if not self._as_machine_code or not model.affine or model.taught_in is not None or derived:
-            return self.watch(memory, planned, model)
-        return self._machine_code(ActionFlow.watch, memory, planned, model=model)
+            return self.detect(memory, planned, model)
+        return self._machine_code(ActionFlow.detect, memory, planned, model=model)
 
     @torch.inference_mode()
-    def _decide(self, *given: Tensor) -> Sequence[Tensor]:
+    def _decide(self, *arguments: Tensor) -> Sequence[Tensor]:
         if self._as_machine_code:
-            return self._machine_code(ActionFlow.decide, *given)
-        return in_one_batch(self.decide, *given)
+            return self._machine_code(ActionFlow.decide, *arguments)
+        return in_one_batch(self.decide, *arguments)

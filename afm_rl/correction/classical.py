@@ -83,10 +83,10 @@ class ClassicalCorrector(PairCorrector):
 
     def _watched(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts with the newest pairs, older ones marked where a change begins."""
-        parts = self.look(memory, model)
+        parts = self.measure(memory, model)
         surprise = parts["pairs"][..., -1:, -self.tail] > self.quiet
         begins = (parts["misaligned"] != 1.0) & surprise
-        return parts | {"pairs": self.aged(parts["pairs"], begins)}
+        return parts | {"pairs": self.mark_old(parts["pairs"], begins)}
 
     def _innovation(self, parts: Fields) -> tuple[Tensor, Tensor]:
         innovation = parts["pairs"][..., -self.recent :, -self.tail].amax(-1)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from afm_rl.correction.readings import READINGS
+from afm_rl.correction.context_windows import CONTEXT_WINDOWS
 from afm_rl.errors import ConfigurationError, check_choice
 
 FILTER = 12  # commands that a lag looks back on
@@ -25,8 +25,8 @@ class Hypothesis(NamedTuple):
 
     name: str
     kind: str
-    """What forecasts. "nominal": the command itself; "network": the network, which has read some
-    pairs (:mod:`~afm_rl.correction.readings`); "linear": a fit
+    """What forecasts. "nominal": the command itself; "network": the network, given some pairs
+    (:mod:`~afm_rl.correction.context_windows`); "linear": a fit
     (:func:`~afm_rl.correction.linear.fit_lines`, in this order); "delay": earlier commands, as the
     row says; "delayed gain": the same times a gain that is fitted; "healthy": models by which there
     is nothing to correct (:func:`~afm_rl.correction.linear.within_rate`,
@@ -38,7 +38,7 @@ class Hypothesis(NamedTuple):
     follows_delay: bool = True
     """Does it take any delay that is believed, or always its own?"""
     log_prior: float | None = 0.0
-    """Prior log-odds against a network's reading; None: those of a fit, ``plain``."""
+    """Prior log-odds against the network's answer; None: those of a fit, ``plain``."""
     cause: str = "a recent change"
     """In plain words."""
 
@@ -59,11 +59,11 @@ def delayed(steps: int) -> str:
 
 def _slow(kind: str, prefix: str = "") -> list[Hypothesis]:
     """Return the rows of a kind for delays of one to eight steps, and for three lags."""
-    late = [
+    delays = [
         Hypothesis(f"{prefix}delay_{k}", kind, delay=k, follows_delay=False, cause=delayed(k))
         for k in range(1, 9)
     ]
-    return late + [
+    return delays + [
         Hypothesis(f"{prefix}lag_{k}", kind, lag=k, follows_delay=False, cause="slow")
         for k in range(1, 4)
     ]
@@ -71,12 +71,15 @@ def _slow(kind: str, prefix: str = "") -> list[Hypothesis]:
 
 UNCHANGED = "nothing has changed"
 NOMINAL = Hypothesis(UNCHANGED, "nominal", follows_delay=False, cause=UNCHANGED)
-CAUSES = {"near": "another ground"}  # of readings by what they read
 HYPOTHESES = (
     NOMINAL,
     *(
-        Hypothesis(name, "network", cause=CAUSES.get(reading.kind, "a recent change"))
-        for name, reading in READINGS.items()
+        Hypothesis(
+            name,
+            "network",
+            cause="another ground" if window.kind == "near" else "a recent change",
+        )
+        for name, window in CONTEXT_WINDOWS.items()
     ),
     # The opposite of the command: it needs no fit, and says what every action does.
     Hypothesis("reversed", "linear"),
@@ -97,8 +100,8 @@ HYPOTHESES = (
     # The gain of commands that are not late, as there is one for every delay and lag.
     Hypothesis("gain_now", "delayed gain", follows_delay=False, log_prior=None),
     *_slow("delayed gain", "gain_"),
-    Hypothesis("only so fast", "healthy", cause="only so fast"),
-    Hypothesis("noisy readings", "healthy", cause="noisy readings"),
+    Hypothesis("rate limit", "healthy", cause="rate limit"),
+    Hypothesis("sensor noise", "healthy", cause="sensor noise"),
 )
 """All of them, kind by kind in the order of :data:`KINDS`. The prior of the first is a setting,
 ``odds``, and those with a delayed gain share one."""
@@ -111,8 +114,8 @@ def choose(names: Sequence[str] | None, by_place: bool, plain: float) -> tuple[H
 
     Args:
         names: of :data:`CHOICES`; all if None.
-        by_place: may the ground differ from place to place? Readings by place are dropped else.
-        plain: prior log-odds of a fit against a reading of the network.
+        by_place: may the ground differ from place to place? Windows by place are dropped else.
+        plain: prior log-odds of a fit against an answer of the network.
 
     Raises:
         ConfigurationError: if it is no list of such names, or none by time is left.
@@ -124,17 +127,17 @@ def choose(names: Sequence[str] | None, by_place: bool, plain: float) -> tuple[H
     names = CHOICES if names is None else names
     if isinstance(names, str) or not isinstance(names, Sequence) or not names:
         raise ConfigurationError(
-            f"corrector.readings={names!r}: expected a list of {', '.join(CHOICES)}"
+            f"corrector.hypotheses={names!r}: expected a list of {', '.join(CHOICES)}"
         )
     for name in names:
-        check_choice("corrector.readings", name, CHOICES)
-    if not any(name in READINGS and READINGS[name].kind != "near" for name in names):
+        check_choice("corrector.hypotheses", name, CHOICES)
+    if not any(name in CONTEXT_WINDOWS and CONTEXT_WINDOWS[name].kind != "near" for name in names):
         raise ConfigurationError(
-            f"corrector.readings={list(names)!r}: expected one by time, such as recent"
+            f"corrector.hypotheses={list(names)!r}: expected one by time, such as recent"
         )
 
     def chosen(row: Hypothesis) -> bool:
-        if row.kind == "network" and READINGS[row.name].kind == "near" and not by_place:
+        if row.kind == "network" and CONTEXT_WINDOWS[row.name].kind == "near" and not by_place:
             return False
         name = row.name.removeprefix("gain_") if row.kind == "delayed gain" else row.name
         return name in names or name not in CHOICES

@@ -64,7 +64,7 @@ class PairCorrector(Corrector):
         """Return the coordinates of states that are remembered with pairs; none by default."""
         return state[..., :0]
 
-    def look(self, memory: Tensor, model: DynamicsModel) -> Fields:
+    def measure(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts of the memory with the newest pairs.
 
         A model that stays as it is needs to be asked about the newest transition only, one that
@@ -114,7 +114,7 @@ class PairCorrector(Corrector):
         reason = "a sign" if bool((gains < 0).any()) else "dt or a unit"
         return f"gain {', '.join(told)}{more}: {reason} of the model?"
 
-    def aged(self, pairs: Tensor, begins: Tensor) -> Tensor:
+    def mark_old(self, pairs: Tensor, begins: Tensor) -> Tensor:
         """Return pairs ``(*B, M, D)`` with all but the newest marked as old.
 
         "valid" is halved: a change has begun since, which only those by place may ignore.

@@ -12,9 +12,10 @@ from torch import Tensor, nn
 from afm_rl.compiling.tracing import somewhere
 from afm_rl.correction.achievable import MODES, attainable, extend
 from afm_rl.correction.belief import mean_and_std
+from afm_rl.correction.context_windows import ContextWindows
+from afm_rl.correction.delay import align, command_acting
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.hypotheses import KINDS, Hypothesis, acting_of
-from afm_rl.correction.late import ago, aligned
 from afm_rl.correction.least_squares import fit_gain, precision_of
 from afm_rl.correction.linear import (
     Lines,
@@ -23,10 +24,7 @@ from afm_rl.correction.linear import (
     within_rate,
 )
 from afm_rl.correction.network import AxisNetwork, Encoded, midpoint
-from afm_rl.correction.readings import Reader
 from afm_rl.errors import check_choice, check_count, check_number
-
-ENOUGH = 0.02  # expected loss that an action must save to be preferred to the plan
 
 
 class Answer(NamedTuple):
@@ -49,31 +47,31 @@ class Answer(NamedTuple):
     """The effects that the newest commands have or will have, likewise, ``(B, K + D, A)``."""
 
 
-class Read(NamedTuple):
-    """What the memory says of actions, by all models."""
+class Fits(NamedTuple):
+    """All models, fitted to the memory."""
 
     encoded: Encoded
-    """What the R readings have read, B R sets."""
+    """The network's code of each of R context windows, B R sets."""
     lines: Lines
     """The linear models."""
-    late: Tensor
-    """Gains of commands that act late, ``(B, W, A)``."""
-    noisy: Tensor
-    """What errors of the readings add to the next effect, ``(B, 1, A)``."""
-    slow: Tensor
-    """Lowest and highest effect of actuators no faster than of late, ``(B, 2, A)``."""
+    gains: Tensor
+    """Of commands that are delayed in W ways, ``(B, W, A)``."""
+    sensor_noise: Tensor
+    """What sensor noise adds to the next effect, ``(B, 1, A)``."""
+    rate_limits: Tensor
+    """Lowest and highest effect at the rate seen recently, ``(B, 2, A)``."""
 
 
 class Models(NamedTuple):
-    """What is believed of the next action."""
+    """The models of which an action is chosen."""
 
     encoded: Encoded
-    """What the most likely reading of every axis has read."""
+    """The most likely context window of every axis."""
     lines: Lines
-    """The linear models, the last one a gain of commands that act late."""
+    """The linear models, the last one a gain of delayed commands."""
     weights: Tensor
-    """Probabilities ``(B, 2 + L, A)``: that actions have their nominal effect, now or late;
-    of a reading; of the linear models."""
+    """Probabilities ``(B, 2 + L, A)``: that actions have their nominal effect, delayed or not; of
+    the network; of the linear models."""
 
 
 class Tick(nn.Module):
@@ -88,11 +86,11 @@ class Tick(nn.Module):
     points: Tensor
     probes: Tensor
     delays: Tensor
-    earlier: Tensor
+    tie_break: Tensor
     filters: Tensor
-    filtered: Tensor
+    filter_of_model: Tensor
     mixing: Tensor
-    ways: Tensor
+    acting: Tensor
     windows: Tensor
 
     def __init__(
@@ -113,23 +111,23 @@ class Tick(nn.Module):
         self.saturation = check_choice("corrector.saturation", saturation, MODES)
         kinds = {kind: [row for row in hypotheses if row.kind == kind] for kind in KINDS}
         self.counts = [len(of_kind) for of_kind in kinds.values()]
-        self.reader = Reader([row.name for row in kinds["network"]], rows, size)
-        ways = acting_of([*kinds["nominal"], *kinds["delay"]])
+        self.context = ContextWindows([row.name for row in kinds["network"]], rows, size)
+        acting = acting_of([*kinds["nominal"], *kinds["delay"]])
         delays = torch.tensor([-1 if row.follows_delay else row.delay for row in hypotheses])
-        self.most_late = max(delays.tolist())
+        self.longest_delay = max(delays.tolist())
         filters, which = filters_of(acting_of(hypotheses))
         fixed = {
             "scale": scale.to(network.modes),
             "points": points_of(check_count("corrector.samples", samples), size),
             "probes": probes_of(size),
             "delays": delays,
-            # Of readings that are alike the first, on any machine and in any batch.
-            "earlier": 1 - 1e-4 * torch.arange(self.counts[1]).unsqueeze(-1),
+            # Of windows with equal probability the first, on any machine and in any batch.
+            "tie_break": 1 - 1e-4 * torch.arange(self.counts[1]).unsqueeze(-1),
             "filters": filters,
-            "filtered": torch.nn.functional.one_hot(which).T.to(scale),
+            "filter_of_model": torch.nn.functional.one_hot(which).T.to(scale),
             "mixing": torch.tensor([row.mixes_axes for row in kinds["linear"]]).unsqueeze(-1),
-            "windows": torch.arange(rows).unsqueeze(-1) + torch.arange(ways.shape[-1]),
-            "ways": ways,
+            "windows": torch.arange(rows).unsqueeze(-1) + torch.arange(acting.shape[-1]),
+            "acting": acting,
         }
         for name, value in fixed.items():
             self.register_buffer(name, value, persistent=False)
@@ -140,7 +138,7 @@ class Tick(nn.Module):
         weights: Tensor,
         noise: Tensor,
         place: Tensor,
-        late: Tensor,
+        delay: Tensor,
         waiting: Tensor,
         planned: Tensor,
         box: Tensor,
@@ -152,14 +150,14 @@ class Tick(nn.Module):
             weights: probabilities of the models, ``(B, M + 1, A)``.
             noise: that no model explains, ``(B, A)``.
             place: where the missions are, ``(B, P)``.
-            late: steps that commands are late, ``(B,)``.
+            delay: of commands, in steps, ``(B,)``.
             waiting: commands that are known to come, the oldest first, ``(B, D, A)``.
             planned: in units of the action, ``(B, A)``.
             box: lowest and highest action, ``(B, 2, A)``.
         """
         unit, ends = planned / self.scale, box / self.scale
-        read = self.read(pairs, noise, place, late)
-        models = self.most_likely(read, weights)
+        fits = self.fit(pairs, noise, place, delay)
+        models = self.most_likely(fits, weights)
         proposals, spread = self.propose(models, unit, ends)
         expected = self.expect(models, proposals)
         reach = self.reach(models, expected)
@@ -168,21 +166,21 @@ class Tick(nn.Module):
         sent = pairs[..., : len(self.scale)]
         bounds = extend(reach, ends, sent.amax(1) - sent.amin(1))
         action, effects = self.decide(models, proposals, expected, wanted, noise)
-        lag = (self.filtered.to(weights) @ weights).argmax(1)  # the most probable one
+        lag = (self.filter_of_model.to(weights) @ weights).argmax(1)  # the most probable one
 
-        def led() -> tuple[Tensor, Tensor]:
-            first, acts = self.lead(action, lag, torch.cat([sent, waiting], 1), ends)
-            return first, self.expect(models, acts.unsqueeze(1)).squeeze(2)
+        def against_lag() -> tuple[Tensor, Tensor]:
+            command, acts = self.lead(action, lag, torch.cat([sent, waiting], 1), ends)
+            return command, self.expect(models, acts.unsqueeze(1)).squeeze(2)
 
-        action, effects = somewhere((lag > 0).any(-1), led, [action, effects])
-        calm = weights[:, 0] + weights[:, -self.counts[-1] :].sum(1)
-        changed = calm < 0.5  # else the plan, to the bit
+        action, effects = somewhere((lag > 0).any(-1), against_lag, [action, effects])
+        healthy = weights[:, 0] + weights[:, -self.counts[-1] :].sum(1)
+        changed = healthy < 0.5  # else the plan, to the bit
         corrects = changed & action.isfinite().all(-1, True)
         action = torch.where(corrects, action, proposals[:, 0])
         effects = torch.where(corrects.unsqueeze(1), effects, expected[:, :, 0])
         predicted = (models.weights * effects).sum(1)
         ahead = torch.cat([waiting, action.unsqueeze(1)], 1)
-        forecasts, under_way = self.forecast(read, weights, late, pairs, ahead)
+        forecasts, under_way = self.forecast(fits, weights, delay, pairs, ahead)
         return Answer(
             action * self.scale,
             predicted * self.scale,
@@ -193,35 +191,35 @@ class Tick(nn.Module):
             under_way,
         )
 
-    def read(self, pairs: Tensor, noise: Tensor, place: Tensor, late: Tensor) -> Read:
-        """Return what the memory says of actions, by all models."""
+    def fit(self, pairs: Tensor, noise: Tensor, place: Tensor, delay: Tensor) -> Fits:
+        """Return all models, fitted to the memory; see :meth:`forward`."""
         size = len(self.scale)
-        follow = aligned(pairs, late, size)
-        rows = self.reader(follow, place)
-        loud = torch.hypot(rows.std, noise[:, None, None]) * rows.valid
-        rows = Rows(*(part.flatten(0, 1) for part in rows._replace(std=loud)))
+        aligned = align(pairs, delay, size)
+        rows = self.context(aligned, place)
+        std = torch.hypot(rows.std, noise[:, None, None]) * rows.valid
+        rows = Rows(*(part.flatten(0, 1) for part in rows._replace(std=std)))
         encoded = self.network.encode(rows, fit_experts(rows))
-        sent, came, std, valid = follow[..., : 3 * size + 1].split([size, size, size, 1], -1)
-        sound = (valid == 1.0).to(pairs)
-        weight = precision_of(torch.hypot(std, noise.unsqueeze(1)), sound)
-        newest = pairs[:, 1 - self.rows - self.ways.shape[-1] :, :size]
-        acted = (self.ways @ newest[:, self.windows]).transpose(1, 2)  # (B, W, K, A)
-        recent = slice(-self.rows, None)
-        gains = fit_gain(acted, came[:, None, recent], weight[:, None, recent])
-        lines = fit_lines(pairs[..., :size], sent, came, weight)
-        noisy, slow = sensor_noise(sent, came, sound), within_rate(came, sound)
-        return Read(encoded, lines, gains, noisy, slow)
+        acted, effect, std, valid = aligned[..., : 3 * size + 1].split([size, size, size, 1], -1)
+        recent = (valid == 1.0).to(pairs)
+        weight = precision_of(torch.hypot(std, noise.unsqueeze(1)), recent)
+        newest = pairs[:, 1 - self.rows - self.acting.shape[-1] :, :size]
+        delayed = (self.acting @ newest[:, self.windows]).transpose(1, 2)  # (B, W, K, A)
+        last = slice(-self.rows, None)
+        gains = fit_gain(delayed, effect[:, None, last], weight[:, None, last])
+        lines = fit_lines(pairs[..., :size], acted, effect, weight)
+        limits = within_rate(effect, recent)
+        return Fits(encoded, lines, gains, sensor_noise(acted, effect, recent), limits)
 
-    def most_likely(self, found: Read, weights: Tensor) -> Models:
+    def most_likely(self, fits: Fits, weights: Tensor) -> Models:
         """Return the models of which an action is chosen."""
-        still, read, linear, late, gained, healthy = weights.split(self.counts, 1)
-        best = found.encoded.choose((read * self.earlier).argmax(1))
-        gain = found.late.gather(1, gained.argmax(1, keepdim=True))  # (B, 1, A)
-        matrix = torch.cat([found.lines.matrix, torch.diag_embed(gain)], 1)
-        lines = Lines(matrix, torch.nn.functional.pad(found.lines.bias, (0, 0, 0, 1)))
-        still = torch.cat([still, late, healthy], 1).sum(1, keepdim=True)
-        read, gained = (part.sum(1, keepdim=True) for part in (read, gained))
-        return Models(best, lines, torch.cat([still, read, linear, gained], 1))
+        nominal, network, linear, delay, gain, healthy = weights.split(self.counts, 1)
+        encoded = fits.encoded.choose((network * self.tie_break).argmax(1))
+        delayed = fits.gains.gather(1, gain.argmax(1, keepdim=True))  # (B, 1, A)
+        matrix = torch.cat([fits.lines.matrix, torch.diag_embed(delayed)], 1)
+        lines = Lines(matrix, torch.nn.functional.pad(fits.lines.bias, (0, 0, 0, 1)))
+        nominal = torch.cat([nominal, delay, healthy], 1).sum(1, keepdim=True)
+        network, gain = (part.sum(1, keepdim=True) for part in (network, gain))
+        return Models(encoded, lines, torch.cat([nominal, network, linear, gain], 1))
 
     def propose(self, models: Models, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions ``(B, C, A)``, the first the planned one, and the samples' deviation.
@@ -229,28 +227,29 @@ class Tick(nn.Module):
         The flow's samples, the exact answers of all fits, and a few actions from all over the box.
         """
         plan = planned.unsqueeze(1)
-        asked = self.network.ask(models.encoded, plan, self.saturation)
+        plan_code = self.network.ask(models.encoded, plan, self.saturation)
         start = plan + self.source_std * self.points
-        ends = midpoint(partial(self.network.velocity, asked), start, self.steps)
+        ends = midpoint(partial(self.network.velocity, plan_code), start, self.steps)
         mean, spread = ends.mean(1, keepdim=True), ends.std(1, correction=0)
-        exact = asked.answers[..., 0, :MISSES].mT
+        exact = plan_code.answers[..., 0, :MISSES].mT
         least, most = box.split(1, 1)
         probes = torch.lerp(least, most, 0.5 * (self.probes + 1))
-        found = [plan, mean, ends, exact, models.lines.invert(planned), probes]
-        return torch.cat(found, 1).clamp(least, most), spread
+        proposals = [plan, mean, ends, exact, models.lines.invert(planned), probes]
+        return torch.cat(proposals, 1).clamp(least, most), spread
 
     def expect(self, models: Models, actions: Tensor) -> Tensor:
         """Return the effects ``(B, 2 + L, C, A)`` of actions ``(B, C, A)`` by every model."""
-        read = self.network.effect(models.encoded, actions).unsqueeze(1)
-        return torch.cat([actions.unsqueeze(1), read, models.lines.effect(actions)], 1)
+        network = self.network.effect(models.encoded, actions).unsqueeze(1)
+        return torch.cat([actions.unsqueeze(1), network, models.lines.effect(actions)], 1)
 
-    def reach(self, models: Models, foreseen: Tensor) -> Tensor:
+    def reach(self, models: Models, effects: Tensor) -> Tensor:
         """Return the lowest and highest effects that actions may have, ``(B, 2, A)``.
 
-        As far as the models differ, the best is hoped for: a planner that may try learns more.
+        Optimistic bounds, mean plus or minus one standard deviation over the models, so that the
+        planner explores.
         """
         weights = models.weights.unsqueeze(2)
-        mean, std = mean_and_std(foreseen.transpose(1, 2), weights.transpose(1, 2))
+        mean, std = mean_and_std(effects.transpose(1, 2), weights.transpose(1, 2))
         return torch.stack([(mean - std).amin(1), (mean + std).amax(1)], 1)
 
     def decide(
@@ -265,27 +264,27 @@ class Tick(nn.Module):
         proposal as a whole, as they may be where one command moves several axes. The loss averages
         models that differ by less than the noise s, and decides between those that differ by
         more: half of two opposite answers would do nothing, and tell nothing. So would small
-        actions in noise: the plan is kept where they promise hardly less.
+        actions in noise: the plan is kept where they save less than .02 of expected loss.
         """
         cost = self.loss(models, expected, wanted, noise)  # (B, C, A)
-        cost = torch.cat([cost[:, :1] - ENOUGH, cost[:, 1:]], 1)
+        cost = torch.cat([cost[:, :1] - 0.02, cost[:, 1:]], 1)
         each = cost.argmin(1, keepdim=True)
         joint = cost.sum(-1).argmin(1)[:, None, None].expand_as(each)
         action, least = proposals.gather(1, joint), cost.gather(1, joint)
         effect = expected.gather(2, joint.unsqueeze(1).expand_as(expected[:, :, :1]))
 
-        def mixed() -> tuple[Tensor, Tensor]:
+        def by_axis() -> tuple[Tensor, Tensor]:
             other = proposals.gather(1, each)
-            foreseen = self.expect(models, other)
-            loss = self.loss(models, foreseen, wanted, noise).sum(-1, keepdim=True)
+            effects = self.expect(models, other)
+            loss = self.loss(models, effects, wanted, noise).sum(-1, keepdim=True)
             better = loss <= least.sum(-1, keepdim=True) + 1e-6
             return (
                 torch.where(better, other, action),
-                torch.where(better.unsqueeze(1), foreseen, effect),
+                torch.where(better.unsqueeze(1), effects, effect),
             )
 
         differ = (each != joint).flatten(1).any(-1)
-        action, effect = somewhere(differ, mixed, [action, effect])
+        action, effect = somewhere(differ, by_axis, [action, effect])
         return action.squeeze(1), effect.squeeze(2)
 
     def lead(self, acts: Tensor, lag: Tensor, sent: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
@@ -314,41 +313,41 @@ class Tick(nn.Module):
         return (models.weights.unsqueeze(2) * miss.log1p()).sum(1)
 
     def forecast(
-        self, read: Read, weights: Tensor, late: Tensor, pairs: Tensor, ahead: Tensor
+        self, fits: Fits, weights: Tensor, delay: Tensor, pairs: Tensor, ahead: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now.
 
-        And those ``(B, K + D, A)`` that the newest commands have or will have, by the models that
-        are so late; the commands themselves where none is to come.
+        And those ``(B, K + D, A)`` that the newest commands have or will have, by the models with
+        the present delay; the commands themselves where none is to come.
 
         Args:
-            read: what the memory says.
-            weights: probabilities of all models, ``(B, M + 1, A)``.
-            late: steps that commands are late, ``(B,)``.
+            fits: all models.
+            weights: their probabilities, ``(B, M + 1, A)``.
+            delay: of commands, in steps, ``(B,)``.
             pairs: what is remembered.
             ahead: commands that wait, and the present one, ``(B, D + 1, A)``.
         """
-        every, now = torch.cat([pairs[..., : len(self.scale)], ahead], 1), ahead[:, :1]
-        acted = every[:, : pairs.shape[1] + 1]
-        acting = ago(acted, late).unsqueeze(1)
-        ways = self.ways @ acted[:, -self.ways.shape[-1] :]  # (B, W, A)
-        newest = every[:, every.shape[1] - self.most_late - ahead.shape[1] + 1 :]
-        shape = -1, self.counts[1], acting.shape[-1]
-        asked = acting.expand(shape).flatten(0, 1).unsqueeze(1)
-        found = self.network.effect(read.encoded, asked).view(shape)
-        each = torch.where(self.mixing, now, acting).unsqueeze(2)  # (B, L, 1, A)
-        linear = read.lines.effect(each).squeeze(2)
-        calmly = [acting.clamp(*read.slow.split(1, 1)), acting + read.noisy]
-        forecasts = torch.cat([now, found, linear, ways[:, 1:], read.late * ways, *calmly], 1)
+        commands, now = torch.cat([pairs[..., : len(self.scale)], ahead], 1), ahead[:, :1]
+        acted = commands[:, : pairs.shape[1] + 1]
+        acts = command_acting(acted, delay).unsqueeze(1)
+        delayed = self.acting @ acted[:, -self.acting.shape[-1] :]  # (B, W, A)
+        newest = commands[:, commands.shape[1] - self.longest_delay - ahead.shape[1] + 1 :]
+        shape = -1, self.counts[1], acts.shape[-1]
+        each = acts.expand(shape).flatten(0, 1).unsqueeze(1)
+        network = self.network.effect(fits.encoded, each).view(shape)
+        each = torch.where(self.mixing, now, acts).unsqueeze(2)  # (B, L, 1, A)
+        linear = fits.lines.effect(each).squeeze(2)
+        healthy = [acts.clamp(*fits.rate_limits.split(1, 1)), acts + fits.sensor_noise]
+        forecasts = [now, network, linear, delayed[:, 1:], fits.gains * delayed, *healthy]
 
-        def on_its_way() -> list[Tensor]:
-            so_late = ((self.delays < 0) | (self.delays == late.unsqueeze(-1))).unsqueeze(-1)
-            models = self.most_likely(read, torch.where(so_late, weights.clamp_min(1e-9), 0.0))
+        def under_way() -> list[Tensor]:
+            has_delay = ((self.delays < 0) | (self.delays == delay.unsqueeze(-1))).unsqueeze(-1)
+            models = self.most_likely(fits, torch.where(has_delay, weights.clamp_min(1e-9), 0.0))
             shares = models.weights / models.weights.sum(1, keepdim=True)
             return [(shares.unsqueeze(2) * self.expect(models, newest)).sum(1)]
 
-        (newest,) = somewhere(late + ahead.shape[1] > 1, on_its_way, [newest])
-        return forecasts, newest
+        (newest,) = somewhere(delay + ahead.shape[1] > 1, under_way, [newest])
+        return torch.cat(forecasts, 1), newest
 
 
 def filters_of(acting: Tensor) -> tuple[Tensor, Tensor]:

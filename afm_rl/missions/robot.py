@@ -82,8 +82,8 @@ class Robot:
         usual_low: lowest corner of the box that actions mostly keep to, the unit of calibrations
             and the box in which residual networks are trained; the action box if None.
         usual_high: its highest corner.
-        readings: those of :data:`~afm_rl.correction.readings.READINGS` that make sense for
-            the robot; all if None.
+        hypotheses: those of :data:`~afm_rl.correction.hypotheses.CHOICES` that make sense for the
+            robot; all if None.
         place: indices of the state coordinates in which the ground may differ, if any.
         place_scale: distance at which ground counts as other ground, in their unit.
         reward: the reward of its task, ``reward(state, action, next_state, *task)``, if it has one
@@ -116,7 +116,7 @@ class Robot:
     score: Score | None = None
     usual_low: Sequence[float] | None = None
     usual_high: Sequence[float] | None = None
-    readings: Sequence[str] | None = None
+    hypotheses: Sequence[str] | None = None
     place: Sequence[int] = ()
     place_scale: float = 1.0
     reward: Callable[..., Tensor] | None = None

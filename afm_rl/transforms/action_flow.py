@@ -14,7 +14,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform
 
 from afm_rl.correction import ActionFlow, Corrector
-from afm_rl.correction.late import arrival
+from afm_rl.correction.delay import arrival
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance
 from afm_rl.spaces.keys import as_key, as_keys

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl.data import Bounded
 
 from afm_rl.correction import ActionFlow, Corrector
-from afm_rl.correction.late import arrival
+from afm_rl.correction.delay import arrival
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
 from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance

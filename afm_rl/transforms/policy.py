@@ -12,7 +12,7 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from afm_rl.compiling.devices import moved
 from afm_rl.correction import Corrector
-from afm_rl.correction.late import arrival
+from afm_rl.correction.delay import arrival
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.planning.receding import ZeroPrimer

@@ -54,7 +54,7 @@ def test_a_transition_becomes_a_pair(line, reached, corrected, pair):
     memory = flow.executing(flow.begin(torch.zeros(1)), sent, sent)
     memory = flow.observe(memory, torch.tensor([reached]))
     memory = flow.pack({**flow.unpack(memory, 1), "misaligned": torch.tensor([corrected])})
-    newest = flow.look(memory, model)["pairs"][-1]
+    newest = flow.measure(memory, model)["pairs"][-1]
     torch.testing.assert_close(newest[[0, 1, 3]], torch.tensor(pair), rtol=0, atol=1e-5)
 
 
@@ -69,12 +69,12 @@ def test_a_transition_becomes_a_pair(line, reached, corrected, pair):
 def test_until_a_change_is_known_models_are_held_together(before, after, expected):
     flow = flow_of(1, odds=1.0, most_odds=16.0)
     losses = torch.tensor([before, 0.0, 0.0]).unsqueeze(-1), torch.tensor(after).unsqueeze(-1)
-    torch.testing.assert_close(flow.surprised(*losses).squeeze(-1), torch.tensor(expected))
+    torch.testing.assert_close(flow.share_losses(*losses).squeeze(-1), torch.tensor(expected))
 
 
 def test_a_model_falls_behind_only_while_an_axis_is_in_doubt():
     losses = torch.tensor([[0.5, 5.0], [40.0, 0.1]])
-    assert torch.equal(flow_of(2).surprised(losses, losses), losses)
+    assert torch.equal(flow_of(2).share_losses(losses, losses), losses)
 
 
 @pytest.mark.parametrize(("largest", "floor"), [(0.1, 0.005), (0.5, 0.01), (3.0, 0.02)])
@@ -91,8 +91,8 @@ def test_while_nothing_has_changed_only_a_delay_that_is_believed_keeps_its_losse
     parts["losses"] = torch.linspace(0.5, 2.0, len(flow.models)).flip(0).unsqueeze(-1)
     parts["losses"][0] = 1.0
     for late, keeps in ((0, flow.delays < -1), (2, (flow.delays == 2) | (flow.delays < 0))):
-        parts["late"] = torch.tensor([float(late)])
-        losses = flow.asleep(parts, torch.zeros(1))["losses"]
+        parts["delay"] = torch.tensor([float(late)])
+        losses = flow.forecast_unchanged(parts, torch.zeros(1))["losses"]
         kept = torch.where(keeps.unsqueeze(-1), parts["losses"], parts["losses"].clamp_max(1.0))
         assert torch.equal(losses, kept)
 
@@ -168,7 +168,7 @@ def test_a_batch_equals_single_missions(line, drive, plans, size, place):
     """From one point: among samples that are as good, rounding would decide."""
     flow = flow_of(size, place=place, source_std=0.0)
     planned = plans(6, 4, size)
-    factor = torch.tensor([1.0, -1.0, 0.5, 0.0]).view(4, 1)  # one is aligned, one is dead
+    factor = torch.tensor([1.0, -1.0, 0.5, 0.0]).view(4, 1)  # one is align, one is dead
     together, _ = drive(flow, line(size), lambda sent: factor * sent[-1], planned)
     assert not together[5][:, 0].any() and together[5][4:, 1].all()
     for k in range(4):
@@ -227,7 +227,7 @@ def test_only_weights_are_stored_and_load_where_they_fit(tmp_path):
         {"saturation": "fold"},
         {"discount": 1.1},
         {"place_scale": 0.0},
-        {"readings": ["late"]},
+        {"hypotheses": ["late"]},
         {"compile": 1},
     ],
     ids=str,

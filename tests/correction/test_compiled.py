@@ -5,15 +5,15 @@ import torch
 
 from afm_rl.compiling import machine_code
 from afm_rl.correction import ActionFlow
+from afm_rl.correction.context_windows import CONTEXT_WINDOWS
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.readings import READINGS
 
 
 def flow_of(cache, **settings):
     network = AxisNetwork(width=8, latent=8)
     # Among samples or readings that are as good, rounding would decide.
-    distinct = [name for name in READINGS if name not in ("long", "nearest")]
-    settings |= {"source_std": 0.0, "readings": distinct, "place": [0]}
+    distinct = [name for name in CONTEXT_WINDOWS if name not in ("long", "nearest")]
+    settings |= {"source_std": 0.0, "hypotheses": distinct, "place": [0]}
     flow = ActionFlow(-torch.ones(1), torch.ones(1), network=network, cache=cache, **settings)
     return flow.double()
 

@@ -7,7 +7,7 @@ import torch
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
 from afm_rl.correction.base import Correction, Corrector
-from afm_rl.correction.late import arrival
+from afm_rl.correction.delay import arrival
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError

@@ -51,7 +51,7 @@ def test_without_names_all_are_chosen():
     ids=str,
 )
 def test_a_list_that_cannot_be_used_is_refused(names, complaint):
-    with pytest.raises(ConfigurationError, match=f"corrector.readings=.*{complaint}"):
+    with pytest.raises(ConfigurationError, match=f"corrector.hypotheses=.*{complaint}"):
         choose(names, True, -6.0)
 
 

@@ -69,7 +69,7 @@ def test_the_published_difference_jumps_at_the_seam(make, wrap):
 def test_the_latch_keeps_what_opened_the_gate(make, transitions, latch):
     flow, (state, action) = make(latch=latch), transitions(3)
     reached = Dubins()(state, action)
-    reached[:2, 0] += 1.0  # the third mission is aligned again
+    reached[:2, 0] += 1.0  # the third mission is align again
     fresh = after(flow, state, action, reached)[0]["features"]
     old = torch.full((3, flow.feature_size), 7.0)
     parts = flow.unpack(flow.begin(state), 3) | {"features": old, "misaligned": torch.ones(3, 1)}

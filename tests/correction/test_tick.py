@@ -20,7 +20,7 @@ def models_of(flow, matrix):
     """Return what is believed where a linear model is certain."""
     size = flow.action_size
     pairs, place = torch.zeros(1, flow.memory, 3 * size + 2), torch.zeros(1, 0)
-    read = flow.tick.read(pairs, torch.ones(1, size), place, torch.zeros(1, dtype=torch.long))
+    read = flow.tick.fit(pairs, torch.ones(1, size), place, torch.zeros(1, dtype=torch.long))
     certain = torch.zeros(1, len(flow.models), size)
     certain[:, flow.models.index("affine")] = 1.0
     found = flow.tick.most_likely(read, certain)
@@ -66,8 +66,8 @@ def test_as_far_as_models_differ_the_best_is_hoped_for():
 @pytest.mark.parametrize(("acts", "command"), [(0.3, None), (0.9, 1.0), (-0.9, -1.0)])
 def test_a_slow_actuator_is_led_as_far_as_the_box_allows(acts, command):
     flow = flow_of()
-    weights = torch.tensor([name == "lag_2" for name in flow.models]).to(flow.tick.filtered)
-    lag = (flow.tick.filtered @ weights).argmax().view(1, 1)
+    weights = torch.tensor([name == "lag_2" for name in flow.models]).to(flow.tick.filter_of_model)
+    lag = (flow.tick.filter_of_model @ weights).argmax().view(1, 1)
     sent, box = torch.full((1, 20, 1), 0.1), torch.tensor([[[-1.0], [1.0]]])
     share = 1 - math.exp(-1 / 2)
     found, led_to = flow.tick.lead(torch.tensor([[acts]]), lag, sent, box)
@@ -80,7 +80,7 @@ def test_a_slow_actuator_is_led_as_far_as_the_box_allows(acts, command):
 def test_models_by_which_nothing_is_wrong_keep_the_plan(healthy, executed):
     flow, plan = flow_of(), torch.tensor([[0.5]])
     weights = torch.zeros(1, len(flow.models), 1)
-    weights[:, flow.models.index("noisy readings")] = healthy
+    weights[:, flow.models.index("sensor noise")] = healthy
     weights[:, flow.models.index("reversed")] = 1 - healthy
     flow.weights = lambda parts: weights
     box = torch.tensor([[[-1.0], [1.0]]])
@@ -93,9 +93,9 @@ def test_maps_that_mix_axes_are_of_the_present_command_whatever_delay_is_believe
     flow = flow_of(2)
     parts = flow.unpack(flow.begin(torch.zeros(3)), 3)
     parts["pairs"][-2:, :2] = torch.tensor([[0.1, 0.2], [0.3, 0.4]])
-    parts["late"] = torch.tensor([2.0])
+    parts["delay"] = torch.tensor([2.0])
     now = torch.tensor([0.7, 0.8])
-    forecasts, _ = flow.foresee(parts, now)
+    forecasts, _ = flow.forecast(parts, now)
     of = dict(zip(flow.models, forecasts, strict=True))  # nothing is known: every fit is nominal
     for name, command in (("affine", now), ("driven", now), ("gain", torch.tensor([0.1, 0.2]))):
         torch.testing.assert_close(of[name], command)

@@ -124,7 +124,7 @@ def test_a_lost_flight_leaves_the_batch(fly):
 
 
 def test_a_thrust_that_cannot_be_negative_is_corrected_as_a_share_of_the_largest(fly):
-    flown = fly("method=afm_physics", "corrector.readings=[recent]")
+    flown = fly("method=afm_physics", "corrector.hypotheses=[recent]")
     flow, robot = flown.agent.transform.corrector, flown.agent.robot
     torch.testing.assert_close(flow.scale, torch.tensor(robot.action_high))
     steps = flown.steps
@@ -202,12 +202,12 @@ def test_a_network_may_be_trained_before_the_flight(make_agent, randomised):
 
 def test_robots_say_which_readings_make_sense(composed):
     chosen = composed("robot=quadrotor", "method=afm_physics").corrector
-    assert list(chosen.readings) == ["recent", "newest", "varied"]
-    assert composed("robot=ugv", "method=afm_physics").corrector.readings is None
+    assert list(chosen.hypotheses) == ["recent", "newest", "varied"]
+    assert composed("robot=ugv", "method=afm_physics").corrector.hypotheses is None
     learning = composed("robot=quadrotor", "method=afm_online_knode").corrector
-    assert list(learning.readings) == ["newest"]
-    own = composed("robot=quadrotor", "method=afm_physics", "corrector.readings=[recent]")
-    assert list(own.corrector.readings) == ["recent"]
+    assert list(learning.hypotheses) == ["newest"]
+    own = composed("robot=quadrotor", "method=afm_physics", "corrector.hypotheses=[recent]")
+    assert list(own.corrector.hypotheses) == ["recent"]
 
 
 def test_before_it_learns_a_model_shares_the_flow_of_the_physics(configure):

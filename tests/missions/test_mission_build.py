@@ -125,7 +125,7 @@ NAN = float("nan")
         ("online_pe", "dynamics.pretrain.epochs", 0, "dynamics.pretrain.epochs=0: expected"),
         ("online_pe", "updater.optimizer.lr", "abc", "updater.lr='abc': expected a finite"),
         ("online_pe", "updater.optimizer._target_", "torch.Nope", "updater.optimizer._target_="),
-        ("afm_physics", "corrector.readings", ["near"], "corrector.readings=.* by time"),
+        ("afm_physics", "corrector.hypotheses", ["near"], "corrector.hypotheses=.* by time"),
         ("afm_paper", "corrector.train.batch_size", 1, "corrector.train.batch_size=1: exp"),
         ("afm_paper", "corrector.error_action", "foo", "corrector.error_action='foo': expected"),
     ],

@@ -25,7 +25,7 @@ from afm_rl.regimes import Schedule
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
 
-READINGS = ["recent", "newest", "delay_1"]
+HYPOTHESES = ["recent", "newest", "delay_1"]
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def make(small_flow):
 
     def build(batch=(4,), max_steps=100, carry_memory=True, **settings):
         # From one point: among samples that are as good, rounding would decide.
-        flow = small_flow(readings=READINGS, source_std=0.0)
+        flow = small_flow(hypotheses=HYPOTHESES, source_std=0.0)
         base = UGVTrack(
             batch_size=batch,
             max_steps=max_steps,
@@ -110,7 +110,7 @@ class Reports(Transform):
 
 def test_it_remembers_what_actuators_report(small_flow, remembered):
     """And forecasts of what was sent count as forecasts of what was given."""
-    flow, base = small_flow(readings=READINGS), UGVTrack(batch_size=[4])
+    flow, base = small_flow(hypotheses=HYPOTHESES), UGVTrack(batch_size=[4])
     transform = ActionFlowTransform(Dubins(), flow, reported_key="given", carry_memory=True)
     env = TransformedEnv(base, Compose(Reports(), transform))
     td = env.reset()

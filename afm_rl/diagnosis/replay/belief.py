@@ -45,10 +45,12 @@ def follow(
     What :meth:`~afm_rl.correction.ActionFlow.predict` says, and the memory as if the action had
     been corrected to itself, for the price of one of them.
     """
-    seen, idle, awake, _ = corrector.watch(memory, action, model)
-    memory = corrector.executing(torch.where(awake.unsqueeze(-1), seen, idle), action, action)
+    measured, unchanged, misaligned, _ = corrector.detect(memory, action, model)
+    memory = corrector.executing(
+        torch.where(misaligned.unsqueeze(-1), measured, unchanged), action, action
+    )
     parts = corrector.unpack(memory, model.state_size)
-    effect, std = mean_and_std(parts["forecasts"], corrector.believed(memory))
+    effect, std = mean_and_std(parts["forecasts"], corrector.weights_in(memory))
     std = torch.hypot(std, parts["noise"])
     return memory, corrector.denormalise(effect), corrector.denormalise(std)
 

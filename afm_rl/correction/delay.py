@@ -1,4 +1,4 @@
-r"""Commands that act late, and where a robot will be when they do.
+r"""Delays of commands, and where a robot will be when they act.
 
 Commands that act late cannot be undone by others. But policy or planner can be asked about the
 state in which their command will act (Smith 1957, Chem. Eng. Progress 53): the model is rolled
@@ -18,44 +18,45 @@ from afm_rl.dynamics import DynamicsModel
 if TYPE_CHECKING:
     from afm_rl.correction.base import Corrector
 
-LEAST = 1e-3  # share of the best that every delay keeps on every axis: none decides alone
-
 
 def delay_tables(delays: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Return what models tell of delays, and the log prior of these, by the delay until now.
+    r"""Return likelihood and log prior of each delay, given the present estimate.
 
-    The first is :math:`m / p_k` for the models that are k steps late, whose prior is :math:`p_k`.
+    The likelihood is linear in the models' probabilities: :math:`1 / p_k` for the models with a
+    delay of k steps, whose prior is :math:`p_k`.
 
-    None, k = 0, is as probable, a priori, as all models that are not late; *nothing has changed*
-    counts among them no more than the others together. A delay that was found stays, as actuators'
-    delays do, until the evidence for another one exceeds the odds of *nothing has changed*. None is
-    not favoured so: a robot that is eight steps late falls before there is much evidence.
+    No delay, k = 0, is as probable, a priori, as all models without one; *nothing has changed*
+    counts among them no more than the others together. An estimate stays, as actuators' delays do,
+    until the evidence for another one exceeds the odds of *nothing has changed*. No delay is not
+    favoured so: a robot whose commands act eight steps late falls before there is much evidence.
 
     Args:
         delays: of the M models, the first of which is *nothing has changed*; -1: they take any.
         prior: log-odds of the models, ``(M,)``.
 
     Returns:
-        Both for every delay until now, ``(K + 1, K + 1, M)`` and ``(K + 1, K + 1)``.
+        Both for every present estimate, ``(K + 1, K + 1, M)`` and ``(K + 1, K + 1)``.
 
-    >>> told, first = delay_tables(torch.tensor([0, -1, 1]), torch.zeros(3))
-    >>> told[0]
+    >>> likelihood, log_prior = delay_tables(torch.tensor([0, -1, 1]), torch.zeros(3))
+    >>> likelihood[0]
     tensor([[1.5000, 1.5000, 0.0000],
             [0.0000, 0.0000, 3.0000]])
     """
-    every = torch.arange(int(delays.max()) + 1)
-    now = torch.where(delays < 0, every.unsqueeze(-1), delays).unsqueeze(1)
-    among = (now == every.unsqueeze(-1)).to(prior)  # (K + 1, K + 1, M)
+    estimates = torch.arange(int(delays.max()) + 1)
+    of_models = torch.where(delays < 0, estimates.unsqueeze(-1), delays).unsqueeze(1)
+    has_delay = (of_models == estimates.unsqueeze(-1)).to(prior)  # (K + 1, K + 1, M)
     share = prior.softmax(0)
-    rest = share[1:][delays[1:] <= 0].sum()
-    among[..., 0] *= (rest / share[0]).clamp_max(1.0)
-    first = among @ share
-    told, first = among / first.unsqueeze(-1), first / first.sum(-1, keepdim=True)
-    stays = torch.lerp(first[1:], torch.eye(len(every))[1:], share[0])
-    return told, torch.cat([first[:1], stays]).log()
+    undelayed = share[1:][delays[1:] <= 0].sum()
+    has_delay[..., 0] *= (undelayed / share[0]).clamp_max(1.0)
+    mass = has_delay @ share
+    likelihood, mass = has_delay / mass.unsqueeze(-1), mass / mass.sum(-1, keepdim=True)
+    stays = torch.lerp(mass[1:], torch.eye(len(estimates))[1:], share[0])
+    return likelihood, torch.cat([mass[:1], stays]).log()
 
 
-def steps_late(weights: Tensor, before: Tensor, told: Tensor, first: Tensor) -> Tensor:
+def likeliest_delay(
+    weights: Tensor, before: Tensor, likelihood: Tensor, log_prior: Tensor
+) -> Tensor:
     r"""Return the most probable delay of commands in steps, ``(*B)``.
 
     .. math:: k = \operatorname{argmax}_k \log p_k + \sum_a \log\frac{p_{ka}}{p_k}
@@ -65,38 +66,39 @@ def steps_late(weights: Tensor, before: Tensor, told: Tensor, first: Tensor) -> 
 
     Args:
         weights: probabilities of the models on every axis, ``(*B, M, A)``.
-        before: the delay until now, ``(*B)``.
-        told: of :func:`delay_tables`.
-        first: likewise.
+        before: the present estimate, ``(*B)``.
+        likelihood: of :func:`delay_tables`.
+        log_prior: likewise.
 
     >>> weights = torch.tensor([[0.1, 0.1], [0.1, 0.1], [0.8, 0.8]])
     >>> tables = delay_tables(torch.tensor([0, -1, 1]), torch.zeros(3))
-    >>> steps_late(weights, torch.tensor(0), *tables)
+    >>> likeliest_delay(weights, torch.tensor(0), *tables)
     tensor(1)
     """
-    evidence = told[before].to(weights) @ weights  # (*B, K + 1, A)
-    evidence = (evidence / evidence.amax(-2, keepdim=True)).clamp_min(LEAST).log()
-    found = (first[before].to(weights) + evidence.sum(-1)).argmax(-1)
-    return torch.where((weights[..., 0, :] < 0.5).any(-1) | (before > 0), found, 0)
+    evidence = likelihood[before].to(weights) @ weights  # (*B, K + 1, A)
+    # No axis decides alone: on each, every delay keeps a thousandth of the best.
+    evidence = (evidence / evidence.amax(-2, keepdim=True)).clamp_min(1e-3).log()
+    delay = (log_prior[before].to(weights) + evidence.sum(-1)).argmax(-1)
+    return torch.where((weights[..., 0, :] < 0.5).any(-1) | (before > 0), delay, 0)
 
 
-def ago(commands: Tensor, late: Tensor) -> Tensor:
+def command_acting(commands: Tensor, delay: Tensor) -> Tensor:
     """Return the command ``(*B, A)`` that acts now, of all ``(*B, N, A)``, the newest last."""
-    row = (commands.shape[-2] - 1 - late)[..., None, None]
+    row = (commands.shape[-2] - 1 - delay)[..., None, None]
     return commands.gather(-2, row.expand(*row.shape[:-1], commands.shape[-1])).squeeze(-2)
 
 
-def aligned(pairs: Tensor, late: Tensor, size: int) -> Tensor:
+def align(pairs: Tensor, delay: Tensor, size: int) -> Tensor:
     """Return pairs ``(*B, M, D)`` with the commands of so many steps before each effect.
 
     >>> pairs = torch.tensor([[0.1, 7.0, 0.0, 1.0], [0.2, 8.0, 0.0, 1.0]])
-    >>> aligned(pairs, torch.tensor(1), 1)[..., [0, 3]]
+    >>> align(pairs, torch.tensor(1), 1)[..., [0, 3]]
     tensor([[0.1000, 0.0000],
             [0.1000, 1.0000]])
     """
-    if all_hold(late == 0):
+    if all_hold(delay == 0):
         return pairs
-    row = torch.arange(pairs.shape[-2], device=pairs.device) - late.unsqueeze(-1)
+    row = torch.arange(pairs.shape[-2], device=pairs.device) - delay.unsqueeze(-1)
     sent = pairs[..., :size]
     sent = sent.gather(-2, row.clamp_min(0).unsqueeze(-1).expand_as(sent))
     valid = pairs[..., 3 * size :][..., :1] * (row >= 0).unsqueeze(-1)

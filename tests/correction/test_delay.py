@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from afm_rl.correction.late import ago, aligned, delay_tables, steps_late
+from afm_rl.correction.delay import align, command_acting, delay_tables, likeliest_delay
 from afm_rl.correction.least_squares import fit_gain
 
 
@@ -12,7 +12,7 @@ def test_a_command_joins_the_effect_that_came_later(late):
     age, count = torch.arange(6.0).unsqueeze(-1), torch.ones(6, 1)
     pairs = torch.cat([age, 100 + age, 0 * age, count, 0 * age], -1).expand(2, 6, 5)
     steps = torch.tensor([0, late])
-    still, found = aligned(pairs, steps, 1)
+    still, found = align(pairs, steps, 1)
     assert torch.equal(still, pairs[0])
     assert found[late:, 0].tolist() == list(range(6 - late)) and found[:, 3].sum() == 6 - late
     assert torch.equal(found[:, 1], pairs[1, :, 1])
@@ -20,9 +20,9 @@ def test_a_command_joins_the_effect_that_came_later(late):
 
 def test_the_command_that_acts_is_so_many_steps_older_than_the_newest():
     commands = torch.arange(24.0).view(3, 4, 2)  # of four steps, the newest last
-    found = ago(commands, torch.tensor([0, 1, 3]))
+    found = command_acting(commands, torch.tensor([0, 1, 3]))
     assert torch.equal(found, torch.stack([commands[0, 3], commands[1, 2], commands[2, 0]]))
-    assert torch.equal(ago(commands[0], torch.tensor(2)), commands[0, 1])
+    assert torch.equal(command_acting(commands[0], torch.tensor(2)), commands[0, 1])
 
 
 def test_gains_of_late_commands_are_found():
@@ -56,8 +56,8 @@ TABLES = delay_tables(DELAYS, torch.tensor([1.0, 0.0, 0.0, 0.0, -2.0]).log_softm
 def test_the_delay_is_that_of_the_models_that_are_believed(believed, before, late):
     weights = torch.full((5, 2), 0.02)
     weights[believed] = 0.92
-    assert steps_late(weights, torch.tensor(before), *TABLES) == late
-    batch = steps_late(weights.expand(3, 5, 2), torch.full((3,), before), *TABLES)
+    assert likeliest_delay(weights, torch.tensor(before), *TABLES) == late
+    batch = likeliest_delay(weights.expand(3, 5, 2), torch.full((3,), before), *TABLES)
     assert batch.tolist() == [late] * 3
 
 
@@ -76,17 +76,17 @@ def test_no_axis_decides_alone_however_sure_it_is():
     sure = torch.tensor([1e-12, 1e-12, 1.0, 1e-12, 1e-12])
     others = torch.tensor([0.005, 0.005, 0.005, 0.98, 0.005])
     weights = torch.stack([sure, others, others], -1)
-    assert steps_late(weights[:, :2], torch.tensor(0), *TABLES) == 1
-    assert steps_late(weights, torch.tensor(0), *TABLES) == 2
+    assert likeliest_delay(weights[:, :2], torch.tensor(0), *TABLES) == 1
+    assert likeliest_delay(weights, torch.tensor(0), *TABLES) == 2
 
 
 def test_one_delay_is_found_from_the_evidence_of_all_axes():
     weights = torch.tensor([[0.05, 0.2], [0.05, 0.2], [0.6, 0.05], [0.25, 0.5], [0.05, 0.05]])
-    assert steps_late(weights[:, :1], torch.tensor(0), *TABLES) == 1
-    assert steps_late(weights, torch.tensor(0), *TABLES) == 2
+    assert likeliest_delay(weights[:, :1], torch.tensor(0), *TABLES) == 1
+    assert likeliest_delay(weights, torch.tensor(0), *TABLES) == 2
 
 
 def test_a_delay_that_was_found_stays_for_a_while():
     weights = torch.tensor([[0.05], [0.05], [0.5], [0.3], [0.1]])
-    assert steps_late(weights, torch.tensor(0), *TABLES) == 1
-    assert steps_late(weights, torch.tensor(2), *TABLES) == 2
+    assert likeliest_delay(weights, torch.tensor(0), *TABLES) == 1
+    assert likeliest_delay(weights, torch.tensor(2), *TABLES) == 2

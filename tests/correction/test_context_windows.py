@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from afm_rl.correction import readings
-from afm_rl.correction.readings import READINGS, Reader, Reading
+from afm_rl.correction import context_windows
+from afm_rl.correction.context_windows import CONTEXT_WINDOWS, ContextWindow, ContextWindows
 
 MANY = 20
 AGES = torch.arange(float(MANY)).unsqueeze(-1)
@@ -23,13 +23,13 @@ def read(name, rows=4, pairs=None):
     Here is where the place is 0.
     """
     pairs = pairs_of() if pairs is None else pairs
-    return [part[0, :, 0] for part in Reader([name], rows, 1)(pairs, torch.zeros(1))]
+    return [part[0, :, 0] for part in ContextWindows([name], rows, 1)(pairs, torch.zeros(1))]
 
 
 @pytest.fixture
 def whole(monkeypatch):
-    """Let readings by place fill all rows."""
-    monkeypatch.setitem(readings.READINGS, "near", Reading("near", share=1.0))
+    """Let windows by place fill all rows."""
+    monkeypatch.setitem(context_windows.CONTEXT_WINDOWS, "near", ContextWindow("near", share=1.0))
 
 
 def test_recent_pairs_are_the_newest_and_fill_half():
@@ -89,9 +89,9 @@ def test_batches_are_read_one_by_one(axes):
     pairs = torch.rand(5, MANY, 3 * axes + 4, generator=generator)
     pairs[..., 3 * axes] = (pairs[..., 3 * axes] > 0.3).float()
     place = torch.rand(5, 2, generator=generator)
-    reader = Reader(list(READINGS), 4, axes)
+    reader = ContextWindows(list(CONTEXT_WINDOWS), 4, axes)
     together = reader(pairs, place)
-    assert together.executed.shape == (5, len(READINGS), 4, axes)
+    assert together.executed.shape == (5, len(CONTEXT_WINDOWS), 4, axes)
     for k in range(5):
         single = reader(pairs[k], place[k])
         assert all(torch.equal(one, many[k]) for one, many in zip(single, together, strict=True))

@@ -1,7 +1,7 @@
-"""Readings: which remembered pairs tell what an action does now.
+"""Context windows: the remembered pairs that the network is given, in several ways.
 
-The newest pairs tell it, unless the ground changes from place to place, or the newest commands were
-all alike. Each reading is a model of the belief, by what the network answers.
+The newest pairs show what an action does now, unless the ground changes from place to place, or
+the newest commands were all alike. Each context window is a model of the belief.
 """
 
 from __future__ import annotations
@@ -14,42 +14,38 @@ from torch import Tensor, nn
 
 from afm_rl.correction.experts import Rows
 
-AGE = 20.0  # steps that separate two pairs as much as one unit of place does
-FAR = 1e3  # squared distance beyond all
-OLDER = 1e-6  # squared distance that a pair is worth less, times its squared age
 
-
-class Reading(NamedTuple):
-    """One way of reading the memory."""
+class ContextWindow(NamedTuple):
+    """Pairs that the network is given."""
 
     kind: str = "newest"
-    """Which pairs it reads: the "newest", those "near" in place, or some as "varied" as can be."""
+    """Which pairs: the "newest", those "near" in place, or some as "varied" as can be."""
     share: float = 0.5
     """Part of the K rows that is filled."""
 
 
-READINGS = {
-    "recent": Reading(),
-    "newest": Reading(share=1 / 6),  # right after a change
-    "long": Reading(share=1.0),
-    "varied": Reading("varied", share=1.0),  # also when it was at rest of late
-    "near": Reading("near"),
-    "nearest": Reading("near", share=1 / 6),
-    "here": Reading("near", share=1 / 12),  # at the edge of two grounds
+CONTEXT_WINDOWS = {
+    "recent": ContextWindow(),
+    "newest": ContextWindow(share=1 / 6),  # right after a change
+    "long": ContextWindow(share=1.0),
+    "varied": ContextWindow("varied", share=1.0),  # also when it was at rest of late
+    "near": ContextWindow("near"),
+    "nearest": ContextWindow("near", share=1 / 6),
+    "here": ContextWindow("near", share=1 / 12),  # at the edge of two grounds
 }
 
 
-class Reader(nn.Module):
-    """Reads a memory in H ways.
+class ContextWindows(nn.Module):
+    """H context windows of a memory.
 
     Args:
-        names: of :data:`READINGS`.
-        rows: of a reading, K.
+        names: of :data:`CONTEXT_WINDOWS`.
+        rows: of a window, K.
         size: number of actions, A.
 
     >>> u = torch.tensor([[0.1], [0.2], [0.3]])
     >>> pairs = torch.cat([u, 10 * u, 0 * u, torch.ones(3, 1), torch.zeros(3, 1)], -1)
-    >>> rows = Reader(["long", "newest"], rows=2, size=1)(pairs, torch.zeros(0))
+    >>> rows = ContextWindows(["long", "newest"], rows=2, size=1)(pairs, torch.zeros(0))
     >>> rows.executed.squeeze(-1), rows.valid.squeeze(-1)
     (tensor([[0.2000, 0.3000],
             [0.0000, 0.3000]]), tensor([[1., 1.],
@@ -62,14 +58,14 @@ class Reader(nn.Module):
 
     def __init__(self, names: Sequence[str], rows: int, size: int) -> None:
         super().__init__()
-        chosen = [READINGS[name] for name in names]
+        windows = [CONTEXT_WINDOWS[name] for name in names]
         self.rows, self.size = rows, size
-        self.kinds = tuple(dict.fromkeys(reading.kind for reading in chosen))
-        count = torch.tensor([max(1, round(reading.share * rows)) for reading in chosen])
+        self.kinds = tuple(dict.fromkeys(window.kind for window in windows))
+        count = torch.tensor([max(1, round(window.share * rows)) for window in windows])
         # What was sound before a change tells nothing about it, but of its place.
-        least = [0.0 if reading.kind == "near" else 0.5 for reading in chosen]
+        least = [0.0 if window.kind == "near" else 0.5 for window in windows]
         fixed = {
-            "source": torch.tensor([self.kinds.index(reading.kind) for reading in chosen]),
+            "source": torch.tensor([self.kinds.index(window.kind) for window in windows]),
             "filled": torch.arange(rows - 1, -1, -1).unsqueeze(-1) < count[:, None, None],
             "least": torch.tensor(least)[:, None, None],
         }
@@ -77,20 +73,20 @@ class Reader(nn.Module):
             self.register_buffer(name, value, persistent=False)
 
     def forward(self, pairs: Tensor, place: Tensor) -> Rows:
-        """Return the rows of each reading, ``(*B, H, K, A)``.
+        """Return the rows of each window, ``(*B, H, K, A)``.
 
         Args:
             pairs: the memory, the oldest first: executed, effective, standard deviation, valid, and
                 innovation and place, ``(*B, M, D)``.
             place: where the robots are, ``(*B, P)``.
         """
-        read = torch.stack([self._read(kind, pairs, place) for kind in self.kinds], -3)
+        rows = torch.stack([self._select(kind, pairs, place) for kind in self.kinds], -3)
         sizes, tail = [self.size] * 3 + [1], pairs.shape[-1] - 3 * self.size - 1
-        u, v, std, valid, _ = read.index_select(-3, self.source).split([*sizes, tail], -1)
+        u, v, std, valid, _ = rows.index_select(-3, self.source).split([*sizes, tail], -1)
         known = ((valid > self.least) & self.filled).to(pairs)
         return Rows(u * known, v * known, std * known, known)
 
-    def _read(self, kind: str, pairs: Tensor, place: Tensor) -> Tensor:
+    def _select(self, kind: str, pairs: Tensor, place: Tensor) -> Tensor:
         if kind == "near":
             away = (pairs[..., 3 * self.size + 2 :] - place.unsqueeze(-2)).square().sum(-1)
             # Only a row that counts has a place.
@@ -103,7 +99,8 @@ class Reader(nn.Module):
 
 def _nearest(pairs: Tensor, away: Tensor, rows: int) -> Tensor:
     """Return the K pairs ``(*B, K, D)`` nearest to here, the nearest last."""
-    age = torch.arange(away.shape[-1] - 1, -1, -1, device=away.device) / AGE
+    # Twenty steps separate two pairs as much as one unit of place does.
+    age = torch.arange(away.shape[-1] - 1, -1, -1, device=away.device) / 20
     nearest = (away + age.square()).topk(rows, -1, largest=False).indices.flip(-1)
     return pairs.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, pairs.shape[-1]))
 
@@ -118,9 +115,10 @@ def _varied(pairs: Tensor, size: int, rows: int) -> Tensor:
     apart = (sent.unsqueeze(-2) - sent.unsqueeze(-3)).square().sum(-1)
     age = torch.arange(pairs.shape[-2] - 1, -1, -1, device=pairs.device)
     later = (age < age.unsqueeze(-1)) & sound.unsqueeze(-2)
-    new = torch.where(later, apart, FAR).amin(-1) - OLDER * age.square()
-    worth, chosen = torch.where(sound, new, -torch.inf).topk(rows, -1)
+    # The squared distance to what came later (1e3: nothing did); of equal ones, the newer.
+    novelty = torch.where(later, apart, 1e3).amin(-1) - 1e-6 * age.square()
+    novelty, chosen = torch.where(sound, novelty, -torch.inf).topk(rows, -1)
     chosen, order = chosen.sort(-1)
     row = chosen.unsqueeze(-1).expand(*chosen.shape, pairs.shape[-1])
-    found = worth.gather(-1, order) > -torch.inf
-    return pairs.gather(-2, row) * found.unsqueeze(-1)
+    is_pair = novelty.gather(-1, order) > -torch.inf
+    return pairs.gather(-2, row) * is_pair.unsqueeze(-1)
