@@ -55,8 +55,9 @@ typecheck: $(VENV)/.with-test build/package ## Check types
 check: ALL := 1
 check: lint typecheck test ## All of lint, typecheck and test, the slow ones, too
 
-format: $(VENV)/.with-test ## Put the code in shape
+format: $(VENV)/.with-test ## Put the code in shape, and what options say into the comments of conf
 	@$(BIN)/ruff check --quiet --fix-only . && $(BIN)/ruff format .
+	@$(BIN)/python -m afm_rl.cli.settings
 
 bench: $(VENV)/.with-base ## Run every benchmarks/bench_*.py, one after the other
 	@for f in $(sort $(wildcard benchmarks/bench_*.py)); do \

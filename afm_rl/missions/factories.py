@@ -32,6 +32,7 @@ from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.checks import check_training
 from afm_rl.missions.collected import fit_collected
 from afm_rl.missions.robot import Robot
+from afm_rl.options import options
 from afm_rl.planning.costs import KnownReward
 from afm_rl.storage.artefacts import load_artefact
 
@@ -89,6 +90,7 @@ def calibrated(robot: Robot, base: Callable[[Robot], Part | DynamicsModel]) -> P
     return part._replace(module=Calibrated(part.module, (high - low) / 2))
 
 
+@options("dynamics", Ensemble, pretrain=pretrain_ensemble)
 def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part:
     """Return an ensemble to be pre-trained on the nominal physics, or on what a robot collects."""
     nominal = robot.model
@@ -111,6 +113,7 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
     return Part(model, Training("ensemble", model, train, unit, [shape]), shape)
 
 
+@options("dynamics", KNODE, pretrain=pretrain_knode)
 def knode(
     robot: Robot,
     pretrain: Mapping[str, Any] | None = None,
@@ -161,6 +164,7 @@ def no_correction(robot: Robot, dynamics: Part) -> Part:
     return Part(None)
 
 
+@options("corrector", ActionFlow, train=train_flow)
 def afm(
     robot: Robot,
     dynamics: Part,
@@ -181,6 +185,7 @@ def afm(
     return Part(flow)
 
 
+@options("corrector", PaperFlow, train=train_flow)
 def paper_flow(
     robot: Robot,
     dynamics: Part,
@@ -211,11 +216,13 @@ def paper_flow(
     return Part(flow, Training("flow", flow, fit, "action units", shape))
 
 
+@options("corrector", LeastSquares)
 def least_squares(robot: Robot, dynamics: Part, **settings: Any) -> LeastSquares:
     """Return least squares with forgetting, which need no training."""
     return LeastSquares(*robot.action_box, **settings)
 
 
+@options("corrector", L1Augmentation)
 def l1(robot: Robot, dynamics: Part, dt: float | None = None, **settings: Any) -> L1Augmentation:
     """Return L1 adaptive augmentation, which needs no training."""
     step: Any = robot.dt if dt is None else dt  # None is refused, by name

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,7 +11,8 @@ import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import option, options
 from afm_rl.spaces.keys import as_keys
 from afm_rl.spaces.manifold import wrap_angle
 
@@ -43,12 +43,6 @@ class GoalDistance(Cost):
     coordinates ``[0, 1]`` with a goal (x, y) are ``goal_position``, and ``[0, 1, 2]`` with
     the same goal are the paper's ``goal_pose``, which asks for heading 0 everywhere.
 
-    Args:
-        coordinates: indices of the state coordinates that count.
-        in_keys: the goal's key.
-        goal_size: number of goal coordinates.
-        weights: weight of each coordinate (1 each), in cost units per m or rad.
-
     >>> cost = GoalDistance([0, 1])
     >>> here = torch.zeros(3)
     >>> cost(here, torch.zeros(2), here, torch.tensor([3.0, 4.0]))
@@ -57,17 +51,19 @@ class GoalDistance(Cost):
 
     weights: Tensor
 
+    @options("cost")
     def __init__(
         self,
-        coordinates: Sequence[int] = (0, 1),
-        in_keys: Sequence[NestedKey] = ("goal",),
-        goal_size: int = 2,
-        weights: Sequence[float] | None = None,
+        coordinates: Sequence[int] = option((0, 1), "coordinates of the state that count", ge=0),
+        in_keys: Sequence[NestedKey] = option(("goal",), "entry of the goal"),
+        goal_size: int = option(2, "coordinates that the goal gives", ge=1),
+        weights: Sequence[float] | None = option(
+            None, "of the coordinates, in cost units per m or rad; None: 1", ge=0
+        ),
     ) -> None:
         super().__init__()
-        self.coordinates = list(coordinates)
-        self.in_keys = as_keys(in_keys)
-        self.in_sizes = [check_count("cost.goal_size", goal_size)]
+        self.coordinates, self.in_keys = list(coordinates), as_keys(in_keys)
+        self.in_sizes = [goal_size]
         if goal_size > len(self.coordinates):
             raise ConfigurationError(
                 f"cost.coordinates={self.coordinates}: expected at least one per goal "
@@ -78,8 +74,7 @@ class GoalDistance(Cost):
             raise ConfigurationError(
                 f"cost.weights={weights}: expected {len(self.coordinates)} numbers"
             )
-        checked = [check_number("cost.weights", weight, low=0.0) for weight in weights]
-        self.register_buffer("weights", torch.tensor(checked), persistent=False)
+        self.register_buffer("weights", torch.tensor(weights), persistent=False)
 
     def forward(self, state: Tensor, action: Tensor, next_state: Tensor, *task: Tensor) -> Tensor:
         """Return the weighted distance ``(*B)``."""
@@ -175,14 +170,6 @@ class TrackingCost(QuadraticCost):
     As the cost of a step, for planners that sample, it looks at the state that the step
     leads to, and knows held references only: the planning environment counts no stages.
 
-    Args:
-        weights: w, one per state coordinate, in cost per squared unit.
-        action_weights: :math:`\rho`, one per action component.
-        coordinates: indices of the coordinates that the reference gives, in its order.
-        rest: targets of the other coordinates, one per state coordinate; zeros if None.
-        angles: indices of the coordinates in rad, whose difference wraps.
-        in_keys: the reference's key; none without a reference.
-
     Raises:
         ConfigurationError: for settings that do not fit together.
 
@@ -197,14 +184,21 @@ class TrackingCost(QuadraticCost):
     rest: Tensor
     select: Tensor
 
+    @options("cost")
     def __init__(
         self,
-        weights: Sequence[float],
-        action_weights: Sequence[float],
-        coordinates: Sequence[int],
-        rest: Sequence[float] | None = None,
-        angles: Sequence[int] = (),
-        in_keys: Sequence[NestedKey] = ("reference",),
+        weights: Sequence[float] = option(..., "w, one per state coordinate", ge=0),
+        action_weights: Sequence[float] = option(..., "rho, one per action component", ge=0),
+        coordinates: Sequence[int] = option(
+            ..., "coordinates that the reference gives, in order", ge=0
+        ),
+        rest: Sequence[float] | None = option(
+            None, "targets of the others, one per state coordinate; None: 0"
+        ),
+        angles: Sequence[int] = option((), "coordinates in rad, whose difference wraps", ge=0),
+        in_keys: Sequence[NestedKey] = option(
+            ("reference",), "entry of the reference; []: there is none"
+        ),
     ) -> None:
         super().__init__()
         size, self.in_keys = len(weights), as_keys(in_keys)
@@ -225,13 +219,9 @@ class TrackingCost(QuadraticCost):
         select = torch.zeros(len(coordinates), size).double()
         for row, coordinate in enumerate(coordinates):
             select[row, coordinate] = 1.0
-        for name, values, low in (
-            ("weights", weights, 0.0),
-            ("action_weights", action_weights, 0.0),
-            ("rest", rest, -math.inf),
-        ):
-            checked = [check_number(f"cost.{name}", x, low=low) for x in values]
-            self.register_buffer(name, torch.tensor(checked, dtype=torch.float64), persistent=False)
+        tensors = {"weights": weights, "action_weights": action_weights, "rest": rest}
+        for name, values in tensors.items():
+            self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
         self.rest *= 1.0 - select.sum(0)
         self.register_buffer("select", select, persistent=False)
 

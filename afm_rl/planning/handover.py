@@ -9,7 +9,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_instance, check_number
+from afm_rl.errors import ConfigurationError, check_instance
+from afm_rl.options import option, options
 from afm_rl.planning.costs import QuadraticCost
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
@@ -31,9 +32,6 @@ class Handover(RecedingHorizonPlanner):
         env: a :class:`PlanningEnv` whose cost is a :class:`QuadraticCost` without a task.
         far: makes the other planner of the environment, such as :class:`ICEM` or :class:`MPPI`,
             whose memory travels in the tensordict.
-        level: cost to go up to which the feedback acts.
-        cap: of the cost to go at the end of the other planner's plans; 0 for none.
-        action_key: where the action goes.
         settings: of the other planner.
 
     Raises:
@@ -54,13 +52,16 @@ class Handover(RecedingHorizonPlanner):
             [-1.0000]])
     """
 
+    @options("planner")
     def __init__(
         self,
         env: PlanningEnv,
         far: Callable[..., RecedingHorizonPlanner],
-        level: float = 4.0,
-        cap: float = 20.0,
-        action_key: NestedKey = "action",
+        level: float = option(4.0, "cost to go up to which LQR acts", ge=0),
+        cap: float = option(
+            20.0, "of the cost to go at the end of a plan; 0: plans end without a value", ge=0
+        ),
+        action_key: NestedKey = option("action", "where the action goes"),
         **settings: Any,
     ) -> None:
         cost = check_instance("planner.env", env, PlanningEnv).cost
@@ -73,8 +74,7 @@ class Handover(RecedingHorizonPlanner):
         check_instance("planner.far", planner, RecedingHorizonPlanner)
         super().__init__(env, planner.memory, action_key)
         self.far = planner
-        self.level = check_number("planner.level", level, low=0.0)
-        self.cap = check_number("planner.cap", cap, low=0.0)
+        self.level, self.cap = level, cap
         self.in_keys = list(planner.in_keys)
 
     def regulator(self, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:

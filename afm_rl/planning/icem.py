@@ -10,7 +10,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import option, options
 from afm_rl.planning.receding import SamplingPlanner, action_spec_of, moments
 from afm_rl.spaces.keys import as_key
 
@@ -60,25 +61,12 @@ class ICEM(SamplingPlanner):
 
     Mean and elites live in the tensordict, so every mission of a batch has its own and resets
     start afresh: append :meth:`make_tensordict_primer` to the environment. A mission whose
-    memory is zero is new: it starts from the middle of the action box, without elites.
+    memory is zero is new: it starts from the middle of the action box, without elites. It holds
+    ``mean`` ``(*B, H, A)`` and ``elites`` ``(*B, k, H, A)``; where an action lasts several steps,
+    also ``held`` ``(*B, A + 1)``, the action and how long it still lasts.
 
     Args:
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
-        horizon: actions of a plan, H.
-        population: candidates of the first iteration, N, at least 2 K.
-        iterations: refinements per step.
-        elites: plans that mean and standard deviation are fitted to, K.
-        keep: share of the elites that goes on to the next iteration and step, in (0, 1].
-        decay: :math:`\gamma`, by which the population shrinks, at least 1.
-        sigma: :math:`\sigma_0`, as a fraction of the half range of each action.
-        beta: exponent of the noise's spectrum, see :func:`coloured`.
-        momentum: :math:`\alpha` in [0, 1]: weight of the old mean and standard deviation.
-        hold: steps that each action of a plan lasts. A new plan is made every ``hold`` steps, and
-            looks ``H * hold`` steps ahead.
-        memory_key: where ``mean`` ``(*B, H, A)`` and ``elites`` ``(*B, k, H, A)`` are kept; with
-            ``hold`` above 1 also ``held`` ``(*B, A + 1)``, an action and how long it lasts.
-        settings: further arguments of :class:`~afm_rl.planning.receding.SamplingPlanner`:
-            ``backend``, ``seed_key``, ``box_key``, ``action_key`` and ``seed``.
 
     >>> from tensordict import TensorDict
     >>> from torchrl.envs import TransformedEnv
@@ -91,31 +79,42 @@ class ICEM(SamplingPlanner):
     torch.Size([3, 2])
     """
 
+    @options("planner")
     def __init__(
         self,
         env: EnvBase,
         horizon: int = 5,
-        population: int = 100,
+        population: int = option(
+            100, "candidates of the first iteration, N, at least twice the elites", ge=1
+        ),
         iterations: int = 3,
-        elites: int = 10,
-        keep: float = 0.3,
-        decay: float = 1.25,
-        sigma: float = 0.5,
-        beta: float = 1.0,
-        momentum: float = 0.1,
-        hold: int = 1,
-        memory_key: NestedKey = "icem",
+        elites: int = option(10, "plans that mean and standard deviation are fitted to, K", ge=1),
+        keep: float = option(
+            0.3, "share of the elites that goes on to the next iteration and step", gt=0, le=1
+        ),
+        decay: float = option(1.25, "gamma, by which the population shrinks", ge=1),
+        sigma: float = option(
+            0.5, "first standard deviation, in half ranges of each action", ge=0, le=100
+        ),
+        beta: float = option(
+            1.0, "exponent of the noise's spectrum; 0: white, 2: red", ge=0, le=100
+        ),
+        momentum: float = option(
+            0.1, "alpha, weight of the old mean and standard deviation", ge=0, le=1
+        ),
+        hold: int = option(
+            1, "steps that each action lasts; a plan looks horizon times hold steps ahead", ge=1
+        ),
+        memory_key: NestedKey = option("icem", "where mean and elites are kept"),
         **settings: Any,
     ) -> None:
-        check_count("planner.elites", elites)
-        check_number("planner.keep", keep, low=0.0, high=1.0, open_low=True)
         kept = max(1, round(keep * elites))
         memory_key = as_key(memory_key)
         root = memory_key if isinstance(memory_key, tuple) else (memory_key,)
         size = len(action_spec_of(env).space.low)
         plan = (horizon, size)
         memory = {(*root, "mean"): plan, (*root, "elites"): (kept, *plan)}
-        if check_count("planner.hold", hold) > 1:
+        if hold > 1:
             memory[(*root, "held")] = (size + 1,)
         super().__init__(env, memory, horizon, population, iterations, hold=hold, **settings)
         if population < 2 * elites:
@@ -123,10 +122,7 @@ class ICEM(SamplingPlanner):
                 f"planner.elites={elites}: expected at most half of planner.population={population}"
             )
         self.elites, self.kept = elites, kept
-        self.decay = check_number("planner.decay", decay, low=1.0)
-        self.sigma = check_number("planner.sigma", sigma, low=0.0, high=100.0)
-        self.beta = check_number("planner.beta", beta, low=0.0, high=100.0)
-        self.momentum = check_number("planner.momentum", momentum, low=0.0, high=1.0)
+        self.decay, self.sigma, self.beta, self.momentum = decay, sigma, beta, momentum
         space = self.action_spec.space
         self.register_buffer("scale", self.sigma * (space.high - space.low) / 2)
 

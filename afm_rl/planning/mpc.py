@@ -9,7 +9,8 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import option, options
 from afm_rl.planning.costs import QuadraticCost
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
@@ -68,13 +69,6 @@ class MPC(RecedingHorizonPlanner):
 
     Args:
         env: a :class:`PlanningEnv` whose cost is a :class:`QuadraticCost`.
-        horizon: stages, N.
-        iterations: linearisations per tick.
-        first_iterations: linearisations at the first tick of a flight.
-        bounded: indices of the action components whose box the plan respects; None for
-            all. Others are only projected when the action is applied.
-        memory_key: where ``states`` ``(*B, N + 1, S)`` and ``actions`` ``(*B, N, A)`` are kept.
-        action_key: where the action goes.
 
     The cost's task entries may be ``(*B, size)``, held over the horizon, or ``(*B, N + 1,
     size)``, one per stage. Solutions that are not finite are counted in :attr:`discarded`;
@@ -98,15 +92,18 @@ class MPC(RecedingHorizonPlanner):
     low: Tensor
     high: Tensor
 
+    @options("planner")
     def __init__(
         self,
         env: PlanningEnv,
-        horizon: int = 20,
-        iterations: int = 1,
-        first_iterations: int = 5,
-        bounded: Sequence[int] | None = None,
-        memory_key: NestedKey = "mpc",
-        action_key: NestedKey = "action",
+        horizon: int = option(20, "stages, N", ge=1, le=10_000),
+        iterations: int = option(1, "linearisations per tick", ge=1, le=10_000),
+        first_iterations: int = option(5, "those at the first tick of a flight", ge=1, le=10_000),
+        bounded: Sequence[int] | None = option(
+            None, "action components whose box the plan respects, not only what is sent; None: all"
+        ),
+        memory_key: NestedKey = option("mpc", "where states and actions of the plan are kept"),
+        action_key: NestedKey = option("action", "where the action goes"),
     ) -> None:
         if not isinstance(env, PlanningEnv) or not isinstance(env.cost, QuadraticCost):
             cost = f" with {type(env.cost).__name__}" if isinstance(env, PlanningEnv) else ""
@@ -114,7 +111,6 @@ class MPC(RecedingHorizonPlanner):
                 f"planner: got {type(env).__name__}{cost}; MPC needs a PlanningEnv with a "
                 "quadratic cost, such as TrackingCost"
             )
-        check_count("planner.horizon", horizon, high=10_000)
         memory_key, size = as_key(memory_key), env.dynamics.action_size
         root = memory_key if isinstance(memory_key, tuple) else (memory_key,)
         memory = {
@@ -123,10 +119,7 @@ class MPC(RecedingHorizonPlanner):
         }
         super().__init__(env, memory, action_key)
         self.horizon, self.stages = horizon, horizon + 1
-        self.iterations = check_count("planner.iterations", iterations, high=10_000)
-        self.first_iterations = check_count(
-            "planner.first_iterations", first_iterations, high=10_000
-        )
+        self.iterations, self.first_iterations = iterations, first_iterations
         space = self.action_spec.space
         within = list(range(size)) if bounded is None else list(bounded)
         if not all(isinstance(i, int) and 0 <= i < size for i in within):

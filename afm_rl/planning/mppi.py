@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.compiling.machine_code import MachineCode
-from afm_rl.errors import check_choice, check_flag, check_number
+from afm_rl.options import option, options
 from afm_rl.planning.receding import SamplingPlanner, action_spec_of
 from afm_rl.spaces.keys import as_key
 
@@ -80,27 +80,11 @@ class MPPI(SamplingPlanner):
     The mean lives in the tensordict, so every mission of a batch has its own and resets
     start afresh: append :meth:`make_tensordict_primer` to the environment.
 
+    The published runs used ``noise="unit"`` and ``past="shifted"``. What is compiled is kept in the
+    cache; where there is no compiler, the planner works as without, with a warning.
+
     Args:
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
-        horizon: steps of a plan, H.
-        population: candidates per iteration, N.
-        iterations: refinements per step.
-        temperature: :math:`\lambda`, in units of the return.
-        sigma: standard deviation of the noise, as a fraction of the half range of each
-            action (``noise="scaled"``).
-        beta: weight of the new action in the smoothing, in (0, 1].
-        truncate: standard deviations at which the noise is cut off.
-        noise: ``"scaled"``, or ``"unit"``: standard deviation 1 whatever the action's unit,
-            as in the published runs, where sigma had no effect.
-        past: the action that smoothing starts from: ``"previous"``, the one last planned,
-            or ``"shifted"``, the first of the shifted mean, as in the published runs.
-        mean_key: where the mean plan is kept.
-        compile: roll out and weigh as machine code, if the model is made of equations and stays
-            as it is. It is compiled once and kept in the cache. Where there is no compiler, the
-            planner works as without, with a warning.
-        cache: folder of compiled functions.
-        settings: further arguments of :class:`~afm_rl.planning.receding.SamplingPlanner`:
-            ``backend``, ``seed_key``, ``box_key``, ``action_key`` and ``seed``.
 
     >>> from tensordict import TensorDict
     >>> from afm_rl.dynamics import Dubins
@@ -112,32 +96,36 @@ class MPPI(SamplingPlanner):
     torch.Size([4, 2])
     """
 
+    @options("planner")
     def __init__(
         self,
         env: EnvBase,
         horizon: int = 5,
         population: int = 300,
         iterations: int = 1,
-        temperature: float = 0.001,
-        sigma: float = 1.0,
-        beta: float = 0.6,
-        truncate: float = 2.0,
-        noise: str = "scaled",
-        past: str = "previous",
-        mean_key: NestedKey = ("mppi", "mean"),
-        compile: bool = False,
-        cache: str | Path = "~/.cache/afm_rl",
+        temperature: float = option(0.001, "lambda, in units of the return", gt=0),
+        sigma: float = option(1.0, "noise, in half ranges of each action", ge=0, le=100),
+        beta: float = option(0.6, "weight of the new action in the smoothing", gt=0, le=1),
+        truncate: float = option(2.0, "standard deviations at which noise is cut off", gt=0),
+        noise: str = option(
+            "scaled",
+            "scaled: sigma applies; unit: standard deviation 1 for every action",
+            choices=("scaled", "unit"),
+        ),
+        past: str = option(
+            "previous",
+            "smoothing starts from the previous action, or the first of the shifted plan",
+            choices=("previous", "shifted"),
+        ),
+        mean_key: NestedKey = option(("mppi", "mean"), "where the mean plan is kept"),
+        compile: bool = option(False, "roll-outs as machine code, over equations; compiled once"),
+        cache: str | Path = option("~/.cache/afm_rl", "folder of what is compiled"),
         **settings: Any,
     ) -> None:
         memory = {as_key(mean_key): (horizon, *action_spec_of(env).shape)}
         super().__init__(env, memory, horizon, population, iterations, **settings)
-        self.temperature = check_number("planner.temperature", temperature, low=0, open_low=True)
-        self.sigma = check_number("planner.sigma", sigma, low=0.0, high=100.0)
-        self.beta = check_number("planner.beta", beta, low=0.0, high=1.0, open_low=True)
-        self.truncate = check_number("planner.truncate", truncate, low=0.0, open_low=True)
-        self.noise = check_choice("planner.noise", noise, ("scaled", "unit"))
-        self.past = check_choice("planner.past", past, ("previous", "shifted"))
-        self.compiles = check_flag("planner.compile", compile)
+        self.temperature, self.sigma, self.beta = temperature, sigma, beta
+        self.truncate, self.noise, self.past, self.compiles = truncate, noise, past, compile
         self.__dict__["_machine_code"] = MachineCode(self, cache)
         space = self.action_spec.space
         half = (space.high - space.low) / 2

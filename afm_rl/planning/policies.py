@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from afm_rl.dynamics import Oracle
-from afm_rl.errors import AFMError, ArtefactError, ConfigurationError, check_choice, check_number
+from afm_rl.errors import AFMError, ArtefactError, ConfigurationError, check_choice
+from afm_rl.options import option, options
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.storage.artefacts import digest_of, read_tensors, save_tensors
 
@@ -215,20 +216,28 @@ def load_policy(file: Path) -> tuple[StoredPolicy, dict[str, Any]]:
 class PolicyPlanner(LawPlanner):
     """A stored policy in the place of a planner: it acts on what it sees, and plans nothing.
 
+    Noise is added while TorchRL explores, as its collectors do: without it a model cannot learn
+    from the policy's data what other actions would have done.
+
     Args:
         env: the planning environment: where state and action are, the action's box, and what a
             policy sees of a state.
         file: written by :func:`save_policy`.
-        noise: standard deviation of normal noise on the actions, in half ranges, while TorchRL
-            explores, as its collectors do: without it a model cannot learn from the policy's data
-            what other actions would have done.
 
     Raises:
         ConfigurationError: if there is no such file, or the policy's sizes do not fit.
         ArtefactError: if the file is damaged, or holds something else.
     """
 
-    def __init__(self, env: PlanningEnv, file: str | Path | None, noise: float = 0.1) -> None:
+    @options("planner")
+    def __init__(
+        self,
+        env: PlanningEnv,
+        file: str | Path | None = option(None, "written by afm_rl.planning.save_policy"),
+        noise: float = option(
+            0.1, "of actions, in half ranges, while data for a learned model are collected", ge=0
+        ),
+    ) -> None:
         super().__init__(env, self._act)
         if not isinstance(file, str | Path):
             raise ConfigurationError(
@@ -238,7 +247,7 @@ class PolicyPlanner(LawPlanner):
             self.policy, _ = load_policy(Path(file).expanduser())
         except (ConfigurationError, ArtefactError) as error:
             raise type(error)(f"planner.file: {error}") from error
-        self.noise = check_number("planner.noise", noise, low=0.0)
+        self.noise = noise
         box = self.action_spec.space
         state = torch.zeros(1, env.dynamics.state_size, dtype=box.low.dtype)
         wanted = self._seen(state).shape[-1], env.dynamics.action_size

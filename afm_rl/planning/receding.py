@@ -19,7 +19,8 @@ from torchrl.modules.planners.common import (
 
 from afm_rl.compiling.devices import moved
 from afm_rl.compiling.tracing import all_hold, may_look
-from afm_rl.errors import ConfigurationError, check_choice, check_count, check_instance
+from afm_rl.errors import ConfigurationError, check_instance
+from afm_rl.options import option, options
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
 
@@ -167,19 +168,12 @@ class SamplingPlanner(RecedingHorizonPlanner):
     Args:
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
         memory: entries that are kept from plan to plan, with their shapes.
-        horizon: steps of a plan, H.
-        population: candidates per iteration, N.
-        iterations: refinements per step.
-        backend: ``"fast"`` uses ``env.returns``, ``"env"`` steps the environment, ``None``
-            takes the fast way where there is one. Both give the same plans.
-        seed_key: entry ``(*B)`` with each mission's seed: missions of one seed share their
-            noise whoever else is in the batch. Without it noise is drawn for the batch.
-        box_key: entry ``(*B, 2, A)`` with the lowest and highest action to plan with, such as the
-            ``effect_bounds`` of :class:`~afm_rl.transforms.ActionFlowTransform`; the action's own
-            bounds, with a warning, where there is none.
-        action_key: where the action goes.
-        seed: seed of the noise without ``seed_key``.
-        hold: steps that each action of a plan lasts.
+
+    With a ``seed_key`` missions of one seed share their noise whoever else is in the batch; without
+    one, noise is drawn for the batch. The entry ``box_key`` ``(*B, 2, A)`` holds the lowest and
+    highest action to plan with, such as the ``effect_bounds`` of
+    :class:`~afm_rl.transforms.ActionFlowTransform`; where there is none the action's own bounds
+    are taken, with a warning.
 
     Returns that are not finite are ignored and counted in :attr:`discarded`; where none is finite,
     the plan from before, shifted, stands and a warning is given.
@@ -187,28 +181,33 @@ class SamplingPlanner(RecedingHorizonPlanner):
 
     scale: Tensor  # standard deviation of the first noise, per action
 
+    @options("planner")
     def __init__(
         self,
         env: EnvBase,
         memory: Mapping[NestedKey, Sequence[int]],
-        horizon: int,
-        population: int,
-        iterations: int,
-        backend: str | None = None,
-        seed_key: NestedKey | None = None,
-        box_key: NestedKey | None = None,
-        action_key: NestedKey = "action",
-        seed: int = 0,
-        hold: int = 1,
+        horizon: int = option(5, "steps of a plan, H", ge=1, le=10_000),
+        population: int = option(300, "candidates per iteration, N", ge=1, le=1_000_000),
+        iterations: int = option(1, "refinements per step", ge=1, le=10_000),
+        backend: str | None = option(
+            None,
+            "env: step the environment; fast: call its `returns`; None: fast where there is one",
+            choices=("fast", "env"),
+        ),
+        seed_key: NestedKey | None = option(None, "missions of one seed share their noise"),
+        box_key: NestedKey | None = option(
+            None, "plan with all effects that actions are known to have; None: with the action box"
+        ),
+        action_key: NestedKey = option("action", "where the action goes"),
+        seed: int = option(0, "of the noise without a seed_key", ge=0),
+        hold: int = option(1, "steps that each action of a plan lasts", ge=1),
     ) -> None:
         super().__init__(env, memory, action_key)
-        self.hold = check_count("planner.hold", hold)
-        self.horizon = check_count("planner.horizon", horizon, high=10_000)
-        self.population = check_count("planner.population", population, high=1_000_000)
-        self.iterations = check_count("planner.iterations", iterations, high=10_000)
+        self.hold, self.horizon = hold, horizon
+        self.population, self.iterations = population, iterations
         if backend is None:
             backend = "fast" if hasattr(env, "returns") else "env"
-        self.backend = check_choice("planner.backend", backend, ("fast", "env"))
+        self.backend = backend
         if self.backend == "fast" and not hasattr(env, "returns"):
             raise ConfigurationError(
                 f"planner.backend='fast': {type(env).__name__} has no `returns`; use 'env'"
@@ -220,7 +219,7 @@ class SamplingPlanner(RecedingHorizonPlanner):
         self.box_key = None if box_key is None else as_key(box_key)
         if self.box_key is not None:
             self.in_keys.append(self.box_key)
-        self.streams = Streams(salt=1, seed=check_count("planner.seed", seed, low=0))
+        self.streams = Streams(salt=1, seed=seed)
         self.discarded = 0
 
     def _noise(

@@ -9,7 +9,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import option, options
 from afm_rl.planning.mppi import path_weights
 from afm_rl.planning.receding import SamplingPlanner, moments
 
@@ -24,12 +25,6 @@ class CEM(SamplingPlanner):
 
     Args:
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
-        horizon: steps of a plan, H.
-        population: candidates per iteration, N.
-        iterations: refinements per step.
-        elites: candidates that the next iteration is fitted to, K.
-        settings: further arguments of :class:`~afm_rl.planning.receding.SamplingPlanner`:
-            ``backend``, ``seed_key``, ``box_key``, ``action_key`` and ``seed``.
 
     Raises:
         ConfigurationError: for a setting or environment that cannot be used.
@@ -43,17 +38,18 @@ class CEM(SamplingPlanner):
     torch.Size([4, 2])
     """
 
+    @options("planner")
     def __init__(
         self,
         env: EnvBase,
         horizon: int = 5,
         population: int = 300,
         iterations: int = 3,
-        elites: int = 30,
+        elites: int = option(30, "candidates that the next iteration is fitted to, K", ge=1),
         **settings: Any,
     ) -> None:
         super().__init__(env, {}, horizon, population, iterations, **settings)
-        self.elites = check_count("planner.elites", elites)
+        self.elites = elites
         if elites > population:
             raise ConfigurationError(
                 f"planner.elites={elites}: expected at most planner.population={population}"
@@ -91,14 +87,9 @@ class TorchRLMPPI(CEM):
 
     Args:
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
-        horizon: steps of a plan, H.
-        population: candidates per iteration, N.
-        iterations: refinements per step.
-        elites: candidates that the next iteration is fitted to, K.
-        temperature: :math:`\lambda`, an inverse temperature.
-        settings: as of :class:`CEM`.
     """
 
+    @options("planner")
     def __init__(
         self,
         env: EnvBase,
@@ -106,11 +97,11 @@ class TorchRLMPPI(CEM):
         population: int = 300,
         iterations: int = 3,
         elites: int = 30,
-        temperature: float = 1.0,
+        temperature: float = option(1.0, "lambda, which multiplies the return", gt=0),
         **settings: Any,
     ) -> None:
         super().__init__(env, horizon, population, iterations, elites, **settings)
-        self.temperature = check_number("planner.temperature", temperature, low=0.0, open_low=True)
+        self.temperature = temperature
 
     def _fit(self, plans: Tensor, returns: Tensor) -> tuple[Tensor, Tensor]:
         return moments(plans, path_weights(returns, 1.0 / self.temperature))

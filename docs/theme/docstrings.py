@@ -1,9 +1,12 @@
-r"""Docstrings as Markdown, for the API page: formulas as $...$, doctests in fences."""
+r"""Docstrings as Markdown, for the API page: formulas as $...$, doctests in fences, options."""
 
+import pydoc
 import re
 import textwrap
 
 from griffe import Extension
+
+from afm_rl.options import options_of, with_arguments
 
 ROLE = re.compile(r":(?:class|func|meth|attr|mod|data):`~?(?:[\w.]+\.)?(\w+)`")
 MATH = re.compile(r":math:`([^`]+)`", re.DOTALL)
@@ -25,8 +28,16 @@ def as_markdown(text: str) -> str:
 
 
 class Docstrings(Extension):
-    """Translates each docstring before it is parsed."""
+    """Translates each docstring before it is parsed; options join the other arguments."""
 
     def on_object(self, *, obj, **kwargs) -> None:
+        taking = obj.members.get("__init__") if obj.is_class else obj
+        known = {}
+        if any("options(" in str(each.value) for each in getattr(taking, "decorators", ())):
+            known = options_of(pydoc.locate(obj.path))
+            for each in taking.parameters:
+                if str(each.default).startswith("option("):
+                    each.default = str(known[each.name].default)
         if obj.docstring:
-            obj.docstring.value = as_markdown(obj.docstring.value)
+            text = with_arguments(obj.docstring.value, known)
+            obj.docstring.value = as_markdown(text)

@@ -9,7 +9,7 @@ from afm_rl.correction import LeastSquares
 from afm_rl.dynamics import Dubins, Ensemble, KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, Updater, UpdaterHook
-from afm_rl.planning import CEM, ICEM, MPC, MPPI, GoalDistance, PlanningEnv
+from afm_rl.planning import CEM, ICEM, MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowTransform
 
@@ -21,6 +21,14 @@ def ensemble(**settings):
     return Ensemble(CAR, **{"action_size": 2, "features": [2], "hidden": [4], **settings})
 
 
+def plans(kind, **settings):
+    return kind(PlanningEnv(Dubins(), GoalDistance(), *BOX), **settings)
+
+
+def tracking(coordinates=(0, 1), **settings):
+    return TrackingCost([1.0, 1.0, 0.0], [0.1, 0.1], coordinates, **settings)
+
+
 REFUSED = {
     "dynamics.action_size=0": lambda: ensemble(action_size=0),
     "dynamics.features=['x']": lambda: ensemble(features=["x"]),
@@ -29,7 +37,18 @@ REFUSED = {
     "dynamics.log_variance=[nan, 1]": lambda: ensemble(log_variance=[float("nan"), 1]),
     "dynamics.seed='a'": lambda: ensemble(seed="a"),
     "dynamics.step=3": lambda: KnownDynamics(3, CAR, 2),
-    "cost.goal_size=0": lambda: GoalDistance(goal_size=0),
+    "cost.coordinates=[0]: expected at least one per goal": lambda: GoalDistance([0]),
+    "cost.weights=[1.0]: expected 2 numbers": lambda: GoalDistance(weights=[1]),
+    "cost.coordinates=[0, 3]: expected distinct indices in 0..2": lambda: tracking([0, 3]),
+    "cost.coordinates=[0, 0]": lambda: tracking([0, 0]),
+    "cost.angles=[3]": lambda: tracking(angles=[3]),
+    "cost.rest=[0.0]: expected 3 numbers": lambda: tracking(rest=[0.0]),
+    "cost.in_keys=[]: expected one key": lambda: tracking(in_keys=[]),
+    "planner.elites=51: expected at most half of": lambda: plans(ICEM, elites=51),
+    "planner.elites=301: expected at most planner": lambda: plans(CEM, elites=301),
+    "planner.bounded=[2]: expected indices in 0..1": lambda: MPC(
+        PlanningEnv(Dubins(), tracking(), *BOX), bounded=[2]
+    ),
     "planner.env: dynamics: expected a DynamicsModel, got None": lambda: PlanningEnv(
         None, GoalDistance(), *BOX
     ),

@@ -251,22 +251,6 @@ def test_plans_that_are_not_minima_are_counted(box, monkeypatch):
     assert (actions.abs() <= box[1]).all()
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"horizon": 0},
-        {"iterations": 0},
-        {"first_iterations": 1.5},
-        {"bounded": [2]},
-        {"bounded": ["v"]},
-    ],
-    ids=str,
-)
-def test_impossible_settings_are_refused(box, settings):
-    with pytest.raises(ConfigurationError, match=f"planner.{next(iter(settings))}"):
-        car(box, **settings)
-
-
 def test_costs_and_environments_that_do_not_fit_are_refused(box):
     with pytest.raises(ConfigurationError, match="PlanningEnv with GoalDistance; MPC needs"):
         MPC(PlanningEnv(Dubins(), GoalDistance(), *box))

@@ -162,27 +162,6 @@ def test_it_drives_to_the_goal(world, settings):
     assert (torch.stack(gaps).amin(0) < 0.2).all()
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"horizon": 0},
-        {"population": -3},
-        {"iterations": 1.5},
-        {"temperature": 0.0},
-        {"sigma": -0.1},
-        {"beta": 0.0},
-        {"beta": 1.1},
-        {"noise": "pink"},
-        {"past": "future"},
-        {"backend": "slow"},
-    ],
-    ids=str,
-)
-def test_impossible_settings_are_refused(world, settings):
-    with pytest.raises(ConfigurationError, match=f"planner.{next(iter(settings))}"):
-        MPPI(world, **settings)
-
-
 def test_a_box_per_mission_replaces_that_of_the_actions(world, box):
     low, high = box
     td = situation(3, 4)

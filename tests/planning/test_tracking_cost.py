@@ -78,25 +78,3 @@ def test_without_a_reference_all_coordinates_have_targets_of_their_own():
     assert cost(state, torch.ones(2, 1), state).tolist() == [17.0, 0.0]
     assert cost.quadratic(state, torch.ones(1, 1))[1].tolist() == [[6.0, 8.0], [0.0, 0.0]]
     assert cost.in_sizes == []
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"weights": [1.0, -1.0, 0.0]},
-        {"weights": [1.0, math.nan, 0.0]},
-        {"action_weights": [-0.1, 0.0]},
-        {"coordinates": [0, 3]},
-        {"coordinates": [0, 0]},
-        {"coordinates": [0.5]},
-        {"angles": [-1]},
-        {"rest": [0.0]},
-        {"rest": [0.0, math.inf, 0.0]},
-        {"in_keys": []},
-    ],
-    ids=str,
-)
-def test_impossible_settings_are_refused(settings):
-    given = {"weights": WEIGHTS, "action_weights": ACTION_WEIGHTS, "coordinates": [0, 1]}
-    with pytest.raises(ConfigurationError, match=f"cost.{next(iter(settings))}"):
-        TrackingCost(**{**given, **settings})

@@ -1,0 +1,224 @@
+"""Options: each is written once, in the signature that takes it, with its unit, range and reason.
+
+What is checked of a value, the argument's line in the documentation, its comment in ``conf`` and
+the tests of what is refused follow from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache, wraps
+from inspect import Parameter, cleandoc, signature
+from math import inf
+from types import EllipsisType, NoneType, SimpleNamespace, UnionType
+from typing import Any, NamedTuple, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+
+from afm_rl.errors import ConfigurationError, check_choice, check_count, check_flag, check_number
+
+T = TypeVar("T")
+Target = TypeVar("Target", bound=Callable[..., Any])
+HUGE = 2**63 - 1  # the largest whole number of 64 bits
+
+
+class Option(NamedTuple):
+    """What an argument with a default is for, and what it may be, see :func:`option`."""
+
+    default: Any
+    about: str
+    low: float
+    high: float
+    is_open: bool
+    choices: Iterable[str] | None
+    least: int
+
+    @property
+    def text(self) -> str:
+        """What it is for, with its range.
+
+        >>> cast(Option, option(None, "pairs of a reading; None: 12", ge=1)).text
+        'pairs of a reading, >= 1; None: 12'
+        >>> cast(Option, option(0.3, "share that is kept", gt=0, le=1)).text
+        'share that is kept, (0, 1]'
+        """
+        first, semicolon, rest = self.about.partition(";")
+        if self.high < inf:
+            first += f", {'(' if self.is_open else '['}{self.low}, {self.high}]"
+        elif self.low > -inf:
+            first += f", {'>' if self.is_open else '>='} {self.low}"
+        return first + semicolon + rest
+
+    def check(self, name: str, kind: Any, value: Any) -> Any:
+        """Return a value that may be given; numbers as floats, lists of them as lists.
+
+        Args:
+            name: of the setting.
+            kind: type of the argument. Of numbers, flags, choices, lists of these and None is
+                checked what is given, and of no other type.
+            value: what is given.
+
+        Raises:
+            ConfigurationError: for one that may not be given, naming the setting.
+        """
+        kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+        if value is None and NoneType in kinds:
+            return None
+        items = [get_args(one)[0] for one in kinds if get_origin(one) is Sequence]
+        if items and not (isinstance(value, int | float | str) and {int, float, str} & {*kinds}):
+            return self._check_list(name, items[0], value)
+        if self.choices is not None:
+            return check_choice(name, value, self.choices)
+        if bool in kinds:
+            return check_flag(name, value)
+        if int in kinds:
+            ends = (int(max(-HUGE, min(HUGE, end))) for end in (self.low, self.high))
+            return check_count(name, value, low=next(ends), high=next(ends))
+        if float in kinds:
+            low, high = self.low, self.high
+            return check_number(name, value, low=low, high=high, open_low=self.is_open)
+        return value
+
+    def _check_list(self, name: str, kind: Any, values: Any) -> list[Any]:
+        if isinstance(values, str) or not isinstance(values, Iterable):
+            raise ConfigurationError(f"{name}={values!r}: expected a list")
+        checked = [self.check(name, kind, value) for value in values]
+        if len(checked) < self.least:
+            raise ConfigurationError(f"{name}={checked}: expected a list of at least {self.least}")
+        return checked
+
+
+class Taken(NamedTuple):
+    """What a function takes."""
+
+    own: dict[str, Option]
+    kinds: Callable[[], dict[str, Any]]
+    """Returns the types of its options."""
+    takers: tuple[Callable[..., Any], ...]
+    parts: dict[str, Callable[..., Any]]
+
+
+NOTHING = Taken({}, dict, (), {})
+
+
+def option(
+    default: T | EllipsisType,
+    about: str,
+    *,
+    ge: float = -inf,
+    gt: float | None = None,
+    le: float = inf,
+    choices: Iterable[str] | None = None,
+    least: int = 0,
+) -> T:
+    """Return the default of an argument, as :func:`options` reads it.
+
+    Args:
+        default: of the argument; ``...``: it must be given.
+        about: what it is for, and its unit.
+        ge: the lowest number.
+        gt: the same, where that is not allowed itself.
+        le: the highest number.
+        choices: the texts that are allowed.
+        least: how many items a list must have.
+    """
+    low = ge if gt is None else gt
+    return cast(T, Option(default, about, low, le, gt is not None, choices, least))
+
+
+def options(
+    group: str, *takers: Callable[..., Any], **parts: Callable[..., Any]
+) -> Callable[[Target], Target]:
+    """Let a function, or a class by its ``__init__``, check its options whenever it is called.
+
+    Args:
+        group: under which settings are found, such as ``planner``.
+        takers: what the function hands its further settings, ``**settings``, to.
+        parts: by argument, what the function hands a mapping of settings to.
+
+    >>> @options("planner")
+    ... def plan(horizon: int = option(5, "steps of a plan", ge=1)):
+    ...     return horizon
+    >>> plan(), options_of(plan)["horizon"].text
+    (5, 'steps of a plan, >= 1')
+    >>> plan(horizon=0)
+    Traceback (most recent call last):
+        ...
+    afm_rl.errors.ConfigurationError: planner.horizon=0: expected a whole number of at least 1
+    """
+
+    def decorate(function: Any) -> Any:
+        names = function.__code__.co_varnames[: function.__code__.co_argcount]
+        defaults, by_name = function.__defaults__ or (), function.__kwdefaults__ or {}
+        given = {**dict(zip(names[len(names) - len(defaults) :], defaults, strict=True)), **by_name}
+        own = {name: each for name, each in given.items() if isinstance(each, Option)}
+        plain = {name: each.default if name in own else each for name, each in given.items()}
+        plain = {name: each for name, each in plain.items() if each is not ...}
+        function.__defaults__ = tuple(plain[name] for name in names if name in plain)
+        function.__kwdefaults__ = {name: plain[name] for name in by_name if name in plain}
+        hints = {name: function.__annotations__[name] for name in own}
+        hinted = SimpleNamespace(__annotations__=hints)
+        kinds = cache(lambda: get_type_hints(hinted, function.__globals__))  # when first needed
+
+        def check(name: str, value: Any) -> Any:
+            place = f"{group}.{name}" if group else name
+            return own[name].check(place, kinds()[name], value) if name in own else value
+
+        @wraps(function)
+        def checked(*args: Any, **settings: Any) -> Any:
+            settings = {name: check(name, value) for name, value in settings.items()}
+            return function(*map(check, names, args), *args[len(names) :], **settings)
+
+        checked.options = Taken(own, kinds, takers, parts)  # type: ignore[attr-defined]
+        checked.__doc__ = with_arguments(function.__doc__ or "", own)
+        return checked
+
+    return decorate
+
+
+def options_of(target: Any) -> dict[str, Option]:
+    """Return the options that a function or class takes, with its own defaults, by name.
+
+    Those of its bases, and of what further settings are handed to, are among them.
+    """
+    sources = [target]
+    if isinstance(target, type):
+        sources = [vars(base).get("__init__") for base in target.__mro__]
+    known: dict[str, Option] = {}
+    for source in sources:
+        taken = getattr(source, "options", NOTHING)
+        known = {**taken.own, **known}
+        for taker in taken.takers:
+            known = {**options_of(taker), **known}
+    arguments = signature(target).parameters
+    open_end = any(each.kind is Parameter.VAR_KEYWORD for each in arguments.values())
+    known = {name: each for name, each in known.items() if name in arguments or open_end}
+    own = {
+        name: known[name]._replace(default=each.default)
+        for name, each in arguments.items()
+        if name in known
+    }
+    return {**own, **known, **own}
+
+
+def with_arguments(text: str, known: dict[str, Option]) -> str:
+    """Return a docstring with the lines of options at the end of its ``Args:``.
+
+    >>> print(with_arguments("Plan.", options_of(option)))
+    Plan.
+    """
+    if not known:
+        return text
+    lines = [f"    {name}: {each.text}." for name, each in known.items()]
+    rows = cleandoc(text).split("\n")
+    if "Args:" not in rows:
+        ends = ("Returns:", "Yields:", "Raises:", ">>> ")
+        at = next((n for n, row in enumerate(rows) if row.startswith(ends)), len(rows))
+        rows[at:at] = ["Args:", ""] if at < len(rows) else ["", "Args:"]
+    start = rows.index("Args:") + 1
+    inside = (n for n, row in enumerate(rows[start:], start) if not row.startswith("    "))
+    at = next(inside, len(rows))
+    return "\n".join([*rows[:at], *lines, *rows[at:]]).strip()
+
+
+def parts_of(target: Any) -> dict[str, Callable[..., Any]]:
+    """Return, by argument, what a function hands a mapping of settings to."""
+    return getattr(target, "options", NOTHING).parts
