@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics.known import KnownDynamics
-from afm_rl.errors import check_number
+from afm_rl.options import option, options
 from afm_rl.spaces.manifold import Manifold, wrap_angle
 
 
@@ -36,11 +36,6 @@ def dubins_step(state: Tensor, action: Tensor, dt: float) -> Tensor:
 class Dubins(KnownDynamics):
     """A Dubins car with unit gains, as the ``physics`` baseline plans with it.
 
-    Args:
-        dt: time step (s).
-        noise_std: standard deviation of the model's own error per step, in m and rad: how
-            far it is trusted, not the simulator's noise.
-
     >>> model = Dubins()
     >>> model(torch.zeros(4, 3), torch.ones(4, 2)).shape
     torch.Size([4, 3])
@@ -49,8 +44,12 @@ class Dubins(KnownDynamics):
     affine = True
     extrapolates = True
 
-    def __init__(self, dt: float = 0.2, noise_std: float = 1e-3) -> None:
-        dt = check_number("dynamics.dt", dt, low=0.0, open_low=True)
+    @options("dynamics")
+    def __init__(
+        self,
+        dt: float = option(0.2, "time step, s", gt=0),
+        noise_std: float = option(1e-3, "how far the model is trusted per step, m and rad", gt=0),
+    ) -> None:
         super().__init__(partial(dubins_step, dt=dt), Manifold(3, angles=[2]), 2, noise_std)
         self.dt = dt
 

@@ -20,11 +20,8 @@ from afm_rl.dynamics.stacked import (
 )
 from afm_rl.errors import (
     ConfigurationError,
-    check_choice,
-    check_count,
-    check_counts,
-    check_flag,
 )
+from afm_rl.options import option, options
 from afm_rl.spaces.manifold import Manifold
 
 Stack = Sequence[Tensor]
@@ -49,7 +46,8 @@ class Ensemble(PerMissionModel):
     work; where that dimension is shorter than E, or is that of the missions, it is the mean.
 
     Only :meth:`forward` knows ``propagation`` and ``precision``: losses, errors and Jacobians
-    are always those of the whole ensemble in the parameters' own precision. States and actions
+    are always those of the whole ensemble in the parameters' own precision, and where gradients are
+    recorded, and in the first and last layer, that is the precision, too. States and actions
     may have another one: networks run in their own, states stay in that of the given state.
 
     Parameters are stacked, ``(*L, E, in, out)``: no loop over members. :meth:`expand_`
@@ -59,20 +57,6 @@ class Ensemble(PerMissionModel):
         manifold: state space.
         action_size: number of action components, A.
         features: indices of the state coordinates that the dynamics depend on.
-        members: number of networks, E.
-        hidden: units of the hidden layers.
-        log_variance: soft lower and upper bound of the log-variance.
-        propagation: ``"mean"``, ``"sample"`` or ``"member"``.
-        seed: seed of the initial weights.
-        init: ``"uniform"``, or ``"sparse"``: a tenth of the weights is not zero.
-        layer_norm: standardise the units of a layer before each LeakyReLU.
-        running_count: None: the statistics that standardise inputs stay as pre-training set
-            them. A count: :meth:`observe_` goes on with them, as if they came from at most
-            so many samples.
-        precision: of the hidden layers in :meth:`forward`: ``"float32"``, or ``"bfloat16"``
-            wherever no gradients are recorded, as in planning. First and last layer and the
-            state stay as they are.
-        encode: show the networks cosines, sines and rotation matrices; False: raw coordinates.
 
     >>> model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], hidden=[16])
     >>> model(torch.zeros(7, 3), torch.zeros(7, 2)).shape
@@ -84,21 +68,42 @@ class Ensemble(PerMissionModel):
     target_mean: Tensor
     target_std: Tensor
 
+    @options("dynamics")
     def __init__(
         self,
         manifold: Manifold,
         action_size: int,
         features: Sequence[int],
-        members: int = 5,
-        hidden: Sequence[int] = (200, 200, 200),
-        log_variance: Sequence[float] = (-10.0, 0.5),
-        propagation: str = "mean",
-        seed: int = 0,
-        init: str = "uniform",
-        layer_norm: bool = False,
-        running_count: int | None = None,
-        precision: str = "float32",
-        encode: bool = True,
+        members: int = option(5, "networks, E", ge=1, le=1000),
+        hidden: Sequence[int] = option(
+            (200, 200, 200), "units per layer", ge=1, le=10_000, least=1
+        ),
+        log_variance: Sequence[float] = option(
+            (-10.0, 0.5), "soft bounds, of the standardised state change"
+        ),
+        propagation: str = option(
+            "mean",
+            "mean: of the members' means; sample: one of each (as published); member: one per plan",
+            choices=PROPAGATIONS,
+        ),
+        seed: int = option(0, "initial weights", ge=0),
+        init: str = option(
+            "uniform", "sparse: nine tenths of the weights are zero; or uniform", choices=INITS
+        ),
+        layer_norm: bool = option(False, "standardise a layer's units before each LeakyReLU"),
+        running_count: int | None = option(
+            None,
+            "samples that pre-training counts for in running statistics; None: they stay",
+            ge=2,
+        ),
+        precision: str = option(
+            "float32",
+            "of hidden layers in rollouts: float32; bfloat16: faster on processors made for it",
+            choices=("float32", "bfloat16"),
+        ),
+        encode: bool = option(
+            True, "show networks cosines and sines of angles; False: raw coordinates, as published"
+        ),
     ) -> None:
         super().__init__(manifold, action_size)
         self.features = list(features)
@@ -106,22 +111,18 @@ class Ensemble(PerMissionModel):
             raise ConfigurationError(
                 f"dynamics.features={self.features}: expected indices in 0..{manifold.size - 1}"
             )
-        self.members = check_count("dynamics.members", members, high=1000)
-        self.hidden = check_counts("dynamics.hidden", hidden, high=10_000, least=1)
+        self.members, self.hidden = members, list(hidden)
         if len(log_variance) != 2 or not log_variance[0] < log_variance[1]:
             raise ConfigurationError(f"dynamics.log_variance={log_variance}: expected low < high")
         low, high = log_variance
         self.log_variance = (float(low), float(high))
-        self.propagation = check_choice("dynamics.propagation", propagation, PROPAGATIONS)
-        check_choice("dynamics.precision", precision, ("float32", "bfloat16"))
-        self.precision, self._cast = precision, CastCache(torch.bfloat16)
-        self.layer_norm = check_flag("dynamics.layer_norm", layer_norm)
-        self._generator = torch.Generator().manual_seed(check_count("dynamics.seed", seed, low=0))
-        self.encode = check_flag("dynamics.encode", encode)
+        self.propagation, self.precision, self.encode = propagation, precision, encode
+        self.layer_norm, self._cast = layer_norm, CastCache(torch.bfloat16)
+        self._generator = torch.Generator().manual_seed(seed)
         self._encoded_size = self._encoded(torch.zeros(manifold.size)).shape[-1]
         inputs, targets = self._encoded_size + action_size, manifold.tangent_size
         sizes = [inputs, *self.hidden, 2 * targets]
-        draw = INITS[check_choice("dynamics.init", init, INITS)]
+        draw = INITS[init]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
             weight, bias = draw(members, fan_in, fan_out, self._generator)
@@ -132,7 +133,6 @@ class Ensemble(PerMissionModel):
             self.register_buffer(f"{name}_std", torch.ones(size))
         self.running_count, self.running = running_count, None
         if running_count is not None:
-            check_count("dynamics.running_count", running_count, low=2)
             self.running = RunningStats(inputs)
 
     def _owned(self) -> Iterator[tuple[nn.Module, str]]:

@@ -13,7 +13,8 @@ from afm_rl.dynamics.base import DynamicsModel, PerMissionModel, jacobian_of_lin
 from afm_rl.dynamics.quadrotor import HeldFlight, Quadrotor
 from afm_rl.dynamics.rates import HeldFunction, HeldRate, runge_kutta, runge_kutta_linearised
 from afm_rl.dynamics.residual import HeldHybrid, Network, draw_network, network_shapes
-from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import option, options
 
 
 class KNODE(PerMissionModel):
@@ -26,6 +27,9 @@ class KNODE(PerMissionModel):
     newest; places that are free hold zeros. Only the newest learns: gradients stop at the others.
     :meth:`push_` puts one in front, and the oldest leaves.
 
+    Along the axes of a quadrotor's body a lost mass or a weak motor stays put while the body turns:
+    what networks saw for a moment then holds for as long as a plan.
+
     Parameters are stacked, ``(*L, P, in, out)``. :meth:`expand_` gives every mission a pool of
     its own.
 
@@ -33,16 +37,6 @@ class KNODE(PerMissionModel):
         nominal: the known dynamics f; also says how far the model is trusted (``noise_scale``).
         rate: f as a function, ``rate(state, action) -> (*B, S)``; None for a
             :class:`~afm_rl.dynamics.Quadrotor`, whose equations are known.
-        dt: control tick (s); that of ``nominal`` if None.
-        units: hidden units of each network.
-        pool: number of networks, P.
-        features: indices of the state coordinates that the networks see; None for all, as
-            published, although positions do not matter to a flight.
-        substeps: Runge-Kutta steps per tick.
-        frame: ``"world"``, as published, or ``"body"``: the networks then give accelerations along
-            the axes of a quadrotor's body, in which a lost mass or a weak motor stays put while
-            the body turns: what they saw for a moment then holds for as long as a plan.
-        seed: seed of the networks that :meth:`push_` draws.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -56,17 +50,27 @@ class KNODE(PerMissionModel):
 
     shares: Tensor
 
+    @options("dynamics")
     def __init__(
         self,
         nominal: DynamicsModel,
         rate: Callable[[Tensor, Tensor], Tensor] | None = None,
-        dt: float | None = None,
-        units: int = 64,
-        pool: int = 3,
-        features: Sequence[int] | None = None,
-        substeps: int = 1,
-        frame: str = "world",
-        seed: int = 0,
+        dt: float | None = option(None, "control tick, s; None: that of the nominal model", gt=0),
+        units: int = option(64, "of each network", ge=1),
+        pool: int = option(
+            3, "networks at most, P; their weights are 1, 1/e, 1/e^2, the newest first", ge=1
+        ),
+        features: Sequence[int] | None = option(
+            None, "state coordinates that networks see; None: all, as published", ge=0
+        ),
+        substeps: int = option(1, "Runge-Kutta steps per control tick", ge=1),
+        frame: str = option(
+            "world",
+            "in which networks give accelerations: body, where a lost mass stays put; world, as "
+            "published",
+            choices=("world", "body"),
+        ),
+        seed: int = option(0, "of networks drawn by the model itself", ge=0),
     ) -> None:
         super().__init__(nominal.manifold, nominal.action_size)
         self.nominal = nominal
@@ -76,11 +80,8 @@ class KNODE(PerMissionModel):
             raise ConfigurationError(
                 f"dynamics.dt=None: {type(nominal).__name__} has no dt, give the control tick (s)"
             )
-        self.dt = check_number("dynamics.dt", given, low=0.0, open_low=True)
-        self.units = check_count("dynamics.units", units)
-        self.pool = check_count("dynamics.pool", pool)
-        self.substeps = check_count("dynamics.substeps", substeps)
-        self.turned = check_choice("dynamics.frame", frame, ("world", "body")) == "body"
+        self.dt, self.units, self.pool, self.substeps = given, units, pool, substeps
+        self.turned = frame == "body"
         if self.turned and not isinstance(nominal, Quadrotor):
             raise ConfigurationError(
                 f"dynamics.frame={frame!r}: expected 'world'; only a Quadrotor has a body to turn "
@@ -93,7 +94,7 @@ class KNODE(PerMissionModel):
             raise ConfigurationError(
                 f"dynamics.features={self.features}: expected distinct indices in 0..{size - 1}"
             )
-        self._generator = torch.Generator().manual_seed(check_count("dynamics.seed", seed, low=0))
+        self._generator = torch.Generator().manual_seed(seed)
         sizes = len(self.features) + self.action_size, self.units, size
         for name, shape in zip(Network._fields, network_shapes(*sizes), strict=True):
             self.register_parameter(name, nn.Parameter(torch.zeros(self.pool, *shape)))

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.dynamics.base import DynamicsModel, PerMissionModel
-from afm_rl.errors import ConfigurationError, check_flag, check_number
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import option, options
 from afm_rl.spaces.manifold import Manifold, wrap_angle
 
 
@@ -20,11 +21,6 @@ class KnownDynamics(DynamicsModel):
         step: ``step(state, action) -> next state``, batched and differentiable.
         manifold: state space.
         action_size: number of action components, A.
-        noise_std: standard deviation of the model's own error per step, one number or one
-            per coordinate, in the state's units: how far it is trusted, not the noise of a
-            simulator.
-        affine: whether the next state is affine in the action: effective actions then take one
-            round.
 
     >>> def push(state, action):  # a cart: position (m), speed (m/s); force (N)
     ...     return state + 0.1 * torch.cat([state[..., 1:], action], -1)
@@ -35,16 +31,19 @@ class KnownDynamics(DynamicsModel):
 
     noise: Tensor
 
+    @options("dynamics")
     def __init__(
         self,
         step: Callable[[Tensor, Tensor], Tensor],
         manifold: Manifold,
         action_size: int,
-        noise_std: float | Sequence[float] = 1e-3,
-        affine: bool = False,
+        noise_std: float | Sequence[float] = option(
+            1e-3, "how far the model is trusted per step, in units of the state", gt=0
+        ),
+        affine: bool = option(False, "the next state is affine in the action"),
     ) -> None:
         super().__init__(manifold, action_size)
-        self.affine = self.affine or check_flag("dynamics.affine", affine)
+        self.affine = self.affine or affine
         if not callable(step):
             raise ConfigurationError(f"dynamics.step={step!r}: expected a function")
         self.step = step
@@ -54,8 +53,7 @@ class KnownDynamics(DynamicsModel):
             raise ConfigurationError(
                 f"dynamics.noise_std={given}: expected one number, or {size} numbers"
             )
-        checked = [check_number("dynamics.noise_std", x, low=0.0, open_low=True) for x in given]
-        self.register_buffer("noise", torch.tensor(checked).expand(size).clone(), persistent=False)
+        self.register_buffer("noise", torch.tensor(given).expand(size).clone(), persistent=False)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the next state ``(*B, S)``.
@@ -146,8 +144,6 @@ class ParametricDynamics(KnownDynamics, PhysicsModel):
         manifold: state space.
         action_size: number of action components, A.
         physics: names of the parameters, with their nominal values.
-        noise_std: see :class:`KnownDynamics`.
-        affine: see :class:`KnownDynamics`.
 
     >>> def push(state, force, physics):  # a cart: position (m), speed (m/s); force (N)
     ...     return state + 0.1 * torch.cat([state[..., 1:], force / physics], -1)

@@ -18,7 +18,8 @@ from afm_rl.dynamics.mujoco_model import (
     space_of,
     state_names,
 )
-from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import option, options
 from afm_rl.regimes import Physics
 
 try:
@@ -113,10 +114,6 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
     Args:
         model: MJCF file or string, ``MjModel``, or environment of gymnasium or dm_control; copied,
             so that later changes of the environment's physics do not reach it.
-        frame_skip: simulation steps per action; None takes the environment's, or 1.
-        noise_std: standard deviation of the model's own error per step: one number; two, for
-            positions and activations, and for velocities; or one per tangent coordinate.
-        threads: that simulate beside the calling one; 0 for none.
         change: returns the model with other physics, of the nominal one and a row ``(P,)`` of
             :class:`~afm_rl.regimes.Physics`.
         physics: names of what may change about the body, with the values that change nothing;
@@ -140,23 +137,26 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
     stiff = True
     mix: Tensor | None
 
+    @options("dynamics")
     def __init__(
         self,
         model: Any,
-        frame_skip: int | None = None,
-        noise_std: float | Sequence[float] = (0.01, 0.1),
-        threads: int = 0,
+        frame_skip: int | None = option(
+            None, "simulation steps per action; None: the environment's, or 1", ge=1
+        ),
+        noise_std: float | Sequence[float] = option(
+            (0.01, 0.1), "how far the model is trusted per step, positions and velocities", gt=0
+        ),
+        threads: int = option(0, "that simulate beside the calling one", ge=0),
         change: Change = changed_model,
         physics: Mapping[str, float] = NOMINAL,
         mix: Sequence[Sequence[float]] | None = None,
     ) -> None:
         found, skip = read_model(model)
         found.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-        skip = skip if frame_skip is None else check_count("dynamics.frame_skip", frame_skip)
+        skip = skip if frame_skip is None else frame_skip
         nominal = tuple(physics.values())
-        simulator: Any = Simulator(
-            found, skip, check_count("dynamics.threads", threads, low=0), change, nominal
-        )
+        simulator: Any = Simulator(found, skip, threads, change, nominal)
         if not isinstance(noise_std, int | float) and len(noise_std) == 2:
             position, velocity = noise_std
             noise_std = [position] * found.nv + [velocity] * found.nv + [position] * found.na

@@ -14,7 +14,8 @@ from afm_rl.compiling.tracing import cached
 from afm_rl.dynamics.base import jacobian_of_linearised
 from afm_rl.dynamics.known import KnownDynamics
 from afm_rl.dynamics.rates import HeldRate, runge_kutta_linearised, runge_kutta_path
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import option, options
 from afm_rl.spaces.airframe import QuadrotorBody
 from afm_rl.spaces.manifold import RigidBodySpace
 
@@ -189,10 +190,6 @@ class Quadrotor(KnownDynamics):
 
     Args:
         body: the quadrotor, a Crazyflie if None.
-        dt: control tick (s).
-        substeps: Runge-Kutta steps per tick; one is accurate to 1e-6 in ordinary flight.
-        noise_std: standard deviation of the model's own error per tick, one number or one per
-            tangent coordinate (m, m/s, rad, rad/s, three of each).
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -207,16 +204,17 @@ class Quadrotor(KnownDynamics):
 
     extrapolates = True
 
+    @options("dynamics")
     def __init__(
         self,
         body: QuadrotorBody | None = None,
-        dt: float = 0.05,
-        substeps: int = 1,
-        noise_std: float | Sequence[float] = 1e-3,
+        dt: float = option(0.05, "control tick, s", gt=0),
+        substeps: int = option(1, "Runge-Kutta steps per tick, accurate to 1e-6 in flight", ge=1),
+        noise_std: float | Sequence[float] = option(
+            1e-3, "how far the model is trusted per tick, m, m/s, rad and rad/s", gt=0
+        ),
     ) -> None:
         body = check_body(body)
-        dt = check_number("dynamics.dt", dt, low=0.0, open_low=True)
-        check_count("dynamics.substeps", substeps)
         step = partial(quadrotor_step, dt=dt, substeps=substeps, body=body)
         super().__init__(step, RigidBodySpace(), 4, noise_std)
         self.body, self.dt, self.substeps = body, dt, substeps

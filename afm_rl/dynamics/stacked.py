@@ -9,7 +9,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.options import option, options
 
 SLOPE = 0.01  # of the LeakyReLU
 EPS = 1e-5  # of the layer norm: torch's own
@@ -87,8 +88,13 @@ def uniform_layer(
     return drawn[:, :fan_in].clone(), drawn[:, fan_in:].clone()
 
 
+@options("")
 def sparse_layer(
-    members: int, fan_in: int, fan_out: int, generator: torch.Generator, density: float = 0.1
+    members: int,
+    fan_in: int,
+    fan_out: int,
+    generator: torch.Generator,
+    density: float = option(0.1, "share of the weights that are not zero", gt=0, le=1),
 ) -> tuple[Tensor, Tensor]:
     r"""Draw weights ``(M, in, out)`` of which most are zero; biases ``(M, 1, out)`` are.
 
@@ -100,7 +106,6 @@ def sparse_layer(
     >>> (weight != 0).sum(1).unique(), bias.abs().sum()
     (tensor([5]), tensor(0.))
     """
-    check_number("density", density, low=0.0, high=1.0, open_low=True)
     keep = max(1, round(density * fan_in))
     weight = _uniform(members, fan_in, fan_out, fan_in, generator)
     rank = torch.rand(weight.shape, generator=generator).argsort(1).argsort(1)
@@ -126,9 +131,7 @@ class RunningStats(nn.Module):
     dimensions ``L`` are independent of each other.
 
     Args:
-        size: number of features, D.
         lead: leading dimensions, L.
-        min_std: least standard deviation, > 0, in the features' units.
 
     >>> stats = RunningStats(1)
     >>> for x in (1.0, 2.0, 6.0):
@@ -144,10 +147,15 @@ class RunningStats(nn.Module):
     count: Tensor
     """Number of samples, n ``(*L, 1)``."""
 
-    def __init__(self, size: int, lead: Sequence[int] = (), min_std: float = 1e-8) -> None:
+    @options("")
+    def __init__(
+        self,
+        size: int = option(..., "features, D", ge=1),
+        lead: Sequence[int] = (),
+        min_std: float = option(1e-8, "least standard deviation, in the features' units", gt=0),
+    ) -> None:
         super().__init__()
-        self.size = check_count("size", size)
-        self.min_std = check_number("min_std", min_std, low=0.0, open_low=True)
+        self.size, self.min_std = size, min_std
         for name, width in (("mean", size), ("scatter", size), ("count", 1)):
             self.register_buffer(name, torch.zeros(*lead, width))
 

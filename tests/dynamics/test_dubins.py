@@ -2,11 +2,9 @@
 
 import math
 
-import pytest
 import torch
 
 from afm_rl.dynamics import Dubins, dubins_step
-from afm_rl.errors import ConfigurationError
 
 
 def test_a_step_by_hand():
@@ -48,9 +46,3 @@ def test_it_learns_nothing_and_keeps_all_missions():
     model = Dubins()
     assert model.lead == () and model.expand_(4) is model and model.select_(torch.tensor([1]))
     assert list(model.parameters()) == [] and model.state_size == 3
-
-
-@pytest.mark.parametrize("settings", [{"dt": 0.0}, {"dt": -0.2}, {"noise_std": 0.0}], ids=str)
-def test_impossible_settings_are_refused(settings):
-    with pytest.raises(ConfigurationError, match=f"dynamics.{next(iter(settings))}"):
-        Dubins(**settings)

@@ -7,10 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from afm_rl.dynamics import Ensemble
 from afm_rl.dynamics import ensemble as module
-from afm_rl.errors import ConfigurationError
-from afm_rl.spaces.manifold import Manifold
 
 
 def member_by_member(model, state, action):
@@ -129,20 +126,3 @@ def test_initial_weights_follow_the_seed_and_the_bounds_of_linear_layers(make_en
     assert one.weights[1].abs().max() <= 0.25  # 1 / sqrt(16)
     assert one.weights[1].abs().max() > 0.24
     assert not torch.equal(one.weights[0][0], one.weights[0][1])  # members differ
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"features": [3]},
-        {"features": [-1]},
-        {"members": 0},
-        {"hidden": [16, 0]},
-        {"log_variance": (0.5, -10.0)},
-        {"propagation": "median"},
-    ],
-    ids=str,
-)
-def test_impossible_settings_are_refused(settings):
-    with pytest.raises(ConfigurationError, match=f"dynamics.{next(iter(settings))}"):
-        Ensemble(Manifold(3, angles=[2]), 2, **{"features": [2], **settings})

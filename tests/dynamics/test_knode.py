@@ -199,12 +199,6 @@ def test_a_shared_pool_stays_as_it_is():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"units": 0}, "dynamics.units=0"),
-        ({"pool": 0}, "dynamics.pool=0"),
-        ({"substeps": 0}, "dynamics.substeps=0"),
-        ({"dt": 0.0}, "dynamics.dt=0.0"),
-        ({"seed": -1}, "dynamics.seed=-1"),
-        ({"frame": "sun"}, "dynamics.frame='sun': expected one of world, body"),
         ({"features": [13]}, r"dynamics.features=\[13\]: expected distinct indices in 0..12"),
         ({"features": [1, 1]}, "expected distinct indices"),
     ],

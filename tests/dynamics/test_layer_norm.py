@@ -8,7 +8,6 @@ from torch import nn
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.stacked import SLOPE, sparse_layer
-from afm_rl.errors import ConfigurationError
 
 HIDDEN = [[16], [8, 8, 8]]
 
@@ -104,11 +103,3 @@ def test_each_unit_keeps_a_tenth_of_its_inputs(fan_in, kept):
     assert 0.95 * fan_in**-0.5 < weight.abs().max() <= fan_in**-0.5
     used = (weight != 0).double().mean((0, 2))  # every input by some units
     torch.testing.assert_close(used, torch.full_like(used, kept / fan_in), rtol=0.35, atol=0.01)
-
-
-@pytest.mark.parametrize("settings", [{"init": "dense"}, {"running_count": 1}], ids=str)
-def test_impossible_settings_are_refused(make_ensemble, settings):
-    with pytest.raises(ConfigurationError, match=f"dynamics.{next(iter(settings))}"):
-        make_ensemble(**settings)
-    with pytest.raises(ConfigurationError, match="density"):
-        sparse_layer(1, 2, 3, torch.Generator(), density=0.0)

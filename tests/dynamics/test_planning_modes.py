@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 
 from afm_rl.dynamics import ensemble as module
-from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
 
 TOLERANCE = 0.02  # standard deviations of the state change: two roundings to 8 bits per layer
@@ -144,9 +143,3 @@ def test_the_copies_are_made_once_per_change(fast, transitions):
         fast.weights[1].mul_(2.0)
         assert agree(fast, state, action)
     assert [one._version for one in cast] != versions  # the same memory
-
-
-@pytest.mark.parametrize("setting", [{"precision": "float16"}, {"propagation": "members"}], ids=str)
-def test_unknown_modes_are_refused(make_ensemble, setting):
-    with pytest.raises(ConfigurationError, match=f"dynamics.{next(iter(setting))}='"):
-        make_ensemble(**setting)

@@ -62,8 +62,6 @@ def test_impossible_bodies_are_refused(settings, message):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"dt": 0.0}, "dynamics.dt=0.0"),
-        ({"substeps": 0}, "dynamics.substeps=0"),
         ({"body": "crazyflie"}, "body='crazyflie': expected a QuadrotorBody"),
         ({"noise_std": [1.0] * 13}, "expected one number, or 12 numbers"),
     ],
