@@ -1,6 +1,6 @@
 """Online learners on the same stream of transitions: how soon they align, and what they forget.
 
-    python benchmarks/bench_learners.py [--seeds 20] [--learners rls rls_pe stream_x_pe online_pe]
+    python benchmarks/bench_learners.py [--seeds 20] [--learners rls stream_x_pe online_pe]
 
 Ground robots take smooth random actions, one robot per family of regimes and seed: 100 steps of
 nominal dynamics, 200 under its regime, 100 under one of another family, 200 of nominal dynamics
@@ -34,7 +34,6 @@ LEARNERS = {
     "rls": ["method=rls"],
     "rls_0.9": ["method=rls", "updater.forgetting=0.9"],
     "rls_0.995": ["method=rls", "updater.forgetting=0.995"],
-    "rls_pe": ["method=rls_pe"],
     "stream_x_pe": ["method=stream_x_pe"],
     "online_pe": ["method=online_pe"],
 }

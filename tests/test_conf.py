@@ -36,7 +36,6 @@ STILL += [
 ]
 PARTNERS = {  # what else must be chosen for a choice to make sense
     "dynamics=oracle": ["updater=oracle"],
-    "dynamics=oracle_pe": ["updater=oracle"],
     "dynamics=knode": ["robot=quadrotor"],
     "dynamics=knode_offline": ["robot=quadrotor"],
     "updater=oracle": ["dynamics=oracle"],
@@ -49,14 +48,12 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "updater=stream_x_unmatched": ["dynamics=pe_stream_x"],
     "updater=knode": ["dynamics=knode", "robot=quadrotor"],
     "updater=sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
-    "method=sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
     "method=afm_sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
     "planner=mpc": ["robot=quadrotor"],
     "planner=icem_lqr": STILL,
     "planner=policy": ["robot=gymnasium", f"planner.file={POLICY}"],
     "method=offline_knode": ["robot=quadrotor"],
     "method=online_knode": ["robot=quadrotor"],
-    "method=afm_offline_knode": ["robot=quadrotor"],
     "method=afm_online_knode": ["robot=quadrotor"],
     "cost=tracking": ["robot=quadrotor"],
     "cost=reward": ["robot=gymnasium"],

@@ -10,121 +10,93 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from afm_rl.dynamics import Calibrated
-from afm_rl.errors import ConfigurationError, check_choice, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_choice, check_number
 from afm_rl.learning.error_decomposition import ErrorParts, decompose_error
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
 from afm_rl.mission_state import MissionState
 
 
-class Rows(NamedTuple):
-    """The latest transitions of l missions, n simultaneous ones, of K rows each."""
-
-    features: Tensor
-    """What the deviation is linear in, phi ``(l, n K, R)``."""
-    deviation: Tensor
-    """How far the robot was from what the nominal model says, y ``(l, n K, G)``."""
-    weight: Tensor
-    """One over the variance of the noise of y, w ``(l, n K, G)``."""
-    valid: Tensor
-    """Which transitions count, ``(l, n)``."""
-    exciting: Tensor
-    """Which of them say anything about slopes, ``(l, n)``: nothing is forgotten for the others."""
-    prior: Tensor
-    """Information of the prior of a fit that begins here, ``(l, G, R)``."""
-
-
 class Fit(NamedTuple):
-    r"""G regressions :math:`y_g = \theta_g^\top \phi` for each of l missions.
-
-    >>> u, zero = torch.tensor([[[-1.0], [0.5], [2.0]]]).double(), torch.zeros(1, 3).bool()
-    >>> rows = Rows(u, 3 * u, torch.ones_like(u), ~zero, ~zero, torch.full((1, 1, 1), 1e-6))
-    >>> advance(nothing(1, 1, 1), rows, gate=1.0).solution()[0].round(decimals=3)
-    tensor([[[3.]]], dtype=torch.float64)
-    """
+    r"""G regressions :math:`y_g = \theta_g^\top \phi` of R numbers, for each of l missions."""
 
     information: Tensor
     """Sum of w phi phi' over the transitions that count, ``(l, G, R, R)``."""
     moment: Tensor
     """Sum of w phi y over them, ``(l, G, R)``."""
-    prior: Tensor
-    """Information of the prior, around zero, ``(l, G, R)``."""
     age: Tensor
-    """Number of transitions since the fit began, ``(l)``."""
-    level: Tensor
-    """Median innovation so far, at least 1: the level of the noise, ``(l)``."""
-    quiet: Tensor
-    """For how many transitions the nominal model has been as good as the fit, ``(l)``."""
-    active: Tensor
-    """Is there a fit? Otherwise the nominal model holds, ``(l)``."""
+    """Number of transitions since the fit began, ``(l)``; 0 where the nominal model holds."""
 
-    def solution(self) -> tuple[Tensor, Tensor]:
+    def solution(self, prior: Tensor) -> tuple[Tensor, Tensor]:
         r"""Return mean ``(l, G, R)`` and covariance ``(l, G, R, R)`` of theta.
 
         .. math:: \Sigma_g = (\textstyle\sum w \phi \phi^\top + P_g)^{-1},\qquad
                   \theta_g = \Sigma_g \textstyle\sum w \phi y_g
 
-        The prior P halves with each transition: it leads first and hardly pulls later.
+        with the information P of a prior around zero, ``(l, G, R)``.
         """
-        fading = (0.5**self.age).clamp_min(1e-4)[:, None, None]
-        precision = self.information + torch.diag_embed(self.prior * fading)
-        covariance = torch.linalg.inv_ex(precision).inverse
+        covariance = torch.linalg.inv_ex(self.information + torch.diag_embed(prior)).inverse
         return (covariance @ self.moment.unsqueeze(-1)).squeeze(-1), covariance
 
 
-def nothing(
+def no_fit(
     missions: int, regressions: int, features: int, device: torch.device | None = None
 ) -> Fit:
     """Return what is known at first, in double precision: the nominal model holds."""
     shape = missions, regressions, features, features
     matrix = torch.zeros(shape, device=device, dtype=torch.float64)
-    vector, count = matrix[..., 0], matrix.new_zeros(missions)
-    return Fit(matrix, vector, vector + 1, count, count + 1, count, count.bool())
+    return Fit(matrix, matrix[..., 0], matrix.new_zeros(missions))
 
 
 def advance(
-    fit: Fit, rows: Rows, forgetting: float = 0.97, gate: float = 5.0, patience: int = 10
+    fit: Fit,
+    features: Tensor,
+    y: Tensor,
+    weight: Tensor,
+    valid: Tensor,
+    prior: Tensor,
+    forgetting: float = 0.97,
+    gate: float = 5.0,
 ) -> Fit:
-    """Take in the latest transitions; nothing happens to missions without a valid one.
+    """Take in the latest transitions: n simultaneous ones of K rows each, for each mission.
 
-    * An innovation beyond the gate is a change: what was known is dropped, and a fit begins with
-      this transition, or none if the nominal model explains it. A fit of few transitions is not
-      judged yet.
-    * Innovations are measured by the noise that the fit has had so far, if that is more than the
-      model's: a robot of which no transition is as predicted is noisy, it does not change.
-    * A fit is also dropped once the nominal model has been as good for ``patience`` transitions.
+    An innovation beyond the gate is a change: what was known is dropped, and a fit begins with
+    this transition, or none if the nominal model explains it. A fit of few transitions is not
+    judged yet. Nothing happens to missions without a valid transition.
+
+    Args:
+        fit: what is known.
+        features: phi ``(l, n, K, R)``.
+        y: how far the robot was from what the nominal model says, ``(l, n, K, G)``.
+        weight: one over the variance of the noise of y, ``(l, n, K, G)``.
+        valid: which transitions count, ``(l, n)``.
+        prior: information of the prior, ``(l, G, R)``.
+        forgetting: weight of a transition relative to the next one.
+        gate: standard deviations.
+
+    >>> u, yes = torch.tensor([-1.0, 0.5, 2.0]).double().view(1, 3, 1, 1), torch.ones(1, 3).bool()
+    >>> prior = torch.full((1, 1, 1), 1e-6)
+    >>> fit = advance(no_fit(1, 1, 1), u, 3 * u, torch.ones_like(u), yes, prior, gate=1.0)
+    >>> fit.solution(prior)[0].round(decimals=3)
+    tensor([[[3.]]], dtype=torch.float64)
     """
-    theta, covariance = fit.solution()
-    features, y, weight, valid, exciting, prior = rows
-    variance = torch.einsum("lnr,lgrk,lnk->lng", features, covariance, features)
-    error = (y - features @ theta.mT).square() * weight / (1 + weight * variance)
-    innovation, nominal = _size(error, valid), _size(y.square() * weight, valid)
-    innovation = torch.where(fit.active, innovation, nominal)
-    shown, telling = valid.any(-1), (exciting & valid).any(-1)
-    explained = nominal <= gate
-    settled = fit.active & (fit.age > features.shape[-1] + 1)
-    changed = (innovation > gate * fit.level) & (settled | ~fit.active)
-    as_good = explained & (nominal <= 1.5 * innovation.clamp_min(1.0))
-    quiet = torch.where(fit.active & as_good, fit.quiet + telling, 0.0)
-    ended = fit.active & ((changed & explained) | (quiet >= patience))
-    active, fresh = (fit.active | changed) & ~ended, changed | ended
-    # A median that is followed: up by a fifth where it is exceeded, else down.
-    rise = torch.where(innovation > fit.level, 0.2, -0.2).exp()
-    level = torch.where(settled, (fit.level * rise).clamp_min(1.0), fit.level)
-    keep = torch.where(fresh, 0.0, torch.where(telling, forgetting, 1.0).to(y))
-    rows_of = y.shape[1] // valid.shape[1]
-    counts = (valid & active.unsqueeze(-1)).repeat_interleave(rows_of, 1).unsqueeze(-1)
-    weighted = (weight * counts).mT.unsqueeze(-1) * features.unsqueeze(1)
+    theta, covariance = fit.solution(prior)
+    variance = torch.einsum("lnkr,lgrs,lnks->lnkg", features, covariance, features)
+    error = (y - features @ theta.mT.unsqueeze(1)).square() * weight / (1 + weight * variance)
+    nominal, active = _typical(y.square() * weight, valid), fit.age > 0
+    innovation = torch.where(active, _typical(error, valid), nominal)
+    judged = ~active | (fit.age > features.shape[-1] + 1)
+    changed = judged & (innovation > gate)
+    active = torch.where(changed, nominal > gate, active)
+    keep = torch.where(changed, 0.0, forgetting).to(y)
+    counts = weight * (valid & active.unsqueeze(-1))[..., None, None]
     after = Fit(
-        information=_like(keep, fit.information) * fit.information
-        + weighted.mT @ features.unsqueeze(1),
-        moment=_like(keep, fit.moment) * fit.moment + (weighted * y.mT.unsqueeze(-1)).sum(-2),
-        prior=torch.where(_like(fresh, prior), prior, fit.prior),
-        age=torch.where(fresh, 0.0, fit.age) + active,
-        level=torch.where(ended, 1.0, level),
-        quiet=torch.where(fresh, 0.0, quiet),
-        active=active,
+        _like(keep, fit.information) * fit.information
+        + torch.einsum("lnkg,lnkr,lnks->lgrs", counts, features, features),
+        _like(keep, fit.moment) * fit.moment + torch.einsum("lnkg,lnkr->lgr", counts * y, features),
+        torch.where(changed, 0.0, fit.age) + active,
     )
+    shown = valid.any(-1)
     return Fit(
         *(torch.where(_like(shown, new), new, old) for new, old in zip(after, fit, strict=True))
     )
@@ -135,13 +107,10 @@ def _like(missions: Tensor, part: Tensor) -> Tensor:
     return missions.reshape(-1, *(1,) * (part.dim() - 1))
 
 
-def _size(squares: Tensor, valid: Tensor) -> Tensor:
+def _typical(squares: Tensor, valid: Tensor) -> Tensor:
     """Return the largest error of each transition, of these the median ``(l)``; 0 for none."""
-    largest = squares.flatten(1).unflatten(1, (valid.shape[1], -1)).amax(-1).sqrt()
+    largest = squares.amax((-2, -1)).sqrt()
     return torch.where(valid, largest, torch.nan).nanmedian(-1).values.nan_to_num(0.0)
-
-
-PARTS = ("all", "matched", "unmatched")
 
 
 class RLSUpdater(Learner):
@@ -152,13 +121,11 @@ class RLSUpdater(Learner):
     executed action in half ranges,
 
     * *matched*: :math:`v = D u + b`, a regression per action axis. The prior is wide for gains
-      and narrow for coupling and bias, so that two transitions are enough for a change of gains,
-      and fades;
+      and narrower for coupling and bias, so that two transitions are enough for a change of gains;
     * *unmatched*: the rest is c seen through the projection onto what no action reaches.
 
-    An innovation beyond the gate is a change: the fit starts anew with it. Once the nominal model
-    explains everything again the calibration is the identity, exactly
-    (:func:`~afm_rl.learning.rls_updater.advance`).
+    An innovation beyond the gate is a change: the fit starts anew with it (resetting of the
+    covariance), or, where the nominal model explains it, the calibration is the identity, exactly.
 
     Missions learn from their own transitions, in one batch; with one calibration for all,
     simultaneous transitions count together. Transitions with a faulty or stale reading are
@@ -171,11 +138,8 @@ class RLSUpdater(Learner):
             undoes what actions can undo, choose ``"unmatched"``: otherwise both correct the same.
         forgetting: weight of a transition relative to the next one, in (0, 1].
         gate: normalised innovation beyond which a transition is a change.
-        patience: transitions for which the nominal model is as good before a fit is dropped.
-        spread: standard deviation of the prior of gains.
-        coupling: that of coupling, and of the bias in half ranges.
-        offset: that of c, in standard deviations of the model.
-        still: half ranges; smaller actions say nothing about slopes, and nothing is forgotten.
+        spread: standard deviation of the prior: of gains, ten times that of coupling and bias (in
+            half ranges); of c, in standard deviations of the model.
         mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
 
     Raises:
@@ -202,31 +166,22 @@ class RLSUpdater(Learner):
         part: str = "all",
         forgetting: float = 0.97,
         gate: float = 5.0,
-        patience: int = 10,
-        spread: float = 1.0,
-        coupling: float = 0.1,
-        offset: float = 100.0,
-        still: float = 0.05,
+        spread: float = 100.0,
         mask_key: NestedKey | None = None,
     ) -> None:
         super().__init__(loss, mask_key)
         if not isinstance(loss.model, Calibrated):
             raise ConfigurationError(
                 f"updater: RLSUpdater teaches a Calibrated model, got {type(loss.model).__name__}; "
-                "choose dynamics=calibrated or dynamics=calibrated_pe"
+                "choose dynamics=calibrated"
             )
-        self.part = check_choice("updater.part", part, PARTS)
+        self.part = check_choice("updater.part", part, ("all", "matched", "unmatched"))
         self.forgetting = check_number(
             "updater.forgetting", forgetting, low=0.0, high=1.0, open_low=True
         )
         self.gate = check_number("updater.gate", gate, low=0.0, open_low=True)
-        self.patience = check_count("updater.patience", patience)
-        self.spread, self.coupling, self.offset = (
-            check_number(f"updater.{name}", value, low=0.0, open_low=True)
-            for name, value in (("spread", spread), ("coupling", coupling), ("offset", offset))
-        )
-        self.still = check_number("updater.still", still, low=0.0)
-        self.matched, self.unmatched = (MissionState(nothing(0, 1, 1)) for _ in range(2))
+        self.spread = check_number("updater.spread", spread, low=0.0, open_low=True)
+        self.matched, self.unmatched = (MissionState(no_fit(0, 1, 1)) for _ in range(2))
 
     @property
     def model(self) -> Calibrated:
@@ -238,8 +193,8 @@ class RLSUpdater(Learner):
         super().start(tensordict)
         missions, device = math.prod(self.model.lead), self.model.bias.device
         size = self.model.action_size
-        self.matched.keep(nothing(missions, size, size + 1, device))
-        self.unmatched.keep(nothing(missions, 1, self.model.manifold.tangent_size, device))
+        self.matched.keep(no_fit(missions, size, size + 1, device))
+        self.unmatched.keep(no_fit(missions, 1, self.model.manifold.tangent_size, device))
 
     def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Learn from transitions ``(*L, *N)``, where ``learn`` says so."""
@@ -259,45 +214,39 @@ class RLSUpdater(Learner):
         parts = ErrorParts(*(flat(part) for part in apart))
         for part in parts:
             valid = valid & part.flatten(2).isfinite().all(-1)
-        parts = ErrorParts(*(torch.where(_wide(valid, part), part, 1.0) for part in parts))
+        blank = (valid.reshape(*valid.shape, *(1,) * (part.dim() - 2)) for part in parts)
+        parts = ErrorParts(
+            *(torch.where(here, part, 1.0) for here, part in zip(blank, parts, strict=True))
+        )
         calibration: dict[str, Tensor] = {}
         if self.part != "unmatched":
-            unit = torch.where(valid.unsqueeze(-1), flat(action / model.half_range), 0.0)
-            theta = self._advance(self.matched, self._matched(unit, parts, valid))
+            theta = self._fit_matched(flat(action / model.half_range), parts, valid)
             linear, calibration["bias"] = theta[..., :-1], theta[..., -1]
             calibration["matrix"] = linear + torch.eye(model.action_size).to(linear)
         if self.part != "matched":
-            theta = self._advance(self.unmatched, self._unmatched(flat(offset), parts, valid))
-            calibration["offset"] = theta.squeeze(1)
+            calibration["offset"] = self._fit_unmatched(flat(offset), parts, valid).squeeze(1)
         model.calibrate_(
             **{name: part.reshape((*lead, *part.shape[1:])) for name, part in calibration.items()}
         )
 
-    def _advance(self, state: MissionState, rows: Rows) -> Tensor:
-        """Take in the latest transitions; return what they say, 0 where the nominal model holds."""
-        fit = advance(state.parts, rows, self.forgetting, self.gate, self.patience)
-        state.keep(fit)
-        return torch.where(fit.active[:, None, None], fit.solution()[0], 0.0)
-
-    def _matched(self, unit: Tensor, parts: ErrorParts, valid: Tensor) -> Rows:
-        """Return the regressions of v - u on u and 1."""
+    def _fit_matched(self, unit: Tensor, parts: ErrorParts, valid: Tensor) -> Tensor:
+        """Return the regressions of v - u on u and 1, ``(l, A, A + 1)``."""
+        unit = torch.where(valid.unsqueeze(-1), unit, 0.0)
         size = unit.shape[-1]
-        widths = unit.new_full((size, size + 1), self.coupling)
-        widths[:, :size] *= self.spread
-        widths[:, :size].fill_diagonal_(self.spread)
-        prior = widths.square().reciprocal().expand(len(unit), -1, -1)
         features = torch.cat([unit, torch.ones_like(unit[..., :1])], -1)
-        exciting = (unit.abs() > self.still).any(-1)
-        return Rows(features, parts.effective - unit, parts.weight, valid, exciting, prior)
+        prior = self.spread**-2 * (100.0 - 99.0 * torch.eye(size, size + 1)).to(unit)
+        rows = (part.unsqueeze(-2) for part in (features, parts.effective - unit, parts.weight))
+        return self._advance(self.matched, *rows, valid, prior.expand(len(unit), -1, -1))
 
-    def _unmatched(self, offset: Tensor, parts: ErrorParts, valid: Tensor) -> Rows:
-        """Return the regression of the rest on what shows of c, both in standard deviations."""
+    def _fit_unmatched(self, offset: Tensor, parts: ErrorParts, valid: Tensor) -> Tensor:
+        """Return the regression of the rest on what shows of c, ``(l, 1, D)``."""
         across = parts.projection / parts.noise.unsqueeze(-2)
-        total = parts.unmatched + (across @ offset.unsqueeze(-1)).squeeze(-1)
-        y = total.flatten(1).unsqueeze(-1)
-        prior = (self.offset * parts.noise.mean(1, keepdim=True)).square().reciprocal()
-        return Rows(across.flatten(1, 2), y, torch.ones_like(y), valid, valid, prior)
+        y = (parts.unmatched + (across @ offset.unsqueeze(-1)).squeeze(-1)).unsqueeze(-1)
+        prior = (self.spread * parts.noise.mean(1, keepdim=True)).square().reciprocal()
+        return self._advance(self.unmatched, across, y, torch.ones_like(y), valid, prior)
 
-
-def _wide(valid: Tensor, like: Tensor) -> Tensor:
-    return valid.reshape(*valid.shape, *(1,) * (like.dim() - 2))
+    def _advance(self, state: MissionState, *rows: Tensor) -> Tensor:
+        """Take in the latest transitions; return what they say, 0 where the nominal model holds."""
+        fit = advance(state.parts, *rows, self.forgetting, self.gate)
+        state.keep(fit)
+        return torch.where(fit.age[:, None, None] > 0, fit.solution(rows[-1])[0], 0.0)

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from afm_rl.dynamics import Calibrated, Dubins
 from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, RLSUpdater
-from afm_rl.learning.rls_updater import Rows, advance, nothing
+from afm_rl.learning.rls_updater import advance, no_fit
 
 HALF = torch.tensor([1.0, 1.5], dtype=torch.float64)
 EYE = torch.eye(2, dtype=torch.float64)
@@ -91,20 +91,19 @@ def test_regimes_are_learnt_and_left_again(regime, steps):
 
 def test_the_recursion_is_weighted_least_squares():
     draw = torch.Generator().manual_seed(0)
-    features, y = (torch.randn(5, 9, n, generator=draw).double() for n in (3, 2))
-    weight = torch.rand(5, 9, 2, generator=draw).double() + 1e3
+    features, y = (torch.randn(5, 9, 1, n, generator=draw).double() for n in (3, 2))
+    weight = torch.rand(5, 9, 1, 2, generator=draw).double() + 1e3
     yes, prior = torch.ones(5, 1).bool(), torch.rand(5, 2, 3, generator=draw).double()
-    fit = nothing(5, 2, 3)
+    fit = no_fit(5, 2, 3)
     for row in zip(*(part.split(1, 1) for part in (features, y, weight)), strict=True):
-        fit = advance(fit, Rows(*row, yes, yes, prior), forgetting=0.9, gate=1e-3)
-        fit = fit._replace(level=fit.level + 1e9)  # a change only at first
-    theta, covariance = fit.solution()
-    root = (weight * (0.9 ** torch.arange(8, -1, -1)).unsqueeze(-1)).sqrt()
+        gate = 1e9 if bool(fit.age.all()) else 1e-3  # a change only at first
+        fit = advance(fit, *row, yes, prior, forgetting=0.9, gate=gate)
+    theta, covariance = fit.solution(prior)
+    root = (weight.squeeze(2) * (0.9 ** torch.arange(8, -1, -1)).unsqueeze(-1)).sqrt()
     for g in range(2):
-        tall = torch.cat(
-            [root[..., g, None] * features, torch.diag_embed((prior[:, g] / 512).sqrt())], 1
-        )
-        wide = torch.cat([root[..., g] * y[..., g], torch.zeros(5, 3)], 1).unsqueeze(-1)
+        rows = root[..., g, None] * features.squeeze(2)
+        tall = torch.cat([rows, torch.diag_embed(prior[:, g].sqrt())], 1)
+        wide = torch.cat([root[..., g] * y[..., 0, g], torch.zeros(5, 3)], 1).unsqueeze(-1)
         expected = torch.linalg.lstsq(tall, wide).solution.squeeze(-1)
         torch.testing.assert_close(theta[:, g], expected)
         torch.testing.assert_close(
@@ -121,15 +120,6 @@ def test_an_outlier_does_harm_for_a_few_steps(regime):
     assert world.recovered(21) <= 20
 
 
-def test_it_goes_home_once_the_nominal_model_is_as_good():
-    world = World()
-    for step in range(40):  # gains that come back slowly: no surprise tells
-        share = min(1.0, step / 30)
-        world.drive(1, matrix=torch.lerp(GAINS.abs(), EYE, share))
-    world.drive(30)
-    assert world.plain
-
-
 def test_what_no_action_explains_becomes_the_offset():
     wind = torch.tensor([0.03, -0.05, 0.0], dtype=torch.float64)
     for part in ("unmatched", "all"):
@@ -139,7 +129,7 @@ def test_what_no_action_explains_becomes_the_offset():
         torch.testing.assert_close(world.model.offset, wind.expand(3, 3), atol=1e-4, rtol=0)
         assert world.errors[-1].max() < 1e-3
         world.drive(20)
-        assert world.plain
+        assert not world.model.offset.any() and world.errors[-1].max() < 1e-3
     world = World(part="matched")
     world.drive(30, wind=wind)
     assert not world.model.offset.any()
@@ -248,11 +238,7 @@ def test_what_was_learnt_keeps_its_digits():
         ({"part": "some"}, "updater.part='some'"),
         ({"forgetting": 0.0}, "updater.forgetting=0.0"),
         ({"gate": 0.0}, "updater.gate=0.0"),
-        ({"patience": 0}, "updater.patience=0"),
         ({"spread": 0.0}, "updater.spread=0.0"),
-        ({"coupling": -1.0}, "updater.coupling=-1.0"),
-        ({"offset": 0.0}, "updater.offset=0.0"),
-        ({"still": -0.1}, "updater.still=-0.1"),
     ],
     ids=str,
 )

@@ -17,8 +17,9 @@ def test_nothing_changes_where_nothing_changed(make_agent, ring):
     same(*(run(make_agent(f"method={name}", **settings)) for name in ("rls", "physics")))
 
 
-@pytest.mark.parametrize("method", ["rls_pe", "oracle_pe"])
+@pytest.mark.parametrize("method", ["rls", "oracle"])
 def test_an_ensemble_is_trained_once_whatever_is_in_front_of_it(configure, method):
-    cfg = [configure(f"method={name}") for name in (method, "frozen_pe")]
+    parts = [f"method={method}", "dynamics@dynamics.base=pe"], ["method=frozen_pe"]
+    cfg = [configure(*chosen) for chosen in parts]
     one, other = ([(t.title, t.settings) for t in build(c).trainings] for c in cfg)
     assert one == other and len(one) == 1

@@ -108,9 +108,8 @@ def test_seconds_are_shared_out_among_the_missions(drive, ring):
     assert seconds.nunique() == 1 and 0 < seconds.sum() < 60
 
 
-OTHERS = {"sysid", "afm_sysid"}  # need MuJoCo, and all with a KNODE a quadrotor
 METHODS = sorted(path.stem for path in Path(afm_rl.conf.__file__).parent.glob("method/*.yaml"))
-METHODS = [name for name in METHODS if name not in OTHERS and "knode" not in name]
+METHODS = [name for name in METHODS if "sysid" not in name and "knode" not in name]
 
 
 @pytest.mark.parametrize(
