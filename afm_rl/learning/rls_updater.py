@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, cast
 
 import torch
@@ -235,18 +236,21 @@ class RLSUpdater(Learner):
         size = unit.shape[-1]
         features = torch.cat([unit, torch.ones_like(unit[..., :1])], -1)
         prior = self.spread**-2 * (100.0 - 99.0 * torch.eye(size, size + 1)).to(unit)
-        rows = (part.unsqueeze(-2) for part in (features, parts.effective - unit, parts.weight))
-        return self._advance(self.matched, *rows, valid, prior.expand(len(unit), -1, -1))
+        rows = [part.unsqueeze(-2) for part in (features, parts.effective - unit, parts.weight)]
+        return self._advance(self.matched, rows, valid, prior.expand(len(unit), -1, -1))
 
     def _fit_unmatched(self, offset: Tensor, parts: ErrorParts, valid: Tensor) -> Tensor:
         """Return the regression of the rest on what shows of c, ``(l, 1, D)``."""
         across = parts.projection / parts.noise.unsqueeze(-2)
         y = (parts.unmatched + (across @ offset.unsqueeze(-1)).squeeze(-1)).unsqueeze(-1)
         prior = (self.spread * parts.noise.mean(1, keepdim=True)).square().reciprocal()
-        return self._advance(self.unmatched, across, y, torch.ones_like(y), valid, prior)
+        return self._advance(self.unmatched, [across, y, torch.ones_like(y)], valid, prior)
 
-    def _advance(self, state: MissionState, *rows: Tensor) -> Tensor:
+    def _advance(
+        self, state: MissionState, rows: Sequence[Tensor], valid: Tensor, prior: Tensor
+    ) -> Tensor:
         """Take in the latest transitions; return what they say, 0 where the nominal model holds."""
-        fit = advance(state.parts, *rows, self.forgetting, self.gate)
+        features, y, weight = rows
+        fit = advance(state.parts, features, y, weight, valid, prior, self.forgetting, self.gate)
         state.keep(fit)
-        return torch.where(fit.age[:, None, None] > 0, fit.solution(rows[-1])[0], 0.0)
+        return torch.where(fit.age[:, None, None] > 0, fit.solution(prior)[0], 0.0)
