@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from afm_rl.report.runs import cell_names
+from afm_rl.report.runs import scenario_names
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "paper" / "published_tables.py"
 STEPS = [100, 200, 4999]
@@ -28,7 +28,7 @@ def ours(paper):
     every = every[["method", "track", "v_gain", "omega_gain", "seed"]]
     missions = every.assign(success_rate=[0.5, 0.75, 1.0] * 88, steps=STEPS * 88)
     missions.loc[missions["method"] == "online_pe", "steps"] -= [30, 0, 0] * 22
-    return missions.assign(cell=cell_names(missions), finished=missions["steps"] < 4999)
+    return missions.assign(scenario=scenario_names(missions), finished=missions["steps"] < 4999)
 
 
 def test_the_published_figures_are_those_of_the_paper(paper):
@@ -85,7 +85,9 @@ def test_the_quadrotor_s_table(paper):
         for seed in range(2)
     ]
     flights = pd.DataFrame(rows)
-    table = paper["flights_table"](flights.assign(cell=flights["track"])).shown.set_index("method")
+    table = paper["flights_table"](flights.assign(scenario=flights["track"])).shown.set_index(
+        "method"
+    )
     assert table.loc["afm_online_knode, ours", "mean change (%)"] == "-10.0"
     assert table.loc["online_knode, Jiahao et al.", "0.8 m/s"] == "0.0660"
     assert table.loc["physics, ours", "1.7 m/s"] == "0.20400"
@@ -96,7 +98,7 @@ def test_tables_replace_those_of_a_page(paper, ours):
     page = "a\n<!-- tables begin -->\nold\n<!-- tables end -->\nz\n"
     found = paper["tables"](ours)
     new = paper["with_tables"](page, "tables", found)
-    assert new.startswith("a\n<!-- tables begin -->\n\n**All cells") and "old" not in new
+    assert new.startswith("a\n<!-- tables begin -->\n\n**All scenarios") and "old" not in new
     assert new.endswith("<!-- tables end -->\nz\n")
     assert paper["with_tables"](new, "tables", found) == new
     assert new.count("\n| --- |") == 5

@@ -20,8 +20,8 @@ Join the results of runs, sweeps and studies; write tables (CSV, LaTeX), figures
 
 A folder is what `afm-rl` has written: missions.csv and measures.json, and steps.parquet for curves,
 maps and recovery times. A study may still be running: the report takes what is finished, and says
-which methods, cells and seeds are missing (missing.csv). Where a job's folder was deleted, it says
-so and ends with status 2. Of a mission that stands in several folders, the last one counts.
+which methods, scenarios and seeds are missing (missing.csv). Where a job's folder was deleted, it
+says so and ends with status 2. Of a mission that stands in several folders, the last one counts.
 """
 
 

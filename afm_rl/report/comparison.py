@@ -14,23 +14,6 @@ from afm_rl.report import style
 from afm_rl.report.statistics import count_budgets, resampled_bounds, split, summarise
 from afm_rl.storage.measures import Measure, Measures
 
-CAPTION = (
-    "Large markers are means over all missions of a method, small dots single missions. Lines are "
-    "95 % intervals of the stratified bootstrap, seeds drawn anew within cells; a mean without one "
-    "has no spread."
-)
-PROFILE_CAPTION = (
-    "Performance profile: the share of a method's missions that were finished within tau times the "
-    "fewest {name} that any method (the oracle included) needed for the same cell and seed. Where "
-    "a line starts (tau = 1) says how often the method was best; how high it ends, how often it "
-    "finished. Missions that no method finished count as not solved."
-)
-PROGRESS_CAPTION = (
-    "Share of what there is to reach ({name}) by a step, mean over all missions of a method; after "
-    "its end a mission keeps its share. Higher and further left is better. Bands: 95 % intervals, "
-    "seeds drawn anew within cells (none where all cells have one seed)."
-)
-
 
 def draw_comparison(missions: pd.DataFrame, measures: Measures, panels: int = 3) -> Figure:
     """Return a figure of the means of each method, one panel for each of the first measures.
@@ -85,15 +68,15 @@ def _limits(measure: Measure, values: pd.Series) -> tuple[float, float]:
 
 
 def ratios(missions: pd.DataFrame, spent: Measure) -> pd.Series:
-    """Return what each mission spent over the least of its cell and seed; inf if not finished.
+    """Return what each mission spent over the least of its scenario and seed; inf if not finished.
 
     >>> steps = Measure("steps", "steps", "steps", budget=True)
-    >>> rows = {"cell": "a", "seed": 0, "steps": [199, 99, 99], "finished": [True, True, False]}
+    >>> rows = {"scenario": "a", "seed": 0, "steps": [199, 99, 99], "finished": [True, True, False]}
     >>> ratios(pd.DataFrame(rows), steps).tolist()
     [2.0, 1.0, inf]
     """
     made = (missions[spent.column] + 1.0).where(missions["finished"].astype(bool), np.inf)
-    fewest = made.groupby([missions["cell"], missions["seed"]]).transform("min")
+    fewest = made.groupby([missions["scenario"], missions["seed"]]).transform("min")
     return (made / fewest).fillna(np.inf)
 
 
@@ -139,7 +122,7 @@ def draw_progress(
     figure = _draw(grid, means, counts, styles, {"gid": "progress"})
     (axes,) = figure.axes
     for method, look in styles.items():
-        samples = split(own[method].to_numpy(), own[method].index.get_level_values("cell"))
+        samples = split(own[method].to_numpy(), own[method].index.get_level_values("scenario"))
         low, high = resampled_bounds(samples, mean, resamples)
         band: style.Look = {"color": look.color, "alpha": 0.15, "linewidth": 0}
         axes.fill_between(grid, 100 * low, 100 * high, **band)

@@ -18,29 +18,12 @@ from afm_rl.diagnosis.replay import Table as Replayed
 from afm_rl.diagnosis.replay.table import AFM, ALONE, SHARES
 from afm_rl.report import style
 from afm_rl.report.figures import Picture
-from afm_rl.report.tables import Table, grid_of, terminal
+from afm_rl.report.tables import Table, grid_of, interval_text, terminal
 from afm_rl.report.write import render_page
 from afm_rl.storage.files import csv_text, write_whole
 
 LOOKS = {"healthy": "green", "changed": "bold red", "dead": "bold red", "cannot tell": "yellow"}
 LOOKS |= {"not measured": "yellow", "not actuated": "yellow"}
-CAPTION = (
-    "Left: an excerpt of command, response and fit. Middle: response against command; the line is "
-    "a healthy actuator. Right: what the fit leaves, over the whole log."
-)
-NOTE = (
-    "95 % intervals in brackets. Gain: response per command. Offset, noise: in units of the "
-    "response. Dead zone, saturation, backlash, rate: in units of the command."
-)
-ERRORS_NOTE = (
-    "Absolute error of what each row was predicted to do, from its command and earlier rows only: "
-    "median and 90th percentile with 95 % intervals, in units of the response."
-)
-ERRORS_CAPTION = (
-    "Running median of the absolute error over {rows} rows: as commanded, the plain method with "
-    "the least median error, and AFM."
-)
-KEPT = ("actuator", "status", "gain", "offset", "delay (s)", "noise", "unexplained (%)")
 
 
 def print_diagnosis(diagnosis: Diagnosis, file: IO[str] | None = None) -> None:
@@ -57,7 +40,8 @@ def print_diagnosis(diagnosis: Diagnosis, file: IO[str] | None = None) -> None:
     wrist: healthy
     """
     console, shown = terminal(file), _table(diagnosis)
-    shown = shown.loc[:, [name for name in shown if name in KEPT or (shown[name] != "-").any()]]
+    always = ("actuator", "status", "gain", "offset", "delay (s)", "noise", "unexplained (%)")
+    shown = shown.loc[:, [name for name in shown if name in always or (shown[name] != "-").any()]]
     looks = [LOOKS[actuator.status] for actuator in diagnosis.actuators]
     console.print(grid_of(shown, lambda row, column: looks[row] if column < 2 else ""))
     for note in diagnosis.notes:
@@ -129,16 +113,19 @@ def write_diagnosis(
 
 def _page(diagnosis: Diagnosis, log: Log, source: str, replayed: Replayed | None) -> str:
     shown = _table(diagnosis)
-    tables = [Table("actuators", "All actuators", NOTE, shown, shown)]
-    figures = [
-        Picture(
-            str(place),
-            actuator.sentence,
-            CAPTION,
-            style.png_bytes(draw_actuator(diagnosis, log, place)),
-        )
-        for place, actuator in enumerate(diagnosis.actuators)
-    ]
+    note = (
+        "95 % intervals in brackets. Gain: response per command. Offset, noise: in units of the "
+        "response. Dead zone, saturation, backlash, rate: in units of the command."
+    )
+    tables = [Table("actuators", "All actuators", note, shown, shown)]
+    caption = (
+        "Left: an excerpt of command, response and fit. Middle: response against command; the line "
+        "is a healthy actuator. Right: what the fit leaves, over the whole log."
+    )
+    figures = []
+    for place, actuator in enumerate(diagnosis.actuators):
+        png = style.png_bytes(draw_actuator(diagnosis, log, place))
+        figures.append(Picture(str(place), actuator.sentence, caption, png))
     summary = (
         f"{diagnosis.rows} rows of {len(diagnosis.actuators)} actuators, a row every "
         f"{diagnosis.step_s:.4g} s, from {source}."
@@ -234,15 +221,18 @@ def errors_table(replayed: Replayed, stretches: bool = True) -> Table:
             row["error"] = kind
             row |= {p["predictor"]: _error_text(p, kind) for _, p in part.iterrows()}
             rows.append(row)
-    return Table("errors", "Error of predictions", ERRORS_NOTE, errors, pd.DataFrame(rows))
+    note = (
+        "Absolute error of what each row was predicted to do, from its command and earlier rows "
+        "only: median and 90th percentile with 95 % intervals, in units of the response."
+    )
+    return Table("errors", "Error of predictions", note, errors, pd.DataFrame(rows))
 
 
 def _error_text(row: pd.Series, kind: str) -> str:
     """Return an error with its interval, with two digits that count."""
     largest = row[f"{kind}_high"]
     digits = min(max(1 - int(np.floor(np.log10(largest))), 0), 9) if largest > 0 else 2
-    middle, low, high = (f"{row[kind + end]:.{digits}f}" for end in ("", "_low", "_high"))
-    return f"{middle} [{low}, {high}]"
+    return interval_text(row, kind, digits)
 
 
 def write_replay(replayed: Replayed, out: Path) -> Path:
@@ -276,7 +266,10 @@ def draw_replay(replayed: Replayed, most: int = 6, points: int = 300) -> tuple[F
         style.dress(axes, lines="both")
     axes.set_xlabel("t (s)", fontsize=style.SMALL)
     style.legend_above(figure, *axes.get_legend_handles_labels())
-    return figure, ERRORS_CAPTION.format(rows=window)
+    return figure, (
+        f"Running median of the absolute error over {window} rows: as commanded, the plain method "
+        "with the least median error, and AFM."
+    )
 
 
 def _running(values: np.ndarray, rows: np.ndarray, window: int) -> list[float]:

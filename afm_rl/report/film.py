@@ -75,20 +75,20 @@ def write_films(
         write_whole(written[-1], ENCODERS[form](pictures))
         echo(f"wrote {written[-1]}")
 
-    cell = first["cell"].iloc[0]
-    beside = first[first["cell"] == cell][:FEW]
+    scenario = first["scenario"].iloc[0]
+    beside = first[first["scenario"] == scenario][:FEW]
     if draw is None and len(beside) > 1 and not space:
         end = last_step(beside)
         parts = {m.method: _checked(rows, m.mission, steps) for m in beside.itertuples()}
         parts = {name: own[own["t"] <= end] for name, own in parts.items()}
-        scene = map_scene(cell, parts, roads.get(beside["track"].iloc[0]))
+        scene = map_scene(scenario, parts, roads.get(beside["track"].iloc[0]))
         write(together, frames(scene, shown(max(map(len, parts.values())))))
     for mission, name in zip(first.itertuples(), names, strict=True):
         if draw is not None:
             own = rows[mission.mission]
             write(name, draw(own.iloc[shown(len(own))]))
             continue
-        own, title = _checked(rows, mission.mission, steps), f"{mission.method}: {mission.cell}"
+        own, title = _checked(rows, mission.mission, steps), f"{mission.method}: {mission.scenario}"
         road = roads.get(mission.track)
         scene = space_scene(title, own) if space else map_scene(title, {mission.method: own}, road)
         write(name, frames(scene, shown(len(own))))

@@ -23,39 +23,18 @@ QUANTITIES = {
     "error": "model's error{units}",
     "loss": "model's loss\n(NLL)",
 }
-CAPTION = (
-    "One column per cell, one seed. Top: how far the robot was after each step from where the plan "
-    "wanted it. Low soon after a change: plans come true again. Second: how far from where model "
-    "and correction together predicted it; where a plan cannot be achieved under the changed "
-    "regime, this one is low and the first is not. Third: how far from what the model alone "
-    "predicts of the executed action; a frozen model under a correction never improves here. Last: "
-    "the model's loss; losses of different kinds of model do not compare. Triangles mark where "
-    "each method's changed regime starts and ends: the sooner they come, the faster the method "
-    "was."
-)
 STAY = 20  # steps that the error must stay low
 MEASURES = {"miss": "motion", "unforeseen": "agent", "error": "model"}  # columns: of what
-NOTE = (
-    "Steps from a change of the regime until the one-step error is back under the nominal level "
-    f"for the first time, and until it stays there for {STAY} steps. The nominal level of a "
-    "mission is 1.5 times the 95th percentile of its errors before the first change, at least "
-    "0.0001. Medians are over all changes, those never recovered from included as ∞; "
-    f"changes with fewer than {STAY} steps to the next one or to the end are left "
-    "out. Three errors: that of the motion, against the plan; "
-    "that of the agent, against the prediction of model and correction together; and that of the "
-    "model alone, against what it predicts of the action that was executed. A method that corrects "
-    "actions over a frozen model recovers in the first two, and its model never does."
-)
 
 
 def draw_learning(
-    missions: pd.DataFrame, steps: pd.DataFrame, units: str = "", cells: int = 4
+    missions: pd.DataFrame, steps: pd.DataFrame, units: str = "", scenarios: int = 4
 ) -> Figure:
     """Return a figure of what came true of plans and predictions against the step.
 
     Rows: the distance from the plan, from the prediction, the model's error and its loss, as far
-    as the steps have them. One column per cell, first seed and six methods only; the footnote says
-    what is left out. Triangles mark where each method's changed regime starts and ends. Where
+    as the steps have them. One column per scenario, first seed and six methods only; the footnote
+    says what is left out. Triangles mark where each method's changed regime starts and ends. Where
     some missions finish, the axis ends soon after the last of them, and its label names the
     methods that go on.
 
@@ -63,14 +42,14 @@ def draw_learning(
         missions: one row per mission.
         steps: one row per mission and step.
         units: of the model's error.
-        cells: how many are shown.
+        scenarios: how many are shown.
     """
-    shown, styles, left_out = style.excerpt(missions, cells)
-    curves, columns = steps_of(steps, shown["mission"]), shown["cell"].nunique()
+    shown, styles, left_out = style.excerpt(missions, scenarios)
+    curves, columns = steps_of(steps, shown["mission"]), shown["scenario"].nunique()
     rows = [name for name in QUANTITIES if name in steps and np.isfinite(steps[name]).any()]
     figure = style.new_figure(max(3.4 * columns, 7.2), 1.0 + 1.5 * len(rows))
     grid = figure.subplots(len(rows), columns, sharex="col", sharey="row", squeeze=False)
-    for column, (cell, own) in zip(grid.T, shown.groupby("cell", sort=False), strict=True):
+    for column, (scenario, own) in zip(grid.T, shown.groupby("scenario", sort=False), strict=True):
         for panel, name in zip(column, rows, strict=True):
             label = QUANTITIES[name].format(units=f"\n({units})" if units else "")
             below = _step_label(own) if panel is column[-1] else ""
@@ -81,7 +60,7 @@ def draw_learning(
                 values = curve[name].where(np.isfinite(curve[name]))
                 look.line(panel, curve["t"], values, gid="curve", linewidth=look.width / 2)
                 _mark_regime(panel, curve, look, alone=len(own) == 1)
-        column[0].set_title(style.literal(str(cell)), fontsize=style.NORMAL, pad=8)
+        column[0].set_title(style.literal(str(scenario)), fontsize=style.NORMAL, pad=8)
     for panels, name in zip(grid, rows, strict=True):
         for panel in panels:
             _scale(panel, name, pd.concat(curves.values())[name])
@@ -232,5 +211,16 @@ def recovery_table(times: pd.DataFrame) -> Table:
         "quartiles": low + " to " + high,
         "never %": (100 * numbers["never"]).map(number),
     }
+    note = (
+        "Steps from a change of the regime until the one-step error is back under the nominal "
+        f"level for the first time, and until it stays there for {STAY} steps. The nominal level "
+        "of a mission is 1.5 times the 95th percentile of its errors before the first change, at "
+        "least 0.0001. Medians are over all changes, those never recovered from included as ∞; "
+        f"changes with fewer than {STAY} steps to the next one or to the end are left out. Three "
+        "errors: that of the motion, against the plan; that of the agent, against the prediction "
+        "of model and correction together; and that of the model alone, against what it predicts "
+        "of the action that was executed. A method that corrects actions over a frozen model "
+        "recovers in the first two, and its model never does."
+    )
     title = "Recovery after each change of the regime"
-    return Table("recovery", title, NOTE, numbers, pd.DataFrame(heads))
+    return Table("recovery", title, note, numbers, pd.DataFrame(heads))

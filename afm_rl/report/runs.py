@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.report.stranger import read_numbers, read_settings, read_table, read_text
+from afm_rl.report.untrusted import read_numbers, read_settings, read_table, read_text
 from afm_rl.storage.manifest import (
     COMPUTE,
     CONFIG,
@@ -24,7 +24,7 @@ from afm_rl.storage.manifest import (
 from afm_rl.storage.measures import FILE, Measures
 
 Plan = list[tuple[str, list[int]]]
-KEY = ["method", "cell", "seed"]
+KEY = ["method", "scenario", "seed"]
 
 
 def outcome(columns: Container[str]) -> str:
@@ -39,32 +39,34 @@ def outcome(columns: Container[str]) -> str:
     return "terminated" if "terminated" in columns else "finished"
 
 
-def cell_names(missions: pd.DataFrame) -> pd.Series:
-    """Return each mission's cell: its track and regime, in words.
+def scenario_names(missions: pd.DataFrame) -> pd.Series:
+    """Return each mission's scenario: its track and regime, in words.
 
     The regime is what the column ``regime`` calls it; without one, its parameters, the columns
     between track and seed, but for gains of 1.
 
     >>> row = {"method": "physics", "track": "oval", "v_gain": 1.0, "seed": 0}
-    >>> cell_names(pd.DataFrame([row, row | {"v_gain": -1.0}])).tolist()
+    >>> scenario_names(pd.DataFrame([row, row | {"v_gain": -1.0}])).tolist()
     ['oval, nominal', 'oval, v_gain = -1']
-    >>> cell_names(pd.DataFrame([row | {"regime": "slip"}])).tolist()
+    >>> scenario_names(pd.DataFrame([row | {"regime": "slip"}])).tolist()
     ['oval, slip']
     """
     tracks = missions["track"].astype(str)
     if "regime" in missions:
         # A family draws its parameters anew for each seed: only its name is the same.
-        return (tracks + ", " + missions["regime"].astype(str)).rename("cell")
+        return (tracks + ", " + missions["regime"].astype(str)).rename("scenario")
     regimes, names = pd.Series("", index=missions.index), list(missions)
     for name in names[names.index("track") + 1 : names.index("seed")]:
         regimes += missions[name].map(f", {name} = {{:g}}".format)
     regimes = regimes.str.replace(r", \w*gain = 1(?=,|$)", "", regex=True)
-    return (tracks + regimes.where(regimes != "", ", nominal")).rename("cell")
+    return (tracks + regimes.where(regimes != "", ", nominal")).rename("scenario")
 
 
-def with_cells(missions: pd.DataFrame) -> pd.DataFrame:
-    """Return the missions with a column ``cell``."""
-    return missions if "cell" in missions else missions.assign(cell=cell_names(missions))
+def with_scenarios(missions: pd.DataFrame) -> pd.DataFrame:
+    """Return the missions with a column ``scenario``."""
+    return (
+        missions if "scenario" in missions else missions.assign(scenario=scenario_names(missions))
+    )
 
 
 def steps_of(steps: pd.DataFrame, missions: Iterable[int]) -> dict[int, pd.DataFrame]:
@@ -146,7 +148,7 @@ def read_measures(run: Path) -> Measures:
 
 
 def read_missions(run: Path, measures: Measures) -> pd.DataFrame:
-    """Return the missions of a run, checked, with ``cell``, and ``seconds`` if they are known."""
+    """Return the missions of a run, checked, with ``scenario``, and ``seconds`` if known."""
     path, whole = run / MISSIONS, ["seed", "steps", "mission"]
     numbers = list(dict.fromkeys([*whole, *measures.columns]))
     missions = read_table(path, numbers, ["method", "track"])
@@ -164,7 +166,7 @@ def read_missions(run: Path, measures: Measures) -> pd.DataFrame:
     reals = [m.column for m in measures if pd.api.types.is_float_dtype(missions[m.column])]
     missions = missions.drop(columns="seconds", errors="ignore").assign(
         **{name: missions[name].map("{:.6g}".format).astype(float) for name in reals},
-        cell=cell_names(missions),
+        scenario=scenario_names(missions),
     )
     if (run / COMPUTE).is_file():
         spent = read_table(run / COMPUTE, ["seconds", "missions"], ["method"])
@@ -180,12 +182,12 @@ class Runs:
     Attributes:
         folders: where they were read.
         missions: one row per mission, numbered through. Beside the columns of the files there are
-            ``cell`` (track and regime in words), ``seconds`` (the time of its run in equal
+            ``scenario`` (track and regime in words), ``seconds`` (the time of its run in equal
             shares, where it was counted), ``file`` (place of its steps in ``files``, -1 if there
             are none) and ``own`` (its number in that file).
         measures: what methods are compared by.
         files: the files of steps.
-        plan: methods, each with seeds that it was to have, in every cell.
+        plan: methods, each with seeds that it was to have, in every scenario.
         notes: what a reader must know of the data, one sentence each.
         lost: what is said of each job that ``jobs.yaml`` names and that is not there.
     """
@@ -210,18 +212,20 @@ class Runs:
 
     @property
     def missing(self) -> pd.DataFrame:
-        """What is missing, one row per ``method``, ``cell`` and ``seed``.
+        """What is missing, one row per ``method``, ``scenario`` and ``seed``.
 
-        Every method is to have each cell and seed that any method has or was to have.
+        Every method is to have each scenario and seed that any method has or was to have.
         """
         there = self.missions[KEY]
         planned = pd.DataFrame(
             [(method, seed) for method, seeds in self.plan for seed in seeds],
             columns=["method", "seed"],
         )
-        cells = there[["cell"]].drop_duplicates()
-        wanted = pd.concat([there, planned.merge(cells, how="cross")]) if len(planned) else there
-        places = wanted[["cell", "seed"]].drop_duplicates()
+        scenarios = there[["scenario"]].drop_duplicates()
+        wanted = (
+            pd.concat([there, planned.merge(scenarios, how="cross")]) if len(planned) else there
+        )
+        places = wanted[["scenario", "seed"]].drop_duplicates()
         every = wanted[["method"]].drop_duplicates().merge(places, how="cross")
         both = every.merge(there, how="left", on=KEY, indicator=True)
         return both.loc[both["_merge"] == "left_only", KEY].reset_index(drop=True)
@@ -255,7 +259,7 @@ def read_runs(folders: Sequence[str | Path]) -> Runs:
     """Read the folders of runs, comparisons, sweeps and studies, and join them.
 
     Files that a manifest names are checked against it first. Where two folders hold the same
-    mission (method, cell and seed), the later one counts; ``notes`` says so.
+    mission (method, scenario and seed), the later one counts; ``notes`` says so.
 
     Raises:
         ConfigurationError: if there is no folder, a folder holds no results or results of another

@@ -1,4 +1,4 @@
-"""Where robots went in space, how high, and with what action: one row per cell."""
+"""Where robots went in space, how high, and with what action: one row per scenario."""
 
 from __future__ import annotations
 
@@ -17,37 +17,32 @@ from afm_rl.report.runs import action_names, steps_of
 
 POSITION, GOAL = ["x", "y", "z"], ["goal_x", "goal_y", "goal_z"]
 COLUMNS = [*POSITION, *GOAL, "regime_active"]  # of the steps
-CAPTION = (
-    "One seed: the path and the reference, the error of the height, the first component of the "
-    "action (thin: planned; thick: executed), and the distance to the reference. Crosses and "
-    "dashed lines mark where a regime begins or ends; the stretch under a changed one is shaded."
-)
 
 
-def draw_space(missions: pd.DataFrame, steps: pd.DataFrame, cells: int = 3) -> Figure:
-    """Return a figure of paths in space, methods over each other, cells below each other.
+def draw_space(missions: pd.DataFrame, steps: pd.DataFrame, scenarios: int = 3) -> Figure:
+    """Return a figure of paths in space, methods over each other, scenarios below each other.
 
     Each row holds the path, the error of the height, the first component of the action (planned:
-    thin; executed: thick) and the distance to the reference. Of each method and cell, only the
+    thin; executed: thick) and the distance to the reference. Of each method and scenario, only the
     first seed is drawn, of six methods at most.
 
     Args:
         missions: one row per mission.
         steps: one row per mission and step, with :data:`COLUMNS` (m) and actions.
-        cells: how many are shown.
+        scenarios: how many are shown.
     """
-    shown, styles, left_out = style.excerpt(missions, cells)
+    shown, styles, left_out = style.excerpt(missions, scenarios)
     flights, action = steps_of(steps, shown["mission"]), action_names(steps)[0]
-    rows = shown["cell"].nunique()
+    rows = shown["scenario"].nunique()
     figure = style.new_figure(12.5, 3.0 * rows + 0.8)
     grid = figure.add_gridspec(rows, 4, width_ratios=[1.15, 1, 1, 1])
     labels = ("error of the height (m)", action, "distance to the reference (m)")
-    for row, (cell, group) in enumerate(shown.groupby("cell", sort=False)):
+    for row, (scenario, group) in enumerate(shown.groupby("scenario", sort=False)):
         space = figure.add_subplot(grid[row, 0], projection="3d")
         panels = [figure.add_subplot(grid[row, k]) for k in (1, 2, 3)]
         for axes, label in zip(panels, labels, strict=True):
             style.dress(axes, "step" * (row == rows - 1), label, "y")
-        panels[0].set_title(style.literal(str(cell)), fontsize=style.NORMAL, loc="left")
+        panels[0].set_title(style.literal(str(scenario)), fontsize=style.NORMAL, loc="left")
         for mission in group.itertuples():
             flight, look = flights[mission.mission], styles[mission.method]
             _draw_path(space, flight, look)

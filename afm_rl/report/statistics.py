@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.stats import bootstrap, trim_mean
 
-from afm_rl.report.runs import outcome, with_cells
+from afm_rl.report.runs import outcome, with_scenarios
 from afm_rl.storage.measures import Measures
 
 Bounds = tuple[float, float]
@@ -35,13 +35,13 @@ def stratified_interval(
 
     Args:
         values: the sample, ``(N,)``.
-        strata: the cell of each, ``(N,)``.
+        strata: the scenario of each, ``(N,)``.
         statistic: takes ``(R, N)`` and ``axis``, returns ``(R,)``.
 
     >>> low, high = stratified_interval([0.0, 1.0] * 50, ["a"] * 100)
     >>> 0.38 < low < 0.42, 0.58 < high < 0.62
     (True, True)
-    >>> stratified_interval([0.0, 1.0] * 50, ["a", "b"] * 50)  # each cell has one value only
+    >>> stratified_interval([0.0, 1.0] * 50, ["a", "b"] * 50)  # each scenario has one value only
     (nan, nan)
     """
     sample = np.asarray(values, dtype=float)
@@ -132,50 +132,50 @@ def probability_of_improvement(mine: pd.DataFrame, other: pd.DataFrame) -> tuple
     .. math:: \frac{1}{C} \sum_c \frac{1}{n_c m_c} \sum_{i, j}
               [x_{ci} > y_{cj}] + \tfrac{1}{2} [x_{ci} = y_{cj}]
 
-    Within each cell that both methods have, every mission of one meets every mission of the
-    other, whatever their seeds; cells count alike. The interval draws the missions of both
-    anew within cells. NaN if no cell is shared.
+    Within each scenario that both methods have, every mission of one meets every mission of the
+    other, whatever their seeds; scenarios count alike. The interval draws the missions of both
+    anew within scenarios. NaN if no scenario is shared.
 
     Args:
-        mine: missions of one method, with ``cell`` and ``rank``.
+        mine: missions of one method, with ``scenario`` and ``rank``.
         other: those of the other one.
 
-    >>> mine = pd.DataFrame({"cell": ["a", "a"], "rank": [1, 3]})
-    >>> probability_of_improvement(mine, pd.DataFrame({"cell": ["a"], "rank": [1]}))[0]
+    >>> mine = pd.DataFrame({"scenario": ["a", "a"], "rank": [1, 3]})
+    >>> probability_of_improvement(mine, pd.DataFrame({"scenario": ["a"], "rank": [1]}))[0]
     0.75
     """
-    ranks = [frame.groupby("cell")["rank"].agg(np.array) for frame in (mine, other)]
-    cells = ranks[0].index.intersection(ranks[1].index)
-    if cells.empty:
+    ranks = [frame.groupby("scenario")["rank"].agg(np.array) for frame in (mine, other)]
+    scenarios = ranks[0].index.intersection(ranks[1].index)
+    if scenarios.empty:
         return math.nan, (math.nan, math.nan)
 
     def share_won(samples: list[np.ndarray]) -> np.ndarray:
-        pairs = zip(samples[: len(cells)], samples[len(cells) :], strict=True)
+        pairs = zip(samples[: len(scenarios)], samples[len(scenarios) :], strict=True)
         won = [0.5 * (np.sign(x[..., None] - y[..., None, :]) + 1) for x, y in pairs]
         return np.mean([part.mean((-2, -1)) for part in won], axis=0)
 
-    samples = [rank[cell].astype(float) for rank in ranks for cell in cells]
+    samples = [rank[scenario].astype(float) for rank in ranks for scenario in scenarios]
     low, high = resampled_bounds(samples, share_won, work=max(map(len, samples)))
     return float(share_won(samples)), (float(low), float(high))
 
 
 def count_budgets(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
-    """Return the missions with ``cell``; those that did not finish count as the cell's budget.
+    """Return the missions with ``scenario``; unfinished ones count as the budget of theirs.
 
-    That is the most that any unfinished mission of the cell spent: without it a method with a
+    That is the most that any unfinished mission of the scenario spent: without it a method with a
     smaller budget would look as if it needed less.
 
     >>> from afm_rl.storage.measures import Measure
     >>> steps = Measures((Measure("steps", "steps", "steps", better="lower", budget=True),))
-    >>> rows = {"cell": ["a"] * 3, "steps": [90, 60, 99], "finished": [True, False, False]}
+    >>> rows = {"scenario": ["a"] * 3, "steps": [90, 60, 99], "finished": [True, False, False]}
     >>> count_budgets(pd.DataFrame(rows), steps)["steps"].tolist()
     [90, 99, 99]
     """
-    missions = with_cells(missions)
+    missions = with_scenarios(missions)
     if measures.budget is None:
         return missions
     column, finished = missions[measures.budget.column], missions["finished"].astype(bool)
-    most = column.where(~finished).groupby(missions["cell"]).transform("max")
+    most = column.where(~finished).groupby(missions["scenario"]).transform("max")
     counted = np.where(finished, column, most).astype(column.dtype)
     return missions.assign(**{measures.budget.column: counted})
 
@@ -185,11 +185,11 @@ def budget_notes(missions: pd.DataFrame, measures: Measures) -> list[str]:
     spent = measures.budget
     if spent is None or (given_up := missions[~missions["finished"].astype(bool)]).empty:
         return []
-    ends = given_up.groupby("cell", sort=False)[spent.column].agg(["min", "max"])
+    ends = given_up.groupby("scenario", sort=False)[spent.column].agg(["min", "max"])
     apart = [
-        f"{cell}: missions were given up after {row['min']} to {row['max']} {spent.name}; all of "
-        f"them count as {row['max']}."
-        for cell, row in ends[ends["min"] < ends["max"]].iterrows()
+        f"{scenario}: missions were given up after {row['min']} to {row['max']} {spent.name}; all "
+        f"of them count as {row['max']}."
+        for scenario, row in ends[ends["min"] < ends["max"]].iterrows()
     ]
     budgets = " or ".join(f"{most} {spent.name}" for most in sorted(set(ends["max"])))
     return [
@@ -205,16 +205,16 @@ def summarise(
 ) -> pd.DataFrame:
     """Return one row per method, in the order in which they first occur.
 
-    Columns: those of ``by``; ``missions`` and ``cells``, how many; the mean of each measure under
-    the name of its column, with ``_low`` and ``_high``; ``finished`` or ``terminated``, a share;
-    ``faults`` and ``seconds``, in all, if they are known. The bounds are 95 % intervals of the
-    stratified bootstrap, seeds drawn anew within cells; they are NaN where no cell has two
-    missions, or where all are alike. Missions without a value (NaN) are left out of its mean.
+    Columns: those of ``by``; ``missions`` and ``scenarios``, how many; the mean of each measure
+    under the name of its column, with ``_low`` and ``_high``; ``finished`` or ``terminated``, a
+    share; ``faults`` and ``seconds``, in all, if they are known. The bounds are 95 % intervals of
+    the stratified bootstrap, seeds drawn anew within scenarios; they are NaN where no scenario has
+    two missions, or where all are alike. Missions without a value (NaN) are left out of its mean.
 
     Args:
         missions: one row per mission.
         measures: what methods are compared by.
-        by: columns that say which missions belong together, such as ``("cell", "method")``.
+        by: columns that say which missions belong together, such as ``("scenario", "method")``.
 
     >>> from afm_rl.storage.measures import Measure
     >>> share = Measures((Measure("share", "share", "share"),))
@@ -225,9 +225,9 @@ def summarise(
     rows, ended = [], outcome(missions)
     for key, group in count_budgets(missions, measures).groupby(list(by), sort=False):
         row = dict(zip(by, key, strict=True)) | {"missions": len(group)}
-        row["cells"] = group["cell"].nunique()
+        row["scenarios"] = group["scenario"].nunique()
         for measure in measures:
-            row |= estimate(measure.column, group[measure.column], group["cell"])
+            row |= estimate(measure.column, group[measure.column], group["scenario"])
         row[ended] = float(group[ended].mean())
         for name in ("faults", "seconds"):
             if name in group:
@@ -237,14 +237,14 @@ def summarise(
 
 
 def pair(missions: pd.DataFrame, method: str, other: str) -> pd.DataFrame:
-    """Return the missions that two methods share: same cell, same seed.
+    """Return the missions that two methods share: same scenario, same seed.
 
     Returns:
-        One row per pair: ``cell``, ``seed``, and the columns of both, the other method's with
+        One row per pair: ``scenario``, ``seed``, and the columns of both, the other method's with
         the ending ``_other``.
     """
     mine, its = (missions[missions["method"] == name] for name in (method, other))
-    return mine.merge(its, on=["cell", "seed"], suffixes=("", "_other"))
+    return mine.merge(its, on=["scenario", "seed"], suffixes=("", "_other"))
 
 
 def aggregate(missions: pd.DataFrame, measures: Measures, oracle: str) -> pd.DataFrame:
@@ -260,7 +260,7 @@ def aggregate(missions: pd.DataFrame, measures: Measures, oracle: str) -> pd.Dat
         own = missions[missions["method"] == row["method"]]
         for measure in measures:
             name = f"{measure.column}_iqm"
-            row |= estimate(name, own[measure.column], own["cell"], interquartile_mean)
+            row |= estimate(name, own[measure.column], own["scenario"], interquartile_mean)
         if measures.budget and oracle in set(missions["method"]):
             pairs = pair(missions, row["method"], oracle)
             finished = pairs[pairs["finished_other"].astype(bool)]
@@ -268,7 +268,7 @@ def aggregate(missions: pd.DataFrame, measures: Measures, oracle: str) -> pd.Dat
                 # Counted from 0: one more has been spent, and no logarithm is of nothing.
                 spent = chosen[measures.budget.column] + 1
                 logs = np.log(spent / (chosen[f"{measures.budget.column}_other"] + 1))
-                found = estimate(name, logs, chosen["cell"])
+                found = estimate(name, logs, chosen["scenario"])
                 row |= {key: float(np.exp(value)) for key, value in found.items()}
                 row[f"{name}_pairs"] = len(chosen)
         counted, seconds = own.get("seconds", pd.Series()).count(), row.pop("seconds", 0.0)
@@ -293,7 +293,7 @@ def rank_missions(missions: pd.DataFrame, measures: Measures) -> pd.DataFrame:
 
 
 def compare(missions: pd.DataFrame, measures: Measures, baselines: Sequence[str]) -> pd.DataFrame:
-    """Return one row per baseline and other method that share a cell.
+    """Return one row per baseline and other method that share a scenario.
 
     Columns: ``baseline``, ``method``, ``pairs``; means of paired differences of each measure under
     its column's name (NaN without pairs), and ``better``, the probability of improvement, each
@@ -304,13 +304,13 @@ def compare(missions: pd.DataFrame, measures: Measures, baselines: Sequence[str]
     for baseline in (name for name in baselines if name in groups):
         for method, group in groups.items():
             other = groups[baseline]
-            if method == baseline or not set(group["cell"]) & set(other["cell"]):
+            if method == baseline or not set(group["scenario"]) & set(other["scenario"]):
                 continue
             pairs = pair(missions, str(method), baseline)
             row = {"baseline": baseline, "method": method, "pairs": len(pairs)}
             for column in (measure.column for measure in measures):
                 apart = pairs[column] - pairs[f"{column}_other"]
-                row |= estimate(column, apart, pairs["cell"])
+                row |= estimate(column, apart, pairs["scenario"])
             row["better"], ends = probability_of_improvement(group, other)
             row["better_low"], row["better_high"] = ends
             rows.append(row)

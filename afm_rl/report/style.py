@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
-from afm_rl.report.runs import with_cells
+from afm_rl.report.runs import with_scenarios
 
 Look = dict[str, Any]
 DPI = 150
@@ -109,16 +109,18 @@ def groups_of_methods(methods: Iterable[str]) -> list[list[str]]:
     return [names[first : first + size] for first in range(0, len(names), size or 1)]
 
 
-def excerpt(missions: pd.DataFrame, cells: int) -> tuple[pd.DataFrame, dict[str, Style], str]:
+def excerpt(missions: pd.DataFrame, scenarios: int) -> tuple[pd.DataFrame, dict[str, Style], str]:
     """Return what a figure shows of some missions.
 
     Returns:
-        The first mission of each method and cell, of the first six methods; how these methods are
-        drawn; and a sentence on what is left out.
+        The first mission of each method and scenario, of the first six methods; how these methods
+        are drawn; and a sentence on what is left out.
     """
-    first = with_cells(missions).drop_duplicates(["method", "cell"])
+    first = with_scenarios(missions).drop_duplicates(["method", "scenario"])
     names = list(dict.fromkeys(missions["method"]))[:FEW]
-    chosen = first["cell"].isin(first["cell"].unique()[:cells]) & first["method"].isin(names)
+    chosen = first["scenario"].isin(first["scenario"].unique()[:scenarios]) & first["method"].isin(
+        names
+    )
     missing = len(missions) - chosen.sum()
     note = f"{missing} of {len(missions)} missions not shown" if missing else ""
     return first[chosen], method_styles(names), note

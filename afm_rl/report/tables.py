@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import shorten
-from typing import IO
+from typing import IO, Any
 
 import pandas as pd
 from rich import box
@@ -18,41 +18,10 @@ from afm_rl.report.statistics import summarise
 from afm_rl.storage.files import csv_text
 from afm_rl.storage.measures import Measures, number
 
-# What LaTeX writes another way; the escapes of pandas leave these alone.
-LATEX = {"±": r"$\pm$", "∞": r"$\infty$"}
-ESCAPES = str.maketrans(
-    {sign: f"\\{sign}" for sign in "%_#&${}"}
-    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-)
-WIDE = 1000  # columns: numbers that are cut off are worse than lines that wrap
 BOOTSTRAP = (
     "Brackets are 95 % intervals of the stratified bootstrap (Agarwal et al. 2021): seeds are "
-    "drawn anew within each cell; there is none where no cell has two missions or where all are "
-    "alike. "
-)
-ALL_NOTE = (
-    "IQM is the interquartile mean, the mean of the middle half of the missions. "
-    + BOOTSTRAP
-    + "{ratio}"
-    "Methods with different numbers of missions were not given the same task: compare them by "
-    "pairs. Bold: the best of those with the most missions, {oracle} apart."
-)
-RATIO_NOTE = (
-    "A mission that did not finish counts with its budget. The ratio of {name} to those of "
-    "{oracle} is a geometric mean over missions of the same cell and seed (n pairs), once where "
-    "{oracle} finished and once over all. "
-)
-PAIRS_NOTE = (
-    "Differences are means over missions of the same cell and seed (n pairs). P(better) is the "
-    "probability that a mission of the method does better than one of the baseline in the same "
-    "cell, all seeds against all (Agarwal et al. 2021): {order}; a tie counts half. "
-    + BOOTSTRAP
-    + "Bold "
-    "where 0, or a probability of 1/2, lies outside the interval."
-)
-MISSING_NOTE = (
-    "Every method is expected to have every cell and seed that any method has, and all that was to "
-    "be run."
+    "drawn anew within each scenario; there is none where no scenario has two missions or where "
+    "all are alike. "
 )
 
 
@@ -91,16 +60,21 @@ class Table:
             looks.iat[row, column] = "textbf:--rwrap;"
         style = self.shown.style.apply(lambda _: looks, axis=None).hide(axis="index")
         style = style.format(escape="latex").format_index(escape="latex", axis=1)
+        escapes: dict[Any, str] = {sign: f"\\{sign}" for sign in "%_#&${}"}
+        escapes |= {
+            "\\": r"\textbackslash{}",
+            "~": r"\textasciitilde{}",
+            "^": r"\textasciicircum{}",
+        }
         text = style.to_latex(
             hrules=True,
             column_format=self.align or "l" + "r" * (self.shown.shape[1] - 1),
-            caption=f"{self.title}. {self.note}".translate(ESCAPES),
+            caption=f"{self.title}. {self.note}".translate(str.maketrans(escapes)),
             label=f"tab:{self.name}",
             position_float="centering",
         )
-        for sign, command in LATEX.items():
-            text = text.replace(sign, command)
-        return text
+        # The escapes of pandas leave these alone.
+        return text.replace("±", r"$\pm$").replace("∞", r"$\infty$")
 
     def to_grid(self, columns: Sequence[int] | None = None, caption: str | None = None) -> Grid:
         """Return some columns of the table, or all, for the terminal."""
@@ -129,7 +103,8 @@ def grid_of(
 
 def terminal(file: IO[str] | None) -> Console:
     """Return what prints tables to a file, or to standard output: plain text off a terminal."""
-    return Console(file=file, width=WIDE, highlight=False)
+    # Numbers that are cut off are worse than lines that wrap.
+    return Console(file=file, width=1000, highlight=False)
 
 
 def interval_text(
@@ -158,7 +133,7 @@ def interval_text(
 def print_summary(
     missions: pd.DataFrame, measures: Measures, file: IO[str] | None = None, abreast: int = 6
 ) -> None:
-    """Print the table of methods, then one of cells x methods if there are several cells.
+    """Print the table of methods, then one of scenarios x methods if there are several scenarios.
 
     In a terminal the best values are bold; a pipe or a file gets plain text. The tables are those
     of the report, intervals included.
@@ -167,7 +142,7 @@ def print_summary(
         missions: one row per mission.
         measures: what methods are compared by.
         file: where to; standard output if none is given.
-        abreast: methods side by side in a table of cells; more get a table below.
+        abreast: methods side by side in a table of scenarios; more get a table below.
 
     >>> from afm_rl.storage.measures import Measure
     >>> steps = Measures((Measure("steps", "steps", "steps", better="lower"),))
@@ -182,21 +157,21 @@ def print_summary(
     console = terminal(file)
     table = summary_table(summarise(missions, measures), measures)
     some = table.shown.apply(lambda texts: texts.str.contains("[", regex=False)).any(axis=None)
-    caption = "mean [95 % interval, seeds drawn anew within cells]" if some else None
+    caption = "mean [95 % interval, seeds drawn anew within scenarios]" if some else None
     console.print(table.to_grid(caption=caption))
-    cells = cell_table(missions, measures)
-    if len(cells.shown) > 1:
+    scenarios = scenario_table(missions, measures)
+    if len(scenarios.shown) > 1:
         caption = f"{' / '.join(measure.head for measure in measures.headlines)}, means"
-        columns = range(1, cells.shown.shape[1])
+        columns = range(1, scenarios.shown.shape[1])
         for first in range(0, len(columns), abreast):
-            console.print(cells.to_grid([0, *columns[first : first + abreast]], caption))
+            console.print(scenarios.to_grid([0, *columns[first : first + abreast]], caption))
 
 
 def summary_table(means: pd.DataFrame, measures: Measures, oracle: str = "") -> Table:
     """Return :func:`~.statistics.aggregate`, or as much of it as there is, as a table.
 
     The best of all complete methods is bold, but for the oracle: it knows what no other method
-    knows and does not compete, and neither does a method that was spared some cells.
+    knows and does not compete, and neither does a method that was spared some scenarios.
     """
     rows, ended = [], outcome(means)
     signs = {f"{ended} (%)": (ended, 1 if ended == "finished" else -1)}
@@ -227,8 +202,19 @@ def summary_table(means: pd.DataFrame, measures: Measures, oracle: str = "") -> 
         if rivals.nunique() > 1:
             column = table.columns.get_loc(head)
             bold |= {(row, column) for row in rivals.index[rivals == rivals.max()]}
-    ratio = RATIO_NOTE.format(name=measures.budget.name, oracle=oracle) if measures.budget else ""
-    note = ALL_NOTE.format(ratio=ratio, oracle=oracle)
+    note = (
+        "IQM is the interquartile mean, the mean of the middle half of the missions. " + BOOTSTRAP
+    )
+    if measures.budget:
+        note += (
+            f"A mission that did not finish counts with its budget. The ratio of "
+            f"{measures.budget.name} to those of {oracle} is a geometric mean over missions of the "
+            f"same scenario and seed (n pairs), once where {oracle} finished and once over all. "
+        )
+    note += (
+        "Methods with different numbers of missions were not given the same task: compare them by "
+        f"pairs. Bold: the best of those with the most missions, {oracle} apart."
+    )
     return Table("aggregate", "All missions of each method", note, means, table, frozenset(bold))
 
 
@@ -237,6 +223,13 @@ def comparison_tables(numbers: pd.DataFrame, measures: Measures) -> list[Table]:
     tables = []
     nulls = {measure.column: 0.0 for measure in measures} | {"better": 0.5}
     order = ", then among equals ".join(f"{m.better} {m.name} first" for m in measures.headlines)
+    note = (
+        "Differences are means over missions of the same scenario and seed (n pairs). P(better) is "
+        "the probability that a mission of the method does better than one of the baseline in the "
+        f"same scenario, all seeds against all (Agarwal et al. 2021): {order}; a tie counts half. "
+        + BOOTSTRAP
+        + "Bold where 0, or a probability of 1/2, lies outside the interval."
+    )
     groups = numbers.groupby("baseline", sort=False) if len(numbers) else ()
     for baseline, group in groups:
         shown, bold = [], set()
@@ -250,20 +243,19 @@ def comparison_tables(numbers: pd.DataFrame, measures: Measures) -> list[Table]:
                 if row[f"{name}_low"] > null or row[f"{name}_high"] < null:
                     bold.add((place, column))
         name, title = f"against_{baseline}", f"Differences from {baseline}"
-        note = PAIRS_NOTE.format(order=order)
         own = group.reset_index(drop=True)
         tables.append(Table(name, title, note, own, pd.DataFrame(shown), frozenset(bold)))
     return tables
 
 
-def cell_table(missions: pd.DataFrame, measures: Measures) -> Table:
-    """Return the means of each method (a column) in each cell (a row), by the headline measures."""
+def scenario_table(missions: pd.DataFrame, measures: Measures) -> Table:
+    """Return the means of each method (a column) in each scenario (a row), by the headlines."""
     timeless = missions.drop(columns="seconds", errors="ignore")  # the same file for the same runs
-    numbers = summarise(timeless, measures, ["cell", "method"])
-    heads, rows, bold = ["cell", *missions["method"].unique()], [], set()
+    numbers = summarise(timeless, measures, ["scenario", "method"])
+    heads, rows, bold = ["scenario", *missions["method"].unique()], [], set()
     short = measures.headlines
-    for place, (cell, group) in enumerate(numbers.groupby("cell", sort=False)):
-        texts, rank = dict.fromkeys(heads, "-") | {"cell": cell}, {}
+    for place, (scenario, group) in enumerate(numbers.groupby("scenario", sort=False)):
+        texts, rank = dict.fromkeys(heads, "-") | {"scenario": scenario}, {}
         for row in group.to_dict("records"):
             # Many numbers side by side: whole percentages are enough.
             parts = [m.text(row[m.column], 0 if m.scale > 1 else m.digits) for m in short]
@@ -274,31 +266,37 @@ def cell_table(missions: pd.DataFrame, measures: Measures) -> Table:
             best = max(rank.values())
             bold |= {(place, heads.index(name)) for name in rank if rank[name] == best}
     heads_of = " / ".join(measure.head for measure in short)
-    note = f"Means: {heads_of}. Bold: the best of a cell."
-    return Table("cells", "Cell by cell", note, numbers, pd.DataFrame(rows), frozenset(bold))
+    note = f"Means: {heads_of}. Bold: the best of a scenario."
+    return Table(
+        "scenarios", "Scenario by scenario", note, numbers, pd.DataFrame(rows), frozenset(bold)
+    )
 
 
-def missing_table(missing: pd.DataFrame, cells: int) -> Table:
+def missing_table(missing: pd.DataFrame, scenarios: int) -> Table:
     """Return the table of what is missing, one row per method and set of seeds."""
     rows = []
-    seeds = missing.groupby(["method", "cell"], sort=False)["seed"].agg(tuple).reset_index()
+    seeds = missing.groupby(["method", "scenario"], sort=False)["seed"].agg(tuple).reset_index()
     for (method, numbers), group in seeds.groupby(["method", "seed"], sort=False):
-        names = f"all {cells}" if len(group) == cells else "; ".join(group["cell"])
+        names = f"all {scenarios}" if len(group) == scenarios else "; ".join(group["scenario"])
         row = {"method": method, "missions": str(len(group) * len(numbers))}
-        rows.append(row | {"seeds": ", ".join(map(str, numbers)), "cells": names})
+        rows.append(row | {"seeds": ", ".join(map(str, numbers)), "scenarios": names})
     shown, align = pd.DataFrame(rows), r"lrlp{0.6\textwidth}"
-    return Table("missing", "Missing missions", MISSING_NOTE, missing, shown, align=align)
+    note = (
+        "Every method is expected to have every scenario and seed that any method has, and all "
+        "that was to be run."
+    )
+    return Table("missing", "Missing missions", note, missing, shown, align=align)
 
 
 def missing_lines(table: Table, width: int = 60) -> list[str]:
     """Say in one line per row of :func:`missing_table` what is missing.
 
-    >>> missing = pd.DataFrame({"method": ["a", "a"], "cell": ["oval", "ring"], "seed": [1, 1]})
-    >>> missing_lines(missing_table(missing, cells=3))
-    ['missing: a: 2 missions, seeds 1, cells oval; ring']
+    >>> missing = pd.DataFrame({"method": ["a", "a"], "scenario": ["oval", "ring"], "seed": [1, 1]})
+    >>> missing_lines(missing_table(missing, scenarios=3))
+    ['missing: a: 2 missions, seeds 1, scenarios oval; ring']
     """
     return [
         f"missing: {row['method']}: {row['missions']} missions, "
-        f"seeds {shorten(row['seeds'], width)}, cells {shorten(row['cells'], width)}"
+        f"seeds {shorten(row['seeds'], width)}, scenarios {shorten(row['scenarios'], width)}"
         for row in table.shown.to_dict("records")
     ]

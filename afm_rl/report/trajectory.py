@@ -1,4 +1,4 @@
-"""Where robots went on the ground: one small map per method and cell."""
+"""Where robots went on the ground: one small map per method and scenario."""
 
 from __future__ import annotations
 
@@ -20,12 +20,6 @@ from afm_rl.report import style
 from afm_rl.report.runs import outcome, steps_of
 from afm_rl.report.style import ROAD
 from afm_rl.storage.measures import Measures
-
-CAPTION = (
-    "One seed: the line that each robot drove, methods side by side, cells below each other, and "
-    "its measures. The stretch under the changed regime is broad. A robot that leaves the road is "
-    "followed a little way only."
-)
 
 
 class Box(NamedTuple):
@@ -134,7 +128,7 @@ def draw_trajectories(
     tracks: Sequence[DrawableTrack] = (),
     panels: int = 24,
 ) -> Figure:
-    """Return a figure of driven lines, methods side by side, cells below each other.
+    """Return a figure of driven lines, methods side by side, scenarios below each other.
 
     Only the first seed is drawn, and 6 methods at most; the footnote says how much is
     left out. The stretch under the changed regime has another colour and a broad band under it.
@@ -150,12 +144,14 @@ def draw_trajectories(
     shown, styles, left_out = style.excerpt(missions, panels // count)
     paths, known = steps_of(steps, shown["mission"]), {track.name: track for track in tracks}
     views = {
-        cell: view(known.get(rows["track"].iloc[0]), [positions(paths[m]) for m in rows.mission])
-        for cell, rows in shown.groupby("cell", sort=False)
+        scenario: view(
+            known.get(rows["track"].iloc[0]), [positions(paths[m]) for m in rows.mission]
+        )
+        for scenario, rows in shown.groupby("scenario", sort=False)
     }
     figure, maps = _maps(list(styles), views)
     for mission in shown.to_dict("records"):
-        axes, track = maps[mission["cell"], mission["method"]], known.get(mission["track"])
+        axes, track = maps[mission["scenario"], mission["method"]], known.get(mission["track"])
         if track is not None:
             draw_road(axes, track)
         ended = outcome(mission)
@@ -243,7 +239,7 @@ def _write_distance(axes: Axes, end: np.ndarray, distance: float) -> None:
 def _maps(
     methods: Sequence[str], views: Mapping[str, Box]
 ) -> tuple[Figure, dict[tuple[str, str], Axes]]:
-    """Return a figure with axes by cell and method; those of a row show the same area."""
+    """Return a figure with axes by scenario and method; those of a row show the same area."""
     most = 3.4
     width = max(1.9, min(9.9 / len(methods), 1.5 * most))
     tall = [min(width * box.ratio, most) for box in views.values()]
@@ -251,8 +247,8 @@ def _maps(
     figure = style.new_figure(max(width * len(methods) + 0.5, 5.0), height)
     grid = figure.add_gridspec(len(views), len(methods), height_ratios=tall)
     maps = {}
-    for row, (cell, box) in enumerate(views.items()):
-        head = cell.replace(", ", "\n") + "\n" if len(views) > 1 else ""
+    for row, (scenario, box) in enumerate(views.items()):
+        head = scenario.replace(", ", "\n") + "\n" if len(views) > 1 else ""
         for column, method in enumerate(methods):
             axes = figure.add_subplot(grid[row, column], aspect="equal")
             axes.set(xlim=box[:2], ylim=box[2:])
@@ -261,7 +257,7 @@ def _maps(
             axes.xaxis.set_major_locator(MaxNLocator(4))
             axes.yaxis.set_major_locator(MaxNLocator(4))
             axes.tick_params(labelleft=column == 0)
-            maps[cell, method] = axes
+            maps[scenario, method] = axes
     return figure, maps
 
 

@@ -17,30 +17,23 @@ from torch.utils.tensorboard import SummaryWriter
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.report.figures import draw_report, draw_run, read_excerpts
 from afm_rl.report.learning import recovery_table
-from afm_rl.report.runs import Runs, steps_of, with_cells
+from afm_rl.report.runs import Runs, steps_of, with_scenarios
 from afm_rl.report.statistics import aggregate, budget_notes, compare, count_budgets
-from afm_rl.report.stranger import LONGEST, read_text
 from afm_rl.report.tables import (
-    cell_table,
     comparison_tables,
     missing_lines,
     missing_table,
+    scenario_table,
     summary_table,
 )
 from afm_rl.report.trajectory import DrawableTrack
+from afm_rl.report.untrusted import LONGEST, read_text
 from afm_rl.storage.files import csv_text, write_whole
 from afm_rl.storage.measures import Measures
 
 # TensorBoard orders groups by name: whether plans came true stands first.
 GROUPS = {"miss": "came_true", "unforeseen": "came_true", "error": "model", "loss": "model"}
 FILE = "events.out.tfevents.0.afm_rl"  # TensorBoard looks for "tfevents" in the name
-REFERENCES = (
-    "R. Agarwal, M. Schwarzer, P. S. Castro, A. Courville, M. G. Bellemare: Deep Reinforcement "
-    "Learning at the Edge of the Statistical Precipice. NeurIPS 2021 (interquartile mean, "
-    "stratified bootstrap, probability of improvement, performance profiles).",
-    "E. D. Dolan, J. J. Moré: Benchmarking optimization software with performance profiles. "
-    "Mathematical Programming 91, 2002.",
-)
 
 
 def write_events(
@@ -74,13 +67,13 @@ def write_events(
     final, columns = [measure.column for measure in measures], list(steps)
     last = columns[columns.index("regime_active") :]  # and what the score logs
     logged = ["t", *(name for name in GROUPS if name in steps), "misaligned", *last]
-    groups = with_cells(missions).groupby("method", sort=False)
+    groups = with_scenarios(missions).groupby("method", sort=False)
     written = []
     for name, (_, group) in zip(folder_names(groups.groups), groups, strict=True):
         own, place = steps[steps["mission"].isin(group["mission"])], folder / name
         written.append(_write(place, curves(own[logged], stride), group[final].mean()))
         single = group[: most if len(group) > 1 else 0]
-        titles = folder_names(single["cell"] + ", seed " + single["seed"].astype(str))
+        titles = folder_names(single["scenario"] + ", seed " + single["seed"].astype(str))
         rows = steps_of(own, single["mission"])
         for title, (_, row) in zip(titles, single.iterrows(), strict=True):
             curve = curves(rows[row["mission"]][logged], stride)
@@ -219,7 +212,7 @@ def write_report(
     """
     out, measures = Path(out), runs.measures
     missions, missing = count_budgets(runs.missions, measures), runs.missing
-    cells = missions["cell"].nunique()
+    scenarios = missions["scenario"].nunique()
     notes = [*runs.lost, *runs.notes, *budget_notes(runs.missions, measures)]
     notes += [f"{folder}: {sentence}" for folder in runs.folders for sentence in _found(folder)]
     if baselines is None:
@@ -230,10 +223,10 @@ def write_report(
         if name not in runs.methods
     ]
     summary = (
-        f"{len(missions)} missions of {len(runs.methods)} methods in {cells} cells, from "
+        f"{len(missions)} missions of {len(runs.methods)} methods in {scenarios} scenarios, from "
         f"{', '.join(map(str, runs.folders))}; {len(missing)} missions are missing."
     )
-    lost = [missing_table(missing, cells)] if len(missing) else []
+    lost = [missing_table(missing, scenarios)] if len(missing) else []
     for line in (summary, *notes, *(line for table in lost for line in missing_lines(table))):
         echo(line)
 
@@ -242,7 +235,7 @@ def write_report(
         summary_table(aggregate(missions, measures, oracle), measures, oracle),
         *comparison_tables(compare(missions, measures, baselines), measures),
         *([recovery_table(recovery)] if len(recovery) else []),
-        cell_table(missions, measures),
+        scenario_table(missions, measures),
         *lost,
     ]
     for table in tables:
@@ -258,9 +251,16 @@ def write_report(
             path = out / "figures" / f"{folder_names([picture.name])[0]}.png"
             write_whole(path, picture.png)
         echo(f"wrote {len(pictures)} figures: {out / 'figures'}")
-    title = f"Results: {len(runs.methods)} methods, {cells} cells"
+    title = f"Results: {len(runs.methods)} methods, {scenarios} scenarios"
+    references = (
+        "R. Agarwal, M. Schwarzer, P. S. Castro, A. Courville, M. G. Bellemare: Deep Reinforcement "
+        "Learning at the Edge of the Statistical Precipice. NeurIPS 2021 (interquartile mean, "
+        "stratified bootstrap, probability of improvement, performance profiles).",
+        "E. D. Dolan, J. J. Moré: Benchmarking optimization software with performance profiles. "
+        "Mathematical Programming 91, 2002.",
+    )
     content = {"title": title, "summary": summary, "notes": notes, "tables": tables}
-    page = render_page(**content, figures=pictures, references=REFERENCES)
+    page = render_page(**content, figures=pictures, references=references)
     write_whole(out / "index.html", page.encode())
     echo(f"Report: {out / 'index.html'}")
     return out / "index.html"

@@ -39,9 +39,10 @@ class Measure:
         scale: what the column is multiplied by to get the unit.
         digits: digits after the point.
         limits: lowest and highest value that the column can have, if both are known.
-        headline: shown where there is room for little, such as tables of cells.
+        headline: shown where there is room for little, such as tables of scenarios.
         budget: what a mission spends, counted from 0: a mission that did not finish counts as the
-            most that any unfinished mission of its cell spent, and methods are compared by ratios.
+            most that any unfinished mission of its scenario spent, and methods are compared by
+            ratios.
     """
 
     column: str

@@ -17,7 +17,7 @@ from pathlib import Path
 import pandas as pd
 
 from afm_rl.report import read_runs
-from afm_rl.report.runs import cell_names
+from afm_rl.report.runs import scenario_names
 from afm_rl.report.statistics import estimate, pair
 from afm_rl.report.tables import Table, interval_text
 from afm_rl.storage.files import write_whole
@@ -60,11 +60,11 @@ MARKS = r"(<!-- {} begin -->\n).*?(<!-- {} end -->)"
 
 
 def published() -> pd.DataFrame:
-    """Return the published means and standard deviations, with our cells."""
+    """Return the published means and standard deviations, with our scenarios."""
     figures = pd.read_csv(Path(__file__).with_name("published.csv"))
     figures["track"] = "ethz_" + figures["track"].astype(str)
     named = figures[["method", "track", "v_gain", "omega_gain"]].assign(seed=0)
-    return figures.assign(cell=cell_names(named))
+    return figures.assign(scenario=scenario_names(named))
 
 
 def budget_note(missions: pd.DataFrame) -> str:
@@ -83,18 +83,18 @@ def cells_table(number: int, ours: pd.DataFrame) -> Table:
     track, others = PRINTED[number]
     figures = published()
     figures = figures[figures["track"] == track]
-    own = ours.groupby(["cell", "method"])[list(MEASURES.values())]
+    own = ours.groupby(["scenario", "method"])[list(MEASURES.values())]
     own = own.agg(["mean", lambda values: values.std(ddof=0)])
     rows, numbers = [], []
-    for cell, group in figures.groupby("cell", sort=False):
+    for scenario, group in figures.groupby("scenario", sort=False):
         printed = group.set_index("method")
         first = group.iloc[0]
         row = {name: f"{first[name]:g}" for name in ("v_gain", "omega_gain")}
         for method in ("afm_paper", CODED, *others):
-            numbers.append({"method": method, **printed.loc[LABELS[method]], "cell": cell})
+            numbers.append({"method": method, **printed.loc[LABELS[method]], "scenario": scenario})
             row[HEADS[method]] = "-"
-            if (cell, method) in own.index:
-                values = own.loc[(cell, method)].to_list()
+            if (scenario, method) in own.index:
+                values = own.loc[(scenario, method)].to_list()
                 names = [f"ours_{name}" for name in list(figures)[-5:-1]]
                 numbers[-1] |= dict(zip(names, values, strict=True))
                 row[HEADS[method]] = _both(*values)
@@ -116,20 +116,20 @@ def _both(success: float, success_std: float, steps: float, steps_std: float) ->
 
 
 def _seeds(missions: pd.DataFrame) -> str:
-    """Say how many seeds there are of a cell: fewer where a study is under way."""
-    counts = missions.groupby(["method", "cell"])["seed"].nunique()
+    """Say how many seeds there are of a scenario: fewer where a study is under way."""
+    counts = missions.groupby(["method", "scenario"])["seed"].nunique()
     least, most = counts.min(), counts.max()
     return f"ours: {most}" if least == most else f"ours: {least} to {most}"
 
 
 def means_table(ours: pd.DataFrame) -> Table:
-    """Return the means over all cells, and the paired differences from Online PE."""
+    """Return the means over all scenarios, and the paired differences from Online PE."""
     figures = published().rename(columns={"method": "printed"})
     rows, numbers = [], []
     for method, name in LABELS.items():
         own = ours[ours["method"] == method]
-        same = figures[figures["cell"].isin(own["cell"])] if len(own) else figures
-        whole = own["cell"].nunique() in (0, figures["cell"].nunique())
+        same = figures[figures["scenario"].isin(own["scenario"])] if len(own) else figures
+        whole = own["scenario"].nunique() in (0, figures["scenario"].nunique())
         printed = same[same["printed"] == name] if name != "afm_dr" else TEXT.head(int(whole))
         figure = {"method": method, "missions": len(own)}
         figure |= printed[["success_mean", "steps_mean"]].mean()
@@ -139,11 +139,11 @@ def means_table(ours: pd.DataFrame) -> Table:
             digits = 3 if head == "success" else 0
             row[f"{head}, ours"] = row[f"{head} - Online PE"] = "-"
             if len(own):
-                figure |= estimate(column, own[column], own["cell"])
+                figure |= estimate(column, own[column], own["scenario"])
                 row[f"{head}, ours"] = interval_text(figure, column, digits)
             if len(pairs) and method != "online_pe":
                 apart = pairs[column] - pairs[f"{column}_other"]
-                figure |= estimate(f"{column}_apart", apart, pairs["cell"])
+                figure |= estimate(f"{column}_apart", apart, pairs["scenario"])
                 row[f"{head} - Online PE"] = interval_text(
                     figure, f"{column}_apart", digits, sign="+"
                 )
@@ -157,19 +157,20 @@ def means_table(ours: pd.DataFrame) -> Table:
         rows.append({name: row[name] for name in ("method", "missions", *heads)})
         numbers.append(figure)
     note = (
-        "Means over the cells that were run (all: 22), with 95 % stratified bootstrap intervals "
-        f"(strata: cells; {_seeds(ours)} seeds of a cell); published: means of the printed tables "
-        "over the same cells, of AFM+DR that of the text, over all. Differences from Online PE are "
-        "paired by cell and seed." + budget_note(ours)
+        "Means over the scenarios that were run (all: 22), with 95 % stratified bootstrap "
+        "intervals "
+        f"(strata: scenarios; {_seeds(ours)} seeds of a scenario); published: means of the printed "
+        "tables over the same scenarios, of AFM+DR that of the text, over all. Differences from "
+        "Online PE are paired by scenario and seed." + budget_note(ours)
     )
-    title = "All cells: success and steps"
+    title = "All scenarios: success and steps"
     return Table("paper_means", title, note, pd.DataFrame(numbers), pd.DataFrame(rows))
 
 
 def tables(missions: pd.DataFrame) -> list[Table]:
-    """Return the means and the paper's four tables; none without a mission of a published cell."""
+    """Return the means and the paper's four tables; none without missions of a published one."""
     ours = missions[missions["method"].isin(list(LABELS))]
-    ours = ours[ours["cell"].isin(published()["cell"])]
+    ours = ours[ours["scenario"].isin(published()["scenario"])]
     if ours.empty:
         return []
     found = [means_table(ours)]
@@ -205,7 +206,7 @@ def flights_table(missions: pd.DataFrame) -> Table:
                 pairs = pair(ours, method, "online_knode")
                 if len(pairs):
                     share = 100 * (pairs["mse"] / pairs["mse_other"] - 1)
-                    figure = estimate("share", share, pairs["cell"])
+                    figure = estimate("share", share, pairs["scenario"])
                     row["mean change (%)"] = interval_text(figure, "share", 1, sign="+")
             rows.append(row)
     rows.append({"method": "AFM over Online-KNODE, the paper's text", "mean change (%)": "-6.6"})

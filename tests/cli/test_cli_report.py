@@ -77,7 +77,7 @@ def call(monkeypatch, capsys):
 def test_a_report_of_a_run(call, run_folder):
     done = call(run_folder, "--baselines", "physics")
     assert (done.status, done.err) == (0, "")
-    assert done.out.splitlines()[0].startswith("4 missions of 2 methods in 1 cells")
+    assert done.out.splitlines()[0].startswith("4 missions of 2 methods in 1 scenarios")
     assert done.out.splitlines()[-1] == f"Report: {run_folder}/report/index.html"
     assert (run_folder / "report" / "figures" / "trajectory_ethz_2.png").exists()
 

@@ -9,7 +9,7 @@ from afm_rl.report.comparison import draw_profile, draw_progress, ratios
 from afm_rl.report.figures import (
     read_excerpts,
     share_reached,
-    telling_cells,
+    telling_scenarios,
     traced_missions,
 )
 from afm_rl.report.statistics import count_budgets
@@ -76,5 +76,5 @@ def test_the_traced_seed_is_the_one_that_most_methods_have(joined):
 def test_curves_and_maps_show_where_methods_differ_most(joined, laps):
     missions, *_ = joined(v_gains=range(2, 8))
     success = (missions["method"] == "physics") * missions["v_gain"] / 10
-    chosen = telling_cells(missions.assign(success_rate=success), laps)
+    chosen = telling_scenarios(missions.assign(success_rate=success), laps)
     assert chosen == [f"ring, v_gain = {gain}" for gain in (4, 5, 6, 7)]

@@ -11,7 +11,7 @@ import yaml
 from afm_rl.cli import report
 from afm_rl.errors import AFMError, ArtefactError, ConfigurationError
 from afm_rl.report import read_runs
-from afm_rl.report.stranger import read_settings
+from afm_rl.report.untrusted import read_settings
 from afm_rl.storage.manifest import write_manifest
 
 
@@ -60,7 +60,7 @@ def test_a_run_is_read_with_its_steps(run_folder, make_results, laps):
     found = read_runs([run_folder(seeds=2)])
     assert found.methods == ["physics", "adaptive", "oracle"] and found.measures == laps
     assert found.missions["mission"].tolist() == list(range(6))
-    assert found.missions["cell"].unique().tolist() == ["ring, v_gain = -1"]
+    assert found.missions["scenario"].unique().tolist() == ["ring, v_gain = -1"]
     assert found.notes == found.plan == found.lost == []
     _, steps = make_results(seeds=2)
     oracle = found.missions[found.missions["method"] == "oracle"]
@@ -76,7 +76,7 @@ def test_a_study_s_missions_stand_in_its_jobs(study_folder, make_results):
     assert len(found.files) == 4 and len(found.missions) == 8
     assert found.methods == ["physics", "oracle"]
     oracle = found.missions[found.missions["method"] == "oracle"]
-    assert oracle["own"].tolist() == [0, 0, 1, 1]  # cell by cell
+    assert oracle["own"].tolist() == [0, 0, 1, 1]  # scenario by scenario
     assert oracle["seed"].tolist() == [0, 1, 0, 1]
     read = found.steps(oracle, ["error"])
     _, steps = make_results(["oracle"], v_gains=[-1.0, 2.0])
@@ -146,7 +146,7 @@ def test_names_that_look_like_numbers_stay_text(run_folder):
     )
     found = read_runs([folder])
     assert found.methods == ["10"]
-    assert found.missions["cell"].tolist() == ["1, v_gain = -1"]
+    assert found.missions["scenario"].tolist() == ["1, v_gain = -1"]
 
 
 def rewrite(folder, name, content):
@@ -228,15 +228,15 @@ def test_a_job_that_was_deleted_is_missed(study_folder, monkeypatch, capsys):
     found = read_runs([folder])
     (lost,) = found.lost
     assert lost.startswith(f"{job}: missing, although jobs.yaml names it")
-    cells = [f"ring, v_gain = {gain}" for gain in (-1, 2)]
-    assert found.missing.to_numpy().tolist() == [["oracle", cell, 0] for cell in cells]
+    scenarios = [f"ring, v_gain = {gain}" for gain in (-1, 2)]
+    assert found.missing.to_numpy().tolist() == [["oracle", scenario, 0] for scenario in scenarios]
     monkeypatch.setattr(sys, "argv", ["afm-rl-report", str(folder), "--no-figures"])
     with pytest.raises(SystemExit) as ended:
         report.main()
     said = capsys.readouterr()
     assert ended.value.code == 2 and said.err == f"afm-rl-report: {lost}\n"
     assert "; 2 missions are missing." in said.out and lost in said.out
-    assert "missing: oracle: 2 missions, seeds 0, cells all 2" in said.out
+    assert "missing: oracle: 2 missions, seeds 0, scenarios all 2" in said.out
     assert str(job) in (folder / "report" / "index.html").read_text()
 
 
@@ -284,7 +284,7 @@ def test_steps_that_are_no_numbers_are_refused(run_folder, spoil):
         found.steps(found.missions, ["error"])
 
 
-def test_measures_of_a_stranger_are_checked(run_folder):
+def test_measures_of_others_are_checked(run_folder):
     folder = run_folder()
     declared = json.loads((folder / "measures.json").read_text())
     declared["each"][0]["better"] = "=cmd"
@@ -308,7 +308,7 @@ def test_folders_without_results_are_refused(tmp_path):
 def test_short_names_leave_out_gains_of_one(run_folder):
     found = read_runs([run_folder(methods=["oracle"], v_gains=[-1.0, 1.0, 1.5, 0.1])])
     names = ["v_gain = -1", "nominal", "v_gain = 1.5", "v_gain = 0.1"]
-    assert found.missions["cell"].tolist() == [f"ring, {name}" for name in names]
+    assert found.missions["scenario"].tolist() == [f"ring, {name}" for name in names]
 
 
 def test_a_name_that_is_a_formula_reads_back_as_it_was(run_folder):

@@ -21,22 +21,22 @@ from afm_rl.report.statistics import (
     summarise,
 )
 from afm_rl.report.tables import (
-    cell_table,
     comparison_tables,
     missing_lines,
     missing_table,
+    scenario_table,
     summary_table,
 )
 from afm_rl.storage.measures import Measure, Measures
 
 
-def rows(method, cell, outcomes):
-    """Missions of a method in a cell: (success, steps) by seed."""
+def rows(method, scenario, outcomes):
+    """Missions of a method in a scenario: (success, steps) by seed."""
     return [
         {
             "method": method,
-            "cell": cell,
-            "track": cell,
+            "scenario": scenario,
+            "track": scenario,
             "seed": seed,
             "success_rate": success,
             "steps": steps,
@@ -81,7 +81,7 @@ def test_the_console_and_the_report_give_the_same_interval(missions, laps):
         method="percentile",
         rng=0,
     )
-    low, high = plain.confidence_interval  # what differs between cells would count as spread
+    low, high = plain.confidence_interval  # what differs between scenarios would count as spread
     assert high - low > 1.2 * (short.loc[0, "steps_high"] - short.loc[0, "steps_low"])
 
 
@@ -92,7 +92,7 @@ def test_success_comes_first_and_fewer_steps_break_ties(laps):
 
 def test_pairs_share_cell_and_seed(missions, laps):
     pairs = pair(missions, "ours", "base")
-    assert pairs[["cell", "seed"]].to_numpy().tolist() == [["a", 0], ["a", 1], ["b", 0]]
+    assert pairs[["scenario", "seed"]].to_numpy().tolist() == [["a", 0], ["a", 1], ["b", 0]]
     assert (pairs["steps"] - pairs["steps_other"]).tolist() == [-100, -300, 0]
 
 
@@ -113,7 +113,7 @@ def test_intervals_hold_the_mean_as_often_as_they_say():
         sample = means[strata] + rng.normal(size=len(strata))
         low, high = stratified_interval(sample, strata)
         held += low <= means.mean() <= high
-        assert high - low < 1.0  # what differs between cells is no spread
+        assert high - low < 1.0  # what differs between scenarios is no spread
     assert 0.88 <= held / 200 <= 0.99
 
 
@@ -141,12 +141,12 @@ def test_the_interquartile_mean_cuts_a_quarter_on_each_side():
 def test_improvement_is_mann_whitney_s_u_in_each_cell():
     rng = np.random.default_rng(1)
     frames = [
-        pd.DataFrame({"cell": rng.choice(["a", "b"], 30), "rank": rng.integers(0, 6, 30)})
+        pd.DataFrame({"scenario": rng.choice(["a", "b"], 30), "rank": rng.integers(0, 6, 30)})
         for _ in range(2)
     ]
     expected = []
-    for cell in "ab":
-        x, y = (frame.loc[frame["cell"] == cell, "rank"] for frame in frames)
+    for scenario in "ab":
+        x, y = (frame.loc[frame["scenario"] == scenario, "rank"] for frame in frames)
         expected.append(scipy.stats.mannwhitneyu(x, y).statistic / (len(x) * len(y)))
     found, (low, high) = probability_of_improvement(*frames)
     assert found == pytest.approx(np.mean(expected))
@@ -158,7 +158,7 @@ def test_improvement_is_mann_whitney_s_u_in_each_cell():
 def test_improvement_s_interval_is_that_of_draws_one_by_one():
     rng = np.random.default_rng(2)
     x, y = rng.normal(0.5, 1, 10).round(1), rng.normal(0, 1, 8).round(1)
-    mine, other = (pd.DataFrame({"cell": "a", "rank": values}) for values in (x, y))
+    mine, other = (pd.DataFrame({"scenario": "a", "rank": values}) for values in (x, y))
     drawn = []
     for _ in range(4000):
         pairs = rng.choice(x, len(x))[:, None] - rng.choice(y, len(y))
@@ -170,7 +170,7 @@ def test_improvement_s_interval_is_that_of_draws_one_by_one():
 def test_aggregates_are_those_found_by_hand(missions, laps):
     means = aggregate(missions, laps, "oracle").set_index("method")
     ours = means.loc["ours"]
-    assert (ours["missions"], ours["cells"], ours["finished"]) == (4, 2, 0.75)
+    assert (ours["missions"], ours["scenarios"], ours["finished"]) == (4, 2, 0.75)
     assert ours["success_rate"] == 0.875
     assert ours["steps"] == (99 + 199 + 499 + 399) / 4
     assert ours["success_rate_iqm"] == 1.0
@@ -181,7 +181,7 @@ def test_aggregates_are_those_found_by_hand(missions, laps):
     assert ours["ratio_all"] == pytest.approx((1 * 2 * 2.5 * 0.8) ** (1 / 4))
     assert means.loc["base", "ratio_all_pairs"] == 3
     assert means.loc["oracle", "ratio"] == 1.0
-    # Two seeds in each cell: the four means of success are 0.75, 0.875 and 1.
+    # Two seeds in each scenario: the four means of success are 0.75, 0.875 and 1.
     assert (ours["success_rate_low"], ours["success_rate_high"]) == (0.75, 1.0)
 
 
@@ -226,38 +226,40 @@ def test_a_cell_shared_without_a_seed_has_no_pairs(missions, laps):
     apart = missions[missions["method"] != "oracle"]
     apart = apart.assign(seed=apart["seed"].where(apart["method"] == "ours", 7))
     (table,) = comparison_tables(
-        compare(apart.drop_duplicates(["method", "cell"]), laps, ["base"]), laps
+        compare(apart.drop_duplicates(["method", "scenario"]), laps, ["base"]), laps
     )
     assert table.shown.iloc[0, 1:4].tolist() == ["0", "-", "-"]
     assert table.shown.loc[0, "P(better)"] == "0.75"
 
 
 def test_cells_times_methods(missions, laps):
-    table = cell_table(missions, laps)
+    table = scenario_table(missions, laps)
     assert table.shown.to_numpy().tolist() == [
         ["a", "100 / 149", "75 / 349", "100 / 99"],
         ["b", "75 / 449", "50 / 499", "75 / 349"],
     ]
     assert table.bold == {(0, 3), (1, 3)}
-    alone = cell_table(missions[(missions["method"] != "base") | (missions["cell"] == "a")], laps)
+    alone = scenario_table(
+        missions[(missions["method"] != "base") | (missions["scenario"] == "a")], laps
+    )
     assert alone.shown.loc[1, "base"] == "-"
 
 
 def test_what_is_missing_is_counted():
     rows = [("ours", "a", 5), ("base", "a", 5), ("base", "b", 5), ("on", "a", 0), ("on", "b", 0)]
-    missing = pd.DataFrame(rows, columns=["method", "cell", "seed"])
-    table = missing_table(missing, cells=2)
+    missing = pd.DataFrame(rows, columns=["method", "scenario", "seed"])
+    table = missing_table(missing, scenarios=2)
     assert table.numbers is missing and table.shown["missions"].tolist() == ["1", "2", "2"]
     assert missing_lines(table) == [
-        "missing: ours: 1 missions, seeds 5, cells a",
-        "missing: base: 2 missions, seeds 5, cells all 2",
-        "missing: on: 2 missions, seeds 0, cells all 2",
+        "missing: ours: 1 missions, seeds 5, scenarios a",
+        "missing: base: 2 missions, seeds 5, scenarios all 2",
+        "missing: on: 2 missions, seeds 0, scenarios all 2",
     ]
 
 
 def test_missions_without_a_value_are_left_out_of_its_mean():
     late = Measures((Measure("recovery", "recovery", "recovery", "steps", "lower"),))
-    values = {"recovery": [3.0, np.nan, 5.0], "finished": True, "cell": "a", "seed": [0, 1, 2]}
+    values = {"recovery": [3.0, np.nan, 5.0], "finished": True, "scenario": "a", "seed": [0, 1, 2]}
     missions = pd.DataFrame({"method": "x", "track": "a"} | values)
     (row,) = aggregate(missions, late, "x").to_dict("records")
     assert row["recovery"] == 4.0 and row["recovery_low"] == 3.0

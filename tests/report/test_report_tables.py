@@ -78,7 +78,7 @@ def test_many_methods_get_tables_below_one_another(four, laps, table):
     rings = [four.assign(track=track) for track in ("ring", "oval")]
     many = [frame.assign(method=frame["method"] + str(k)) for frame in rings for k in range(4)]
     lines = table(pd.concat(many, ignore_index=True), io.StringIO()).splitlines()
-    heads = [line.split()[1:] for line in lines if line.split()[:1] == ["cell"]]
+    heads = [line.split()[1:] for line in lines if line.split()[:1] == ["scenario"]]
     assert [name for head in heads for name in head] == list(
         dict.fromkeys(name for k in range(4) for name in (f"a{k}", f"b{k}"))
     )

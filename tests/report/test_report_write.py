@@ -65,7 +65,7 @@ class Page(HTMLParser):
 def test_everything_is_written_the_same_each_time(run_folder, report):
     source = run_folder(seeds=2, v_gains=[-1.0, 2.0])
     folder, said = report(source)
-    tables = ["aggregate", "against_physics", "recovery", "cells"]
+    tables = ["aggregate", "against_physics", "recovery", "scenarios"]
     figures = ["summary", "learning_ring", "profile", "progress", "trajectory_ring"]
     assert files(folder) == {
         "index.html",
@@ -73,7 +73,7 @@ def test_everything_is_written_the_same_each_time(run_folder, report):
         *(f"tables/{name}.{kind}" for name in tables for kind in ("csv", "tex")),
         *(f"figures/{name}.png" for name in figures),
     }
-    assert said[0].startswith("12 missions of 3 methods in 2 cells")
+    assert said[0].startswith("12 missions of 3 methods in 2 scenarios")
     assert said[-1] == f"Report: {folder / 'index.html'}"
     assert pd.read_csv(folder / "missing.csv").empty
     before = {name: (folder / name).read_bytes() for name in files(folder)}
@@ -142,7 +142,7 @@ def test_tables_can_be_set_in_latex(run_folder, report):
     assert len(names) == 5
     for path in names:
         check_latex(path.read_text())
-    text = (folder / "tables" / "cells.tex").read_text()
+    text = (folder / "tables" / "scenarios.tex").read_text()
     assert r"v\_gain = -1" in text and r"\textbf{" in text
 
 
@@ -152,7 +152,7 @@ def test_what_is_missing_is_said_three_times(run_folder, report):
         run_folder("b", methods=["oracle"], v_gains=[2.0]),
         baselines=["physics", "online_pe"],
     )
-    assert "missing: physics: 1 missions, seeds 0, cells ring, v_gain = 2" in said
+    assert "missing: physics: 1 missions, seeds 0, scenarios ring, v_gain = 2" in said
     assert "There are no missions of online_pe: comparisons with it are left out." in said
     expected = [["physics", "ring, v_gain = 2", 0]]
     assert pd.read_csv(folder / "missing.csv").to_numpy().tolist() == expected

@@ -201,7 +201,7 @@ def test_scores_are_shares_of_what_all_methods_span_in_a_task():
     rows = pd.DataFrame({"method": ["nothing", "oracle"] * 4, "regime": ["in"] * 4 + ["out"] * 4})
     rows["return"] = [0, 10, 5, 10, -1, 99, 5, 10]
     rows["track"] = ["ode"] * 6 + ["cartpole"] * 2
-    rows = rows.assign(cell=rows["track"] + rows["regime"])
+    rows = rows.assign(scenario=rows["track"] + rows["regime"])
     found = scores(rows).set_index(["split", "method"])["score"]
     assert found["in", "nothing"] == pytest.approx((0.01 + 0.06) / 2)
     assert found["out", "oracle"] == 1

@@ -27,7 +27,7 @@ def scores(missions: pd.DataFrame) -> pd.DataFrame:
     both = pd.concat([known.assign(split="all"), known.assign(split=known["regime"])])
     return pd.DataFrame(
         {"method": method, "split": split, "contexts": len(rows)}
-        | estimate("score", rows["score"], rows["cell"], interquartile_mean)
+        | estimate("score", rows["score"], rows["scenario"], interquartile_mean)
         for (method, split), rows in both.groupby(["method", "split"], sort=False)
     )
 

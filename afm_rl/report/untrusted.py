@@ -1,4 +1,4 @@
-"""Files that a stranger may have written: bounded, checked, and named if they are refused.
+"""Files that anybody may have written: bounded, checked, and named if they are refused.
 
 Nothing in them is executed or interpolated.
 """
