@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import shorten
-from typing import IO, Any
+from typing import IO
 
 import pandas as pd
 from rich import box
@@ -60,7 +60,7 @@ class Table:
             looks.iat[row, column] = "textbf:--rwrap;"
         style = self.shown.style.apply(lambda _: looks, axis=None).hide(axis="index")
         style = style.format(escape="latex").format_index(escape="latex", axis=1)
-        escapes: dict[Any, str] = {sign: f"\\{sign}" for sign in "%_#&${}"}
+        escapes: dict[str, str | int | None] = {sign: f"\\{sign}" for sign in "%_#&${}"}
         escapes |= {
             "\\": r"\textbackslash{}",
             "~": r"\textasciitilde{}",
