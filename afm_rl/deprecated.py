@@ -10,7 +10,11 @@ from typing import Any, TypeVar
 
 import lazy_loader
 
-NAMES = {"afm_rl.report.check_video": "afm_rl.film.check_video"}
+NAMES = {
+    "afm_rl.envs.Table": "afm_rl.envs.SampledReference",
+    "afm_rl.play.Robot": "afm_rl.play.PlayedRobot",
+    "afm_rl.report.check_video": "afm_rl.film.check_video",
+}
 """New names of parts, both with their package."""
 ARGUMENTS: dict[str, dict[str, tuple[str, dict[Any, Any]]]] = {
     "ActionFlow": {"readings": ("hypotheses", {})},

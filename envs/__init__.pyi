@@ -3,7 +3,7 @@ from .courses.flights import (
     FigureEight as FigureEight,
     Hover as Hover,
     Reference as Reference,
-    Table as Table,
+    SampledReference as SampledReference,
     Waypoints as Waypoints,
     find_reference as find_reference,
     load_reference as load_reference,

@@ -10,6 +10,7 @@ import numpy as np
 from afm_rl.diagnosis.checks import travel
 from afm_rl.diagnosis.fit import FLOOR, consistent, fit_response
 from afm_rl.diagnosis.intervals import independence
+from afm_rl.diagnosis.lines import ridge
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.model import Model, Problem, costs, scale_of, weight_of
 from afm_rl.diagnosis.response import lagging, look_back
@@ -185,9 +186,7 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
 def _left_over(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the squared residual of lines, and the lines, from moments ``(B, P, P)``."""
     gram, cross = moments[:, :-1, :-1], moments[:, :-1, -1:]
-    size = gram.shape[-1]
-    ridge = 1e-9 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(size)
-    solution = np.linalg.solve(gram + ridge, cross)
+    solution = ridge(gram, cross, 1e-9)
     left = moments[:, -1, -1] - (solution * cross).sum((1, 2))
     return np.maximum(left, 0.0), solution[..., 0]
 

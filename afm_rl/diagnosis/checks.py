@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from afm_rl.diagnosis.findings import Status
+from afm_rl.diagnosis.lines import missed
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.response import follow_with_stiction
 from afm_rl.diagnosis.search import Lead, find_leads, without_outliers
@@ -139,21 +140,11 @@ def _causes(log: Log, cause: np.ndarray, effect: np.ndarray, past: int = 8) -> b
         late = np.arange(1, past + 1) * every
         own, other = (series[rows[:, None] - late] for series in (effect, cause))
         alone = np.column_stack([np.ones(len(rows)), own])
-        test = np.arange(len(rows)) * 20 // len(rows) % 2 == 0
-        missed = [
-            sum(_missed(x, effect[rows], some) for some in (test, ~test))
-            for x in (alone, np.column_stack([alone, other]))
-        ]
-        shares.append(1 - missed[1] / max(missed[0], 1e-300))
+        before, after = (
+            missed(x, effect[rows], 1e-9) for x in (alone, np.column_stack([alone, other]))
+        )
+        shares.append(1 - after / max(before, 1e-300))
     return max(shares, default=0.0) > 0.1
-
-
-def _missed(x: np.ndarray, y: np.ndarray, test: np.ndarray) -> float:
-    """Return the squared error in some rows of lines that are fitted to the others."""
-    gram = x[~test].T @ x[~test]
-    gram += 1e-9 * gram.trace() / len(gram) * np.eye(len(gram))
-    line = np.linalg.solve(gram, x[~test].T @ y[~test])
-    return float(((y - x @ line)[test] ** 2).sum())
 
 
 def _summed(log: Log, leads: Sequence[Lead], settings: Settings) -> set[int]:

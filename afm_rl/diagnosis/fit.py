@@ -28,8 +28,6 @@ from afm_rl.diagnosis.response import Shape, respond
 from afm_rl.diagnosis.settings import Settings
 
 FLOOR = 1e-7  # share of the variance: better fits are all the same
-QUICK = ("play", "stick", "hold")  # may be mistaken for delay and lag
-DYNAMICS = ("delay", "keep", "rate")
 COST = attrgetter("cost")
 NONE = Shape._field_defaults
 
@@ -65,7 +63,8 @@ def _dynamics(problem: Problem, driver: int, starts: Sequence[Shape]) -> list[Mo
     """Return the best models with none, some, and all of delay, lag and rate limit."""
     options: dict[tuple[str, ...], list[Model]] = {(): [Model(driver, Shape())]}
     for start in starts:
-        names = tuple(name for name in DYNAMICS if getattr(start, name) != NONE[name])
+        kinds = ("delay", "keep", "rate")
+        names = tuple(name for name in kinds if getattr(start, name) != NONE[name])
         more = ("delay", *(name for name in names if name != "delay"))
         for some in dict.fromkeys((names, more, more[1:], ("delay",))):
             shape = Shape(**{name: getattr(start, name) for name in some})
@@ -197,7 +196,8 @@ def _bases(model: Model, names: str) -> Iterator[Model]:
     """Yield the model, and what may stand in the place of its delay and lag."""
     yield model
     rest = tuple(name for name in model.active if name not in ("delay", "keep"))
-    if names.split()[0] not in QUICK or len(rest) == len(model.active):
+    # Some may be mistaken for delay and lag.
+    if names.split()[0] not in ("play", "stick", "hold") or len(rest) == len(model.active):
         return
     yield replace(model, active=rest, shape=model.shape._replace(delay=0.0, keep=0.0))
     delay = round(model.shape.delay)

@@ -11,7 +11,6 @@ from afm_rl.errors import ConfigurationError
 
 FEWEST = 20  # rows
 MOST = 256  # actuators
-GAP = 1.5  # steps: where the time between two rows is longer, commands between them are not known
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,6 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.spaces.manifold import wrap_angle
 
 NEAR = 0.1  # a factor this near to 1 is none
-LATEST, LONGEST = 8, 20  # steps late; steps of the model in one of the robot
-GAINS = (1.0, -1.0, 0.01, 0.1, 10.0, 100.0, *UNITS.values())
-SCALES = (1.0, 0.3, 0.1, 0.02, 10.0)
-ANGLES = {math.pi / 180: "degrees, the model in radians", 180 / math.pi: "radians, not in degrees"}
-SMALL = 6  # entries of a state of which all combinations are tried
 
 
 class Transitions(NamedTuple):
@@ -40,7 +35,7 @@ class Transitions(NamedTuple):
     def of(cls, model: DynamicsModel, state: Tensor, action: Tensor, after: Tensor) -> Transitions:
         """Return transitions in the order of time, of which some follow each other."""
         follows = (state[1:] == after[:-1]).all(-1)
-        sent = {k: _earlier(action, follows, k) for k in (-1, *range(1, LATEST + 1))}
+        sent = {k: _earlier(action, follows, k) for k in (-1, *range(1, 9))}
         return cls(model, state, action, after, _earlier(state, follows, 1), sent)
 
     def part(self, most: int) -> Transitions:
@@ -100,7 +95,8 @@ def usual_mistakes(
     for k, earlier in sent.items():
         told = f"acts {k} step{'s' * (k > 1)} late" if k > 0 else "acts on the next row's action"
         yield Mistake(told, between(after, model(state, earlier)), (k,))
-    begin = [1.0] if model.stiff else GAINS  # what is far off may be more than a simulator bears
+    many = [1.0, -1.0, 0.01, 0.1, 10.0, 100.0, *UNITS.values()]
+    begin = many[:1] if model.stiff else many  # what is far off may be more than a simulator bears
     (gain,), left = _fit(seen, size, [[k] for k in begin], lambda x: {"gain": x})
     if abs(gain - 1) > NEAR:
         yield Mistake(f"acts on {gain:.3g} times the action ({_unit(gain)})", left, (gain,), 1)
@@ -109,7 +105,7 @@ def usual_mistakes(
         told = f"moves {pace:.3g} times as far in a step (dt)"
         yield Mistake(told, motion - pace * step, (pace,), 1)
     there = model(state, action)
-    for n in range(2, LONGEST + 1):
+    for n in range(2, 21):
         there = model(there, action)
         told = f"makes {n} steps of the model in one (dt, frame_skip)"
         yield Mistake(told, between(after, there), (n,), 1)
@@ -128,8 +124,13 @@ def usual_mistakes(
 def _other_units(seen: Transitions, size: Tensor, names: Sequence[str]) -> Iterator[Mistake]:
     """Yield mistakes in the units of the state's entries, in the motion and in forces only."""
     count, motion, stiff = len(size), seen.motion(), seen.model.stiff
-    lengths = [count] if stiff else [1, count] if count > SMALL else range(1, count + 1)
-    for unit, words in list(ANGLES.items())[: 1 if stiff else 2]:  # simulators have radians
+    # Of a small state all combinations are tried.
+    lengths = [count] if stiff else [1, count] if count > 6 else range(1, count + 1)
+    angles = [
+        (math.pi / 180, "degrees, the model in radians"),
+        (180 / math.pi, "radians, not in degrees"),
+    ]
+    for unit, words in angles[: 1 if stiff else 2]:  # simulators have radians
         step = seen.step(unit, unit)
         yield Mistake(f"has states and actions in {words}", motion - step, [unit], 1)
         for chosen in (c for length in lengths for c in combinations(range(count), length)):
@@ -141,9 +142,10 @@ def _other_units(seen: Transitions, size: Tensor, names: Sequence[str]) -> Itera
             yield Mistake(told, motion - scale * step, scale.tolist(), 1)
     if stiff:
         return
-    starts = [[math.log(k)] * count + [0.01] * count for k in SCALES]
+    scales = (1.0, 0.3, 0.1, 0.02, 10.0)
+    starts = [[math.log(k)] * count + [0.01] * count for k in scales]
     found, left = _fit(
-        seen, size, starts, lambda x: {"scale": x[:count].exp(), "offset": x[count:]}, len(SCALES)
+        seen, size, starts, lambda x: {"scale": x[:count].exp(), "offset": x[count:]}, len(scales)
     )
     factor = [math.exp(x) for x in found[:count]]
     pairs = zip(factor, names, found[count:], strict=True)

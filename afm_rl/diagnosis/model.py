@@ -10,12 +10,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from afm_rl.diagnosis.intervals import half_widths, independence
+from afm_rl.diagnosis.lines import ridge
 from afm_rl.diagnosis.log import Clock
 from afm_rl.diagnosis.response import Shape, lagging, respond, shaped
 
-STEPS = {"delay": 0.05, "keep": 0.01, "rate": 0.003}  # of numeric derivatives, otherwise 0.01
-STEPPED = ("jump", "stick", "hold", "phase")  # the response changes by jumps with these
-CURVED = ("dead_zone", "cut", "low", "high", "play", "jump", "stick", "rate")
 DOWN, GAIN_DRIFT, OFFSET_DRIFT = -1, -2, -3
 """Among the others: the response of negative commands, that times the time, and the time."""
 
@@ -64,7 +62,8 @@ class Model:
     @property
     def smooth(self) -> tuple[str, ...]:
         """Of the active numbers, those by which the response has derivatives."""
-        return tuple(name for name in self.active if name not in STEPPED)
+        stepped = ("jump", "stick", "hold", "phase")  # the response changes by jumps with these
+        return tuple(name for name in self.active if name not in stepped)
 
     def parts(self, problem: Problem) -> list[np.ndarray]:
         """Return the responses at gain 1 to the driver and to the others, ``(N,)`` each."""
@@ -84,7 +83,8 @@ class Model:
 
     def led_by(self, own: int) -> Model:
         """Return the model with another of its commands as the driver, where both act alike."""
-        if own not in self.others or min(self.others) < 0 or {*CURVED} & {*self.active}:
+        curved = {"dead_zone", "cut", "low", "high", "play", "jump", "stick", "rate"}
+        if own not in self.others or min(self.others) < 0 or curved & {*self.active}:
             return self
         gains = {self.driver: self.gain, **dict(zip(self.others, self.gains, strict=True))}
         gain = gains.pop(own)
@@ -135,21 +135,15 @@ def fit_lines(problem: Problem, model: Model, rounds: int = 0) -> Model:
     use = problem.use
     design = np.column_stack([*(x[use] for x in model.parts(problem)), np.ones(use.sum())])
     y = problem.y[use]
-    gram = design.T @ design
-    gram += 1e-12 * gram.trace() * np.eye(len(gram))
-    solution = np.linalg.solve(gram, design.T @ y)
-    for _ in range(rounds):
+    heavy = design
+    for later in reversed(range(rounds + 1)):
+        solution = ridge(heavy.T @ design, heavy.T @ y, 1e-12)
         residual = y - design @ solution
-        scale = 2.0 * scale_of(residual)
-        if not scale > 1e-9:
+        if not later or not (scale := 2.0 * scale_of(residual)) > 1e-9:
             break
-        weight = 1 / np.sqrt(1 + (residual / scale) ** 2)
-        heavy = design * weight[:, None]
-        gram = heavy.T @ design
-        gram += 1e-12 * gram.trace() * np.eye(len(gram))
-        solution = np.linalg.solve(gram, heavy.T @ y)
+        heavy = design / np.sqrt(1 + (residual / scale) ** 2)[:, None]
     gains = tuple(float(g) for g in solution[1:-1])
-    cost = float(costs(y - design @ solution).mean())
+    cost = float(costs(residual).mean())
     return replace(
         model, gain=float(solution[0]), offset=float(solution[-1]), gains=gains, cost=cost
     )
@@ -225,7 +219,7 @@ def slopes(problem: Problem, model: Model, central: bool = True) -> np.ndarray:
     here = values_of(model)
     first = len(here) - len(model.smooth)
     for place, name in enumerate(model.smooth, first):
-        width = STEPS.get(name, 0.01)
+        width = {"delay": 0.05, "rate": 0.003}.get(name, 0.01)
         up, down = here.copy(), here.copy()
         up[place] += width
         down[place] -= width
@@ -270,5 +264,4 @@ def interval_widths(problem: Problem, model: Model, centre: float = 0.0) -> np.n
         by = {"delay": 1.0, "keep": 1 / (max(keep, 0.05) * math.log(max(keep, 0.05)) ** 2)}
         late += by.get(name, 0.0) * influence[:, place]
     three = (influence[:, 0], influence[:, 1] + centre * influence[:, 0], late)
-    widths = half_widths(np.column_stack(three)) * freedom
-    return widths
+    return half_widths(np.column_stack(three)) * freedom

@@ -16,12 +16,10 @@ from afm_rl.diagnosis.mistakes import Transitions, some_of, usual_mistakes
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
 
-GOOD, FAIR = 0.9, 0.5  # shares of the motion that a right model predicts, and of each entry's
+GOOD = 0.9  # share of the motion that a right model predicts
 EXACT = 0.99  # the share that a model without any mistake predicts
-MOST, FEW = 4000, 300  # transitions that are looked at; and of these, where a cause is searched
-FLOOR = 1e-3  # what is missed below this share of the motion is all the same
+FEW = 300  # transitions that are looked at where a cause is searched
 SURE = 10.0  # nats that a cause has to gain, and each number that is fitted for it
-BETTER = 0.1  # share of the motion that it has to gain, if it does not halve what is missed
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,7 @@ class ModelCheck:
     @property
     def right(self) -> bool:
         """Is the model right, as far as this motion shows it?"""
-        fair = float(np.nanmin(self.predicted)) >= FAIR
+        fair = float(np.nanmin(self.predicted)) >= 0.5
         return not self.cause and self.share >= GOOD and fair
 
     def __str__(self) -> str:
@@ -120,10 +118,11 @@ def check_transitions(
             f"expected {FEWEST} rows or more, of {sizes} numbers"
         )
     finite = torch.cat(given, -1).isfinite().all(-1)
-    seen = Transitions.of(model, *(x[finite] for x in given)).part(MOST)
+    seen = Transitions.of(model, *(x[finite] for x in given)).part(4000)
     size, miss = seen.motion().abs().mean(0), seen.miss()
     largest = seen.state.abs().amax() + size.amax()
-    floor = torch.maximum(FLOOR * size, 8 * torch.finfo(dtype).eps * largest)
+    # What is missed below a thousandth of the motion is all the same.
+    floor = torch.maximum(1e-3 * size, 8 * torch.finfo(dtype).eps * largest)
 
     def share(miss: Tensor) -> Tensor:
         left = miss.abs().mean(0)
@@ -150,7 +149,8 @@ def check_transitions(
         gained = ((old.abs().mean(0) + floor) / (new.abs().mean(0) + floor)).log()
         nats = len(miss) * float(gained.sum()) - SURE * mistake.fitted
         before, after = share(old), share(new)
-        clear = (after - before > BETTER) | (after > before) & (gained > math.log(2))
+        # It has to gain a tenth of the motion, if it does not halve what is missed.
+        clear = (after - before > 0.1) | (after > before) & (gained > math.log(2))
         if mistake.fitted > model.action_size:  # so many numbers would refine any model
             clear &= (before < GOOD) & (after.nanmean() >= GOOD)
         if known.sum() >= FEWEST and nats > most and bool(clear.any()):

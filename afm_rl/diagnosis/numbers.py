@@ -56,23 +56,20 @@ def likely_intervals(
 
 def _others(problem: Problem, model: Model, settings: Settings) -> list[Model]:
     """Return other explanations: one number more, or another mixture of delay and lag."""
-    if len(problem.y) <= settings.fitted:
-        found = list(larger(problem, model))
-    else:
-        found = []
-    late = model.shape.delay
+    if len(problem.y) > settings.fitted:
+        return []
+    found, late = list(larger(problem, model)), model.shape.delay
     if model.shape.keep > 0:
         late -= 1 / math.log(model.shape.keep)
     rest = tuple(name for name in model.active if name not in ("delay", "keep"))
-    if len(problem.y) <= settings.fitted:
-        for names, delay, lag in (
-            (("delay",), late, 0.0),
-            (("keep",), 0.0, max(late, 0.3)),
-            (("delay", "keep"), late / 2, max(late, 0.3) / 2),
-        ):
-            keep = math.exp(-1 / lag) if lag else 0.0
-            shape = model.shape._replace(delay=delay, keep=keep)
-            found.append(replace(model, active=(*rest, *names), shape=shape))
+    for names, delay, lag in (
+        (("delay",), late, 0.0),
+        (("keep",), 0.0, max(late, 0.3)),
+        (("delay", "keep"), late / 2, max(late, 0.3) / 2),
+    ):
+        keep = math.exp(-1 / lag) if lag else 0.0
+        shape = model.shape._replace(delay=delay, keep=keep)
+        found.append(replace(model, active=(*rest, *names), shape=shape))
     return [refine(problem, other) for other in found]
 
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from afm_rl.diagnosis.changes import Part
-from afm_rl.diagnosis.log import GAP, Log
+from afm_rl.diagnosis.lines import missed
+from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.model import Model, Problem, cut
 from afm_rl.diagnosis.response import look_back, respond
 from afm_rl.diagnosis.search import Lead, beginning
 
 SIZE, SPEED, EARLIER = "the size of its command", "how fast its command changes", "earlier commands"
-OTHERS, TIME = "other commands", "the time"
 OWN = (SIZE, SPEED, EARLIER)
 LIKE = {SIZE: ", as if its gain varied", SPEED: ", as if its delay varied"}  # scatter with these
 
@@ -67,9 +67,9 @@ def _features(problem: Problem, model: Model) -> dict[str, list[np.ndarray]]:
         SIZE: [followed, hats(followed)],
         SPEED: [speed, slow, hats(speed), hats(slow)],
         EARLIER: late,
-        TIME: [time, time * followed[:, None]],
+        "the time": [time, time * followed[:, None]],
     }
-    return found | ({OTHERS: with_others} if others.shape[1] else {})
+    return found | ({"other commands": with_others} if others.shape[1] else {})
 
 
 def hats(x: np.ndarray, count: int = 8) -> np.ndarray:
@@ -78,18 +78,10 @@ def hats(x: np.ndarray, count: int = 8) -> np.ndarray:
     return np.column_stack([np.interp(x, knots, unit) for unit in np.eye(len(knots))])
 
 
-def predictable(columns: np.ndarray, y: np.ndarray, folds: int = 20) -> float:
+def predictable(columns: np.ndarray, y: np.ndarray) -> float:
     """Return the share of the variance that lines in one half of the rows predict in the other."""
-    rows = len(y)
-    design = np.column_stack([np.ones(rows), columns])
-    held_out = np.arange(rows) * folds // rows % 2 == 0
-    missed = 0.0
-    for test in (held_out, ~held_out):
-        x = design[~test]
-        gram = x.T @ x
-        gram += 1e-4 * gram.trace() / len(gram) * np.eye(len(gram))
-        missed += float(((y - design @ np.linalg.solve(gram, x.T @ y[~test]))[test] ** 2).sum())
-    return 1.0 - missed / max(float((y**2).sum()), 1e-300)
+    design = np.column_stack([np.ones(len(y)), columns])
+    return 1.0 - missed(design, y, 1e-4) / max(float((y**2).sum()), 1e-300)
 
 
 def without_lost(
@@ -117,7 +109,8 @@ def without_lost(
     options = []
     for shape in lead.starts:
         place = clock.places(shape.delay).astype(int)
-        near = clock.time[np.minimum(place + 1, len(y) - 1)] - clock.time[place] < GAP
+        # Where the time between two rows is longer, commands between them are not known.
+        near = clock.time[np.minimum(place + 1, len(y) - 1)] - clock.time[place] < 1.5
         x = respond(clock, u, shape, begin)
         options.append(_trimmed(np.column_stack([x, np.ones(len(y))]), y, known & near, apart))
     line, chosen = min(options, key=lambda option: np.abs(y - option[0])[option[1]].mean())

@@ -21,7 +21,6 @@ from afm_rl.diagnosis.words import UNITS
 WEAK = {"delay": 0.1, "keep": 0.05, "rate": 2.0, "dead_zone": 0.01, "play": 0.01, "cut": 1.0}
 WEAK |= {"low": -1.0, "high": 1.0}
 """Numbers with which next to nothing happens, in half ranges and steps."""
-SIDES = set("left right front rear back fl fr rl rr bl br lf rf lh rh lr l r f b".split())
 
 
 def kind_of(name: str) -> str:
@@ -33,7 +32,8 @@ def kind_of(name: str) -> str:
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", name)
     if len(name) < 2:
         return name
-    return " ".join(word.lower() for word in words if word.lower() not in SIDES)
+    sides = set("left right front rear back fl fr rl rr bl br lf rf lh rh lr l r f b".split())
+    return " ".join(word.lower() for word in words if word.lower() not in sides)
 
 
 def small_twins(names: Sequence[str], ranges: np.ndarray, small: float = 1 / 3) -> dict[int, str]:

@@ -186,7 +186,7 @@ class Quadrotor(KnownDynamics):
 
     States are position (m), velocity (m/s), quaternion (scalar-last) and body rate (rad/s), S = 13
     and D = 12; actions are thrust (N) and moments (N m) that the motors are taken to give:
-    :func:`~afm_rl.spaces.airframe.saturate` is the plant's affair. Quaternions stay of length 1.
+    :func:`~afm_rl.spaces.airframe.within_motors` is the plant's affair. Quaternions keep length 1.
 
     Args:
         body: the quadrotor, a Crazyflie if None.

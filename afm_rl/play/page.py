@@ -16,7 +16,7 @@ from afm_rl.play.server import LocalServer
 from afm_rl.play.world import SIDES, World
 from afm_rl.regimes import presets
 
-FRAME, WORDS = 0.04, 0.25  # seconds between two pictures, and between two texts
+FRAME = 0.04  # seconds between two pictures
 PLOT: Any = {"aspect": 2.0, "scales": {"x": uplot.Scale(time=False)}}
 STROKES = {name: f"rgb{colour}" for name, colour in COLOURS.items()}
 
@@ -174,7 +174,7 @@ class Page:
                 if 2 * last - before > now + FRAME:  # no time for another one: slower than life
                     break
             self.draw()
-            if now - worded > WORDS:
+            if now - worded > 0.25:  # s
                 self.say()
                 worded = now
             time.sleep(max(0.0, now + FRAME - time.monotonic()))

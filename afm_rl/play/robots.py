@@ -24,14 +24,10 @@ from afm_rl.planning import MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost, 
 from afm_rl.planning.riccati import stationary_value
 
 Acting = Callable[[np.ndarray], np.ndarray]
-LONG, NEAR = 3600.0, 3.0  # s, of a flight; m, from its reference, beyond which it is lost
-# Where a wheel has the policies of others, and where they are in the repository.
-INSTALLED = Path(__file__).parent / "policies"
-IN_TREE = Path(__file__).parents[2] / "examples" / "policies" / "zoo"
 
 
 @dataclass(frozen=True)
-class Robot:
+class PlayedRobot:
     """What the page needs to know of a robot.
 
     Attributes:
@@ -59,7 +55,7 @@ class Robot:
     task: str | None = None
 
 
-def make_robot(name: str | None = None, file: str | Path | None = None) -> Robot:
+def make_robot(name: str | None = None, file: str | Path | None = None) -> PlayedRobot:
     """Return a robot of :data:`ROBOTS`, or the one that the policy in a file was trained for.
 
     Args:
@@ -85,7 +81,7 @@ def make_robot(name: str | None = None, file: str | Path | None = None) -> Robot
     return robot
 
 
-def _stored(file: Path, name: str | None = None) -> Robot:
+def _stored(file: Path, name: str | None = None) -> PlayedRobot:
     """Return the robot of gymnasium that a stored policy acts in."""
     policy, about = load_policy(file)
     task, settings = about.get("id"), about.get("settings", {})
@@ -117,7 +113,7 @@ def _numeric(value: Any) -> bool:
 
 def _gymnasium(
     name: str, task: str, policy: Callable[[], Acting], settings: dict[str, Any]
-) -> Robot:
+) -> PlayedRobot:
     def make() -> gymnasium.Env:
         return gymnasium.make(task, max_episode_steps=-1, **settings)
 
@@ -127,13 +123,13 @@ def _gymnasium(
         found = inner.model
         joints = [found.joint(joint).name for joint in found.actuator_trnid[:, 0]]
         model: dict[str, Any] = {"model": "mujoco"}
-        return Robot(name, make, policy, model, _push_root, inner.dt, joints, task=kind)
+        return PlayedRobot(name, make, policy, model, _push_root, inner.dt, joints, task=kind)
     if kind != "Pendulum":
         raise ConfigurationError("it is neither a task of MuJoCo nor the pendulum")
     model = {"model": pendulum_step}
     model["state"] = lambda env, seen: env.unwrapped.state
     model["observe"] = lambda s: np.c_[np.cos(s[:, 0]), np.sin(s[:, 0]), s[:, 1]]
-    return Robot(name, make, policy, model, _push_pendulum, inner.dt, ["joint"], task=kind)
+    return PlayedRobot(name, make, policy, model, _push_pendulum, inner.dt, ["joint"], task=kind)
 
 
 def _push_root(inner: Any, direction: float) -> None:
@@ -145,7 +141,7 @@ def _push_pendulum(inner: Any, direction: float) -> None:
     inner.state = np.array(inner.state) + [0.0, 3.0 * direction]
 
 
-def _cart_pole() -> Robot:
+def _cart_pole() -> PlayedRobot:
     """A cart with a pole, by the linear quadratic regulator."""
     env: Any = gymnasium.make("InvertedPendulum-v5")
     upright = torch.zeros(4, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
@@ -192,7 +188,7 @@ def _first(size: int) -> dict[str, Any]:
     return {"state": state, "observe": observe}
 
 
-def _ugv() -> Robot:
+def _ugv() -> PlayedRobot:
     """The ground robot on its track, by MPPI."""
     low, high = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
     dynamics = Dubins()
@@ -208,10 +204,10 @@ def _ugv() -> Robot:
         inner._data["pose"] += torch.tensor([0.0, 0.0, 0.5 * direction])
 
     model = {"model": dynamics, **_first(3)}
-    return Robot("ugv", make, policy, model, push, 0.2, ["speed", "turn"], score="reached")
+    return PlayedRobot("ugv", make, policy, model, push, 0.2, ["speed", "turn"], score="reached")
 
 
-def _quadrotor() -> Robot:
+def _quadrotor() -> PlayedRobot:
     """A small quadrotor that flies in a circle, by model predictive control."""
     name, ahead = "afm_rl/CrazyflieTrack-v0", 20
     dynamics, level = Quadrotor(dt=0.05), [0.0] * 9 + [1.0] + [0.0] * 3
@@ -220,7 +216,8 @@ def _quadrotor() -> Robot:
     unit = torch.tensor([0.575, 3e-4, 3e-4, 1e-4])  # what flights use of the box
 
     def make() -> gymnasium.Env:
-        env = gymnasium.make(name, max_episode_steps=-1, duration=LONG, horizon=ahead, limit=NEAR)
+        long: dict[str, Any] = {"max_episode_steps": -1, "duration": 3600.0}  # s
+        env = gymnasium.make(name, **long, horizon=ahead, limit=3.0)  # m: then it is lost
         shape = (13 + 6 * (ahead + 1),)
         space = gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
 
@@ -241,15 +238,18 @@ def _quadrotor() -> Robot:
     model = {"model": dynamics, **_first(13)}
     names = ["thrust", "roll", "pitch", "yaw"]
     corrector = partial(ActionFlow, -unit, unit)
-    return Robot("quadrotor", make, policy, model, push, 0.05, names, corrector=corrector)
+    return PlayedRobot("quadrotor", make, policy, model, push, 0.05, names, corrector=corrector)
 
 
-def _usual(name: str, file: str) -> Callable[[], Robot]:
-    folder = INSTALLED if INSTALLED.is_dir() else IN_TREE
+def _usual(name: str, file: str) -> Callable[[], PlayedRobot]:
+    """Return what makes a robot of a policy that a wheel has, or the repository's examples."""
+    folder = Path(__file__).parent / "policies"
+    if not folder.is_dir():
+        folder = Path(__file__).parents[2] / "examples" / "policies" / "zoo"
     return lambda: _stored(folder / f"{file}.safetensors", name)
 
 
-ROBOTS: dict[str, Callable[[], Robot]] = {
+ROBOTS: dict[str, Callable[[], PlayedRobot]] = {
     "half_cheetah": _usual("half_cheetah", "half_cheetah_tqc"),
     "hopper": _usual("hopper", "hopper_trpo"),
     "walker2d": _usual("walker2d", "walker2d_tqc"),

@@ -10,7 +10,6 @@ import trimesh
 
 COLOURS = {"alone": (213, 94, 0), "AFM": (0, 114, 178)}
 LANE = 1.6  # m from the middle to either robot
-GROUND, TRACK, LINE = (225, 228, 232), (205, 208, 212), (120, 120, 120)
 
 
 class MuJoCoFigure:
@@ -33,7 +32,7 @@ class MuJoCoFigure:
         floor = (place[0], place[1], self._lowest())
         size = {"width": 12.0, "height": 2 * LANE - 0.2, "cell_size": 0.5, "section_size": 1.0}
         self.floor = server.scene.add_grid(
-            f"/floor/{name}", **size, position=floor, plane_color=GROUND, plane_opacity=1.0
+            f"/floor/{name}", **size, position=floor, plane_color=(225, 228, 232), plane_opacity=1.0
         )
 
     def _lowest(self) -> float:
@@ -64,7 +63,7 @@ class PendulumFigure:
         rod = trimesh.creation.capsule(height=1.0, radius=0.08)
         rod.apply_translation([0.0, 0.0, 0.5 - rod.bounds.mean(0)[2]])
         server.scene.add_mesh_simple(f"/{name}/rod", rod.vertices, rod.faces, color=COLOURS[name])
-        server.scene.add_icosphere(f"/{name}/hinge", radius=0.1, color=LINE)
+        server.scene.add_icosphere(f"/{name}/hinge", radius=0.1, color=(120, 120, 120))
 
     def draw(self) -> None:
         """Turn the rod."""
@@ -87,7 +86,7 @@ class GroundFigure:
         here = np.arange(len(line))
         after, other = np.roll(here, -1), here + len(line)
         faces = np.r_[np.c_[here, after, other], np.c_[after, np.roll(other, -1), other]]
-        server.scene.add_mesh_simple("/track", points, faces, color=TRACK, side="double")
+        server.scene.add_mesh_simple("/track", points, faces, color=(205, 208, 212), side="double")
         self.root = server.scene.add_frame(f"/{name}", show_axes=False)
         cone = trimesh.creation.cone(radius=0.15, height=0.5)
         cone.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))

@@ -15,7 +15,6 @@ from websockets.http11 import Request, Response
 from afm_rl.errors import ConfigurationError
 
 NAMES = ("127.0.0.1", "localhost")
-LONGEST = 2**16  # bytes of a message; a browser's have a hundred
 
 
 class Setting(msgspec.Struct):
@@ -94,7 +93,8 @@ class LocalServer(viser.ViserServer):
 
         def serve(*parts: Any, **settings: Any) -> serving.serve:
             guarded.append(True)
-            settings |= {"max_size": LONGEST, "create_connection": partial(Connection, self)}
+            # Messages are of so many bytes at most; a browser's have a hundred.
+            settings |= {"max_size": 2**16, "create_connection": partial(Connection, self)}
             return usual(*parts, **settings)
 
         serving.serve = serve  # type: ignore[assignment, misc]

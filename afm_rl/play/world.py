@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 import torch
 
-from afm_rl.play.robots import Robot
+from afm_rl.play.robots import PlayedRobot
 from afm_rl.regimes import Actuators
 from afm_rl.regimes.presets import Fault
 from afm_rl.transforms.gymnasium import ActionFlowWrapper
@@ -59,7 +59,7 @@ class FaultyEnv(gymnasium.Wrapper):
 class Side:
     """One of the two robots."""
 
-    def __init__(self, robot: Robot, corrected: bool) -> None:
+    def __init__(self, robot: PlayedRobot, corrected: bool) -> None:
         self.robot, self.act = robot, robot.policy()
         self.env: Any = FaultyEnv(robot.make())
         self.faulty: FaultyEnv = self.env
@@ -109,7 +109,7 @@ class World:
     1
     """
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: PlayedRobot) -> None:
         self.robot, self.lock = robot, RLock()
         self.fault: Fault = {}
         self.sides = {name: Side(robot, name == "AFM") for name in SIDES}

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from rich.text import Text
 
 from afm_rl.diagnosis import Actuator, Diagnosis, Log
-from afm_rl.diagnosis.replay import Table as Replayed
+from afm_rl.diagnosis.replay import Replayed
 from afm_rl.diagnosis.replay.table import AFM, ALONE, SHARES
 from afm_rl.report import style
 from afm_rl.report.figures import Picture

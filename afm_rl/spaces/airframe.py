@@ -128,14 +128,14 @@ def unmix(action: Tensor, body: QuadrotorBody) -> Tensor:
     return _through(_mixers(body, action.dtype, action.device)[1], action)
 
 
-def saturate(action: Tensor, body: QuadrotorBody) -> Tensor:
+def within_motors(action: Tensor, body: QuadrotorBody) -> Tensor:
     r"""Return the wrench ``(*B, 4)`` that the motors give when they are asked for ``action``.
 
     .. math:: \mathrm{mix}(\mathrm{clamp}(\mathrm{mix}^{-1} u, 0, F_\mathrm{max}))
 
     A wrench within their means is kept to the bit.
 
-    >>> saturate(torch.tensor([0.8, 0.0, 0.0, 0.0]), QuadrotorBody())[0]
+    >>> within_motors(torch.tensor([0.8, 0.0, 0.0, 0.0]), QuadrotorBody())[0]
     tensor(0.5750)
     """
     forces = unmix(action, body)

@@ -59,7 +59,7 @@ def references_at(references: Sequence[Reference], index: Tensor, time: Tensor) 
     return every.gather(0, chosen).squeeze(0)
 
 
-class Table(Reference):
+class SampledReference(Reference):
     """Positions and velocities at given times, linear in between and constant outside.
 
     Args:
@@ -72,7 +72,7 @@ class Table(Reference):
         ConfigurationError: for numbers that do not go together.
 
     >>> rows = torch.tensor([[0.0, 0, 0], [1.0, 0, 0]])
-    >>> Table(torch.tensor([0.0, 2.0]), rows, rows).at(torch.tensor(1.0))
+    >>> SampledReference(torch.tensor([0.0, 2.0]), rows, rows).at(torch.tensor(1.0))
     tensor([0.5000, 0.0000, 0.0000, 0.5000, 0.0000, 0.0000])
     """
 
@@ -100,7 +100,7 @@ class Table(Reference):
         return torch.lerp(rows[last - 1], rows[last], share.unsqueeze(-1))
 
 
-def load_reference(path: str | Path, velocity: str = "columns") -> Table:
+def load_reference(path: str | Path, velocity: str = "columns") -> SampledReference:
     """Read a reference from a CSV file with the columns t,x,y,z,vx,vy,vz (s, m, m/s).
 
     Args:
@@ -128,7 +128,7 @@ def load_reference(path: str | Path, velocity: str = "columns") -> Table:
     velocities = rows[:, 4:] if velocity == "columns" else torch.zeros_like(positions)
     if velocity == "differences" and len(times) > 1 and times.diff().gt(0).all():
         (velocities,) = torch.gradient(positions, spacing=(times,), dim=0)
-    return Table(times, positions, velocities, path.stem)
+    return SampledReference(times, positions, velocities, path.stem)
 
 
 class Hover(Reference):
@@ -275,14 +275,6 @@ def _points(name: str, points: Sequence[Sequence[float]]) -> Tensor:
     return rows - local_origin(rows)
 
 
-NUMBER = r"(\d+(?:\.\d+)?)"
-NAMED: dict[str, Callable[..., Reference]] = {
-    "hover": Hover,
-    f"circle_{NUMBER}m_{NUMBER}mps": Circle,
-    f"figure_8_{NUMBER}s": lambda period: FigureEight(period=period),
-}
-
-
 def find_reference(name: str) -> Reference:
     """Return a reference by its name, or from a CSV file.
 
@@ -296,7 +288,13 @@ def find_reference(name: str) -> Reference:
     >>> find_reference("circle_3m_1.2mps").speed
     1.2
     """
-    for pattern, make in NAMED.items():
+    number = r"(\d+(?:\.\d+)?)"
+    named: dict[str, Callable[..., Reference]] = {
+        "hover": Hover,
+        f"circle_{number}m_{number}mps": Circle,
+        f"figure_8_{number}s": lambda period: FigureEight(period=period),
+    }
+    for pattern, make in named.items():
         found = re.fullmatch(pattern, name)
         if found:
             return make(*map(float, found.groups()))

@@ -15,7 +15,7 @@ from afm_rl.envs.courses.track import Track
 from afm_rl.errors import check_count
 from afm_rl.film import picture
 
-ROAD, LINE, ROBOT, GOAL, TRAIL = "#dddddd", "#999999", "#0072b2", "#d55e00", "#56b4e9"
+LINE = "#999999"
 DPI = 64  # a power of two, so that sizes in inches are exact
 OUTLINE = torch.tensor([[0.6, 0.0], [-0.4, 0.35], [-0.2, 0.0], [-0.4, -0.35]])  # robot (m)
 
@@ -62,13 +62,13 @@ class TrackCanvas:
         axes = self.figure.add_axes((0, 0, 1, 1), xlim=(left, right), ylim=(bottom, top))
         axes.set_axis_off()
         x, y = torch.cat([track.centerline, track.centerline[:1]]).unbind(-1)
-        (road,) = axes.plot(x, y, color=ROAD, linewidth=track.width * metre * 72 / DPI)
+        (road,) = axes.plot(x, y, color="#dddddd", linewidth=track.width * metre * 72 / DPI)
         road.set(solid_capstyle="round", solid_joinstyle="round")
         axes.plot(x, y, color=LINE, linewidth=1, linestyle="--")
         axes.plot(*track.waypoints.unbind(-1), color=LINE, linestyle="", marker="o", markersize=3)
-        (self._trail,) = axes.plot([], [], color=TRAIL, linewidth=1.5)
-        self._goal = Circle((0, 0), fill=False, edgecolor=GOAL, linewidth=2, zorder=3)
-        self._robot = Polygon(OUTLINE.numpy(), color=ROBOT, zorder=3)
+        (self._trail,) = axes.plot([], [], color="#56b4e9", linewidth=1.5)
+        self._goal = Circle((0, 0), fill=False, edgecolor="#d55e00", linewidth=2, zorder=3)
+        self._robot = Polygon(OUTLINE.numpy(), color="#0072b2", zorder=3)
         axes.add_patch(self._goal)
         axes.add_patch(self._robot)
 

@@ -37,11 +37,12 @@ class CrazyflieTrack(MissionEnv):
 
     The plant is the rigid body of :func:`~afm_rl.dynamics.quadrotor.quadrotor_rate`,
     integrated at 500 Hz while the action :math:`u = (T, M_x, M_y, M_z)` in N and N m is held for a
-    control tick of 50 ms. What the motors can give of it (:func:`~afm_rl.spaces.airframe.saturate`)
-    goes through a regime whose parameters follow the mission's phases. There is no ground, no drag
-    and no motor lag. The reward is minus the squared distance to the reference (m^2), averaged over
-    the tick. A flight is truncated after ``duration``; it terminates when it is lost: further than
-    ``limit`` from the reference, or no longer finite. It then stays at the last good state.
+    control tick of 50 ms. What the motors can give of it
+    (:func:`~afm_rl.spaces.airframe.within_motors`) goes through a regime whose parameters follow
+    the mission's phases. There is no ground, no drag and no motor lag. The reward is minus the
+    squared distance to the reference (m^2), averaged over the tick. A flight is truncated after
+    ``duration``; it terminates when it is lost: further than ``limit`` from the reference, or no
+    longer finite. It then stays at the last good state.
 
     ================= ================ ==================================================
     ``observation``   ``(*B, 13)``     position (m), velocity (m/s), quaternion

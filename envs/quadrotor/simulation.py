@@ -14,7 +14,7 @@ from afm_rl.dynamics.quadrotor import quadrotor_path
 from afm_rl.envs.courses.flights import Reference, references_at
 from afm_rl.envs.missions.env import PhasedSimulation
 from afm_rl.regimes import Regime, Schedule, wind_of
-from afm_rl.spaces.airframe import QuadrotorBody, saturate
+from afm_rl.spaces.airframe import QuadrotorBody, within_motors
 from afm_rl.spaces.manifold import RigidBodySpace
 
 
@@ -74,7 +74,7 @@ class QuadrotorSimulation(PhasedSimulation):
         two observations ``(*B, 12 (substeps - 1))``, and for a noisy regime ``(*B, 4)``.
         """
         mission, pose, step = data["mission"], data["pose"], data["step"]
-        action = saturate(data["action"].to(pose.dtype), self.body)
+        action = within_motors(data["action"].to(pose.dtype), self.body)
         path, plant = self.flown(data, action, self.regime_now(mission, data), actuator)
 
         # The published metric compares with the reference one plant step ahead of the state.

@@ -12,13 +12,10 @@ import torch
 from torch import Tensor
 
 from afm_rl.dynamics import MuJoCoDynamics
-from afm_rl.envs.task.own import EXACT, Limits
-from afm_rl.envs.task.task import Reward, Task, trust
-from afm_rl.errors import check_count
+from afm_rl.envs.task.own import EXACT, Limits, simulated
+from afm_rl.envs.task.task import Reward, Task, bound_noise
 
-MODEL = Path(__file__).with_name("arm.xml")
 JOINTS = 7
-SKIP = 5  # simulation steps per action: 50 ms
 
 
 def chain(model: Any, site: str) -> tuple[Tensor, Tensor]:
@@ -77,7 +74,7 @@ def arm_task(
     """
     import mujoco
 
-    world = MuJoCoDynamics(MODEL, SKIP)
+    world = MuJoCoDynamics(Path(__file__).with_name("arm.xml"), 5)  # of 10 ms each
     data = mujoco.MjData(world.mjcf)
     mujoco.mj_resetDataKeyframe(world.mjcf, data, 0)
     first = torch.cat([torch.tensor(data.qpos), torch.zeros(JOINTS)]).float()
@@ -88,19 +85,10 @@ def arm_task(
 
     low = world.action_low.tolist() if action_low is None else action_low
     high = world.action_high.tolist() if action_high is None else action_high
-    trust(world, first, low, high, EXACT)
+    bound_noise(world, first, low, high, EXACT)
     offsets, axes = chain(world.mjcf, "tip")
-    states, actions = world.names
-    return Task(
-        name="arm",
-        world=world,
-        start=start,
-        reward=partial(miss, offsets=offsets, axes=axes) if reward is None else reward,
-        low=low,
-        high=high,
-        dt=world.dt,
-        steps=check_count("robot.steps", steps),
-        state_names=states,
-        action_names=actions,
-        goal_names=states[:JOINTS],
-    )
+    known = {
+        "reward": partial(miss, offsets=offsets, axes=axes) if reward is None else reward,
+        "goal_names": world.names[0][:JOINTS],
+    }
+    return simulated("arm", world, start, known, steps, low, high)

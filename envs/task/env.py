@@ -20,9 +20,6 @@ from afm_rl.errors import ConfigurationError, check_count, check_instance
 from afm_rl.film import body_pictures, curves
 from afm_rl.regimes import ActionGain, Regime, Schedule
 
-SALT = 0x5441534B  # of the noise of actuators
-NEXT_SEED = 1_000_003  # what an episode that follows of itself adds to its mission's seed
-
 
 class TaskEnv(MissionEnv):
     r"""Episodes of a :class:`~afm_rl.envs.Task` under regimes, batched.
@@ -76,7 +73,7 @@ class TaskEnv(MissionEnv):
         steps = task.steps if max_steps is None else check_count("max_steps", max_steps)
         schedule = Schedule([0.5]) if schedule is None else schedule
         self.task = task
-        self.noise = MissionNoise({"actuator": (SALT, len(low))})
+        self.noise = MissionNoise({"actuator": (0x5441534B, len(low))})
         self.simulation = TaskSimulation(
             task,
             check_regime(regime, lambda: default, len(task.state_names), len(low)),
@@ -108,7 +105,8 @@ class TaskEnv(MissionEnv):
         mission = super()._missions_of(given, batch)
         again = None if given is None else given.get("_reset", None)
         if again is not None:
-            mission["seed"] = mission["seed"] + NEXT_SEED * again.reshape(batch)
+            # An episode that follows of itself begins elsewhere.
+            mission["seed"] = mission["seed"] + 1_000_003 * again.reshape(batch)
         return mission
 
 

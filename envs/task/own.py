@@ -11,7 +11,7 @@ from torch import Tensor
 
 from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
 from afm_rl.envs.task.rewards import Rewards
-from afm_rl.envs.task.task import NOWHERE, Reward, Task, trust
+from afm_rl.envs.task.task import NOWHERE, Reward, Task, bound_noise
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.spaces.manifold import Manifold
 
@@ -120,7 +120,7 @@ def mujoco_task(
 
     name = "mjcf" if str(xml).lstrip().startswith("<") else Path(xml).stem
     low, high = action_low or world.action_low.tolist(), action_high or world.action_high.tolist()
-    trust(world, first, low, high)
+    bound_noise(world, first, low, high)
     return simulated(name, world, start, {"reward": reward}, steps, low, high)
 
 
@@ -157,7 +157,7 @@ def function_task(
     world = KnownDynamics(step, Manifold(len(first), angles), len(action_low))
     return Task(
         name=getattr(step, "__name__", "function"),
-        world=trust(world, first, action_low, action_high),
+        world=bound_noise(world, first, action_low, action_high),
         start=begin,
         reward=reward,
         low=action_low,

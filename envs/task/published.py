@@ -26,7 +26,7 @@ from afm_rl.envs.task.rewards import (
     pendulum_step,
     seen_target,
 )
-from afm_rl.envs.task.task import NOWHERE, Reward, Task, trust
+from afm_rl.envs.task.task import NOWHERE, Reward, Task, bound_noise
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.targets import check_name
@@ -138,7 +138,7 @@ def gymnasium_task(
 
     seen = {"observe": partial(_observation_of, inner)}
     world = MuJoCoDynamics(env)
-    trust(world, start(0)[0], world.action_low.tolist(), world.action_high.tolist(), EXACT)
+    bound_noise(world, start(0)[0], world.action_low.tolist(), world.action_high.tolist(), EXACT)
     return simulated(id, world, start, {**known, **seen}, steps, *limits)
 
 

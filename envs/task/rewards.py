@@ -40,7 +40,6 @@ def pendulum_observation(state: Tensor) -> Tensor:
 
 Reward = Callable[..., Tensor]
 LINK = 0.12  # m, each of the reacher's links
-HINGE = 3  # MuJoCo's number for joints that turn about an axis
 
 
 class Rewards(NamedTuple):
@@ -163,7 +162,7 @@ def planar_body(model: Any) -> dict[str, Tensor]:
     )
     arms, turns = share.unsqueeze(-1) * centres, torch.zeros(model.nbody, model.nv).double()
     for joint, body in enumerate(model.jnt_bodyid):
-        if model.jnt_type[joint] == HINGE:
+        if model.jnt_type[joint] == 3:  # a hinge
             below = [k for k in range(body, model.nbody) if _is_above(model, body, k)]
             turns[below, model.jnt_dofadr[joint]] = 1.0
     for body in range(1, model.nbody):

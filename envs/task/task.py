@@ -16,7 +16,6 @@ from afm_rl.regimes import Regime
 
 Reward = Callable[..., Tensor]
 Contexts = Mapping[str, Sequence[Sequence[Mapping[str, float]]]]
-ENDLESS = 1e30  # what unbounded specs say
 PROBE = 2, 3  # batch in which a reward is tried
 NOWHERE = torch.zeros(0)  # the goal of a task without one
 
@@ -76,7 +75,8 @@ class Task:
     def __post_init__(self) -> None:
         """Check limits and rewards."""
         bounds = torch.tensor([list(self.low), list(self.high)])
-        endless = (~(bounds.abs() < ENDLESS).all(0)).nonzero().flatten().tolist()
+        # Unbounded specs say 1e30 or more.
+        endless = (~(bounds.abs() < 1e30).all(0)).nonzero().flatten().tolist()
         if endless:
             names = ", ".join(self.action_names[axis] for axis in endless)
             raise ConfigurationError(
@@ -191,7 +191,7 @@ class Task:
         """Bring such a world into the state that a history led to."""
 
 
-def trust(
+def bound_noise(
     world: KnownDynamics,
     state: Tensor,
     low: Sequence[float],

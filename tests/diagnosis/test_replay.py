@@ -14,7 +14,7 @@ from afm_rl.diagnosis.replay.belief import believe, identity, watcher
 from afm_rl.diagnosis.replay.table import (
     AFM,
     ALONE,
-    Table,
+    Replayed,
     affine,
     arx,
     quantile_with_interval,
@@ -146,7 +146,7 @@ def test_sentences():
     log = make(rows=30)
 
     def say(*shares):
-        return Table(log, {}, log.command, None, dict(zip("abc", shares, strict=False))).sentence
+        return Replayed(log, {}, log.command, None, dict(zip("abc", shares, strict=False))).sentence
 
     assert say(0.5, 0.7) == (
         "A correction would have removed 50 % of the error of a, and 70 % of the error of b."

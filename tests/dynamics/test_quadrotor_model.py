@@ -10,7 +10,7 @@ from afm_rl.dynamics import quadrotor as equations
 from afm_rl.dynamics.quadrotor import quadrotor_path, quadrotor_rate, quadrotor_step
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import flight_regimes
-from afm_rl.spaces.airframe import QuadrotorBody, mix, saturate, unmix
+from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix, within_motors
 
 BODY = QuadrotorBody()
 INERTIA = torch.tensor(BODY.inertia, dtype=torch.float64)
@@ -82,14 +82,14 @@ def test_the_mixer_is_the_published_one():
 
 def test_motors_saturate_one_by_one():
     forces = torch.tensor([0.2, 0.05, -0.01, 0.1], dtype=torch.float64)
-    given = unmix(saturate(mix(forces, BODY), BODY), BODY)
+    given = unmix(within_motors(mix(forces, BODY), BODY), BODY)
     torch.testing.assert_close(given, forces.clamp(0.0, BODY.max_force), rtol=1e-12, atol=1e-15)
 
 
 def test_actions_within_the_means_of_the_motors_are_kept_to_the_bit():
     forces = 0.01 + 0.12 * torch.rand(1000, 4)
     action = mix(forces, BODY)
-    assert (saturate(action, BODY) == action).all()
+    assert (within_motors(action, BODY) == action).all()
 
 
 def test_the_wind_pushes():
@@ -237,7 +237,7 @@ def test_agrees_with_rotorpy():
     exact = {"method": "DOP853", "rtol": 1e-11, "atol": 1e-12}
     other = multirotor.Multirotor(parameters, aero=False, integrator_kwargs=exact)
     states, actions = flights(10)
-    actions = saturate(actions, BODY)
+    actions = within_motors(actions, BODY)
     speeds = (unmix(actions, BODY).clamp(min=0) / BODY.k_t).sqrt().numpy()
     ours = quadrotor_step(states, actions, 0.05, 100, BODY)
     for state, speed, expected in zip(states.numpy(), speeds, ours, strict=True):

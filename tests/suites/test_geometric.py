@@ -11,7 +11,7 @@ from afm_rl.dynamics.quadrotor import quadrotor_path, quadrotor_step
 from afm_rl.envs import Circle, CrazyflieTrack, Hover
 from afm_rl.errors import ConfigurationError, NonFiniteError
 from afm_rl.planning import GoalDistance, PlanningEnv
-from afm_rl.spaces.airframe import QuadrotorBody, saturate
+from afm_rl.spaces.airframe import QuadrotorBody, within_motors
 from afm_rl.spaces.manifold import RigidBodySpace
 
 BODY, DT = QuadrotorBody(), 0.05
@@ -114,7 +114,7 @@ def test_flights_of_a_batch_are_independent(batch):
     alone = [steer(one) for one in state.reshape(-1, 13)]
     alike = {"rtol": 1e-6, "atol": 1e-9}  # to rounding, which depends on processor and batch
     torch.testing.assert_close(action.reshape(-1, 4), torch.stack(alone), **alike)
-    torch.testing.assert_close(saturate(action, BODY), action)  # the motors can do it
+    torch.testing.assert_close(within_motors(action, BODY), action)  # the motors can do it
 
 
 def circle(speed=0.8, preview=True, ticks=100):

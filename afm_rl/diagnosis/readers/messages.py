@@ -6,7 +6,7 @@ import io
 import json
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, redirect_stdout
+from contextlib import closing, redirect_stdout
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -21,6 +21,7 @@ from afm_rl.diagnosis.readers.source import (
     Source,
     check_names,
     check_regular,
+    reading,
 )
 from afm_rl.errors import ConfigurationError, printable
 
@@ -32,8 +33,6 @@ Messages = Iterator[tuple[str, float, Any]]
 TIME = "timestamp"  # in microseconds
 CHUNK = 1 << 26
 """Most bytes that a chunk of an MCAP file unpacks to."""
-UNPACKED = 1 << 24, 100
-"""Most bytes that all of them do: so many, and so many for each byte of the file."""
 
 
 def fields_of(message: Any, depth: int = 8, most: int = 64) -> Iterator[tuple[str, Field]]:
@@ -137,7 +136,7 @@ def open_mcap(path: Path) -> Source:
     def messages(topics: Collection[str] | None) -> Messages:
         schemas: dict[int, Any] = {}
         channels: dict[int, tuple[str, Any]] = {}  # topic, and what decodes its messages
-        with _reading("MCAP file"), path.open("rb") as file:
+        with reading("no MCAP file, or a damaged one"), path.open("rb") as file:
             for record in _records(file, path.stat().st_size):
                 if isinstance(record, Schema):
                     schemas[record.id] = record
@@ -157,8 +156,8 @@ def _records(file: BinaryIO, size: int) -> Iterator[Any]:
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader, breakup_chunk
 
-    least, ratio = UNPACKED
-    left = least + ratio * size
+    ratio = 100  # most bytes in all for each byte of the file
+    left = (1 << 24) + ratio * size
     for record in StreamReader(file, emit_chunks=True).records:
         if isinstance(record, Chunk):
             most = min(left, CHUNK)
@@ -197,7 +196,7 @@ def open_bag(path: Path) -> Source:
             _check_tables(part)
 
     def messages(topics: Collection[str] | None) -> Messages:
-        with _reading("bag of ROS"):
+        with reading("no bag of ROS, or a damaged one"):
             types = get_typestore(Stores.LATEST)  # of bags that have none
             with AnyReader([path], default_typestore=types) as bag:
                 wanted = [c for c in bag.connections if topics is None or c.topic in topics]
@@ -210,7 +209,10 @@ def open_bag(path: Path) -> Source:
 def _check_tables(file: Path) -> None:
     """Refuse views in a database: what they hold is computed, and need not end."""
     address = f"{file.resolve().as_uri()}?immutable=1"
-    with _reading("bag of ROS"), closing(sqlite3.connect(address, uri=True)) as base:
+    with (
+        reading("no bag of ROS, or a damaged one"),
+        closing(sqlite3.connect(address, uri=True)) as base,
+    ):
         view = base.execute("SELECT name FROM sqlite_master WHERE type = 'view'").fetchone()
     if view:
         raise ConfigurationError(f"view {printable(str(view[0]))}: expected tables alone")
@@ -253,18 +255,6 @@ def _decoder(schema: Any, encoding: str) -> Any:
     return lambda data: store.deserialize_cdr(data, schema.name)
 
 
-@contextmanager
-def _reading(what: str) -> Iterator[None]:
-    """Turn an error of the reader into one line: of damaged bytes it may be of any kind."""
-    try:
-        yield
-    except (GeneratorExit, ConfigurationError, MemoryError):
-        raise
-    except Exception as error:
-        reason = printable(f"{type(error).__name__}: {error}", 120)
-        raise ConfigurationError(f"no {what}, or a damaged one: {reason}") from error
-
-
 def open_ulog(path: Path) -> Source:
     """Return the fields of a ULog: ``TOPIC.FIELD``, or ``TOPIC[1].FIELD`` of a second instance."""
     try:
@@ -287,7 +277,11 @@ def open_ulog(path: Path) -> Source:
     class Bounded(ULog):
         _MessageAddLogged = Subscription
 
-    with _reading("ULog"), path.open("rb") as file, redirect_stdout(io.StringIO()):
+    with (
+        reading("no ULog, or a damaged one"),
+        path.open("rb") as file,
+        redirect_stdout(io.StringIO()),
+    ):
         topics = {
             f"{data.name}[{data.multi_id}]" if data.multi_id else data.name: data.data
             for data in Bounded(file).data_list

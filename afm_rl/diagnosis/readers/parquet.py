@@ -6,7 +6,6 @@ import json
 import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from afm_rl.diagnosis.readers.source import (
     blocks_of,
     check_names,
     check_regular,
+    reading,
 )
 from afm_rl.diagnosis.readers.tables import EPISODE, TIME
 from afm_rl.errors import ConfigurationError, printable
@@ -91,7 +91,7 @@ def source_of(
 
 def columns_of(file: Path) -> dict[str, arrow.DataType]:
     """Return names and types of the columns of a file."""
-    with _reading(file):
+    with reading(_no_parquet(file)):
         schema = parquet.read_schema(file)
     return dict(zip(check_names(schema.names), schema.types, strict=True))
 
@@ -101,7 +101,7 @@ def widths_of(file: Path, columns: Iterable[str]) -> dict[str, int | None]:
 
     Of lists of more than ``WIDEST`` numbers it is the mean, which is known without reading them.
     """
-    with _reading(file):
+    with reading(_no_parquet(file)):
         opened, first = parquet.ParquetFile(file), 0
         stored, schema = opened.metadata, opened.schema_arrow
         groups = [stored.row_group(k) for k in range(stored.num_row_groups)]
@@ -152,7 +152,7 @@ def check_width(column: str, width: int | None) -> None:
 
 
 def _rows(file: Path) -> int:
-    with _reading(file):
+    with reading(_no_parquet(file)):
         return parquet.read_metadata(file).num_rows
 
 
@@ -175,7 +175,7 @@ def _read(
         for column, longest in widths_of(file, columns).items():
             check_width(column, longest)
             check_kind(column, columns_of(file)[column])
-        with _reading(file):
+        with reading(_no_parquet(file)):
             for first, batch in _batches(file, columns, width, wanted):
                 numbers.append(begin + first + np.arange(len(batch)))
                 for column in columns:
@@ -236,23 +236,8 @@ def _values(name: str, column: arrow.Array) -> np.ndarray:
         return column.to_numpy(zero_copy_only=False).astype(float)
 
 
-@contextmanager
-def _reading(file: Path) -> Iterator[None]:
-    """Turn an error of the reader into one line."""
-    try:
-        yield
-    except (ConfigurationError, MemoryError):
-        raise
-    except OSError as error:
-        reason = error.strerror or printable(str(error))
-        raise ConfigurationError(
-            f"{printable(str(file), 200)}: no parquet file: {reason}"
-        ) from error
-    except (arrow.ArrowException, ValueError, TypeError, OverflowError, KeyError) as error:
-        reason = printable(str(error), 120)
-        raise ConfigurationError(
-            f"{printable(str(file), 200)}: no parquet file: {reason}"
-        ) from error
+def _no_parquet(file: Path) -> str:
+    return f"{printable(str(file), 200)}: no parquet file"
 
 
 def open_lerobot(folder: Path) -> Source:

@@ -25,8 +25,6 @@ from afm_rl.errors import ConfigurationError, printable
 
 PAIRS = ("command", "response")
 TRANSITIONS = ("action", "state")
-EFFORT = re.compile(r"(pwm|thrust|throttle|motor|esc)[._]?\d*")
-"""Columns that say how hard the motors are driven, if at all."""
 LARGEST = 1e30  # squares of larger numbers leave single precision
 
 READERS: dict[str, Callable[[Path], Source]] = {
@@ -197,7 +195,8 @@ def _about(path: str | Path) -> Iterator[None]:
 
 def _effort(source: Source, most: int = 16) -> dict[str, np.ndarray]:
     """Return how hard the motors were driven, as far as that was logged in numbers."""
-    names = [name for name in source.names if EFFORT.fullmatch(name)][:most]
+    motors = re.compile(r"(pwm|thrust|throttle|motor|esc)[._]?\d*")
+    names = [name for name in source.names if motors.fullmatch(name)][:most]
     try:
         found = source.read(names) if names else {}
     except ConfigurationError:

@@ -6,7 +6,8 @@ import difflib
 import re
 import stat
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -133,6 +134,18 @@ def check_regular(path: Path) -> Path:
             "expected a file"
         )
     return path
+
+
+@contextmanager
+def reading(what: str) -> Iterator[None]:
+    """Turn an error into one line that begins with ``what``: of damaged bytes it may be any."""
+    try:
+        yield
+    except (ConfigurationError, MemoryError):
+        raise
+    except Exception as error:
+        reason = getattr(error, "strerror", None) or f"{type(error).__name__}: {error}"
+        raise ConfigurationError(f"{what}: {printable(str(reason), 120)}") from error
 
 
 def check_names(names: Sequence[str]) -> Sequence[str]:

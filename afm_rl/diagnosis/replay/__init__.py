@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.replay.table import AFM, SIMPLE, Table, errors_of, removed_by, slow_in
+from afm_rl.diagnosis.replay.table import AFM, SIMPLE, Replayed, errors_of, removed_by, slow_in
 
-__all__ = ["Table", "replay"]
+__all__ = ["Replayed", "replay"]
 
 
-def replay(log: Log, seen: Callable[[float], object] = lambda share: None) -> Table:
+def replay(log: Log, seen: Callable[[float], object] = lambda share: None) -> Replayed:
     """Predict every row of a log from its command and the rows before, and compare.
 
     The robot's state is its response, and the model says that a response is its command. So the
@@ -35,4 +35,4 @@ def replay(log: Log, seen: Callable[[float], object] = lambda share: None) -> Ta
     found = {name: p(log.command, log.response, missing > 0) for name, p in SIMPLE.items()}
     corrector = watcher(len(log.names))
     found[AFM], std = believe_log(corrector, log.command, log.response, missing, seen)
-    return Table(log, found, std, errors_of(log, found), removed_by(log, found), slow_in(log))
+    return Replayed(log, found, std, errors_of(log, found), removed_by(log, found), slow_in(log))

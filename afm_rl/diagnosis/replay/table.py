@@ -114,7 +114,7 @@ def _least_squares(
 
 
 @dataclass(frozen=True)
-class Table:
+class Replayed:
     """A log, what was predicted of it, and how far that was off.
 
     Args:
@@ -183,7 +183,7 @@ class Table:
 
 
 def errors_of(log: Log, predictions: Mapping[str, np.ndarray], stretches: int = 4) -> pd.DataFrame:
-    """Return :attr:`Table.errors`: of the whole log, and of stretches of equally many rows."""
+    """Return :attr:`Replayed.errors`: of the whole log, and of stretches of equally many rows."""
     size, since = len(log.command), log.since
     parts = [("all", 0, size)]
     if size >= 20 * stretches:

@@ -19,7 +19,7 @@ from afm_rl.dynamics.mujoco_model import NAMES, changed_model
 from afm_rl.envs import dm_control_task
 from afm_rl.envs.task.own import Limits
 from afm_rl.envs.task.published import quiet
-from afm_rl.envs.task.task import Reward, Task, trust
+from afm_rl.envs.task.task import Reward, Task, bound_noise
 from afm_rl.errors import check_choice, check_count
 
 LEGS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
@@ -132,7 +132,7 @@ def actuator_inversion_task(
         domain, name, nominal, spans = BODIES[task]
         change = partial(stretched, domain) if domain in EDITS else changed_model
         found = dm_control_task(domain, name, change=change)
-        trust(cast(KnownDynamics, found.world), found.start(0)[0], found.low, found.high)
+        bound_noise(cast(KnownDynamics, found.world), found.start(0)[0], found.low, found.high)
         signs = SIGNS if domain in EDITS else SIGNS[:1]
         regime = partial(body_regime, len(found.low), **nominal)
         found = replace(found, contexts=contexts_of(spans, regime, signs, contexts))

@@ -15,7 +15,7 @@ from torch import Tensor
 from afm_rl.dynamics.quadrotor import check_body
 from afm_rl.errors import ConfigurationError, check_count, check_number
 from afm_rl.planning.planning_env import PlanningEnv
-from afm_rl.spaces.airframe import QuadrotorBody, saturate
+from afm_rl.spaces.airframe import QuadrotorBody, within_motors
 from afm_rl.spaces.keys import as_key
 
 LEAST = 1.0  # m/s^2 upwards: with less, tilting would not steer
@@ -85,7 +85,7 @@ def geometric_wrench(
     inertia = torch.tensor(body.inertia, dtype=state.dtype, device=state.device)
     moment = inertia * (-gains.attitude * error - gains.rate * rate)
     moment = moment + torch.linalg.cross(rate, inertia * rate)
-    return saturate(torch.cat([thrust, moment], -1), body)
+    return within_motors(torch.cat([thrust, moment], -1), body)
 
 
 def _within_means(wanted: Tensor, body: QuadrotorBody, tilt: float) -> Tensor:

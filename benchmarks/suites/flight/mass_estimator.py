@@ -13,7 +13,7 @@ from afm_rl.dynamics import Oracle, Quadrotor
 from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
-from afm_rl.spaces.airframe import saturate
+from afm_rl.spaces.airframe import within_motors
 
 
 def inverse_mass(
@@ -125,7 +125,7 @@ class MassEstimator(Learner):
         physics = cast(Quadrotor, self.model.model)
         body = physics.body
         state, action, after = (transitions.get(key) for key in self.loss.in_keys)
-        thrust = saturate(action, body)[..., 0]
+        thrust = within_motors(action, body)[..., 0]
         turns = (roma.unitquat_to_rotmat(part[..., 6:10])[..., 2] for part in (state, after))
         axis = sum(turns) / 2
         enough = thrust >= self.least_thrust * body.hover_thrust

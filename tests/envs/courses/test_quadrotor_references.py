@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from afm_rl.envs import Circle, FigureEight, Hover, Table, Waypoints, load_reference
+from afm_rl.envs import Circle, FigureEight, Hover, SampledReference, Waypoints, load_reference
 from afm_rl.envs.courses.flights import references_at
 from afm_rl.errors import ConfigurationError
 
@@ -103,7 +103,10 @@ def test_files_that_cannot_be_used_say_why(tmp_path, header, rows, settings, mes
         (lambda: Waypoints([[0, 0, math.inf], [0, 0, 0]]), "waypoints: points"),
         (lambda: Waypoints(SQUARE, speed=0.0), "waypoints: speed=0.0"),
         (lambda: Waypoints(SQUARE, closed="yes"), "waypoints: closed='yes'"),
-        (lambda: Table(torch.arange(2.0), torch.zeros(2, 3), torch.zeros(2, 2)), r"\(N, 3\) each"),
+        (
+            lambda: SampledReference(torch.arange(2.0), torch.zeros(2, 3), torch.zeros(2, 2)),
+            r"\(N, 3\) each",
+        ),
     ],
 )
 def test_impossible_references_are_refused(make, message):

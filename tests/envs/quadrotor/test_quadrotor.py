@@ -13,7 +13,7 @@ from afm_rl.envs import Circle, CrazyflieTrack, Hover, Reference, schedule_in_se
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import ActionGain, Delay, GainNoise, MassFactor, Schedule, flight_regimes
 from afm_rl.regimes import Compose as Families
-from afm_rl.spaces.airframe import QuadrotorBody, saturate
+from afm_rl.spaces.airframe import QuadrotorBody, within_motors
 
 BODY = QuadrotorBody()
 HOVER = (BODY.hover_thrust, 0.0, 0.0, 0.0)
@@ -56,7 +56,7 @@ def test_specs_hold_in_either_precision(dtype):
 def test_a_step_is_the_rigid_body_under_what_the_motors_give():
     env = CrazyflieTrack(dtype=torch.float64)
     action = torch.tensor([0.5, 5e-3, -4e-3, 1e-4], dtype=torch.float64)  # beyond the motors
-    given = saturate(action, BODY)
+    given = within_motors(action, BODY)
     assert (given != action).any()
     after = act(env, env.reset(), action)
     expected = Quadrotor(substeps=25)(env.reset()["pose"], given)

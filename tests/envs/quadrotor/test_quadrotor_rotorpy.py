@@ -12,7 +12,7 @@ from afm_rl.envs import Hover, RotorPyTrack, rotorpy_crazyflie
 from afm_rl.envs.quadrotor import rotorpy as quadrotor_rotorpy
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import Schedule
-from afm_rl.spaces.airframe import QuadrotorBody, mix, saturate, unmix
+from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix, within_motors
 
 pytest.importorskip("rotorpy")
 pytest.importorskip("roma")
@@ -44,7 +44,7 @@ def peer(params, wind=(0.0, 0.0, 0.0)):
         **{"x": np.zeros(3), "v": np.zeros(3), "q": np.array([0.0, 0.0, 0.0, 1.0])},
         **{"w": np.zeros(3), "wind": np.array(wind), "rotor_speeds": np.full(4, speed)},
     }
-    asked = saturate(torch.tensor(ASKED, dtype=torch.float64), body)
+    asked = within_motors(torch.tensor(ASKED, dtype=torch.float64), body)
     control = {"cmd_motor_speeds": (unmix(asked, body) / body.k_t).sqrt().numpy()}
     for _ in range(TICKS * SUBSTEPS):
         state = vehicle.step(state, control, 0.05 / SUBSTEPS)
