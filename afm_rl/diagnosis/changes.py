@@ -124,9 +124,9 @@ def _divide(log: Log, j: int, whole: Part, most: int, settings: Settings) -> lis
     if not apart and whole.model.cost < 0.1:  # what leaves more may mix several
         return [whole]
     first = _divide(log, j, left, most - 1, settings)
-    found = first + _divide(log, j, right, most - len(first), settings)
+    parts = first + _divide(log, j, right, most - len(first), settings)
     # What changes twice may show in the parts of a part only.
-    return found if apart or len(found) > 2 else [whole]
+    return parts if apart or len(parts) > 2 else [whole]
 
 
 def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | None:
@@ -136,8 +136,8 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
     slow = lagging(problem.clock, u, shape.keep) if shape.keep else u
     linear = shape.linear
     late = [look_back(problem.clock, slow, linear)[rows], u[rows, own, None]]
-    for more in (1, 3, 8) if len(part) > 400 else ():
-        later = linear._replace(delay=linear.delay + more)
+    for steps in (1, 3, 8) if len(part) > 400 else ():
+        later = linear._replace(delay=linear.delay + steps)
         late.append(look_back(problem.clock, slow[:, own], later)[rows, None])
     late.append(model.parts(problem)[0][rows, None])
     if len(part) < 200 + 40 * u.shape[1]:
@@ -155,7 +155,7 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
         return None
     before, places, total = before[good], places[good], sums.sum(0)
     one = _left_over(total[None])[1]
-    (left, early), (right, after) = (_left_over(some) for some in (before, total - before))
+    (left, early), (right, after) = (_left_over(moments) for moments in (before, total - before))
     best = int(np.argmin(left + right))
     misses = [y - table[:, :-1] @ line for line in (one[0], early[best], after[best])]
     near = np.arange(len(y))
@@ -167,11 +167,11 @@ def _likely_change(log: Log, j: int, part: Part, settings: Settings) -> int | No
     )
     split = np.where(near < row, misses[1], misses[2])
     scale = scale_of(split)
-    gain, kept = costs(misses[0], scale), costs(split, scale)
-    won = len(y) * math.log((gain.mean() + FLOOR) / (kept.mean() + FLOOR))
+    gain, split_cost = costs(misses[0], scale), costs(split, scale)
+    won = len(y) * math.log((gain.mean() + FLOOR) / (split_cost.mean() + FLOOR))
     apart = float(np.std(misses[1] - misses[2]))
     sides = near < row, near >= row
-    clear = any(consistent((gain - kept)[side], settings) for side in sides)
+    clear = any(consistent((gain - split_cost)[side], settings) for side in sides)
     clean = min(sides, key=lambda side: split[side].std())  # the other one may change again
     alone = independence(split[clean])
     if (
@@ -187,8 +187,8 @@ def _left_over(moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the squared residual of lines, and the lines, from moments ``(B, P, P)``."""
     gram, cross = moments[:, :-1, :-1], moments[:, :-1, -1:]
     solution = ridge(gram, cross, 1e-9)
-    left = moments[:, -1, -1] - (solution * cross).sum((1, 2))
-    return np.maximum(left, 0.0), solution[..., 0]
+    residual = moments[:, -1, -1] - (solution * cross).sum((1, 2))
+    return np.maximum(residual, 0.0), solution[..., 0]
 
 
 def _exact_row(
@@ -217,11 +217,11 @@ def _apart(log: Log, j: int, whole: Part, left: Part, right: Part, settings: Set
     sides = [side & use for side in (early, ~early) if (side & use).any()]
     split = np.where(early, first, second)
     scale = scale_of((y - split)[use])
-    kept, gain = costs(y - split, scale), costs(y - one, scale)
-    gain -= kept
+    split_cost, gain = costs(y - split, scale), costs(y - one, scale)
+    gain -= split_cost
     weight = min(independence((y - split)[use]), 0.5 + 0.5 * whole.weight)
-    more = left.model.size + right.model.size + 4 - whole.model.size
-    better, best = gain[use].mean() + kept[use].mean(), kept[use].mean()
+    numbers = left.model.size + right.model.size + 4 - whole.model.size
+    better, best = gain[use].mean() + split_cost[use].mean(), split_cost[use].mean()
     won = len(y) * weight * math.log((better + FLOOR) / (best + FLOOR))
     moved = min(travel(log, own, part.rows) for part in (left, right))
     rest = [((y - split)[side].var(), y[side].var()) for side in sides]
@@ -229,7 +229,7 @@ def _apart(log: Log, j: int, whole: Part, left: Part, right: Part, settings: Set
     known = all(left < 0.5 * moves or moves < 0.05 * y[use].var() for left, moves in rest)
     apart = min(float(np.sqrt(((first - second)[side] ** 2).mean())) for side in sides)
     return (
-        won > settings.price(len(y) * weight) * max(more, 2)
+        won > settings.price(len(y) * weight) * max(numbers, 2)
         and any(consistent(gain[side], settings) for side in sides)
         and apart > 2 * settings.matters * split[use].std()
         and (explained or known and moved >= 0.5 * settings.travel)

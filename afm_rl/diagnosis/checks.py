@@ -82,12 +82,12 @@ def effort_notes(log: Log, often: float = 0.2) -> tuple[str, ...]:
 def echoes(log: Log, rows: Sequence[int] = (0, 1)) -> list[bool]:
     """Return which responses are exactly their commands, of the same row or of the one before."""
     apart = np.cumsum(log.begins)
-    found = np.zeros(len(log.names), dtype=bool)
+    exact = np.zeros(len(log.names), dtype=bool)
     for late in rows:
         u, y = log.command[: len(apart) - late], log.response[late:]
         same = apart[late:] == apart[: len(apart) - late]
-        found |= (u == y)[same].all(0)
-    return list(found & (np.ptp(log.command, axis=0) > 0))
+        exact |= (u == y)[same].all(0)
+    return list(exact & (np.ptp(log.command, axis=0) > 0))
 
 
 def travel(log: Log, j: int, rows: slice = slice(None), least: float = 0.1) -> float:
@@ -156,9 +156,9 @@ def _summed(log: Log, leads: Sequence[Lead], settings: Settings) -> set[int]:
     rates[log.begins] = 0.0
     spread = without_outliers(rates).std(0)
     changes = replace(log, response=rates / np.where(spread > 0, spread, 1.0))
-    found = find_leads(changes.thinned(settings.searched), odd, settings)
+    rate_leads = find_leads(changes.thinned(settings.searched), odd, settings)
     return {
         j
-        for j, rate in zip(odd, found, strict=True)
+        for j, rate in zip(odd, rate_leads, strict=True)
         if rate.left < 0.3 * leads[j].left and rate.driver == j
     }

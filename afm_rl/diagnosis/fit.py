@@ -48,8 +48,8 @@ def fit_response(
     added = 0
     for step in (larger, _with_drift):  # a drift last, since it explains a little of everything
         while added < settings.most:
-            found = [refine(large, other) for other in step(problem, model)]
-            better = min(found, key=COST, default=model)
+            refined = [refine(large, other) for other in step(problem, model)]
+            better = min(refined, key=COST, default=model)
             if not (
                 needed(large, better, model, settings) and _visible(large, better, model, settings)
             ):
@@ -65,25 +65,27 @@ def _dynamics(problem: Problem, driver: int, starts: Sequence[Shape]) -> list[Mo
     for start in starts:
         kinds = ("delay", "keep", "rate")
         names = tuple(name for name in kinds if getattr(start, name) != NONE[name])
-        more = ("delay", *(name for name in names if name != "delay"))
-        for some in dict.fromkeys((names, more, more[1:], ("delay",))):
-            shape = Shape(**{name: getattr(start, name) for name in some})
-            options.setdefault(some, []).append(fit_lines(problem, Model(driver, shape, some)))
-    best = sorted((min(some, key=COST) for some in options.values()), key=lambda m: m.shape.rate)
-    found: list[Model] = []
+        delayed = ("delay", *(name for name in names if name != "delay"))
+        for active in dict.fromkeys((names, delayed, delayed[1:], ("delay",))):
+            shape = Shape(**{name: getattr(start, name) for name in active})
+            options.setdefault(active, []).append(fit_lines(problem, Model(driver, shape, active)))
+    best = sorted(
+        (min(active, key=COST) for active in options.values()), key=lambda m: m.shape.rate
+    )
+    models: list[Model] = []
     for model in reversed(best):  # limits last: row after row takes time
-        if model.shape.rate == math.inf or model.cost < 2 * min(m.cost for m in found):
-            found.append(refine(problem, model))
-    return sorted(found, key=lambda model: (model.size, -model.cost))
+        if model.shape.rate == math.inf or model.cost < 2 * min(m.cost for m in models):
+            models.append(refine(problem, model))
+    return sorted(models, key=lambda model: (model.size, -model.cost))
 
 
 def _simplest(problem: Problem, models: Sequence[Model], settings: Settings) -> Model:
     """Return the simplest of some models that is not clearly worse than a larger one."""
     first, *others = [refine(problem, model) for model in models]
     for size in sorted({other.size for other in others}):
-        best, *some = sorted((other for other in others if other.size == size), key=COST)
+        best, *rivals = sorted((other for other in others if other.size == size), key=COST)
         rows = problem.use.sum() * weight_of(problem, best)
-        alike = [m for m in some if rows * math.log((m.cost + FLOOR) / (best.cost + FLOOR)) < 4]
+        alike = [m for m in rivals if rows * math.log((m.cost + FLOOR) / (best.cost + FLOOR)) < 4]
         better = min(
             (best, *alike), key=lambda m: ("rate" in m.active, "delay" not in m.active, m.cost)
         )
@@ -92,21 +94,21 @@ def _simplest(problem: Problem, models: Sequence[Model], settings: Settings) -> 
     return first
 
 
-def needed(problem: Problem, more: Model, less: Model, settings: Settings) -> bool:
+def needed(problem: Problem, large: Model, small: Model, settings: Settings) -> bool:
     """Return whether a model wins enough likelihood by the numbers that it has more.
 
     Neighbouring residuals that are alike count as fewer rows; and the model has to be better all
     over the log, not in one place.
     """
     y, use = problem.y, problem.use
-    residual = (y - more.predict(problem))[use]
+    residual = (y - large.predict(problem))[use]
     scale = scale_of(residual)
-    gain = costs((y - less.predict(problem))[use], scale) - costs(residual, scale)
-    rows = use.sum() * weight_of(problem, more)
-    won = rows * math.log((less.cost + FLOOR) / (more.cost + FLOOR))
-    others = problem.u.shape[1] if len(more.others) > len(less.others) else 1
+    gain = costs((y - small.predict(problem))[use], scale) - costs(residual, scale)
+    rows = use.sum() * weight_of(problem, large)
+    won = rows * math.log((small.cost + FLOOR) / (large.cost + FLOOR))
+    others = problem.u.shape[1] if len(large.others) > len(small.others) else 1
     chance = 2 * math.log(others)  # another command is the best of many
-    enough = settings.price(rows) * (more.size - less.size) + chance
+    enough = settings.price(rows) * (large.size - small.size) + chance
     return won > enough and consistent(gain, settings, math.sqrt(chance))
 
 
@@ -131,22 +133,22 @@ def _visible(problem: Problem, one: Model, other: Model, settings: Settings) -> 
 def _with_drift(problem: Problem, model: Model) -> Iterator[Model]:
     """Yield the model with a gain, or an offset, that drifts."""
     for kind in {GAIN_DRIFT, OFFSET_DRIFT} - {*model.others}:
-        some = replace(model, others=(*model.others, kind), gains=(*model.gains, 0.0))
-        yield fit_lines(problem, some)
+        drifting = replace(model, others=(*model.others, kind), gains=(*model.gains, 0.0))
+        yield fit_lines(problem, drifting)
 
 
 def larger(problem: Problem, model: Model, tried: int = 3) -> Iterator[Model]:
     """Yield the best models with one number more, each with a good beginning for it."""
     own, shape = problem.u[:, model.driver], model.shape
-    found = []
+    models = []
     for names, options in _beginnings(own, shape).items():
         for begin in _bases(model, names):
             trial = replace(begin, active=(*begin.active, *names.split()))
-            found.append(_best(problem, trial, options))
+            models.append(_best(problem, trial, options))
     if own.min() < 0 < own.max() and DOWN not in model.others:
         sides = replace(model, others=(*model.others, DOWN), gains=(*model.gains, 0.0))
-        found.append(fit_lines(problem, sides))
-    for best in sorted(found, key=COST)[:tried]:
+        models.append(fit_lines(problem, sides))
+    for best in sorted(models, key=COST)[:tried]:
         for width in (0.12, 0.03):
             for name in {"jump", "stick"} & {*best.active} - {*model.active}:
                 near = getattr(best.shape, name) * np.linspace(1 - width, 1 + width, 9)
@@ -231,12 +233,12 @@ def _with_another(
     power = (others**2).sum(0)
     slope = residual @ others / np.maximum(power, 1e-300)
     spread = problem.u[:, rest].std(0)
-    kept = power / len(residual) > 1e-4 * spread**2  # not a copy of the driver
+    independent = power / len(residual) > 1e-4 * spread**2  # not a copy of the driver
     influence = np.abs(slope) * spread
     main = abs(model.gain) * parts[0].std()
-    left = residual[:, None] - slope * others  # of each, were it the one
-    error = half_widths(left * others / np.maximum(power, 1e-300), chosen=1.0) / 1.96
-    good = kept & (np.abs(slope) > clear * error) & (influence > coupled * main)
+    remaining = residual[:, None] - slope * others  # of each, were it the one
+    error = half_widths(remaining * others / np.maximum(power, 1e-300), chosen=1.0) / 1.96
+    good = independent & (np.abs(slope) > clear * error) & (influence > coupled * main)
     won = float(np.max(slope**2 * power, initial=0.0, where=good))
     if won > 2 * _by_chance(raw, residual, design):
         best = int(np.argmax(np.where(good, slope**2 * power, -1.0)))
@@ -274,8 +276,8 @@ def _smaller(problem: Problem, model: Model, settings: Settings) -> Model:
             )
             for left_out in _removable(model)
         ]
-        found = [refine(problem, option) for option in options]
-        better = min(found, key=COST, default=model)
+        models = [refine(problem, option) for option in options]
+        better = min(models, key=COST, default=model)
         if better is model or needed(problem, model, better, settings):
             return model
         model = better

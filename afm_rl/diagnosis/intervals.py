@@ -54,10 +54,10 @@ def _density_at_zero(series: np.ndarray, power: float) -> float:
         means = series[: rows // width * width].reshape(-1, width).mean(1)
         if width > 1 and len(means) < 40:
             break
-        some = means - means.mean()
-        left = float(some @ some) / len(some)
-        if left > 0:
-            densities.append(width * _autoregression(some, left))
+        centred = means - means.mean()
+        variance = float(centred @ centred) / len(centred)
+        if variance > 0:
+            densities.append(width * _autoregression(centred, variance))
     return max(densities, default=power)
 
 

@@ -63,8 +63,8 @@ def explain(
     sound = np.isfinite(u).all(1) & np.isfinite(y).all(1) & np.isfinite(weight).all(1)
     u, y, weight = u[sound], y[sound], weight[sound]
     if len(u) < fewest:
-        found = [judge(Actuator(name=name, rows=len(u))) for name in names]
-        return Diagnosis(actuators=tuple(found), step_s=step, rows=len(u))
+        unknown = [judge(Actuator(name=name, rows=len(u))) for name in names]
+        return Diagnosis(actuators=tuple(unknown), step_s=step, rows=len(u))
     late = np.zeros((delays, *u.shape))
     for delay in range(delays):
         late[delay, delay:] = u[: len(u) - delay]
@@ -94,12 +94,12 @@ def _fit(
     shortest, rounded = delays + fewest, float((10 * rounding) ** 2 * late[0].var(0).max())
     for share in (4, 2, 1):  # the newest quarter, half, all
         first = max(rows - max(rows // share, shortest), min(delays - 1, rows - fewest))
-        found = _line(late[:, first:], y[first:], weight[first:], own, rounding)
+        line = _line(late[:, first:], y[first:], weight[first:], own, rounding)
         if share == 4:
-            newest, start = found, first
-        elif first < start and found[-1] > stale * max(newest[-1], rounded):
+            newest, start = line, first
+        elif first < start and line[-1] > stale * max(newest[-1], rounded):
             break
-        best, start = found, first
+        best, start = line, first
     delay, driver, gain, offset, _ = best
     x, y, weight = late[delay, start:], y[start:], weight[start:]
     residual = y - gain * x[:, driver] - offset
@@ -177,13 +177,13 @@ def _line(
     centred, moved = x - mean[:, None], y - level
     power = share @ centred**2
     slope = (share * moved) @ centred / np.maximum(power, 1e-12)
-    left = np.maximum((share * moved) @ moved - slope**2 * power, 0.0)
-    left += rounding**2 * np.maximum(power.max(), 1e-300)
+    squared = np.maximum((share * moved) @ moved - slope**2 * power, 0.0)
+    squared += rounding**2 * np.maximum(power.max(), 1e-300)
     # the own command without delay, unless another is clearly better
-    clear = left[:, own].min() < better * left[0, own]
-    best = (int(left[:, own].argmin()) if clear else 0, own)
-    other = np.unravel_index(left.argmin(), left.shape)
-    if left[other] < better**2 * left[best]:
+    clear = squared[:, own].min() < better * squared[0, own]
+    best = (int(squared[:, own].argmin()) if clear else 0, own)
+    other = np.unravel_index(squared.argmin(), squared.shape)
+    if squared[other] < better**2 * squared[best]:
         best = (int(other[0]), int(other[1]))
     gain = float(slope[best])
-    return best[0], best[1], gain, float(level - gain * mean[best]), float(left[best])
+    return best[0], best[1], gain, float(level - gain * mean[best]), float(squared[best])

@@ -101,7 +101,7 @@ class Log:
         Rows that do not follow each other become episodes of their own.
         """
         index = np.arange(len(self.command))[rows]
-        kept = np.cumsum(self.begins)[index]
+        episode = np.cumsum(self.begins)[index]
         apart = np.diff(index, prepend=index[:1] - 1) > 1
         return replace(
             self,
@@ -109,7 +109,7 @@ class Log:
             response=self.response[index],
             t=self.seconds[index],
             row=index if self.row is None else self.row[index],
-            episode=np.cumsum(apart | (np.diff(kept, prepend=kept[:1]) != 0)),
+            episode=np.cumsum(apart | (np.diff(episode, prepend=episode[:1]) != 0)),
         )
 
     def thinned(self, rows: int, blocks: int = 5) -> Log:

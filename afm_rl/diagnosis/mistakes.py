@@ -90,33 +90,33 @@ def usual_mistakes(
     jumps = (miss.abs().amax(0) > math.pi) & (miss.abs().median(0).values < 1)
     if flat and bool(jumps.any()):
         which = jumps.nonzero().flatten().tolist()
-        told = f"turns through pi in {_where(names, jumps)} (Manifold({states}, angles={which}))"
-        yield Mistake(told, torch.where(jumps, wrap_angle(miss), miss))
+        cause = f"turns through pi in {_where(names, jumps)} (Manifold({states}, angles={which}))"
+        yield Mistake(cause, torch.where(jumps, wrap_angle(miss), miss))
     for k, earlier in sent.items():
-        told = f"acts {k} step{'s' * (k > 1)} late" if k > 0 else "acts on the next row's action"
-        yield Mistake(told, between(after, model(state, earlier)), (k,))
+        cause = f"acts {k} step{'s' * (k > 1)} late" if k > 0 else "acts on the next row's action"
+        yield Mistake(cause, between(after, model(state, earlier)), (k,))
     many = [1.0, -1.0, 0.01, 0.1, 10.0, 100.0, *UNITS.values()]
     begin = many[:1] if model.stiff else many  # what is far off may be more than a simulator bears
-    (gain,), left = _fit(seen, size, [[k] for k in begin], lambda x: {"gain": x})
+    (gain,), residual = _fit(seen, size, [[k] for k in begin], lambda x: {"gain": x})
     if abs(gain - 1) > NEAR:
-        yield Mistake(f"acts on {gain:.3g} times the action ({_unit(gain)})", left, (gain,), 1)
+        yield Mistake(f"acts on {gain:.3g} times the action ({_unit(gain)})", residual, (gain,), 1)
     pace = _ratio(motion, step)
     if abs(pace - 1) > NEAR:
-        told = f"moves {pace:.3g} times as far in a step (dt)"
-        yield Mistake(told, motion - pace * step, (pace,), 1)
+        cause = f"moves {pace:.3g} times as far in a step (dt)"
+        yield Mistake(cause, motion - pace * step, (pace,), 1)
     there = model(state, action)
     for n in range(2, 21):
         there = model(there, action)
-        told = f"makes {n} steps of the model in one (dt, frame_skip)"
-        yield Mistake(told, between(after, there), (n,), 1)
-    told = "feels other forces that depend on its state (gravity, damping, stiffness)"
-    left, fitted = _without_forces(seen, miss)
-    yield Mistake(told, left, (), fitted)
+        cause = f"makes {n} steps of the model in one (dt, frame_skip)"
+        yield Mistake(cause, between(after, there), (n,), 1)
+    cause = "feels other forces that depend on its state (gravity, damping, stiffness)"
+    residual, fitted = _without_forces(seen, miss)
+    yield Mistake(cause, residual, (), fitted)
     if axes > 1:
-        gains, left = _fit(seen, size, [[1.0] * axes, [gain] * axes], lambda x: {"gain": x}, 1)
+        gains, residual = _fit(seen, size, [[1.0] * axes, [gain] * axes], lambda x: {"gain": x}, 1)
         pairs = zip(gains, actuators, strict=True)
         each = some_of([f"{k:.3g} times {name}" for k, name in pairs if abs(k - 1) > NEAR])
-        yield Mistake(f"acts on {each or 'all'} (signs, gains or units)", left, gains, axes)
+        yield Mistake(f"acts on {each or 'all'} (signs, gains or units)", residual, gains, axes)
     if flat:
         yield from _other_units(seen, size, names)
 
@@ -137,23 +137,23 @@ def _other_units(seen: Transitions, size: Tensor, names: Sequence[str]) -> Itera
             which = torch.zeros(count, dtype=torch.bool)
             which[list(chosen)] = True
             scale = torch.where(which, unit, 1.0).to(size)
-            step, told = seen.step(scale=scale), f"has {_where(names, which)} in {words}"
-            yield Mistake(told, motion - step, scale.tolist(), 1)
-            yield Mistake(told, motion - scale * step, scale.tolist(), 1)
+            step, cause = seen.step(scale=scale), f"has {_where(names, which)} in {words}"
+            yield Mistake(cause, motion - step, scale.tolist(), 1)
+            yield Mistake(cause, motion - scale * step, scale.tolist(), 1)
     if stiff:
         return
     scales = (1.0, 0.3, 0.1, 0.02, 10.0)
     starts = [[math.log(k)] * count + [0.01] * count for k in scales]
-    found, left = _fit(
+    numbers, residual = _fit(
         seen, size, starts, lambda x: {"scale": x[:count].exp(), "offset": x[count:]}, len(scales)
     )
-    factor = [math.exp(x) for x in found[:count]]
-    pairs = zip(factor, names, found[count:], strict=True)
+    factor = [math.exp(x) for x in numbers[:count]]
+    pairs = zip(factor, names, numbers[count:], strict=True)
     each = some_of([f"{k:.3g} {name} {round(b, 4) + 0.0:+.3g}" for k, name, b in pairs])
     near = all(abs(k - 1) < NEAR for k in factor)
     reason = "another zero, the sign of gravity" if near else "normalised observations, units"
-    told = f"has states that the model knows as {each} ({reason})"
-    yield Mistake(told, left, factor, 2 * count)
+    cause = f"has states that the model knows as {each} ({reason})"
+    yield Mistake(cause, residual, factor, 2 * count)
 
 
 def _fit(
@@ -214,7 +214,7 @@ def _without_forces(seen: Transitions, miss: Tensor) -> tuple[Tensor, int]:
     """
     model, before = seen.model, seen.before
     free = model.manifold.difference(model(before, torch.zeros_like(seen.action)), before)
-    known, left, fitted = free.isfinite().all(-1), torch.full_like(miss, torch.nan), 0
+    known, remaining, fitted = free.isfinite().all(-1), torch.full_like(miss, torch.nan), 0
     for j, own in enumerate(miss[known].double().cpu().T):
         rows = torch.cat([torch.ones_like(free[:, :1]), before, free[:, j : j + 1]], -1)[known]
         rows = rows.double().cpu()
@@ -222,21 +222,21 @@ def _without_forces(seen: Transitions, miss: Tensor) -> tuple[Tensor, int]:
         line = torch.linalg.lstsq(rows, own.unsqueeze(-1), driver="gelsd").solution
         rest = own - (rows @ line).squeeze(-1)
         explains = bool(rest.abs().mean() < 0.5 * own.abs().mean())
-        left[known, j] = (rest if explains else own).to(left)
+        remaining[known, j] = (rest if explains else own).to(remaining)
         fitted += rows.shape[-1] * explains
-    return left, fitted
+    return remaining, fitted
 
 
 def _earlier(values: Tensor, follows: Tensor, steps: int) -> Tensor:
     """Return the values ``(N, A)`` some steps earlier, NaN where an episode begins."""
-    found, count = torch.full_like(values, torch.nan), len(values) - abs(steps)
+    shifted, count = torch.full_like(values, torch.nan), len(values) - abs(steps)
     if count > 0:
         whole = follows.unfold(0, abs(steps), 1).all(-1, keepdim=True)
         there, here = (
-            (values[:count], found[-count:]) if steps > 0 else (values[-count:], found[:count])
+            (values[:count], shifted[-count:]) if steps > 0 else (values[-count:], shifted[:count])
         )
         here.copy_(torch.where(whole, there, torch.nan))
-    return found
+    return shifted
 
 
 def _unit(gain: float) -> str:

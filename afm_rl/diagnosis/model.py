@@ -176,7 +176,7 @@ def refine(problem: Problem, model: Model) -> Model:
         return slopes(problem, _with_values(model, values), central=False)[use]
 
     begin = np.clip(values_of(model), low + 1e-9, high - 1e-9)
-    found = least_squares(
+    solution = least_squares(
         miss,
         begin,
         slope,
@@ -187,7 +187,7 @@ def refine(problem: Problem, model: Model) -> Model:
         ftol=1e-6,
         xtol=1e-6,
     )
-    better = fit_lines(problem, _with_values(model, found.x), 2)
+    better = fit_lines(problem, _with_values(model, solution.x), 2)
     return better if better.cost < model.cost else model
 
 

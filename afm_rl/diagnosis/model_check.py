@@ -125,9 +125,9 @@ def check_transitions(
     floor = torch.maximum(1e-3 * size, 8 * torch.finfo(dtype).eps * largest)
 
     def share(miss: Tensor) -> Tensor:
-        left = miss.abs().mean(0)
-        total = torch.maximum(size, left)
-        return torch.where(total > floor, 1 - left / total, torch.nan)
+        error = miss.abs().mean(0)
+        total = torch.maximum(size, error)
+        return torch.where(total > floor, 1 - error / total, torch.nan)
 
     predicted = share(miss)
     if bool(predicted.isnan().all()):
@@ -138,9 +138,9 @@ def check_transitions(
     if len(names) != len(size):
         names = [f"state[{k}]" for k in range(len(size))]
     actuators = actuators or own[1] or [f"action[{k}]" for k in range(model.action_size)]
-    found, most = ModelCheck(tuple(names), tuple(predicted.tolist()), len(miss)), SURE
+    check, most = ModelCheck(tuple(names), tuple(predicted.tolist()), len(miss)), SURE
     if bool((predicted.nan_to_num(1.0) > EXACT).all()):
-        return found
+        return check
     seen = seen.part(FEW // 3 if model.stiff else FEW)  # simulators take their time
     miss = seen.miss()
     for mistake in usual_mistakes(seen, miss, size + floor, names, actuators):
@@ -156,7 +156,7 @@ def check_transitions(
         if known.sum() >= FEWEST and nats > most and bool(clear.any()):
             most, corrected = nats, float(after.nanmean())
             cause, factor = mistake.cause, tuple(mistake.factor)
-            found = replace(found, cause=cause, factor=factor, corrected=corrected)
+            check = replace(check, cause=cause, factor=factor, corrected=corrected)
             if corrected > EXACT:
                 break
-    return found
+    return check

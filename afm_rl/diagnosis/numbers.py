@@ -40,15 +40,15 @@ def likely_intervals(
     """
     rows = problem.use.sum() * weight_of(problem, model)
     ends = []
-    for found in [model, *_others(problem, model, settings)]:
-        lost = rows * math.log((found.cost + FLOOR) / (model.cost + FLOOR))
-        if lost < 4.0 - 6.0 * max(found.size - max(model.size, 1), 0):
-            gain, offset = values_of(found)[:2]
-            late = max(found.shape.delay, 0.0)
-            if found.shape.keep > 1e-6:
-                late -= 1 / math.log(found.shape.keep)
+    for likely in [model, *_others(problem, model, settings)]:
+        lost = rows * math.log((likely.cost + FLOOR) / (model.cost + FLOOR))
+        if lost < 4.0 - 6.0 * max(likely.size - max(model.size, 1), 0):
+            gain, offset = values_of(likely)[:2]
+            late = max(likely.shape.delay, 0.0)
+            if likely.shape.keep > 1e-6:
+                late -= 1 / math.log(likely.shape.keep)
             middle = np.array([gain, offset + centre * gain, late])
-            widths = interval_widths(problem, found, centre)
+            widths = interval_widths(problem, likely, centre)
             ends.append([middle - widths, middle + widths])
     lows, highs = np.moveaxis(np.array(ends), 1, 0)
     return np.stack([lows.min(0), highs.max(0)], -1)
@@ -58,7 +58,7 @@ def _others(problem: Problem, model: Model, settings: Settings) -> list[Model]:
     """Return other explanations: one number more, or another mixture of delay and lag."""
     if len(problem.y) > settings.fitted:
         return []
-    found, late = list(larger(problem, model)), model.shape.delay
+    models, late = list(larger(problem, model)), model.shape.delay
     if model.shape.keep > 0:
         late -= 1 / math.log(model.shape.keep)
     rest = tuple(name for name in model.active if name not in ("delay", "keep"))
@@ -69,8 +69,8 @@ def _others(problem: Problem, model: Model, settings: Settings) -> list[Model]:
     ):
         keep = math.exp(-1 / lag) if lag else 0.0
         shape = model.shape._replace(delay=delay, keep=keep)
-        found.append(replace(model, active=(*rest, *names), shape=shape))
-    return [refine(problem, other) for other in found]
+        models.append(replace(model, active=(*rest, *names), shape=shape))
+    return [refine(problem, other) for other in models]
 
 
 def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Settings) -> Actuator:
@@ -99,8 +99,8 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
     rows = rows[(rows >= part.first) & (rows < part.last)]
     whole = (scaled.log.response[:, j] - part.predict(clean, j))[rows]
     total = float(scaled.log.response[rows, j].var())
-    left = min(float(whole.var()) / total, 1.0) if total > 0 else 0.0
-    left *= not held
+    unexplained = min(float(whole.var()) / total, 1.0) if total > 0 else 0.0
+    unexplained *= not held
     noticed = residual.var() > 0.005 * total and not held
     pattern, share = find_pattern(problem, model) if noticed else ("", 0.0)
     coupling = {log.names[i]: float(g * spread[j] / reach[i]) for i, g in extra.items() if i >= 0}
@@ -142,9 +142,9 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
         driven_by=log.names[model.driver] if model.driver != j else largest,
         coupling=coupling,
         noise=float(residual.std() * spread[j]),
-        unexplained=left,
+        unexplained=unexplained,
         pattern=pattern,
-        misfit=share * left,
+        misfit=share * unexplained,
         command_range=(float(low), float(high)),
         drift=drift,
         rows=len(part),

@@ -39,8 +39,8 @@ def find_pattern(
         return "", 0.0
     size = np.abs(residual) - np.abs(residual).mean()
     shares, scatters = {}, {}
-    for name, (first, *more) in _features(problem, model).items():
-        columns = np.column_stack([first, *more])[rows]
+    for name, (first, *others) in _features(problem, model).items():
+        columns = np.column_stack([first, *others])[rows]
         shares[name] = predictable(columns, residual)
         grows = name not in LIKE or size @ np.abs(first[rows]) > 0
         scatters[name] = predictable(columns, size) if grows else 0.0
@@ -63,13 +63,13 @@ def _features(problem: Problem, model: Model) -> dict[str, list[np.ndarray]]:
     others = np.delete(look_back(clock, u, linear), model.driver, axis=1)
     others = others[:, others.std(0) > 0]
     with_others = [others, np.abs(others), others * followed[:, None]]
-    found = {
+    groups = {
         SIZE: [followed, hats(followed)],
         SPEED: [speed, slow, hats(speed), hats(slow)],
         EARLIER: late,
         "the time": [time, time * followed[:, None]],
     }
-    return found | ({"other commands": with_others} if others.shape[1] else {})
+    return groups | ({"other commands": with_others} if others.shape[1] else {})
 
 
 def hats(x: np.ndarray, count: int = 8) -> np.ndarray:
@@ -136,14 +136,14 @@ def without_lost(
 
 
 def _trimmed(
-    design: np.ndarray, y: np.ndarray, known: np.ndarray, apart: float, kept: float = 0.55
+    design: np.ndarray, y: np.ndarray, known: np.ndarray, apart: float, share: float = 0.55
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the line through the share of rows that it fits best, and which rows are near it."""
     chosen = known
     for _ in range(15):
         line = design @ np.linalg.lstsq(design[chosen], y[chosen], rcond=None)[0]
         far = np.abs(y - line)
-        chosen = known & (far <= np.quantile(far[known], kept))
+        chosen = known & (far <= np.quantile(far[known], share))
     for _ in range(2):
         chosen = known & (far <= apart * _scale(far[chosen]))
         line = design @ np.linalg.lstsq(design[chosen], y[chosen], rcond=None)[0]

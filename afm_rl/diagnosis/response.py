@@ -125,13 +125,13 @@ def lagging(clock: Clock, values: np.ndarray, keep: float) -> np.ndarray:
     """Return values ``(N, ...)`` behind a lag of first order, at rest where an episode begins."""
     if not keep:
         return values
-    kept = np.full(len(values), keep)
+    kept_by_row = np.full(len(values), keep)
     if not clock.even:
-        kept[1:] = keep ** np.diff(clock.time)
-    kept[clock.start == np.arange(len(values))] = 0.0
+        kept_by_row[1:] = keep ** np.diff(clock.time)
+    kept_by_row[clock.start == np.arange(len(values))] = 0.0
     band = np.ones((2, len(values)))
-    band[1, :-1] = -kept[1:]
-    drive = (values.T * (1.0 - kept)).T
+    band[1, :-1] = -kept_by_row[1:]
+    drive = (values.T * (1.0 - kept_by_row)).T
     return dtbtrs(band, drive, uplo="L")[0].reshape(values.shape)
 
 
@@ -204,11 +204,11 @@ def _many(start: np.ndarray, least: int = 12) -> bool:
 
 def _side_by_side(values: np.ndarray, start: np.ndarray, move: Any) -> np.ndarray:
     """Return ``x_k = move(x_{k-1}, value_k)``, from the first value of each episode on."""
-    found = values.copy()
+    places = values.copy()
     begins = np.unique(start)
     lengths = np.diff(np.append(begins, len(start)))
     begins, lengths = begins[order := np.argsort(-lengths)], lengths[order]
     for k in range(1, int(lengths[0])):
         rows = begins[: np.searchsorted(-lengths, -k)] + k
-        found[rows] = move(found[rows - 1], values[rows])
-    return found
+        places[rows] = move(places[rows - 1], values[rows])
+    return places

@@ -79,12 +79,12 @@ def unwrapped(log: Log, settings: Settings) -> tuple[Log, dict[int, float]]:
         if _turn(log.command[:, j]) == turn:
             both = _with(options[0], "command", j, np.unwrap(log.command[:, j], period=turn))
             options.append(both)
-        left = [
+        unexplained = [
             find_leads(option.thinned(settings.searched), [j], settings)[0].left
             for option in (log, *options)
         ]
-        best = int(np.argmin(left))
-        if best and left[best] < 0.3 * left[0]:
+        best = int(np.argmin(unexplained))
+        if best and unexplained[best] < 0.3 * unexplained[0]:
             log = _near_line(options[best - 1], j, turn, settings)
             if best == 1:
                 turns[j] = turn

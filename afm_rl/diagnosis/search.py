@@ -44,12 +44,12 @@ class Lead(NamedTuple):
 def find_leads(log: Log, actuators: Sequence[int], settings: Settings) -> list[Lead]:
     """Return where to begin with each of some actuators."""
     delays = _delays(log, settings)
-    found = [
+    scans = [
         _scan(log, clock, log.response[:, actuators], delays, settings) for clock in clocks_of(log)
     ]
     leads = []
     for place, j in enumerate(actuators):
-        options = [_choose(scan, place, j, k) for k, scan in enumerate(found)]
+        options = [_choose(scan, place, j, k) for k, scan in enumerate(scans)]
         leads.append(min(options, key=lambda lead: lead.left))
     return [
         _with_starts(log, j, lead, delays, settings)
@@ -68,17 +68,17 @@ def rows_enough(log: Log, settings: Settings) -> np.ndarray:
     if every < 2 or len(rows) < 100 * every:
         return rows
     start = np.maximum.accumulate(np.where(log.begins, rows, 0))
-    some = rows[(rows - start) % every == 0]
+    sparse = rows[(rows - start) % every == 0]
     moved = [int(j) for j in np.flatnonzero(np.ptp(log.command, axis=0) > 0)]
     if not moved:
         return rows
-    left = [
+    unexplained = [
         np.median(
             [lead.left for lead in find_leads(part.thinned(settings.searched), moved, settings)]
         )
-        for part in (log, only(log, some))
+        for part in (log, only(log, sparse))
     ]
-    return some if left[1] < 1.1 * left[0] + 1e-3 else rows
+    return sparse if unexplained[1] < 1.1 * unexplained[0] + 1e-3 else rows
 
 
 def only(log: Log, rows: np.ndarray) -> Log:
@@ -145,12 +145,14 @@ def _scan(
 def _choose(scan: tuple[np.ndarray, ...], place: int, j: int, clock: int) -> Lead:
     """Choose for one response: the own command, unless another one leaves less than half."""
     grid, single, joint, lines = scan
-    left = np.maximum(single[:, place].min(0), 1e-12)  # of each command with its best dynamics
-    driver = int(left.argmin()) if left.min() < 0.5 * left[j] else j
+    unexplained = np.maximum(
+        single[:, place].min(0), 1e-12
+    )  # of each command with its best dynamics
+    driver = int(unexplained.argmin()) if unexplained.min() < 0.5 * unexplained[j] else j
     # The dynamics are those of all commands together; the driver may be one of several.
     best, alone = int(joint[:, place].argmin()), int(single[:, place, driver].argmin())
     gain, offset = lines[alone, :, place, driver]
-    line = (float(gain), float(offset)) if left[driver] < 0.7 and gain else None
+    line = (float(gain), float(offset)) if unexplained[driver] < 0.7 and gain else None
     delay, keep = grid[best]
     return Lead(clock, float(delay), float(keep), driver, float(joint[best, place]), line)
 
@@ -169,7 +171,7 @@ def _with_starts(log: Log, j: int, lead: Lead, delays: np.ndarray, settings: Set
     here = begin_at(clock, u, begin, 0.0)
     fast = limit_rate(np.repeat(here[:, None], len(rates), 1), rates, clock.start)
     late = delays[delays >= 0]
-    found: dict[tuple[bool, bool], tuple[float, Shape]] = {}
+    best_of: dict[tuple[bool, bool], tuple[float, Shape]] = {}
     for lag, limited in product((0.0, 1.5, 4.0, 12.0), (False, True)):
         keep = math.exp(-1 / lag) if lag else 0.0
         slow = lagging(clock, fast if limited else here[:, None], keep)
@@ -182,9 +184,9 @@ def _with_starts(log: Log, j: int, lead: Lead, delays: np.ndarray, settings: Set
             best = int(won.argmax())
             shape = Shape(float(delay), keep, rate=float(rates[best]) if limited else math.inf)
             kind = (bool(keep), limited)
-            if kind not in found or won[best] > found[kind][0]:
-                found[kind] = (float(won[best]), shape)
-    return lead._replace(starts=(*plain, *(shape for _, shape in found.values())))
+            if kind not in best_of or won[best] > best_of[kind][0]:
+                best_of[kind] = (float(won[best]), shape)
+    return lead._replace(starts=(*plain, *(shape for _, shape in best_of.values())))
 
 
 def beginning(clock: Clock, u: np.ndarray, y: np.ndarray, line: tuple[float, float]) -> np.ndarray:

@@ -45,19 +45,19 @@ def small_twins(names: Sequence[str], ranges: np.ndarray, small: float = 1 / 3) 
     kinds = defaultdict(list)
     for j, name in enumerate(names):
         kinds[kind_of(name)].append(j)
-    found = {}
+    notes = {}
     for one, other in (pair for pair in kinds.values() if len(pair) == 2):
         low, high = sorted((one, other), key=lambda j: ranges[j])
         if 0 < ranges[low] < small * ranges[high]:
-            found[low] = (
+            notes[low] = (
                 f"it moves by {100 * ranges[low] / ranges[high]:.0f} % of what {names[high]} does, "
                 "and friction looks like a fault; move it more"
             )
-    return found
+    return notes
 
 
 def agree(
-    log: Log, found: Mapping[int, Sequence[Part]], reach: np.ndarray, settings: Settings
+    log: Log, parts_of: Mapping[int, Sequence[Part]], reach: np.ndarray, settings: Settings
 ) -> dict[int, Sequence[Part]]:
     """Return the parts of all actuators, those of one kind with the same numbers.
 
@@ -65,20 +65,20 @@ def agree(
     together (BIC) is fitted to each. Members that changed, or follow another command, stay.
     """
     kinds = defaultdict(list)
-    for j, parts in found.items():
+    for j, parts in parts_of.items():
         if len(parts) == 1 and parts[0].model.driver == j:
             kinds[kind_of(log.names[j])].append(j)
-    better = dict(found)
+    better = dict(parts_of)
     for members in kinds.values():
-        if len({found[j][0].model.active for j in members}) < 2:
+        if len({parts_of[j][0].model.active for j in members}) < 2:
             continue
-        some = log.thinned(settings.refined)
-        problems = {j: problem_of(some, j, found[j][0].lead, settings) for j in members}
-        rows = {j: len(problem.y) * found[j][0].weight for j, problem in problems.items()}
+        part_of_log = log.thinned(settings.refined)
+        problems = {j: problem_of(part_of_log, j, parts_of[j][0].lead, settings) for j in members}
+        rows = {j: len(problem.y) * parts_of[j][0].weight for j, problem in problems.items()}
         options = []
         for other in members:
-            pattern = found[other][0].model
-            models = {j: _like(problems[j], found[j][0].model, pattern) for j in members}
+            pattern = parts_of[other][0].model
+            models = {j: _like(problems[j], parts_of[j][0].model, pattern) for j in members}
             score = sum(
                 rows[j] * math.log(model.cost + FLOOR) + settings.price(rows[j]) * model.size
                 for j, model in models.items()
@@ -88,43 +88,47 @@ def agree(
         rates = [models[j].shape.rate * reach[j] for j in members]
         if max(rates) > 2 * min(rates):  # a limit that another one exceeds is none
             models = {j: _without_rate(problems[j], model) for j, model in models.items()}
-        better |= {j: [replace(found[j][0], model=model)] for j, model in models.items()}
+        better |= {j: [replace(parts_of[j][0], model=model)] for j, model in models.items()}
     return better
 
 
 def _without_rate(problem: Problem, model: Model) -> Model:
     """Return a model whose rate limit is a lag instead."""
-    kept = tuple(name for name in model.active if name != "rate")
+    active = tuple(name for name in model.active if name != "rate")
     shape = model.shape._replace(rate=math.inf, keep=model.shape.keep or 0.5)
-    return refine(problem, replace(model, active=tuple({*kept, "keep"}), shape=shape))
+    return refine(problem, replace(model, active=tuple({*active, "keep"}), shape=shape))
 
 
 def _like(problem: Problem, own: Model, pattern: Model) -> Model:
     """Return a model with the numbers that another one needs."""
     if own.active == pattern.active:
         return refine(problem, own)
-    kept = {name: getattr(own.shape, name) for name in own.active if name in pattern.active}
+    shared = {name: getattr(own.shape, name) for name in own.active if name in pattern.active}
     weak = {name: WEAK[name] for name in pattern.active if name in WEAK}
-    shapes = (pattern.shape, pattern.shape._replace(**kept), pattern.shape._replace(**weak | kept))
+    shapes = (
+        pattern.shape,
+        pattern.shape._replace(**shared),
+        pattern.shape._replace(**weak | shared),
+    )
     return min(
         (refine(problem, replace(own, active=pattern.active, shape=shape)) for shape in shapes),
         key=lambda model: model.cost,
     )
 
 
-def unit_of(found: Sequence[Sequence[Actuator]]) -> list[list[Actuator]]:
+def unit_of(actuators: Sequence[Sequence[Actuator]]) -> list[list[Actuator]]:
     """Return the parts of all actuators with the gain of a healthy one.
 
     That is 1, or that of two known units if most have it.
     """
-    last = [parts[-1] for parts in found]
+    last = [parts[-1] for parts in actuators]
     gains = np.array([abs(a.gain) for a in last])
     clear = [a.gain_interval[0] * a.gain_interval[1] > 0 and abs(a.gain) > 1e-4 for a in last]
     unit = 1.0
     if any(clear):
         middle = float(np.median(gains[clear]))
         unit = next((gain for gain in UNITS.values() if abs(middle / gain - 1) < 0.1), 1.0)
-    return [[_in_unit(part, unit) for part in parts] for parts in found]
+    return [[_in_unit(part, unit) for part in parts] for parts in actuators]
 
 
 def _in_unit(actuator: Actuator, unit: float) -> Actuator:
@@ -151,9 +155,9 @@ def with_basis(actuators: Sequence[Actuator], settings: Settings) -> list[Actuat
     Speed and rate of turn of which one side follows by p and the other one by q have
     :math:`M_{11} = M_{22} = (p + q)/2`, and :math:`M_{12} M_{21} = (p - q)^2/4`.
     """
-    found = {a.name: a for a in actuators}
+    by_name = {a.name: a for a in actuators}
     for one in actuators:
-        other = found.get(one.driven_by or "")
+        other = by_name.get(one.driven_by or "")
         if other is None or set(one.coupling) != {other.name} or set(other.coupling) != {one.name}:
             continue
         across, back = one.coupling[other.name], other.coupling[one.name]
@@ -165,8 +169,8 @@ def with_basis(actuators: Sequence[Actuator], settings: Settings) -> list[Actuat
         apart = 0.5 * (across + back) if same else math.sqrt(across * back)
         gains = (middle + apart, middle - apart)
         kind = "sums" if same else "sides"
-        found[one.name] = replace(one, basis=(other.name, kind, *gains))
-    return list(found.values())
+        by_name[one.name] = replace(one, basis=(other.name, kind, *gains))
+    return list(by_name.values())
 
 
 def _half(actuator: Actuator) -> float:
@@ -198,10 +202,10 @@ def shared_delay(
     near = times[(times <= most) & (times > late)]
     delay, lag = (float(np.median([getattr(a, n) for a in known])) for n in ("delay_s", "lag_s"))
     parts = [f"a delay of {_span([delay], log)}", f"a lag of {_span([lag], log)}"]
-    kept = [text for text, time in zip(parts, (delay, lag), strict=True) if time > 0.1 * middle]
+    causes = [text for text, time in zip(parts, (delay, lag), strict=True) if time > 0.1 * middle]
     note = (
-        f"all actuators are {_span(near, log)} behind their commands ({' and '.join(kept)}): that "
-        "is the loop's, and no fault of one of them"
+        f"all actuators are {_span(near, log)} behind their commands ({' and '.join(causes)}): "
+        "that is the loop's, and no fault of one of them"
     )
     return [max(most, log.usual_delay)] * len(actuators), (note,)
 
@@ -218,5 +222,5 @@ def _span(times: Sequence[float] | np.ndarray, log: Log) -> str:
     low, high = min(times), max(times)
     texts = [f"{time / log.step:.2g}" for time in (low, high)]
     seconds = [f"{time:.2g}" for time in (low, high)]
-    steps, known = (" to ".join(dict.fromkeys(some)) for some in (texts, seconds))
+    steps, known = (" to ".join(dict.fromkeys(ends)) for ends in (texts, seconds))
     return f"{steps} steps" + (f" ({known} s)" if log.step != 1.0 else "")

@@ -47,7 +47,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
     straight, turns = unwrapped(read, settings)
     scaled = scale(straight)
     clean, parts, doubts = _explain(scaled, exact, settings)
-    found, fitted = [], np.repeat(straight.response.mean(0)[None], len(rows), 0)
+    actuators, fitted = [], np.repeat(straight.response.mean(0)[None], len(rows), 0)
     for j, name in enumerate(log.names):
         own = parts.get(j, ())
         numbers = [numbers_of(scaled, clean, part, j, settings) for part in own]
@@ -55,20 +55,20 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         how: dict[str, Any] = {"units": log.units, "copies": tuple(log.names[i] for i in same[j])}
         how |= {"turn": turns.get(j, 0.0), "quantum": quantum_of(straight.response[:, j])}
         lost = float((clean.response[:, j] != scaled.log.response[:, j]).mean())
-        found.append([replace(actuator, lost=lost, **how) for actuator in numbers])
+        actuators.append([replace(actuator, lost=lost, **how) for actuator in numbers])
         for part in own:
             fitted[part.rows, j] = part.predict(clean, j)[part.rows] * scaled.spread[j]
-    found = unit_of(found)
-    if all(len(own) == 1 for own in found):
-        found = [[actuator] for actuator in with_basis([one for (one,) in found], settings)]
-    usual, shared = shared_delay([own[-1] for own in found], log, settings)
+    actuators = unit_of(actuators)
+    if all(len(own) == 1 for own in actuators):
+        actuators = [[actuator] for actuator in with_basis([one for (one,) in actuators], settings)]
+    usual, shared = shared_delay([own[-1] for own in actuators], log, settings)
     times = {j: [float(read.since[part.first]) for part in own] for j, own in parts.items()}
     notes = [f"{log.names[j]}: an angle that jumps by {turns[j]:.4g}; unwrapped" for j in turns]
     if len(rows) < len(log.command):
         notes.append(f"every {round(len(log.command) / len(rows))}th row is looked at")
     fitted += read.response - straight.response
     return Diagnosis(
-        actuators=_judged(found, times, doubts, usual, scaled, log.step, settings),
+        actuators=_judged(actuators, times, doubts, usual, scaled, log.step, settings),
         step_s=log.step,
         rows=len(log.command),
         notes=(*log.notes, *shared, *effort_notes(log), *notes),
@@ -99,7 +99,7 @@ def _explain(
 
 
 def _judged(
-    found: Sequence[Sequence[Actuator]],
+    actuators_by_part: Sequence[Sequence[Actuator]],
     times: Mapping[int, Sequence[float]],
     doubts: Mapping[int, Doubt],
     usual: Sequence[float],
@@ -109,7 +109,7 @@ def _judged(
 ) -> tuple[Actuator, ...]:
     """Return the last part of each actuator with its status, its sentence, and its changes."""
     actuators, small = [], small_twins(scaled.raw.names, scaled.reach)
-    for j, numbers in enumerate(found):
+    for j, numbers in enumerate(actuators_by_part):
         how: dict[str, Any] = {
             "step": step,
             "timed": step != 1.0,

@@ -44,13 +44,13 @@ def judge(
     status, faults = _judged(actuator, step, usual_delay, doubt, timed, s)
     if actuator.changes and not doubt:
         now = ", ".join(faults) or "healthy"
-        first, *more = actuator.changes
+        first, *later = actuator.changes
         when = [_when(change.t, step, timed) for change in actuator.changes]
         story = f"changed at {when[0]}: {_said(first.before)}, then "
         story += "".join(
-            f"{_said(c.before)}; at {at} " for c, at in zip(more, when[1:], strict=True)
+            f"{_said(c.before)}; at {at} " for c, at in zip(later, when[1:], strict=True)
         )
-        if not more and first.before.status == "healthy":
+        if not later and first.before.status == "healthy":
             story, now = "", f"{now}, since {when[0]}"
         parts = [now, *(_said(c.before) for c in actuator.changes)]
         since = len(parts) == 2 and first.before.status == "healthy"
@@ -78,17 +78,17 @@ def _judged(
     width = 0.5 * (high - low) / actuator.unit
     size = abs(actuator.gain) / actuator.unit
     coarse = actuator.noise < 0.5 * actuator.quantum  # that is what is left
-    left = actuator.unexplained - actuator.lost
-    noticed = bool(actuator.pattern) and left > 0.005 and not coarse
+    unexplained = actuator.unexplained - actuator.lost
+    noticed = bool(actuator.pattern) and unexplained > 0.005 and not coarse
     unclear = low <= 0.0 <= high
-    follows = left < 0.6  # of the variance: that little is the command, for certain
+    follows = unexplained < 0.6  # of the variance: that little is the command, for certain
     if doubt:
         return doubt[0], [f"{doubt[0]}: {doubt[1]}"]
-    if actuator.misfit > 0.1 or noticed and left > s.unknown:
+    if actuator.misfit > 0.1 or noticed and unexplained > s.unknown:
         closest = "" if unclear or not width < s.vague * max(1.0, size) else _closest(faults)
         return "changed", [f"{NO_FAULT}: {_rest(actuator)}{closest}"]
     if (
-        max(-low, high) < (s.vague if unclear or left > 0.9 else s.dead) * actuator.unit
+        max(-low, high) < (s.vague if unclear or unexplained > 0.9 else s.dead) * actuator.unit
         and actuator.driven_by is None
         and actuator.gain_down is None
         and not (outside(widened((low, high), s)) and follows)
@@ -98,11 +98,11 @@ def _judged(
     if not width < s.vague * max(1.0, size):
         return "cannot tell", [f"cannot tell: {_reason(actuator)}"]
     if not faults and not noticed:
-        return "healthy", ["healthy", _rest(actuator)] if left > s.left else []
-    if faults and left > s.unknown:
+        return "healthy", ["healthy", _rest(actuator)] if unexplained > s.left else []
+    if faults and unexplained > s.unknown:
         return "changed", [_rest(actuator) + _closest(faults)]
-    status: Status = "changed" if faults or left > s.left else "healthy"
-    if noticed or left > s.left:
+    status: Status = "changed" if faults or unexplained > s.left else "healthy"
+    if noticed or unexplained > s.left:
         faults = [*(faults or ["nearly healthy"]), _rest(actuator)]
     return status, faults
 
@@ -116,8 +116,8 @@ def _closest(faults: list[str]) -> str:
 
 
 def _copied(actuator: Actuator) -> str:
-    first, *more = actuator.copies
-    return f"that of {first} is" if not more else f"those of {len(actuator.copies)} others are"
+    first, *others = actuator.copies
+    return f"that of {first} is" if not others else f"those of {len(actuator.copies)} others are"
 
 
 def _rest(actuator: Actuator) -> str:

@@ -120,8 +120,8 @@ def _gymnasium(
     inner: Any = make().unwrapped
     kind = gymnasium.spec(task).name
     if hasattr(inner, "model"):
-        found = inner.model
-        joints = [found.joint(joint).name for joint in found.actuator_trnid[:, 0]]
+        mjcf = inner.model
+        joints = [mjcf.joint(joint).name for joint in mjcf.actuator_trnid[:, 0]]
         model: dict[str, Any] = {"model": "mujoco"}
         return PlayedRobot(name, make, policy, model, _push_root, inner.dt, joints, task=kind)
     if kind != "Pendulum":

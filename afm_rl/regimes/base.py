@@ -191,11 +191,17 @@ class Regime(ABC):
     @staticmethod
     def distinct(names: Sequence[str], axes: int | None = None) -> tuple[str, ...]:
         """Return ``names`` as a tuple; they must be distinct, one for each of the ``axes``."""
-        found = tuple(names)
-        if not found or len(set(found)) < len(found) or len(found) != (axes or len(found)):
+        axis_names = tuple(names)
+        if (
+            not axis_names
+            or len(set(axis_names)) < len(axis_names)
+            or len(axis_names) != (axes or len(axis_names))
+        ):
             count = "" if axes is None else f"{axes} "
-            raise ConfigurationError(f"names={found}: expected {count}distinct names, one per axis")
-        return found
+            raise ConfigurationError(
+                f"names={axis_names}: expected {count}distinct names, one per axis"
+            )
+        return axis_names
 
     def check_names(self, names: Iterable[str]) -> None:
         """Check that all ``names`` are parameters; the error names the first that is not."""

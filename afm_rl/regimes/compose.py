@@ -104,17 +104,17 @@ class Compose(Regime):
         """
         free = torch.full_like(high, torch.inf)
         action, active = _spread(action, parameters), self._active(parameters)
-        found = action
+        command = action
         for regime, part in reversed([pair for pair in active if pair[0].closed_form]):
-            found = regime.inverse(found, part, state, -free, free)
-        found = found.clamp(low, high)
+            command = regime.inverse(command, part, state, -free, free)
+        command = command.clamp(low, high)
         slow = [~regime.is_identity(part) for regime, part in active if not regime.closed_form]
         if slow:
             rows = torch.stack(slow).any(0).expand(action.shape[:-1])
             a, p, s = (part.expand(*rows.shape, -1)[rows] for part in (action, parameters, state))
-            found = found.clone()
-            found[rows] = super().inverse(a, p, s, low, high)
-        return found
+            command = command.clone()
+            command[rows] = super().inverse(a, p, s, low, high)
+        return command
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw parameters ``(*shape, F)``: one list of the prior each, or every family."""
@@ -153,8 +153,8 @@ class Compose(Regime):
     def physics_of(self, parameters: Tensor) -> Tensor | None:
         """Return the columns of the first family that has any."""
         parts = zip(self.regimes.values(), self._parts, strict=True)
-        found = (regime.physics_of(parameters[..., at]) for regime, at in parts)
-        return next((rows for rows in found if rows is not None), None)
+        columns = (regime.physics_of(parameters[..., at]) for regime, at in parts)
+        return next((rows for rows in columns if rows is not None), None)
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
         self.check_names(values)

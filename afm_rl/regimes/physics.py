@@ -52,14 +52,14 @@ class Physics(StaticRegime):
 
     def __init__(self, ranges: Mapping[str, Sequence[float]] | None = None) -> None:
         super().__init__()
-        found = dict(ranges) if ranges else {**FACTORS, **ADDED}
-        unknown = sorted(found.keys() - set(self.names))
-        bad = [name for name, span in found.items() if len(span) != 2 or not span[0] <= span[1]]
+        spans = dict(ranges) if ranges else {**FACTORS, **ADDED}
+        unknown = sorted(spans.keys() - set(self.names))
+        bad = [name for name, span in spans.items() if len(span) != 2 or not span[0] <= span[1]]
         if unknown or bad:
             raise ConfigurationError(
-                f"robot.physics={found}: expected [low, high] of any of {', '.join(self.names)}"
+                f"robot.physics={spans}: expected [low, high] of any of {', '.join(self.names)}"
             )
-        self.ranges = found
+        self.ranges = spans
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         return action.expand(*torch.broadcast_shapes(action.shape[:-1], parameters.shape[:-1]), -1)

@@ -159,12 +159,12 @@ def draw_actuator(diagnosis: Diagnosis, log: Log, place: int, points: int = 3000
     left.plot(t[rows], y[rows], color=style.COLOURS[0], linewidth=1.4, label="response")
     fitted = {"color": style.REGIME, "linewidth": 1.1, "linestyle": (0, (4, 1.5))}
     left.plot(t[rows], fit[rows], label="fit", **fitted)
-    some = np.unique(np.linspace(0, len(t) - 1, min(points, len(t))).astype(int))
+    dotted = np.unique(np.linspace(0, len(t) - 1, min(points, len(t))).astype(int))
     dots = {"s": 3, "linewidths": 0, "rasterized": True}
-    middle.scatter(u[some], y[some], color=style.COLOURS[0], alpha=0.35, **dots)
+    middle.scatter(u[dotted], y[dotted], color=style.COLOURS[0], alpha=0.35, **dots)
     ends = np.array(actuator.command_range)
     middle.plot(ends, actuator.unit * ends, color=style.NOMINAL, linewidth=1.0)
-    right.scatter(t[some], (y - fit)[some], color=style.FAINT, alpha=0.5, **dots)
+    right.scatter(t[dotted], (y - fit)[dotted], color=style.FAINT, alpha=0.5, **dots)
     for change in actuator.changes:
         for axes in (left, right):
             if axes is right or t[rows][0] <= change.t <= t[rows][-1]:

@@ -230,5 +230,5 @@ def _pages(name: str, title: str, methods: Iterable[str]) -> Iterator[tuple[str,
     """
     groups = style.groups_of_methods(methods)
     for number, group in enumerate(groups, 1):
-        some = f"{name}_{number}", f"{title}, page {number} of {len(groups)}"
-        yield *(some if len(groups) > 1 else (name, title)), group
+        numbered = f"{name}_{number}", f"{title}, page {number} of {len(groups)}"
+        yield *(numbered if len(groups) > 1 else (name, title)), group

@@ -135,8 +135,8 @@ def read_joined_plan(folder: Path) -> Plan:
     """Return the methods and seeds of the table of all jobs of a batch, if there is one."""
     if not (folder / MISSIONS).is_file():
         return []
-    asked = read_table(folder / MISSIONS, ["seed"], ["method"])
-    return [(str(name), seeds.tolist()) for name, seeds in asked.groupby("method")["seed"]]
+    planned = read_table(folder / MISSIONS, ["seed"], ["method"])
+    return [(str(name), seeds.tolist()) for name, seeds in planned.groupby("method")["seed"]]
 
 
 def read_measures(run: Path) -> Measures:

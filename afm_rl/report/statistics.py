@@ -110,7 +110,7 @@ def resampled_bounds(
         return statistic(every)
 
     size = work * sum(sample.size for sample in samples)
-    found = bootstrap(
+    result = bootstrap(
         [samples[k] for k in drawn],
         with_the_rest,
         n_resamples=resamples,
@@ -121,9 +121,9 @@ def resampled_bounds(
         method="percentile",
         rng=0,
     )
-    draws = found.bootstrap_distribution
+    draws = result.bootstrap_distribution
     alike = np.ptp(draws, -1) < 1e-12 * np.maximum(1.0, np.abs(draws).max(-1))
-    return np.where(alike, math.nan, np.stack(found.confidence_interval))
+    return np.where(alike, math.nan, np.stack(result.confidence_interval))
 
 
 def probability_of_improvement(mine: pd.DataFrame, other: pd.DataFrame) -> tuple[float, Bounds]:
@@ -268,8 +268,8 @@ def aggregate(missions: pd.DataFrame, measures: Measures, oracle: str) -> pd.Dat
                 # Counted from 0: one more has been spent, and no logarithm is of nothing.
                 spent = chosen[measures.budget.column] + 1
                 logs = np.log(spent / (chosen[f"{measures.budget.column}_other"] + 1))
-                found = estimate(name, logs, chosen["scenario"])
-                row |= {key: float(np.exp(value)) for key, value in found.items()}
+                entries = estimate(name, logs, chosen["scenario"])
+                row |= {key: float(np.exp(value)) for key, value in entries.items()}
                 row[f"{name}_pairs"] = len(chosen)
         counted, seconds = own.get("seconds", pd.Series()).count(), row.pop("seconds", 0.0)
         row["per_hour"] = 3600 * counted / seconds if seconds else math.nan

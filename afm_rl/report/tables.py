@@ -156,8 +156,10 @@ def print_summary(
     """
     console = terminal(file)
     table = summary_table(summarise(missions, measures), measures)
-    some = table.shown.apply(lambda texts: texts.str.contains("[", regex=False)).any(axis=None)
-    caption = "mean [95 % interval, seeds drawn anew within scenarios]" if some else None
+    has_intervals = table.shown.apply(lambda texts: texts.str.contains("[", regex=False)).any(
+        axis=None
+    )
+    caption = "mean [95 % interval, seeds drawn anew within scenarios]" if has_intervals else None
     console.print(table.to_grid(caption=caption))
     scenarios = scenario_table(missions, measures)
     if len(scenarios.shown) > 1:

@@ -63,12 +63,12 @@ def read_settings(path: Path, deepest: int = 50) -> dict[str, Any]:
                 raise yaml.YAMLError("aliases (*name) are not read")
             if depth > deepest:
                 raise yaml.YAMLError(f"more than {deepest} levels")
-        found = yaml.load(text, LOADER)
+        settings = yaml.load(text, LOADER)
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         raise ConfigurationError(f"{path}: damaged: {_first_line(error)}") from error
-    if not isinstance(found, dict):
+    if not isinstance(settings, dict):
         raise ConfigurationError(f"{path}: damaged; expected a mapping")
-    return found
+    return settings
 
 
 def read_table(path: Path, numbers: Sequence[str], others: Sequence[str] = ()) -> pd.DataFrame:
@@ -136,8 +136,8 @@ def read_numbers(
         raise ConfigurationError(f"{path}: expected the columns mission and t, each name once")
     try:
         chosen = [("mission", "in", list(missions))]
-        found = parquet.read_table(path, columns=wanted, filters=chosen)
-        steps = found.to_pandas(ignore_metadata=True)
+        table = parquet.read_table(path, columns=wanted, filters=chosen)
+        steps = table.to_pandas(ignore_metadata=True)
     except (OSError, ValueError, MemoryError, pyarrow.ArrowException) as error:
         raise ConfigurationError(f"{path}: damaged: {_first_line(error)}") from error
     strange = [name for name in steps if not _is_number(steps[name])]

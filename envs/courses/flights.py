@@ -295,9 +295,9 @@ def find_reference(name: str) -> Reference:
         f"figure_8_{number}s": lambda period: FigureEight(period=period),
     }
     for pattern, make in named.items():
-        found = re.fullmatch(pattern, name)
-        if found:
-            return make(*map(float, found.groups()))
+        match = re.fullmatch(pattern, name)
+        if match:
+            return make(*map(float, match.groups()))
     if not name.lower().endswith(".csv"):
         raise ConfigurationError(
             f"tracks={name!r}: expected hover, a circle such as circle_2m_0.8mps (radius, speed), "

@@ -36,8 +36,10 @@ def read_columns(
     header = tuple(cell.strip().lower() for cell in lines[0][1]) if lines else ()
     if header not in headers:
         allowed = " or ".join(",".join(columns) for columns in headers)
-        found = ",".join(header) or "nothing"
-        raise ConfigurationError(f"tracks: {path}: the first line is {found}, expected {allowed}")
+        first_line = ",".join(header) or "nothing"
+        raise ConfigurationError(
+            f"tracks: {path}: the first line is {first_line}, expected {allowed}"
+        )
     rows = []
     for number, line in lines[1:]:
         if len(line) != len(header):

@@ -32,12 +32,12 @@ def known_of(
         )
     rewards = table[name]
     if isinstance(rewards, Rewards):
-        found, within = rewards, {}
+        known, within = rewards, {}
     else:
-        found, within = rewards(model), {"reward_in": lambda other: rewards(other).reward}
+        known, within = rewards(model), {"reward_in": lambda other: rewards(other).reward}
     size = 0 if model is None else model.nq + model.nv + model.na
-    features = [k for k in range(size) if k not in found.ignored] if found.ignored else []
-    own = {"reward": found.reward, "plan": found.plan, "ends": found.ends, "features": features}
+    features = [k for k in range(size) if k not in known.ignored] if known.ignored else []
+    own = {"reward": known.reward, "plan": known.plan, "ends": known.ends, "features": features}
     return {**own, **within}
 
 

@@ -92,21 +92,21 @@ class Task:
         check_arguments("robot.reward", reward, 3 + len(goals))
         action = torch.zeros(*PROBE, len(self.low))
         try:
-            found = reward(state, action, state, *goals)
+            value = reward(state, action, state, *goals)
         except Exception as error:  # of somebody else's function
             raise ConfigurationError(
                 f"robot.reward: fails for states {tuple(state.shape)} and actions "
                 f"{tuple(action.shape)}: {error}"
             ) from error
-        shape = tuple(found.shape) if isinstance(found, Tensor) else type(found).__name__
+        shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
         if shape != PROBE:
             raise ConfigurationError(
                 f"robot.reward: returned {shape} for states {tuple(state.shape)}; expected a "
                 f"tensor {PROBE}, one number per state"
             )
-        if not bool(found.isfinite().all()):
+        if not bool(value.isfinite().all()):
             raise ConfigurationError(
-                f"robot.reward: is {found[0, 0]:g} in the first state, {state[0, 0].tolist()}, for "
+                f"robot.reward: is {value[0, 0]:g} in the first state, {state[0, 0].tolist()}, for "
                 "an action of zeros; expected a finite number"
             )
 
@@ -122,17 +122,17 @@ class Task:
 
         Where ``rows`` ``(*B)`` is false, they are not used.
         """
-        asked = seeds if rows is None else torch.where(rows, seeds, 0)
-        known = {seed: self.start(seed) for seed in set(asked.flatten().tolist())}
-        states, goals = zip(*(known[seed] for seed in asked.flatten().tolist()), strict=True)
-        found = {"pose": torch.stack(states)}
+        needed = seeds if rows is None else torch.where(rows, seeds, 0)
+        known = {seed: self.start(seed) for seed in set(needed.flatten().tolist())}
+        states, goals = zip(*(known[seed] for seed in needed.flatten().tolist()), strict=True)
+        entries = {"pose": torch.stack(states)}
         if self.goal_names:
-            found["goal"] = torch.stack(goals)
+            entries["goal"] = torch.stack(goals)
             if self.goal_in is not None and physics is not None:
                 models = self._models(physics.reshape(-1, physics.shape[-1]))
                 pairs = zip(models, goals, strict=True)
-                found["goal"] = torch.stack([self.goal_in(model, goal) for model, goal in pairs])
-        return {name: value.reshape(*seeds.shape, -1) for name, value in found.items()}
+                entries["goal"] = torch.stack([self.goal_in(model, goal) for model, goal in pairs])
+        return {name: value.reshape(*seeds.shape, -1) for name, value in entries.items()}
 
     def step(
         self, data: Any, action: Tensor, physics: Tensor | None = None
@@ -177,11 +177,11 @@ class Task:
         batch = given[0].shape[:-1]
         kinds, which = physics.expand(*batch, -1).flatten(0, -2).unique(dim=0, return_inverse=True)
         flat = [part.reshape(-1, part.shape[-1]) for part in given]
-        found = flat[0].new_zeros(len(which))
+        rewards = flat[0].new_zeros(len(which))
         for kind, model in enumerate(self._models(kinds)):
             rows = which == kind
-            found[rows] = self.reward_in(model)(*(part[rows] for part in flat))
-        return found.reshape(batch)
+            rewards[rows] = self.reward_in(model)(*(part[rows] for part in flat))
+        return rewards.reshape(batch)
 
     def history(self) -> dict[str, Any]:
         """Return what leads to the present state of a world that keeps it to itself: nothing."""

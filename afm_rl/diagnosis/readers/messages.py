@@ -157,17 +157,17 @@ def _records(file: BinaryIO, size: int) -> Iterator[Any]:
     from mcap.stream_reader import StreamReader, breakup_chunk
 
     ratio = 100  # most bytes in all for each byte of the file
-    left = (1 << 24) + ratio * size
+    budget = (1 << 24) + ratio * size
     for record in StreamReader(file, emit_chunks=True).records:
         if isinstance(record, Chunk):
-            most = min(left, CHUNK)
+            most = min(budget, CHUNK)
             data = _unpacked(record.data, record.compression, most + 1)
             if len(data) > most:
                 raise ConfigurationError(
                     f"a chunk unpacks to more than {most:,} bytes: expected at most {CHUNK:,}, and "
                     f"{ratio} times the file's size in all"
                 )
-            left -= len(data)
+            budget -= len(data)
             yield from breakup_chunk(replace(record, data=data, compression=""))
         else:
             yield record
@@ -294,12 +294,12 @@ def open_ulog(path: Path) -> Source:
     }
 
     def read(wanted: Sequence[str]) -> dict[str, Series]:
-        found = {}
+        series = {}
         for name in wanted:
             topic, field = fields[name]
             t = topics[topic][TIME].astype(float) / 1e6
-            found[name] = sorted_series(topics[topic][field].astype(float), t)
-        return found
+            series[name] = sorted_series(topics[topic][field].astype(float), t)
+        return series
 
     counts = {topic: len(data[TIME]) for topic, data in topics.items() if TIME in data}
     return Source(path, list(fields), read, topics=counts)

@@ -74,7 +74,7 @@ def source_of(
         columns = list(dict.fromkeys(names[name][0] for name in wanted))
         width = sum(widths[column] for column in columns)
         number, arrays = _read(files, sizes, columns, width, blocks_of(total, width))
-        found = {}
+        series = {}
         for name in wanted:
             column, place = names[name]
             values = arrays[column]
@@ -82,8 +82,8 @@ def source_of(
                 expected = "one number a row" if place is None else f"lists of more than {place}"
                 raise ConfigurationError(f"{printable(column)}: expected {expected}")
             values = values if place is None else values[:, place]
-            found[name] = Series(values, None, number, total)
-        return found
+            series[name] = Series(values, None, number, total)
+        return series
 
     at, number = (name if name in names else None for name in (time, episode))
     return Source(path, list(names), read, frame, at, number, notes=notes)
@@ -117,8 +117,8 @@ def widths_of(file: Path, columns: Iterable[str]) -> dict[str, int | None]:
         short = [name for name, mean in means.items() if mean <= WIDEST]
         row = next(opened.iter_batches(1, columns=short), None) if short else None
         lengths = {} if row is None or not len(row) else {n: row.column(n)[0] for n in short}
-    found = {n: len(cell.values) if cell.is_valid else 0 for n, cell in lengths.items()}
-    return {name: found.get(name, means.get(name)) for name in columns}
+    exact = {n: len(cell.values) if cell.is_valid else 0 for n, cell in lengths.items()}
+    return {name: exact.get(name, means.get(name)) for name in columns}
 
 
 def check_kind(column: str, kind: arrow.DataType) -> None:
@@ -181,14 +181,14 @@ def _read(
                 for column in columns:
                     parts[column].append(_values(column, batch.column(column)))
         begin += size
-    for column, found in parts.items():
-        kinds = {str(part.shape[1]) if part.ndim > 1 else "single" for part in found}
+    for column, arrays in parts.items():
+        kinds = {str(part.shape[1]) if part.ndim > 1 else "single" for part in arrays}
         if len(kinds) > 1:
             raise ConfigurationError(
                 f"{printable(column)}: lists of {' and '.join(sorted(kinds)[:8])} numbers: "
                 "expected one length"
             )
-    joined = {name: np.concatenate(found or [np.empty(0)]) for name, found in parts.items()}
+    joined = {name: np.concatenate(arrays or [np.empty(0)]) for name, arrays in parts.items()}
     return np.concatenate(numbers), joined
 
 
@@ -264,12 +264,12 @@ def open_lerobot(folder: Path) -> Source:
     source = source_of(folder, files, names, STAMP, EPISODE, 1 / fps, notes)
 
     def read(wanted: Sequence[str]) -> dict[str, Series]:
-        found = dict(source.read([name for name in wanted if name in names]))
-        row = next(iter(found.values())).row
-        t = found[STAMP].values if every else np.asarray(row) / fps
+        series = dict(source.read([name for name in wanted if name in names]))
+        row = next(iter(series.values())).row
+        t = series[STAMP].values if every else np.asarray(row) / fps
         whole = np.round(t * fps) / fps  # stored in single precision, a little off
         t = np.where(np.abs(t - whole) < 0.02 / fps, whole, t)
-        return found | {STAMP: Series(t, row=row)}
+        return series | {STAMP: Series(t, row=row)}
 
     return replace(source, read=read, time=STAMP)
 
@@ -296,11 +296,11 @@ def _info(file: Path) -> tuple[dict[str, Any], float]:
 
 def _files(folder: Path) -> tuple[list[Path], tuple[str, ...]]:
     """Return the parquet files of a data set, and a note of what was skipped."""
-    found = sorted(folder.glob("data/chunk-*/*.parquet"))
-    regular = [file for file in found if _is_regular(file)]
+    files = sorted(folder.glob("data/chunk-*/*.parquet"))
+    regular = [file for file in files if _is_regular(file)]
     if not regular:
         raise ConfigurationError("no data/chunk-*/*.parquet: expected at least one file")
-    skipped = [printable(file.name) for file in found if file not in set(regular)]
+    skipped = [printable(file.name) for file in files if file not in set(regular)]
     if not skipped:
         return regular, ()
     return regular, (f"skipped, no regular file: {', '.join(skipped[:8])}",)

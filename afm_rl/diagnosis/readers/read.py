@@ -124,19 +124,19 @@ def read_log(
         Unchosen: if it is not known what a command is; has a listing of what there is.
         ConfigurationError: if the file cannot be used; says what was expected.
     """
-    found = read_columns(Path(path), PAIRS, command, response, episode)
+    columns = read_columns(Path(path), PAIRS, command, response, episode)
     with _about(path):
         return Log(
-            names=tuple(printable(name) for name in found.names[0]),
-            command=found.first,
-            response=found.second,
-            t=found.t,
-            episode=found.episode,
-            usual_delay=found.frame,
-            row=found.row if found.read_from > len(found.first) else None,
-            read_from=found.read_from,
-            notes=found.notes,
-            effort=found.effort,
+            names=tuple(printable(name) for name in columns.names[0]),
+            command=columns.first,
+            response=columns.second,
+            t=columns.t,
+            episode=columns.episode,
+            usual_delay=columns.frame,
+            row=columns.row if columns.read_from > len(columns.first) else None,
+            read_from=columns.read_from,
+            notes=columns.notes,
+            effort=columns.effort,
         )
 
 
@@ -156,20 +156,20 @@ def read_columns(
             source = replace(source, episode=episode)
         wanted, names, notes = choose(source, kinds, command, response, kinds == PAIRS)
         others = [name for name in (source.time, source.episode) if name is not None]
-        found = source.read(list(dict.fromkeys([*wanted[0], *wanted[1], *others])))
-        clock = found[wanted[1][0]].t
+        columns = source.read(list(dict.fromkeys([*wanted[0], *wanted[1], *others])))
+        clock = columns[wanted[1][0]].t
         if clock is not None:
-            found = {name: _held(series, clock) for name, series in found.items()}
-        for name, series in found.items():
+            columns = {name: _held(series, clock) for name, series in columns.items()}
+        for name, series in columns.items():
             if not (np.abs(series.values[np.isfinite(series.values)]) < LARGEST).all():
                 row = int(np.flatnonzero(np.abs(np.nan_to_num(series.values)) >= LARGEST)[0])
                 raise ConfigurationError(
                     f"{printable(name)}: row {row}: expected numbers below {LARGEST:g}"
                 )
-        first, second = (np.column_stack([found[n].values for n in group]) for group in wanted)
-        time = found[source.time].values if source.time else clock
-        border = found[source.episode].values if source.episode else None
-        leading = found[wanted[0][0]]
+        first, second = (np.column_stack([columns[n].values for n in group]) for group in wanted)
+        time = columns[source.time].values if source.time else clock
+        border = columns[source.episode].values if source.episode else None
+        leading = columns[wanted[0][0]]
         number = np.arange(len(first)) if leading.row is None else leading.row
         notes = (*source.notes, *thinned_note(number, leading.rows), *notes)
         done = _complete(source, names, first, second, number, time, border, notes)
@@ -198,11 +198,11 @@ def _effort(source: Source, most: int = 16) -> dict[str, np.ndarray]:
     motors = re.compile(r"(pwm|thrust|throttle|motor|esc)[._]?\d*")
     names = [name for name in source.names if motors.fullmatch(name)][:most]
     try:
-        found = source.read(names) if names else {}
+        logged = source.read(names) if names else {}
     except ConfigurationError:
         return {}
-    kept = {name: series.values[np.isfinite(series.values)] for name, series in found.items()}
-    return {printable(name): values for name, values in kept.items() if len(values)}
+    finite = {name: series.values[np.isfinite(series.values)] for name, series in logged.items()}
+    return {printable(name): values for name, values in finite.items() if len(values)}
 
 
 def _held(series: Series, clock: np.ndarray) -> Series:
@@ -267,5 +267,5 @@ def _complete(
             f"{source.episode}: {border[-1] + 1} episodes in {len(rows)} rows: expected some of "
             "several rows; leave the column out, or see --episode"
         )
-    kept = first[rows], second[rows], time, border, number, total
-    return Columns(names, *kept, source.frame, notes)
+    complete = first[rows], second[rows], time, border, number, total
+    return Columns(names, *complete, source.frame, notes)

@@ -227,11 +227,11 @@ def choose(
                 f"({_some(second)}): expected a response for each command, in the same order"
             )
         return (read_first, read_second), (first, first if paired else second), ()
-    found = [[n for n in source.names if n.startswith(f"{kind}.")] for kind in kinds]
+    groups = [[n for n in source.names if n.startswith(f"{kind}.")] for kind in kinds]
     heads = list(kinds)
-    if not all(found):
-        found, heads = map(list, zip(*(_group(source, h) for h in (ACTIONS, STATES)), strict=True))
-    if not all(found):
+    if not all(groups):
+        groups, heads = map(list, zip(*(_group(source, h) for h in (ACTIONS, STATES)), strict=True))
+    if not all(groups):
         if source.topics is not None:
             raise Unchosen(
                 f"{len(source.names)} fields of {len(source.topics)} topics: name commands and "
@@ -243,9 +243,9 @@ def choose(
             f"{kinds[1]}.NAME; rename them, or name what is there with --command and --response",
             source.listing(),
         )
-    first, second = ([n[len(h) + 1 :] for n in g] for g, h in zip(found, heads, strict=True))
+    first, second = ([n[len(h) + 1 :] for n in g] for g, h in zip(groups, heads, strict=True))
     if not paired:
-        return (found[0], found[1]), (first, second), ()
+        return (groups[0], groups[1]), (first, second), ()
     alone = sorted(set(first) - set(second)) or sorted(set(second) - set(first))
     if set(first) - set(second):
         alone = sorted(set(first) ^ set(second))
@@ -254,8 +254,8 @@ def choose(
             "name; or name them in pairs, with --command and --response"
         )
     notes = (f"responses without a command were left out: {_some(alone)}",) if alone else ()
-    partner = dict(zip(second, found[1], strict=True))
-    return (found[0], [partner[name] for name in first]), (first, first), notes
+    partner = dict(zip(second, groups[1], strict=True))
+    return (groups[0], [partner[name] for name in first]), (first, first), notes
 
 
 def _group(source: Source, heads: Sequence[str]) -> tuple[list[str], str]:
@@ -275,17 +275,17 @@ def _expanded(source: Source, option: str, given: Sequence[str]) -> Pairs:
         own, _, field = text.rpartition("=")
         if text in source.names:
             own, field = "", text
-        found = [field] if field in source.names else []
-        found = found or [n for n in source.names if n.startswith((f"{field}.", f"{field}["))]
-        if not found:
-            some = [name for name in source.names[: NAMES // 10] if len(name) < 200]
-            near = difflib.get_close_matches(field, some, n=1)
+        matching = [field] if field in source.names else []
+        matching = matching or [n for n in source.names if n.startswith((f"{field}.", f"{field}["))]
+        if not matching:
+            short_names = [name for name in source.names[: NAMES // 10] if len(name) < 200]
+            near = difflib.get_close_matches(field, short_names, n=1)
             advice = f"did you mean {printable(near[0])}?" if near else "leave it out for a listing"
             raise ConfigurationError(
                 f"{option} {printable(field)}: there is no such name; {advice}"
             )
-        fields += found
-        called += [own or None] if len(found) == 1 else [None] * len(found)
+        fields += matching
+        called += [own or None] if len(matching) == 1 else [None] * len(matching)
     short = [name.rpartition("/")[2].partition(".")[2] or name for name in fields]
     counts = Counter(short)
     names = [

@@ -70,8 +70,8 @@ def _large(path: Path, width: int, large: int = 1 << 25) -> tuple[list[tuple[int
     blocks = blocks_of(before - 1, width)  # without the head line
     if len(blocks) == 1:
         return [], 0
-    found = [(at, max(line, 0), blocks[0][1]) for at, line in zip(starts, lines, strict=True)]
-    return found, before - 1
+    places = [(at, max(line, 0), blocks[0][1]) for at, line in zip(starts, lines, strict=True)]
+    return places, before - 1
 
 
 def _read(path: Path, names: list[str], wanted: Sequence[str]) -> Mapping[str, Series]:

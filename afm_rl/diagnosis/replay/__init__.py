@@ -32,7 +32,14 @@ def replay(log: Log, seen: Callable[[float], object] = lambda share: None) -> Re
 
     steps = np.round(np.diff(log.seconds, prepend=log.seconds[0]) / log.step)
     missing = np.where(log.begins, BLANK, (steps - 1).clip(0, BLANK)).astype(int)
-    found = {name: p(log.command, log.response, missing > 0) for name, p in SIMPLE.items()}
+    predictions = {name: p(log.command, log.response, missing > 0) for name, p in SIMPLE.items()}
     corrector = watcher(len(log.names))
-    found[AFM], std = believe_log(corrector, log.command, log.response, missing, seen)
-    return Replayed(log, found, std, errors_of(log, found), removed_by(log, found), slow_in(log))
+    predictions[AFM], std = believe_log(corrector, log.command, log.response, missing, seen)
+    return Replayed(
+        log,
+        predictions,
+        std,
+        errors_of(log, predictions),
+        removed_by(log, predictions),
+        slow_in(log),
+    )

@@ -76,13 +76,13 @@ def believe(
     model = identity(sent.shape[-1])
     turn = (torch.arange(1.0, len(felt) + 1) % 2).view(-1, *[1] * (felt.dim() - 1))
     felt = torch.cat([felt, turn.expand(*felt.shape[:-1], 1)], -1)
-    memory, found = corrector.begin(torch.zeros_like(felt[0])), []
+    memory, forecasts = corrector.begin(torch.zeros_like(felt[0])), []
     for row, (action, state) in enumerate(zip(sent, felt, strict=True)):
         memory, effect, std = follow(corrector, memory, action, model)
-        found.append(torch.stack([effect, std]))
+        forecasts.append(torch.stack([effect, std]))
         memory = corrector.observe(memory, state)
         seen(row)
-    effects, stds = torch.stack(found, 1).numpy().astype(float)
+    effects, stds = torch.stack(forecasts, 1).numpy().astype(float)
     return effects, stds
 
 
@@ -130,11 +130,11 @@ def believe_log(
     felt = np.where(row[..., None] >= 0, response[row] / scale, np.nan)
     steps = len(row)
     effect, std = believe(corrector, sent, felt, lambda step: seen((step + 1) / steps))
-    found = np.empty((2, *command.shape))
+    mean_and_std = np.empty((2, *command.shape))
     own = (place >= starts) & (row >= 0)
-    found[0][row[own]] = (effect * scale)[own]
-    found[1][row[own]] = (std * scale)[own]
-    return found[0], found[1]
+    mean_and_std[0][row[own]] = (effect * scale)[own]
+    mean_and_std[1][row[own]] = (std * scale)[own]
+    return mean_and_std[0], mean_and_std[1]
 
 
 def _with_blanks(missing: np.ndarray) -> np.ndarray:

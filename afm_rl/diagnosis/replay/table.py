@@ -100,17 +100,17 @@ def _least_squares(
 ) -> np.ndarray:
     """Return each actuator's prediction by its columns ``(N, F)``, fitted to earlier rows."""
     earlier = partial(lfilter, [0.0, 1.0], [1.0, -forgetting], axis=0)
-    found = np.empty_like(command)
+    predictions = np.empty_like(command)
     for j, x in enumerate(columns):
         mean = np.square(x).cumsum(0) / np.arange(1, len(x) + 1)[:, None]  # of rows so far
         weight = ridge * mean.clip(1e-100)
-        told = x if skipped is None else x * ~skipped[:, None]
-        gram = earlier(told[:, :, None] * told[:, None, :])
+        fitted_to = x if skipped is None else x * ~skipped[:, None]
+        gram = earlier(fitted_to[:, :, None] * fitted_to[:, None, :])
         gram += weight[:, :, None] * np.eye(x.shape[1])
         miss = response[:, j] - x @ prior[j]
-        change = np.linalg.solve(gram, earlier(told * miss[:, None])[..., None])[..., 0]
-        found[:, j] = (x * (prior[j] + change)).sum(1)
-    return found
+        change = np.linalg.solve(gram, earlier(fitted_to * miss[:, None])[..., None])[..., 0]
+        predictions[:, j] = (x * (prior[j] + change)).sum(1)
+    return predictions
 
 
 @dataclass(frozen=True)
@@ -139,12 +139,12 @@ class Replayed:
     @property
     def sentence(self) -> str:
         """What a correction would have done."""
-        gone = {name: share for name, share in self.removed.items() if share > 0}
-        said = [f"{100 * gone[name]:.0f} % of the error of {name}" for name in gone]
+        removed = {name: share for name, share in self.removed.items() if share > 0}
+        said = [f"{100 * removed[name]:.0f} % of the error of {name}" for name in removed]
         none = [name for name, share in self.removed.items() if share == 0]
-        more = [f"{-100 * s:.0f} % to that of {name}" for name, s in self.removed.items() if s < 0]
+        added = [f"{-100 * s:.0f} % to that of {name}" for name, s in self.removed.items() if s < 0]
         said += [f"none of {_listed(none)}"] if none else []
-        both = [("removed", said, ","), ("added", more, "")]
+        both = [("removed", said, ","), ("added", added, "")]
         parts = [f"{done} {_listed(what, comma)}" for done, what, comma in both if what]
         return f"A correction would have {', and '.join(parts)}."
 
@@ -176,10 +176,10 @@ class Replayed:
                 f"afm.{name}": self.predictions[AFM][:, j],
                 f"std.{name}": self.std[:, j],
             }
-        found = pd.DataFrame(columns)
+        table = pd.DataFrame(columns)
         if log.row is None:
-            return found
-        return found.set_axis(log.row).reindex(range(log.read_from or int(log.row[-1]) + 1))
+            return table
+        return table.set_axis(log.row).reindex(range(log.read_from or int(log.row[-1]) + 1))
 
 
 def errors_of(log: Log, predictions: Mapping[str, np.ndarray], stretches: int = 4) -> pd.DataFrame:
@@ -233,7 +233,7 @@ def removed_by(
 
     It is 0 where it is smaller than ``least``, or where the difference of the errors may be chance.
     """
-    found = {}
+    shares = {}
     for j, name in enumerate(log.names):
         alone, corrected = (
             np.abs(predictions[kind][:, j] - log.response[:, j]) for kind in (ALONE, AFM)
@@ -242,8 +242,8 @@ def removed_by(
         low, _, high = quantile_with_interval(alone - corrected, 0.5)
         share = 1 - after / before if before > 0 else 0.0
         clear = low > 0 if share > 0 else high < 0
-        found[name] = share if clear and abs(share) >= least else 0.0
-    return found
+        shares[name] = share if clear and abs(share) >= least else 0.0
+    return shares
 
 
 def slow_in(log: Log, share: float = 0.5) -> tuple[str, ...]:

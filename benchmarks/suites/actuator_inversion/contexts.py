@@ -59,7 +59,7 @@ def contexts_of(
         signs: of the actions.
         count: contexts of a split.
     """
-    found: dict[str, list] = {"nominal": [({}, {})], "reversed": [({}, regime(-1.0))]}
+    contexts: dict[str, list] = {"nominal": [({}, {})], "reversed": [({}, regime(-1.0))]}
     splits = [spread(*span) for span in spans.values()]
     for name in splits[0]:
         values = np.meshgrid(*(split[name] for split in splits), indexing="ij")
@@ -67,8 +67,8 @@ def contexts_of(
         for suffix, own in (("", signs), ("_reversed", (-1.0,))):
             rows = [(*row, sign) for row in grid.tolist() for sign in sorted(own)]
             chosen = np.linspace(0, len(rows) - 1, count).round().astype(int)
-            found[name + suffix] = [
+            contexts[name + suffix] = [
                 (regime(1.0, *row), regime(sign, *row))
                 for *row, sign in (rows[index] for index in chosen)
             ]
-    return found
+    return contexts

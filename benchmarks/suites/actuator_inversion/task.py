@@ -47,10 +47,10 @@ def stretched(domain: str, model: Any, row: tuple[float, ...]) -> Any:
         element.set(attribute, " ".join(repr(number) for number in numbers))
     with quiet():
         text = ElementTree.tostring(root, encoding="unicode")
-        found = mujoco.MjModel.from_xml_string(text, dict(common.ASSETS))
-    found.opt.disableflags = model.opt.disableflags
+        changed = mujoco.MjModel.from_xml_string(text, dict(common.ASSETS))
+    changed.opt.disableflags = model.opt.disableflags
     rest = tuple({**value, "length": 1.0}.values())
-    return changed_model(found, rest)
+    return changed_model(changed, rest)
 
 
 def _named(root: Any, kind: str, names: Sequence[str]) -> list[Any]:
@@ -127,19 +127,19 @@ def actuator_inversion_task(
     check_choice("robot.task", task, (*BODIES, *TOYS))
     check_count("robot.contexts", contexts)
     if task in TOYS:
-        found = TOYS[task](contexts)
+        made = TOYS[task](contexts)
     else:
         domain, name, nominal, spans = BODIES[task]
         change = partial(stretched, domain) if domain in EDITS else changed_model
-        found = dm_control_task(domain, name, change=change)
-        bound_noise(cast(KnownDynamics, found.world), found.start(0)[0], found.low, found.high)
+        made = dm_control_task(domain, name, change=change)
+        bound_noise(cast(KnownDynamics, made.world), made.start(0)[0], made.low, made.high)
         signs = SIGNS if domain in EDITS else SIGNS[:1]
-        regime = partial(body_regime, len(found.low), **nominal)
-        found = replace(found, contexts=contexts_of(spans, regime, signs, contexts))
+        regime = partial(body_regime, len(made.low), **nominal)
+        made = replace(made, contexts=contexts_of(spans, regime, signs, contexts))
     return replace(
-        found,
-        plan=found.plan if reward is None else reward,
-        low=action_low or found.low,
-        high=action_high or found.high,
-        steps=found.steps if steps is None else check_count("robot.steps", steps),
+        made,
+        plan=made.plan if reward is None else reward,
+        low=action_low or made.low,
+        high=action_high or made.high,
+        steps=made.steps if steps is None else check_count("robot.steps", steps),
     )

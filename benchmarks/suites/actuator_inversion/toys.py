@@ -121,9 +121,9 @@ class Coefficients(Regime):
         wanted = (first * number + second * number**2) / NOMINAL
         root, ahead = (1 + 4 * wanted).sqrt(), 1 + 2 * number
         root = torch.where((root * ahead.conj()).real < 0, -root, root)
-        found = torch.view_as_real((root - 1) / 2)
+        effect = torch.view_as_real((root - 1) / 2)
         nominal = self.is_identity(parameters).unsqueeze(-1)  # to the bit
-        return torch.where(nominal, action, found)
+        return torch.where(nominal, action, effect)
 
 
 def drift(state: Tensor, action: Tensor) -> Tensor:

@@ -74,9 +74,9 @@ class Raptor(RecedingHorizonPlanner):
         numbers = torch.cat(parts, -1).reshape(-1, 22).cpu().numpy()
         recurrent = self.policy.layers[1]
         recurrent.state = hidden.reshape(-1, HIDDEN).cpu().numpy()
-        asked = torch.from_numpy(self.policy.evaluate_step(numbers)).to(last)
-        asked = asked.clamp(-1.0, 1.0).reshape(last.shape)
+        speeds_asked = torch.from_numpy(self.policy.evaluate_step(numbers)).to(last)
+        speeds_asked = speeds_asked.clamp(-1.0, 1.0).reshape(last.shape)
         hidden = torch.from_numpy(recurrent.state).to(hidden).reshape(hidden.shape)
         self.policy.reset()  # what it remembers is in the tensordict alone
-        speeds = self.body.rotor_speed * (asked[..., self.order] + 1) / 2
-        return mix(self.body.k_t * speeds.square(), self.body), [hidden, asked]
+        speeds = self.body.rotor_speed * (speeds_asked[..., self.order] + 1) / 2
+        return mix(self.body.k_t * speeds.square(), self.body), [hidden, speeds_asked]

@@ -92,8 +92,8 @@ class Agent:
         self.td.set(("next", "observation"), after.float())
         if self.updater is not None:
             self.updater(self.td)
-        kept = self.td.get("next").exclude("observation")
-        self.td = self.td.exclude("next").update(kept)
+        carried = self.td.get("next").exclude("observation")
+        self.td = self.td.exclude("next").update(carried)
 
 
 CEM = partial(ICEM, horizon=14, population=128, iterations=2, elites=12, sigma=0.8, beta=1.0)

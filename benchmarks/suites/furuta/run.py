@@ -169,11 +169,11 @@ def print_tables(rows: pd.DataFrame, methods: Sequence[str]) -> None:
     print(f"\n| film | {' | '.join(EVENTS)} | lost | ms a step: median, 95 %, mean |")
     print(f"|---|{'---|' * (len(EVENTS) + 2)}")
     for method in methods:
-        found, alone = (_of(rows, method, part) for part in ("film", "time"))
-        cells = [f"{_middle(found[name])}, {found[name].max():.2f}" for name in EVENTS]
-        lost = np.isinf(found[[*EVENTS]]).any(axis=1).sum()
+        events, alone = (_of(rows, method, part) for part in ("film", "time"))
+        cells = [f"{_middle(events[name])}, {events[name].max():.2f}" for name in EVENTS]
+        lost = np.isinf(events[[*EVENTS]]).any(axis=1).sum()
         ms = ", ".join(f"{alone[f'ms {q}'].mean():.1f}" for q in ("50", "95", "mean"))
-        row = f"| {method} | {' | '.join(cells)} | {lost}/{len(found)} | {ms} |"
+        row = f"| {method} | {' | '.join(cells)} | {lost}/{len(events)} | {ms} |"
         print(row.replace("inf", "∞"))
 
 

@@ -40,14 +40,14 @@ def errors(predict: Predictor) -> pd.Series:
         predict: ``predict(command, response, begins) -> prediction``, arrays ``(N, 2)``; that of a
             row may depend on its command and on earlier rows.
     """
-    found = {}
+    quantiles = {}
     for ground in (*GROUNDS, TRACKS):
         log = read_log(LOGS / f"{ground}.csv")
         miss = np.abs(predict(log.command, log.response, log.begins) - log.response)
         for name, column in zip(log.names, miss.T, strict=True):
             for kind, share in SHARES.items():
-                found[ground, name, kind] = float(np.quantile(column, share))
-    return pd.Series(found)
+                quantiles[ground, name, kind] = float(np.quantile(column, share))
+    return pd.Series(quantiles)
 
 
 def by(corrector: PairCorrector) -> Predictor:
@@ -55,8 +55,8 @@ def by(corrector: PairCorrector) -> Predictor:
 
     def predict(command: np.ndarray, response: np.ndarray, begins: np.ndarray) -> np.ndarray:
         unit = np.abs(command).max(0)
-        found, _ = believe(corrector, (command / unit)[:, None], (response / unit)[:, None])
-        return unit * found[:, 0]
+        predicted, _ = believe(corrector, (command / unit)[:, None], (response / unit)[:, None])
+        return unit * predicted[:, 0]
 
     return predict
 

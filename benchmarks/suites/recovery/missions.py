@@ -78,24 +78,24 @@ def rewards(
     """Return the rewards after the fault by fault and seed, and seconds a step."""
     mission, name = MISSIONS[task], METHODS[method]
     faults = {"none": "{}", **{fault: mission.faults.get(fault) for fault in names}}
-    asked = [fault for fault, regime in faults.items() if regime]
+    played = [fault for fault, regime in faults.items() if regime]
     folder = out / "missions" / f"{task.replace(' ', '_')}.{name}"
     command = [sys.executable, "-m", "afm_rl", *mission.options, f"compare=[{name}]"]
-    command += [f"regimes=[{', '.join(faults[fault] for fault in asked)}]", f"seeds={seeds}"]
+    command += [f"regimes=[{', '.join(faults[fault] for fault in played)}]", f"seeds={seeds}"]
     command += [f"{mission.setting}={steps or mission.steps}", f"hydra.run.dir={folder}"]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     table = pd.read_parquet(folder / "steps.parquet")
     groups = [group for _, group in table.groupby("mission")]
     at = [int(group["regime_active"].to_numpy().argmax()) for group in groups]
     at[:seeds] = [int(np.median(at[seeds:]))] * seeds  # healthy ones show no change
-    found, length = {}, max(len(group) for group in groups)
+    by_seed, length = {}, max(len(group) for group in groups)
     for number, (group, begin) in enumerate(zip(groups, at, strict=True)):
         mine = _rewards(group)
         # What ended early has no reward any more, or its worst error.
         rest = min(0.0, mine.min()) if "reward" not in group else 0.0
         mine = np.append(mine, np.full(max(0, length - len(group)), rest))
-        found[asked[number // seeds], number % seeds] = mine[begin:]
-    return found, mission.dt
+        by_seed[played[number // seeds], number % seeds] = mine[begin:]
+    return by_seed, mission.dt
 
 
 def _rewards(steps: pd.DataFrame) -> np.ndarray:
@@ -105,5 +105,5 @@ def _rewards(steps: pd.DataFrame) -> np.ndarray:
     if "square_error_x" in steps:
         return -np.sqrt(steps[[f"square_error_{axis}" for axis in "xyz"]].sum(1).to_numpy(float))
     place, goal = steps[["x", "y"]].to_numpy(float), steps[["goal_x", "goal_y"]].to_numpy(float)
-    left = np.linalg.norm(goal - place, axis=1)[:-1]
-    return left - np.linalg.norm(goal[:-1] - place[1:], axis=1)
+    distance = np.linalg.norm(goal - place, axis=1)[:-1]
+    return distance - np.linalg.norm(goal[:-1] - place[1:], axis=1)

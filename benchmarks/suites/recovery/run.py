@@ -111,8 +111,8 @@ def print_table(rows: pd.DataFrame, args: argparse.Namespace) -> None:
     for task in args.tasks:
         cells = []
         for fault in args.faults:
-            found = [middle.get((task, fault, method), np.nan) for method in args.methods]
-            cells.append("–" if np.isnan(found).all() else ", ".join(map(_seconds, found)))
+            medians = [middle.get((task, fault, method), np.nan) for method in args.methods]
+            cells.append("–" if np.isnan(medians).all() else ", ".join(map(_seconds, medians)))
         print(f"| {task.replace('_', ' ')} | {' | '.join(cells)} |")
 
 

@@ -54,18 +54,18 @@ def play(
     box = torch.stack([-world.limit, world.limit]).expand(count, 2, size)
     reading = last = state
     memory = None if corrector is None else corrector.begin(reading)
-    costs, kept = torch.zeros(count), torch.zeros(count, size)
+    costs, held = torch.zeros(count), torch.zeros(count, size)
     for time in range(world.steps):
         planned = world.policy(reading, time)
         planned = torch.where(rules["bang"] > 0, world.limit * planned.sign(), planned)
         later = time >= since
         planned = torch.where((rules["zero"] > 0) & torch.tensor(later), 0.0, planned)
-        kept = planned if time <= since else kept
-        planned = torch.where((rules["constant"] > 0) & torch.tensor(later), kept, planned)
+        held = planned if time <= since else held
+        planned = torch.where((rules["constant"] > 0) & torch.tensor(later), held, planned)
         executed = planned
         if corrector is not None:
-            memory, found = corrector.correct(memory, planned, model, box)
-            executed = found.executed.clamp(-world.limit, world.limit)
+            memory, correction = corrector.correct(memory, planned, model, box)
+            executed = correction.executed.clamp(-world.limit, world.limit)
         rules["jump"] = torch.full((count, 1), float(time == since + 5))
         gain = (1 - rules["fade"] * world.dt * time).clamp_min(0.2) * (fault if later else 1.0)
         after = world.move(state, gain * executed, rules, draw(torch.randn, 3))

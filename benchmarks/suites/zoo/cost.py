@@ -32,8 +32,8 @@ def main() -> None:
     spent = {name: np.quantile(times, 0.5) for name, times in measure(task, args).items()}
     print("| method | µs a step | of AFM's |\n|---|---|---|")
     for name, seconds in spent.items():
-        more = seconds - spent["alone"]
-        print(f"| {name} | {1e6 * more:.0f} | {more / (spent['AFM'] - spent['alone']):.2f} |")
+        added = seconds - spent["alone"]
+        print(f"| {name} | {1e6 * added:.0f} | {added / (spent['AFM'] - spent['alone']):.2f} |")
 
 
 def measure(task: Task, args: argparse.Namespace) -> dict[str, list[float]]:

@@ -38,9 +38,9 @@ def main() -> None:
     env = gymnasium.make(task, **settings)
     policy = first_numbers(policy, env.observation_space.shape[0])
     save_policy(args.out, policy, about)
-    found = returns(env, args.out, args.episodes)
-    save_policy(args.out, policy, {**about, "return": round(sum(found) / len(found), 1)})
-    print(f"{args.out}: returns {', '.join(f'{x:.0f}' for x in found)}")
+    results = returns(env, args.out, args.episodes)
+    save_policy(args.out, policy, {**about, "return": round(sum(results) / len(results), 1)})
+    print(f"{args.out}: returns {', '.join(f'{x:.0f}' for x in results)}")
 
 
 def first_numbers(policy: StoredPolicy, count: int) -> StoredPolicy:
@@ -66,16 +66,16 @@ def first_numbers(policy: StoredPolicy, count: int) -> StoredPolicy:
 
 def returns(env: gymnasium.Env, file: Path, episodes: int) -> list[float]:
     """Return the returns of a stored policy in the healthy task."""
-    (policy, _), found = load_policy(file), [0.0] * episodes
+    (policy, _), totals = load_policy(file), [0.0] * episodes
     for episode in range(episodes):
         observation, _ = env.reset(seed=episode)
         over = False
         while not over:
             action = policy(torch.as_tensor(observation, dtype=torch.float32)).numpy()
             observation, reward, terminated, truncated, _ = env.step(action)
-            found[episode] += float(reward)
+            totals[episode] += float(reward)
             over = terminated or truncated
-    return found
+    return totals
 
 
 if __name__ == "__main__":

@@ -42,10 +42,10 @@ def main() -> None:
         for method in args.methods:
             complete(task, method, faults, args.episodes, args.out, args.steps)
     results = read(args.out)
-    asked = results["policy"].isin(names) & (results["episode"] < args.episodes)
+    chosen_rows = results["policy"].isin(names) & (results["episode"] < args.episodes)
     for column, chosen in (("method", args.methods), ("fault", args.faults)):
-        asked &= results[column].isin(chosen) if chosen else True
-    results = results[asked]
+        chosen_rows &= results[column].isin(chosen) if chosen else True
+    results = results[chosen_rows]
     if {"alone", "none"} <= set(results["method"]) | set(results["fault"]):
         results = shares(ordered(results, list(METHODS), list(presets(2))))
         print_tables(results)

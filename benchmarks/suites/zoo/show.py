@@ -32,11 +32,11 @@ def shares(results: pd.DataFrame) -> pd.DataFrame:
 def ordered(results: pd.DataFrame, methods: list[str], faults: list[str]) -> pd.DataFrame:
     """Return results whose methods and faults sort in the given order."""
     kinds = {"method": methods, "fault": faults}
-    found = {
+    columns = {
         name: pd.Categorical(results[name], [x for x in order if x in set(results[name])])
         for name, order in kinds.items()
     }
-    return results.assign(**found)
+    return results.assign(**columns)
 
 
 def print_tables(results: pd.DataFrame) -> None:
