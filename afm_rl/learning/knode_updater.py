@@ -13,7 +13,6 @@ from afm_rl.dynamics.knode import KNODE
 from afm_rl.dynamics.residual import Network
 from afm_rl.errors import (
     ConfigurationError,
-    check_choice,
     check_count,
     check_flag,
     check_number,
@@ -40,7 +39,6 @@ class Rows(NamedTuple):
     """Whether the step is to be learnt from, ``(l, n, R)``; the others hold zeros."""
 
 
-TRAINERS = ("fast", "exact")
 NONE = -1  # no network is under way
 
 
@@ -81,8 +79,6 @@ class KNODEUpdater(Learner):
         lr: their size.
         l2: weight of the squared parameters.
         noise: standard deviation of what is added to states in training, in their units.
-        trainer: ``"fast"``, to first order in the network, or ``"exact"``, through the
-            integration.
         published_random: the published quirk: each network starts from the same random numbers,
             and the noise, which is the same each time, also goes to the actions.
         trace_key: where the trace is.
@@ -115,7 +111,6 @@ class KNODEUpdater(Learner):
         lr: float = 0.01,
         l2: float = 5e-8,
         noise: float = 1e-4,
-        trainer: str = "fast",
         published_random: bool = False,
         trace_key: NestedKey = ("next", "trace"),
         mask_key: NestedKey | None = None,
@@ -140,7 +135,6 @@ class KNODEUpdater(Learner):
         self.lr = check_number("updater.lr", lr, low=0.0, open_low=True)
         self.l2 = check_number("updater.l2", l2, low=0.0)
         self.noise = check_number("updater.noise", noise, low=0.0)
-        self.exact = check_choice("updater.trainer", trainer, TRAINERS) == "exact"
         self.published_random = check_flag("updater.published_random", published_random)
         self.trace_key, self.seed_key = (
             None if key is None else as_key(key) for key in (trace_key, seed_key)
@@ -219,7 +213,6 @@ class KNODEUpdater(Learner):
             epochs=self.epochs,
             lr=self.lr,
             l2=self.l2,
-            exact=self.exact,
         )
         taught = rows.counts.flatten(1).any(-1)  # nothing is learnt from nothing
         self.pending.keep(Pending(*network, taught))

@@ -75,19 +75,16 @@ class OnlineUpdater(Learner):
         self.optimizer.step()
 
 
-FORMS = ("error", "loss")
-
-
 class StreamXUpdater(OnlineUpdater):
     r"""One overshooting-bounded step on the latest transition, per mission and member.
 
     The stream-x recipe (Elsayed et al. 2024, arXiv 2410.14606) for one-step supervised
-    learning: :class:`~afm_rl.learning.ObGD` without traces, :math:`z = g`, on
+    learning: :class:`~afm_rl.learning.ObGD` on
 
     * ``form="error"``: the members' error :math:`\delta = \|y - \mu\|_2` in standardised
-      units, :math:`z = \nabla_w \delta`. The head of the log-variance :math:`\ell`, which
+      units, :math:`g = \nabla_w \delta`. The head of the log-variance :math:`\ell`, which
       this does not reach, takes a step on the likelihood: :math:`\delta = 1`,
-      :math:`z = \nabla \sum_d [(y_d - \mu_d)^2 e^{-\ell_d} + \ell_d] / D`.
+      :math:`g = \nabla \sum_d [(y_d - \mu_d)^2 e^{-\ell_d} + \ell_d] / D`.
     * ``form="loss"``: the likelihood for everything, the literal reading: steps of one size
       however small the error.
 
@@ -132,7 +129,7 @@ class StreamXUpdater(OnlineUpdater):
                 f"{type(loss.model).__name__}; choose an ensemble, such as dynamics=pe_stream_x"
             )
         super().__init__(loss, partial(ObGD, lr=lr, kappa=kappa, lead_dims=1), mask_key, wrap)
-        self.form = check_choice("updater.form", form, FORMS)
+        self.form = check_choice("updater.form", form, ("error", "loss"))
 
     def _measure(self, transitions: TensorDictBase) -> dict[str, Tensor]:
         """Return the loss ``(*B)`` and what it is made of, ``(*B, E, D)`` each."""

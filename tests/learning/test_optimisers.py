@@ -1,0 +1,167 @@
+"""The optimisers: steps that do not overshoot, and an Adam that is new at every step."""
+
+import pytest
+import torch
+from torch import nn
+
+from afm_rl.errors import ConfigurationError
+from afm_rl.learning import ObGD, ResetAdam
+
+PROBLEMS = 1000
+
+
+def draw(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("lr", "kappa"), [(1.0, 2.0), (30.0, 1.0), (1e-3, 2.0)])
+def test_no_step_overshoots_on_its_sample(lr, kappa):
+    weights = nn.Parameter(draw(PROBLEMS, 20))
+    optimizer = ObGD([weights], lr=lr, kappa=kappa, lead_dims=1)
+    scale = 10.0 ** draw(PROBLEMS, seed=1)  # targets of all sizes
+    for seed in range(5):
+        inputs = 2 * torch.rand(PROBLEMS, 20, dtype=torch.float64) - 1
+        target = scale * draw(PROBLEMS, seed=10 + seed)
+        before = target - (weights * inputs).sum(-1)
+        optimizer.zero_grad()
+        (-(weights * inputs).sum()).backward()
+        optimizer.step(before.detach())
+        change = before - (target - (weights * inputs).sum(-1))
+        largest = inputs.abs().amax(-1) / (kappa * before.abs().clamp_min(1))
+        assert (change.abs() <= largest * before.abs() * (1 + 1e-9)).all()
+        assert (change * before > 0).all()
+        assert ((before - change) * before > 0).all()  # the sign stays
+
+
+def test_small_steps_are_those_of_gradient_descent():
+    ours, theirs = (nn.Parameter(draw(6)) for _ in range(2))
+    left, right = ObGD([ours], lr=1e-4), torch.optim.SGD([theirs], lr=1e-4)
+    for step in range(5):
+        ours.grad = draw(6, seed=step)
+        theirs.grad = ours.grad.clone()
+        left.step(), right.step()
+    torch.testing.assert_close(ours, theirs)
+    assert not left.state  # nothing is stored
+
+
+def test_a_step_follows_the_equations():
+    weight, bias = nn.Parameter(draw(3, 2)), nn.Parameter(draw(2))
+    optimizer = ObGD([weight, bias], lr=0.5, kappa=3.0)
+    expected = [weight.detach().clone(), bias.detach().clone()]
+    for step, delta in enumerate((0.3, -4.0, 1e-3, 0.0)):
+        weight.grad = draw(3, 2, seed=step)
+        bias.grad = draw(2, seed=10 + step) if step != 1 else None
+        optimizer.step(delta)
+        gradients = [0.0 * p if p.grad is None else p.grad for p in (weight, bias)]
+        bound = 0.5 * 3.0 * max(abs(delta), 1.0) * sum(g.abs().sum() for g in gradients)
+        for value, gradient in zip(expected, gradients, strict=True):
+            value -= 0.5 / max(1.0, bound) * delta * gradient
+        torch.testing.assert_close([weight.data, bias.data], expected)
+
+
+@pytest.mark.parametrize("lead", [(3,), (2, 3)], ids=str)
+def test_stacked_learners_equal_a_loop(lead):
+    shapes = [(4, 2), (1, 2), ()]
+    stacked = [nn.Parameter(draw(*lead, *shape, seed=k)) for k, shape in enumerate(shapes)]
+    optimizer = ObGD(stacked, lead_dims=len(lead))
+    index = [tuple(i) for i in torch.ones(lead).nonzero().tolist()]
+    alone = {i: [nn.Parameter(p.detach()[i].clone()) for p in stacked] for i in index}
+    singles = {i: ObGD(parameters) for i, parameters in alone.items()}
+    for step in range(4):
+        delta = draw(*lead, seed=100 + step)
+        for k, parameter in enumerate(stacked):
+            parameter.grad = 10.0 ** (step - 2) * draw(*parameter.shape, seed=10 * step + k)
+        optimizer.step(delta)
+        for i in index:
+            for parameter, whole in zip(alone[i], stacked, strict=True):
+                parameter.grad = whole.grad[i].clone()
+            singles[i].step(float(delta[i]))
+    for i in index:
+        for parameter, whole in zip(alone[i], stacked, strict=True):
+            torch.testing.assert_close(parameter, whole[i])
+
+
+def test_groups_are_bounded_apart():
+    left, right = (nn.Parameter(torch.zeros(2)) for _ in range(2))
+    optimizer = ObGD([{"params": [left]}, {"params": [right], "kappa": 4.0}])
+    left.grad = right.grad = torch.full((2,), 100.0)
+    optimizer.step()
+    torch.testing.assert_close(left.data, torch.full((2,), -0.25))
+    torch.testing.assert_close(right.data, torch.full((2,), -0.125))
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "settings"),
+    [
+        (ObGD, {"lr": 0.0}),
+        (ObGD, {"lr": float("nan")}),
+        (ObGD, {"kappa": -1.0}),
+        (ObGD, {"lead_dims": -1}),
+        (ObGD, {"lead_dims": 2}),  # one of the parameters has a single dimension
+        (ResetAdam, {"lr": 0.0}),
+        (ResetAdam, {"lr": float("nan")}),
+        (ResetAdam, {"eps": 0.0}),
+    ],
+    ids=str,
+)
+def test_impossible_settings_are_refused(optimizer, settings):
+    with pytest.raises(ConfigurationError, match=f"updater.{next(iter(settings))}"):
+        optimizer(parameters(), **settings)
+
+
+def test_learners_that_do_not_fit_are_refused():
+    with pytest.raises(ConfigurationError, match=r"lead_dims=1: parameters of shape \(3, 2\) and"):
+        ObGD([nn.Parameter(torch.zeros(3, 2)), nn.Parameter(torch.zeros(2, 2))], lead_dims=1)
+    weights = nn.Parameter(torch.zeros(3, 2))
+    optimizer = ObGD([weights], lead_dims=1)
+    weights.grad = torch.ones(3, 2)
+    with pytest.raises(ConfigurationError, match=r"delta of shape \(2,\): expected .* \(3,\)"):
+        optimizer.step(torch.ones(2))
+    for delta in (float("nan"), "1", None):
+        with pytest.raises(ConfigurationError, match="delta"):
+            optimizer.step(delta)
+
+
+def parameters(seed=0):
+    torch.manual_seed(seed)
+    return [nn.Parameter(torch.randn(4, 3, dtype=torch.float64)), nn.Parameter(torch.zeros(2))]
+
+
+def test_each_step_is_the_first_step_of_a_new_adam():
+    ours, theirs = parameters(), parameters()
+    optimizer = ResetAdam(ours, lr=0.02)
+    for step in range(5):
+        fresh = torch.optim.Adam(theirs, lr=0.02)
+        for left, right in zip(ours, theirs, strict=True):
+            left.grad = torch.randn_like(left) * 10.0 ** (step - 6)
+            right.grad = left.grad.clone()
+        optimizer.step(), fresh.step()
+        for left, right in zip(ours, theirs, strict=True):
+            torch.testing.assert_close(left, right)
+
+
+@pytest.mark.parametrize("size", [1, 5, 7, 12, 100])
+@pytest.mark.parametrize("turned", [False, True])
+def test_pieces_change_nothing(size, turned, monkeypatch):
+    monkeypatch.setattr(ResetAdam, "piece", size)
+    start, gradient = (torch.randn(4, 3, dtype=torch.float64) for _ in range(2))
+    weight = nn.Parameter(start.clone().T if turned else start.clone())
+    weight.grad = gradient.T if turned else gradient
+    ResetAdam([weight], lr=0.1).step()
+    expected = start - 0.1 * gradient / (gradient.abs() + 1e-8)
+    torch.testing.assert_close(weight.data.T if turned else weight.data, expected)
+
+
+def test_what_has_no_gradient_stays():
+    still, zero = parameters()
+    zero.grad = torch.zeros(2)
+    before = still.clone()
+    ResetAdam([still, zero], lr=1.0).step()
+    assert torch.equal(still, before) and torch.equal(zero, torch.zeros(2))
+
+
+def test_groups_have_step_sizes_of_their_own():
+    slow, fast = (nn.Parameter(torch.zeros(1)) for _ in range(2))
+    slow.grad, fast.grad = torch.ones(1), -torch.ones(1)
+    ResetAdam([{"params": [slow], "lr": 0.1}, {"params": [fast]}], lr=0.5).step()
+    torch.testing.assert_close(torch.cat([slow, fast]).data, torch.tensor([-0.1, 0.5]))
