@@ -6,7 +6,7 @@ the tests of what is refused follow from there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, wraps
 from inspect import Parameter, cleandoc, signature
 from math import inf
@@ -89,6 +89,7 @@ class Option(NamedTuple):
 class Taken(NamedTuple):
     """What a function takes."""
 
+    group: str
     own: dict[str, Option]
     kinds: Callable[[], dict[str, Any]]
     """Returns the types of its options."""
@@ -96,7 +97,7 @@ class Taken(NamedTuple):
     parts: dict[str, Callable[..., Any]]
 
 
-NOTHING = Taken({}, dict, (), {})
+NOTHING = Taken("", {}, dict, (), {})
 
 
 def option(
@@ -159,6 +160,8 @@ def options(
         kinds = cache(lambda: get_type_hints(hinted, function.__globals__))  # when first needed
 
         def check(name: str, value: Any) -> Any:
+            if name in parts and value is not None:
+                check_settings(parts[name], value)
             place = f"{group}.{name}" if group else name
             return own[name].check(place, kinds()[name], value) if name in own else value
 
@@ -167,7 +170,7 @@ def options(
             settings = {name: check(name, value) for name, value in settings.items()}
             return function(*map(check, names, args), *args[len(names) :], **settings)
 
-        checked.options = Taken(own, kinds, takers, parts)  # type: ignore[attr-defined]
+        checked.options = Taken(group, own, kinds, takers, parts)  # type: ignore[attr-defined]
         checked.__doc__ = with_arguments(function.__doc__ or "", own)
         return checked
 
@@ -197,6 +200,22 @@ def options_of(target: Any) -> dict[str, Option]:
         if name in known
     }
     return {**own, **known, **own}
+
+
+def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
+    """Check settings of a function that is called later, by name and value.
+
+    >>> @options("fit")
+    ... def fit(*, epochs: int = option(8, "passes", ge=1)): ...
+    >>> check_settings(fit, {"epoch": 9})
+    Traceback (most recent call last):
+        ...
+    afm_rl.errors.ConfigurationError: fit: setting='epoch': expected one of epochs
+    """
+    group, own, kinds, *_ = function.options
+    for name, value in settings.items():
+        check_choice(f"{group}: setting", name, own)
+        own[name].check(f"{group}.{name}", kinds()[name], value)
 
 
 def with_arguments(text: str, known: dict[str, Option]) -> str:

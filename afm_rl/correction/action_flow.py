@@ -10,7 +10,8 @@ from torch import Tensor
 
 from afm_rl.compiling.machine_code import MachineCode, in_one_batch
 from afm_rl.compiling.tracing import all_hold, somewhere
-from afm_rl.correction.base import Correction, Fields
+from afm_rl.correction.achievable import SATURATION
+from afm_rl.correction.base import LONGEST, Correction, Fields
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.delay import command_acting, delay_tables, likeliest_delay
 from afm_rl.correction.hypotheses import CHOICES, acting_of, choose, delayed
@@ -19,7 +20,8 @@ from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.tick import Tick
 from afm_rl.deprecated import old_arguments
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_count, check_flag, check_number
+from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.options import option, options
 
 
 class ActionFlow(PairCorrector):
@@ -44,38 +46,7 @@ class ActionFlow(PairCorrector):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        hypotheses: names of :data:`~afm_rl.correction.hypotheses.CHOICES`; all if None.
-        rows: pairs of a context window, K; None: 12, or more for more than eight actions.
-        memory: pairs that are remembered.
-        place: coordinates of the state in which the ground may differ; context windows by place are
-            left out if there are none.
-        place_scale: distance at which ground counts as other ground, in their unit.
-        plain: prior log-odds of a linear model that is fitted against a reading: a local fit does
-            not extrapolate.
-        samples: starting points of the flow.
-        source_std: :math:`\sigma`, a share of the largest action.
-        steps: midpoint steps.
-        saturation: what gives way when a plan is not achievable in full, see
-            :func:`~afm_rl.correction.achievable.saturate`.
-        compile: run the tick as machine code, which is faster for a single
-            mission; it is compiled once and kept in the cache. Where there is no compiler, the
-            tick runs as it is. Results agree to rounding.
-        cache: folder of compiled ticks.
         network: the network; None: the universal one that comes with the package.
-        odds: prior log-odds of *nothing has changed* against all other models together; a larger
-            one acts later, and a legged robot that is reversed falls.
-        most_odds: what evidence for *nothing has changed* can make of them: what was learnt in a
-            thousand healthy steps must not hide a change for longer than a few.
-        discount: of the losses; .95 looks back on twenty steps.
-        noise: standard deviation that no model explains, at first, a share of the largest action.
-        noise_rate: share of its square that is renewed at every step.
-        least_noise: its floor, a share of the largest command that is remembered: effects nearer
-            than that are all the same. In more noise a belief looks back longer.
-        least_command: what the largest command counts as at least, a share of the largest action: a
-            quadrotor that hovers needs a hundredth of its moments.
-        quiet: normalised innovation up to which a transition needs no explanation.
-        tails: degrees of freedom of the Student-t distribution of what is missed.
-        delay: steps that are known, D at most; those of the models come on top.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -102,55 +73,76 @@ class ActionFlow(PairCorrector):
     episodic = (*PairCorrector.episodic, "under_way")
 
     @old_arguments
+    @options("corrector")
     def __init__(
         self,
         action_low: Tensor,
         action_high: Tensor,
-        hypotheses: Sequence[str] | None = None,
-        rows: int | None = None,
-        memory: int = 80,
-        place: Sequence[int] = (),
-        place_scale: float = 0.5,
-        plain: float = -6.0,
-        samples: int = 16,
-        source_std: float = 0.3,
-        steps: int = 1,
-        saturation: str = "mixed",
-        compile: bool = False,
-        cache: str | Path = "~/.cache/afm_rl",
+        hypotheses: Sequence[str] | None = option(None, "context windows and delays; None: all"),
+        rows: int | None = option(
+            None, "pairs of a context window, K; None: 12, or four more than actions", ge=1
+        ),
+        memory: int = option(80, "transitions that are remembered", ge=1),
+        place: Sequence[int] = option((), "state coordinates in which the ground may differ", ge=0),
+        place_scale: float = option(
+            0.5, "distance at which ground counts as other ground, in their unit", gt=0
+        ),
+        plain: float = option(
+            -6.0, "prior log-odds of a linear model, against the network; it does not extrapolate"
+        ),
+        samples: int = option(16, "starting points of the flow", ge=1),
+        source_std: float = option(0.3, "of these, sigma, a share of the largest action", ge=0),
+        steps: int = option(1, "midpoint steps", ge=1),
+        saturation: str = SATURATION,
+        compile: bool = option(
+            False, "the tick as machine code, faster for one mission; compiled once"
+        ),
+        cache: str | Path = option("~/.cache/afm_rl", "folder of what is compiled"),
         network: AxisNetwork | None = None,
-        odds: float = 1.0,
-        most_odds: float = 16.0,
-        discount: float = 0.95,
-        noise: float = 0.05,
-        noise_rate: float = 0.1,
-        least_noise: float = 0.02,
-        least_command: float = 0.25,
-        quiet: float = 1.0,
-        tails: float = 1.0,
-        delay: int | Sequence[int] = 0,
+        odds: float = option(
+            1.0, "prior log-odds that nothing has changed; a larger one acts later", ge=0
+        ),
+        most_odds: float = option(
+            16.0, "what healthy steps can make of them, so that no change is hidden for long", ge=0
+        ),
+        discount: float = option(
+            0.95,
+            "of how well models predicted; .95: looks back on 20 steps, longer in noise",
+            ge=0,
+            le=1,
+        ),
+        noise: float = option(
+            0.05, "that no model explains, at first, a share of the largest action", ge=0
+        ),
+        noise_rate: float = option(0.1, "share of its square renewed at every step", ge=0, le=1),
+        least_noise: float = option(
+            0.02, "its floor, a share of the largest command that is remembered", gt=0
+        ),
+        least_command: float = option(
+            0.25, "which counts as this at least, a share of the largest action", gt=0, le=1
+        ),
+        quiet: float = option(
+            1.0, "standard deviations of the model's own noise that need no explanation", ge=0
+        ),
+        tails: float = option(
+            1.0, "degrees of freedom of the Student-t distribution of what is missed", gt=0
+        ),
+        delay: int | Sequence[int] = option(
+            0,
+            "known steps from a command to its effect, of all or of each; more are found out",
+            ge=0,
+            le=LONGEST,
+        ),
     ) -> None:
         size, place = len(torch.as_tensor(action_low)), list(place)
-        rows = max(12, size + 4) if rows is None else check_count("corrector.rows", rows)
+        rows = max(12, size + 4) if rows is None else rows
         super().__init__(action_low, action_high, rows, memory, len(place), quiet, delay)
         self.hypotheses = choose(hypotheses, bool(place), plain)
         self.models = tuple(row.name for row in self.hypotheses)
-        self.odds = check_number("corrector.odds", odds, low=0.0)
-        self.most_odds = check_number("corrector.most_odds", most_odds, low=0.0)
-        self.discount = check_number("corrector.discount", discount, low=0.0, high=1.0)
-        self.noise_rate = check_number("corrector.noise_rate", noise_rate, low=0.0, high=1.0)
-        self.least_noise = check_number(
-            "corrector.least_noise", least_noise, low=0.0, open_low=True
-        )
-        self.noise = check_number("corrector.noise", noise, low=self.least_noise)
-        self.least_command = check_number(
-            "corrector.least_command", least_command, low=0.0, high=1.0, open_low=True
-        )
-        self.tails = check_number("corrector.tails", tails, low=0.0, open_low=True)
-        self.place = place
-        self.place_scale = check_number(
-            "corrector.place_scale", place_scale, low=0.0, open_low=True
-        )
+        self.odds, self.most_odds, self.discount, self.tails = odds, most_odds, discount, tails
+        self.noise = check_number("corrector.noise", noise, low=least_noise)
+        self.noise_rate, self.least_noise = noise_rate, least_noise
+        self.least_command, self.place, self.place_scale = least_command, place, place_scale
         nominal, *others = self.hypotheses
         log_prior = torch.tensor([row.log_prior for row in others])
         prior = torch.cat([torch.full((1,), self.odds), log_prior.log_softmax(0)])
@@ -179,7 +171,7 @@ class ActionFlow(PairCorrector):
                 f"corrector.memory={memory!r}: expected at least {longest} for {rows} rows and the "
                 f"hypotheses {', '.join(row.name for row in others if row.name in CHOICES)}"
             )
-        self.compiles = check_flag("corrector.compile", compile)
+        self.compiles = compile
         self.__dict__["_machine_code"] = MachineCode(self, cache)
         network = load_universal() if network is None else network
         self.tick = Tick(

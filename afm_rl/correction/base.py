@@ -12,8 +12,9 @@ from torch import Tensor, nn
 
 from afm_rl.correction.first_steps import FirstSteps
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.errors import ConfigurationError
 from afm_rl.faults import count_repeats, trusted
+from afm_rl.options import option, options
 
 LONGEST = 1000  # steps that a known delay may have: a typing error rather than a robot
 
@@ -53,7 +54,6 @@ class Corrector(nn.Module, ABC):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        recent: transitions that are kept as they were observed, R.
         delay: steps from an action to its effect that are known, one number or one per axis. Faster
             axes are kept waiting for the slowest, so that actions have their effects together.
 
@@ -68,12 +68,13 @@ class Corrector(nn.Module, ABC):
     episodic: tuple[str, ...] = ("state", "planned", "executed", "repeats", "sent")
     """Parts of a memory that belong to one episode; the others are what was learnt."""
 
+    @options("corrector")
     def __init__(
         self,
         action_low: Tensor,
         action_high: Tensor,
-        recent: int,
-        delay: int | Sequence[int] = 0,
+        recent: int = option(..., "transitions that are kept as they were observed, R", ge=1),
+        delay: int | Sequence[int] = option(0, "known steps to its effect", ge=0, le=LONGEST),
     ) -> None:
         super().__init__()
         low, high = torch.as_tensor(action_low), torch.as_tensor(action_high)
@@ -85,7 +86,7 @@ class Corrector(nn.Module, ABC):
             )
         self.layouts: dict[int, tuple[list, list, list]] = {}  # by the size of a state
         self.first_steps = FirstSteps()
-        self.recent = check_count("corrector.recent", recent)
+        self.recent = recent
         scale = torch.maximum(low.abs(), high.abs())
         self.action_size = len(scale)
         ends = {"scale": scale, "lowest": low / scale, "highest": high / scale}
@@ -96,7 +97,6 @@ class Corrector(nn.Module, ABC):
             raise ConfigurationError(
                 f"corrector.delay={delay!r}: expected one number of steps, or {self.action_size}"
             )
-        steps = [check_count("corrector.delay", k, low=0, high=LONGEST) for k in steps]
         self.delay, self.holds = max(steps), min(steps) < max(steps)
         self.register_buffer("hold", self.delay - torch.tensor(steps), persistent=False)
 

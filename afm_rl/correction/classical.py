@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.compiling.tracing import somewhere
-from afm_rl.correction.achievable import MODES, saturate
+from afm_rl.correction.achievable import SATURATION, saturate
 from afm_rl.correction.base import Correction, Fields
 from afm_rl.correction.experts import Rows, confidence
 from afm_rl.correction.least_squares import (
@@ -21,7 +21,7 @@ from afm_rl.correction.least_squares import (
 )
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import check_choice, check_number
+from afm_rl.options import option, options
 
 FORMS = ("gain", "gain_offset", "affine")
 
@@ -32,14 +32,21 @@ class ClassicalCorrector(PairCorrector):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        gate: largest innovation of the remembered transitions at which it does nothing, in
-            standard deviations that the model states.
-        window: transitions that are remembered, K.
     """
 
-    def __init__(self, action_low: Tensor, action_high: Tensor, gate: float, window: int) -> None:
-        quiet = check_number("corrector.gate", gate, low=0.0)
-        super().__init__(action_low, action_high, window, window, quiet=quiet)
+    @options("corrector")
+    def __init__(
+        self,
+        action_low: Tensor,
+        action_high: Tensor,
+        window: int = option(24, "transitions that can be remembered, K", ge=1),
+        gate: float = option(
+            5.0, "innovation at which it does nothing, standard deviations of the model", ge=0
+        ),
+        saturation: str = SATURATION,
+    ) -> None:
+        super().__init__(action_low, action_high, window, window, quiet=gate)
+        self.saturation = saturation
 
     def rows(self, parts: Fields) -> Rows:
         """Return what is remembered as rows."""
@@ -112,11 +119,6 @@ class LeastSquares(ClassicalCorrector):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        form: ``"gain"`` or ``"gain_offset"``, each axis for itself, or ``"affine"``.
-        window: transitions that are remembered, K.
-        forgetting: weight of a transition relative to the next one, in (0, 1].
-        gate: innovation at which it does nothing, in standard deviations that the model states.
-        saturation: ``"clip"``, as is customary, ``"direction"`` or ``"mixed"``.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -125,22 +127,23 @@ class LeastSquares(ClassicalCorrector):
     24
     """
 
+    @options("corrector")
     def __init__(
         self,
         action_low: Tensor,
         action_high: Tensor,
-        form: str = "gain",
+        form: str = option(
+            "gain", "gain or gain_offset, each axis for itself; or affine", choices=FORMS
+        ),
         window: int = 24,
-        forgetting: float = 0.8,
+        forgetting: float = option(
+            0.8, "weight of a transition relative to the next one", gt=0, le=1
+        ),
         gate: float = 5.0,
         saturation: str = "clip",
     ) -> None:
-        super().__init__(action_low, action_high, gate, window)
-        self.form = check_choice("corrector.form", form, FORMS)
-        self.forgetting = check_number(
-            "corrector.forgetting", forgetting, low=0.0, high=1.0, open_low=True
-        )
-        self.saturation = check_choice("corrector.saturation", saturation, MODES)
+        super().__init__(action_low, action_high, window, gate, saturation)
+        self.form, self.forgetting = form, forgetting
 
     def inverse(self, rows: Rows, planned: Tensor) -> Tensor:
         """Invert the fit."""
@@ -194,11 +197,6 @@ class L1Augmentation(ClassicalCorrector):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-        dt: control tick (s).
-        bandwidth: of the low-pass, :math:`\omega` (rad/s).
-        window: transitions that can be remembered, K.
-        gate: innovation at which it does nothing, in standard deviations that the model states.
-        saturation: ``"clip"``, as is customary, ``"direction"`` or ``"mixed"``.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -207,20 +205,19 @@ class L1Augmentation(ClassicalCorrector):
     24
     """
 
+    @options("corrector")
     def __init__(
         self,
         action_low: Tensor,
         action_high: Tensor,
-        dt: float,
-        bandwidth: float = 5.0,
+        dt: float = option(..., "control tick, s", gt=0),
+        bandwidth: float = option(5.0, "omega of the low-pass, rad/s", gt=0),
         window: int = 24,
         gate: float = 5.0,
         saturation: str = "clip",
     ) -> None:
-        super().__init__(action_low, action_high, gate, window)
-        self.dt = check_number("corrector.dt", dt, low=0.0, open_low=True)
-        self.bandwidth = check_number("corrector.bandwidth", bandwidth, low=0.0, open_low=True)
-        self.saturation = check_choice("corrector.saturation", saturation, MODES)
+        super().__init__(action_low, action_high, window, gate, saturation)
+        self.dt, self.bandwidth = dt, bandwidth
 
     def inverse(self, rows: Rows, planned: Tensor) -> Tensor:
         """Take the disturbance off."""

@@ -12,7 +12,6 @@ from afm_rl.correction.experts import LIMIT
 from afm_rl.correction.least_squares import fit_gain
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.dynamics.inverse import effective_action
-from afm_rl.errors import check_count, check_number
 
 
 class PairCorrector(Corrector):
@@ -44,8 +43,7 @@ class PairCorrector(Corrector):
         delay: int | Sequence[int] = 0,
     ) -> None:
         super().__init__(action_low, action_high, recent, delay)
-        self.memory = max(check_count("corrector.memory", memory), recent)
-        self.quiet = check_number("corrector.quiet", quiet, low=0.0)
+        self.memory, self.quiet = max(memory, recent), quiet
         self.pair_size, self.tail = 3 * self.action_size + 2 + place, 1 + place
         is_valid = torch.arange(self.pair_size) == 3 * self.action_size
         self.register_buffer("is_valid", is_valid, persistent=False)

@@ -11,14 +11,8 @@ from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction.base import Correction, Corrector, Fields
 from afm_rl.correction.network import midpoint, mlp
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import (
-    ConfigurationError,
-    check_choice,
-    check_count,
-    check_counts,
-    check_flag,
-    check_number,
-)
+from afm_rl.errors import ConfigurationError, check_count, check_counts
+from afm_rl.options import option, options
 from afm_rl.spaces.manifold import draw_states, uniform
 
 
@@ -28,50 +22,49 @@ class PaperFlow(Corrector):
     Trained on :math:`e = f(s, a^1) \ominus f(s, a^0)` with the velocity
     :math:`a^1 - a^0` along :math:`a^\tau = (1-\tau) a^0 + \tau a^1` (paper, section IV-C).
     It is kept for comparison: see the documentation for why it brings little. Its quirks
-    have switches, set as in the published runs.
+    have switches, set as in the published runs. With the rule that its authors coded, the plan is
+    executed once a misalignment is noted, the transition before that describes the regime, and all
+    other actions are transformed.
 
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
         features: indices of the state coordinates that the network sees.
         state_size: number of state coordinates, D of the error.
-        rule: ``"text"``: transform actions while the model is misaligned, as the paper has it.
-            ``"code"``, as its authors coded it: execute the plan once a misalignment is noted, let
-            the transition before that describe the regime, and transform all actions otherwise.
-        gate: the threshold delta_M on the error's norm, in mixed units (m, rad).
-        steps: midpoint steps.
-        width: units of both layers of an encoder, 64 in the paper.
-        head: units of the hidden layers that join the encoders.
-        error_action: the action whose prediction the error is taken against: ``"planned"``
-            as published, or ``"executed"``.
-        wrap: take differences on the manifold; the published runs subtracted angles.
-        latch: keep the transition that opened the gate until it closes (as published)
-            instead of using the latest; with ``rule="text"``.
-        seed: seed of the initial weights.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
     """
 
+    @options("corrector")
     def __init__(
         self,
         action_low: Tensor,
         action_high: Tensor,
         features: Sequence[int],
         state_size: int,
-        rule: str = "text",
-        gate: float = 1.0,
-        steps: int = 10,
-        width: int = 64,
-        head: Sequence[int] = (128, 64),
-        error_action: str = "planned",
-        wrap: bool = False,
-        latch: bool = True,
-        seed: int = 0,
+        rule: str = option(
+            "text",
+            "text: transform while misaligned, as written; code: then execute the plan, and "
+            "transform otherwise",
+            choices=("text", "code"),
+        ),
+        gate: float = option(1.0, "delta_M, m and rad mixed", ge=0),
+        steps: int = option(10, "midpoint steps", ge=1),
+        width: int = option(64, "units of an encoder's layers", ge=1),
+        head: Sequence[int] = option((128, 64), "units of the hidden layers behind them", ge=1),
+        error_action: str = option(
+            "planned",
+            "the error is taken against the planned action; or executed",
+            choices=("planned", "executed"),
+        ),
+        wrap: bool = option(False, "wrap differences of angles; the published runs did not"),
+        latch: bool = option(
+            True, "keep the transition that opened the gate until it closes; False: the latest"
+        ),
+        seed: int = option(0, "initial weights", ge=0),
     ) -> None:
         super().__init__(action_low, action_high, recent=1)
-        self.rule = check_choice("corrector.rule", rule, ("text", "code"))
-        self.gate = check_number("corrector.gate", gate, low=0.0)
         self.state_size = check_count("corrector.state_size", state_size)
         self.state_features = check_counts("corrector.features", features, low=0)
         if max(self.state_features, default=0) >= state_size:
@@ -79,19 +72,12 @@ class PaperFlow(Corrector):
                 f"corrector.features={self.state_features}: expected indices of the {state_size} "
                 f"state coordinates, 0 to {state_size - 1}"
             )
-        self.steps = check_count("corrector.steps", steps)
-        self.error_action = check_choice(
-            "corrector.error_action", error_action, ("planned", "executed")
-        )
-        self.wrap = check_flag("corrector.wrap", wrap)
-        self.latch = check_flag("corrector.latch", latch)
-        check_count("corrector.width", width)
-        size = self.action_size
-        generator = torch.Generator().manual_seed(check_count("corrector.seed", seed, low=0))
+        self.rule, self.gate, self.steps, self.latch = rule, gate, steps, latch
+        self.error_action, self.wrap, size = error_action, wrap, self.action_size
+        generator = torch.Generator().manual_seed(seed)
         self.regime_encoder = mlp([self.feature_size, width, width], generator, nn.ELU)
         self.action_encoder = mlp([1 + size, width, width], generator, nn.ELU)
-        units = check_counts("corrector.head", head)
-        self.head = mlp([2 * width, *units, size], generator, nn.ELU)
+        self.head = mlp([2 * width, *head, size], generator, nn.ELU)
 
     @property
     def feature_size(self) -> int:

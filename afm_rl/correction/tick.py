@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from afm_rl.compiling.tracing import somewhere
-from afm_rl.correction.achievable import MODES, attainable, extend
+from afm_rl.correction.achievable import attainable, extend
 from afm_rl.correction.belief import mean_and_std
 from afm_rl.correction.context_windows import ContextWindows
 from afm_rl.correction.delay import align, command_acting
@@ -24,7 +24,6 @@ from afm_rl.correction.linear import (
     within_rate,
 )
 from afm_rl.correction.network import AxisNetwork, Encoded, midpoint
-from afm_rl.errors import check_choice, check_count, check_number
 
 
 class Answer(NamedTuple):
@@ -106,9 +105,7 @@ class Tick(nn.Module):
     ) -> None:
         super().__init__()
         self.network, self.rows, size = network, rows, len(scale)
-        self.source_std = check_number("corrector.source_std", source_std, low=0.0)
-        self.steps = check_count("corrector.steps", steps)
-        self.saturation = check_choice("corrector.saturation", saturation, MODES)
+        self.source_std, self.steps, self.saturation = source_std, steps, saturation
         kinds = {kind: [row for row in hypotheses if row.kind == kind] for kind in KINDS}
         self.counts = [len(of_kind) for of_kind in kinds.values()]
         self.context = ContextWindows([row.name for row in kinds["network"]], rows, size)
@@ -118,7 +115,7 @@ class Tick(nn.Module):
         filters, which = filters_of(acting_of(hypotheses))
         fixed = {
             "scale": scale.to(network.modes),
-            "points": points_of(check_count("corrector.samples", samples), size),
+            "points": points_of(samples, size),
             "probes": probes_of(size),
             "delays": delays,
             # Of windows with equal probability the first, on any machine and in any batch.

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import DynamicsModel, Ensemble
-from afm_rl.errors import NonFiniteError, check_count, check_flag, check_number
+from afm_rl.errors import NonFiniteError, check_count
 from afm_rl.learning.loss import gaussian_nll
+from afm_rl.options import option, options
 from afm_rl.progress import Bar
 from afm_rl.spaces.keys import as_keys
 from afm_rl.spaces.manifold import uniform
@@ -41,19 +42,29 @@ class FitReport:
                 f"the model leaves more than a third of the variance of {', '.join(bad)} "
                 "unexplained: give it more or wider data, name the angles of the manifold, or add "
                 "the coordinates it depends on to features",
-                stacklevel=4,
+                stacklevel=5,
             )
 
 
+@options("")
 def fit_ensemble(
     model: Ensemble,
     transitions: TensorDictBase,
     *,
-    epochs: int = 40,
-    batch_size: int = 256,
-    lr: float = 2e-3,
-    beta: float = 0.0,
-    held_out: float = 0.1,
+    epochs: int = option(40, "passes over the data", ge=1),
+    batch_size: int = option(
+        256, "transitions per step and member, at most: a pass has at least eight steps", ge=1
+    ),
+    lr: float = option(2e-3, "largest step size of Adam", gt=0),
+    beta: float = option(
+        0.0,
+        "how little a row's stated variance takes from its weight, see gaussian_nll",
+        ge=0,
+        le=1,
+    ),
+    held_out: float = option(
+        0.1, "share of the transitions, picked at random, that only judges", gt=0, le=0.5
+    ),
     keys: tuple[NestedKey, NestedKey, NestedKey] = (
         "observation",
         "action",
@@ -71,13 +82,6 @@ def fit_ensemble(
     Args:
         model: ensemble to fit, in place; its normaliser is set from the data.
         transitions: any batch shape and precision, N in all; see :func:`~afm_rl.learning.collect`.
-        epochs: passes over the data.
-        batch_size: transitions per step and member, at most; fewer where a pass would otherwise
-            have fewer than eight steps.
-        lr: largest step size.
-        beta: 0 to 1: how little a row's stated variance takes from its weight, see
-            :func:`~afm_rl.learning.loss.gaussian_nll`.
-        held_out: share of the transitions, picked at random, that only judges.
         keys: where state, action and next state are.
         names: of the coordinates of the tangent space.
         seed: seed of the order.
@@ -98,7 +102,6 @@ def fit_ensemble(
     >>> fit_ensemble(model, cart, lr=2e-2, batch_size=32).error < 0.2
     True
     """
-    check_number("held_out", held_out, low=0.0, high=0.5, open_low=True)
     transitions = transitions.to(device_of(model))
     state, action, after = (transitions.get(key).flatten(0, -2) for key in as_keys(keys))
     for key, value in zip(keys, (state, action, after), strict=True):
@@ -115,10 +118,10 @@ def fit_ensemble(
         action,
         change,
         samples=samples,
-        epochs=check_count("epochs", epochs),
-        batch_size=min(check_count("batch_size", batch_size), max(16, samples // 8), samples),
-        lr=check_number("lr", lr, low=0.0, open_low=True),
-        beta=check_number("beta", beta, low=0.0, high=1.0),
+        epochs=epochs,
+        batch_size=min(batch_size, max(16, samples // 8), samples),
+        lr=lr,
+        beta=beta,
         generator=generator,
         title="fitting the ensemble",
         names=names,
@@ -202,20 +205,27 @@ def judge(model: Ensemble, inputs: Tensor, target: Tensor) -> tuple[Tensor, floa
     return error, float(gaussian_nll(mean, log_variance, target).mean())
 
 
+@options("dynamics.pretrain")
 def pretrain_ensemble(
     model: Ensemble,
     teacher: DynamicsModel,
     state_box: tuple[Tensor, Tensor],
     action_box: tuple[Tensor, Tensor],
     *,
-    samples: int = 50_000,
-    epochs: int = 16,
-    batch_size: int = 256,
-    lr: float = 2e-3,
-    one_cycle: bool = True,
-    tolerance: float = 0.0,
-    action_noise: float = 0.0,
-    seed: int = 0,
+    samples: int = option(
+        50_000, "transitions; a tenth as many are held out", ge=1, le=100_000_000
+    ),
+    epochs: int = option(16, "passes over them", ge=1, le=100_000_000),
+    batch_size: int = option(256, "transitions per step and member", ge=1, le=100_000_000),
+    lr: float = option(2e-3, "largest step size of Adam", gt=0, le=1),
+    one_cycle: bool = option(True, "the step size rises and falls; False: it stays, as published"),
+    tolerance: float = option(
+        0.0, "stop once the held-out loss changes by less between epochs; published: 1e-3", ge=0
+    ),
+    action_noise: float = option(
+        0.0, "0.1: actions perturbed by +-10 % (domain randomisation)", ge=0
+    ),
+    seed: int = option(0, "of data and order", ge=0),
     names: Sequence[str] | None = None,
     progress: bool = False,
 ) -> FitReport:
@@ -229,29 +239,13 @@ def pretrain_ensemble(
         teacher: model that gives the next states.
         state_box: lowest and highest state, ``(S,)`` each.
         action_box: lowest and highest action, ``(A,)`` each.
-        samples: size of the training set; a tenth as many are held out.
-        epochs: passes over the data.
-        batch_size: samples per step and member.
-        lr: largest step size.
-        one_cycle: let the step size rise and fall; False: it stays, as published.
-        tolerance: stop once the held-out Gaussian NLL changes by less from one epoch to the next;
-            0: never (published: 1e-3, and at most 32 epochs).
-        action_noise: relative perturbation of the teacher's action, 0.1 for +-10 %
-            (domain randomisation).
-        seed: seed of data and order.
         names: of the coordinates of the tangent space, for the warning.
         progress: show progress.
 
     Warns:
         UserWarning: if more than a third of the variance of a coordinate is left unexplained.
     """
-    check_count("dynamics.pretrain.batch_size", batch_size)
     check_count("dynamics.pretrain.samples", samples, low=batch_size)
-    check_count("dynamics.pretrain.epochs", epochs)
-    check_number("dynamics.pretrain.lr", lr, low=0.0, open_low=True)
-    check_flag("dynamics.pretrain.one_cycle", one_cycle)
-    check_number("dynamics.pretrain.tolerance", tolerance, low=0.0)
-    check_number("dynamics.pretrain.action_noise", action_noise, low=0.0)
     generator, device = torch.Generator().manual_seed(seed), device_of(model)
     total = samples + samples // 10
     low, high, lowest, highest = (end.to(device) for end in (*state_box, *action_box))

@@ -11,7 +11,8 @@ from afm_rl.compiling.devices import device_of
 from afm_rl.dynamics import DynamicsModel, Oracle
 from afm_rl.dynamics.knode import KNODE
 from afm_rl.dynamics.residual import Network, residual, to_world
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import option, options
 from afm_rl.progress import Bar
 from afm_rl.regimes import Regime
 from afm_rl.spaces.manifold import uniform, wrap_angle
@@ -109,6 +110,7 @@ def _difference(model: KNODE, state: Tensor, origin: Tensor) -> Tensor:
     return torch.where(model.manifold.is_angle, wrap_angle(gap), gap)
 
 
+@options("dynamics.pretrain")
 def pretrain_knode(
     model: KNODE,
     teacher: DynamicsModel,
@@ -116,12 +118,14 @@ def pretrain_knode(
     action_box: tuple[Tensor, Tensor],
     *,
     regime: Regime | None = None,
-    flights: int = 64,
-    ticks: int = 16,
-    epochs: int = 200,
-    lr: float = 0.01,
-    noise: float = 1e-4,
-    seed: int = 0,
+    flights: int = option(64, "a tenth as many are held out", ge=1, le=100_000_000),
+    ticks: int = option(16, "length of each", ge=1, le=100_000_000),
+    epochs: int = option(200, "full-batch steps of Adam", ge=1, le=100_000_000),
+    lr: float = option(0.01, "step size", gt=0, le=1),
+    noise: float = option(
+        1e-4, "standard deviation of what is added to states, m, m/s, rad, rad/s", ge=0
+    ),
+    seed: int = option(0, "of data and network", ge=0),
     progress: bool = False,
 ) -> float:
     """Fit a new network of a KNODE to short flights of a teacher; return its held-out error.
@@ -137,12 +141,6 @@ def pretrain_knode(
         state_box: lowest and highest first state, ``(S,)`` each.
         action_box: lowest and highest action, ``(A,)`` each.
         regime: every flight is under a regime of its own from this prior; nominal if None.
-        flights: number of flights; a tenth as many more are held out.
-        ticks: their length.
-        epochs: steps of Adam.
-        lr: their size.
-        noise: standard deviation of what is added to states on the tangent space.
-        seed: seed of data and network.
         progress: show progress.
 
     Returns:
@@ -163,12 +161,6 @@ def pretrain_knode(
         raise ConfigurationError(
             f"dynamics: train the model before it is given to {model.lead[0]} missions"
         )
-    check_count("dynamics.pretrain.flights", flights)
-    check_count("dynamics.pretrain.ticks", ticks)
-    check_count("dynamics.pretrain.epochs", epochs)
-    check_number("dynamics.pretrain.lr", lr, low=0.0, open_low=True)
-    check_number("dynamics.pretrain.noise", noise, low=0.0)
-    check_count("dynamics.pretrain.seed", seed, low=0)
     generator, device = torch.Generator().manual_seed(seed), device_of(model)
     space, total = model.manifold, flights + -(-flights // 10)
     low, high, lowest, highest = (end.to(device) for end in (*state_box, *action_box))

@@ -11,17 +11,13 @@ from torch import Tensor
 
 from afm_rl.dynamics.knode import KNODE
 from afm_rl.dynamics.residual import Network
-from afm_rl.errors import (
-    ConfigurationError,
-    check_count,
-    check_flag,
-    check_number,
-)
+from afm_rl.errors import ConfigurationError
 from afm_rl.faults import whole
 from afm_rl.learning.knode_fit import fit_network
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
 from afm_rl.mission_state import MissionState
+from afm_rl.options import option, options
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
 
@@ -72,20 +68,6 @@ class KNODEUpdater(Learner):
 
     Args:
         loss: a loss over a :class:`~afm_rl.dynamics.KNODE`, whose keys are read.
-        window: time that one network learns from (s).
-        begin: time at which rows are first gathered (s); 0 to learn at once.
-        latency: time of flight that training takes (s).
-        epochs: full-batch steps of Adam per network.
-        lr: their size.
-        l2: weight of the squared parameters.
-        noise: standard deviation of what is added to states in training, in their units.
-        published_random: the published quirk: each network starts from the same random numbers,
-            and the noise, which is the same each time, also goes to the actions.
-        trace_key: where the trace is.
-        mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn from this transition?
-        seed_key: entry ``(*B)`` with the seeds of missions, which then have random numbers of
-            their own; None for the same numbers for all.
-        seed: seed of these numbers.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -101,21 +83,30 @@ class KNODEUpdater(Learner):
     True
     """
 
+    @options("updater")
     def __init__(
         self,
         loss: GaussianNLLLoss,
-        window: float = 0.15,
-        begin: float = 2.0,
-        latency: float = 0.05,
-        epochs: int = 80,
-        lr: float = 0.01,
-        l2: float = 5e-8,
-        noise: float = 1e-4,
-        published_random: bool = False,
-        trace_key: NestedKey = ("next", "trace"),
+        window: float = option(0.15, "that one network learns from, s", gt=0),
+        begin: float = option(2.0, "when rows are first gathered, s", ge=0),
+        latency: float = option(
+            0.05, "time of flight that training takes, s: the network joins so much later", ge=0
+        ),
+        epochs: int = option(80, "full-batch steps of Adam", ge=1),
+        lr: float = option(0.01, "step size", gt=0),
+        l2: float = option(5e-8, "weight of the squared parameters", ge=0),
+        noise: float = option(
+            1e-4, "standard deviation of what is added to states, in their units", ge=0
+        ),
+        published_random: bool = option(
+            False, "True: the same random numbers for each network, also on the actions"
+        ),
+        trace_key: NestedKey = option(("next", "trace"), "entry of the plant's own time steps"),
         mask_key: NestedKey | None = None,
-        seed_key: NestedKey | None = None,
-        seed: int = 0,
+        seed_key: NestedKey | None = option(
+            None, "missions have random numbers of their own; None: the same for all"
+        ),
+        seed: int = option(0, "of these numbers", ge=0),
     ) -> None:
         super().__init__(loss, mask_key)
         if not isinstance(loss.model, KNODE):
@@ -124,22 +115,18 @@ class KNODEUpdater(Learner):
                 "dynamics=knode"
             )
         dt = loss.model.dt
-        self.ticks = round(check_number("updater.window", window, low=0.0, open_low=True) / dt)
+        self.ticks = round(window / dt)
         if self.ticks < 1 or not math.isclose(self.ticks * dt, window, rel_tol=1e-6):
             raise ConfigurationError(
                 f"updater.window={window!r}: expected a multiple of the control tick, {dt:g} s"
             )
-        self.first = _ticks(check_number("updater.begin", begin, low=0.0), dt)
-        self.delay = _ticks(check_number("updater.latency", latency, low=0.0), dt)
-        self.epochs = check_count("updater.epochs", epochs)
-        self.lr = check_number("updater.lr", lr, low=0.0, open_low=True)
-        self.l2 = check_number("updater.l2", l2, low=0.0)
-        self.noise = check_number("updater.noise", noise, low=0.0)
-        self.published_random = check_flag("updater.published_random", published_random)
+        self.first, self.delay = _ticks(begin, dt), _ticks(latency, dt)
+        self.epochs, self.lr, self.l2, self.noise = epochs, lr, l2, noise
+        self.published_random = published_random
         self.trace_key, self.seed_key = (
             None if key is None else as_key(key) for key in (trace_key, seed_key)
         )
-        self.streams = Streams(salt=4, seed=check_count("updater.seed", seed, low=0))
+        self.streams = Streams(salt=4, seed=seed)
         self.window, self.pending = (MissionState(_nothing(kind)) for kind in (Rows, Pending))
         self.tick, self.due = 0, NONE
 

@@ -11,9 +11,11 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import check_choice, check_flag, check_instance
+from afm_rl.errors import check_instance
+from afm_rl.options import option, options
 
 REDUCTIONS = ("mean", "sum", "none")
+WRAP = option(True, "False: a turn across +-pi counts as one of 2 pi, as in the published runs")
 
 
 class InPlaceLoss(LossModule):
@@ -23,14 +25,18 @@ class InPlaceLoss(LossModule):
     of ``_AcceptedKeys``, in order; change them with ``set_keys`` or through ``in_keys``.
     ``loss_mask_key`` is honoured.
 
-    Args:
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (one value per batch element).
     """
 
-    def __init__(self, reduction: str) -> None:
+    @options("loss")
+    def __init__(
+        self,
+        reduction: str = option(
+            "mean", "mean, sum or none: one value per batch element", choices=REDUCTIONS
+        ),
+    ) -> None:
         self._in_keys: list[NestedKey] | None = None
         super().__init__()
-        self.reduction = check_choice("loss.reduction", reduction, REDUCTIONS)
+        self.reduction = reduction
 
     @property
     def functional(self) -> bool:
@@ -80,9 +86,6 @@ class GaussianNLLLoss(InPlaceLoss):
 
     Args:
         model: any :class:`~afm_rl.dynamics.DynamicsModel`.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (one value per transition).
-        wrap: take state changes on the manifold; False subtracts angles as they are, so that
-            each crossing of pi is an outlier of 2 pi, as in the published runs.
 
     Keys (change them with ``set_keys``): ``state`` ("observation"), ``action`` ("action"),
     ``next_state`` (("next", "observation")).
@@ -112,10 +115,11 @@ class GaussianNLLLoss(InPlaceLoss):
     target_model_params: None
     out_keys = ["loss_nll"]
 
-    def __init__(self, model: DynamicsModel, reduction: str = "mean", wrap: bool = True) -> None:
+    @options("loss")
+    def __init__(self, model: DynamicsModel, reduction: str = "mean", wrap: bool = WRAP) -> None:
         super().__init__(reduction)
         self.model = check_instance("loss.model", model, DynamicsModel)
-        self.wrap = check_flag("loss.wrap", wrap)
+        self.wrap = wrap
 
     def target(self, state: Tensor, next_state: Tensor) -> Tensor:
         """Return the standardised state change ``(*B, D)``."""

@@ -12,11 +12,12 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from afm_rl.dynamics import Ensemble
-from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance, check_number
+from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.learning.error_decomposition import check_half_range, decompose_error
-from afm_rl.learning.loss import GaussianNLLLoss, gaussian_nll
+from afm_rl.learning.loss import WRAP, GaussianNLLLoss, gaussian_nll
 from afm_rl.learning.optimisers import ObGD
 from afm_rl.learning.updater import Learner, Updater
+from afm_rl.options import option, options
 
 
 class OnlineUpdater(Learner):
@@ -29,21 +30,20 @@ class OnlineUpdater(Learner):
     Args:
         loss: the loss to descend.
         optimizer: makes the optimiser of the model's parameters.
-        mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
-        wrap: see :class:`~afm_rl.learning.GaussianNLLLoss`.
     """
 
     by_gradient = True
 
+    @options("updater")
     def __init__(
         self,
         loss: GaussianNLLLoss,
         optimizer: Callable[..., Optimizer],
         mask_key: NestedKey | None = None,
-        wrap: bool = True,
+        wrap: bool = WRAP,
     ) -> None:
         super().__init__(loss, mask_key)
-        loss.wrap = check_flag("updater.wrap", wrap)
+        loss.wrap = wrap
         if not any(True for _ in loss.model.parameters()):
             raise ConfigurationError(
                 "updater: the dynamics model has nothing to learn; choose dynamics=pe, or "
@@ -93,11 +93,6 @@ class StreamXUpdater(OnlineUpdater):
 
     Args:
         loss: a loss over an :class:`~afm_rl.dynamics.Ensemble`.
-        form: ``"error"`` or ``"loss"``.
-        lr: step size, > 0; 1 leaves it to the bound.
-        kappa: strictness of the bound, > 0.
-        mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
-        wrap: see :class:`~afm_rl.learning.GaussianNLLLoss`.
 
     Raises:
         ConfigurationError: for settings out of range, or a model that is no ensemble.
@@ -114,12 +109,17 @@ class StreamXUpdater(OnlineUpdater):
 
     optimizer: ObGD
 
+    @options("updater")
     def __init__(
         self,
         loss: GaussianNLLLoss,
-        form: str = "error",
-        lr: float = 1.0,
-        kappa: float = 2.0,
+        form: str = option(
+            "error",
+            "error: descend each member's error; or loss: its likelihood",
+            choices=("error", "loss"),
+        ),
+        lr: float = option(1.0, "step size before the bound", gt=0),
+        kappa: float = option(2.0, "strictness of the bound", gt=0),
         mask_key: NestedKey | None = None,
         wrap: bool = True,
     ) -> None:
@@ -129,7 +129,7 @@ class StreamXUpdater(OnlineUpdater):
                 f"{type(loss.model).__name__}; choose an ensemble, such as dynamics=pe_stream_x"
             )
         super().__init__(loss, partial(ObGD, lr=lr, kappa=kappa, lead_dims=1), mask_key, wrap)
-        self.form = check_choice("updater.form", form, ("error", "loss"))
+        self.form = form
 
     def _measure(self, transitions: TensorDictBase) -> dict[str, Tensor]:
         """Return the loss ``(*B)`` and what it is made of, ``(*B, E, D)`` each."""
@@ -194,7 +194,6 @@ class UnmatchedUpdater(Updater):
         loss: the loss to descend.
         updater: makes the updater that learns, ``updater(loss)``.
         scale: half range of each action, ``(A,)``.
-        gate: standard deviations of the model that the rest must exceed, >= 0.
 
     Raises:
         ConfigurationError: for a scale that does not fit the model, or an updater with a
@@ -215,12 +214,15 @@ class UnmatchedUpdater(Updater):
     learns = True
     scale: Tensor
 
+    @options("updater")
     def __init__(
         self,
         loss: GaussianNLLLoss,
         updater: Callable[[GaussianNLLLoss], OnlineUpdater],
         scale: Sequence[float] | Tensor,
-        gate: float = 5.0,
+        gate: float = option(
+            5.0, "standard deviations of the model that an error no action explains exceeds", ge=0
+        ),
     ) -> None:
         super().__init__(loss)
         self.updater = check_instance("updater.updater", updater(loss), OnlineUpdater)
@@ -233,7 +235,7 @@ class UnmatchedUpdater(Updater):
         self.register_buffer(
             "scale", check_half_range(scale, loss.model.action_size), persistent=False
         )
-        self.gate = check_number("updater.gate", gate, low=0.0)
+        self.gate = gate
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         with torch.no_grad():

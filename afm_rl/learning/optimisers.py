@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.options import option, options
 
 
 class ObGD(Optimizer):
@@ -119,8 +120,6 @@ class ResetAdam(Optimizer):
 
     Args:
         params: parameters.
-        lr: step size, > 0.
-        eps: keeps the quotient finite, > 0.
 
     >>> w = nn.Parameter(torch.tensor([1.0, 1.0]))
     >>> w.grad = torch.tensor([5.0, 0.0])
@@ -132,9 +131,13 @@ class ResetAdam(Optimizer):
     piece = 2**16
     """Numbers that are stepped at once: three times 256 KiB in float32 fit into a cache."""
 
-    def __init__(self, params: Iterable[nn.Parameter], lr: float = 1e-3, eps: float = 1e-8) -> None:
-        check_number("updater.lr", lr, low=0.0, open_low=True)
-        check_number("updater.eps", eps, low=0.0, open_low=True)
+    @options("updater")
+    def __init__(
+        self,
+        params: Iterable[nn.Parameter],
+        lr: float = option(1e-3, "step size", gt=0),
+        eps: float = option(1e-8, "keeps the quotient finite", gt=0),
+    ) -> None:
         super().__init__(params, {"lr": lr, "eps": eps})
 
     @torch.no_grad()

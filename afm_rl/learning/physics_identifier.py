@@ -11,11 +11,12 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from afm_rl.dynamics import PhysicsModel
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.learning.error_decomposition import check_half_range, decompose_error
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
 from afm_rl.mission_state import MissionState
+from afm_rl.options import option, options
 
 
 class Belief(NamedTuple):
@@ -52,16 +53,7 @@ class PhysicsIdentifier(Learner):
             :class:`~afm_rl.dynamics.ParametricDynamics`; its keys are read.
         ranges: lowest and highest value of each parameter that may differ, by its name in
             ``model.physics_names``.
-        count: candidates per parameter, at equal distances; the nominal physics come on top. All
-            combinations are tried, at most ``most``. What too coarse a grid leaves over looks like
-            actuators.
         scale: half range of each action, ``(A,)``.
-        gate: standard deviations of the model that an error which no action explains must exceed.
-        forgetting: weight of a transition relative to the next one, in (0, 1].
-        margin: nats by which another candidate must be better than the one that is believed.
-        lost: nats that a candidate loses whose simulation breaks off.
-        most: candidates at most, all of which are simulated.
-        mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
 
     Raises:
         ConfigurationError: for a setting out of range, or a model without physics.
@@ -88,17 +80,22 @@ class PhysicsIdentifier(Learner):
     candidates: Tensor
     scale: Tensor
 
+    @options("updater")
     def __init__(
         self,
         loss: GaussianNLLLoss,
         ranges: Mapping[str, Sequence[float]],
         scale: Sequence[float] | Tensor,
-        count: int = 97,
-        gate: float = 3.0,
-        forgetting: float = 0.95,
-        margin: float = 3.0,
-        lost: float = 20.0,
-        most: int = 1000,
+        count: int = option(97, "candidates per parameter, all combinations of them", ge=2),
+        gate: float = option(
+            3.0, "standard deviations of the model that an error no action explains exceeds", ge=0
+        ),
+        forgetting: float = option(
+            0.95, "weight of a transition relative to the next one", gt=0, le=1
+        ),
+        margin: float = option(3.0, "nats by which another candidate must be better", ge=0),
+        lost: float = option(20.0, "nats that a simulation which breaks off loses", ge=0),
+        most: int = option(1000, "candidates at most, all of which are simulated", ge=1),
         mask_key: NestedKey | None = None,
     ) -> None:
         super().__init__(loss, mask_key)
@@ -115,12 +112,7 @@ class PhysicsIdentifier(Learner):
         self.register_buffer(
             "scale", check_half_range(scale, loss.model.action_size), persistent=False
         )
-        self.gate = check_number("updater.gate", gate, low=0.0)
-        self.forgetting = check_number(
-            "updater.forgetting", forgetting, low=0.0, high=1.0, open_low=True
-        )
-        self.margin = check_number("updater.margin", margin, low=0.0)
-        self.lost = check_number("updater.lost", lost, low=0.0)
+        self.gate, self.forgetting, self.margin, self.lost = gate, forgetting, margin, lost
         self.belief = MissionState(self._nothing(1))
 
     @property
@@ -183,14 +175,14 @@ def _candidates(
     model: PhysicsModel, ranges: Mapping[str, Sequence[float]], count: int, most: int
 ) -> Tensor:
     """Return rows of physics ``(K, P)``; the first is the nominal one."""
-    names, count = model.physics_names, check_count("updater.count", count, low=2)
+    names = model.physics_names
     if not isinstance(ranges, Mapping) or not ranges or not set(ranges) <= set(names):
         raise ConfigurationError(
             f"updater.ranges={ranges!r}: expected what may differ about the body, such as "
             f"{{mass: [0.5, 2.0]}}; names are {', '.join(names)}"
         )
     total = count ** len(ranges)
-    if total > check_count("updater.most", most):
+    if total > most:
         raise ConfigurationError(
             f"updater.count={count}: {total} combinations of {len(ranges)} parameters, expected at "
             f"most {most}; choose a lower count or fewer ranges"

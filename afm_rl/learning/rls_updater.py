@@ -11,11 +11,12 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from afm_rl.dynamics import Calibrated
-from afm_rl.errors import ConfigurationError, check_choice, check_number
+from afm_rl.errors import ConfigurationError
 from afm_rl.learning.error_decomposition import ErrorParts, decompose_error
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
 from afm_rl.mission_state import MissionState
+from afm_rl.options import option, options
 
 
 class Fit(NamedTuple):
@@ -135,13 +136,6 @@ class RLSUpdater(Learner):
 
     Args:
         loss: a loss over a :class:`~afm_rl.dynamics.Calibrated` model, whose keys are read.
-        part: ``"matched"``, ``"unmatched"`` or ``"all"``. Beside an action flow transform, which
-            undoes what actions can undo, choose ``"unmatched"``: otherwise both correct the same.
-        forgetting: weight of a transition relative to the next one, in (0, 1].
-        gate: normalised innovation beyond which a transition is a change.
-        spread: standard deviation of the prior: of gains, ten times that of coupling and bias (in
-            half ranges); of c, in standard deviations of the model.
-        mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
 
     Raises:
         ConfigurationError: for a setting out of range, or a model that is not calibrated.
@@ -161,13 +155,24 @@ class RLSUpdater(Learner):
 
     sets = "calibration"
 
+    @options("updater")
     def __init__(
         self,
         loss: GaussianNLLLoss,
-        part: str = "all",
-        forgetting: float = 0.97,
-        gate: float = 5.0,
-        spread: float = 100.0,
+        part: str = option(
+            "all",
+            "matched: what other actions can undo; unmatched: the rest, for use beside AFM; or all",
+            choices=("all", "matched", "unmatched"),
+        ),
+        forgetting: float = option(
+            0.97, "weight of a transition relative to the next one", gt=0, le=1
+        ),
+        gate: float = option(5.0, "innovation beyond which a transition is a change", gt=0),
+        spread: float = option(
+            100.0,
+            "standard deviation of the prior of gains, ten times that of coupling and bias",
+            gt=0,
+        ),
         mask_key: NestedKey | None = None,
     ) -> None:
         super().__init__(loss, mask_key)
@@ -176,12 +181,7 @@ class RLSUpdater(Learner):
                 f"updater: RLSUpdater teaches a Calibrated model, got {type(loss.model).__name__}; "
                 "choose dynamics=calibrated"
             )
-        self.part = check_choice("updater.part", part, ("all", "matched", "unmatched"))
-        self.forgetting = check_number(
-            "updater.forgetting", forgetting, low=0.0, high=1.0, open_low=True
-        )
-        self.gate = check_number("updater.gate", gate, low=0.0, open_low=True)
-        self.spread = check_number("updater.spread", spread, low=0.0, open_low=True)
+        self.part, self.forgetting, self.gate, self.spread = part, forgetting, gate, spread
         self.matched, self.unmatched = (MissionState(no_fit(0, 1, 1)) for _ in range(2))
 
     @property

@@ -16,6 +16,7 @@ from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.faults import count_repeats, trusted, whole
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.mission_state import MissionState
+from afm_rl.options import option, options
 from afm_rl.spaces.keys import as_key
 
 
@@ -128,7 +129,6 @@ class Learner(Updater, ABC):
 
     Args:
         loss: how well the model explains a transition.
-        mask_key: boolean entry ``(*B)`` or ``(*B, 1)``: learn here?
     """
 
     learns = True
@@ -139,7 +139,12 @@ class Learner(Updater, ABC):
     by_gradient = False
     """Whether learning needs the gradients of what is measured."""
 
-    def __init__(self, loss: GaussianNLLLoss, mask_key: NestedKey | None = None) -> None:
+    @options("updater")
+    def __init__(
+        self,
+        loss: GaussianNLLLoss,
+        mask_key: NestedKey | None = option(None, "boolean entry (*B) or (*B, 1): learn here?"),
+    ) -> None:
         super().__init__(loss)
         self.mask_key = None if mask_key is None else as_key(mask_key)
         self.refused = 0

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from inspect import signature
 from typing import Any
 
 from tensordict import unravel_key
@@ -16,10 +15,6 @@ from afm_rl.dynamics.mujoco_model import check_files
 from afm_rl.errors import (
     AFMError,
     ConfigurationError,
-    check_choice,
-    check_count,
-    check_flag,
-    check_number,
 )
 from afm_rl.learning import Updater
 from afm_rl.planning import Cost
@@ -61,37 +56,6 @@ def check_models(settings: Mapping[str, Any]) -> None:
     for place, _, value in leaves(settings):
         if isinstance(value, str):
             check_files(place, value, folders)
-
-
-def check_training(
-    group: str, train: Callable[..., Any], settings: Mapping[str, Any], **least: int
-) -> None:
-    """Check the ``settings`` of a training function by its defaults, which say what there is.
-
-    Flags must be flags, counts at least 1, or what ``least`` says; other numbers must not be
-    negative, and step sizes at most 1.
-    """
-    known = {
-        name: parameter.default
-        for name, parameter in signature(train).parameters.items()
-        if parameter.kind is parameter.KEYWORD_ONLY and name != "progress"
-    }
-    for name, value in settings.items():
-        check_choice(f"{group}: setting", name, known)
-        if value is None and known[name] is None:
-            continue
-        if isinstance(known[name], bool):
-            check_flag(f"{group}.{name}", value)
-        elif known[name] is None or isinstance(known[name], int):
-            if name == "seed":
-                check_count(f"{group}.{name}", value, low=0)
-            else:
-                check_count(f"{group}.{name}", value, low=least.get(name, 1), high=100_000_000)
-        else:
-            step = name == "lr"
-            check_number(
-                f"{group}.{name}", value, low=0.0, high=1.0 if step else 1e6, open_low=step
-            )
 
 
 def check_label(label: Any) -> str | None:

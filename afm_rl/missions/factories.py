@@ -27,9 +27,8 @@ from afm_rl.dynamics import (
     Quadrotor,
     UnknownDynamics,
 )
-from afm_rl.errors import AFMError, ConfigurationError, check_flag, check_instance
+from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag, check_instance
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
-from afm_rl.missions.checks import check_training
 from afm_rl.missions.collected import fit_collected
 from afm_rl.missions.robot import Robot
 from afm_rl.options import options
@@ -94,8 +93,8 @@ def calibrated(robot: Robot, base: Callable[[Robot], Part | DynamicsModel]) -> P
 def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part:
     """Return an ensemble to be pre-trained on the nominal physics, or on what a robot collects."""
     nominal = robot.model
-    least = {"samples": pretrain.get("batch_size", 1)}
-    check_training("dynamics.pretrain", pretrain_ensemble, pretrain, **least)
+    least = pretrain.get("batch_size", 1)
+    check_count("dynamics.pretrain.samples", pretrain.get("samples", least), low=least)
     model = Ensemble(nominal.manifold, nominal.action_size, list(robot.features), **settings)
     own = _without(settings, "propagation", "precision")
     unit = "standard deviations of the data"
@@ -135,7 +134,6 @@ def knode(
     check_flag("dynamics.randomised", randomised)
     if pretrain is None:
         return Part(model)
-    check_training("dynamics.pretrain", pretrain_knode, pretrain)
 
     def train(progress: bool) -> float:
         (low, high), (least, most) = robot.action_box, robot.usual_box
@@ -201,7 +199,6 @@ def paper_flow(
         )
     size, features = model.state_size, list(robot.features)
     flow = PaperFlow(*robot.action_box, features=features, state_size=size, **settings)
-    check_training("corrector.train", train_flow, train, batch_size=2)
     if checkpoint is not None:
         _load(flow, checkpoint)
         return Part(flow)

@@ -36,7 +36,7 @@ class Docstrings(Extension):
         if any("options(" in str(each.value) for each in getattr(taking, "decorators", ())):
             known = options_of(pydoc.locate(obj.path))
             for each in taking.parameters:
-                if str(each.default).startswith("option("):
+                if each.name in known and each.default is not None:
                     each.default = str(known[each.name].default)
         if obj.docstring:
             text = with_arguments(obj.docstring.value, known)

@@ -89,7 +89,6 @@ def test_a_folder_that_cannot_be_written(refuse, tmp_path):
 def test_a_cache_that_cannot_be_written(afm_rl, tmp_path, quick, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setattr("afm_rl.missions.factories.train_flow", lambda *args, **settings: 1 / 0)
-    monkeypatch.setattr("afm_rl.missions.factories.check_training", lambda *args, **settings: None)
     folder = f"hydra.run.dir={tmp_path}/run"
     done = afm_rl("method=afm_paper", f"cache={tmp_path}/file/parts", folder, *quick)
     assert done.status == 2

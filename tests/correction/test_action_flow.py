@@ -11,7 +11,7 @@ from afm_rl.correction.achievable import MODES
 from afm_rl.correction.belief import Belief
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.tick import points_of, probes_of
-from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.errors import ArtefactError
 from afm_rl.storage.artefacts import load_artefact, save_artefact
 
 SIZES = [1, 2, 6, 17]
@@ -206,32 +206,3 @@ def test_only_weights_are_stored_and_load_where_they_fit(tmp_path):
     paper = PaperFlow([-1.0], [1.0], [0], 1)
     with pytest.raises(ArtefactError, match="kind"):
         load_artefact(path, paper, paper.signature)
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"rows": 0},
-        {"memory": 0},
-        {"memory": 19},
-        {"odds": -1.0},
-        {"odds": float("nan")},
-        {"noise": 0.01},
-        {"noise_rate": 1.1},
-        {"least_noise": 0.0},
-        {"quiet": -1.0},
-        {"tails": 0.0},
-        {"samples": 0},
-        {"source_std": -0.1},
-        {"steps": 0},
-        {"saturation": "fold"},
-        {"discount": 1.1},
-        {"place_scale": 0.0},
-        {"hypotheses": ["late"]},
-        {"compile": 1},
-    ],
-    ids=str,
-)
-def test_impossible_settings_are_refused(settings):
-    with pytest.raises(ConfigurationError, match=f"corrector.{next(iter(settings))}"):
-        flow_of(2, **settings)

@@ -7,7 +7,6 @@ from afm_rl.correction import LeastSquares
 from afm_rl.correction.achievable import MODES
 from afm_rl.correction.classical import weigh
 from afm_rl.correction.least_squares import fit_affine, fit_gain
-from afm_rl.errors import ConfigurationError
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 TURN = torch.tensor([[0.6, -0.8], [0.8, 0.6]])
@@ -76,19 +75,3 @@ def test_actions_stay_in_the_box(line, drive, plans, form, saturation):
     corrector = LeastSquares(LOW, HIGH, form=form, saturation=saturation)
     (executed, *_), _ = drive(corrector, line(2), lambda sent: 0.01 * sent[-1], plans(5, 7, 2))
     assert ((executed >= LOW - 1e-6) & (executed <= HIGH + 1e-6)).all()
-
-
-@pytest.mark.parametrize(
-    ("setting", "name"),
-    [
-        ({"form": "cubic"}, "corrector.form"),
-        ({"forgetting": 0.0}, "corrector.forgetting"),
-        ({"forgetting": 1.5}, "corrector.forgetting"),
-        ({"window": 0}, "corrector.recent"),
-        ({"gate": -1.0}, "corrector.gate"),
-        ({"saturation": "none"}, "corrector.saturation"),
-    ],
-)
-def test_bad_settings_are_refused(setting, name):
-    with pytest.raises(ConfigurationError, match=name):
-        LeastSquares(LOW, HIGH, **setting)

@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins
-from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, gaussian_nll
 
 
@@ -121,11 +120,6 @@ def test_the_model_is_shared_not_copied(data):
     loss(td)["loss_nll"].backward()
     assert all(parameter.grad.abs().sum() > 0 for parameter in model.parameters())
     loss._forward_value_estimator_keys()  # torchrl calls this when keys change
-
-
-def test_unknown_reductions_are_refused():
-    with pytest.raises(ConfigurationError, match="loss.reduction='median'"):
-        GaussianNLLLoss(Dubins(), reduction="median")
 
 
 @pytest.mark.parametrize(("wrap", "turn"), [(True, 0.2), (False, 0.2 - 2 * math.pi)])

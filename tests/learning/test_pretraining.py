@@ -113,11 +113,6 @@ def test_an_ensemble_can_teach_another(fit, make_ensemble):
     assert all(parameter.grad is None for parameter in teacher.parameters())
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [{"samples": 63}, {"epochs": 0}, {"batch_size": 0}, {"lr": 0.0}, {"action_noise": -0.1}],
-    ids=str,
-)
-def test_impossible_settings_are_refused(fit, settings):
-    with pytest.raises(ConfigurationError, match=f"dynamics.pretrain.{next(iter(settings))}"):
-        fit(**settings)
+def test_there_is_a_batch(fit):
+    with pytest.raises(ConfigurationError, match="dynamics.pretrain.samples=63"):
+        fit(samples=63)

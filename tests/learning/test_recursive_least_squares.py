@@ -232,21 +232,6 @@ def test_what_was_learnt_keeps_its_digits():
     torch.testing.assert_close(other.model.matrix, world.model.matrix, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"part": "some"}, "updater.part='some'"),
-        ({"forgetting": 0.0}, "updater.forgetting=0.0"),
-        ({"gate": 0.0}, "updater.gate=0.0"),
-        ({"spread": 0.0}, "updater.spread=0.0"),
-    ],
-    ids=str,
-)
-def test_impossible_settings_are_refused(settings, message):
-    with pytest.raises(ConfigurationError, match=message):
-        World(**settings)
-
-
 def test_other_models_are_refused():
     with pytest.raises(ConfigurationError, match="teaches a Calibrated model, got Dubins"):
         RLSUpdater(GaussianNLLLoss(Dubins()))

@@ -114,7 +114,6 @@ def test_faults_are_refused(taught):
         ({"scale": [1.0]}, "updater.scale=.*expected 2 positive numbers"),
         ({"scale": [1.0, 0.0]}, "updater.scale="),
         ({"scale": [1.0, float("nan")]}, "updater.scale="),
-        ({"gate": -1.0}, "updater.gate=-1"),
         ({"updater": partial(GRADIENT, mask_key="mine")}, "updater.updater.mask_key='mine'"),
         ({"updater": lambda loss: loss}, "updater.updater"),
     ],

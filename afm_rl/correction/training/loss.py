@@ -9,12 +9,13 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor
 
-from afm_rl.correction.achievable import MODES
+from afm_rl.correction.achievable import SATURATION
 from afm_rl.correction.experts import Rows, fit_experts
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.training.prior import Drawn
-from afm_rl.errors import check_choice, check_count, check_instance
+from afm_rl.errors import check_instance
 from afm_rl.learning import InPlaceLoss
+from afm_rl.options import option, options
 
 SOURCE_STD = 0.3  # of the path's start around the plan, in half ranges
 EFFECT_WEIGHT, SIZE_WEIGHT = 0.6, 0.5  # of the loss of effects, and of the size of all errors
@@ -86,17 +87,18 @@ class CFMLoss(InPlaceLoss):
     target_network_params: None
     out_keys = ["loss_cfm"]
 
+    @options("loss")
     def __init__(
         self,
         network: AxisNetwork,
-        saturation: str = "mixed",
+        saturation: str = SATURATION,
         reduction: str = "mean",
-        seed: int = 0,
+        seed: int = option(0, "of the points on the paths", ge=0),
     ) -> None:
         super().__init__(reduction)
         self.network = check_instance("loss.network", network, AxisNetwork)
-        self.saturation = check_choice("loss.saturation", saturation, MODES)
-        self._generator = torch.Generator().manual_seed(check_count("loss.seed", seed, low=0))
+        self.saturation = saturation
+        self._generator = torch.Generator().manual_seed(seed)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

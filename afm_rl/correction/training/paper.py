@@ -8,19 +8,21 @@ from torch import Tensor
 from afm_rl.compiling.devices import device_of
 from afm_rl.correction.paper_flow import PaperFlow
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_count, check_instance, check_number
+from afm_rl.errors import ConfigurationError, check_instance
+from afm_rl.options import option, options
 from afm_rl.progress import Bar
 
 
+@options("corrector.train")
 def train_flow(
     flow: PaperFlow,
     model: DynamicsModel,
     states: tuple[Tensor, Tensor] | Tensor,
     *,
-    iterations: int = 1000,
-    batch_size: int = 160,
-    lr: float = 1e-3,
-    seed: int = 0,
+    iterations: int = option(1000, "gradient steps", ge=1, le=100_000_000),
+    batch_size: int = option(160, "examples per step", ge=2, le=100_000_000),
+    lr: float = option(1e-3, "step size of Adam", gt=0, le=1),
+    seed: int = option(0, "of everything drawn", ge=0),
     progress: bool = False,
 ) -> float:
     """Train the published flow by Adam, on transitions of one action registered as another's.
@@ -32,10 +34,6 @@ def train_flow(
         model: base dynamics model, not changed.
         states: lowest and highest state, ``(S,)`` each; or a pool of observed ones, ``(P, S)``,
             where states keep to a small part of their box.
-        iterations: gradient steps.
-        batch_size: examples per step.
-        lr: step size.
-        seed: of everything drawn.
         progress: show a progress bar.
 
     Returns:
@@ -45,10 +43,6 @@ def train_flow(
         ConfigurationError: for a setting that cannot be used.
     """
     check_instance("flow", flow, PaperFlow)
-    check_count("corrector.train.iterations", iterations)
-    check_count("corrector.train.batch_size", batch_size, low=2)
-    check_count("corrector.train.seed", seed, low=0)
-    check_number("corrector.train.lr", lr, low=0.0, open_low=True)
     for rows in states if isinstance(states, tuple) else [states]:
         if rows.shape[-1] != model.state_size or not bool(rows.isfinite().all()):
             raise ConfigurationError(

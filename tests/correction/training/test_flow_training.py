@@ -95,8 +95,6 @@ def test_the_network_is_shared_and_learns_through_the_loss(examples):
     [
         ({"network": None}, "loss.network: expected a AxisNetwork"),
         ({"reduction": "median"}, "loss.reduction"),
-        ({"saturation": "fold"}, "loss.saturation"),
-        ({"seed": 1.5}, "loss.seed=1.5"),
     ],
     ids=str,
 )
