@@ -31,9 +31,12 @@ demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and f
 	@echo "Look at outputs/demo/figures/trajectory.png: paths are black while the robot is healthy, orange"
 	@echo "while its motors are reversed; and at the film outputs/demo/video/all_methods.gif"
 
-test: $(VENV)/.with-test ## Run the tests with coverage (at least 95 %); ALL=1 adds those marked slow
-	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --dist worksteal $(if $(ALL),,-m "not slow") \
-		--cov --cov-report=term-missing:skip-covered --cov-fail-under=95 --durations=10
+# Tracing every line takes a quarter of the time.
+COVERED := --cov --cov-report=term-missing:skip-covered --cov-fail-under=95
+
+test: $(VENV)/.with-test ## Run the tests; ALL=1 adds those marked slow, and coverage (at least 95 %)
+	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --dist worksteal --durations=10 \
+		$(if $(ALL),$(COVERED),-m "not slow")
 
 lint: $(VENV)/.with-test ## Check style, format and spelling
 	@$(BIN)/ruff check --quiet . && $(BIN)/ruff format --quiet --check . && $(BIN)/codespell

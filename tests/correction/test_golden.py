@@ -1,0 +1,116 @@
+"""The correctors answer as they did when their answers were stored.
+
+    python tests/correction/test_golden.py   # stores them anew; the commit says why they changed
+
+Ten effects of actuators and two amounts of noise are twenty rows of a batch; one robot has one
+action, one two, one six. What a place or a delay changes is asked of a ground robot.
+"""
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares
+from afm_rl.dynamics import Dubins, KnownDynamics
+from afm_rl.spaces.manifold import Manifold
+
+FILE = Path(__file__).with_name("golden.safetensors")
+TICKS, CHANGE, NOISE = 36, 10, (1e-3, 0.05)
+
+
+def before(sent, ticks):
+    return sent[-1 - ticks] if len(sent) > ticks else torch.zeros_like(sent[-1])
+
+
+def first_alone(sent):
+    return torch.cat([-sent[-1][:, :1], sent[-1][:, 1:]], -1)
+
+
+EFFECTS = {
+    "healthy": lambda sent: sent[-1],
+    "reversed": lambda sent: -sent[-1],
+    "half": lambda sent: 0.5 * sent[-1],
+    "offset": lambda sent: sent[-1] + 0.2,
+    "two steps late": lambda sent: before(sent, 2),
+    "reversed and late": lambda sent: -before(sent, 2),
+    "slow": lambda sent: sum(0.6 * 0.4**k * before(sent, k) for k in range(5)),
+    "first reversed": first_alone,
+    "swapped": lambda sent: sent[-1].flip(-1),
+    "dead zone": lambda sent: torch.where(sent[-1].abs() < 0.2, 0 * sent[-1], -sent[-1]),
+}
+
+
+def point(size):
+    """Return the model of a point that goes where it is told."""
+    return KnownDynamics(lambda state, action: state + action, Manifold(size), size)
+
+
+def flow(size, **settings):
+    return ActionFlow(-torch.ones(size), torch.ones(size), **settings)
+
+
+def least_squares(form):
+    return LeastSquares(-torch.ones(2), torch.ones(2), form=form)
+
+
+def ground(**settings):
+    high = torch.tensor([1.0, 1.5])
+    return ActionFlow(-high, high, place=[0, 1], **settings)
+
+
+CASES = {
+    "one action": lambda: (flow(1), point(1)),
+    "two actions": lambda: (flow(2), point(2)),
+    "six actions": lambda: (flow(6), point(6)),
+    "ground": lambda: (ground(), Dubins()),
+    "ground, a known delay": lambda: (ground(delay=1), Dubins()),
+    **{
+        f"least squares, {form}": lambda form=form: (least_squares(form), point(2))
+        for form in ("gain", "gain_offset", "affine")
+    },
+    "L1": lambda: (L1Augmentation(-torch.ones(2), torch.ones(2), dt=0.1), point(2)),
+}
+
+
+def answers(name):
+    """Drive every row; return the tick's answers, each ``(T, B, A)``."""
+    corrector, model = (part.double() for part in CASES[name]())
+    draws = torch.Generator().manual_seed(0)
+    size, rows, noise = corrector.lowest.shape[-1], len(EFFECTS) * len(NOISE), torch.tensor(NOISE)
+    noise = noise.double().repeat(len(EFFECTS)).unsqueeze(-1)
+    box = torch.stack(
+        [corrector.denormalise(part) for part in (corrector.lowest, corrector.highest)]
+    )
+    state, plan = torch.zeros(rows, model.state_size).double(), torch.zeros(rows, size).double()
+    memory, sent, found = corrector.begin(state), [], []
+    for tick in range(TICKS):
+        drawn = torch.rand(rows, size, generator=draws, dtype=torch.float64)
+        plan = 0.7 * plan + 0.5 * (2 * drawn - 1)
+        memory, answer = corrector.correct(
+            memory, plan.clamp(-0.8, 0.8), model, box.expand(rows, 2, -1)
+        )
+        sent.append(corrector.sending(memory, answer.executed))
+        parts = [effect(sent) for effect in EFFECTS.values()]
+        rows_of = torch.arange(rows)
+        effects = torch.stack(parts)[rows_of // len(NOISE), rows_of] if tick >= CHANGE else sent[-1]
+        state = model(state, effects)
+        state = state + noise * torch.randn(state.shape, generator=draws, dtype=torch.float64)
+        memory = corrector.observe(memory, state)
+        found.append((answer.executed, answer.predicted, answer.noise))
+    executed, predicted, spread = map(torch.stack, zip(*found, strict=True))
+    return {"executed": executed, "predicted": predicted, "noise": spread}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_answers_are_those_that_were_stored(name):
+    stored = load_file(FILE)
+    for part, values in answers(name).items():
+        # to the precision of what is stored: other processors round otherwise
+        torch.testing.assert_close(values.float(), stored[f"{name}: {part}"], rtol=1e-4, atol=1e-4)
+
+
+if __name__ == "__main__":
+    found = {f"{name}: {part}": x.float() for name in CASES for part, x in answers(name).items()}
+    save_file({name: x.contiguous() for name, x in found.items()}, FILE)
