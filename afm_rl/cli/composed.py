@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from afm_rl.errors import ConfigurationError, printable
-from afm_rl.targets import check_name, find_code, leaves
+from afm_rl.trust import check_name, find_code, leaves
 
 CALLED = ("hydra.callbacks", "hydra.launcher", "hydra.sweeper", "hydra.job.env_set")
 """What Hydra calls, or sets."""

@@ -42,7 +42,7 @@ from afm_rl.report import (
 from afm_rl.report.diagnosis import write_diagnosis
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import JOBS, extend_manifest, read_manifest, write_manifest
-from afm_rl.targets import check_targets
+from afm_rl.trust import check_targets
 
 ENDS = (signal.SIGINT, signal.SIGTERM)
 """Batch systems send the latter before they kill; a shell ignores the former for what it runs

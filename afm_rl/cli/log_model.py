@@ -17,8 +17,7 @@ from afm_rl.dynamics.mujoco_model import check_files
 from afm_rl.errors import ConfigurationError, printable
 from afm_rl.missions.explained import effective_log
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.targets import find_code
-from afm_rl.trust import name_of, trusted, trusted_folders, trusting
+from afm_rl.trust import find_code, name_of, trusted, trusted_folders, trusting
 
 SIMULATED = 4000  # rows of a log that a simulator is asked about
 
@@ -45,7 +44,7 @@ def model_of(name: str, trust: Sequence[str], columns: Columns) -> DynamicsModel
         step = np.median(np.diff(columns.t)[np.diff(columns.episode) == 0])
         return MuJoCoDynamics(name, frame_skip=max(1, round(float(step) / model.dt)))
     with trusting(trust):
-        packages = ["afm_rl.dynamics", *map(name_of, trusted() or ())]
+        packages = ["afm_rl.dynamics", *map(name_of, trusted())]
         if not any(name.startswith(f"{package}.") for package in packages):
             raise ConfigurationError(
                 f"--model {printable(name)}: expected a file .xml, or a function of a package that "

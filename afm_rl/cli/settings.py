@@ -19,7 +19,7 @@ import yaml
 import afm_rl.conf
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import options_of, parts_of
-from afm_rl.targets import find_code
+from afm_rl.trust import find_code
 
 LINE = re.compile(r"( *)(\w+):((?: +[^ #][^#]*?)?)(?: +#.*)?")
 WORDS = {"None": "null", "True": "true", "False": "false"}

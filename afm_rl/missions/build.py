@@ -43,9 +43,8 @@ from afm_rl.missions.selection import (
 )
 from afm_rl.planning import Cost, PlanningEnv
 from afm_rl.storage.artefacts import cached
-from afm_rl.targets import check_targets, instantiate
 from afm_rl.transforms import ActionFlowTransform, Guard
-from afm_rl.trust import check_trust, trusting
+from afm_rl.trust import check_targets, check_trust, instantiate, trusting
 
 TRANSFORM = ("enabled", "extend_action_box")
 """Settings of whatever corrector is chosen."""

@@ -18,8 +18,7 @@ from afm_rl.errors import (
 )
 from afm_rl.learning import Updater
 from afm_rl.planning import Cost
-from afm_rl.targets import leaves
-from afm_rl.trust import trusted_folders
+from afm_rl.trust import leaves, trusted_folders
 
 MISTAKES = (
     *(ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, RuntimeError),

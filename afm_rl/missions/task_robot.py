@@ -12,7 +12,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.missions.robot import Collection, Robot
 from afm_rl.missions.scores import ReturnScore
 from afm_rl.regimes import Compose, Physics, Regime, Schedule, actuator_regimes
-from afm_rl.targets import find_code
+from afm_rl.trust import find_code
 
 CODE = ("reward", "step")
 """Settings that may name a function."""

@@ -29,8 +29,7 @@ from afm_rl.envs.task.rewards import (
 from afm_rl.envs.task.task import NOWHERE, Reward, Task, bound_noise
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.targets import check_name
-from afm_rl.trust import restricted
+from afm_rl.trust import check_name, restricted
 
 
 @contextmanager

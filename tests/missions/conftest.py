@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from small import shrink
 
 from afm_rl.missions import build, prepare, run
-from afm_rl.targets import instantiate
+from afm_rl.trust import instantiate
 
 SMALL = {"budget": 12, "planner.population": 16, "planner.elites": 4}
 TARGETS = 20  # of the ring
