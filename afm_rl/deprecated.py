@@ -13,11 +13,15 @@ import lazy_loader
 NAMES = {
     "afm_rl.envs.Table": "afm_rl.envs.SampledReference",
     "afm_rl.play.Robot": "afm_rl.play.PlayedRobot",
+    "afm_rl.learning.watching.Watching": "afm_rl.transforms.collect_then_fit.CollectThenFit",
     "afm_rl.report.check_video": "afm_rl.film.check_video",
 }
 """New names of parts, both with their package."""
+_LATE = {"late": ("delay_compensation", {"predict": True, "leave": False})}
 ARGUMENTS: dict[str, dict[str, tuple[str, dict[Any, Any]]]] = {
     "ActionFlow": {"readings": ("hypotheses", {})},
+    "ActionFlowTransform": _LATE,
+    "GymnasiumShell": _LATE,
 }
 """New names of arguments, by function or class, and new values for old ones."""
 

@@ -72,6 +72,38 @@ def explain(
     return Diagnosis(actuators=tuple(shown), step_s=step, rows=len(u))
 
 
+def describe(
+    pairs: np.ndarray | None,
+    names: Sequence[str],
+    step: float = 1.0,
+    delay: int = 0,
+    known: int = 0,
+    compensated: bool = False,
+) -> str:
+    """Say in words what pairs show of each actuator, and how late actions are.
+
+    Args:
+        pairs: executed and effective actions and the standard deviations of these, side by side,
+            ``(K, 3 A)``, oldest first; None where nothing has changed.
+        names: of the A actuators.
+        step: time of a step (s).
+        delay: steps from an action to its effect.
+        known: how many of them the pairs already take into account.
+        compensated: is it made up for?
+
+    >>> describe(None, ["pan"], delay=2, compensated=True).splitlines()
+    ['healthy', 'lateness: 2 steps, made up for']
+    """
+    text = "healthy"
+    if pairs is not None:
+        executed, effective, std = np.split(pairs, 3, axis=1)
+        delays = max(5, delay - known + 1)
+        text = str(explain(executed, effective, names, std=std, step=step, delays=delays))
+    if delay:
+        text += f"\nlateness: {delay} step{'s' * (delay > 1)}{', made up for' * compensated}"
+    return text
+
+
 def _fit(
     late: np.ndarray,
     y: np.ndarray,

@@ -13,57 +13,36 @@ from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform
 
-from afm_rl.correction import ActionFlow, Corrector
-from afm_rl.correction.delay import arrival
+from afm_rl.correction import Corrector
+from afm_rl.deprecated import old_arguments
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance
 from afm_rl.spaces.keys import as_key, as_keys
-from afm_rl.transforms.carried import CarriedTransform
-from afm_rl.transforms.memory import (
-    LATE,
-    UNSEEN,
-    begin,
-    bounds_of,
-    correct,
-    corrector_for,
-    entries_spec,
-    observe,
-    precise,
-    warn_of_old,
-)
+from afm_rl.transforms import delay_compensation as delays
+from afm_rl.transforms.loop import CorrectionLoop, Shell, bounds_of, precise, warn_of_old
 from afm_rl.transforms.simulation import SIMULATOR_STATE, Simulation, simulation_in
+from afm_rl.transforms.stateful import StatefulTransform
 
-UNKNOWN = f"{UNSEEN}; put the transform before those that change observations, or late='leave'"
+UNKNOWN = delays.UNKNOWN.format("put the transform before those that change observations")
 
 
-class ActionFlowTransform(CarriedTransform):
+class ActionFlowTransform(Shell, StatefulTransform):
     r"""Action Flow Matching: the planned action goes in, the action that does it comes out.
 
-    On the way to the environment the transform asks the dynamics model what the last executed
-    actions did (of a model that learns, the *present* one about the newest transitions again)
-    and, while the model is misaligned, replaces the planned action by the corrector's answer
-    (paper, section IV-D). On the way back it adds the transition to its memory. It never learns
-    and never changes the model, which it shares with planner and updater.
+    A view of the :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``,
+    ``enabled``, ``delay``, ``delay_compensation``, ``belief``, ``keep_memory_on_reset`` and
+    ``extend_action_box``. On the way to the environment the planned action is corrected; on the way
+    back the transition enters the memory. The dynamics model is shared with planner and updater; of
+    one that learns, the *present* one is asked about the newest transitions again.
 
-    Every mission of a batch has a memory of its own, which a reset empties. Of use to others are,
-    under ``prefix``,
+    Every mission of a batch has a memory of its own, which a reset empties. Under ``prefix`` are
+    the entries of the loop (the root action stays the planned one, which losses of policies need;
+    models learn from the executed one), and
 
-    * ``(prefix, "planned_action")`` and ``(prefix, "executed_action")`` ``(*B, A)``: the root
-      action stays the planned one, which losses of policies need; models learn from the executed
-      one,
-    * ``(prefix, "predicted_effect")`` ``(*B, A)``: the effect that the executed action is
-      predicted to have; where nothing is corrected, itself,
-    * ``(prefix, "misaligned")`` ``(*B)``: does the model misjudge actions, so that they are
-      corrected (with ``enabled=False``: so that they would be)?
     * ``(prefix, "observation")`` and ``(prefix, "arrival")`` ``(*B, S)``: the measured state, and
       the one in which the next action will act; while no action is late, the same,
     * ``(prefix, "delay")`` ``(*B)``: in how many steps that will be, an integer; 0 at once, and
-      with ``enabled=False``,
-    * ``(prefix, "innovation")`` ``(*B)``: the misalignment, in the unit of the gate,
-    * ``(prefix, "spread")`` ``(*B, A)``: standard deviation of the flow's samples,
-    * ``(prefix, "noise")`` ``(*B, A)``: standard deviation of effects that nothing explains,
-    * ``(prefix, "effect_bounds")`` ``(*B, 2, A)``: lowest and highest effect that an action can
-      have, at least the action box: for planners that can plan beyond it.
+      with ``enabled=False``.
 
     The memory is large, and no part of rollouts and of what collectors yield: of the newest step it
     is held here. A tensordict of another step goes on with an empty one, and a warning.
@@ -80,27 +59,15 @@ class ActionFlowTransform(CarriedTransform):
     Args:
         model: dynamics model, shared (it does not become part of the state dict); ``"mujoco"``: the
             environment's simulation as it is at first, with the frames that are skipped.
-        corrector: the correction, owned; None: the universal
-            :class:`~afm_rl.correction.ActionFlow` for the environment's action box.
+        corrector: an option of the loop, as those that follow and are not named here.
         in_keys: the state; if None, ``["simulator_state"]`` with ``"mujoco"``, else
             ``["observation"]``.
         in_keys_inv: the action; ``["action"]`` if None.
-        prefix: where the entries are kept.
-        enabled: False to watch only.
-        extend_action_box: let planners know of effects beyond the action box, if the model can
-            predict them.
+        prefix: where the entries are.
         reported_key: where the environment reports the action ``(*B, A)`` that its actuators gave
             in a step, if that is known and not what they were sent: motors that lag.
-        late: what policies are shown while actions act late: ``"predict"``, the state in which the
-            next action will act; ``"leave"``, the measured one.
-        delay: steps from an action to its effect that are known, one number or one per axis.
-        belief: keep ``(prefix, "belief")`` ``(*B, C, A)``, too: how probable the ``causes`` of the
-            :class:`~afm_rl.correction.ActionFlow` are, by axis.
         carry_memory: carry the memory in the tensordict instead, as ``(prefix, "memory")``
             ``(*B, P)``: branches and resumed rollouts are exact, in another environment, too.
-        keep_memory_on_reset: go on with what was learnt in the episodes before, as where a fault
-            outlasts them: the pairs, the noise and the belief of the newest step. So rollouts
-            depend on those before them, and branches of rollouts are not exact.
 
     Raises:
         ConfigurationError: for parts that do not fit each other, also when it is put around an
@@ -117,6 +84,7 @@ class ActionFlowTransform(CarriedTransform):
     torch.Size([5, 2])
     """
 
+    @old_arguments
     def __init__(
         self,
         model: DynamicsModel | str,
@@ -127,92 +95,89 @@ class ActionFlowTransform(CarriedTransform):
         enabled: bool = True,
         extend_action_box: bool = True,
         reported_key: NestedKey | None = None,
-        late: str = "predict",
+        delay_compensation: bool = True,
         delay: int | Sequence[int] | None = None,
         belief: bool = False,
         carry_memory: bool = False,
         keep_memory_on_reset: bool = False,
     ) -> None:
-        self.delay, self.belief = delay, check_flag("transform.belief", belief)
-        self.late = check_choice("transform.late", late, LATE)
-        usual, known = "observation", None
+        state, known = "observation", None
         if isinstance(model, str):
             check_choice("transform.model", model, ["mujoco"])
-            usual = SIMULATOR_STATE
+            state = SIMULATOR_STATE
         else:
             known = check_instance("transform.model", model, DynamicsModel)
-        state = _one_key("in_keys", [usual] if in_keys is None else in_keys)
-        action = _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv)
-        super().__init__(state, action, prefix)
-        self.__dict__.update(_model=known, _simulation=(None, None))  # shared: not registered
-        if corrector is not None and known is not None:
-            corrector = corrector_for("transform", known, corrector, None, delay)
-        self._corrector = corrector
-        self.enabled = check_flag("transform.enabled", enabled)
-        self.extend_action_box = check_flag("transform.extend_action_box", extend_action_box)
+        super().__init__(
+            _one_key("in_keys", [state] if in_keys is None else in_keys),
+            _one_key("in_keys_inv", ["action"] if in_keys_inv is None else in_keys_inv),
+            prefix,
+        )
+        loop = CorrectionLoop(
+            "transform",
+            known,
+            corrector,
+            enabled=enabled,
+            delay=delay,
+            delay_compensation=delay_compensation,
+            belief=belief,
+            keep_memory_on_reset=keep_memory_on_reset,
+            extend_action_box=extend_action_box,
+        )
+        self._loop = loop if corrector is None or known is None else loop.complete()
+        self._corrector = corrector  # registered here
+        self._simulation: Any = (None, None)
         self.reported_key = None if reported_key is None else as_key(reported_key)
         self.carry_memory = check_flag("transform.carry_memory", carry_memory)
-        keep = check_flag("transform.keep_memory_on_reset", keep_memory_on_reset)
-        self.keep_memory_on_reset = keep
         self._newest: Any = None  # the entries of the newest step, and its memory
+
+    @property
+    def loop(self) -> CorrectionLoop:
+        """The loop; what is not given is made for the environment: simulation and corrector."""
+        loop = self._loop
+        if loop.model is not None and loop.corrector is not None:
+            return loop
+        if self.parent is None:
+            raise ConfigurationError(
+                "ActionFlowTransform: simulation and action box are not known yet; put the "
+                "transform around an environment first, or give model and corrector"
+            )
+        model = loop.model
+        if model is None:
+            try:
+                model = Simulation(self.parent).dynamics(*bounds_of(self._action_spec))
+            except ConfigurationError as error:
+                raise ConfigurationError(f"ActionFlowTransform: model='mujoco': {error}") from error
+        self._loop = loop.complete(model, self._action_spec)
+        self._corrector = self._loop.corrector
+        return self._loop
 
     @property
     def corrector(self) -> Corrector:
         """The correction; the universal one is made for the environment's action box."""
-        if self._corrector is None:
-            if self.parent is None:
-                raise ConfigurationError(
-                    "ActionFlowTransform.corrector: the action box is not known yet; put the "
-                    "transform around an environment first, or give a corrector"
-                )
-            self._corrector = corrector_for(
-                "transform", self.model, None, self._action_spec, self.delay
-            )
-        return self._corrector
+        return self.loop.corrector if self._loop.corrector is None else self._loop.corrector
 
     def state_dict(self, *args: Any, **kwargs: Any) -> Any:
         """Return the state of the corrector, the universal one's too, from the beginning on."""
-        self._complete()
+        if self.parent is not None:
+            self.loop  # noqa: B018
         return super().state_dict(*args, **kwargs)
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        self._complete()
-        super()._load_from_state_dict(*args, **kwargs)
-
-    def _complete(self) -> None:
-        """Make the corrector now, if there is an environment to make it for."""
         if self.parent is not None:
-            self.corrector  # noqa: B018
-
-    @property
-    def model(self) -> DynamicsModel:
-        """The dynamics model; that of a simulation is known inside an environment."""
-        if self._model is None:
-            if self.parent is None:
-                raise ConfigurationError(
-                    "ActionFlowTransform.model: the simulation is not known yet; put the transform "
-                    "around an environment first"
-                )
-            try:
-                found = Simulation(self.parent).dynamics(*bounds_of(self._action_spec))
-            except ConfigurationError as error:
-                raise ConfigurationError(f"ActionFlowTransform: model='mujoco': {error}") from error
-            if self._corrector is not None:
-                corrector_for("transform", found, self._corrector, None, self.delay)
-            self.__dict__["_model"] = found
-        return self._model
+            self.loop  # noqa: B018
+        super()._load_from_state_dict(*args, **kwargs)
 
     @property
     def simulation(self) -> Simulation | None:
         """The simulation that the state is of, if it is ``"simulator_state"``."""
-        parent, found = self._simulation
+        parent, simulation = self._simulation
         if self.observation_key == SIMULATOR_STATE and parent is not self.parent:
-            found = simulation_in(self.parent)
-            unknown = found is not None and self.late == "predict" and not found.seen
+            simulation = simulation_in(self.parent)
+            unknown = simulation is not None and self.delay_compensation and not simulation.seen
             if unknown and self.delay is not None:
                 raise ConfigurationError(f"ActionFlowTransform: delay={self.delay!r}: {UNKNOWN}")
-            self.__dict__["_simulation"] = self.parent, found
-        return found
+            self._simulation = self.parent, simulation
+        return simulation
 
     @property
     def _action_spec(self):
@@ -255,7 +220,7 @@ class ActionFlowTransform(CarriedTransform):
             "give carry_memory=True",
             stacklevel=2,
         )
-        begun = begin(self.corrector, state, self._action_spec, self._learnt).get("memory")
+        begun = self.loop.begin(state, self._action_spec, self._learnt).get("memory")
         return torch.where(known.unsqueeze(-1), newest.get("memory"), begun) if fits else begun
 
     @property
@@ -268,33 +233,13 @@ class ActionFlowTransform(CarriedTransform):
         """Replace the planned action by the corrected one."""
         warn_of_old(tensordict, self.prefix)
         planned = tensordict.get(self.action_key, None)
-        entries = correct(
-            memory,
-            planned,
-            self.model,
-            self.corrector,
-            self._action_spec,
-            self.enabled,
-            self.extend_action_box,
-            self.action_key,
-        )
+        entries = self.loop.act(memory, planned, self._action_spec, self.action_key)
         tensordict.set(self.action_key, entries.get("executed_action"))
-        kept = tensordict.get(self.prefix).select("observation", "arrival", "delay")
+        measured = tensordict.get(self.prefix).select("observation", "arrival", "delay")
         if self.simulation is None:
             # Environments without a state of their own go on from what is under this key.
-            tensordict.set(self.observation_key, kept.get("observation"))
-        return tensordict.set(self.prefix, self._believed(entries.update(kept)))
-
-    def _believed(self, entries: TensorDictBase) -> TensorDictBase:
-        """Return the entries with the belief, if it is asked for."""
-        if self.belief:
-            entries.set("belief", self._believer.belief_in(entries.get("memory")))
-        return entries
-
-    @property
-    def _believer(self) -> ActionFlow:
-        name = "transform.belief=True: transform.corrector"
-        return check_instance(name, self.corrector, ActionFlow)
+            tensordict.set(self.observation_key, measured.get("observation"))
+        return tensordict.set(self.prefix, entries.update(measured))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         entries = dict(tensordict.get(self.prefix).items())
@@ -303,11 +248,11 @@ class ActionFlowTransform(CarriedTransform):
             given = next_tensordict.get(self.reported_key).to(memory.dtype)
             memory = self.corrector.reported(memory, given)
         state = self._state(next_tensordict)
-        memory = observe(memory, state, self.model, self.corrector, self.observation_key)
+        memory = self.loop.observe(memory, state, self.observation_key)
         entries |= {"memory": memory, **self._seen(memory, state, next_tensordict)}
         # Of the device that the next tensordict names: else every entry is moved to where it is.
-        found = TensorDict(entries, memory.shape[:-1], device=next_tensordict.device)
-        return next_tensordict.set(self.prefix, self._hold(found))
+        later = TensorDict(entries, memory.shape[:-1], device=next_tensordict.device)
+        return next_tensordict.set(self.prefix, self._hold(later))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -316,13 +261,12 @@ class ActionFlowTransform(CarriedTransform):
         state = self._state(tensordict_reset)
         if state is None:
             self._entry("in_keys", self.parent.full_observation_spec)
-        before = self._learnt
-        if before is not None:  # a tensordict's own goes before, if the reset is told of it
-            before = tensordict.get(self.key("memory"), before)
-        entries = begin(self.corrector, state, self._action_spec, before)
+        learnt = self._learnt
+        if learnt is not None:  # a tensordict's own goes before, if the reset has it
+            learnt = tensordict.get(self.key("memory"), learnt)
+        entries = self.loop.begin(state, self._action_spec, learnt)
         entries.update(self._seen(entries.get("memory"), state, tensordict_reset))
-        found = self._hold(self._believed(entries), self._rows(tensordict))
-        return tensordict_reset.set(self.prefix, found)
+        return tensordict_reset.set(self.prefix, self._hold(entries, self._rows(tensordict)))
 
     def _hold(self, entries: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
         """Hold the entries of a step, or of the ``rows`` that begin; return what is carried."""
@@ -359,13 +303,12 @@ class ActionFlowTransform(CarriedTransform):
 
     def _seen(self, memory: Tensor, state: Tensor, tensordict: TensorDictBase) -> dict[str, Any]:
         """Return the entries of what was measured and of where the next action acts."""
-        there, steps = arrival(self.corrector, memory, self.model)
-        delay = steps if self.enabled else torch.zeros_like(steps)
-        there = torch.where((delay > 0).unsqueeze(-1), there.to(state.dtype), state)
+        reached, delay = self.loop.arrival(memory)
+        reached = torch.where((delay > 0).unsqueeze(-1), reached.to(state.dtype), state)
         measured = self._measured(tensordict, state).clone()
-        if self.late == "predict":
-            self._show(tensordict, there, delay > 0)
-        return {"observation": measured, "arrival": there, "delay": delay}
+        if self.delay_compensation:
+            self._show(tensordict, reached, delay > 0)
+        return {"observation": measured, "arrival": reached, "delay": delay}
 
     @property
     def _seen_keys(self) -> list[NestedKey]:
@@ -378,12 +321,12 @@ class ActionFlowTransform(CarriedTransform):
             return tensordict.select(*self._seen_keys)
         return tensordict.get(*self._seen_keys) if self._seen_keys else state
 
-    def _show(self, tensordict: TensorDictBase, there: Tensor, late: Tensor) -> None:
+    def _show(self, tensordict: TensorDictBase, reached: Tensor, late: Tensor) -> None:
         """Let policies find what is observed in the state in which their action will act."""
         if self.simulation is None:
-            tensordict.set(self.observation_key, there)
+            tensordict.set(self.observation_key, reached)
         elif self.simulation.seen and late.any():
-            self.simulation.show(tensordict, there, late)
+            self.simulation.show(tensordict, reached, late)
         elif late.any():
             warnings.warn(f"ActionFlowTransform: actions act late: {UNKNOWN}", stacklevel=2)
 
@@ -426,7 +369,7 @@ class ActionFlowTransform(CarriedTransform):
                 f"{self.model.state_size} numbers{self._way}"
             )
         batch, corrector = found.shape[:-1], self.corrector  # agents have a dimension of their own
-        entries = entries_spec(corrector, batch, self._action_spec.dtype)
+        entries = self.loop.spec(batch, self._action_spec.dtype)
         seen = Composite({key: specs[key] for key in self._seen_keys}, shape=spec.shape)
         first = next(iter(seen.values()), found)  # of one or none
         entries["observation"] = (seen if len(self._seen_keys) > 1 else first).clone()
@@ -437,7 +380,7 @@ class ActionFlowTransform(CarriedTransform):
             size = (*batch, corrector.memory_size(self.model.state_size))
             entries["memory"] = Unbounded(size, dtype=kind)
         if self.belief:
-            size = (*batch, len(self._believer.causes), corrector.action_size)
+            size = (*batch, len(corrector.causes), corrector.action_size)
             entries["belief"] = Unbounded(size, dtype=kind)
         return entries
 

@@ -14,9 +14,8 @@ from torchrl.envs import EnvBase, TransformedEnv
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics
 from afm_rl.errors import ConfigurationError, check_count
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.transforms.correction_loop import Model, State, as_numbers
-from afm_rl.transforms.gymnasium import ActionFlowWrapper
-from afm_rl.transforms.memory import bounds_of
+from afm_rl.transforms.gymnasium import ActionFlowWrapper, Model, State, as_numbers
+from afm_rl.transforms.loop import bounds_of
 from afm_rl.transforms.simulation import SIMULATOR_STATE, Simulation, SimulatorState, layers_of
 
 if TYPE_CHECKING:
@@ -72,8 +71,8 @@ def _in_gymnasium(
     env: gymnasium.Env, model: Model, policy: Any, state: State | None, steps: int, seed: int
 ) -> tuple[DynamicsModel, list[Tensor]]:
     """Return the model, and states, actions and next states as a wrapper has them."""
-    wrapper = ActionFlowWrapper(env, model, state, enabled=False, late="leave")
-    if wrapper.watching is not None:
+    wrapper = ActionFlowWrapper(env, model, state, enabled=False, delay_compensation=False)
+    if wrapper.collection is not None:
         raise ConfigurationError("check_model: model='learn': there is no model yet to check")
     space: Any = env.action_space
     space.seed(seed)
@@ -87,9 +86,10 @@ def _in_gymnasium(
             wanted = space.sample() if policy is None else policy(observation)
             planned = as_numbers("action", wanted, space.shape).numpy()
             action = np.clip(planned, space.low, space.high).astype(space.dtype)
-            before = wrapper._state(observation)[0]
+            (before,) = wrapper._states_in([observation])
             observation, _, terminated, truncated, _ = env.step(action)
-            rows.append((before, torch.from_numpy(action), wrapper._state(observation)[0]))
+            (after,) = wrapper._states_in([observation])
+            rows.append((before, torch.from_numpy(action), after))
             if terminated or truncated:
                 observation, _ = env.reset()
     finally:

@@ -20,10 +20,10 @@ from afm_rl.faults import (
     trusted,
 )
 from afm_rl.spaces.keys import as_key
-from afm_rl.transforms.carried import CarriedTransform
+from afm_rl.transforms.stateful import StatefulTransform
 
 
-class Guard(CarriedTransform):
+class Guard(StatefulTransform):
     r"""Finite actions inside the action spec, whatever came before; and a look at the readings.
 
     .. math:: a_\mathrm{exec} = \min(\max(a, l), h), \quad

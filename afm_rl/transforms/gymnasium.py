@@ -2,37 +2,282 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+import warnings
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import gymnasium
 import numpy as np
+import torch
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from torch import Tensor
+from torchrl.data import Bounded
 
 from afm_rl.correction import Corrector
-from afm_rl.dynamics import MuJoCoDynamics
+from afm_rl.correction.pairs import PairCorrector
+from afm_rl.deprecated import old_arguments, old_attribute
+from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.transforms.correction_loop import CorrectionLoop, Model, Observe, State, as_numbers
+from afm_rl.faults import fault_of
+from afm_rl.spaces.manifold import Manifold
+from afm_rl.transforms import delay_compensation as delays
+from afm_rl.transforms.loop import CorrectionLoop, precise
+from afm_rl.transforms.simulation import Simulation
 
-if TYPE_CHECKING:
-    from afm_rl.learning.watching import Watching
+if TYPE_CHECKING:  # a room that is entered when it is asked for
+    from afm_rl.transforms.collect_then_fit import CollectThenFit
+
+Model: TypeAlias = "DynamicsModel | Callable[[Tensor, Tensor], Tensor] | CollectThenFit | str"
+State = Callable[[Any, Any], Any]
+Observe = Callable[[np.ndarray], Any]
+UNKNOWN = delays.UNKNOWN.format("give observe=, a function from states (N, S) to observations")
+SHOWN = {
+    "planned": "planned_action",
+    "executed": "executed_action",
+    "predicted": "predicted_effect",
+    "corrects": "misaligned",
+    "innovation": "innovation",
+    "noise": "noise",
+}
+"""What ``info["afm"]`` has of the entries."""
 
 
-class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
+class GymnasiumShell:
+    """The loop for N environments of gymnasium: what :class:`ActionFlowWrapper` says."""
+
+    env: Any
+
+    @old_arguments
+    def __init__(
+        self,
+        env: Any,
+        model: Model = "mujoco",
+        state: State | None = None,
+        corrector: Corrector | None = None,
+        enabled: bool = True,
+        delay_compensation: bool = True,
+        observe: Observe | None = None,
+        delay: int | Sequence[int] | None = None,
+        belief: bool = False,
+        keep_memory_on_reset: bool = False,
+    ) -> None:
+        options: Any = {"corrector": corrector, "enabled": enabled, "delay": delay}
+        options |= {"delay_compensation": delay_compensation, "belief": belief}
+        options |= {"keep_memory_on_reset": keep_memory_on_reset}
+        given: Any = {"model": model, "state": state, "observe": observe, **options}
+        RecordConstructorArgs.__init__(self, **given)  # type: ignore[arg-type]
+        super().__init__(env)  # type: ignore[call-arg]
+        self._options = CorrectionLoop("wrapper", **options)
+        actions = getattr(env, "single_action_space", env.action_space)
+        if not isinstance(actions, Box) or len(actions.shape) != 1 or actions.dtype.kind != "f":
+            raise ConfigurationError(
+                f"ActionFlowWrapper: action_space={actions}: expected a Box of one vector of real "
+                "numbers"
+            )
+        self._actions, self._collection = actions, _collection(model)
+        self._model: Any = _simulation(env) if _is(model, "mujoco") else model
+        if self._collection is None and not callable(self._model):
+            raise ConfigurationError(
+                f"ActionFlowWrapper: model={model!r}: expected 'mujoco', 'learn', a step function "
+                "or a DynamicsModel"
+            )
+        simulated, inner = isinstance(self._model, MuJoCoDynamics), env.unwrapped
+        if simulated and hasattr(inner, "data") and env.action_space != inner.action_space:
+            raise ConfigurationError(
+                f"ActionFlowWrapper: actions of {env} are others than those of its simulation; "
+                "put the wrapper inside of those that change actions"
+            )
+        if state is None and simulated:
+            state = _vector_state if isinstance(env, VectorEnv) else _env_state
+            simulation = Simulation(env)
+            if observe is None and simulation.seen:
+                observe = partial(_observed_in, simulation)
+        self._observed_in = observe  # None: known at the first reset, or not at all
+        seen = getattr(env, "single_observation_space", env.observation_space)
+        if state is None and not (isinstance(seen, Box) and len(seen.shape) == 1):
+            raise ConfigurationError(
+                f"ActionFlowWrapper: observation_space={seen}: expected a Box of one vector; say "
+                "what the state is by state=lambda env, observation: ..."
+            )
+        self._state_of: State = _observed if state is None else state
+        names = self._model.names[1] if simulated else None
+        self._names = names or [f"actuator {k}" for k in range(actions.shape[0])]
+        self._entries: Any = None  # a tensordict, from the first reset on
+        one = not isinstance(env, VectorEnv)
+        self._mode = AutoresetMode.DISABLED if one else autoreset_mode_of(env)
+        self._over = np.zeros(1 if one else env.num_envs, dtype=bool)  # which the next step resets
+
+    @property
+    def collection(self) -> CollectThenFit | None:
+        """What is collected, and the fit to it, with ``model="learn"``."""
+        return self._collection
+
+    watching = old_attribute("collection")
+
+    @torch.no_grad()
+    def _begin(
+        self,
+        observations: Any,
+        states: Tensor,
+        rows: np.ndarray | None = None,
+        seed: int | None = None,
+    ) -> None:
+        """Begin episodes in ``states`` ``(N, S)``; only in ``rows`` ``(N,)``, if given."""
+        states = states.to(precise(states.dtype))
+        keeps = self._options.keep_memory_on_reset and self._entries is not None
+        learnt = self._entries.get("memory") if keeps else None
+        if self._collection is not None and seed is not None:
+            self._collection.restart(seed)
+        fits = self._collection is not None and self._collection.fits()
+        if self._entries is None or fits:
+            rows = learnt = None
+            self._complete(observations, states)
+        fresh = self._loop.begin(states, self._spec, learnt)
+        if rows is None:
+            self._entries, self._states = fresh, states
+        else:
+            mask = torch.from_numpy(rows)
+            self._entries = torch.where(mask, fresh, self._entries)
+            self._states = torch.where(mask.unsqueeze(-1), states, self._states)
+        self._info = self._describe()
+
+    def _complete(self, observations: Any, states: Tensor) -> None:
+        """Build what depends on size and precision of the state."""
+        if self._observed_in is None and np.array_equal(observations, states.numpy()):
+            self._observed_in = _same
+        options, collection = self._options, self._collection
+        if self._observed_in is None and options.delay is not None and options.delay_compensation:
+            raise ConfigurationError(f"ActionFlowWrapper: delay={options.delay!r}: {UNKNOWN}")
+        size, count = states.shape[-1], self._actions.shape[0]
+        model = self._model if collection is None else collection.fitted
+        if model is None:
+            model = UnknownDynamics(Manifold(size), count)
+        elif not isinstance(model, DynamicsModel):
+            model = KnownDynamics(model, Manifold(size), count)
+        if states.dim() != 2 or size != model.state_size:
+            raise ConfigurationError(
+                f"ActionFlowWrapper: the state has {tuple(states.shape[1:])} numbers, that of the "
+                f"model {model.state_size}; say what it is by state=lambda env, observation: ..."
+            )
+        low, high = (torch.as_tensor(x).to(states) for x in (self._actions.low, self._actions.high))
+        self._spec = Bounded(low, high, low.shape, dtype=low.dtype)
+        self._loop = options.complete(model, self._spec)
+        if collection is not None and collection.fitted is None:
+            self._loop = collection.collecting(self._loop)
+        self._loop.corrector.to(states.dtype)
+
+    def _act(self, planned: Tensor) -> np.ndarray:
+        """Return what to execute instead of ``planned`` ``(N, A)``."""
+        if self._entries is None:
+            raise ResetNeeded("call reset() before step()")
+        # A policy knows no effects beyond the space, as a planner may: these are cut first.
+        space = self._spec.space
+        inside = planned.clamp(space.low.to(planned), space.high.to(planned))
+        planned = torch.where(planned.isfinite(), inside, planned).detach()
+        self._entries = self._loop.act(self._entries.get("memory"), planned, self._spec)
+        self._info = self._describe()
+        return self._info["executed"].astype(self._actions.dtype)
+
+    def _observe(self, observations: Any, over: np.ndarray) -> Any:
+        """Add what the actions led to; return what is shown. Episodes are ``over`` ``(N,)``."""
+        same_step, entries = self._mode is AutoresetMode.SAME_STEP, self._entries
+        fresh = over if same_step else self._over
+        states = self._states_in(observations)
+        states = states.to(precise(states.dtype))
+        # What led into a new episode is no transition.
+        reached = states.masked_fill(torch.from_numpy(fresh).unsqueeze(-1), torch.nan)
+        entries.set("memory", self._loop.observe(entries.get("memory"), reached))
+        self._states, info = states, self._info
+        if fresh.any():
+            self._begin(observations, states, fresh)
+            self._info = info
+        self._over = over & (self._mode is AutoresetMode.NEXT_STEP)
+        return self._shown(observations, None if same_step else over)
+
+    def _shown(self, observations: Any, over: np.ndarray | None = None) -> Any:
+        """Return the observations ``(N, ...)`` in the states in which the next actions act.
+
+        Not where episodes are ``over`` ``(N,)``. Completes what is told of the step.
+        """
+        memory, loop = self._entries.get("memory"), self._loop
+        if loop.delay_compensation:
+            states, steps = loop.arrival(memory)
+        else:
+            states, steps = self._states, loop.corrector.under_way(memory)[2] * loop.enabled
+        self._info |= {"delay": steps.numpy().copy(), "observation": observations}
+        rows = (steps > 0).numpy() & (True if over is None else ~over)
+        if not loop.delay_compensation or not rows.any():
+            return observations
+        if self._observed_in is None:
+            warnings.warn(f"ActionFlowWrapper: actions act late: {UNKNOWN}", stacklevel=3)
+            return observations
+        shown = np.array(observations)
+        shown[rows] = self._observed_in(states.numpy()[rows])
+        return shown
+
+    def _diagnosis(self, row: int) -> str:
+        """Say in words what the pairs that an environment remembers show of its actuators."""
+        from afm_rl.diagnosis.live import describe
+
+        if self._entries is None:
+            return describe(None, self._names)
+        memory, corrector = self._entries.get("memory")[row], self._loop.corrector
+        delay, pairs = int(corrector.under_way(memory)[2]), None
+        changed = delay > corrector.delay or bool(self._entries.get("misaligned")[row])
+        if changed and isinstance(corrector, PairCorrector):
+            size = 3 * len(self._names)
+            rows = corrector.unpack(memory, self._states.shape[-1])["pairs"]
+            pairs = rows[rows[:, size] > 0, :size].numpy()
+        how: Any = {"delay": delay, "known": corrector.delay}
+        how["compensated"] = self._loop.delay_compensation and self._observed_in is not None
+        how["compensated"] &= self._loop.enabled
+        return describe(pairs, self._names, getattr(self._loop.model, "dt", 1.0), **how)
+
+    def _describe(self) -> dict[str, Any]:
+        """Return what is known of the newest step, ``(N, ...)`` each."""
+        info: Any = {name: self._entries.get(key).numpy().copy() for name, key in SHOWN.items()}
+        info["corrects"] &= self._loop.enabled
+        if self._collection is not None:
+            info["learned"] = np.full(len(info["corrects"]), self._collection.fitted is not None)
+        if self._options.belief:
+            belief = self._entries.get("belief").numpy()
+            causes = self._loop.corrector.causes
+            info["belief"] = dict(zip(causes, belief.swapaxes(0, 1), strict=True))
+        return info
+
+    def _states_in(self, observations: Any) -> Tensor:
+        """Return the states ``(N, S)``."""
+        states, shape = self._state_of(self.env, observations), self._state_shape
+        return as_numbers("observations", states, shape and (self.env.num_envs, *shape))
+
+    @property
+    def _state_shape(self) -> tuple[int, ...] | None:
+        """Shape of one state, once it is known."""
+        return None if self._entries is None else tuple(self._states.shape[1:])
+
+
+class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs):
     r"""Corrects the actions of whatever policy acts in a gymnasium environment.
 
     The policy's action is the planned one. While the model explains what happens, it is executed
     as it is, brought into the action space; when it does not, the corrector's answer is. Seeds,
-    rewards, ends and observations are the environment's own.
+    rewards, ends and observations are the environment's own. It is a view of the
+    :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``, ``enabled``,
+    ``delay_compensation``, ``delay``, ``belief`` and ``keep_memory_on_reset``.
 
     ``info["afm"]`` has, after each step, ``planned``, ``executed`` and ``predicted`` ``(A,)``, the
     last being the effect that the executed action is expected to have; ``corrects``, whether the
     planned action was replaced by the corrector's; the ``innovation``, in standard deviations of
-    the model; the ``noise`` ``(A,)`` of the effects that was learnt; and the ``delay``, in how many
-    steps the next action will act, known and found: who follows a clock looks as far ahead. With
-    ``enabled=False`` it is 0. :attr:`diagnosis` says in words what the actuators seem to do.
+    the model; the ``noise`` ``(A,)`` of the effects that was learnt; the ``observation`` that was
+    measured; and the ``delay``, in how many steps the next action will act, known and found: who
+    follows a clock looks as far ahead. With ``enabled=False`` it is 0. With ``belief=True`` there is
+    the ``belief``, how probable ``(A,)`` each cause is, by name, such as ``"nothing has changed"``
+    or ``"2 steps late"``. :attr:`diagnosis` says in words what the actuators seem to do.
 
     What the model takes for the state is, with ``"mujoco"`` or a
     :class:`~afm_rl.dynamics.MuJoCoDynamics`, the whole state of the environment's simulation, else
@@ -42,27 +287,16 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         env: with a vector of real numbers between finite bounds as action.
         model: ``"mujoco"``, the environment's own model as it is now, with its frame skip; a
             step function ``step(state, action) -> next_state`` in torch, batched; any
-            :class:`~afm_rl.dynamics.DynamicsModel`; or ``"learn"``, which watches healthy steps and
-            fits an ensemble between two episodes, see
-            :class:`~afm_rl.learning.watching.Watching`, of which one with other settings can be
-            given. Then ``info["afm"]["learned"]`` says whether there is a model yet, and
-            :attr:`watching` how many steps were watched and how good it is.
+            :class:`~afm_rl.dynamics.DynamicsModel`; or ``"learn"``, which collects healthy steps
+            and fits an ensemble between two episodes, see
+            :class:`~afm_rl.transforms.collect_then_fit.CollectThenFit`, of which one with other
+            settings can be given. Then ``info["afm"]["learned"]`` says whether there is a model
+            yet, and :attr:`collection` how many steps there are and how good the model is.
         state: ``state(env, observation)`` returns the state ``(S,)`` that the model knows.
-        corrector: the correction, owned; None: the universal
-            :class:`~afm_rl.correction.ActionFlow` for the action space.
-        enabled: False to watch only.
-        late: what the policy is shown while commands act late: ``"predict"``, the observation in
-            the state in which its next command will act; ``"leave"``, what was measured. That is in
-            ``info["afm"]["observation"]`` in any case. Rewards and ends stay the environment's own.
+        corrector: an option of the loop, as those that follow and are not named here.
         observe: ``observe(states)`` returns what is observed in states ``(N, S)``, arrays both;
             None: the states, if they are what is observed at the first reset, or what a gymnasium
             task with MuJoCo observes in them.
-        delay: steps from a command to its effect that are known, one number or one per actuator:
-            used from the first step on. What comes on top of it is found out.
-        belief: have ``info["afm"]["belief"]``, too: how probable ``(A,)`` each cause is, by name,
-            such as ``"nothing has changed"`` or ``"2 steps late"``.
-        keep_memory_on_reset: go on with what was learnt in the episodes before, as where a fault
-            outlasts them; else each episode begins with an empty memory.
 
     Raises:
         ConfigurationError: for spaces or a model that cannot be used, or do not fit each other;
@@ -72,76 +306,35 @@ class ActionFlowWrapper(gymnasium.Wrapper, RecordConstructorArgs):
     >>> env.reset(seed=0)[1]["afm"]["learned"]
     False
     >>> _, _, _, _, info = env.step(np.zeros(1, dtype=np.float32))
-    >>> info["afm"]["corrects"], env.watching.count
+    >>> info["afm"]["corrects"], env.collection.count
     (False, 1)
     """
-
-    def __init__(
-        self,
-        env: gymnasium.Env,
-        model: Model = "mujoco",
-        state: State | None = None,
-        corrector: Corrector | None = None,
-        enabled: bool = True,
-        late: str = "predict",
-        observe: Observe | None = None,
-        delay: int | Sequence[int] | None = None,
-        belief: bool = False,
-        keep_memory_on_reset: bool = False,
-    ) -> None:
-        given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
-        given |= {"late": late, "observe": observe, "delay": delay, "belief": belief}
-        given |= {"keep_memory_on_reset": keep_memory_on_reset}
-        RecordConstructorArgs.__init__(self, **given)
-        gymnasium.Wrapper.__init__(self, env)
-        inner: Any = env.unwrapped
-        spaces = env.observation_space, env.action_space
-        self._loop = CorrectionLoop(*spaces, source=env, **given)
-        simulated = isinstance(self._loop.model, MuJoCoDynamics)
-        if simulated and hasattr(inner, "data") and env.action_space != inner.action_space:
-            raise ConfigurationError(
-                f"ActionFlowWrapper: actions of {env} are others than those of its simulation; "
-                "put the wrapper inside of those that change actions"
-            )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Begin an episode, with an empty memory or what was learnt."""
         observation, info = self.env.reset(seed=seed, options=options)
-        measured = np.asarray(observation)[None]
-        self._loop.begin(self._state(observation), seed=seed, observations=measured)
-        shown = self._loop.at_arrival(measured)[0]
-        return shown, {**info, "afm": self._told(observation)}
+        self._begin([observation], self._states_in([observation]), seed=seed)
+        (shown,) = self._shown([observation])
+        return shown, {**info, "afm": _first(self._info)}
 
     def step(self, action: Any):
         """Execute the corrected action."""
-        planned = as_numbers("action", action, self.action_space.shape)
-        executed = self._loop.act(planned[None])[0]
+        (executed,) = self._act(as_numbers("action", action, self.action_space.shape)[None])
         observation, reward, terminated, truncated, info = self.env.step(executed)
-        self._loop.observe(self._state(observation))
-        over = np.array([terminated or truncated])
-        shown = self._loop.at_arrival(np.asarray(observation)[None], over)[0]
-        info = {**info, "afm": self._told(observation)}
-        return shown, reward, terminated, truncated, info
-
-    @property
-    def watching(self) -> Watching | None:
-        """What has been learned, with ``model="learn"``."""
-        return self._loop.watching
+        (shown,) = self._observe([observation], np.array([terminated or truncated]))
+        return shown, reward, terminated, truncated, {**info, "afm": _first(self._info)}
 
     @property
     def diagnosis(self) -> str:
         """What the actuators seem to do, in words; takes some milliseconds."""
-        return self._loop.diagnosis(0)
+        return self._diagnosis(0)
 
-    def _state(self, observation: Any) -> Tensor:
-        state = self._loop.state(self.env, observation)
-        return as_numbers("observation", state, self._loop.state_shape)[None]
-
-    def _told(self, observation: Any) -> dict[str, Any]:
-        return {**_first(self._loop.told), "observation": observation}
+    def _states_in(self, observations: Any) -> Tensor:
+        state = self._state_of(self.env, observations[0])
+        return as_numbers("observation", state, self._state_shape)[None]
 
 
-class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
+class ActionFlowVectorWrapper(GymnasiumShell, VectorWrapper, RecordConstructorArgs):
     """Corrects the actions of a policy in a vector of gymnasium environments.
 
     As :class:`ActionFlowWrapper`, with arrays ``(N, ...)``, each environment with a memory of its
@@ -158,75 +351,36 @@ class ActionFlowVectorWrapper(VectorWrapper, RecordConstructorArgs):
     [False, False]
     """
 
-    def __init__(
-        self,
-        env: VectorEnv,
-        model: Model = "mujoco",
-        state: State | None = None,
-        corrector: Corrector | None = None,
-        enabled: bool = True,
-        late: str = "predict",
-        observe: Observe | None = None,
-        delay: int | Sequence[int] | None = None,
-        belief: bool = False,
-        keep_memory_on_reset: bool = False,
-    ) -> None:
-        given: Any = {"model": model, "state": state, "corrector": corrector, "enabled": enabled}
-        given |= {"late": late, "observe": observe, "delay": delay, "belief": belief}
-        given |= {"keep_memory_on_reset": keep_memory_on_reset}
-        RecordConstructorArgs.__init__(self, **given)
-        VectorWrapper.__init__(self, env)
-        spaces = env.single_observation_space, env.single_action_space
-        self._loop = CorrectionLoop(*spaces, source=env, **given)
-        self._mode = autoreset_mode_of(env)
-        self._over = np.zeros(env.num_envs, dtype=bool)
-
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None):
         """Begin episodes, only those in ``options["reset_mask"]`` if it is given."""
         rows = (options or {}).get("reset_mask")
         rows = np.ones(self.env.num_envs, dtype=bool) if rows is None else rows.copy()
         observations, infos = self.env.reset(seed=seed, options=options)
         first = seed[0] if isinstance(seed, list | tuple) else seed
-        self._loop.begin(self._states(observations), rows, first, observations)
+        self._begin(observations, self._states_in(observations), rows, first)
         self._over &= ~rows
-        shown = self._loop.at_arrival(observations)
-        return shown, {**infos, "afm": self._told(observations), "_afm": rows}
+        shown = self._shown(observations)
+        return shown, {**infos, "afm": self._info, "_afm": rows}
 
     def step(self, actions: Any):
         """Execute the corrected actions."""
-        executed = self._loop.act(as_numbers("actions", actions, self.action_space.shape))
+        executed = self._act(as_numbers("actions", actions, self.action_space.shape))
         observations, rewards, terminated, truncated, infos = self.env.step(executed)
         made, over = ~self._over, np.asarray(terminated) | np.asarray(truncated)
-        same = self._mode is AutoresetMode.SAME_STEP
-        self._loop.observe(self._states(observations), over if same else self._over)
-        self._over = over & (self._mode is AutoresetMode.NEXT_STEP)
-        shown = self._loop.at_arrival(observations, None if same else over)
-        infos = {**infos, "afm": self._told(observations), "_afm": made}
-        return shown, rewards, terminated, truncated, infos
-
-    @property
-    def watching(self) -> Watching | None:
-        """What has been learned, with ``model="learn"``."""
-        return self._loop.watching
+        shown = self._observe(observations, over)
+        return shown, rewards, terminated, truncated, {**infos, "afm": self._info, "_afm": made}
 
     @property
     def diagnosis(self) -> list[str]:
         """What the actuators of each environment seem to do, in words."""
-        return [self._loop.diagnosis(row) for row in range(self.num_envs)]
-
-    def _told(self, observations: Any) -> dict[str, Any]:
-        return {**self._loop.told, "observation": observations}
-
-    def _states(self, observations: Any) -> Tensor:
-        states, shape = self._loop.state(self.env, observations), self._loop.state_shape
-        return as_numbers("observations", states, shape and (self.num_envs, *shape))
+        return [self._diagnosis(row) for row in range(self.num_envs)]
 
 
-def _first(told: Any) -> Any:
-    """Return what is told of the first environment."""
-    if isinstance(told, dict):
-        return {name: _first(value) for name, value in told.items()}
-    return told[0].item() if isinstance(told[0], np.generic) else told[0]
+def _first(info: Any) -> Any:
+    """Return what is said of the first environment."""
+    if isinstance(info, dict):
+        return {name: _first(value) for name, value in info.items()}
+    return info[0].item() if isinstance(info[0], np.generic) else info[0]
 
 
 def autoreset_mode_of(env: VectorEnv) -> AutoresetMode:
@@ -247,3 +401,77 @@ def autoreset_mode_of(env: VectorEnv) -> AutoresetMode:
         f"ActionFlowVectorWrapper: {env}: metadata['autoreset_mode']={given!r}: expected one of "
         f"{', '.join(map(str, AutoresetMode))}; set it to what the vector does"
     )
+
+
+def _is(model: Any, name: str) -> bool:
+    return isinstance(model, str) and model == name
+
+
+def _collection(model: Model) -> CollectThenFit | None:
+    """Return what collects data and fits a model, if there is none yet."""
+    if callable(model) or isinstance(model, str) and model != "learn":
+        return None
+    from afm_rl.transforms.collect_then_fit import CollectThenFit
+
+    if isinstance(model, CollectThenFit):
+        return deepcopy(model)
+    return CollectThenFit() if isinstance(model, str) else None
+
+
+def as_numbers(name: str, given: Any, shape: Sequence[int] | None) -> Tensor:
+    """Return real numbers of a shape (None: of any) as a tensor, a copy.
+
+    Raises:
+        ConfigurationError: for anything else, naming what was given and what was expected.
+
+    >>> as_numbers("action", [1, 0.5], (2,))
+    tensor([1.0000, 0.5000], dtype=torch.float64)
+    """
+    if isinstance(given, Tensor) and given.dtype is torch.bfloat16:  # which numpy does not know
+        given = given.float()
+    try:
+        numbers = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given)
+    except ValueError:  # lists of several lengths
+        numbers = np.asarray(None)
+    found: Any = torch.tensor(numbers) if numbers.dtype.kind in "iufcb" else given
+    fault = fault_of(found, np.shape(numbers) if shape is None else shape)
+    if fault:
+        raise ConfigurationError(f"ActionFlowWrapper: {name}: {fault}")
+    return found if found.is_floating_point() else found.to(torch.get_default_dtype())
+
+
+def _observed(env: Any, observation: Any) -> Any:
+    return observation
+
+
+def _same(states: np.ndarray) -> np.ndarray:
+    return states
+
+
+def _observed_in(simulation: Simulation, states: np.ndarray) -> np.ndarray:
+    return simulation.observe(states)["observation"]
+
+
+def _env_state(env: Any, observation: Any) -> np.ndarray:
+    """Return positions, velocities and activations of a simulation."""
+    data = env.unwrapped.data
+    return np.concatenate([data.qpos, data.qvel, data.act])
+
+
+def _vector_state(env: Any, observations: Any) -> np.ndarray:
+    """Return positions and velocities of each simulation."""
+    return np.stack(env.unwrapped.call("state_vector"))
+
+
+def _simulation(source: Any) -> MuJoCoDynamics:
+    """Return the MuJoCo model of an environment, or of the first of a vector of them."""
+    try:
+        inner: Any = source.unwrapped
+        if not isinstance(source, VectorEnv):
+            return MuJoCoDynamics(inner)
+        return MuJoCoDynamics(inner.get_attr("model")[0], inner.get_attr("frame_skip")[0])
+    except (ConfigurationError, AttributeError) as error:
+        raise ConfigurationError(
+            f"ActionFlowWrapper: model='mujoco', but {source} has no MuJoCo model ({error}); give "
+            "a step function, a DynamicsModel, or 'learn'"
+        ) from error

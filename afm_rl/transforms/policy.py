@@ -12,49 +12,36 @@ from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 
 from afm_rl.compiling.devices import moved
 from afm_rl.correction import Corrector
-from afm_rl.correction.delay import arrival
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.errors import ConfigurationError, check_flag, check_instance
+from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.planning.receding import ZeroPrimer
 from afm_rl.spaces.keys import as_key
-from afm_rl.transforms.carried import check_free
-from afm_rl.transforms.memory import (
-    begin,
-    correct,
-    corrector_for,
-    entries_spec,
-    observe,
-    precise,
-    warn_of_old,
-)
+from afm_rl.transforms.delay_compensation import Arrival
+from afm_rl.transforms.loop import CorrectionLoop, Shell, precise, warn_of_old
+from afm_rl.transforms.stateful import check_free
 
 
-class ActionFlowPolicy(TensorDictModuleBase):
+class ActionFlowPolicy(Shell, TensorDictModuleBase):
     """The correction of :class:`~afm_rl.transforms.ActionFlowTransform` as the end of a policy.
 
     Put it after a planner in a ``TensorDictSequential``: a state goes in, the action to execute
-    comes out under ``action_key``, as a robot wants it that is no environment. Under ``prefix`` are
-    the entries that the transform has, and ``"_memory"`` ``(*B, P)``, which collectors leave out;
-    the next ones go to ``("next", prefix)``, as planners have it. Prime the first tensordict with
-    :meth:`make_tensordict_primer` (or append that to an environment), and carry ``"next"`` on
-    (``step_mdp`` does). Actions are the same as the transform's.
+    comes out under ``action_key``, as a robot wants it that is no environment. It is a view of the
+    :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``, ``enabled``,
+    ``extend_action_box``, ``delay`` and ``keep_memory_on_reset``. Under ``prefix`` are its entries,
+    with the memory as ``"_memory"``, which collectors leave out; the next ones go to ``("next",
+    prefix)``, as planners have it. Prime the first tensordict with :meth:`make_tensordict_primer`
+    (or append that to an environment), which keeps what was learnt of the last step, or of the
+    tensordict that it is given; and carry ``"next"`` on (``step_mdp`` does). Actions are the same
+    as the transform's.
 
     Args:
         model: dynamics model, shared with the planner (it does not become part of the state dict).
         action_spec: actions that the robot takes, such as ``env.action_spec``; without batch
             dimensions.
-        corrector: the correction, owned; None: the universal
-            :class:`~afm_rl.correction.ActionFlow` for the spec's action box.
+        corrector: an option of the loop, as those that follow and are not named here.
         observation_key: the state.
         action_key: where the planned action is, and the executed one goes.
-        prefix: where the entries are kept.
-        enabled: False to watch only.
-        extend_action_box: let planners know of effects beyond the action box, if the model can
-            predict them.
-        delay: steps from an action to its effect that are known, one number or one per axis.
-        keep_memory_on_reset: go on with what was learnt in the episodes before, see
-            :class:`~afm_rl.transforms.ActionFlowTransform`: the primer keeps it of the last step,
-            or of the tensordict that it is given.
+        prefix: where the entries are.
 
     Raises:
         ConfigurationError: for parts that do not fit each other.
@@ -89,19 +76,24 @@ class ActionFlowPolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.action_spec = check_instance("policy.action_spec", action_spec, Bounded)
-        self.corrector = corrector_for("policy", model, corrector, action_spec, delay)
+        loop = CorrectionLoop(
+            "policy",
+            model,
+            corrector,
+            enabled=enabled,
+            delay=delay,
+            keep_memory_on_reset=keep_memory_on_reset,
+            extend_action_box=extend_action_box,
+        )
+        self._loop = loop.complete(action_spec=action_spec)
+        self.corrector = self._loop.corrector  # registered here; the model is not
         if action_spec.shape != (self.corrector.action_size,):
             raise ConfigurationError(
                 f"policy.action_spec: of the shape {tuple(action_spec.shape)}, expected "
                 f"({self.corrector.action_size},), as corrector and model have it"
             )
-        self.__dict__["model"] = model  # shared with the planner, so not registered
         self.observation_key, self.action_key = as_key(observation_key), as_key(action_key)
         self.prefix = as_key(prefix)
-        self.enabled = check_flag("policy.enabled", enabled)
-        self.extend_action_box = check_flag("policy.extend_action_box", extend_action_box)
-        keep = check_flag("policy.keep_memory_on_reset", keep_memory_on_reset)
-        self.keep_memory_on_reset = keep
         kept = [unravel_key((self.prefix, name)) for name in self._spec.keys(True, True)]
         self.in_keys = [self.observation_key, self.action_key, self.memory_key]
         self.out_keys = [self.action_key, *(unravel_key(("next", key)) for key in kept)]
@@ -119,27 +111,27 @@ class ActionFlowPolicy(TensorDictModuleBase):
     @property
     def _spec(self) -> Composite:
         dtype = self.action_spec.dtype
-        spec = entries_spec(self.corrector, torch.Size(), dtype)
+        spec = self.loop.spec(torch.Size(), dtype)
         size = self.corrector.memory_size(self.model.state_size)
         spec["_memory"] = Unbounded((size,), dtype=precise(dtype))
         return spec
 
     def arrival(self) -> Arrival:
-        """Return the module that tells a planner in which state its action will act."""
+        """Return the module that writes in which state the planned action will act."""
         return Arrival(self)
 
     def make_tensordict_primer(self) -> MemoryPrimer:
         """Return the transform that puts an empty memory into a tensordict, or every reset."""
         return MemoryPrimer(self)
 
-    def empty(self, batch: torch.Size, before: Tensor | None = None) -> TensorDictBase:
+    def empty(self, batch: torch.Size, learnt: Tensor | None = None) -> TensorDictBase:
         """Return the entries of missions whose state has not been seen: it is NaN.
 
-        With what was learnt in a memory ``(*B, P)`` ``before``, if one is given.
+        With what was learnt in a memory ``(*B, P)``, if one is given.
         """
         size, space = (*batch, self.model.state_size), self.action_spec.space
         nowhere = torch.full(size, torch.nan, dtype=space.low.dtype, device=space.low.device)
-        entries = begin(self.corrector, nowhere, self.action_spec, before)
+        entries = self.loop.begin(nowhere, self.action_spec, learnt)
         return entries.rename_key_("memory", "_memory")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -151,49 +143,13 @@ class ActionFlowPolicy(TensorDictModuleBase):
                 "make_tensordict_primer() to the first one, and carry the entries of 'next' on"
             )
         warn_of_old(tensordict, self.prefix)
-        planned = tensordict.get(self.action_key, None)
         state = tensordict.get(self.observation_key, None)
-        entries = correct(
-            observe(memory, state, self.model, self.corrector, self.observation_key),
-            planned,
-            self.model,
-            self.corrector,
-            self.action_spec,
-            self.enabled,
-            self.extend_action_box,
-            self.action_key,
-        )
+        memory = self.loop.observe(memory, state, self.observation_key)
+        planned = tensordict.get(self.action_key, None)
+        entries = self.loop.act(memory, planned, self.action_spec, self.action_key)
         entries.rename_key_("memory", "_memory")
         tensordict.set(unravel_key(("next", self.prefix)), entries)
         return tensordict.set(self.action_key, entries.get("executed_action"))
-
-
-class Arrival(TensorDictModuleBase):
-    """Writes the state in which the next action will act to ``(prefix, "arrival")``.
-
-    And in how many steps that will be to ``(prefix, "delay")`` ``(*B)``.
-
-    Put it before the planner, which reads that: ``PlanningEnv(..., observation_key=("afm",
-    "arrival"))``.
-
-    Args:
-        policy: the correction after the planner, whose memory it reads.
-    """
-
-    def __init__(self, policy: ActionFlowPolicy) -> None:
-        super().__init__()
-        self.__dict__["policy"] = policy  # shared, so not registered
-        self.in_keys = [policy.observation_key, policy.memory_key]
-        self.out_keys = [unravel_key((policy.prefix, name)) for name in ("arrival", "delay")]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Look at the state, and roll the model to where the next action will act."""
-        policy, (key, kept) = self.policy, self.in_keys
-        state, model = tensordict.get(key, None), policy.model
-        memory = observe(tensordict.get(kept), state, model, policy.corrector, key)
-        there, steps = arrival(policy.corrector, memory, model)
-        there_key, delay_key = self.out_keys
-        return tensordict.set(there_key, there.to(state.dtype)).set(delay_key, steps)
 
 
 class MemoryPrimer(ZeroPrimer):
@@ -207,7 +163,7 @@ class MemoryPrimer(ZeroPrimer):
         spec = policy._spec.to(policy.action_spec.device)
         super().__init__(Composite({policy.prefix: spec}))
         self.__dict__["policy"] = policy  # shared, so not registered
-        self._last: Tensor | None = None  # the memory of the last step, which a reset is not told
+        self._last: Tensor | None = None  # the memory of the last step, which a reset does not have
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         check_free("ActionFlowPolicy", self.policy.prefix, observation_spec)
@@ -216,10 +172,10 @@ class MemoryPrimer(ZeroPrimer):
     def _reset_func(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        before = None
+        learnt = None
         if self.policy.keep_memory_on_reset:
-            before = tensordict.get(self.policy.memory_key, self._last)
-        entries = self.policy.empty(tensordict_reset.batch_size, before)
+            learnt = tensordict.get(self.policy.memory_key, self._last)
+        entries = self.policy.empty(tensordict_reset.batch_size, learnt)
         return tensordict_reset.set(self.policy.prefix, entries)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -12,10 +12,10 @@ from torchrl.data import Composite, Unbounded
 from afm_rl.errors import ConfigurationError, check_flag
 from afm_rl.regimes import Regime, Schedule, phase_parameters, shifted
 from afm_rl.streams import Streams
-from afm_rl.transforms.carried import CarriedTransform
+from afm_rl.transforms.stateful import StatefulTransform
 
 
-class RegimeTransform(CarriedTransform):
+class RegimeTransform(StatefulTransform):
     r"""Change the dynamics of any environment: it receives the effects of actions.
 
     .. math:: a_\mathrm{eff} = \mathrm{clip}(g(a_t;\, \rho_k,\, s_t))

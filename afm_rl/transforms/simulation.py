@@ -29,7 +29,7 @@ from torchrl.envs import (
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.dynamics.mujoco_model import read_model
 from afm_rl.errors import ConfigurationError
-from afm_rl.transforms.carried import CarriedTransform
+from afm_rl.transforms.stateful import StatefulTransform
 
 SIMULATOR_STATE = "simulator_state"
 """The key of a simulation's whole state: positions, velocities and activations."""
@@ -120,7 +120,7 @@ class Simulation:
         else:
             space = getattr(env, "single_observation_space", env.observation_space)
             shapes = {"observation": space.shape}
-        harmless = DTypeCastTransform, CarriedTransform
+        harmless = DTypeCastTransform, StatefulTransform
         changes = [t for t in self._transforms if not isinstance(t, harmless)]
         changed = {key for t in changes for key in (*t.in_keys, *t.out_keys)}
         found = {key: value.shape[1:] for key, value in self.observe(self._state[None]).items()}

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from afm_rl import ActionFlowVectorWrapper
 from afm_rl.correction import L1Augmentation, LeastSquares
-from afm_rl.learning.watching import Watching
+from afm_rl.transforms.collect_then_fit import CollectThenFit
 
 Acting = Callable[[np.ndarray], np.ndarray]
-WATCHED = 24  # healthy environments that a model is learned from, side by side
+COLLECTING = 24  # healthy environments that a model is learned from, side by side
 
 
 def alone(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
@@ -44,18 +44,18 @@ def afm(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
 @cache
 def learned(task: Task) -> tuple[Any, Any]:
     """Return an ensemble that is fitted to healthy episodes of a policy, and its corrector."""
-    healthy = ActionFlowVectorWrapper(task.vector(WATCHED), Watching())
-    observations, infos = healthy.reset(seed=list(range(10_000, 10_000 + WATCHED)))
+    healthy = ActionFlowVectorWrapper(task.vector(COLLECTING), CollectThenFit())
+    observations, infos = healthy.reset(seed=list(range(10_000, 10_000 + COLLECTING)))
     while not infos["afm"]["learned"].all():
         for _ in range(task.steps):
             observations = healthy.step(task.act(observations))[0]
         observations, infos = healthy.reset()
     healthy.close()
-    return healthy.watching.fitted, healthy._loop.corrector
+    return healthy.collection.fitted, healthy._loop.corrector
 
 
 def afm_learned(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
-    """The same over a model that was learned from watching."""
+    """The same over a model that was fitted to healthy steps."""
     model, corrector = learned(task)
     return ActionFlowVectorWrapper(envs, model, corrector=corrector), task.act
 

@@ -1,9 +1,9 @@
-"""A model learned from healthy steps that were watched."""
+"""A model that is fitted to healthy steps, which are collected first."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,27 +11,29 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from afm_rl.dynamics import Ensemble
+from afm_rl.correction import Correction, Corrector
+from afm_rl.dynamics import DynamicsModel, Ensemble
 from afm_rl.errors import check_count, check_number
 from afm_rl.learning.fitting import FitReport, fit_ensemble
 from afm_rl.spaces.manifold import Manifold
+from afm_rl.transforms.loop import CorrectionLoop
 
 
 @dataclass
-class Watching:
+class CollectThenFit:
     r"""Learns an :class:`~afm_rl.dynamics.Ensemble` from transitions of a healthy robot.
 
-    After ``transitions`` of them it is fitted, at the next :meth:`fit`. It is good enough when
+    After ``transitions`` of them it is fitted, when the next episode begins. It is good enough when
     its held-out error, root mean square in standard deviations of the data, is at most ``error``;
     if not, twice as many transitions are waited for.
 
-    A policy's action is a function of the state, so that its own data do not tell what another
-    action would have done. While it watches, normal noise on the executed action does. Every robot
-    has a standard deviation of its own, drawn anew between 0 and ``noise`` every ``hold`` steps: so
-    the model knows the policy's own motion well, and also what is around it.
+    A policy's action is a function of the state, so that its own data do not show what another
+    action would have done. Normal noise on the executed action does. Every robot has a standard
+    deviation of its own, drawn anew between 0 and ``noise`` every ``hold`` steps: so the model
+    knows the policy's own motion well, and also what is around it.
 
     Args:
-        transitions: watched before the first fit.
+        transitions: collected before the first fit.
         error: largest held-out error of a model that is used.
         noise: largest standard deviation, in half ranges of the action box; 0 leaves actions as
             they are.
@@ -44,11 +46,11 @@ class Watching:
     Raises:
         ConfigurationError: for numbers that cannot be used.
 
-    >>> watching = Watching(transitions=300, model={"hidden": [16], "members": 2})
+    >>> collection = CollectThenFit(transitions=300, model={"hidden": [16], "members": 2})
     >>> state, action = torch.randn(300, 1, 2), torch.randn(300, 1, 1)
     >>> for s, a in zip(state, action, strict=True):
-    ...     watching.add(s, a, s + 0.5 * a, torch.tensor([True]))
-    >>> watching.due
+    ...     collection.add(s, a, s + 0.5 * a)
+    >>> collection.due
     True
     """
 
@@ -80,7 +82,7 @@ class Watching:
 
     @property
     def count(self) -> int:
-        """Number of transitions that were watched."""
+        """Number of transitions that were collected."""
         return sum(map(len, self._seen))
 
     @property
@@ -88,15 +90,15 @@ class Watching:
         """Are there enough transitions for the next fit?"""
         return self.fitted is None and self.count >= self.needed
 
-    def add(self, state: Tensor, action: Tensor, next_state: Tensor, valid: Tensor) -> None:
-        """Remember a transition of each of N robots: ``(N, S)``, ``(N, A)``, ``(N,)``."""
+    def add(self, state: Tensor, action: Tensor, next_state: Tensor) -> None:
+        """Remember a transition of each of N robots: ``(N, S)``, ``(N, A)``; not what is NaN."""
         if not self._seen:
             self._seen = [[] for _ in range(len(state))]
             self._sizes = state.shape[-1], action.shape[-1]
         rows = torch.cat([state, action, next_state], -1)
-        for mine, row, whole in zip(self._seen, rows, valid & rows.isfinite().all(-1), strict=True):
+        for own, row, whole in zip(self._seen, rows, rows.isfinite().all(-1), strict=True):
             if bool(whole):
-                mine.append(row)
+                own.append(row)
 
     def restart(self, seed: int) -> None:
         """Draw the noise of actions from ``seed`` on."""
@@ -109,10 +111,22 @@ class Watching:
         self._steps += 1
         return torch.from_numpy(self._level * self._random.standard_normal(shape))
 
+    def collecting(self, loop: CorrectionLoop) -> CorrectionLoop:
+        """Return the loop that collects, for the time before there is a model."""
+        corrector = Excitation(loop.corrector, self)
+        return replace(loop, corrector=corrector, enabled=True, delay_compensation=False)
+
+    def fits(self) -> bool:
+        """Fit a model if there is enough for it; is it good enough?"""
+        if self.due:
+            self.learn()
+            return self.fitted is not None
+        return False
+
     def learn(self) -> FitReport:
-        """Fit a model to all that was watched; :attr:`fitted` is set if it is good enough."""
+        """Fit a model to all that was collected; :attr:`fitted` is set if it is good enough."""
         states, actions = self._sizes
-        rows = torch.stack([row for mine in self._seen for row in mine])
+        rows = torch.stack([row for own in self._seen for row in own])
         manifold = Manifold(states) if self.manifold is None else self.manifold
         features, settings = list(range(states)), {"seed": self.seed, **self.model}
         model = Ensemble(manifold, actions, features, **settings)
@@ -126,3 +140,38 @@ class Watching:
         else:
             self.needed = 2 * self.count
         return self.report
+
+
+class Excitation(Corrector):
+    """Adds noise to actions, and hands transitions on to a collection.
+
+    Args:
+        corrector: that comes afterwards, whose belief is that of a beginning until then.
+        collection: where noise comes from and transitions go.
+    """
+
+    def __init__(self, corrector: Any, collection: CollectThenFit) -> None:
+        ends = (corrector.denormalise(end) for end in (corrector.lowest, corrector.highest))
+        super().__init__(*ends, recent=1, delay=corrector.delay)
+        self.corrector, self.collection = corrector, collection
+        self.causes = getattr(corrector, "causes", ())
+
+    def observe(self, memory: Tensor, next_state: Tensor) -> Tensor:
+        """Collect the transition, too."""
+        state, _, executed = self.latest(memory)
+        self.collection.add(state, executed, next_state)
+        return super().observe(memory, next_state)
+
+    def correct(
+        self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
+    ) -> tuple[Tensor, Correction]:
+        """Return the planned action with noise, in the box."""
+        low, high = box.unbind(-2)
+        noise = self.collection.excitation(planned.shape).to(planned)
+        noisy = (planned + noise * (high - low) / 2).clamp(low, high)
+        answer = self.unchanged(planned, torch.zeros_like(planned[..., 0]), box)
+        return memory, answer._replace(executed=noisy, predicted=noisy)
+
+    def belief_in(self, memory: Tensor) -> Tensor:
+        """Return the belief of a beginning."""
+        return self.corrector.belief_in(self.corrector.begin(self.latest(memory)[0]))

@@ -1,4 +1,4 @@
-"""A transform whose memory is carried in the tensordict."""
+"""A transform whose state is carried in the tensordict."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.keys import as_key
 
 
-class CarriedTransform(Transform, ABC):
+class StatefulTransform(Transform, ABC):
     """Stands between policy and environment, and remembers under ``prefix``.
 
     Each environment of a batch has a memory of its own, and resets, branches and resumed rollouts

@@ -1,0 +1,82 @@
+"""Compensation of delays: policy or planner acts for the state in which its action will act.
+
+An action that acts late cannot be undone by another one. But who acts can be asked about the state
+in which the action will act (Smith 1957, Chem. Eng. Progress 53): the model is rolled through the
+effects of the actions that are still under way.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from afm_rl.compiling.tracing import all_hold, may_look
+from afm_rl.correction import Corrector
+from afm_rl.dynamics import DynamicsModel
+
+if TYPE_CHECKING:
+    from afm_rl.transforms.policy import ActionFlowPolicy
+
+UNKNOWN = (
+    "what is observed in the state in which they act is not known; {}, or delay_compensation=False"
+)
+
+
+@torch.no_grad()
+def state_at_arrival(
+    corrector: Corrector, memory: Tensor, model: DynamicsModel
+) -> tuple[Tensor, Tensor]:
+    """Return the state ``(*B, S)`` in which the next action will act, and in how many steps.
+
+    The present state and 0 where no action is late, or where the model leads to no number.
+
+    Args:
+        corrector: whose memory it is.
+        memory: up to the present state, ``(*B, P)``.
+        model: the dynamics model as it is now.
+    """
+    state, effects, steps = corrector.under_way(memory)
+    if not effects.shape[-2] or all_hold(steps == 0):
+        return state, steps
+    most = int(steps.max()) if may_look(steps) else effects.shape[-2]
+    # Every mission's actions under way, the oldest first; what follows them is not looked at.
+    ages = effects.shape[-2] - steps.unsqueeze(-1) + torch.arange(most, device=steps.device)
+    ages = ages.clamp_max(effects.shape[-2] - 1).unsqueeze(-1)
+    plan = effects.gather(-2, ages.expand(*ages.shape[:-1], effects.shape[-1]))
+    states = model.rollout(state, plan.unsqueeze(-3)).squeeze(-3)
+    last = (steps - 1).clamp_min(0)[..., None, None].expand(*steps.shape, 1, state.shape[-1])
+    reached = states.gather(-2, last).squeeze(-2).to(state)
+    steps = torch.where(reached.isfinite().all(-1), steps, 0)
+    return torch.where((steps > 0).unsqueeze(-1), reached, state), steps
+
+
+class Arrival(TensorDictModuleBase):
+    """Writes the state in which the next action will act to ``(prefix, "arrival")``.
+
+    And in how many steps that will be to ``(prefix, "delay")`` ``(*B)``.
+
+    Put it before the planner, which reads that: ``PlanningEnv(..., observation_key=("afm",
+    "arrival"))``.
+
+    Args:
+        policy: the correction after the planner, whose memory it reads.
+    """
+
+    def __init__(self, policy: ActionFlowPolicy) -> None:
+        super().__init__()
+        self.__dict__["policy"] = policy  # shared, so not registered
+        self.in_keys = [policy.observation_key, policy.memory_key]
+        self.out_keys = [unravel_key((policy.prefix, name)) for name in ("arrival", "delay")]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Look at the state, and roll the model to where the next action will act."""
+        loop, (key, memory_key) = self.policy.loop, self.in_keys
+        state = tensordict.get(key, None)
+        memory = loop.observe(tensordict.get(memory_key), state, key)
+        reached, steps = loop.arrival(memory)
+        arrival_key, delay_key = self.out_keys
+        return tensordict.set(arrival_key, reached.to(state.dtype)).set(delay_key, steps)

@@ -1,0 +1,346 @@
+"""The loop around a corrector: begin, act, observe. Transform, policy and wrappers are its views."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Composite, TensorSpec, Unbounded
+
+from afm_rl.correction import ActionFlow, Corrector
+from afm_rl.dynamics import DynamicsModel
+from afm_rl.errors import ConfigurationError, check_flag, check_instance
+from afm_rl.faults import check_numbers, safe_action
+from afm_rl.transforms.delay_compensation import state_at_arrival
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectionLoop:
+    r"""Begin, act, observe: the correction of one environment or of a batch ``(*B)`` of them.
+
+    Each step is a pure function of the corrector's memory ``(*B, P)``, which belongs to the caller,
+    as do action spec and state. While the model explains what happens, the planned action is
+    executed; when it does not, the corrector's answer is (paper, section IV-D). It never learns and
+    never changes the model. What it tells of a step, in a tensordict ``(*B)``:
+
+    * ``"planned_action"`` and ``"executed_action"`` ``(*B, A)``,
+    * ``"predicted_effect"`` ``(*B, A)``: the effect that the executed action is predicted to have;
+      where nothing is corrected, itself,
+    * ``"misaligned"`` ``(*B)``: does the model misjudge actions, so that they are corrected (with
+      ``enabled=False``: so that they would be)?
+    * ``"innovation"`` ``(*B)``: the misalignment, in standard deviations that the model states,
+    * ``"spread"`` ``(*B, A)``: standard deviation of the flow's samples,
+    * ``"noise"`` ``(*B, A)``: standard deviation of effects that nothing explains,
+    * ``"effect_bounds"`` ``(*B, 2, A)``: lowest and highest effect that an action can have, at
+      least the action box: for planners that can plan beyond it,
+    * ``"belief"`` ``(*B, C, A)``, if it is asked for: how probable the ``causes`` of the
+      :class:`~afm_rl.correction.ActionFlow` are, by axis,
+    * ``"memory"`` ``(*B, P)``.
+
+    Its options are those of transform, policy and wrappers, where they have them.
+
+    Args:
+        owner: whose options these are, for messages.
+        model: dynamics model, shared with planner and updater; None: said by :meth:`complete`.
+        corrector: the correction, owned; None: the universal
+            :class:`~afm_rl.correction.ActionFlow` for the action box.
+        enabled: False to watch only.
+        delay: steps from an action to its effect that are known, one number or one per axis: used
+            from the first step on. Faster axes are kept waiting. What comes on top is found out.
+        delay_compensation: show the policy, while actions act late, what is observed in the state
+            in which its next action will act (a Smith predictor); False: what was measured.
+        belief: tell the belief, too.
+        keep_memory_on_reset: go on with what was learnt in the episodes before, the pairs, the
+            noise and the belief of the newest step, as where a fault outlasts them. So rollouts
+            depend on those before them, and branches of rollouts are not exact. Else each episode
+            begins with an empty memory.
+        extend_action_box: let planners know of effects beyond the action box, if the model can
+            predict them.
+
+    Raises:
+        ConfigurationError: for options that cannot be used, or parts that do not fit each other.
+
+    >>> from torchrl.data import Bounded
+    >>> from afm_rl.dynamics import Dubins
+    >>> spec = Bounded(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
+    >>> loop, state = CorrectionLoop("example").complete(Dubins(), spec), torch.zeros(3)
+    >>> entries = loop.begin(state, spec)
+    >>> for _ in range(8):  # both motors are reversed
+    ...     entries = loop.act(entries["memory"], torch.tensor([0.5, 0.2]), spec)
+    ...     state = Dubins()(state, -entries["executed_action"])
+    ...     entries["memory"] = loop.observe(entries["memory"], state)
+    >>> entries["executed_action"].round(decimals=1)
+    tensor([-0.5000, -0.2000])
+    """
+
+    owner: str
+    model: Any = None
+    corrector: Any = None
+    enabled: bool = True
+    delay: int | Sequence[int] | None = None
+    delay_compensation: bool = True
+    belief: bool = False
+    keep_memory_on_reset: bool = False
+    extend_action_box: bool = True
+
+    def __post_init__(self) -> None:
+        """Check what is true or false."""
+        for name, value in vars(self).items():
+            if isinstance(getattr(CorrectionLoop, name, None), bool):
+                check_flag(f"{self.owner}.{name}", value)
+
+    def complete(
+        self, model: DynamicsModel | None = None, action_spec: TensorSpec | None = None
+    ) -> CorrectionLoop:
+        """Return the loop with a model, and with the universal corrector if there is none.
+
+        Args:
+            model: the one that it has if None.
+            action_spec: actions that can be executed, for which the corrector is made.
+
+        Raises:
+            ConfigurationError: for parts that do not fit each other.
+        """
+        check_precision()
+        owner, corrector = self.owner, self.corrector
+        model = check_instance(f"{owner}.model", model or self.model, DynamicsModel)
+        size = model.action_size
+        if corrector is None:
+            low, high = bounds_of(action_spec)
+            if low.shape[-1] != size or not bool((high - low).isfinite().all()):
+                raise ConfigurationError(
+                    f"{owner}: actions between {low.tolist()} and {high.tolist()}: expected the "
+                    f"{size} finite bounds of the dynamics model's actions; limit the action spec, "
+                    "or give a corrector with bounds of its own"
+                )
+            low, high = low.reshape(-1, size)[0], high.reshape(-1, size)[0]
+            corrector = ActionFlow(low, high, delay=self.delay or 0)
+        elif self.delay is not None:
+            raise ConfigurationError(
+                f"{owner}.delay={self.delay!r}: a corrector was given too; say it there, as in "
+                f"ActionFlow(low, high, delay={self.delay!r})"
+            )
+        check_instance(f"{owner}.corrector", corrector, Corrector)
+        if corrector.action_size != size:
+            raise ConfigurationError(
+                f"{owner}.corrector: made for {corrector.action_size} actions, but the dynamics "
+                f"model has {size}"
+            )
+        if self.belief:
+            check_instance(f"{owner}.belief=True: {owner}.corrector", corrector, ActionFlow)
+        return replace(self, model=model, corrector=corrector)
+
+    def spec(self, batch: torch.Size, dtype: torch.dtype) -> Composite:
+        """Return the specs of the entries but memory and belief, for a type of actions."""
+        actions = self.corrector.action_size
+
+        def real(*shape: int) -> Unbounded:
+            return Unbounded((*batch, *shape), dtype=dtype)
+
+        return Composite(
+            planned_action=real(actions),
+            executed_action=real(actions),
+            predicted_effect=real(actions),
+            effect_bounds=real(2, actions),
+            spread=real(actions),
+            noise=real(actions),
+            innovation=real(),
+            misaligned=Binary(shape=batch, dtype=torch.bool),
+            shape=batch,
+        )
+
+    @torch.no_grad()
+    def begin(
+        self, state: Tensor, action_spec: TensorSpec, learnt: Tensor | None = None
+    ) -> TensorDictBase:
+        """Return the entries of missions that begin in ``state`` ``(*B, S)``.
+
+        With what was learnt in a memory ``(*B, P)``, if one is given.
+        """
+        check_precision()
+        entries = self.spec(state.shape[:-1], action_spec.dtype).to(state.device).zero()
+        entries.set("effect_bounds", box_of(action_spec, entries.get("planned_action")))
+        state = state.to(precise(state.dtype))
+        if learnt is None or learnt.shape[:-1] != state.shape[:-1]:
+            return self._with_belief(entries.set("memory", self.corrector.begin(state)))
+        memory = self.corrector.resume(learnt.to(state), state)
+        return self._with_belief(entries.set("memory", memory))
+
+    @torch.no_grad()
+    def act(
+        self,
+        memory: Tensor,
+        planned: Tensor,
+        action_spec: TensorSpec,
+        key: NestedKey = "action",
+    ) -> TensorDictBase:
+        """Return the entries with what was planned ``(*B, A)`` and what should be executed.
+
+        Args:
+            memory: up to the present state.
+            planned: the planned action; where it is not finite, the one before is taken.
+            action_spec: actions that can be executed.
+            key: where the planned action was found.
+
+        Raises:
+            ConfigurationError: for a plan that is not real numbers ``(*B, A)``.
+        """
+        check_precision()
+        model, corrector, enabled = self.model, self.corrector, self.enabled
+        low, high = bounds_of(action_spec)
+        check_numbers(key, planned, (*memory.shape[:-1], corrector.action_size))
+        planned = computable(planned, low, high, memory.dtype)
+        box = box_of(action_spec, planned)
+        _, last, sent = corrector.latest(memory)
+        plan = torch.where(planned.isfinite().all(-1, keepdim=True), planned, last)
+        memory, answer = corrector.correct(memory, plan, model, box)
+        if enabled:
+            corrector.first_steps(answer.misaligned, partial(corrector.cause_in, memory))
+        # The last clamp depends on nothing but the spec, whatever the corrector answers.
+        executed, _ = safe_action(answer.executed if enabled else plan, low, high, sent)
+        executed, predicted = executed.to(memory.dtype), answer.predicted
+        if enabled:  # a corrector that keeps to the box has noted all of it
+            memory = Corrector.executing(corrector, memory, plan, executed)
+            executed = corrector.sending(memory, executed)
+        else:
+            memory, predicted = corrector.executing(memory, plan, executed), executed
+        bounds = answer.bounds if enabled else box
+        if not (self.extend_action_box and model.extrapolates):
+            low, high = box.unbind(-2)
+            bounds = torch.minimum(torch.maximum(bounds, low.unsqueeze(-2)), high.unsqueeze(-2))
+        entries = {
+            "planned_action": planned,
+            "executed_action": executed,
+            "predicted_effect": predicted,
+            "effect_bounds": bounds,
+            "spread": answer.spread if enabled else torch.zeros_like(answer.spread),
+            "noise": answer.noise,
+            "innovation": answer.innovation,
+        }
+        entries = {name: value.to(action_spec.dtype) for name, value in entries.items()}
+        entries |= {"misaligned": answer.misaligned, "memory": memory}
+        return self._with_belief(
+            TensorDict(entries, planned.shape[:-1], device=planned.device)
+        )
+
+    @torch.no_grad()
+    def observe(self, memory: Tensor, state: Any, key: NestedKey = "observation") -> Tensor:
+        """Return the memory with the state ``(*B, S)`` that was found under a key.
+
+        Raises:
+            ConfigurationError: for anything but real numbers of this shape.
+        """
+        state = check_numbers(key, state, (*memory.shape[:-1], self.model.state_size))
+        return self.corrector.observe(memory, state.to(memory.dtype))
+
+    def arrival(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the state ``(*B, S)`` in which the next action acts, and in how many steps.
+
+        The present state and 0 while no action is late, and with ``enabled=False``.
+        """
+        if self.enabled:
+            return state_at_arrival(self.corrector, memory, self.model)
+        state = self.corrector.latest(memory)[0]
+        return state, torch.zeros_like(state[..., 0], dtype=torch.long)
+
+    def _with_belief(self, entries: TensorDictBase) -> TensorDictBase:
+        if self.belief:
+            entries.set("belief", self.corrector.belief_in(entries.get("memory")))
+        return entries
+
+
+def precise(dtype: torch.dtype) -> torch.dtype:
+    """Return the type in which numbers are remembered: theirs, or single precision for 16 bits."""
+    return dtype if dtype in (torch.float32, torch.float64) else torch.float32
+
+
+def check_precision() -> None:
+    """Refuse a default type of 16 bits, in which the belief would be computed."""
+    if torch.get_default_dtype().itemsize < 4:
+        raise ConfigurationError(
+            f"torch.get_default_dtype() is {torch.get_default_dtype()}: expected float32 or "
+            "float64 while actions are corrected; set_default_dtype(torch.float32), and give "
+            "16 bits to the policy alone"
+        )
+
+
+def computable(plan: Tensor, low: Tensor, high: Tensor, dtype: torch.dtype) -> Tensor:
+    r"""Return a plan ``(*B, A)`` in a precision, with NaN where it is infinite.
+
+    Beyond the box by more than :math:`\varepsilon^{-1/2}` times its width, rounding would leave
+    nothing of the box: there it is brought back to this distance.
+
+    >>> computable(torch.tensor([1e30, 0.5]), -torch.ones(2), torch.ones(2), torch.float32)
+    tensor([5.7936e+03, 5.0000e-01])
+    """
+    reach = torch.finfo(dtype).eps ** -0.5 * (high - low)
+    near = torch.minimum(torch.maximum(plan, low - reach), high + reach)
+    return torch.where(plan.isinf(), torch.nan, near).to(dtype)
+
+
+def warn_of_old(tensordict: TensorDictBase, prefix: NestedKey) -> None:
+    """Warn if a tensordict holds the entries of the next step already: it is an old one."""
+    later = tensordict.get("next", None)
+    if later is not None and later.get(prefix, None) is not None:
+        warnings.warn(
+            f"this step was made before: ('next', {prefix!r}) is in the tensordict, so its memory "
+            "is an old one; go on with step_mdp(tensordict)",
+            stacklevel=3,
+        )
+
+
+def bounds_of(action_spec: TensorSpec | None) -> tuple[Tensor, Tensor]:
+    """Return the lowest and the highest action of a spec.
+
+    Raises:
+        ConfigurationError: if its actions are no real numbers between bounds.
+    """
+    space: Any = getattr(action_spec, "space", None)
+    if not hasattr(space, "low") or not action_spec.dtype.is_floating_point:  # type: ignore[union-attr]
+        raise ConfigurationError(
+            f"action_spec={action_spec}: expected a Bounded spec of real numbers; limit the "
+            "environment's actions first"
+        )
+    return space.low, space.high
+
+
+def box_of(action_spec: TensorSpec, like: Tensor) -> Tensor:
+    """Return the action box for actions ``(*B, A)``: ``(*B, 2, A)``."""
+    low, high = bounds_of(action_spec)
+    return torch.stack([low.expand_as(like), high.expand_as(like)], -2).to(like)
+
+
+def _option(name: str) -> property:
+    def change(shell: Shell, value: Any) -> None:
+        shell._loop = replace(shell._loop, **{name: value})
+
+    return property(lambda shell: getattr(shell._loop, name), change)
+
+
+class Shell:
+    """A view of the loop; the loop's options are attributes, some of which may be changed."""
+
+    _loop: CorrectionLoop
+
+    @property
+    def loop(self) -> CorrectionLoop:
+        """The loop of which this is a view."""
+        return self._loop
+
+    @property
+    def model(self) -> DynamicsModel:
+        """The dynamics model, shared."""
+        return self.loop.model if self._loop.model is None else self._loop.model
+
+    enabled = _option("enabled")
+    delay = _option("delay")
+    delay_compensation = _option("delay_compensation")
+    belief = _option("belief")
+    keep_memory_on_reset = _option("keep_memory_on_reset")
+    extend_action_box = _option("extend_action_box")
