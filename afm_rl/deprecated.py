@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
 from typing import Any, TypeVar
 
 import lazy_loader
@@ -40,14 +44,33 @@ def lazy_package(package: str, file: str) -> tuple[Callable[[str], Any], Any, li
     load, list_names, names = lazy_loader.attach_stub(package, file)
 
     def get(name: str) -> Any:
-        new = NAMES.get(f"{package}.{name}")
-        if new is None:
-            return load(name)
-        _warn(f"{package}.{name}", new)
-        module, _, part = new.rpartition(".")
-        return getattr(import_module(module), part)
+        return _new(package, name) if f"{package}.{name}" in NAMES else load(name)
 
     return get, list_names, names
+
+
+class OldModules(MetaPathFinder, Loader):
+    """Finds modules that are gone and of which names are in :data:`NAMES`."""
+
+    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        known = any(old.rpartition(".")[0] == fullname for old in NAMES)
+        return ModuleSpec(fullname, self) if known else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__getattr__ = partial(_new, module.__name__)  # type: ignore[method-assign]
+
+
+sys.meta_path.append(OldModules())  # after those that find what is there
+
+
+def old_attribute(old: str, new: str) -> property:
+    """Return the property that stands for an attribute that is called ``new`` now."""
+
+    def get(instance: Any) -> Any:
+        _warn(f"{type(instance).__name__}.{old}", new)
+        return getattr(instance, new)
+
+    return property(get)
 
 
 def old_arguments(function: Function) -> Function:
@@ -65,17 +88,27 @@ def old_arguments(function: Function) -> Function:
     >>> del ARGUMENTS["wait"]
     """
     owner = function.__qualname__.removesuffix(".__init__")
+    is_method = owner != function.__qualname__
 
     @wraps(function)
     def call(*args: Any, **given: Any) -> Any:
         for old, (new, values) in ARGUMENTS.get(owner, {}).items():
             if old in given:
-                _warn(f"{owner}: {old}", new)
+                _warn(f"{type(args[0]).__name__ if is_method else owner}: {old}", new)
                 value = given.pop(old)
                 given[new] = values.get(value, value) if values else value
         return function(*args, **given)
 
     return call  # type: ignore[return-value]
+
+
+def _new(package: str, name: str) -> Any:
+    """Return what an old name stands for."""
+    if f"{package}.{name}" not in NAMES:
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+    _warn(f"{package}.{name}", NAMES[f"{package}.{name}"])
+    module, _, part = NAMES[f"{package}.{name}"].rpartition(".")
+    return getattr(import_module(module), part)
 
 
 def _warn(old: str, new: str) -> None:

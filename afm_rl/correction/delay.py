@@ -1,22 +1,11 @@
-r"""Delays of commands, and where a robot will be when they act.
-
-Commands that act late cannot be undone by others. But policy or planner can be asked about the
-state in which their command will act (Smith 1957, Chem. Eng. Progress 53): the model is rolled
-through the effects of the commands that are still under way.
-"""
+"""How probable each delay of commands is, and which commands act now."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from afm_rl.compiling.tracing import all_hold, may_look
-from afm_rl.dynamics import DynamicsModel
-
-if TYPE_CHECKING:
-    from afm_rl.correction.base import Corrector
+from afm_rl.compiling.tracing import all_hold
 
 
 def delay_tables(delays: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
@@ -103,29 +92,3 @@ def align(pairs: Tensor, delay: Tensor, size: int) -> Tensor:
     sent = sent.gather(-2, row.clamp_min(0).unsqueeze(-1).expand_as(sent))
     valid = pairs[..., 3 * size :][..., :1] * (row >= 0).unsqueeze(-1)
     return torch.cat([sent, pairs[..., size : 3 * size], valid, pairs[..., 3 * size + 1 :]], -1)
-
-
-def arrival(corrector: Corrector, memory: Tensor, model: DynamicsModel) -> tuple[Tensor, Tensor]:
-    """Return the state ``(*B, S)`` in which the next command will act, and in how many steps.
-
-    The present state and 0 where no command is late, or where the model leads to no number.
-
-    Args:
-        corrector: whose memory it is.
-        memory: up to the present state, ``(*B, P)``.
-        model: the dynamics model as it is now.
-    """
-    with torch.no_grad():
-        state, effects, steps = corrector.under_way(memory)
-        if not effects.shape[-2] or all_hold(steps == 0):
-            return state, steps
-        most = int(steps.max()) if may_look(steps) else effects.shape[-2]
-        # Every mission's commands under way, the oldest first; what follows them is not looked at.
-        ages = effects.shape[-2] - steps.unsqueeze(-1) + torch.arange(most, device=steps.device)
-        ages = ages.clamp_max(effects.shape[-2] - 1).unsqueeze(-1)
-        plan = effects.gather(-2, ages.expand(*ages.shape[:-1], effects.shape[-1]))
-        states = model.rollout(state, plan.unsqueeze(-3)).squeeze(-3)
-        last = (steps - 1).clamp_min(0)[..., None, None].expand(*steps.shape, 1, state.shape[-1])
-        found = states.gather(-2, last).squeeze(-2).to(state)
-        steps = torch.where(found.isfinite().all(-1), steps, 0)
-        return torch.where((steps > 0).unsqueeze(-1), found, state), steps

@@ -179,7 +179,8 @@ def _build(settings: dict[str, Any]) -> Agent:
         if corrector.module is not None:
             around["reported_key"] = robot.reported
             # Scores and updaters read what was measured; planners the state in which they will act.
-            around |= {"delay_compensation": False, "carry_memory": True}  # missions leave, and are resumed
+            around["delay_compensation"] = False
+            around["carry_memory"] = True  # missions leave, and are resumed
             transform = ActionFlowTransform(model, corrector.module, **around)
     shape = {name: value for name, value in settings["robot"].items() if name in SHAPE_TRAINING}
     trainings = [

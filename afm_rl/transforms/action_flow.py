@@ -380,7 +380,7 @@ class ActionFlowTransform(Shell, StatefulTransform):
             size = (*batch, corrector.memory_size(self.model.state_size))
             entries["memory"] = Unbounded(size, dtype=kind)
         if self.belief:
-            size = (*batch, len(corrector.causes), corrector.action_size)
+            size = (*batch, len(self.loop.corrector.causes), corrector.action_size)
             entries["belief"] = Unbounded(size, dtype=kind)
         return entries
 

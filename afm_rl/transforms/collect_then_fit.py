@@ -151,8 +151,8 @@ class Excitation(Corrector):
     """
 
     def __init__(self, corrector: Any, collection: CollectThenFit) -> None:
-        ends = (corrector.denormalise(end) for end in (corrector.lowest, corrector.highest))
-        super().__init__(*ends, recent=1, delay=corrector.delay)
+        low, high = map(corrector.denormalise, (corrector.lowest, corrector.highest))
+        super().__init__(low, high, recent=1, delay=corrector.delay)
         self.corrector, self.collection = corrector, collection
         self.causes = getattr(corrector, "causes", ())
 

@@ -80,7 +80,9 @@ class GymnasiumShell:
                 "numbers"
             )
         self._actions, self._collection = actions, _collection(model)
-        self._model: Any = _simulation(env) if _is(model, "mujoco") else model
+        self._model: Any = model
+        if isinstance(model, str) and model == "mujoco":
+            self._model = _simulation(env)
         if self._collection is None and not callable(self._model):
             raise ConfigurationError(
                 f"ActionFlowWrapper: model={model!r}: expected 'mujoco', 'learn', a step function "
@@ -105,8 +107,8 @@ class GymnasiumShell:
                 "what the state is by state=lambda env, observation: ..."
             )
         self._state_of: State = _observed if state is None else state
-        names = self._model.names[1] if simulated else None
-        self._names = names or [f"actuator {k}" for k in range(actions.shape[0])]
+        names: Any = self._model.names[1] if simulated else None
+        self._names: list[str] = names or [f"actuator {k}" for k in range(actions.shape[0])]
         self._entries: Any = None  # a tensordict, from the first reset on
         one = not isinstance(env, VectorEnv)
         self._mode = AutoresetMode.DISABLED if one else autoreset_mode_of(env)
@@ -117,7 +119,7 @@ class GymnasiumShell:
         """What is collected, and the fit to it, with ``model="learn"``."""
         return self._collection
 
-    watching = old_attribute("collection")
+    watching = old_attribute("watching", "collection")
 
     @torch.no_grad()
     def _begin(
@@ -275,9 +277,9 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
     planned action was replaced by the corrector's; the ``innovation``, in standard deviations of
     the model; the ``noise`` ``(A,)`` of the effects that was learnt; the ``observation`` that was
     measured; and the ``delay``, in how many steps the next action will act, known and found: who
-    follows a clock looks as far ahead. With ``enabled=False`` it is 0. With ``belief=True`` there is
-    the ``belief``, how probable ``(A,)`` each cause is, by name, such as ``"nothing has changed"``
-    or ``"2 steps late"``. :attr:`diagnosis` says in words what the actuators seem to do.
+    follows a clock looks as far ahead. With ``enabled=False`` it is 0. With ``belief=True`` there
+    is the ``belief``, how probable ``(A,)`` each cause is, by name, such as ``"nothing has
+    changed"`` or ``"2 steps late"``. :attr:`diagnosis` says in words what the actuators seem to do.
 
     What the model takes for the state is, with ``"mujoco"`` or a
     :class:`~afm_rl.dynamics.MuJoCoDynamics`, the whole state of the environment's simulation, else
@@ -401,10 +403,6 @@ def autoreset_mode_of(env: VectorEnv) -> AutoresetMode:
         f"ActionFlowVectorWrapper: {env}: metadata['autoreset_mode']={given!r}: expected one of "
         f"{', '.join(map(str, AutoresetMode))}; set it to what the vector does"
     )
-
-
-def _is(model: Any, name: str) -> bool:
-    return isinstance(model, str) and model == name
 
 
 def _collection(model: Model) -> CollectThenFit | None:

@@ -1,4 +1,4 @@
-"""The loop around a corrector: begin, act, observe. Transform, policy and wrappers are its views."""
+"""The loop around a corrector: begin, act, observe; transform, policy and wrappers are views."""
 
 from __future__ import annotations
 
@@ -225,9 +225,7 @@ class CorrectionLoop:
         }
         entries = {name: value.to(action_spec.dtype) for name, value in entries.items()}
         entries |= {"misaligned": answer.misaligned, "memory": memory}
-        return self._with_belief(
-            TensorDict(entries, planned.shape[:-1], device=planned.device)
-        )
+        return self._with_belief(TensorDict(entries, planned.shape[:-1], device=planned.device))
 
     @torch.no_grad()
     def observe(self, memory: Tensor, state: Any, key: NestedKey = "observation") -> Tensor:

@@ -14,7 +14,7 @@ WAITING = {  # what waits for the device at a step, see docs/howto/gpu.md
 
 def parts_of(module):
     """Return a module, and the one that it shares with others, if it does."""
-    shared = vars(module).get("model")
+    shared = getattr(module, "model", None)
     return [module] if shared is None else [module, shared]
 
 

@@ -7,12 +7,12 @@ import torch
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares, PaperFlow
 from afm_rl.correction.base import Correction, Corrector
-from afm_rl.correction.delay import arrival
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.faults import PATIENCE
 from afm_rl.spaces.manifold import Manifold
+from afm_rl.transforms.delay_compensation import state_at_arrival
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 
@@ -136,7 +136,7 @@ def test_arrival_is_the_state_after_the_commands_under_way_or_the_present_one():
     memory = corrector.begin(torch.tensor([[5.0], [6.0]]))
     sent = torch.tensor([[[0.5], [0.25]], [[1.0], [0.0]]])  # the second leads to no number
     memory = corrector.pack({**corrector.unpack(memory, 1), "sent": sent})
-    state, steps = arrival(corrector, memory, model)
+    state, steps = state_at_arrival(corrector, memory, model)
     assert state.tolist() == [[11.0], [6.0]] and steps.tolist() == [2, 0]
 
 

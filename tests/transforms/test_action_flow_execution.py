@@ -19,7 +19,7 @@ from afm_rl.planning import GoalDistance, KnownReward, PlanningEnv
 from afm_rl.regimes import ActionGain
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
-from afm_rl.transforms.memory import correct
+from afm_rl.transforms.loop import CorrectionLoop
 
 LOW, HIGH = torch.tensor([-1.0, -math.pi / 2]), torch.tensor([1.0, math.pi / 2])
 BOX = torch.stack([LOW, HIGH])
@@ -124,7 +124,7 @@ def test_only_finite_actions_in_the_box_are_executed_whatever_is_answered(batch)
             return memory, Correction(**{**found._asdict(), **answers})
 
         corrector.correct = wild
-        entries = correct(memory, drawn(2), Dubins(), corrector, spec)
+        entries = CorrectionLoop("test", Dubins(), corrector).act(memory, drawn(2), spec)
         executed = entries["executed_action"]
         assert ((executed >= low) & (executed <= high)).all()
         assert torch.equal(corrector.latest(entries["memory"])[2], executed)

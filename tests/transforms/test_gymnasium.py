@@ -1,6 +1,5 @@
 """The wrapper corrects, and an environment stays what it was."""
 
-import math
 import warnings
 
 import gymnasium
@@ -11,18 +10,13 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Discrete
 from gymnasium.utils.env_checker import check_env
 from puck import Puck, play, push
-from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
 
 import afm_rl
 from afm_rl import ActionFlowWrapper
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.learning.watching import Watching
-from afm_rl.planning import KnownReward, PlanningEnv
 from afm_rl.spaces.manifold import Manifold
-from afm_rl.transforms import ActionFlowTransform
-from afm_rl.transforms.correction_loop import CorrectionLoop
+from afm_rl.transforms.collect_then_fit import CollectThenFit
 
 SMALL = {
     "transitions": 800,
@@ -37,7 +31,10 @@ def test_the_package_offers_it():
         afm_rl.Nothing  # noqa: B018
 
 
-@pytest.mark.parametrize("model", [push, Watching(**SMALL), "mujoco"], ids=["step", "learn", "mj"])
+MODELS = {"step": push, "learn": CollectThenFit(**SMALL), "mujoco": "mujoco"}
+
+
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_gymnasiums_own_check_passes(model):
     if model == "mujoco":
         pytest.importorskip("mujoco")
@@ -64,7 +61,7 @@ def test_healthy_steps_are_those_of_the_environment(dtype):
 
 def test_reversed_actuators_do_what_was_planned():
     env = ActionFlowWrapper(Puck(gain=-1.0), push, belief=True)
-    assert env.diagnosis == "as the model expects"
+    assert env.diagnosis == "healthy"
     unaware = env.reset(seed=0)[1]["afm"]["belief"]["nothing has changed"]
     assert (unaware > 0.7).all()
     told = [info["afm"] for *_, info in play(env, 30)]
@@ -74,27 +71,6 @@ def test_reversed_actuators_do_what_was_planned():
         np.testing.assert_allclose(each["predicted"], each["planned"], atol=0.1)
         assert (each["belief"]["a recent change"] > 0.9).all()
     assert "actuator 0: reversed" in env.diagnosis
-
-
-def test_actions_are_those_of_the_transform():
-    def healthy(state, action):
-        return state + 0.1 * action
-
-    low, high = -torch.ones(2), torch.ones(2)
-    cost = KnownReward(lambda state, action, ahead: -ahead.square().sum(-1))
-    world = PlanningEnv(KnownDynamics(lambda s, a: healthy(s, -a), Manifold(2), 2), cost, low, high)
-    env = TransformedEnv(world, ActionFlowTransform(KnownDynamics(healthy, Manifold(2), 2)))
-    loop = CorrectionLoop(Box(-9, 9, (2,)), Box(-1, 1, (2,)), healthy)
-    data = env.reset(TensorDict({"observation": torch.tensor([0.3, -0.2])}))
-    loop.begin(data["observation"].clone()[None])
-    for step in range(15):
-        planned = torch.tensor([0.6, 0.4]) * math.cos(step)
-        data, after = env.step_and_maybe_reset(data.set("action", planned))
-        executed = loop.act(planned[None])
-        loop.observe(data["next", "observation"][None])
-        np.testing.assert_array_equal(executed[0], data["next", "afm", "executed_action"])
-        data = after
-    assert loop.told["corrects"].all()
 
 
 def test_states_of_ones_own():
@@ -148,7 +124,7 @@ def test_an_episode_begins_with_an_empty_memory():
     env = ActionFlowWrapper(Puck(gain=-1.0), push)
     assert play(env, 10)[-1][-1]["afm"]["corrects"]
     _, info = env.reset()
-    assert not info["afm"]["corrects"] and env.diagnosis == "as the model expects"
+    assert not info["afm"]["corrects"] and env.diagnosis == "healthy"
     assert not env.step(np.zeros(2))[-1]["afm"]["corrects"]
 
 
@@ -202,15 +178,15 @@ def test_steps_need_a_reset():
 @pytest.mark.filterwarnings("ignore")
 def test_models_are_learned_from_healthy_steps():
     torch.manual_seed(0)
-    env = ActionFlowWrapper(Puck(ends=50), Watching(**SMALL))
+    env = ActionFlowWrapper(Puck(ends=50), CollectThenFit(**SMALL))
     told = play(env, 50, hold=1.0)[-1][-1]["afm"]
-    assert env.watching.count == 50 and not told["learned"] and env.watching.report is None
-    assert "tensor" not in repr(env.watching)  # of thousands of transitions
+    assert env.collection.count == 50 and not told["learned"] and env.collection.report is None
+    assert "tensor" not in repr(env.collection)  # of thousands of transitions
     assert (told["planned"] != told["executed"]).any()  # noise, so that actions tell something
     for episode in range(16):
         play(env, 50, episode, hold=1.0)
     _, info = env.reset()
-    assert info["afm"]["learned"] and env.watching.report.error < 0.2
+    assert info["afm"]["learned"] and env.collection.report.error < 0.2
     alarms = [info["afm"]["corrects"] for *_, info in play(env, 50, 9, hold=1.0)]
     env.unwrapped.gain = -1.0
     told = [info["afm"] for *_, info in play(env, 50, 9, hold=1.0)]
@@ -221,12 +197,14 @@ def test_models_are_learned_from_healthy_steps():
 
 @pytest.mark.filterwarnings("ignore")
 def test_models_that_are_not_good_enough_are_not_used():
-    watching = Watching(**{**SMALL, "error": 1e-6, "fit": {"epochs": 1}, "transitions": 260})
-    env = ActionFlowWrapper(Puck(), watching)
+    settings = {**SMALL, "error": 1e-6, "fit": {"epochs": 1}, "transitions": 260}
+    collection = CollectThenFit(**settings)
+    env = ActionFlowWrapper(Puck(), collection)
     play(env, 270)
     _, info = env.reset()
-    assert not info["afm"]["learned"] and env.watching.report.error > 1e-6
-    assert env.watching.needed == 540 and watching.count == 0  # that of the user is a description
+    assert not info["afm"]["learned"] and env.collection.report.error > 1e-6
+    assert env.collection.needed == 540
+    assert collection.count == 0  # that of the user is a description
 
 
 def test_what_cannot_be_used_is_refused():

@@ -12,7 +12,7 @@ from puck import Puck, play, push
 
 from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
 from afm_rl.errors import ConfigurationError
-from afm_rl.learning import watching
+from afm_rl.transforms import collect_then_fit
 
 GAINS, ENDS = (1.0, -1.0, 0.5), (6, 9, 7)
 
@@ -73,7 +73,7 @@ def test_what_is_learned_from_are_steps_within_episodes(mode, monkeypatch):
         learned_from.append(data)
         return SimpleNamespace(error=1.0)
 
-    monkeypatch.setattr(watching, "fit_ensemble", fit)
+    monkeypatch.setattr(collect_then_fit, "fit_ensemble", fit)
     vector = SyncVectorEnv([lambda: Puck(ends=6), lambda: Puck(ends=9)], autoreset_mode=mode)
     envs = ActionFlowVectorWrapper(vector, "learn")
     envs.reset(seed=0)
@@ -83,12 +83,12 @@ def test_what_is_learned_from_are_steps_within_episodes(mode, monkeypatch):
         count += (infos["_afm"] & ~np.asarray(lost)).sum()
         if mode is AutoresetMode.DISABLED and over.any():
             envs.reset(options={"reset_mask": over.copy()})
-    envs.watching.learn()
+    envs.collection.learn()
     (data,) = learned_from
     torch.testing.assert_close(
         data["next", "observation"], push(data["observation"], data["action"])
     )
-    assert len(data) == envs.watching.count == count
+    assert len(data) == envs.collection.count == count
 
 
 def test_mujoco_in_a_vector_of_one_process_or_of_several():

@@ -94,20 +94,21 @@ def test_actuators_with_delays_of_their_own_act_together():
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["", "reversed"])
 def test_a_delay_is_found_and_made_up_for(sign):
     cost = {}
-    for late in ("predict", "leave"):
-        env = ActionFlowWrapper(Carts((4, 4), at=5, sign=sign), glide, late=late, belief=True)
-        cost[late] = np.square(drive(env, 100)[0][50:]).mean()
+    for compensated in (True, False):
+        settings = {"delay_compensation": compensated, "belief": True}
+        env = ActionFlowWrapper(Carts((4, 4), at=5, sign=sign), glide, **settings)
+        cost[compensated] = np.square(drive(env, 100)[0][50:]).mean()
         assert (drive(env, 25)[1]["afm"]["belief"]["4 steps late"] > 0.9).all()
-    assert 10 * cost["predict"] < cost["leave"], cost
+    assert 10 * cost[True] < cost[False], cost
 
 
 WAYS = {  # delays of the robot, settings, steps that are told at the end, what is said of them
     "found": ((8, 8), {}, 8, "8 steps late\nlateness: 8 steps, made up for"),
-    "known": ((3, 3), {"delay": 3}, 3, "as the model expects\nlateness: 3 steps, made up for"),
+    "known": ((3, 3), {"delay": 3}, 3, "healthy\nlateness: 3 steps, made up for"),
     "both": ((5, 5), {"delay": 3}, 5, "2 steps late\nlateness: 5 steps, made up for"),
-    "left": ((8, 8), {"late": "leave"}, 8, "8 steps late\nlateness: 8 steps"),
+    "left": ((8, 8), {"delay_compensation": False}, 8, "8 steps late\nlateness: 8 steps"),
     "watched": ((2, 2), {"enabled": False}, 0, "2 steps late\nlateness: 2 steps"),
-    "none": ((0, 0), {}, 0, "as the model expects"),
+    "none": ((0, 0), {}, 0, "healthy"),
 }
 
 
@@ -249,7 +250,7 @@ def test_a_policy_without_an_environment_is_told_the_same():
         ({"delay": 10**6}, "delay"),
         ({"belief": True, "corrector": LeastSquares([-1.0] * 2, [1.0] * 2)}, "a ActionFlow"),
         ({"belief": "yes"}, "belief='yes'"),
-        ({"late": "ignore"}, "predict, leave|'predict'"),
+        ({"delay_compensation": "yes"}, "delay_compensation='yes'"),
         ({"delay": 2, "state": lambda env, seen: 2 * seen}, "observe="),
         ({"delay": 2, "corrector": ActionFlow(-torch.ones(2), torch.ones(2))}, "corrector"),
     ],
