@@ -16,7 +16,7 @@ from torchrl.envs.utils import step_mdp
 
 from afm_rl.errors import AFMError, NonFiniteError
 from afm_rl.missions.build import Agent
-from afm_rl.missions.state import Loop, StepLog, leave, owner, restore, snapshot, unsaved
+from afm_rl.missions.state import Loop, StepLog, leave, owner, restore, snapshot
 from afm_rl.progress import Bar
 from afm_rl.storage.artefacts import Checkpoints
 from afm_rl.storage.measures import Measures
@@ -131,7 +131,7 @@ def _start(agent: Agent) -> Loop:
     ends = {name: part.to(agent.device) for name, part in ends.items()}
     whole = ["misaligned", "regime_active", "fault", *agent.robot.metrics.whole]
     log = StepLog(_columns(agent), whole)
-    return Loop(td, torch.arange(total, device=agent.device), ends, log, unsaved=unsaved(agent))
+    return Loop(td, torch.arange(total, device=agent.device), ends, log)
 
 
 def _advance(agent: Agent, loop: Loop, aligned: float = 5.0, still: float = 0.1) -> None:
