@@ -83,6 +83,6 @@ def _run(arguments: list[str]) -> None:
     )
     print("exporting: tracing, then compiling, which takes about six times as long", flush=True)
     controller = Controller(None if alone else agent.planner, policy)
-    checksum = export_controller(controller, path, cfg.cache)
+    checksum = export_controller(controller, path)
     print(f"wrote {path}: " + ", ".join(f"{k} ({n})" for k, n in controller.sizes.items()))
     print(f"sha256 {checksum}: whoever loads this program should ask for it")

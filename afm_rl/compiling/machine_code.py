@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import hmac
 import io
 import json
 import os
-import secrets
 import shutil
-import stat
 import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +20,7 @@ from torch import Tensor, nn
 
 from afm_rl._version import __version__
 from afm_rl.progress import waiting
-from afm_rl.storage.files import write_whole
+from afm_rl.storage.signed import read_signed, write_signed
 
 
 def checksum_of(code: bytes) -> str:
@@ -39,94 +35,6 @@ def checksum_of(code: bytes) -> str:
 def loaded(code: bytes) -> Any:
     """Return the function of a program. It may do anything: know first where it comes from."""
     return torch._inductor.aoti_load_package(io.BytesIO(code))
-
-
-def folder_in(cache: str | Path) -> Path:
-    """Return where programs are in a cache: its name is a secret of this user and this place.
-
-    Thus a cache that somebody gives away holds no program that is run.
-    """
-    place = Path(cache).expanduser().resolve()
-    return place / f"compiled-{hmac.digest(_secret(), str(place).encode(), 'sha256').hex()[:16]}"
-
-
-@lru_cache
-def _secret() -> bytes:
-    """Return the key of this user, made when it is first needed; one of this process if it cannot.
-
-    It is where the user keeps things, wherever settings let them be kept.
-    """
-    path = Path(os.environ.get("AFM_RL_CACHE", "~/.cache/afm_rl")).expanduser() / "key"
-    try:
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            number, part = tempfile.mkstemp(dir=path.parent)  # for this user's eyes only
-            with open(number, "wb") as file:
-                file.write(secrets.token_bytes(32))
-            os.replace(part, path)
-        return path.read_bytes()
-    except OSError:
-        return secrets.token_bytes(32)
-
-
-def recall(path: Path) -> tuple[bytes | None, str]:
-    """Return a program that :func:`keep` wrote.
-
-    The bytes that were checked are those that are returned, so that nobody can change them
-    in between.
-
-    Returns:
-        The program; or None, and why what is there must not run, if anything is there.
-    """
-    why = _why_not_ours(path.parent)
-    if why or not path.exists():
-        return None, why
-    code, note = path.read_bytes(), path.with_suffix(".sha256")
-    if not note.is_file():
-        return None, f"{path} has no checksum"
-    if note.read_bytes()[:64] != checksum_of(code).encode():
-        return None, f"{path} is not what its checksum says"
-    return code, ""
-
-
-def keep(path: Path, code: bytes) -> None:
-    """Write a program and its checksum, unless the folder is that of another user."""
-    if claim(path.parent):
-        write_whole(path, code)
-        write_whole(path.with_suffix(".sha256"), f"{checksum_of(code)}  {path.name}\n".encode())
-
-
-def claim(folder: Path) -> bool:
-    """Make a folder into which only this user can write; return whether it is one.
-
-    What it holds is removed if others might have written it.
-    """
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if not _why_not_ours(folder):
-        return True
-    if _belongs_to_another(folder):
-        return False
-    folder.chmod(0o700)
-    for part in folder.iterdir():
-        if part.is_dir() and not part.is_symlink():
-            shutil.rmtree(part)
-        else:
-            part.unlink()
-    return True
-
-
-def _belongs_to_another(folder: Path) -> bool:
-    found = folder.lstat()
-    return not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid()
-
-
-def _why_not_ours(folder: Path) -> str:
-    if os.name != "posix" or not folder.exists():  # elsewhere a user's folders are private
-        return ""
-    if _belongs_to_another(folder):
-        return f"{folder} belongs to another user"
-    others = stat.S_IWGRP | stat.S_IWOTH
-    return f"others may write into {folder}" if folder.stat().st_mode & others else ""
 
 
 class Trace(NamedTuple):
@@ -145,17 +53,12 @@ def trace(module: nn.Module, inputs: Sequence[Tensor], shapes: Any = None) -> Tr
     return Trace(program, time.monotonic() - begun)
 
 
-def package(
-    traced: Trace, settings: Mapping[str, Any], cache: str | Path, times: float = 6.0
-) -> bytes:
+def package(traced: Trace, settings: Mapping[str, Any], times: float = 6.0) -> bytes:
     """Return a traced function as a program; show how far it is."""
     with tempfile.TemporaryDirectory() as made, torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        path, scratch = Path(made) / "program.pt2", folder_in(cache) / "torch"
-        with (
-            _working_in(scratch if claim(scratch) else Path(made)),
-            waiting("compiling", times * traced.took),
-        ):
+        path = Path(made) / "program.pt2"
+        with _working_in(Path(made)), waiting("compiling", times * traced.took):
             torch._inductor.aoti_compile_and_package(
                 traced.program, package_path=str(path), inductor_configs=dict(settings)
             )
@@ -240,8 +143,8 @@ def compile_module(
     """Return a module as machine code, for any number of missions.
 
     It is compiled ahead of time (AOTInductor), which takes half a minute of one core, and only if
-    the cache does not hold it already for these weights, shapes, settings and versions, with its
-    checksum and in a folder of this user alone; a line says why if it does not run what is there.
+    the cache does not hold it already for these weights, shapes, settings and versions, with this
+    user's signature; a line says so if it does not run what is there.
 
     Args:
         module: takes tensors whose first dimension counts missions, returns a tuple of such.
@@ -255,12 +158,14 @@ def compile_module(
     """
     try:
         drawn = _trace(module, inputs) if traced else None
-        path = folder_in(cache) / f"{_digest(module, inputs, drawn and drawn.program)}.pt2"
-        code, why = recall(path)
+        name = f"{_digest(module, inputs, drawn and drawn.program)}.pt2"
+        path = Path(cache).expanduser() / "compiled" / name
+        code = read_signed(path)
         if code is None:
-            print(f"{why or 'nothing compiled for this robot yet'}: compiling anew", flush=True)
-            code = _compile(module, inputs, drawn, cache)
-            keep(path, code)
+            found = f"{path} was not written by you" if path.exists() else "nothing compiled yet"
+            print(f"{found}: compiling anew", flush=True)
+            code = _compile(module, inputs, drawn)
+            write_signed(path, code)
         # What is loaded could be called, but would read its description anew each time.
         run = loaded(code).loader.boxed_run
         return lambda *given: run(list(given))
@@ -280,12 +185,10 @@ def _trace(module: nn.Module, inputs: Sequence[Tensor]) -> Trace:
     return trace(module, inputs, (tuple({0: missions} for _ in inputs),))
 
 
-def _compile(
-    module: nn.Module, inputs: Sequence[Tensor], traced: Trace | None, cache: str | Path
-) -> bytes:
+def _compile(module: nn.Module, inputs: Sequence[Tensor], traced: Trace | None) -> bytes:
     if not has_compiler():
         raise RuntimeError("no C++ compiler was found")
-    code = package(traced or _trace(module, inputs), settings_for(inputs), cache)
+    code = package(traced or _trace(module, inputs), settings_for(inputs))
     with torch.no_grad():
         for one, other in zip(loaded(code)(*inputs), module(*inputs), strict=True):
             if not torch.allclose(one, other, rtol=1e-2, atol=1e-2, equal_nan=True):

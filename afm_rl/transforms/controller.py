@@ -191,9 +191,7 @@ def check_exportable(path: str | Path) -> Path:
     return path
 
 
-def export_controller(
-    controller: Controller, path: str | Path, cache: str | Path = "~/.cache/afm_rl"
-) -> str:
+def export_controller(controller: Controller, path: str | Path) -> str:
     """Write a controller as machine code (``.pt2``), which torch runs without this library.
 
     Its metadata names the arguments and their sizes (``memory:982 observation:3 ...``) and the
@@ -203,7 +201,6 @@ def export_controller(
     Args:
         controller: what to export, with weights and settings as they are now.
         path: the file, ``.pt2``.
-        cache: folder of what the compiler keeps for the next time.
 
     Returns:
         The SHA-256 of the file.
@@ -227,6 +224,6 @@ def export_controller(
             f"cannot be exported: {reason}"
         ) from error
     settings = settings_for([controller.policy.action_spec.zero()])
-    code = package(traced, {"aot_inductor.metadata": about, **settings}, cache)
+    code = package(traced, {"aot_inductor.metadata": about, **settings})
     write_whole(path, code)
     return checksum_of(code)

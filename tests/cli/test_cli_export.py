@@ -15,7 +15,7 @@ def run(monkeypatch, capsys):
     made = []
     monkeypatch.setattr(controller, "has_compiler", lambda: True)
 
-    def export_controller(what, path, cache):
+    def export_controller(what, path):
         made.append(what)
         return "c0ffee"
 

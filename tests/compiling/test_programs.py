@@ -9,7 +9,8 @@ import torch
 from torch import nn
 
 from afm_rl.compiling import machine_code
-from afm_rl.compiling.machine_code import checksum_of, claim, folder_in, keep, recall
+from afm_rl.storage import signed
+from afm_rl.storage.signed import read_signed, write_signed
 
 CODE = os.urandom(1000)
 
@@ -17,100 +18,83 @@ CODE = os.urandom(1000)
 @pytest.fixture(scope="module", autouse=True)
 def own_key(tmp_path_factory):
     """Keep the key of this user out of the tests."""
-    machine_code._secret.cache_clear()
+    signed._key.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("AFM_RL_CACHE", str(tmp_path_factory.mktemp("own")))
         yield
-    machine_code._secret.cache_clear()
+    signed._key.cache_clear()
 
 
 @pytest.fixture
 def path(tmp_path):
     """A program that is kept."""
-    keep(tmp_path / "compiled" / "a.pt2", CODE)
+    write_signed(tmp_path / "compiled" / "a.pt2", CODE)
     return tmp_path / "compiled" / "a.pt2"
 
 
-def test_a_program_comes_back_from_a_folder_that_is_ours_alone(path):
-    assert recall(path) == (CODE, "") and recall(path.with_name("b.pt2")) == (None, "")
-    assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
-    note = path.with_suffix(".sha256").read_text()
-    assert note == f"{checksum_of(CODE)}  a.pt2\n"  # as sha256sum reads it
+def test_a_program_comes_back_in_this_process_and_the_next(path):
+    assert read_signed(path) == CODE and read_signed(path.with_name("b.pt2")) is None
+    key = Path(os.environ["AFM_RL_CACHE"], "key")
+    assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    signed._key.cache_clear()
+    assert read_signed(path) == CODE
 
 
 def test_every_bit_that_flips_is_found(path):
-    for bit in range(0, 8 * len(CODE), 79):
-        damaged = bytearray(CODE)
+    whole = path.read_bytes()
+    for bit in range(0, 8 * len(whole), 79):
+        damaged = bytearray(whole)
         damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
-        code, why = recall(path)
-        assert code is None and why == f"{path} is not what its checksum says"
+        assert read_signed(path) is None
 
 
-def planted(path):
-    path.with_suffix(".sha256").unlink()
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda path: path.write_bytes(CODE),
+        lambda path: path.write_bytes(path.read_bytes()[:-1]),
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_bytes(path.with_name("b.pt2").read_bytes()),
+    ],
+    ids=["planted", "cut", "empty", "another one"],
+)
+def test_what_was_not_written_here_is_not_read(path, change):
+    write_signed(path.with_name("b.pt2"), b"another")
+    change(path)
+    assert read_signed(path) is None
+    write_signed(path, b"anew")
+    assert read_signed(path) == b"anew"
 
 
-def cut(path):
-    path.write_bytes(CODE[:-1])
+def another_user(monkeypatch, tmp_path, key):
+    monkeypatch.setenv("AFM_RL_CACHE", str(tmp_path / "another user"))
 
 
-def open_to_all(path):
-    path.parent.chmod(0o777)
+def no_place(monkeypatch, tmp_path, key):
+    monkeypatch.setenv("AFM_RL_CACHE", str(key))  # a file cannot hold a key
 
 
-def open_to_the_group(path):
-    path.parent.chmod(0o770)
+def known_to_others(monkeypatch, tmp_path, key):
+    key.chmod(0o640)
 
 
-FAULTS = {
-    planted: "has no checksum",
-    cut: "is not what its checksum says",
-    open_to_all: "others may write into",
-    open_to_the_group: "others may write into",
-}
+def of_another(monkeypatch, tmp_path, key):
+    monkeypatch.setattr(os, "getuid", lambda: key.stat().st_uid + 1)
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_what_others_may_have_written_is_not_read(path, fault):
-    fault(path)
-    code, why = recall(path)
-    assert code is None and FAULTS[fault] in why
-    keep(path, b"anew")
-    assert recall(path) == (b"anew", "")
-
-
-def test_whatever_lay_in_an_open_folder_is_removed(path):
-    keep(path.with_name("b.pt2"), CODE)
-    (path.parent / "torch").mkdir()
-    path.parent.chmod(0o777)
-    assert claim(path.parent) and not list(path.parent.iterdir())
-
-
-def test_a_folder_of_another_user_is_left_alone(path, monkeypatch):
-    monkeypatch.setattr(os, "getuid", lambda: path.stat().st_uid + 1)
-    assert recall(path) == (None, f"{path.parent} belongs to another user")
-    keep(path, b"mine")
-    assert path.read_bytes() == CODE
-
-
-def test_a_link_to_a_folder_is_not_followed(path, tmp_path):
-    link = tmp_path / "link"
-    link.symlink_to(path.parent)
-    assert "belongs to another user" in recall(link / "a.pt2")[1] and not claim(link)
-
-
-def test_a_cache_from_elsewhere_holds_no_program_that_is_run(tmp_path, monkeypatch):
-    mine = folder_in(tmp_path / "a")
+@pytest.mark.parametrize("change", [another_user, no_place, known_to_others, of_another])
+def test_the_key_is_this_user_s_alone(path, change, monkeypatch, tmp_path):
     key = Path(os.environ["AFM_RL_CACHE"], "key")
-    assert mine.parent == tmp_path / "a" and stat.S_IMODE(key.stat().st_mode) == 0o600
-    assert folder_in(tmp_path / "b").name != mine.name  # a copy elsewhere
-    machine_code._secret.cache_clear()  # as in the next process
-    assert folder_in(tmp_path / "b" / ".." / "a") == mine
-    for place in (tmp_path / "another user", key):  # the latter cannot hold a key
-        monkeypatch.setenv("AFM_RL_CACHE", str(place))
-        machine_code._secret.cache_clear()
-        assert folder_in(tmp_path / "a").name != mine.name
+    change(monkeypatch, tmp_path, key)
+    signed._key.cache_clear()
+    try:
+        assert read_signed(path) is None
+        write_signed(path, CODE)
+        assert read_signed(path) == CODE
+    finally:
+        signed._key.cache_clear()
+        key.chmod(0o600)
 
 
 class Doubled(nn.Module):
@@ -138,35 +122,24 @@ def compiled(tmp_path_factory):
 def real(compiled, tmp_path, monkeypatch):
     """Where that program belongs in another cache, and its code; nothing else can be compiled."""
     monkeypatch.setattr(machine_code, "has_compiler", lambda: False)
-    (path,) = folder_in(compiled).glob("*.pt2")
-    claim(folder_in(tmp_path))
-    return folder_in(tmp_path) / path.name, path.read_bytes()
+    (path,) = compiled.glob("compiled/*.pt2")
+    return tmp_path / "compiled" / path.name, read_signed(path)
 
 
 @pytest.mark.slow
 def test_a_real_program_runs_at_once_the_second_time(real, tmp_path, capfd):
-    keep(*real)
+    write_signed(*real)
     assert run(tmp_path) == [2.0] * 3 and "compiling" not in capfd.readouterr().out
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", ["planted", "one bit", "open folder"])
-def test_a_real_program_that_may_be_anothers_does_not_run(
-    real, fault, tmp_path, capfd, monkeypatch
-):
+def test_a_real_program_that_may_be_anothers_does_not_run(real, tmp_path, capfd, monkeypatch):
     path, code = real
-    if fault == "planted":
-        path.write_bytes(code)
-    elif fault == "one bit":
-        keep(path, code)
-        middle = len(code) // 2
-        path.write_bytes(code[:middle] + bytes([code[middle] ^ 1]) + code[middle + 1 :])
-    else:
-        keep(path, code)
-        path.parent.chmod(0o777)
+    path.parent.mkdir()
+    path.write_bytes(code)
     ran = []
     monkeypatch.setattr(machine_code, "loaded", ran.append)
     with pytest.warns(UserWarning, match="goes on uncompiled: no C.. compiler"):
         assert run(tmp_path) is None
     (line,) = capfd.readouterr().out.splitlines()
-    assert line.endswith(": compiling anew") and str(path.parent) in line and not ran
+    assert line == f"{path} was not written by you: compiling anew" and not ran

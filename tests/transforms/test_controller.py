@@ -189,7 +189,7 @@ def test_a_file_acts_the_same_without_this_library(tmp_path):
     # What an ActionFlow computes is traced above; a small program is compiled as fast as any.
     controller = Controller(None, policy_of(LeastSquares(LOW, HIGH)))
     path = tmp_path / "policy.pt2"
-    checksum = export_controller(controller, path, tmp_path / "cache")
+    checksum = export_controller(controller, path)
     assert sha256(path.read_bytes()).hexdigest() == checksum
     plan = torch.tensor([0.4, -0.3]).double()
     kept = torch.zeros(controller.sizes["memory"]).double()
