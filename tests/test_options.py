@@ -4,6 +4,7 @@ import pkgutil
 import re
 from importlib import import_module
 from inspect import isfunction
+from itertools import chain
 from math import inf, nan
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from typing import NamedTuple
 import pytest
 
 import afm_rl.conf
+import afm_rl.envs
 from afm_rl.cli.settings import commented
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import option, options, options_of, with_arguments
@@ -51,7 +53,8 @@ class Case(NamedTuple):
 
 def cases():
     """Yield each option of each function that checks some."""
-    for module in pkgutil.walk_packages(afm_rl.__path__, "afm_rl."):
+    packages = (afm_rl, "afm_rl."), (afm_rl.envs, "afm_rl.envs.")
+    for module in chain(*(pkgutil.walk_packages(top.__path__, name) for top, name in packages)):
         for found in (
             vars(import_module(module.name)).values() if "__main__" not in module.name else ()
         ):

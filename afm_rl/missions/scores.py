@@ -12,7 +12,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import option, options
 from afm_rl.storage.measures import Measure, Measures
 
 
@@ -230,13 +231,6 @@ class TrackingScore(Score):
     of ``hold`` seconds in which :math:`|e_z|` is below ``band`` after each step; ``steps``;
     ``finished``, whether the mission was not lost. A number that does not exist is NaN.
 
-    Args:
-        dt: time of a step (s).
-        band: error along z at which a mission counts as settled (m).
-        hold: time for which it must stay there (s).
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
     """
 
     measures = Measures(
@@ -251,10 +245,14 @@ class TrackingScore(Score):
     whole = ("phase",)
     reads = ("reference", "square_error", "pose", "phase", "step", "since", "lost")
 
-    def __init__(self, dt: float, band: float = 0.02, hold: float = 0.2) -> None:
-        self.dt = check_number("score.dt", dt, low=0.0, open_low=True)
-        self.band = check_number("score.band", band, low=0.0, open_low=True)
-        self.hold = max(1, math.ceil(check_number("score.hold", hold, low=0.0) / dt - 1e-6))
+    @options("score")
+    def __init__(
+        self,
+        dt: float = option(..., "time of a step, s", gt=0),
+        band: float = option(0.02, "error of the height at which it counts as settled, m", gt=0),
+        hold: float = option(0.2, "if it stays there for so long, s", ge=0),
+    ) -> None:
+        self.dt, self.band, self.hold = dt, band, max(1, math.ceil(hold / dt - 1e-6))
 
     def goal(self, td: TensorDictBase) -> Tensor:
         return td["reference"][..., 0, :3]

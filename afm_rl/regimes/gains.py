@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.options import option, options
 from afm_rl.regimes.base import MOST, HalfRange, Regime, StaticRegime, check_span, draw_between
 
 MOST_GAIN = 100.0  # gains beyond are typing errors
@@ -22,9 +23,6 @@ class ActionGain(StaticRegime):
 
     Args:
         names: one parameter name per action axis.
-        low: smallest size of a gain in the prior, > 0.
-        high: largest size of a gain in the prior.
-        nominal: probability that an axis keeps gain 1.
 
     >>> gains = ActionGain(["v_gain", "omega_gain"])
     >>> row = gains.encode({"v_gain": -1.7})
@@ -32,21 +30,20 @@ class ActionGain(StaticRegime):
     tensor([-0.8500,  1.0000])
     """
 
+    @options("")
     def __init__(
         self,
         names: Sequence[str],
-        low: float = 0.05,
-        high: float = 3.0,
-        nominal: float = 0.25,
+        low: float = option(0.05, "smallest gain in the prior, log-uniform, any sign", gt=0),
+        high: float = option(3.0, "largest gain in the prior", gt=0),
+        nominal: float = option(0.25, "probability that an axis keeps its gain", ge=0, le=1),
     ) -> None:
         self.names = self.distinct(names)
         self.identity = (1.0,) * len(self.names)
         self.limits = dict.fromkeys(self.names, (-MOST_GAIN, MOST_GAIN))
-        self.low = check_number("low", low, low=0.0, open_low=True)
-        self.high = check_number("high", high, low=0.0, open_low=True)
-        if self.low > self.high:
+        if low > high:
             raise ConfigurationError(f"low={low!r}: expected at most high={high!r}")
-        self.nominal = check_number("nominal", nominal, low=0.0, high=1.0)
+        self.low, self.high, self.nominal = low, high, nominal
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         if action.shape[-1] != len(self.names):

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.errors import check_counts, check_number
+from afm_rl.errors import check_number
+from afm_rl.options import option, options
 from afm_rl.regimes.base import MOST, HalfRange, Regime, StaticRegime, check_span, draw_between
 from afm_rl.regimes.gains import MOST_GAIN, divide
 
@@ -95,8 +96,6 @@ class Patches(Regime):
     The prior turns the first axis around, with log-uniform size, and keeps the others.
 
     Args:
-        size: side l of the squares (m).
-        where: indices of the state coordinates (m) that say where the robot is.
         names: one parameter name per action axis.
         span: smallest and largest size of the first gain in the prior, > 0.
 
@@ -109,15 +108,15 @@ class Patches(Regime):
 
     by_state = True
 
+    @options("")
     def __init__(
         self,
-        size: float = 2.0,
-        where: Sequence[int] = (0, 1),
+        size: float = option(2.0, "side l of the squares, m", gt=0),
+        where: Sequence[int] = option((0, 1), "state coordinates x and y, m", ge=0),
         names: Sequence[str] = ("patch_v_gain", "patch_omega_gain"),
         span: Sequence[float] = (0.5, 1.5),
     ) -> None:
-        self.size = check_number("size", size, low=0.0, open_low=True)
-        self.where = check_counts("where", where, low=0)
+        self.size, self.where = size, list(where)
         self.names = self.distinct(names)
         self.limits = dict.fromkeys(self.names, (-MOST_GAIN, MOST_GAIN))
         self.identity = (1.0,) * len(self.names)

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_count, check_counts
+from afm_rl.errors import ConfigurationError, check_counts
+from afm_rl.options import option, options
 from afm_rl.regimes.base import DelayedRegime, HalfRange, check_span
 
 MOST_STEPS = 10
@@ -62,6 +63,7 @@ class Delay(DelayedRegime):
 
 
 SLOWEST = 8.0  # steps
+HISTORY = option(8, "commands that are remembered", ge=1)
 
 
 class Lag(DelayedRegime):
@@ -74,7 +76,6 @@ class Lag(DelayedRegime):
 
     Args:
         span: lowest and highest time constant T (steps) in the prior, uniform.
-        history: number of commands that are remembered.
 
     >>> import torch
     >>> slow, past = Lag(history=3), torch.zeros(3, 1)
@@ -86,9 +87,10 @@ class Lag(DelayedRegime):
     identity = (0.0,)
     limits = {"lag": (0.0, SLOWEST)}
 
-    def __init__(self, span: Sequence[float] = (0.5, 3.0), history: int = 8) -> None:
+    @options("")
+    def __init__(self, span: Sequence[float] = (0.5, 3.0), history: int = HISTORY) -> None:
         self.span = check_span("span", span, 0.0, SLOWEST)
-        self.history = check_count("history", history)
+        self.history = history
 
     def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
         keep = (-1 / parameters.abs()).exp()  # 0 where there is no lag
@@ -110,7 +112,6 @@ class Backlash(DelayedRegime):
     Args:
         half_range: half ranges of the action axes.
         span: lowest and highest half width b in the prior, uniform.
-        history: number of commands that are remembered.
 
     >>> loose = Backlash(half_range=[1.0], history=2)
     >>> past = torch.tensor([[0.5], [0.0]])  # newest first: up to 0.5 - 0.2, then back
@@ -122,15 +123,16 @@ class Backlash(DelayedRegime):
     identity = (0.0,)
     limits = {"backlash": (0.0, 1.0)}
 
+    @options("")
     def __init__(
         self,
         half_range: Sequence[float],
         span: Sequence[float] = (0.05, 0.3),
-        history: int = 8,
+        history: int = HISTORY,
     ) -> None:
         self.half_range = HalfRange(half_range)
         self.span = check_span("span", span, 0.0, 1.0)
-        self.history = check_count("history", history)
+        self.history = history
 
     def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
         width = parameters * self.half_range.like(action)

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.errors import ConfigurationError, check_choice, check_number
+from afm_rl.errors import ConfigurationError, check_number
+from afm_rl.options import option, options
 
 
 class Schedule:
@@ -19,17 +20,24 @@ class Schedule:
     *greater than* breakpoint k.
 
     Args:
-        at: increasing breakpoints: fractions of the targets reached (``by="progress"``), or
-            step numbers (``by="step"``).
-        by: ``"progress"`` or ``"step"``.
+        at: increasing breakpoints.
 
     >>> schedule = Schedule([0.15, 0.80])
     >>> schedule.phase(torch.tensor([0.1, 0.5, 0.9]), torch.zeros(3))
     tensor([0, 1, 2])
     """
 
-    def __init__(self, at: Sequence[float] = (0.15, 0.80), by: str = "progress") -> None:
-        self.by = check_choice("schedule.by", by, ("progress", "step"))
+    @options("schedule")
+    def __init__(
+        self,
+        at: Sequence[float] = (0.15, 0.80),
+        by: str = option(
+            "progress",
+            "progress: share of the targets, or the episode; or step",
+            choices=("progress", "step"),
+        ),
+    ) -> None:
+        self.by = by
         high = 1.0 if by == "progress" else float("inf")
         self.at = tuple(check_number("schedule.at", value, low=0.0, high=high) for value in at)
         if list(self.at) != sorted(self.at):

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from afm_rl.envs.courses.track import check_near, local_origin, read_columns
-from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance, check_number
+from afm_rl.errors import ConfigurationError, check_choice, check_instance
+from afm_rl.options import option, options
 
 
 class Reference(ABC):
@@ -158,10 +159,6 @@ class Circle(Reference):
 
     .. math:: r = R (\cos \varphi, \sin \varphi, 0),\quad \varphi = v t / R
 
-    Args:
-        radius: R (m).
-        speed: v (m/s).
-
     Raises:
         ConfigurationError: for a setting that cannot be used.
 
@@ -169,9 +166,13 @@ class Circle(Reference):
     tensor([2.0000, 0.0000, 0.0000, -0.0000, 0.5000, 0.0000])
     """
 
-    def __init__(self, radius: float = 2.0, speed: float = 0.8) -> None:
-        self.radius = check_number("circle: radius", radius, low=0.0, open_low=True)
-        self.speed = check_number("circle: speed", speed, low=0.0)
+    @options("circle")
+    def __init__(
+        self,
+        radius: float = option(2.0, "R, m", gt=0),
+        speed: float = option(0.8, "v, m/s", ge=0),
+    ) -> None:
+        self.radius, self.speed = radius, speed
         self.name = f"circle_{self.radius:g}m_{self.speed:g}mps"
 
     def at(self, time: Tensor) -> Tensor:
@@ -186,11 +187,6 @@ class FigureEight(Reference):
 
     .. math:: r = (a \sin \varphi, b \sin 2 \varphi, 0),\quad \varphi = 2 \pi t / P
 
-    Args:
-        length: half length a (m).
-        width: half width b (m).
-        period: P (s).
-
     Raises:
         ConfigurationError: for a setting that cannot be used.
 
@@ -198,10 +194,13 @@ class FigureEight(Reference):
     tensor([1., -0.])
     """
 
-    def __init__(self, length: float = 1.0, width: float = 0.5, period: float = 8.0) -> None:
-        names = ("length", "width", "period")
-        for name, value in zip(names, (length, width, period), strict=True):
-            check_number(f"figure_8: {name}", value, low=0.0, open_low=True)
+    @options("figure_8")
+    def __init__(
+        self,
+        length: float = option(1.0, "half length a, m", gt=0),
+        width: float = option(0.5, "half width b, m", gt=0),
+        period: float = option(8.0, "P, s", gt=0),
+    ) -> None:
         self.length, self.width, self.pulse = length, width, 2 * math.pi / period
         self.name = f"figure_8_{period:g}s"
 
@@ -218,9 +217,6 @@ class Waypoints(Reference):
 
     Args:
         points: two or more points x, y, z (m), no two neighbours the same.
-        speed: speed (m/s).
-        closed: whether to go on to the first point and start again.
-        name: how missions call it.
 
     Raises:
         ConfigurationError: for a setting that cannot be used.
@@ -231,17 +227,17 @@ class Waypoints(Reference):
             [2.0000, 0.0000]])
     """
 
+    @options("waypoints")
     def __init__(
         self,
         points: Sequence[Sequence[float]],
-        speed: float = 0.5,
-        closed: bool = False,
-        name: str = "waypoints",
+        speed: float = option(0.5, "m/s", gt=0),
+        closed: bool = option(False, "go on to the first point and start again"),
+        name: str = option("waypoints", "how missions call it"),
     ) -> None:
         self.name = name
         corners = _points("waypoints: points", points)
-        self.closed = check_flag("waypoints: closed", closed)
-        speed = check_number("waypoints: speed", speed, low=0.0, open_low=True)
+        self.closed = closed
         if self.closed:
             corners = torch.cat([corners, corners[:1]])
         lengths = corners.diff(dim=0).norm(dim=-1)

@@ -20,8 +20,8 @@ from afm_rl.errors import (
     NonFiniteError,
     check_choice,
     check_count,
-    check_number,
 )
+from afm_rl.options import option, options
 from afm_rl.regimes import Regime, Schedule, blend_phases, shifted
 
 
@@ -106,7 +106,6 @@ class MissionEnv(EnvBase):
     Args:
         start_noise: standard deviation of the start pose.
         batch_size: number of missions, or ``()`` for any.
-        seed: missions without a seed of their own get ``seed, seed + 1, ...``.
         device: where the tensors live.
         missions: what missions are unless ``reset`` is given others: a tensordict that
             broadcasts to ``batch_size``, or the arguments of :meth:`mission`.
@@ -123,11 +122,12 @@ class MissionEnv(EnvBase):
     more: Sequence[str] = ()  # arguments of `mission` beside those of the format
     _last: TensorDictBase | None = None
 
+    @options("")
     def __init__(
         self,
         start_noise: float,
         batch_size: Sequence[int] = (),
-        seed: int = 0,
+        seed: int = option(0, "missions without one of their own get seed, seed + 1, ...", ge=0),
         device: torch.device | str | None = None,
         missions: TensorDictBase | Mapping[str, Any] | None = None,
         dtype: torch.dtype | None = None,
@@ -136,8 +136,7 @@ class MissionEnv(EnvBase):
         super().__init__(device=device, batch_size=batch)
         self._batch_locked = bool(batch)
         self.dtype = check_dtype(dtype)
-        self.seed = check_count("seed", seed, low=0)
-        self.start_noise = check_number("start_noise", start_noise, low=0.0)
+        self.seed, self.start_noise = seed, start_noise
         self._given = missions
 
     @property

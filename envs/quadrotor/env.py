@@ -24,7 +24,8 @@ from afm_rl.envs.missions.settings import (
     steps_at,
 )
 from afm_rl.envs.quadrotor.simulation import QuadrotorSimulation
-from afm_rl.errors import ConfigurationError, check_choice, check_count, check_flag, check_number
+from afm_rl.errors import ConfigurationError
+from afm_rl.options import option, options
 from afm_rl.regimes import Regime, Schedule, flight_regimes
 from afm_rl.spaces.airframe import QuadrotorBody
 
@@ -79,19 +80,6 @@ class CrazyflieTrack(MissionEnv):
         regime: regime family; all of :func:`~afm_rl.regimes.flight_regimes` if None.
         schedule: when regimes change: a schedule, or times in s; at 2 s and 5 s if None.
         body: the quadrotor, a Crazyflie if None.
-        duration: length of a flight (s).
-        max_steps: control ticks after which a flight is over, if that is earlier.
-        horizon: ticks N by which ``reference`` looks ahead.
-        preview: whether it holds the future; otherwise it repeats the present set-point.
-        start: ``"moving"``, with the velocity of the reference, or ``"rest"``. Either starts at
-            the reference, level. None: moving with a preview, and at rest without, as published.
-        limit: distance from the reference at which a flight is lost (m).
-        sensor_noise: standard deviation in ``observation``: one number, or four for position
-            (m), velocity (m/s), attitude (rad) and body rate (rad/s).
-        start_noise: standard deviation of the start position per axis (m).
-        dt: control tick (s).
-        substeps: plant steps per tick, K.
-        trace: whether to publish the states in between.
         action_low: lowest action, ``(4,)``; what the motors can do if None.
         action_high: highest action.
         settings: further arguments of :class:`~afm_rl.envs.missions.env.MissionEnv`:
@@ -114,23 +102,34 @@ class CrazyflieTrack(MissionEnv):
     plant: type[QuadrotorSimulation] = QuadrotorSimulation
     more = ("times",)
 
+    @options("")
     def __init__(
         self,
         tracks: Sequence[Reference | str | Path] | Reference | str | Path = "circle_2m_0.8mps",
         regime: Regime | None = None,
         schedule: Schedule | Sequence[float] | None = None,
         body: QuadrotorBody | None = None,
-        duration: float = 8.0,
-        horizon: int = 20,
-        preview: bool = True,
-        start: str | None = None,
-        limit: float = 50.0,
-        sensor_noise: float | Sequence[float] = 0.0,
-        start_noise: float = 0.0,
-        dt: float = 0.05,
-        substeps: int = 25,
-        trace: bool = False,
-        max_steps: int = 5000,
+        duration: float = option(8.0, "of a flight, s, a multiple of dt", gt=0),
+        horizon: int = option(20, "ticks by which the reference looks ahead, N", ge=1),
+        preview: bool = option(
+            True, "False: the planner is given one set-point, as in the published flights"
+        ),
+        start: str | None = option(
+            None,
+            "moving, as fast as the reference, or rest; None: rest without preview, as published",
+            choices=("rest", "moving"),
+        ),
+        limit: float = option(50.0, "distance from the reference at which it is lost, m", gt=0),
+        sensor_noise: float | Sequence[float] = option(
+            0.0, "standard deviation, or four: m, m/s, rad, rad/s", ge=0
+        ),
+        start_noise: float = option(0.0, "standard deviation of the start position, m", ge=0),
+        dt: float = option(0.05, "control tick, s", gt=0),
+        substeps: int = option(25, "steps of the plant per tick, K", ge=1),
+        trace: bool = option(
+            False, "publish the plant's own steps of a tick, which updater=knode learns from"
+        ),
+        max_steps: int = option(5000, "ticks after which a flight is over, if earlier", ge=1),
         action_low: Sequence[float] | None = None,
         action_high: Sequence[float] | None = None,
         **settings: Any,
@@ -145,12 +144,9 @@ class CrazyflieTrack(MissionEnv):
         names = [reference.name for reference in self.references]
         check_names("tracks", names)
         self.body = check_body(body)
-        substeps = check_count("substeps", substeps)
         self.noise = flight_noise(between=substeps - 1)
-        dt = check_number("dt", dt, low=0.0, open_low=True)
         if not isinstance(schedule, Schedule):
             schedule = schedule_in_seconds((2.0, 5.0) if schedule is None else schedule, dt)
-        preview = check_flag("preview", preview)
         if start is None:
             start = "moving" if preview else "rest"
         self.simulation = self.plant(
@@ -160,13 +156,13 @@ class CrazyflieTrack(MissionEnv):
             body=self.body,
             dt=dt,
             substeps=substeps,
-            steps=min(_ticks(duration, dt), check_count("max_steps", max_steps)),
-            horizon=check_count("horizon", horizon),
+            steps=min(_ticks(duration, dt), max_steps),
+            horizon=horizon,
             preview=preview,
-            start=check_choice("start", start, ("rest", "moving")),
-            limit=check_number("limit", limit, low=0.0, open_low=True),
+            start=start,
+            limit=limit,
             sensor_noise=_sensor_noise(sensor_noise),
-            trace=check_flag("trace", trace),
+            trace=trace,
         )
         pairs = zip((action_low, action_high), self.body.bounds, strict=True)
         low, high = (most if given is None else given for given, most in pairs)
@@ -228,7 +224,6 @@ class CrazyflieTrack(MissionEnv):
 
 def _ticks(duration: float, dt: float) -> int:
     """Return the number of control ticks in a flight, whose duration (s) must be a multiple."""
-    duration = check_number("duration", duration, low=0.0, open_low=True)
     steps = round(duration / dt)
     if steps < 1 or abs(steps * dt - duration) > 1e-6 * duration:
         raise ConfigurationError(f"duration={duration!r}: expected a multiple of dt={dt!r} s")
@@ -240,8 +235,7 @@ def _sensor_noise(std: float | Sequence[float]) -> Tensor:
     given = list(std) if isinstance(std, Sequence) and not isinstance(std, str) else [std] * 4
     if len(given) != 4:
         raise ConfigurationError(f"sensor_noise={std!r}: expected one number, or four")
-    checked = [check_number("sensor_noise", value, low=0.0) for value in given]
-    return torch.tensor(checked, dtype=torch.float64).repeat_interleave(3)
+    return torch.tensor(given, dtype=torch.float64).repeat_interleave(3)
 
 
 class CrazyflieTrackGym(MissionGym):

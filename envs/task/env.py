@@ -16,8 +16,9 @@ from afm_rl.envs.missions.env import MissionEnv, PhasedSimulation
 from afm_rl.envs.missions.format import MissionNoise
 from afm_rl.envs.missions.settings import check_bounds, check_regime
 from afm_rl.envs.task.task import Task
-from afm_rl.errors import ConfigurationError, check_count, check_instance
+from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.film import body_pictures, curves
+from afm_rl.options import option, options
 from afm_rl.regimes import ActionGain, Regime, Schedule
 
 
@@ -49,13 +50,14 @@ class TaskEnv(MissionEnv):
 
     simulation: TaskSimulation
 
+    @options("")
     def __init__(
         self,
         task: Task,
         tracks: Sequence[str] | None = None,
         regime: Regime | None = None,
         schedule: Schedule | None = None,
-        max_steps: int | None = None,
+        max_steps: int | None = option(None, "of an episode; None: those of the task", ge=1),
         action_low: Sequence[float] | None = None,
         action_high: Sequence[float] | None = None,
         **settings: Any,
@@ -70,7 +72,7 @@ class TaskEnv(MissionEnv):
         bounds = check_bounds(low, high, task.action_names)
         axes = range(len(low))
         default = ActionGain([f"gain_{axis}" for axis in axes])
-        steps = task.steps if max_steps is None else check_count("max_steps", max_steps)
+        steps = task.steps if max_steps is None else max_steps
         schedule = Schedule([0.5]) if schedule is None else schedule
         self.task = task
         self.noise = MissionNoise({"actuator": (0x5441534B, len(low))})

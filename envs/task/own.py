@@ -12,7 +12,8 @@ from torch import Tensor
 from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
 from afm_rl.envs.task.rewards import Rewards
 from afm_rl.envs.task.task import NOWHERE, Reward, Task, bound_noise
-from afm_rl.errors import ConfigurationError, check_count, check_number
+from afm_rl.errors import ConfigurationError, check_count
+from afm_rl.options import option, options
 from afm_rl.spaces.manifold import Manifold
 
 Limits = Sequence[float] | None
@@ -71,24 +72,25 @@ def state_of(data: Any) -> Tensor:
     return torch.cat([torch.tensor(part) for part in (data.qpos, data.qvel, data.act)])
 
 
+@options("robot")
 def mujoco_task(
     xml: str | Path | None,
     reward: Reward | None,
-    steps: int = 1000,
-    frame_skip: int = 1,
-    start_noise: float = 0.01,
+    steps: int = option(1000, "of an episode", ge=1),
+    frame_skip: int = option(1, "simulation steps per action", ge=1),
+    start_noise: float = option(
+        0.01, "standard deviation of positions and velocities at the start", ge=0
+    ),
     action_low: Limits = None,
     action_high: Limits = None,
 ) -> Task:
     """Return a task with a robot of one's own: an MJCF file, and a reward.
 
+    It starts around the model's first keyframe, if it has one.
+
     Args:
         xml: file, or text that begins with ``<``.
         reward: see :class:`~afm_rl.envs.Task`.
-        steps: length of an episode.
-        frame_skip: simulation steps per action.
-        start_noise: standard deviation of positions and velocities at the start, around the
-            model's own (its first keyframe if it has one).
         action_low: lowest action; the actuators' control range if None.
         action_high: highest action.
 
@@ -101,10 +103,8 @@ def mujoco_task(
             f"{missing}: expected a setting; robot=mujoco needs robot.xml=FILE and "
             "robot.reward=MODULE.FUNCTION"
         )
-    noise = check_number("robot.start_noise", start_noise, low=0.0)
-    skip = check_count("robot.frame_skip", frame_skip)
     try:
-        world = MuJoCoDynamics(xml, skip)
+        world = MuJoCoDynamics(xml, frame_skip)
     except ConfigurationError as error:
         raise ConfigurationError(str(error).replace("dynamics.model", "robot.xml")) from error
     import mujoco
@@ -116,7 +116,7 @@ def mujoco_task(
 
     def start(seed: int) -> tuple[Tensor, Tensor]:
         drawn = torch.randn(size, generator=torch.Generator().manual_seed(seed)).double()
-        return world.manifold.add(first, noise * drawn), NOWHERE
+        return world.manifold.add(first, start_noise * drawn), NOWHERE
 
     name = "mjcf" if str(xml).lstrip().startswith("<") else Path(xml).stem
     low, high = action_low or world.action_low.tolist(), action_high or world.action_high.tolist()

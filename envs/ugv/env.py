@@ -19,7 +19,8 @@ from afm_rl.envs.courses.tracks import load_track
 from afm_rl.envs.missions.env import MissionEnv, PhasedSimulation
 from afm_rl.envs.missions.format import MissionNoise
 from afm_rl.envs.missions.settings import check_bounds, check_names, check_regime
-from afm_rl.errors import AFMError, check_choice, check_count, check_instance, check_number
+from afm_rl.errors import AFMError, check_choice, check_instance
+from afm_rl.options import option, options
 from afm_rl.regimes import ActionGain, Regime, Schedule
 from afm_rl.spaces.manifold import wrap_angle
 
@@ -167,15 +168,9 @@ class UGVTrack(MissionEnv):
         tracks: names, CSV paths (see :func:`~afm_rl.envs.courses.tracks.load_track`) or tracks.
         regime: regime family; gains on v and omega by default.
         schedule: when regimes change; by default at 0.15 and 0.80 of the targets.
-        process_noise: standard deviation per step of each pose component (m, m, rad).
-        start_noise: the same for the start pose.
-        dt: time step of Dubins dynamics (s).
-        reach: distance at which a target counts as reached (m).
-        max_steps: steps after which an episode is truncated.
         action_low: lower bounds of v (m/s) and omega (rad/s).
         action_high: upper bounds. Actions are clamped before the regime acts on them.
         world: how the robot moves; Dubins if None.
-        observed: how many of the state's coordinates are observed; all if None.
         settings: further arguments of :class:`~afm_rl.envs.missions.env.MissionEnv`:
             ``batch_size``, ``seed``, ``device``, ``missions`` and ``dtype``.
 
@@ -193,20 +188,21 @@ class UGVTrack(MissionEnv):
 
     simulation: UGVSimulation
 
+    @options("")
     def __init__(
         self,
         tracks: Sequence[str | Path | Track] = ("ethz_2",),
         regime: Regime | None = None,
         schedule: Schedule | None = None,
-        process_noise: float = 1e-5,
-        start_noise: float = 0.02,
-        dt: float = 0.2,
-        reach: float = 0.5,
-        max_steps: int = 5000,
+        process_noise: float = option(1e-5, "standard deviation per step, m and rad", ge=0),
+        start_noise: float = option(0.02, "standard deviation, m and rad", ge=0),
+        dt: float = option(0.2, "time step, s", gt=0),
+        reach: float = option(0.5, "distance at which a target counts as reached, m", gt=0),
+        max_steps: int = option(5000, "steps after which an episode is truncated", ge=1),
         action_low: Sequence[float] = (-1.0, -math.pi / 2),
         action_high: Sequence[float] = (1.0, math.pi / 2),
         world: DynamicsModel | None = None,
-        observed: int | None = None,
+        observed: int | None = option(None, "coordinates of the state; None: all", ge=1),
         **settings: Any,
     ) -> None:
         super().__init__(start_noise, **settings)
@@ -215,11 +211,10 @@ class UGVTrack(MissionEnv):
         self.tracks = tuple(one if isinstance(one, Track) else load_track(one) for one in tracks)
         names = [track.name for track in self.tracks]
         check_names("tracks", names)
-        self.process_noise = check_number("process_noise", process_noise, low=0.0)
-        self.noise = MissionNoise()
+        self.process_noise, self.noise = process_noise, MissionNoise()
         bounds = check_bounds(action_low, action_high, ACTIONS)
         schedule = Schedule() if schedule is None else schedule
-        world = Dubins(check_number("dt", dt, low=0.0, open_low=True)) if world is None else world
+        world = Dubins(dt) if world is None else world
         self.simulation = UGVSimulation(
             Course(self.tracks, self.dtype),
             check_regime(regime, lambda: ActionGain(["v_gain", "omega_gain"]), world.state_size, 2),
@@ -227,9 +222,9 @@ class UGVTrack(MissionEnv):
             low=bounds[0].to(self.dtype),
             high=bounds[1].to(self.dtype),
             world=world,
-            observed=world.state_size if observed is None else check_count("observed", observed),
-            reach=check_number("reach", reach, low=0.0, open_low=True),
-            steps=check_count("max_steps", max_steps),
+            observed=world.state_size if observed is None else observed,
+            reach=reach,
+            steps=max_steps,
         ).to(self.device)
         self._complete(names, bounds)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.dynamics.mujoco_model import changed_model
-from afm_rl.errors import check_count, check_number
+from afm_rl.options import option, options
 from afm_rl.regimes import Physics
 
 MODEL = Path(__file__).with_name("skid_steer.xml")
@@ -19,8 +19,13 @@ STEP = 0.01  # s, of the simulation
 PLANAR = 3  # state coordinates that make the pose: x, y, theta
 
 
+@options("dynamics")
 def skid_steer(
-    dt: float = 0.2, noise_std: float | Sequence[float] = (2e-3, 2e-2), threads: int = 0
+    dt: float = option(0.2, "time of an action, s, a multiple of 0.01 s", ge=STEP),
+    noise_std: float | Sequence[float] = option(
+        (2e-3, 2e-2), "how far the model is trusted per step, positions and velocities", gt=0
+    ),
+    threads: int = option(0, "that simulate beside the calling one", ge=0),
 ) -> MuJoCoDynamics:
     r"""Return a small robot with four wheels; actions are v (m/s) and omega (rad/s).
 
@@ -30,22 +35,17 @@ def skid_steer(
     larger than the robot's, as its wheels skid in turns. The state begins with x, y (m) and theta
     (rad); then height, pitch, roll, the angles of the wheels, and the velocities of all of these.
 
-    Args:
-        dt: time of an action (s), a multiple of 0.01 s.
-        noise_std: see :class:`~afm_rl.dynamics.MuJoCoDynamics`.
-        threads: that simulate; 0 for the calling one.
-
     >>> import torch
     >>> robot = skid_steer()
     >>> robot(torch.zeros(20), torch.tensor([1.0, 0.0]))[0] > 0.1
     tensor(True)
     """
-    skip = round(check_number("dynamics.dt", dt, low=STEP) / STEP)
+    skip = round(dt / STEP)
     turn = WIDTH / 2 / RADIUS
     mix = [[1 / RADIUS, -turn], [1 / RADIUS, turn]] * 2
     return MuJoCoDynamics(
         MODEL,
-        check_count("dynamics.dt", skip),
+        skip,
         noise_std,
         threads,
         changed_wheels,

@@ -315,7 +315,6 @@ def test_values_beyond_their_limits_are_refused(family, values, complaint):
         (lambda: DeadZone([1.0, math.inf]), r"half_range=\[1.0, inf\]: .*action_high"),
         (lambda: WheelSlip(HALF, at=[-1, 1]), "at=-1: expected"),
         (lambda: WheelSlip(HALF, peak=["a", 1]), "peak='a': expected"),
-        (lambda: Patches(size=0.0), "size=0.0: expected"),
         (lambda: Patches(names=[]), r"names=\(\): expected distinct names"),
         (lambda: Delay([3, 2]), r"span=\[3, 2\]: expected two numbers of steps"),
         (lambda: Delay([1, 11]), "highest <= 10"),

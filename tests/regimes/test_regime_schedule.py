@@ -80,7 +80,6 @@ def test_without_a_ramp_a_change_is_sudden_to_the_bit():
         {"at": [math.nan]},
         {"at": [math.inf], "by": "step"},
         {"at": ["0.5"]},
-        {"by": "steps"},
     ],
     ids=str,
 )

@@ -95,14 +95,9 @@ def test_files_that_cannot_be_used_say_why(tmp_path, header, rows, settings, mes
     [
         (lambda: Hover([0, 0]), "hover: position=.*expected finite numbers x, y, z"),
         (lambda: Hover("abc"), "hover: position"),
-        (lambda: Circle(radius=0), "circle: radius=0"),
-        (lambda: Circle(speed=-1.0), "circle: speed=-1.0"),
-        (lambda: FigureEight(period=0.0), "figure_8: period=0.0"),
         (lambda: Waypoints([[0, 0, 0]]), "two or more"),
         (lambda: Waypoints([[0, 0, 0], [0, 0, 0]]), "each unlike the one before"),
         (lambda: Waypoints([[0, 0, math.inf], [0, 0, 0]]), "waypoints: points"),
-        (lambda: Waypoints(SQUARE, speed=0.0), "waypoints: speed=0.0"),
-        (lambda: Waypoints(SQUARE, closed="yes"), "waypoints: closed='yes'"),
         (
             lambda: SampledReference(torch.arange(2.0), torch.zeros(2, 3), torch.zeros(2, 2)),
             r"\(N, 3\) each",
