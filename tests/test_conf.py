@@ -26,14 +26,6 @@ ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 POLICY = Path(__file__).parents[1] / "examples" / "policies" / "pendulum_sac.safetensors"
 OWN = [f"robot.xml={ASSETS / 'inverted_pendulum.xml'}"]
 OWN += ["robot.reward=afm_rl.envs.task.rewards.upright"]
-STILL = ["robot=inverted_pendulum", "cost=tracking", "cost.weights=[1,1,1,1]"]
-STILL += [
-    "~planner.temperature",
-    "cost.action_weights=[1]",
-    "cost.coordinates=[]",
-    "cost.rest=null",
-    "cost.in_keys=[]",
-]
 PARTNERS = {  # what else must be chosen for a choice to make sense
     "dynamics=oracle": ["updater=oracle"],
     "dynamics=knode": ["robot=quadrotor"],
@@ -50,7 +42,6 @@ PARTNERS = {  # what else must be chosen for a choice to make sense
     "updater=sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
     "method=afm_sysid": ["robot=inverted_pendulum", "robot.physics={length:[0.5,2.0]}"],
     "planner=mpc": ["robot=quadrotor"],
-    "planner=icem_lqr": STILL,
     "planner=policy": ["robot=gymnasium", f"planner.file={POLICY}"],
     "method=offline_knode": ["robot=quadrotor"],
     "method=online_knode": ["robot=quadrotor"],

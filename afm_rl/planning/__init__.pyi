@@ -5,7 +5,6 @@ from .costs import (
     QuadraticCost as QuadraticCost,
     TrackingCost as TrackingCost,
 )
-from .handover import Handover as Handover
 from .icem import ICEM as ICEM
 from .imported_policy import (
     policy_from_cleanrl as policy_from_cleanrl,

@@ -17,7 +17,16 @@ MODULES = sorted(
     for path in folder.parent.glob("*.py")
 )
 FLIGHT = "robot=quadrotor"
+STILL = ["robot=inverted_pendulum", "cost=tracking", "cost.weights=[1,1,1,1]"]
+STILL += [
+    "~planner.temperature",
+    "cost.action_weights=[1]",
+    "cost.coordinates=[]",
+    "cost.rest=null",
+    "cost.in_keys=[]",
+]
 PARTNERS = {
+    "planner=icem_lqr": STILL,
     "planner=law": ["robot=gusty_pendulum"],
     "planner=geometric": [FLIGHT],
     "planner=geometric_soft": [FLIGHT],

@@ -6,13 +6,14 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
+from handover import Handover
 from plant import LENGTHS, SPACE, TIPS, VOLTAGE, Plant, step
 from tensordict import TensorDict
 from torch import Tensor
 
 from afm_rl.dynamics import ParametricDynamics
 from afm_rl.learning import GaussianNLLLoss, PhysicsIdentifier
-from afm_rl.planning import ICEM, MPPI, Handover, PlanningEnv, TrackingCost
+from afm_rl.planning import ICEM, MPPI, PlanningEnv, TrackingCost
 from afm_rl.transforms.policy import ActionFlowPolicy
 
 MIDDLE = {"length": sum(LENGTHS) / 2, "tip": sum(TIPS) / 2}

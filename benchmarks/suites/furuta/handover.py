@@ -11,8 +11,7 @@ from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.options import option, options
-from afm_rl.planning.costs import QuadraticCost
-from afm_rl.planning.planning_env import PlanningEnv
+from afm_rl.planning import PlanningEnv, QuadraticCost
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.planning.riccati import stationary_value
 
@@ -21,8 +20,8 @@ class Handover(RecedingHorizonPlanner):
     r"""Plans with another planner, and hands over to LQR where that can do it alone.
 
     Around the equilibrium :math:`\bar x` at which the cost is least, the model is linearised at
-    every tick, for every mission, and :func:`~.riccati.stationary_value` gives the cost to go
-    :math:`V(x) = e^\top P e` and the feedback :math:`u = -K e`, :math:`e = x \ominus \bar x`. It
+    every tick, for every mission, and :func:`~afm_rl.planning.riccati.stationary_value` gives the
+    cost to go :math:`V(x) = e^\top P e` and the feedback :math:`u = -K e`, :math:`e = x \ominus \bar x`. It
     acts where V is at most ``level`` and its action is within the box. Elsewhere the other planner
     does, which begins anew when it is needed again. To each of its plans ``min(V, cap)`` of the
     last state is added (:attr:`PlanningEnv.value`): so plans need not reach the goal, and those

@@ -7,11 +7,12 @@ from functools import partial
 import pytest
 import scipy.linalg
 import torch
+from furuta.handover import Handover
 from tensordict import TensorDict
 
 from afm_rl.dynamics import KnownDynamics, ParametricDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import ICEM, GoalDistance, Handover, PlanningEnv, TrackingCost
+from afm_rl.planning import ICEM, GoalDistance, PlanningEnv, TrackingCost
 from afm_rl.planning.riccati import stationary_value
 from afm_rl.spaces.manifold import Manifold
 
