@@ -125,6 +125,21 @@ def option(
     return cast(T, Option(default, about, low, le, gt is not None, choices, least))
 
 
+def choice(default: T, *about: str, **choices: str) -> T:
+    """Return the default of an argument that has one of some texts, as :func:`options` reads it.
+
+    Args:
+        default: of the argument.
+        about: what it is for.
+        choices: what each text means.
+
+    >>> cast(Option, choice("mean", "of batches", mean="their mean", none="")).text
+    'of batches; mean: their mean; none'
+    """
+    named = [f"{name}: {text}" if text else name for name, text in choices.items()]
+    return option(default, "; ".join([*about, *named]), choices=tuple(choices))
+
+
 def options(
     group: str, *takers: Callable[..., Any], **parts: Callable[..., Any]
 ) -> Callable[[Target], Target]:
@@ -227,6 +242,8 @@ def with_arguments(text: str, known: dict[str, Option]) -> str:
     if not known:
         return text
     lines = [f"    {name}: {each.text}." for name, each in known.items()]
+    if "Raises:" not in text:
+        lines += ["", "Raises:", "    ConfigurationError: for an option that is out of its range."]
     rows = cleandoc(text).split("\n")
     if "Args:" not in rows:
         ends = ("Returns:", "Yields:", "Raises:", ">>> ")

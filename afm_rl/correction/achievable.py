@@ -5,14 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from afm_rl.options import option
+from afm_rl.options import choice
 
 LIMIT = 4.0  # half ranges: effects beyond carry no more news
 MODES = ("mixed", "direction", "clip")
-SATURATION = option(
-    "mixed",
-    "clip: cut each component; direction: do it slower; mixed: slower if under 15 %",
-    choices=MODES,
+SATURATION = choice(
+    "mixed", mixed="slower if under 15 %", direction="do it slower", clip="cut each component"
 )
 LEAST = 0.15  # share of an action that must be had for "mixed" to clip it
 LITTLE = 0.3  # share of the box that must be reached for plans to keep to it

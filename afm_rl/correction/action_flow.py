@@ -48,9 +48,6 @@ class ActionFlow(PairCorrector):
         action_high: highest action, ``(A,)``.
         network: the network; None: the universal one that comes with the package.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> flow = ActionFlow(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
     >>> from afm_rl.dynamics import Dubins
     >>> memory, state = flow.begin(torch.zeros(3)), torch.zeros(3)
@@ -79,57 +76,37 @@ class ActionFlow(PairCorrector):
         action_low: Tensor,
         action_high: Tensor,
         hypotheses: Sequence[str] | None = option(None, "context windows and delays; None: all"),
-        rows: int | None = option(
-            None, "pairs of a context window, K; None: 12, or four more than actions", ge=1
-        ),
+        rows: int | None = option(None, "pairs of a context window; None: 12, or more", ge=1),
         memory: int = option(80, "transitions that are remembered", ge=1),
         place: Sequence[int] = option((), "state coordinates in which the ground may differ", ge=0),
-        place_scale: float = option(
-            0.5, "distance at which ground counts as other ground, in their unit", gt=0
-        ),
-        plain: float = option(
-            -6.0, "prior log-odds of a linear model, against the network; it does not extrapolate"
-        ),
+        place_scale: float = option(0.5, "distance to other ground, in their unit", gt=0),
+        plain: float = option(-6.0, "prior log-odds of linear models against the network"),
         samples: int = option(16, "starting points of the flow", ge=1),
         source_std: float = option(0.3, "of these, sigma, a share of the largest action", ge=0),
         steps: int = option(1, "midpoint steps", ge=1),
         saturation: str = SATURATION,
-        compile: bool = option(
-            False, "the tick as machine code, faster for one mission; compiled once"
-        ),
+        compile: bool = option(False, "the tick as machine code; faster for one mission"),
         cache: str | Path = option("~/.cache/afm_rl", "folder of what is compiled"),
         network: AxisNetwork | None = None,
-        odds: float = option(
-            1.0, "prior log-odds that nothing has changed; a larger one acts later", ge=0
-        ),
-        most_odds: float = option(
-            16.0, "what healthy steps can make of them, so that no change is hidden for long", ge=0
-        ),
+        odds: float = option(1.0, "prior log-odds that nothing has changed", ge=0),
+        most_odds: float = option(16.0, "what a long healthy time can make of them", ge=0),
         discount: float = option(
             0.95,
-            "of how well models predicted; .95: looks back on 20 steps, longer in noise",
+            "of losses; .95: looks back on 20 steps",
             ge=0,
             le=1,
         ),
-        noise: float = option(
-            0.05, "that no model explains, at first, a share of the largest action", ge=0
-        ),
+        noise: float = option(0.05, "unexplained at first, a share of the largest action", ge=0),
         noise_rate: float = option(0.1, "share of its square renewed at every step", ge=0, le=1),
-        least_noise: float = option(
-            0.02, "its floor, a share of the largest command that is remembered", gt=0
-        ),
-        least_command: float = option(
-            0.25, "which counts as this at least, a share of the largest action", gt=0, le=1
-        ),
+        least_noise: float = option(0.02, "its floor, a share of the largest recent command", gt=0),
+        least_command: float = option(0.25, "its floor, a share of the largest action", gt=0, le=1),
         quiet: float = option(
-            1.0, "standard deviations of the model's own noise that need no explanation", ge=0
+            1.0, "innovation that needs no explanation, in standard deviations", ge=0
         ),
-        tails: float = option(
-            1.0, "degrees of freedom of the Student-t distribution of what is missed", gt=0
-        ),
+        tails: float = option(1.0, "degrees of freedom of Student-t residuals", gt=0),
         delay: int | Sequence[int] = option(
             0,
-            "known steps from a command to its effect, of all or of each; more are found out",
+            "known steps to its effect, of all or each action",
             ge=0,
             le=LONGEST,
         ),

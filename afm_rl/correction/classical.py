@@ -21,9 +21,7 @@ from afm_rl.correction.least_squares import (
 )
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel
-from afm_rl.options import option, options
-
-FORMS = ("gain", "gain_offset", "affine")
+from afm_rl.options import choice, option, options
 
 
 class ClassicalCorrector(PairCorrector):
@@ -40,9 +38,7 @@ class ClassicalCorrector(PairCorrector):
         action_low: Tensor,
         action_high: Tensor,
         window: int = option(24, "transitions that can be remembered, K", ge=1),
-        gate: float = option(
-            5.0, "innovation at which it does nothing, standard deviations of the model", ge=0
-        ),
+        gate: float = option(5.0, "innovation at which it does nothing, standard deviations", ge=0),
         saturation: str = SATURATION,
     ) -> None:
         super().__init__(action_low, action_high, window, window, quiet=gate)
@@ -120,9 +116,6 @@ class LeastSquares(ClassicalCorrector):
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> LeastSquares(torch.tensor([-1.0]), torch.tensor([1.0])).memory
     24
     """
@@ -132,13 +125,9 @@ class LeastSquares(ClassicalCorrector):
         self,
         action_low: Tensor,
         action_high: Tensor,
-        form: str = option(
-            "gain", "gain or gain_offset, each axis for itself; or affine", choices=FORMS
-        ),
+        form: str = choice("gain", gain="each axis for itself", gain_offset="", affine=""),
         window: int = 24,
-        forgetting: float = option(
-            0.8, "weight of a transition relative to the next one", gt=0, le=1
-        ),
+        forgetting: float = option(0.8, "weight of a transition against the next one", gt=0, le=1),
         gate: float = 5.0,
         saturation: str = "clip",
     ) -> None:
@@ -197,9 +186,6 @@ class L1Augmentation(ClassicalCorrector):
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
 
     >>> L1Augmentation(torch.tensor([-1.0]), torch.tensor([1.0]), dt=0.2).memory
     24

@@ -12,7 +12,7 @@ from afm_rl.correction.base import Correction, Corrector, Fields
 from afm_rl.correction.network import midpoint, mlp
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_count, check_counts
-from afm_rl.options import option, options
+from afm_rl.options import choice, option, options
 from afm_rl.spaces.manifold import draw_states, uniform
 
 
@@ -31,9 +31,6 @@ class PaperFlow(Corrector):
         action_high: highest action, ``(A,)``.
         features: indices of the state coordinates that the network sees.
         state_size: number of state coordinates, D of the error.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
     """
 
     @options("corrector")
@@ -43,25 +40,18 @@ class PaperFlow(Corrector):
         action_high: Tensor,
         features: Sequence[int],
         state_size: int,
-        rule: str = option(
-            "text",
-            "text: transform while misaligned, as written; code: then execute the plan, and "
-            "transform otherwise",
-            choices=("text", "code"),
+        rule: str = choice(
+            "text", text="transform while misaligned", code="execute the plan then, transform else"
         ),
         gate: float = option(1.0, "delta_M, m and rad mixed", ge=0),
         steps: int = option(10, "midpoint steps", ge=1),
         width: int = option(64, "units of an encoder's layers", ge=1),
         head: Sequence[int] = option((128, 64), "units of the hidden layers behind them", ge=1),
-        error_action: str = option(
-            "planned",
-            "the error is taken against the planned action; or executed",
-            choices=("planned", "executed"),
+        error_action: str = choice(
+            "planned", "action that the error is taken against", planned="", executed=""
         ),
         wrap: bool = option(False, "wrap differences of angles; the published runs did not"),
-        latch: bool = option(
-            True, "keep the transition that opened the gate until it closes; False: the latest"
-        ),
+        latch: bool = option(True, "keep the transition that opened the gate; False: the latest"),
         seed: int = option(0, "initial weights", ge=0),
     ) -> None:
         super().__init__(action_low, action_high, recent=1)

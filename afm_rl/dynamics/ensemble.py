@@ -21,12 +21,11 @@ from afm_rl.dynamics.stacked import (
 from afm_rl.errors import (
     ConfigurationError,
 )
-from afm_rl.options import option, options
+from afm_rl.options import choice, option, options
 from afm_rl.spaces.manifold import Manifold
 
 Stack = Sequence[Tensor]
 Parameters = tuple[Iterable[Tensor], Iterable[Tensor]]  # weights and biases, layer by layer
-PROPAGATIONS = ("mean", "sample", "member")
 INITS = {"uniform": uniform_layer, "sparse": sparse_layer}
 CHUNK = 2**18  # activations per layer and chunk: 1 MiB in float32, so that they stay in cache
 
@@ -75,34 +74,29 @@ class Ensemble(PerMissionModel):
         action_size: int,
         features: Sequence[int],
         members: int = option(5, "networks, E", ge=1, le=1000),
-        hidden: Sequence[int] = option(
-            (200, 200, 200), "units per layer", ge=1, le=10_000, least=1
-        ),
+        hidden: Sequence[int] = option((200, 200, 200), "units", ge=1, le=10_000, least=1),
         log_variance: Sequence[float] = option(
-            (-10.0, 0.5), "soft bounds, of the standardised state change"
+            (-10.0, 0.5), "soft bounds, of standardised changes"
         ),
-        propagation: str = option(
-            "mean",
-            "mean: of the members' means; sample: one of each (as published); member: one per plan",
-            choices=PROPAGATIONS,
+        propagation: str = choice(
+            "mean", mean="of all means", sample="of each, as published", member="one per plan"
         ),
         seed: int = option(0, "initial weights", ge=0),
-        init: str = option(
-            "uniform", "sparse: nine tenths of the weights are zero; or uniform", choices=INITS
-        ),
+        init: str = choice("uniform", uniform="", sparse="nine tenths of the weights are zero"),
         layer_norm: bool = option(False, "standardise a layer's units before each LeakyReLU"),
         running_count: int | None = option(
             None,
-            "samples that pre-training counts for in running statistics; None: they stay",
+            "samples pre-training counts for; None: statistics stay",
             ge=2,
         ),
-        precision: str = option(
+        precision: str = choice(
             "float32",
-            "of hidden layers in rollouts: float32; bfloat16: faster on processors made for it",
-            choices=("float32", "bfloat16"),
+            "of hidden layers in rollouts",
+            float32="",
+            bfloat16="faster, where processors have it",
         ),
         encode: bool = option(
-            True, "show networks cosines and sines of angles; False: raw coordinates, as published"
+            True, "cosines and sines of angles as inputs; False: raw, as published"
         ),
     ) -> None:
         super().__init__(manifold, action_size)

@@ -14,7 +14,7 @@ from afm_rl.dynamics.quadrotor import HeldFlight, Quadrotor
 from afm_rl.dynamics.rates import HeldFunction, HeldRate, runge_kutta, runge_kutta_linearised
 from afm_rl.dynamics.residual import HeldHybrid, Network, draw_network, network_shapes
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import choice, option, options
 
 
 class KNODE(PerMissionModel):
@@ -38,9 +38,6 @@ class KNODE(PerMissionModel):
         rate: f as a function, ``rate(state, action) -> (*B, S)``; None for a
             :class:`~afm_rl.dynamics.Quadrotor`, whose equations are known.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> model = KNODE(Quadrotor()).push_()
     >>> level = torch.zeros(4, 13).index_fill(1, torch.tensor(9), 1.0)
     >>> ahead, by_state, by_action = model.linearise(level, torch.zeros(4, 4))
@@ -57,18 +54,16 @@ class KNODE(PerMissionModel):
         rate: Callable[[Tensor, Tensor], Tensor] | None = None,
         dt: float | None = option(None, "control tick, s; None: that of the nominal model", gt=0),
         units: int = option(64, "of each network", ge=1),
-        pool: int = option(
-            3, "networks at most, P; their weights are 1, 1/e, 1/e^2, the newest first", ge=1
-        ),
+        pool: int = option(3, "networks at most, P; the newest weighs most", ge=1),
         features: Sequence[int] | None = option(
-            None, "state coordinates that networks see; None: all, as published", ge=0
+            None, "coordinates that networks see; None: all", ge=0
         ),
         substeps: int = option(1, "Runge-Kutta steps per control tick", ge=1),
-        frame: str = option(
+        frame: str = choice(
             "world",
-            "in which networks give accelerations: body, where a lost mass stays put; world, as "
-            "published",
-            choices=("world", "body"),
+            "axes of the networks' accelerations",
+            body="a lost mass stays put",
+            world="as published",
         ),
         seed: int = option(0, "of networks drawn by the model itself", ge=0),
     ) -> None:

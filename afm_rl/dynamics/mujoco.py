@@ -141,9 +141,7 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
     def __init__(
         self,
         model: Any,
-        frame_skip: int | None = option(
-            None, "simulation steps per action; None: the environment's, or 1", ge=1
-        ),
+        frame_skip: int | None = option(None, "of the simulation per action; None: its own", ge=1),
         noise_std: float | Sequence[float] = option(
             (0.01, 0.1), "how far the model is trusted per step, positions and velocities", gt=0
         ),

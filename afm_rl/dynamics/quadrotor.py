@@ -191,9 +191,6 @@ class Quadrotor(KnownDynamics):
     Args:
         body: the quadrotor, a Crazyflie if None.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> import torch
     >>> model = Quadrotor()
     >>> level = torch.zeros(4, 13).index_fill(1, torch.tensor(9), 1.0)

@@ -53,18 +53,16 @@ def fit_ensemble(
     *,
     epochs: int = option(40, "passes over the data", ge=1),
     batch_size: int = option(
-        256, "transitions per step and member, at most: a pass has at least eight steps", ge=1
+        256, "transitions per step, so that a pass has eight steps at least", ge=1
     ),
     lr: float = option(2e-3, "largest step size of Adam", gt=0),
     beta: float = option(
         0.0,
-        "how little a row's stated variance takes from its weight, see gaussian_nll",
+        "how little variance takes from weights, see gaussian_nll",
         ge=0,
         le=1,
     ),
-    held_out: float = option(
-        0.1, "share of the transitions, picked at random, that only judges", gt=0, le=0.5
-    ),
+    held_out: float = option(0.1, "share of transitions that only judges", gt=0, le=0.5),
     keys: tuple[NestedKey, NestedKey, NestedKey] = (
         "observation",
         "action",
@@ -212,19 +210,15 @@ def pretrain_ensemble(
     state_box: tuple[Tensor, Tensor],
     action_box: tuple[Tensor, Tensor],
     *,
-    samples: int = option(
-        50_000, "transitions; a tenth as many are held out", ge=1, le=100_000_000
-    ),
+    samples: int = option(50_000, "transitions; a tenth more are held out", ge=1, le=100_000_000),
     epochs: int = option(16, "passes over them", ge=1, le=100_000_000),
     batch_size: int = option(256, "transitions per step and member", ge=1, le=100_000_000),
     lr: float = option(2e-3, "largest step size of Adam", gt=0, le=1),
     one_cycle: bool = option(True, "the step size rises and falls; False: it stays, as published"),
     tolerance: float = option(
-        0.0, "stop once the held-out loss changes by less between epochs; published: 1e-3", ge=0
+        0.0, "least change of the held-out loss to go on; published: 1e-3", ge=0
     ),
-    action_noise: float = option(
-        0.0, "0.1: actions perturbed by +-10 % (domain randomisation)", ge=0
-    ),
+    action_noise: float = option(0.0, "0.1: actions perturbed by +-10 %", ge=0),
     seed: int = option(0, "of data and order", ge=0),
     names: Sequence[str] | None = None,
     progress: bool = False,

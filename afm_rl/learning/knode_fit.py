@@ -122,9 +122,7 @@ def pretrain_knode(
     ticks: int = option(16, "length of each", ge=1, le=100_000_000),
     epochs: int = option(200, "full-batch steps of Adam", ge=1, le=100_000_000),
     lr: float = option(0.01, "step size", gt=0, le=1),
-    noise: float = option(
-        1e-4, "standard deviation of what is added to states, m, m/s, rad, rad/s", ge=0
-    ),
+    noise: float = option(1e-4, "noise of states, m, m/s, rad, rad/s", ge=0),
     seed: int = option(0, "of data and network", ge=0),
     progress: bool = False,
 ) -> float:

@@ -69,9 +69,6 @@ class KNODEUpdater(Learner):
     Args:
         loss: a loss over a :class:`~afm_rl.dynamics.KNODE`, whose keys are read.
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> from tensordict import TensorDict
     >>> from afm_rl.dynamics import Quadrotor
     >>> updater = KNODEUpdater(GaussianNLLLoss(KNODE(Quadrotor()).expand_(4)), begin=0.0)
@@ -89,23 +86,15 @@ class KNODEUpdater(Learner):
         loss: GaussianNLLLoss,
         window: float = option(0.15, "that one network learns from, s", gt=0),
         begin: float = option(2.0, "when rows are first gathered, s", ge=0),
-        latency: float = option(
-            0.05, "time of flight that training takes, s: the network joins so much later", ge=0
-        ),
+        latency: float = option(0.05, "flight time until a new network joins, s", ge=0),
         epochs: int = option(80, "full-batch steps of Adam", ge=1),
         lr: float = option(0.01, "step size", gt=0),
         l2: float = option(5e-8, "weight of the squared parameters", ge=0),
-        noise: float = option(
-            1e-4, "standard deviation of what is added to states, in their units", ge=0
-        ),
-        published_random: bool = option(
-            False, "True: the same random numbers for each network, also on the actions"
-        ),
+        noise: float = option(1e-4, "noise of states, in their units", ge=0),
+        published_random: bool = option(False, "the same random numbers for each network"),
         trace_key: NestedKey = option(("next", "trace"), "entry of the plant's own time steps"),
         mask_key: NestedKey | None = None,
-        seed_key: NestedKey | None = option(
-            None, "missions have random numbers of their own; None: the same for all"
-        ),
+        seed_key: NestedKey | None = option(None, "seeds of missions; None: all have the same"),
         seed: int = option(0, "of these numbers", ge=0),
     ) -> None:
         super().__init__(loss, mask_key)

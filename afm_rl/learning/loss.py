@@ -12,9 +12,8 @@ from torchrl.objectives import LossModule
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_instance
-from afm_rl.options import option, options
+from afm_rl.options import choice, option, options
 
-REDUCTIONS = ("mean", "sum", "none")
 WRAP = option(True, "False: a turn across +-pi counts as one of 2 pi, as in the published runs")
 
 
@@ -30,9 +29,7 @@ class InPlaceLoss(LossModule):
     @options("loss")
     def __init__(
         self,
-        reduction: str = option(
-            "mean", "mean, sum or none: one value per batch element", choices=REDUCTIONS
-        ),
+        reduction: str = choice("mean", mean="", sum="", none="one value per batch element"),
     ) -> None:
         self._in_keys: list[NestedKey] | None = None
         super().__init__()

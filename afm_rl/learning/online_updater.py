@@ -17,7 +17,7 @@ from afm_rl.learning.error_decomposition import check_half_range, decompose_erro
 from afm_rl.learning.loss import WRAP, GaussianNLLLoss, gaussian_nll
 from afm_rl.learning.optimisers import ObGD
 from afm_rl.learning.updater import Learner, Updater
-from afm_rl.options import option, options
+from afm_rl.options import choice, option, options
 
 
 class OnlineUpdater(Learner):
@@ -113,11 +113,7 @@ class StreamXUpdater(OnlineUpdater):
     def __init__(
         self,
         loss: GaussianNLLLoss,
-        form: str = option(
-            "error",
-            "error: descend each member's error; or loss: its likelihood",
-            choices=("error", "loss"),
-        ),
+        form: str = choice("error", "what each member descends", error="", loss="its likelihood"),
         lr: float = option(1.0, "step size before the bound", gt=0),
         kappa: float = option(2.0, "strictness of the bound", gt=0),
         mask_key: NestedKey | None = None,
@@ -220,9 +216,7 @@ class UnmatchedUpdater(Updater):
         loss: GaussianNLLLoss,
         updater: Callable[[GaussianNLLLoss], OnlineUpdater],
         scale: Sequence[float] | Tensor,
-        gate: float = option(
-            5.0, "standard deviations of the model that an error no action explains exceeds", ge=0
-        ),
+        gate: float = option(5.0, "unmatched error that it must exceed, standard deviations", ge=0),
     ) -> None:
         super().__init__(loss)
         self.updater = check_instance("updater.updater", updater(loss), OnlineUpdater)

@@ -87,12 +87,8 @@ class PhysicsIdentifier(Learner):
         ranges: Mapping[str, Sequence[float]],
         scale: Sequence[float] | Tensor,
         count: int = option(97, "candidates per parameter, all combinations of them", ge=2),
-        gate: float = option(
-            3.0, "standard deviations of the model that an error no action explains exceeds", ge=0
-        ),
-        forgetting: float = option(
-            0.95, "weight of a transition relative to the next one", gt=0, le=1
-        ),
+        gate: float = option(3.0, "unmatched error that it must exceed, standard deviations", ge=0),
+        forgetting: float = option(0.95, "weight of a transition against the next one", gt=0, le=1),
         margin: float = option(3.0, "nats by which another candidate must be better", ge=0),
         lost: float = option(20.0, "nats that a simulation which breaks off loses", ge=0),
         most: int = option(1000, "candidates at most, all of which are simulated", ge=1),

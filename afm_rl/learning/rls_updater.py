@@ -16,7 +16,7 @@ from afm_rl.learning.error_decomposition import ErrorParts, decompose_error
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.learning.updater import Learner
 from afm_rl.mission_state import MissionState
-from afm_rl.options import option, options
+from afm_rl.options import choice, option, options
 
 
 class Fit(NamedTuple):
@@ -159,18 +159,14 @@ class RLSUpdater(Learner):
     def __init__(
         self,
         loss: GaussianNLLLoss,
-        part: str = option(
-            "all",
-            "matched: what other actions can undo; unmatched: the rest, for use beside AFM; or all",
-            choices=("all", "matched", "unmatched"),
+        part: str = choice(
+            "all", matched="what actions can undo", unmatched="the rest, beside AFM", all=""
         ),
-        forgetting: float = option(
-            0.97, "weight of a transition relative to the next one", gt=0, le=1
-        ),
+        forgetting: float = option(0.97, "weight of a transition against the next one", gt=0, le=1),
         gate: float = option(5.0, "innovation beyond which a transition is a change", gt=0),
         spread: float = option(
             100.0,
-            "standard deviation of the prior of gains, ten times that of coupling and bias",
+            "prior deviation of gains, ten times that of coupling and bias",
             gt=0,
         ),
         mask_key: NestedKey | None = None,

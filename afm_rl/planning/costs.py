@@ -57,9 +57,7 @@ class GoalDistance(Cost):
         coordinates: Sequence[int] = option((0, 1), "coordinates of the state that count", ge=0),
         in_keys: Sequence[NestedKey] = option(("goal",), "entry of the goal"),
         goal_size: int = option(2, "coordinates that the goal gives", ge=1),
-        weights: Sequence[float] | None = option(
-            None, "of the coordinates, in cost units per m or rad; None: 1", ge=0
-        ),
+        weights: Sequence[float] | None = option(None, "of the coordinates; None: 1", ge=0),
     ) -> None:
         super().__init__()
         self.coordinates, self.in_keys = list(coordinates), as_keys(in_keys)
@@ -189,16 +187,10 @@ class TrackingCost(QuadraticCost):
         self,
         weights: Sequence[float] = option(..., "w, one per state coordinate", ge=0),
         action_weights: Sequence[float] = option(..., "rho, one per action component", ge=0),
-        coordinates: Sequence[int] = option(
-            ..., "coordinates that the reference gives, in order", ge=0
-        ),
-        rest: Sequence[float] | None = option(
-            None, "targets of the others, one per state coordinate; None: 0"
-        ),
+        coordinates: Sequence[int] = option(..., "that the reference gives, in order", ge=0),
+        rest: Sequence[float] | None = option(None, "targets of the others; None: 0"),
         angles: Sequence[int] = option((), "coordinates in rad, whose difference wraps", ge=0),
-        in_keys: Sequence[NestedKey] = option(
-            ("reference",), "entry of the reference; []: there is none"
-        ),
+        in_keys: Sequence[NestedKey] = option(("reference",), "entry of the reference; []: none"),
     ) -> None:
         super().__init__()
         size, self.in_keys = len(weights), as_keys(in_keys)

@@ -84,26 +84,18 @@ class ICEM(SamplingPlanner):
         self,
         env: EnvBase,
         horizon: int = 5,
-        population: int = option(
-            100, "candidates of the first iteration, N, at least twice the elites", ge=1
-        ),
+        population: int = option(100, "first candidates, N, at least twice the elites", ge=1),
         iterations: int = 3,
         elites: int = option(10, "plans that mean and standard deviation are fitted to, K", ge=1),
         keep: float = option(
-            0.3, "share of the elites that goes on to the next iteration and step", gt=0, le=1
+            0.3, "share of the elites that stays for the next iteration", gt=0, le=1
         ),
         decay: float = option(1.25, "gamma, by which the population shrinks", ge=1),
-        sigma: float = option(
-            0.5, "first standard deviation, in half ranges of each action", ge=0, le=100
-        ),
-        beta: float = option(
-            1.0, "exponent of the noise's spectrum; 0: white, 2: red", ge=0, le=100
-        ),
-        momentum: float = option(
-            0.1, "alpha, weight of the old mean and standard deviation", ge=0, le=1
-        ),
+        sigma: float = option(0.5, "first deviation, half ranges of each action", ge=0, le=100),
+        beta: float = option(1.0, "exponent of the spectrum; 0: white, 2: red", ge=0, le=100),
+        momentum: float = option(0.1, "alpha, weight of the old mean and deviation", ge=0, le=1),
         hold: int = option(
-            1, "steps that each action lasts; a plan looks horizon times hold steps ahead", ge=1
+            1, "steps that each action lasts; plans are longer by this factor", ge=1
         ),
         memory_key: NestedKey = option("icem", "where mean and elites are kept"),
         **settings: Any,

@@ -99,9 +99,7 @@ class MPC(RecedingHorizonPlanner):
         horizon: int = option(20, "stages, N", ge=1, le=10_000),
         iterations: int = option(1, "linearisations per tick", ge=1, le=10_000),
         first_iterations: int = option(5, "those at the first tick of a flight", ge=1, le=10_000),
-        bounded: Sequence[int] | None = option(
-            None, "action components whose box the plan respects, not only what is sent; None: all"
-        ),
+        bounded: Sequence[int] | None = option(None, "actions that plans bound; None: all"),
         memory_key: NestedKey = option("mpc", "where states and actions of the plan are kept"),
         action_key: NestedKey = option("action", "where the action goes"),
     ) -> None:

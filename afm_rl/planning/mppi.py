@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.compiling.machine_code import MachineCode
-from afm_rl.options import option, options
+from afm_rl.options import choice, option, options
 from afm_rl.planning.receding import SamplingPlanner, action_spec_of
 from afm_rl.spaces.keys import as_key
 
@@ -107,15 +107,11 @@ class MPPI(SamplingPlanner):
         sigma: float = option(1.0, "noise, in half ranges of each action", ge=0, le=100),
         beta: float = option(0.6, "weight of the new action in the smoothing", gt=0, le=1),
         truncate: float = option(2.0, "standard deviations at which noise is cut off", gt=0),
-        noise: str = option(
-            "scaled",
-            "scaled: sigma applies; unit: standard deviation 1 for every action",
-            choices=("scaled", "unit"),
-        ),
-        past: str = option(
+        noise: str = choice("scaled", scaled="sigma applies", unit="deviation 1 for every action"),
+        past: str = choice(
             "previous",
-            "smoothing starts from the previous action, or the first of the shifted plan",
-            choices=("previous", "shifted"),
+            previous="smoothing starts from the previous action",
+            shifted="from the shifted plan",
         ),
         mean_key: NestedKey = option(("mppi", "mean"), "where the mean plan is kept"),
         compile: bool = option(False, "roll-outs as machine code, over equations; compiled once"),

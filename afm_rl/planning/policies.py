@@ -234,9 +234,7 @@ class PolicyPlanner(LawPlanner):
         self,
         env: PlanningEnv,
         file: str | Path | None = option(None, "written by afm_rl.planning.save_policy"),
-        noise: float = option(
-            0.1, "of actions, in half ranges, while data for a learned model are collected", ge=0
-        ),
+        noise: float = option(0.1, "of actions, in half ranges, while data are collected", ge=0),
     ) -> None:
         super().__init__(env, self._act)
         if not isinstance(file, str | Path):

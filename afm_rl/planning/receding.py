@@ -20,7 +20,7 @@ from torchrl.modules.planners.common import (
 from afm_rl.compiling.devices import moved
 from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.options import option, options
+from afm_rl.options import choice, option, options
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
 
@@ -189,15 +189,11 @@ class SamplingPlanner(RecedingHorizonPlanner):
         horizon: int = option(5, "steps of a plan, H", ge=1, le=10_000),
         population: int = option(300, "candidates per iteration, N", ge=1, le=1_000_000),
         iterations: int = option(1, "refinements per step", ge=1, le=10_000),
-        backend: str | None = option(
-            None,
-            "env: step the environment; fast: call its `returns`; None: fast where there is one",
-            choices=("fast", "env"),
+        backend: str | None = choice(
+            None, "None: fast where there is `returns`", fast="calls it", env="steps"
         ),
         seed_key: NestedKey | None = option(None, "missions of one seed share their noise"),
-        box_key: NestedKey | None = option(
-            None, "plan with all effects that actions are known to have; None: with the action box"
-        ),
+        box_key: NestedKey | None = option(None, "box to plan with; None: that of the actions"),
         action_key: NestedKey = option("action", "where the action goes"),
         seed: int = option(0, "of the noise without a seed_key", ge=0),
         hold: int = option(1, "steps that each action of a plan lasts", ge=1),

@@ -26,9 +26,6 @@ class CEM(SamplingPlanner):
     Args:
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
 
-    Raises:
-        ConfigurationError: for a setting or environment that cannot be used.
-
     >>> from tensordict import TensorDict
     >>> from afm_rl.dynamics import Dubins
     >>> from afm_rl.planning import GoalDistance, PlanningEnv

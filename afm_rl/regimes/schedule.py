@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.options import option, options
+from afm_rl.options import choice, options
 
 
 class Schedule:
@@ -31,11 +31,7 @@ class Schedule:
     def __init__(
         self,
         at: Sequence[float] = (0.15, 0.80),
-        by: str = option(
-            "progress",
-            "progress: share of the targets, or the episode; or step",
-            choices=("progress", "step"),
-        ),
+        by: str = choice("progress", progress="share of targets or episode", step=""),
     ) -> None:
         self.by = by
         high = 1.0 if by == "progress" else float("inf")

@@ -159,9 +159,6 @@ class Circle(Reference):
 
     .. math:: r = R (\cos \varphi, \sin \varphi, 0),\quad \varphi = v t / R
 
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
-
     >>> Circle(radius=2.0, speed=0.5).at(torch.zeros(()))
     tensor([2.0000, 0.0000, 0.0000, -0.0000, 0.5000, 0.0000])
     """
@@ -186,9 +183,6 @@ class FigureEight(Reference):
     r"""A level figure of eight, which starts in its centre.
 
     .. math:: r = (a \sin \varphi, b \sin 2 \varphi, 0),\quad \varphi = 2 \pi t / P
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
 
     >>> FigureEight(period=4.0).at(torch.ones(()))[:2].round(decimals=4)
     tensor([1., -0.])
@@ -217,9 +211,6 @@ class Waypoints(Reference):
 
     Args:
         points: two or more points x, y, z (m), no two neighbours the same.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
 
     >>> line = Waypoints([[0, 0, 0], [2, 0, 0]], speed=0.5)
     >>> line.at(torch.tensor([1.0, 9.0]))[:, [0, 3]]

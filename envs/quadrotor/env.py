@@ -25,7 +25,7 @@ from afm_rl.envs.missions.settings import (
 )
 from afm_rl.envs.quadrotor.simulation import QuadrotorSimulation
 from afm_rl.errors import ConfigurationError
-from afm_rl.options import option, options
+from afm_rl.options import choice, option, options
 from afm_rl.regimes import Regime, Schedule, flight_regimes
 from afm_rl.spaces.airframe import QuadrotorBody
 
@@ -111,13 +111,9 @@ class CrazyflieTrack(MissionEnv):
         body: QuadrotorBody | None = None,
         duration: float = option(8.0, "of a flight, s, a multiple of dt", gt=0),
         horizon: int = option(20, "ticks by which the reference looks ahead, N", ge=1),
-        preview: bool = option(
-            True, "False: the planner is given one set-point, as in the published flights"
-        ),
-        start: str | None = option(
-            None,
-            "moving, as fast as the reference, or rest; None: rest without preview, as published",
-            choices=("rest", "moving"),
+        preview: bool = option(True, "False: one set-point is given, as in the published flights"),
+        start: str | None = choice(
+            None, "None: rest without preview, as published", moving="as the reference", rest=""
         ),
         limit: float = option(50.0, "distance from the reference at which it is lost, m", gt=0),
         sensor_noise: float | Sequence[float] = option(
@@ -126,9 +122,7 @@ class CrazyflieTrack(MissionEnv):
         start_noise: float = option(0.0, "standard deviation of the start position, m", ge=0),
         dt: float = option(0.05, "control tick, s", gt=0),
         substeps: int = option(25, "steps of the plant per tick, K", ge=1),
-        trace: bool = option(
-            False, "publish the plant's own steps of a tick, which updater=knode learns from"
-        ),
+        trace: bool = option(False, "publish the plant's own steps, for updater=knode"),
         max_steps: int = option(5000, "ticks after which a flight is over, if earlier", ge=1),
         action_low: Sequence[float] | None = None,
         action_high: Sequence[float] | None = None,

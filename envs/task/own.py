@@ -78,9 +78,7 @@ def mujoco_task(
     reward: Reward | None,
     steps: int = option(1000, "of an episode", ge=1),
     frame_skip: int = option(1, "simulation steps per action", ge=1),
-    start_noise: float = option(
-        0.01, "standard deviation of positions and velocities at the start", ge=0
-    ),
+    start_noise: float = option(0.01, "deviation of positions and velocities", ge=0),
     action_low: Limits = None,
     action_high: Limits = None,
 ) -> Task:

@@ -38,9 +38,6 @@ def train_flow(
 
     Returns:
         Root mean square error of the corrected action on new examples, in action units.
-
-    Raises:
-        ConfigurationError: for a setting that cannot be used.
     """
     check_instance("flow", flow, PaperFlow)
     for rows in states if isinstance(states, tuple) else [states]:

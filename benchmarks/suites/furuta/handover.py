@@ -57,9 +57,7 @@ class Handover(RecedingHorizonPlanner):
         env: PlanningEnv,
         far: Callable[..., RecedingHorizonPlanner],
         level: float = option(4.0, "cost to go up to which LQR acts", ge=0),
-        cap: float = option(
-            20.0, "of the cost to go at the end of a plan; 0: plans end without a value", ge=0
-        ),
+        cap: float = option(20.0, "of the cost to go at the end of a plan; 0: without one", ge=0),
         action_key: NestedKey = option("action", "where the action goes"),
         **settings: Any,
     ) -> None:
