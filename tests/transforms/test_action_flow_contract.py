@@ -1,11 +1,7 @@
 """The action flow transform does what TorchRL asks of every transform."""
 
-import copy
-import pickle
-
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.utils._pytree import tree_leaves, tree_map
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import (
@@ -19,14 +15,13 @@ from torchrl.data import (
 from torchrl.envs import (
     Compose,
     EnvBase,
-    ParallelEnv,
     SerialEnv,
     StepCounter,
     TransformedEnv,
 )
 from torchrl.envs.utils import check_env_specs
 
-from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
+from afm_rl.correction import ActionFlow, LeastSquares
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
@@ -49,11 +44,6 @@ def env(*more, **settings):
     return TransformedEnv(track(**settings), Compose(transform(), *more))
 
 
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-def test_single_environment(batch):
-    check_env_specs(env(batch_size=batch), break_when_any_done="both")
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_either_precision(dtype):
     whole = env(batch_size=(2,), dtype=dtype)
@@ -61,46 +51,6 @@ def test_either_precision(dtype):
     check_env_specs(whole)
     data = whole.rollout(2)["next", "afm"]
     assert data["observation"].dtype is data["planned_action"].dtype is dtype
-
-
-def test_planning_environment(box):
-    check_env_specs(TransformedEnv(PlanningEnv(Dubins(), GoalDistance(), *box), transform()))
-
-
-def test_published_flow(box):
-    flow = PaperFlow(*box, features=[2], state_size=3, width=8, gate=0.0)
-    chain = ActionFlowTransform(Dubins(), flow)
-    check_env_specs(TransformedEnv(track(batch_size=(2,)), chain), break_when_any_done="both")
-
-
-def test_inside_a_serial_environment():
-    check_env_specs(SerialEnv(2, env), break_when_any_done="both")
-
-
-def test_around_a_serial_environment():
-    check_env_specs(TransformedEnv(SerialEnv(2, track), transform()), break_when_any_done="both")
-
-
-def test_around_batches_in_series():
-    nested = TransformedEnv(SerialEnv(2, lambda: track(batch_size=(3,))), transform())
-    check_env_specs(nested)
-    assert nested.rollout(3)["next", "afm", "executed_action"].shape == (2, 3, 3, 2)
-
-
-@pytest.mark.parametrize("inside", [True, False])
-def test_with_a_parallel_environment(inside):
-    parallel = ParallelEnv(2, env if inside else track, mp_start_method="fork")
-    try:
-        check_env_specs(parallel if inside else TransformedEnv(parallel, transform()))
-    finally:
-        parallel.close(raise_if_closed=False)
-
-
-def test_without_an_environment():
-    td = TensorDict({"observation": torch.randn(5, 3), "action": torch.randn(5, 2)}, [5])
-    assert (transform()(td.clone()) == td).all()
-    assert (transform().inv(td.clone()) == td).all()
-    assert (Compose(transform(), transform(prefix="b"))(td.clone()) == td).all()
 
 
 def primed():
@@ -133,37 +83,6 @@ def test_in_a_replay_buffer():
         assert sample["next", "afm", "executed_action"].shape == (7, 2)
         found = (sample["action"].unsqueeze(1) == data["action"]).all(-1)
         assert found.any(-1).all()  # the planned actions, as they were
-
-
-def test_keys_may_be_nested_and_come_from_yaml(box):
-    cost = GoalDistance(in_keys=[["task", "goal"]])
-    world = PlanningEnv(Dubins(), cost, *box, ["robot", "pose"], ["robot", "action"])
-    chain = transform(
-        in_keys=[["robot", "pose"]], in_keys_inv=[["robot", "action"]], prefix=["robot", "afm"]
-    )
-    nested = TransformedEnv(world, chain)
-    check_env_specs(nested)
-    assert nested.rollout(3)["next", "robot", "afm", "executed_action"].shape == (3, 2)
-    assert chain.key("memory") == ("robot", "afm", "memory")
-
-
-@pytest.mark.parametrize("double", [copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))])
-def test_copies_behave_alike(double):
-    original = transform()
-    twin = double(original)
-    results = []
-    for chain in (original, twin):
-        torch.manual_seed(0)
-        results.append(TransformedEnv(track(batch_size=(2,)), chain).rollout(3))
-    torch.testing.assert_close(results[0], results[1])
-    assert twin.corrector is not original.corrector and twin.model is not original.model
-
-
-def test_a_copied_environment_keeps_its_own_model():
-    whole = env(batch_size=(2,))
-    twin = copy.deepcopy(whole)
-    torch.testing.assert_close(twin.rollout(2).shape, whole.rollout(2).shape)
-    assert twin.transform[0].model is not whole.transform[0].model
 
 
 def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble, small_flow):

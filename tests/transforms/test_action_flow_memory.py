@@ -13,7 +13,6 @@ from torchrl.envs import (
     GymWrapper,
     ParallelEnv,
     SerialEnv,
-    StepCounter,
     Transform,
     TransformedEnv,
 )
@@ -176,15 +175,6 @@ def test_environments_in_series_obey_the_tensordict_given(make):
     first, expected = follow(series, fork.clone(), actions[2:])
     again, executed = follow(series, fork.clone(), actions[2:])
     assert torch.equal(executed, expected)
-
-
-@pytest.mark.parametrize("more", [[], [StepCounter()]], ids=["alone", "in company"])
-def test_a_tensordict_without_memory_is_refused_clearly(small_flow, more):
-    chain = Compose(ActionFlowTransform(Dubins(), small_flow(), prefix=["my", "afm"]), *more)
-    env = TransformedEnv(UGVTrack(), chain)
-    td = env.reset().exclude("my")
-    with pytest.raises(KeyError, match=r"no \('my', 'afm'\) in the tensordict; start from env.r"):
-        env.step(td.set("action", torch.zeros(2)))
 
 
 def parallel(count, makers):

@@ -6,10 +6,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, GymEnv, SerialEnv, Transform, TransformedEnv
-from torchrl.envs.utils import check_env_specs, step_mdp
+from torchrl.envs import Compose, Transform, TransformedEnv
+from torchrl.envs.utils import step_mdp
 
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.envs import CrazyflieTrack, UGVTrack
@@ -151,27 +149,3 @@ def test_an_action_of_another_shape_is_refused():
     td = env.reset().set("action", torch.zeros(4, 3))
     with pytest.raises(ConfigurationError, match=r"'action': shape \(4, 3\), expected \(4, 2\)"):
         env.step(td)
-
-
-def pendulum():
-    return GymEnv("Pendulum-v1")
-
-
-@pytest.mark.parametrize("make", [pendulum, lambda: SerialEnv(2, pendulum), UGVTrack])
-def test_the_specs_hold(make):
-    check_env_specs(TransformedEnv(make(), Compose(Guard())), break_when_any_done="both")
-
-
-def test_a_replay_buffer_and_a_tensordict_without_memory():
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(4), transform=Guard(), batch_size=2)
-    buffer.extend(TensorDict({"observation": torch.zeros(4, 3), "action": torch.ones(4, 2)}, [4]))
-    assert buffer.sample()["action"].shape == (2, 2)
-    env = TransformedEnv(UGVTrack(batch_size=(1,)), Compose(Guard()))
-    td = env.reset().exclude("guard").set("action", torch.zeros(1, 2))
-    with pytest.raises(KeyError, match="start from env.reset"):
-        env.step(td)
-
-
-def test_discrete_actions_are_refused():
-    with pytest.raises(ConfigurationError, match="expected vectors of real numbers"):
-        TransformedEnv(GymEnv("CartPole-v1"), Compose(Guard())).reset()

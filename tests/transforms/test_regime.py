@@ -1,13 +1,10 @@
 """The regime transform: any regime on any environment."""
 
-import copy
-
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import (
     Compose,
     GymEnv,
@@ -59,13 +56,6 @@ def line(dtype=torch.float32):
     model = KnownDynamics(push, Manifold(1), action_size=1)
     low, high = torch.tensor([-1.0], dtype=dtype), torch.tensor([1.0], dtype=dtype)
     return PlanningEnv(model, KnownReward(lambda s, a, after: -after[..., 0].abs()), low, high)
-
-
-@pytest.mark.parametrize("regime", [GAIN, LATE], ids=["gain", "delay"])
-@pytest.mark.parametrize("make", [pendulum, lambda: SerialEnv(2, pendulum), line])
-def test_the_specs_hold(make, regime):
-    chain = RegimeTransform(regime, [{}, {"torque": 0.5}], at=[1])
-    check_env_specs(TransformedEnv(make(), chain), break_when_any_done="both")
 
 
 def test_inside_a_serial_environment():
@@ -217,42 +207,6 @@ def test_noise_depends_on_the_seed_only():
     assert effects[0][0] != effects[0][1]
 
 
-def test_keys_and_prefix_may_be_nested():
-    model = KnownDynamics(push, Manifold(1), action_size=1)
-    reward = KnownReward(lambda s, a, after: after[..., 0])
-    robot = (["robot", "position"], ["robot", "force"])
-    world = PlanningEnv(model, reward, torch.tensor([-1.0]), torch.tensor([1.0]), *robot)
-    keys = dict(zip(("observation_key", "action_key"), robot, strict=True))
-    chain = reversal(0, prefix=["robot", "regime"], **keys)
-    env = TransformedEnv(world, chain)
-    check_env_specs(env)
-    assert chain.key("parameters") == ("robot", "regime", "parameters")
-    assert env.rollout(2)["next", "robot", "regime", "parameters"].tolist() == [[-1.0], [-1.0]]
-
-
-def test_without_an_environment():
-    td = TensorDict({"observation": torch.randn(5, 3), "action": torch.randn(5, 1)}, [5])
-    assert (reversal()(td.clone()) == td).all()
-    assert (reversal().inv(td.clone()) == td).all()
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(5), batch_size=5, transform=reversal()
-    )
-    buffer.extend(td)
-    assert set(buffer.sample()["action"].flatten().tolist()) <= set(td["action"].flatten().tolist())
-
-
-def test_without_its_memory():
-    env = TransformedEnv(line(), reversal())
-    td = TensorDict({"observation": torch.zeros(1), "action": torch.ones(1)}, [])
-    with pytest.raises(KeyError, match="no 'regime' in the tensordict; start from"):
-        env.step(td)
-
-
-def test_copies_behave_alike():
-    env = TransformedEnv(line(), reversal(1))
-    assert ratio(copy.deepcopy(env).rollout(3)) == ratio(env.rollout(3)) == [1.0, -1.0, -1.0]
-
-
 @pytest.mark.parametrize(
     "phases, at",
     [([{}], [3]), ([{}, {}], []), ([], []), (torch.ones(2, 2), [3]), (torch.ones(3, 1), [3])],
@@ -261,8 +215,3 @@ def test_copies_behave_alike():
 def test_phases_that_do_not_fit_are_refused(phases, at):
     with pytest.raises(ConfigurationError, match=r"phases=.*one more than at=.*torque"):
         RegimeTransform(GAIN, phases, at=at)
-
-
-def test_actions_that_are_no_vectors_are_refused():
-    with pytest.raises(ConfigurationError, match="action_key='action': .* vector of real numbers"):
-        TransformedEnv(GymEnv("CartPole-v1"), reversal()).reset()
