@@ -16,16 +16,19 @@ from afm_rl.regimes.compose import Compose
 from afm_rl.regimes.gains import ActionGain, divide
 from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix
 
-LEAST, MOST = 0.01, 100.0  # factors beyond these are typing errors
+MOST = 100.0  # factors beyond are typing errors
 
 
 class _Divisor(StaticRegime):
     """A factor that divides some components of the action."""
 
+    identity = (1.0,)
     divided: tuple[bool, bool, bool, bool]
 
-    def __init__(self, span: Sequence[float]) -> None:
-        self.span = check_span("span", span, LEAST, MOST)
+    def __init__(self, span: Sequence[float] | None = None) -> None:
+        least, most = 0.01, MOST
+        self.limits = {self.names[0]: (least, most)}
+        self.span = check_span("span", self.span if span is None else span, least, most)
 
     def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         return action / self._divisors(parameters)
@@ -50,12 +53,8 @@ class MassFactor(_Divisor):
     """
 
     names = ("mass",)
-    identity = (1.0,)
-    limits = {"mass": (LEAST, MOST)}
+    span = (0.5, 1.5)
     divided = (True, False, False, False)
-
-    def __init__(self, span: Sequence[float] = (0.5, 1.5)) -> None:
-        super().__init__(span)
 
 
 class InertiaFactor(_Divisor):
@@ -71,12 +70,8 @@ class InertiaFactor(_Divisor):
     """
 
     names = ("inertia",)
-    identity = (1.0,)
-    limits = {"inertia": (LEAST, MOST)}
+    span = (0.5, 2.0)
     divided = (False, True, True, True)
-
-    def __init__(self, span: Sequence[float] = (0.5, 2.0)) -> None:
-        super().__init__(span)
 
 
 class MotorEfficiency(StaticRegime):

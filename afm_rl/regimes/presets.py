@@ -92,10 +92,20 @@ class Actuators:
         """
         rows = [self.regime.encode({k: v for k, v in x.items() if k != "rate"}) for x in faults]
         rates = [[fault.get("rate", math.inf)] for fault in faults]
-        self.rows, rate = torch.stack(rows).double(), torch.tensor(rates).double()
-        if len(faults) == 1:
-            self.rows, rate = self.rows[0], rate[0]
+        both = torch.stack(rows).double(), torch.tensor(rates).double()
+        self.rows, rate = (x.expand(*self.batch, -1) if self.batch else x[0] for x in both)
         self.most = rate * (self.high - self.low) / 2
+
+    def value(self, name: str) -> Tensor:
+        """Return a parameter of the fault, such as ``delay``, ``(*B)``."""
+        return self.rows[..., self.regime.names.index(name)]
+
+    @property
+    def memoryless(self) -> Tensor:
+        """The parameters ``(*B, F)`` without delay and lag: what a command does in the end."""
+        rows = self.rows.clone()
+        rows[..., [self.regime.names.index(name) for name in ("delay", "lag")]] = 0.0
+        return rows
 
     def __call__(self, command: Tensor) -> Tensor:
         """Return the effect ``(*B, A)`` of a command, in double precision."""

@@ -69,20 +69,6 @@ def test_the_prior_covers_what_it_says():
     assert float((changed.abs() < middle).float().mean()) == pytest.approx(0.5, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"names": []},
-        {"names": ["a", "a"]},
-        {"low": 3.5},
-    ],
-    ids=str,
-)
-def test_impossible_priors_are_refused(settings):
-    with pytest.raises(ConfigurationError, match=next(iter(settings))):
-        ActionGain(**{"names": ["a"], **settings})
-
-
 @pytest.mark.parametrize("count", [1, 3])
 def test_each_action_has_a_name(count):
     with pytest.raises(ConfigurationError, match="the robot has 2 actions; give one name for each"):

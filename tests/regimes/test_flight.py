@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from afm_rl.dynamics.quadrotor import quadrotor_rate
-from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import (
     Compose,
     InertiaFactor,
@@ -21,7 +20,6 @@ from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix
 
 BODY = QuadrotorBody()
 LOW, HIGH = (torch.tensor(bound, dtype=torch.float64) for bound in BODY.bounds)
-FAMILIES = [MassFactor(), InertiaFactor(), MotorEfficiency(), Payload(), Wind(), flight_regimes()]
 
 
 def actions(*batch):
@@ -32,28 +30,6 @@ def states(*batch):
     state = torch.randn(*batch, 13, dtype=torch.float64)
     state[..., 6:10] /= state[..., 6:10].norm(dim=-1, keepdim=True)
     return state
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_nominal_parameters_keep_an_action_to_the_bit(family):
-    action, row = actions(1000), family.encode({}).double()
-    assert (family.apply(action, row, states(1000)) == action).all()
-    assert family.is_identity(row)
-
-
-@pytest.mark.parametrize("family", FAMILIES)
-def test_draws_are_legal_and_undone_by_the_inverse(family):
-    rows = family.sample((200,), torch.Generator().manual_seed(0)).double()
-    assert rows.shape == (200, len(family.names))
-    for row in rows[:20]:
-        family.encode(dict(zip(family.names, row.tolist(), strict=True)))
-    action, state = actions(200), states(200)
-    wide = torch.full((4,), torch.inf, dtype=torch.float64)
-    command = family.inverse(action, rows, state, -wide, wide)
-    torch.testing.assert_close(family.apply(command, rows, state), action)
-    assert family.closed_form
-    boxed = family.inverse(action, rows, state, LOW, HIGH)
-    assert ((boxed >= LOW) & (boxed <= HIGH)).all()
 
 
 @pytest.mark.parametrize("factor", [0.5, 4 / 3])
@@ -115,35 +91,3 @@ def test_a_draw_changes_one_thing():
         changed = (rows[:, columns] != nominal[columns]).any(-1)
         assert 20 < changed.sum() < 120, name
         assert (rows[changed][:, others] == nominal[others]).all()
-
-
-@pytest.mark.parametrize(
-    ("family", "values", "message"),
-    [
-        (MassFactor(), {"mass": 0.0}, r"mass=0.0: expected a finite number in \[0.01, 100\]"),
-        (MassFactor(), {"mass": -1.0}, "mass=-1.0"),
-        (InertiaFactor(), {"inertia": 0.0}, "inertia=0.0"),
-        (MotorEfficiency(), {"motor_2": 1.5}, r"motor_2=1.5: expected a finite number in \[0, 1\]"),
-        (Payload(), {"payload": -0.1}, "payload=-0.1"),
-        (Wind(), {"wind_x": float("inf")}, "wind_x=inf"),
-    ],
-)
-def test_impossible_parameters_are_refused(family, values, message):
-    with pytest.raises(ConfigurationError, match=message):
-        family.encode(values)
-
-
-@pytest.mark.parametrize(
-    ("make", "settings"),
-    [
-        (MassFactor, {"span": (0.0, 1.0)}),
-        (InertiaFactor, {"span": 2.0}),
-        (MotorEfficiency, {"span": (0.5, 1.5)}),
-        (Payload, {"share": (-0.5, 0.5)}),
-        (Payload, {"offset": (0.01, -0.01)}),
-        (Wind, {"span": (1.0,)}),
-    ],
-)
-def test_impossible_priors_are_refused(make, settings):
-    with pytest.raises(ConfigurationError, match=next(iter(settings))):
-        make(**settings)

@@ -1,4 +1,4 @@
-"""What all families of regimes have in common, and what each does to an action."""
+"""What all regimes have in common, and what each does to an action."""
 
 import math
 
@@ -17,18 +17,24 @@ from afm_rl.regimes import (
     DeadZone,
     Delay,
     GainNoise,
+    InertiaFactor,
     Lag,
+    MassFactor,
+    MotorEfficiency,
     Patches,
+    Payload,
     Permutation,
     Quantisation,
     Rotation,
     Saturation,
     WheelSlip,
+    Wind,
+    flight_regimes,
 )
+from afm_rl.spaces.airframe import QuadrotorBody
 
 HALF = [1.0, 1.5]
 LOW, HIGH = -torch.tensor(HALF), torch.tensor(HALF)
-FREE = torch.full((2,), torch.inf)
 STATE = torch.zeros(3)
 NAMES = ["v_bias", "omega_bias"]
 FAMILIES = {
@@ -48,14 +54,30 @@ FAMILIES = {
     "backlash": Backlash(HALF),
     "lag": Lag(),
 }
+FLIGHT = {
+    "mass": MassFactor(),
+    "inertia": InertiaFactor(),
+    "motors": MotorEfficiency(),
+    "payload": Payload(),
+    "wind": Wind(),
+    "flight": flight_regimes(),
+}
+FAMILIES |= FLIGHT
 every_family = pytest.mark.parametrize("family", FAMILIES.values(), ids=FAMILIES)
+
+
+def box(family):
+    """Return lowest and highest actions of the robot that has these regimes."""
+    flies = any(family is other for other in FLIGHT.values())
+    return map(torch.tensor, QuadrotorBody().bounds) if flies else (LOW, HIGH)
 
 
 def drawn(family, count=400, dtype=torch.float64):
     """Return actions in the box, parameters from the prior and places."""
     generator = torch.Generator().manual_seed(0)
-    action = LOW + (HIGH - LOW) * torch.rand(count, 2, generator=generator, dtype=dtype)
-    state = 10 * torch.rand(count, 3, generator=generator, dtype=dtype) - 5
+    low, high = box(family)
+    action = low + (high - low) * torch.rand(count, len(low), generator=generator, dtype=dtype)
+    state = 10 * torch.rand(count, 13, generator=generator, dtype=dtype) - 5
     return action, family.sample((count,), generator).to(dtype), state
 
 
@@ -64,38 +86,43 @@ def drawn(family, count=400, dtype=torch.float64):
 def test_the_nominal_regime_keeps_every_action_to_the_bit(family, dtype):
     action, _, state = drawn(family, dtype=dtype)
     nominal = family.encode({}).to(dtype).expand(400, -1)
-    past, noise = torch.rand(400, family.history, 2, dtype=dtype), torch.randn(400, 2, dtype=dtype)
+    past = torch.rand(400, family.history, action.shape[-1], dtype=dtype)
+    noise, endless = torch.randn_like(action), torch.full_like(action[0], torch.inf)
     assert family.is_identity(nominal).all()
     assert torch.equal(family.apply(action, nominal, state), action)
     assert torch.equal(family.apply(action, nominal, state, past, noise), action)
-    assert torch.equal(family.inverse(action, nominal, state, -FREE, FREE), action)
+    assert torch.equal(family.inverse(action, nominal, state, -endless, endless), action)
 
 
 @every_family
 def test_what_an_action_can_be_worth_is_had_by_the_inverse(family):
     commanded, rows, state = drawn(family)
     wanted = family.apply(commanded, rows, state)
-    found = family.inverse(wanted, rows, state, -FREE, FREE)
-    torch.testing.assert_close(family.apply(found, rows, state), wanted, rtol=0, atol=2e-6)
+    endless = torch.full_like(wanted[0], torch.inf)
+    command = family.inverse(wanted, rows, state, -endless, endless)
+    torch.testing.assert_close(family.apply(command, rows, state), wanted, rtol=0, atol=2e-6)
+    assert family.closed_form
 
 
 @every_family
 def test_the_inverse_stays_in_the_box(family):
     wanted, rows, state = drawn(family)
-    found = family.inverse(3 * wanted, rows, state, LOW, HIGH)
-    assert ((found >= LOW) & (found <= HIGH)).all()
+    low, high = box(family)
+    command = family.inverse(3 * wanted, rows, state, low, high)
+    assert ((command >= low) & (command <= high)).all()
 
 
 @every_family
 def test_a_batch_is_what_its_rows_are_alone(family):
     action, rows, state = drawn(family, 20)
-    past, noise = torch.rand(20, 8, 2).double(), torch.randn(20, 2).double()
+    past, noise = torch.rand(20, 8, action.shape[-1]).double(), torch.randn_like(action)
+    ends = list(box(family))
     whole = family.apply(action, rows, state, past, noise)
-    back = family.inverse(action, rows, state, LOW, HIGH)
+    back = family.inverse(action, rows, state, *ends)
     for k in (0, 7, 19):
         one = family.apply(action[k], rows[k], state[k], past[k], noise[k])
         torch.testing.assert_close(whole[k], one)
-        torch.testing.assert_close(back[k], family.inverse(action[k], rows[k], state[k], LOW, HIGH))
+        torch.testing.assert_close(back[k], family.inverse(action[k], rows[k], state[k], *ends))
     wide = family.apply(action.unsqueeze(1), rows.unsqueeze(1), state.unsqueeze(1))
     torch.testing.assert_close(wide.squeeze(1), family.apply(action, rows, state))
 
@@ -293,6 +320,12 @@ def test_a_row_is_described_by_what_is_not_nominal(gains):
         ("delay", {"delay": 11}, r"delay=11: expected a finite number in \[0, 10\]"),
         ("delay", {"delay": 0.5}, "delay=0.5: expected whole steps"),
         ("bias", {"v_bias": math.nan}, r"v_bias=nan: expected a finite number in \[-10, 10\]"),
+        ("mass", {"mass": 0.0}, r"mass=0.0: expected a finite number in \[0.01, 100\]"),
+        ("mass", {"mass": -1.0}, "mass=-1.0"),
+        ("inertia", {"inertia": 0.0}, "inertia=0.0"),
+        ("motors", {"motor_2": 1.5}, r"motor_2=1.5: expected a finite number in \[0, 1\]"),
+        ("payload", {"payload": -0.1}, "payload=-0.1"),
+        ("wind", {"wind_x": math.inf}, "wind_x=inf"),
     ],
 )
 def test_values_beyond_their_limits_are_refused(family, values, complaint):
@@ -321,6 +354,15 @@ def test_values_beyond_their_limits_are_refused(family, values, complaint):
         (lambda: AsymmetricGain(["v"], span=[0.0, 1.0]), "span=0.0: expected"),
         (lambda: Permutation(["a"], HALF), r"names=\('a',\): expected 2 distinct names"),
         (lambda: GainNoise(span=[-0.1, 1.0]), "span=-0.1: expected"),
+        (lambda: MassFactor(span=(0.0, 1.0)), "span"),
+        (lambda: InertiaFactor(span=2.0), "span"),
+        (lambda: MotorEfficiency(span=(0.5, 1.5)), "span"),
+        (lambda: Payload(share=(-0.5, 0.5)), "share"),
+        (lambda: Payload(offset=(0.01, -0.01)), "offset"),
+        (lambda: Wind(span=(1.0,)), "span"),
+        (lambda: ActionGain([]), "names"),
+        (lambda: ActionGain(["a", "a"]), "names"),
+        (lambda: ActionGain(["a"], low=3.5), "low"),
     ],
 )
 def test_impossible_settings_are_refused(make, complaint):

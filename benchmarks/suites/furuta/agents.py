@@ -44,7 +44,7 @@ class Agent:
         level: cost to go below which LQR takes over; 0 for the planner alone.
         correct: is the motor corrected?
         learn: are length and tip mass learnt?
-        told: is all of it known at once?
+        informed: is all of it known at once?
     """
 
     def __init__(
@@ -55,9 +55,9 @@ class Agent:
         cap: float = 20.0,
         correct: bool = True,
         learn: bool = True,
-        told: bool = False,
+        informed: bool = False,
     ) -> None:
-        self.model, self.told = Model(), told
+        self.model, self.informed = Model(), informed
         cost = TrackingCost([0.01, 1.0, 0.002, 0.01], [0.002], [], angles=[0, 1], in_keys=[])
         env = PlanningEnv(self.model, cost, [-VOLTAGE], [VOLTAGE])
         self.planner = Handover(env, far, level, cap)
@@ -67,15 +67,15 @@ class Agent:
         for part in (self.planner, self.policy):
             td = part.make_tensordict_primer()(td)
         self.td, self.signs = td, torch.ones(count, 1)
-        self.correct, self.updater = correct and not told, None
-        if learn and not told:
+        self.correct, self.updater = correct and not informed, None
+        if learn and not informed:
             ranges = {"length": LENGTHS, "tip": TIPS}
             loss = GaussianNLLLoss(self.model)
             self.updater = PhysicsIdentifier(loss, ranges, [VOLTAGE], count=21)
 
-    def tell(self, plants: Sequence[Plant]) -> None:
-        """Say which plants these are, to those who are told."""
-        if self.told:
+    def inform(self, plants: Sequence[Plant]) -> None:
+        """Say which plants these are, to those who are informed."""
+        if self.informed:
             rows = torch.tensor([[plant.length, plant.tip] for plant in plants])
             self.model.set_physics(rows)
             self.signs = torch.tensor([[float(plant.sign)] for plant in plants])
@@ -105,5 +105,5 @@ METHODS = {
     "iCEM": partial(Agent, far=CEM, level=0.0, cap=0.0),
     "MPPI": partial(Agent, far=PATHS, level=0.0, cap=0.0),
     "uncorrected": partial(Agent, far=CEM, correct=False),
-    "truth": partial(Agent, far=CEM, told=True),
+    "truth": partial(Agent, far=CEM, informed=True),
 }

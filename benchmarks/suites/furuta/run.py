@@ -105,7 +105,6 @@ def complete(file: Path, runs: Sequence[Run], part: str, method: str) -> pd.Data
     for first in range(len(table), len(runs), TOGETHER):
         rows = pd.DataFrame(play(runs[first : first + TOGETHER], METHODS[method]))
         table = pd.concat([table, rows.assign(part=part, method=method)], ignore_index=True)
-        file.parent.mkdir(parents=True, exist_ok=True)
         write_whole(file, table.to_csv(index=False).encode())
         print(f"{part}, {method}: {len(table)} of {len(runs)}", flush=True)
     return table
@@ -122,7 +121,7 @@ def play(runs: Sequence[Run], method: Callable[..., Agent]) -> list[dict]:
             if k and k in run.plants:
                 plants[row] = run.plants[k]
                 world.change(row, plants[row])
-        agent.tell(plants)
+        agent.inform(plants)
         began = time.process_time()
         voltages = agent.act(state)
         spent.append(time.process_time() - began)

@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from afm_rl.regimes import presets
+
 METHODS = {"alone": "physics", "AFM": "afm_physics", "truth": "oracle"}
 
 
@@ -24,16 +26,10 @@ class Mission(NamedTuple):
 
 
 def _actuators(count: int) -> dict[str, str]:
-    every = range(count)
-    faults = {
-        "one reversed": "{gain_0: -1}",
-        "all reversed": "{" + ", ".join(f"gain_{k}: -1" for k in every) + "}",
-        "half": "{" + ", ".join(f"gain_{k}: .5" for k in every) + "}",
-        "bias .3": "{" + ", ".join(f"bias_{k}: .3" for k in every) + "}",
-        "late 2": "{delay: 2}",
-        "swapped pair": "{from_0: 1, from_1: 0}",
+    return {
+        name: "{" + ", ".join(f"{part}: {value:g}" for part, value in fault.items()) + "}"
+        for name, fault in presets(count).items()
     }
-    return faults if count > 1 else {k: v for k, v in faults.items() if k != "swapped pair"}
 
 
 GROUND = {

@@ -26,35 +26,31 @@ def rewards(
     starts = [np.random.default_rng(seed).normal([0, np.pi, 0, 0], 0.05) for _, seed in pairs]
     world, agent = Simulated([PLANT] * len(pairs), np.array(starts)), NAMES[method]
     agent = METHODS[agent](len(pairs))
-    agent.tell([PLANT] * len(pairs))
+    agent.inform([PLANT] * len(pairs))
     own = [faults[fault] for fault, _ in pairs]
-    late = torch.tensor([int(fault.get("delay", 0)) for fault in own])
-    others = [
-        {name: x for name, x in fault.items() if name not in ("delay", "rate")} for fault in own
-    ]
-    static = torch.stack([actuators.regime.encode(fault) for fault in others]).double()
     up = []
     state = world.states
     for k in range(steps or STEPS):
+        if k == AT:
+            actuators.fail(*own)
         known = method == "truth" and k >= AT
-        seen = _arrival(state, actuators, static, late) if known else state
+        seen = _arrival(state, actuators) if known else state
         voltages = agent.act(seen).double()
         if known:
             box = actuators.low, actuators.high
-            voltages = actuators.regime.inverse(voltages, static, voltages, *box)
-        if k == AT:
-            actuators.fail(*own)
+            voltages = actuators.regime.inverse(voltages, actuators.memoryless, voltages, *box)
         state = world.step(actuators(voltages), [0.0] * len(pairs))
         agent.learn(state)
         up.append((state[:, 1].abs() < NEAR).double().numpy())
     return dict(zip(pairs, np.stack(up[AT:], 1), strict=True)), PERIOD
 
 
-def _arrival(state: Tensor, actuators: Actuators, static: Tensor, late: Tensor) -> Tensor:
+def _arrival(state: Tensor, actuators: Actuators) -> Tensor:
     """Return the states in which the next voltages act."""
     physics = torch.tensor([[PLANT.length, PLANT.tip]], dtype=torch.float64)
-    for k in range(int(late.max()), 0, -1):  # the oldest of those under way first
+    delay = actuators.value("delay").long()
+    for k in range(int(delay.max()), 0, -1):  # the oldest of those under way first
         pending = actuators.past[:, k - 1]
-        effect = actuators.regime.apply(pending, static, pending)
-        state = torch.where((late >= k)[:, None], step(state, effect, physics), state)
+        effect = actuators.regime.apply(pending, actuators.memoryless, pending)
+        state = torch.where((delay >= k)[:, None], step(state, effect, physics), state)
     return state

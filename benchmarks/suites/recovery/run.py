@@ -55,7 +55,6 @@ def main() -> None:
             file = args.out / f"{task.replace(' ', '_')}.{method}.csv"
             if not file.is_file():
                 rows = pd.DataFrame(times(task, method, level, args))
-                args.out.mkdir(parents=True, exist_ok=True)
                 write_whole(file, rows.to_csv(index=False).encode())
                 print(f"{task}, {method}: done", flush=True)
             tables.append(pd.read_csv(file))

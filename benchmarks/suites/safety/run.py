@@ -60,7 +60,6 @@ def costs(name: str, seeds: int, out: Path, settings: dict[str, float]) -> pd.Da
         for k, value in enumerate(row)
     ]
     table = pd.DataFrame(rows)
-    out.mkdir(parents=True, exist_ok=True)
     write_whole(file, table.to_csv(index=False).encode())
     return table
 

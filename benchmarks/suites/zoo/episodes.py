@@ -49,7 +49,6 @@ def complete(
     for first in range(0, len(missing), together):
         start, pairs = time.perf_counter(), missing[first : first + together]
         rows += play(task, method, pairs, steps or task.steps)
-        out.mkdir(parents=True, exist_ok=True)
         write_whole(file, pd.DataFrame(rows).to_csv(index=False).encode())
         spent = time.perf_counter() - start
         print(f"{task.name}, {method}: {len(pairs)} episodes in {spent:.0f} s", flush=True)

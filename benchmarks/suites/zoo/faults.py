@@ -33,10 +33,10 @@ class FaultyVector(VectorWrapper):
         self.faults = faults
 
     def reset(self, **options: Any):
-        """Begin with actuators that are healthy and were not used yet."""
+        """Begin with actuators that were not used yet, healthy if they fail later."""
         self.count = 0
         self.actuators.reset()
-        self.actuators.fail({})
+        self.actuators.fail(*(self.faults if self.failed else [{}]))
         return self.env.reset(**options)
 
     @property
@@ -46,11 +46,8 @@ class FaultyVector(VectorWrapper):
 
     def step(self, actions: Any):
         """Send the actuators what they make of ``actions`` ``(N, A)``."""
+        effect = self.actuators(torch.as_tensor(np.asarray(actions))).numpy()
+        self.count += 1
         if self.count == self.at:
             self.actuators.fail(*self.faults)
-        self.count += 1
-        space, effect = (
-            self.single_action_space,
-            self.actuators(torch.as_tensor(np.asarray(actions))),
-        )
-        return self.env.step(effect.numpy().clip(space.low, space.high).astype(space.dtype))
+        return self.env.step(effect.astype(self.single_action_space.dtype))

@@ -69,35 +69,26 @@ class Truth:
 
     def __init__(self, task: Task, envs: FaultyVector) -> None:
         self.task, self.envs = task, envs
-        self.regime = envs.actuators.regime
-        delay, lag = (
-            torch.tensor([[fault.get(name, 0.0)] for fault in envs.faults]).double()
-            for name in ("delay", "lag")
-        )
-        self.delay = delay.flatten().int().tolist()
-        self.keep = torch.where(lag > 0, (-1 / lag).exp(), 0.0)
-        others = [
-            {name: x for name, x in fault.items() if name not in ("delay", "lag", "rate")}
-            for fault in envs.faults
-        ]
-        self.static = torch.stack([self.regime.encode(fault) for fault in others]).double()
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         if not self.envs.failed:
             return self.task.act(observations)
-        regime, past = self.regime, self.envs.actuators.past
+        actuators = self.envs.actuators
+        regime, past, static = actuators.regime, actuators.past, actuators.memoryless
+        lag = actuators.value("lag").unsqueeze(-1)
+        keep = torch.where(lag > 0, (-1 / lag).exp(), 0.0)
         expected = observations.copy()
-        for row, steps in enumerate(self.delay):
+        for row, steps in enumerate(actuators.value("delay").int().tolist()):
             if steps:
-                parameters = self.static[row].expand(steps, -1)
+                parameters = static[row].expand(steps, -1)
                 pending = past[row, :steps].flip(0)  # oldest first
                 effects = regime.apply(pending, parameters, pending[:, :1])
                 expected[row] = self.task.after(self.envs.env.envs[row], effects.numpy())
         wanted = torch.as_tensor(self.task.act(expected)).double()
-        reached = _lagged(past, self.keep)
-        wanted = (wanted - self.keep * reached) / (1 - self.keep)
+        reached = _lagged(past, keep)
+        wanted = (wanted - keep * reached) / (1 - keep)
         box = self.task.low, self.task.high
-        return regime.inverse(wanted, self.static, wanted[:, :1], *box).numpy()
+        return regime.inverse(wanted, static, wanted[:, :1], *box).numpy()
 
 
 def _lagged(past: Tensor, keep: Tensor) -> Tensor:
