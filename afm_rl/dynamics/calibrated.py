@@ -10,8 +10,6 @@ from afm_rl.dynamics.base import DynamicsModel, PerMissionModel
 from afm_rl.dynamics.rates import linearised
 from afm_rl.errors import ConfigurationError
 
-CALIBRATION = ("matrix", "bias", "offset")
-
 
 class Calibrated(PerMissionModel):
     r"""A frozen model behind an affine map of its action and in front of an offset.
@@ -128,7 +126,7 @@ class Calibrated(PerMissionModel):
         return self.model.noise_scale(state, self.effective(action))
 
     def _owned(self) -> list[tuple[nn.Module, str]]:
-        return [(self, name) for name in CALIBRATION]
+        return [(self, name) for name in ("matrix", "bias", "offset")]
 
     @property
     def _flat(self) -> bool:

@@ -291,8 +291,6 @@ def actuator_names(model: Any) -> list[str]:
 
 
 NAMES = Physics.names
-SLIDE, FREE = 2, 0  # MuJoCo's numbers of joints that let a body travel
-LONG = (3, 5)  # and of capsules and cylinders, whose second size is half their length
 
 
 def changed_model(model: Any, row: tuple[float, ...]) -> Any:
@@ -327,7 +325,8 @@ def changed_model(model: Any, row: tuple[float, ...]) -> Any:
     found.body_inertia[links] *= value["length"] ** 2
     found.geom_pos[geoms] *= value["length"]
     found.site_pos[sites] *= value["length"]
-    found.geom_size[[geom for geom in geoms if model.geom_type[geom] in LONG], 1] *= value["length"]
+    long = [geom for geom in geoms if model.geom_type[geom] in (3, 5)]  # capsules and cylinders
+    found.geom_size[long, 1] *= value["length"]  # half of it
     found.tendon_range[:] *= value["length"]
     mujoco.mj_setConst(found, mujoco.MjData(found))
     return found
@@ -340,6 +339,7 @@ def _links(model: Any) -> list[int]:
         first = model.body_jntadr[body]
         kinds = model.jnt_type[first : first + model.body_jntnum[body]] if first >= 0 else ()
         carried = model.body_parentid[body] in links
-        if (carried or len(kinds)) and not any(kind in (SLIDE, FREE) for kind in kinds):
+        travels = any(kind in (0, 2) for kind in kinds)  # free joints and slides
+        if (carried or len(kinds)) and not travels:
             links.append(body)
     return links

@@ -13,15 +13,16 @@ from torchrl.envs import EnvBase
 from afm_rl.errors import check_count
 from afm_rl.spaces.keys import as_keys
 
-KEYS = ("observation", "action", ("next", "observation"), ("next", "reward"), ("next", "done"))
-
 
 def collect(
     env: EnvBase,
     policy: Callable[[TensorDictBase], TensorDictBase] | None = None,
     frames: int = 1000,
     *,
-    keys: Sequence[NestedKey] = KEYS,
+    keys: Sequence[NestedKey] = (
+        *("observation", "action"),
+        *(("next", "observation"), ("next", "reward"), ("next", "done")),
+    ),
     seed: int = 0,
 ) -> TensorDictReplayBuffer:
     """Let a policy act, and keep every transition in a replay buffer.

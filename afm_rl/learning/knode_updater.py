@@ -35,9 +35,6 @@ class Rows(NamedTuple):
     """Whether the step is to be learnt from, ``(l, n, R)``; the others hold zeros."""
 
 
-NONE = -1  # no network is under way
-
-
 class Pending(NamedTuple):
     """Networks that were trained and join the pool later, one per mission."""
 
@@ -117,7 +114,7 @@ class KNODEUpdater(Learner):
         )
         self.streams = Streams(salt=4, seed=seed)
         self.window, self.pending = (MissionState(_nothing(kind)) for kind in (Rows, Pending))
-        self.tick, self.due = 0, NONE
+        self.tick, self.due = 0, -1
 
     @property
     def model(self) -> KNODE:
@@ -127,7 +124,7 @@ class KNODEUpdater(Learner):
     def start(self, tensordict: TensorDictBase | None = None) -> None:
         """Forget the window and the network under way; the pool stays."""
         super().start()
-        self.tick, self.due = 0, NONE
+        self.tick, self.due = 0, -1
         self.window.keep(_nothing(Rows))
         self.pending.keep(_nothing(Pending))
 
@@ -145,7 +142,7 @@ class KNODEUpdater(Learner):
             self._gather(rows, self.ticks * each)
         self.tick += 1
         self._deliver()
-        if self.window.parts.counts.shape[-1] == self.ticks * each and self.due == NONE:
+        if self.window.parts.counts.shape[-1] == self.ticks * each and self.due < 0:
             self._train(transitions, self.model.dt / each)
             self._deliver()
 
@@ -213,12 +210,12 @@ class KNODEUpdater(Learner):
 
     def _deliver(self) -> None:
         """Push the network under way if its time has come."""
-        if self.due != NONE and self.tick >= self.due:
+        if self.due >= 0 and self.tick >= self.due:
             lead = self.model.lead
             *network, taught = self.pending.parts
             parts = (part.reshape(*lead, *part.shape[1:]) for part in network)
             self.model.push_(Network(*parts), taught.reshape(lead))
-            self.due = NONE
+            self.due = -1  # no network is under way
 
 
 def _nothing(kind: Any) -> Any:

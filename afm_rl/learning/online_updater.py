@@ -168,9 +168,6 @@ class StreamXUpdater(OnlineUpdater):
         return chosen.reshape(*lead, -1, values.shape[-1]).sum(-2) / count
 
 
-MASK = "unmatched"
-
-
 class UnmatchedUpdater(Updater):
     r"""Another updater, which learns from effective actions, not from executed ones.
 
@@ -225,7 +222,7 @@ class UnmatchedUpdater(Updater):
                 f"updater.updater.mask_key={self.updater.mask_key!r}: expected none; where to "
                 "learn is decided here, by updater.gate"
             )
-        self.updater.mask_key = MASK
+        self.updater.mask_key = "unmatched"
         self.register_buffer(
             "scale", check_half_range(scale, loss.model.action_size), persistent=False
         )
@@ -241,6 +238,6 @@ class UnmatchedUpdater(Updater):
             parts = decompose_error(self.loss.model, state, action, after, scale)
         action = torch.where(action.isfinite(), (parts.effective * scale).to(action), action)
         shown.set(self.loss.in_keys[1], action)  # a faulty action stays one
-        learnt = self.updater(shown.set(MASK, (parts.unmatched.abs() > self.gate).any(-1)))
+        learnt = self.updater(shown.set("unmatched", (parts.unmatched.abs() > self.gate).any(-1)))
         self.refused = self.updater.refused
         return learnt.set("loss", torch.where(learnt["loss"].isnan(), torch.nan, loss))

@@ -20,12 +20,6 @@ from afm_rl.learning import Updater
 from afm_rl.planning import Cost
 from afm_rl.trust import leaves, trusted_folders
 
-MISTAKES = (
-    *(ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, RuntimeError),
-    *(TypeError, ValueError),
-)
-KEYS = ("seed_key", "mask_key", "regime_key")  # settings that name an entry of the environment
-
 
 @contextmanager
 def blaming(group: str) -> Iterator[None]:
@@ -41,7 +35,10 @@ def blaming(group: str) -> Iterator[None]:
         yield
     except AFMError:
         raise
-    except MISTAKES as error:
+    except (
+        *(ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError),
+        *(RuntimeError, TypeError, ValueError),
+    ) as error:
         raise ConfigurationError(f"{group}: {str(error) or type(error).__name__}") from error
 
 
@@ -113,7 +110,12 @@ def check_cost(cost: Cost, env: EnvBase, stages: int | None = None) -> None:
             )
 
 
-def check_keys(group: str, part: Any, env: EnvBase, names: Iterable[str] = KEYS) -> None:
+def check_keys(
+    group: str,
+    part: Any,
+    env: EnvBase,
+    names: Iterable[str] = ("seed_key", "mask_key", "regime_key"),
+) -> None:
     """Check that the entries that a part was told to read are there."""
     given = list(env.observation_spec.keys(True, True))
     for name in names:

@@ -17,7 +17,6 @@ from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Compose, Schedule
 
 KEYS = ("draw", "set", "ramp", "changes")
-IDLE = ("afm_rl.learning.Updater", "afm_rl.missions.factories.no_correction")
 """Parts that do nothing, and are not named."""
 
 
@@ -148,7 +147,6 @@ def _stable(name: str, seed: int) -> int:
 
 
 Entry = Family | Listed
-PLAN = ("phases", "at", "ramp")
 
 
 def select_tracks(tracks: Any, robot: Robot) -> list[str]:
@@ -199,7 +197,7 @@ def _entry(entry: Any, robot: Robot) -> Entry:
     planned = isinstance(entry, Mapping) and "phases" in entry
     given = dict(entry) if planned else {"phases": entry}
     for key in given:
-        check_choice("regimes: setting", key, PLAN)
+        check_choice("regimes: setting", key, ("phases", "at", "ramp"))
     for key in ("phases", "at") if planned else ():
         if not isinstance(given.get(key, []), list):
             raise ConfigurationError(f"regimes: {key}={given[key]!r}: expected a list")
@@ -265,4 +263,5 @@ def name_method(settings: Mapping[str, Any]) -> str:
     if chosen.get("method"):
         return str(chosen["method"])
     made = [settings[group]["_target_"] for group in ("dynamics", "updater", "corrector")]
-    return "+".join(name.rpartition(".")[2] for name in made if name not in IDLE)
+    idle = ("afm_rl.learning.Updater", "afm_rl.missions.factories.no_correction")
+    return "+".join(name.rpartition(".")[2] for name in made if name not in idle)

@@ -14,7 +14,6 @@ from afm_rl.missions.scores import ReturnScore
 from afm_rl.regimes import Compose, Physics, Regime, Schedule, actuator_regimes
 from afm_rl.trust import find_code
 
-CODE = ("reward", "step")
 """Settings that may name a function."""
 
 
@@ -54,7 +53,9 @@ class TaskRobot(Robot):
         data: Collection | None = None,
         **settings: Any,
     ) -> None:
-        code = {key: settings[key] for key in CODE if isinstance(settings.get(key), str)}
+        code = {
+            key: settings[key] for key in ("reward", "step") if isinstance(settings.get(key), str)
+        }
         found = {key: find_code(f"robot.{key}", name) for key, name in code.items()}
         task = source(**{**settings, **found})
         model = copy.deepcopy(task.world) if model is None else model

@@ -30,7 +30,6 @@ from afm_rl.regimes import Regime, Schedule, flight_regimes
 from afm_rl.spaces.airframe import QuadrotorBody
 
 ACTIONS = ("thrust (N)", "moment_x (N m)", "moment_y (N m)", "moment_z (N m)")
-UNIT = 1e-3  # how far a quaternion's length may be from 1
 
 
 class CrazyflieTrack(MissionEnv):
@@ -190,7 +189,7 @@ class CrazyflieTrack(MissionEnv):
                 "velocity, quaternion (scalar-last), body rate"
             )
         length = pose[..., 6:10].norm(dim=-1).reshape(-1)
-        rows = (length - 1).abs().gt(UNIT).nonzero().flatten().tolist()
+        rows = (length - 1).abs().gt(1e-3).nonzero().flatten().tolist()
         if rows:
             raise ConfigurationError(
                 f"pose: quaternions of flights {rows}: length {length[rows[0]].item():g}, "

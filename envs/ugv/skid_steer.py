@@ -11,12 +11,10 @@ from afm_rl.dynamics.mujoco_model import changed_model
 from afm_rl.options import option, options
 from afm_rl.regimes import Physics
 
-MODEL = Path(__file__).with_name("skid_steer.xml")
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 RADIUS = 0.098  # m, of a wheel
 WIDTH = 0.9  # m, distance of wheels on an axle that would turn like this without skidding
 STEP = 0.01  # s, of the simulation
-PLANAR = 3  # state coordinates that make the pose: x, y, theta
 
 
 @options("dynamics")
@@ -44,7 +42,7 @@ def skid_steer(
     turn = WIDTH / 2 / RADIUS
     mix = [[1 / RADIUS, -turn], [1 / RADIUS, turn]] * 2
     return MuJoCoDynamics(
-        MODEL,
+        Path(__file__).with_name("skid_steer.xml"),
         skip,
         noise_std,
         threads,

@@ -17,8 +17,7 @@ from afm_rl.errors import check_instance
 from afm_rl.learning import InPlaceLoss
 from afm_rl.options import option, options
 
-SOURCE_STD = 0.3  # of the path's start around the plan, in half ranges
-EFFECT_WEIGHT, SIZE_WEIGHT = 0.6, 0.5  # of the loss of effects, and of the size of all errors
+EFFECT_WEIGHT = 0.6  # of the loss of effects
 PRECISION = 0.01  # half ranges: smaller errors count less
 
 
@@ -32,7 +31,7 @@ def flow_losses(
               |r|_\epsilon = \sqrt{r^2 + \epsilon^2} - \epsilon
 
     with :math:`x_\tau = (1 - \tau) x_0 + \tau x_1` (conditional flow matching, Lipman et al.
-    2023; paper, eq. 6), :math:`x_0 = u_0 + \sigma\,\epsilon` around the plan and the intended
+    2023; paper, eq. 6), :math:`x_0 = u_0 + 0.3\,\epsilon` around the plan and the intended
     action :math:`x_1 = T^{-1}(u_0)`, both as means over plans and axes.
     """
     with torch.no_grad():
@@ -40,11 +39,11 @@ def flow_losses(
     encoded = network.encode(drawn.rows, experts)
     noise = torch.randn(drawn.planned.shape, generator=generator).to(drawn.planned)
     tau = torch.rand(*drawn.planned.shape[:-1], 1, generator=generator).to(noise)
-    start = drawn.planned + SOURCE_STD * noise
+    start = drawn.planned + 0.3 * noise
     point = torch.lerp(start, drawn.intended, tau)
     velocity = network.velocity(network.ask(encoded, drawn.planned, mode), tau, point)
     off = velocity - (drawn.intended - start)
-    loss = (off.square() + SIZE_WEIGHT * _size(off)).mean((-2, -1))
+    loss = (off.square() + 0.5 * _size(off)).mean((-2, -1))
     return loss, _size(network.effect(encoded, drawn.probe) - drawn.effect).mean((-2, -1))
 
 

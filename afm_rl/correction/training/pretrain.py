@@ -26,7 +26,6 @@ from afm_rl.storage.files import write_whole
 
 SIZES = {1: 0.12, 2: 0.45, 3: 0.15, 4: 0.08, 6: 0.15, 9: 0.05}  # share of numbers of actions
 SHARES = {"mixed": 0.5, "clip": 0.3, "direction": 0.2}  # share of saturation modes
-PLANS = 4  # per window
 LESIONS = ("across", "experts", "noise")  # parts of the network that can be left out
 POOL = 8  # batches that are drawn at once
 
@@ -64,7 +63,7 @@ def pretrain(
         mode = MODES[int(torch.multinomial(shares, 1, generator=generator))]
         pool = pools.setdefault((size, mode), [])
         if not pool:
-            many = draw_examples(POOL * batch_size, size, rows, PLANS, mode, generator)
+            many = draw_examples(POOL * batch_size, size, rows, 4, mode, generator)
             for _ in range(reuse):
                 order = torch.randperm(POOL * batch_size, generator=generator)
                 pool.extend(_take(many, index) for index in order.split(batch_size))

@@ -22,7 +22,6 @@ from afm_rl.correction.achievable import LEAST, LIMIT
 from afm_rl.correction.experts import Rows
 
 GRID = 257  # points of a tabulated map
-EDGE = 1.6  # centres of narrow windows are drawn in this box and cut: many actions saturate
 KINDS = {  # share of each kind of scalar map among the regimes
     "linear": 0.52,
     "slip": 0.17,
@@ -333,7 +332,8 @@ def draw_actions(count: int, rows: int, axes: int, draw: Draw) -> Tensor:
     twelve jumps between the limits.
     """
     wide = draw.uniform(-1.0, 1.0, count, rows, axes)
-    around = EDGE * draw.uniform(-1.0, 1.0, count, 1, axes)
+    # Centres of narrow windows are drawn in a larger box and cut: many actions saturate.
+    around = 1.6 * draw.uniform(-1.0, 1.0, count, 1, axes)
     spread = draw.log_uniform(0.01, 0.6, count, 1, axes) * draw.chance(0.8, count, 1, 1)
     wide = torch.where(draw.chance(1 / 12, count, 1, 1), wide.sign(), wide)
     return torch.where(draw.chance(0.55, count, 1, 1), wide, (around + spread * wide).clamp(-1, 1))
