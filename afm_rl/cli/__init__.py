@@ -6,12 +6,14 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from afm_rl import conf
 from afm_rl._version import __version__
 from afm_rl.cli.error_messages import explain, one_line
 from afm_rl.cli.launcher import register
@@ -51,11 +53,20 @@ def _explained(sweep: bool = False) -> Iterator[None]:
         sys.exit(1 if isinstance(error, JobsFailed) else 2)
 
 
+def _chosen(arguments: list[str]) -> list[Path]:
+    """Return the settings files of choices, group=choice; their comments say what options are."""
+    paths = [Path(conf.__path__[0], f"{text.replace('=', '/', 1)}.yaml") for text in arguments]
+    return [path for path in paths if path.is_file()]
+
+
 def main() -> None:
     """Run ``afm-rl``; a mistake in the settings ends in one line and exit status 2."""
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # hand errors to us instead of printing them
     if sys.argv[1:] == ["--version"]:
         print(f"afm-rl {__version__}")
+        return
+    if {"-h", "--help"} & {*sys.argv[1:]} and (files := _chosen(sys.argv[1:])):
+        print(*(path.read_text(encoding="utf-8") for path in files), sep="\n", end="")
         return
     _launched.clear()
     sys.argv[1:] = with_sweep_folder(relaxed(sys.argv[1:]))

@@ -27,13 +27,15 @@ from afm_rl.dynamics import (
     Quadrotor,
     UnknownDynamics,
 )
-from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag, check_instance
+from afm_rl.errors import AFMError, ConfigurationError, check_count, check_instance
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.collected import fit_collected
 from afm_rl.missions.robot import Robot
-from afm_rl.options import options
+from afm_rl.options import option, options
 from afm_rl.planning.costs import KnownReward
 from afm_rl.storage.artefacts import load_artefact
+
+CHECKPOINT = option(None, "file of weights of your own; None: none")
 
 
 class Training(NamedTuple):
@@ -116,13 +118,12 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
 def knode(
     robot: Robot,
     pretrain: Mapping[str, Any] | None = None,
-    randomised: bool = False,
+    randomised: bool = option(False, "pre-train on flights under regimes of the prior"),
     **settings: Any,
 ) -> Part:
     """Return a quadrotor's physics plus networks; ``pretrain`` says how the first one is trained.
 
-    If ``randomised``, on flights under regimes of the prior, not under the nominal one; further
-    ``settings`` are those of :class:`~afm_rl.dynamics.KNODE`.
+    Further ``settings`` are those of :class:`~afm_rl.dynamics.KNODE`.
     """
     nominal = robot.model
     if not isinstance(nominal, Quadrotor):
@@ -131,7 +132,6 @@ def knode(
             "is not known; choose robot=quadrotor, or dynamics=pe"
         )
     model = KNODE(nominal, **settings)
-    check_flag("dynamics.randomised", randomised)
     if pretrain is None:
         return Part(model)
 
@@ -162,11 +162,11 @@ def no_correction(robot: Robot, dynamics: Part) -> Part:
     return Part(None)
 
 
-@options("corrector", ActionFlow, train=train_flow)
+@options("corrector", ActionFlow)
 def afm(
     robot: Robot,
     dynamics: Part,
-    checkpoint: str | None = None,
+    checkpoint: str | None = CHECKPOINT,
     train: None = None,
     **settings: Any,
 ) -> Part:
@@ -188,7 +188,7 @@ def paper_flow(
     robot: Robot,
     dynamics: Part,
     train: Mapping[str, Any],
-    checkpoint: str | None = None,
+    checkpoint: str | None = CHECKPOINT,
     **settings: Any,
 ) -> Part:
     """Return the published flow, to be trained over a model whose states are plain numbers."""
