@@ -153,5 +153,6 @@ def check_instance(name: str, value: Any, kind: type) -> Any:
     3
     """
     if not isinstance(value, kind):
-        raise ConfigurationError(f"{name}: expected a {kind.__name__}, got {value!r:.80}")
+        shown = " ".join(repr(value).split())  # modules are described in several lines
+        raise ConfigurationError(f"{name}: expected a {kind.__name__}, got {shown:.80}")
     return value

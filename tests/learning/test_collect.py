@@ -1,11 +1,9 @@
 """Collecting transitions from environments that are not ours."""
 
-import pytest
 import torch
 from torchrl.envs import GymEnv, SerialEnv, TransformedEnv
 
 from afm_rl.dynamics import Ensemble
-from afm_rl.errors import ConfigurationError
 from afm_rl.learning import collect
 from afm_rl.planning import MPPI, KnownReward, PlanningEnv
 from afm_rl.spaces.manifold import Manifold
@@ -53,8 +51,3 @@ def test_a_planner_over_a_learned_model_can_be_the_policy():
     expected = env.rollout(6, twin)["action"]
     torch.testing.assert_close(data["action"], expected)  # nobody else drew from its noise
     assert not env.is_closed
-
-
-def test_no_frames_are_refused():
-    with pytest.raises(ConfigurationError, match="frames=0"):
-        collect(pendulum(), frames=0)

@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Calibrated, Dubins, Ensemble
-from afm_rl.errors import ConfigurationError, NonFiniteError
+from afm_rl.errors import NonFiniteError
 from afm_rl.learning import (
     GaussianNLLLoss,
     OnlineUpdater,
@@ -206,8 +206,3 @@ def test_numbers_that_are_not_finite_are_refused(make_ensemble, observed, key):
     observed[key][3, 4, 0] = torch.nan
     with pytest.raises(NonFiniteError, match="transitions: .*not finite"):
         fit_ensemble(make_ensemble(), observed)
-
-
-def test_one_transition_is_too_few(make_ensemble, observed):
-    with pytest.raises(ConfigurationError, match="transitions=1"):
-        fit_ensemble(make_ensemble(), observed[:1, :1])

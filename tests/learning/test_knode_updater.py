@@ -7,10 +7,9 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from afm_rl.dynamics import KNODE, Dubins, Quadrotor
+from afm_rl.dynamics import KNODE, Quadrotor
 from afm_rl.dynamics.quadrotor import quadrotor_path
 from afm_rl.dynamics.residual import Network
-from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, KNODEUpdater
 from afm_rl.learning.knode_fit import first_order, fit_network
 from afm_rl.missions.state import Loop, StepLog, restore, snapshot
@@ -268,21 +267,3 @@ def test_the_loss_is_measured_before_learning():
         expected = GaussianNLLLoss(KNODE(Quadrotor()), reduction="none")(td)["loss_nll"]
         torch.testing.assert_close(updater(td)["loss"], expected.detach())
     assert model.networks.inner.any() and updater.learns
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"window": 0.12}, "updater.window=0.12: expected a multiple of the control tick, 0.05 s"),
-        ({"window": 0.01}, "updater.window=0.01: expected a multiple"),
-    ],
-    ids=str,
-)
-def test_impossible_settings_are_refused(settings, message):
-    with pytest.raises(ConfigurationError, match=message):
-        KNODEUpdater(GaussianNLLLoss(KNODE(Quadrotor())), **settings)
-
-
-def test_other_models_are_refused():
-    with pytest.raises(ConfigurationError, match="teaches a KNODE, got Dubins"):
-        KNODEUpdater(GaussianNLLLoss(Dubins()))

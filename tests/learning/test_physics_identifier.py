@@ -4,8 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from afm_rl.dynamics import Dubins, MuJoCoDynamics
-from afm_rl.errors import ConfigurationError
+from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.learning import GaussianNLLLoss, PhysicsIdentifier
 from afm_rl.regimes import Physics
 
@@ -81,26 +80,3 @@ def test_bad_readings_teach_nothing():
     updater(td.set(("next", "observation"), state * torch.nan))
     assert updater.refused == 3
     assert all(torch.equal(*pair) for pair in zip(updater.belief.parts, before, strict=True))
-
-
-@pytest.mark.parametrize(
-    ("settings", "word"),
-    [
-        ({"ranges": {}}, "expected what may differ about the body"),
-        ({"ranges": None}, "expected what may differ about the body"),
-        ({"ranges": {"colour": [0, 1]}}, "names are mass"),
-        ({"ranges": {"length": [1.0]}}, r"length=\[1.0\]: expected \[low, high\]"),
-        ({"ranges": {"length": [2.0, 1.0]}}, "length: high=1.0"),
-        ({"ranges": {"length": [1, 2], "mass": [1, 2]}, "count": 40}, "1600 combinations"),
-        ({"scale": [1.0, 2.0]}, "expected 1 positive numbers"),
-    ],
-)
-def test_bad_settings_are_named(settings, word):
-    with pytest.raises(ConfigurationError, match=word) as caught:
-        updater_of(**settings)
-    assert "\n" not in str(caught.value)
-
-
-def test_other_models_are_refused():
-    with pytest.raises(ConfigurationError, match="needs a model with physics, got Dubins"):
-        PhysicsIdentifier(GaussianNLLLoss(Dubins()), LENGTHS, [1.0, 1.0])

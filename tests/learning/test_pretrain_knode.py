@@ -1,10 +1,8 @@
 """A KNODE's first network, before any flight."""
 
-import pytest
 import torch
 
 from afm_rl.dynamics import KNODE, Oracle, Quadrotor
-from afm_rl.errors import ConfigurationError
 from afm_rl.learning.knode_fit import pretrain_knode
 from afm_rl.regimes import MassFactor
 
@@ -38,8 +36,3 @@ def test_flights_may_be_under_regimes_of_their_own():
     assert error < 0.5 * train(KNODE(Quadrotor()), epochs=1)  # as with a heavy teacher
     anything = MassFactor([0.5, 1.5])
     assert error < pretrain_knode(many, Quadrotor(), STATES, ACTIONS, regime=anything, **settings)
-
-
-def test_it_comes_before_the_missions():
-    with pytest.raises(ConfigurationError, match="before it is given to 4 missions"):
-        train(KNODE(Quadrotor()).expand_(4))

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from afm_rl.dynamics import Dubins
-from afm_rl.errors import ConfigurationError
 from afm_rl.learning import fitting, pretrain_ensemble
 
 SHORT = {"samples": 512, "epochs": 2, "batch_size": 64}
@@ -111,8 +110,3 @@ def test_an_ensemble_can_teach_another(fit, make_ensemble):
     assert math.isfinite(error)
     assert all(torch.equal(teacher.state_dict()[name], before[name]) for name in before)
     assert all(parameter.grad is None for parameter in teacher.parameters())
-
-
-def test_there_is_a_batch(fit):
-    with pytest.raises(ConfigurationError, match="dynamics.pretrain.samples=63"):
-        fit(samples=63)

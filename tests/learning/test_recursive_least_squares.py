@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Calibrated, Dubins
-from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, RLSUpdater
 from afm_rl.learning.rls_updater import advance, no_fit
 
@@ -230,11 +229,6 @@ def test_what_was_learnt_keeps_its_digits():
     for each in (world, other):
         each.drive(3, matrix=GAINS)
     torch.testing.assert_close(other.model.matrix, world.model.matrix, atol=1e-6, rtol=0)
-
-
-def test_other_models_are_refused():
-    with pytest.raises(ConfigurationError, match="teaches a Calibrated model, got Dubins"):
-        RLSUpdater(GaussianNLLLoss(Dubins()))
 
 
 def test_a_mission_alone_learns_the_same_to_the_bit():

@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins
-from afm_rl.errors import ConfigurationError
 from afm_rl.learning import GaussianNLLLoss, StreamXUpdater, gaussian_nll, pretrain_ensemble
 
 FORMS = ["error", "loss"]
@@ -148,8 +147,3 @@ def test_missions_may_leave_and_a_shared_model_learns_from_all(missions, make, t
     losses = [updater_of(shared)(transition(*transitions(6, dtype=torch.float64)))["loss"]]
     losses += [updater_of(shared)(transition(*transitions(6, dtype=torch.float64)))["loss"]]
     assert losses[1].mean() < losses[0].mean() and shared.running.count == 62
-
-
-def test_other_models_are_refused():
-    with pytest.raises(ConfigurationError, match="teaches an Ensemble, got Dubins"):
-        updater_of(Dubins())

@@ -7,7 +7,6 @@ import torch
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins, Ensemble
-from afm_rl.errors import ConfigurationError
 from afm_rl.learning import (
     GaussianNLLLoss,
     OnlineUpdater,
@@ -28,7 +27,7 @@ def taught():
     """Return the weights of an ensemble that knows the car."""
     model = blank()
     box = torch.tensor([0.0, 0.0, -3.14]), torch.tensor([0.0, 0.0, 3.14])
-    pretrain_ensemble(model, Dubins(), box, (LOW, HIGH), samples=40_000, epochs=10)
+    pretrain_ensemble(model, Dubins(), box, (LOW, HIGH), samples=16_000, epochs=10)
     return model.state_dict()
 
 
@@ -106,19 +105,3 @@ def test_faults_are_refused(taught):
     assert updater.refused == 2
     changed = (weights(updater) != before).any(1)
     assert changed.tolist() == [k not in (2, 5) for k in range(8)]
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"scale": [1.0]}, "updater.scale=.*expected 2 positive numbers"),
-        ({"scale": [1.0, 0.0]}, "updater.scale="),
-        ({"scale": [1.0, float("nan")]}, "updater.scale="),
-        ({"updater": partial(GRADIENT, mask_key="mine")}, "updater.updater.mask_key='mine'"),
-        ({"updater": lambda loss: loss}, "updater.updater"),
-    ],
-)
-def test_settings_are_checked(settings, words):
-    settings = {"updater": GRADIENT, "scale": HIGH, **settings}
-    with pytest.raises(ConfigurationError, match=words):
-        UnmatchedUpdater(GaussianNLLLoss(blank()), **settings)

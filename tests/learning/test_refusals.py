@@ -1,0 +1,98 @@
+"""What cannot be learnt, or from, is refused by name, in one line."""
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import GymEnv
+
+from afm_rl.dynamics import KNODE, Dubins, Ensemble, MuJoCoDynamics, Quadrotor
+from afm_rl.errors import ConfigurationError
+from afm_rl.learning import (
+    GaussianNLLLoss,
+    KNODEUpdater,
+    OnlineUpdater,
+    PhysicsIdentifier,
+    ResetAdam,
+    RLSUpdater,
+    StreamXUpdater,
+    UnmatchedUpdater,
+    collect,
+    fit_ensemble,
+    pretrain_ensemble,
+    pretrain_knode,
+)
+from afm_rl.spaces.manifold import Manifold
+
+BOX = torch.tensor([0.0, 0.0, -3.14]), torch.tensor([0.0, 0.0, 3.14])
+GRADIENT = partial(OnlineUpdater, optimizer=ResetAdam)
+SLED = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1"/></body>
+</worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
+LENGTHS = {"length": [0.5, 1.5]}
+
+
+def ensemble():
+    return Ensemble(Manifold(3, angles=[2]), 2, features=[2], members=2, hidden=[4])
+
+
+def identify(ranges=LENGTHS, scale=(1.0,), model=None, **settings):
+    pytest.importorskip("mujoco")
+    loss = GaussianNLLLoss(model or MuJoCoDynamics(SLED))
+    return PhysicsIdentifier(loss, ranges, scale, **{"count": 11, **settings})
+
+
+def over(model, kind, *settings, **more):
+    return kind(GaussianNLLLoss(model), *settings, **more)
+
+
+def beside(scale=(1.0, 1.5), updater=GRADIENT):
+    return over(ensemble(), UnmatchedUpdater, updater, scale)
+
+
+def rows(count):
+    driven = torch.zeros(count, 3)
+    parts = {"observation": driven, "action": driven[:, :2], ("next", "observation"): driven}
+    return TensorDict(parts, [count])
+
+
+REFUSED = [
+    (
+        lambda: over(KNODE(Quadrotor()), KNODEUpdater, window=0.12),
+        "updater.window=0.12: expected",
+    ),
+    (lambda: over(KNODE(Quadrotor()), KNODEUpdater, window=0.01), "multiple of the control tick"),
+    (lambda: over(Dubins(), KNODEUpdater), "teaches a KNODE, got Dubins"),
+    (lambda: over(Dubins(), RLSUpdater), "teaches a Calibrated model, got Dubins"),
+    (lambda: over(Dubins(), StreamXUpdater), "teaches an Ensemble, got Dubins"),
+    (lambda: identify(model=Dubins()), "needs a model with physics, got Dubins"),
+    (lambda: identify({}), "expected what may differ about the body"),
+    (lambda: identify(None), "expected what may differ about the body"),
+    (lambda: identify({"colour": [0, 1]}), "names are mass"),
+    (lambda: identify({"length": [1.0]}), r"length=\[1.0\]: expected \[low, high\]"),
+    (lambda: identify({"length": [2.0, 1.0]}), "length: high=1.0"),
+    (lambda: identify({"length": [1, 2], "mass": [1, 2]}, count=40), "1600 combinations"),
+    (lambda: identify(scale=[1.0, 2.0]), "expected 1 positive numbers"),
+    (lambda: beside([1.0]), "updater.scale=.*expected 2 positive numbers"),
+    (lambda: beside([1.0, 0.0]), "updater.scale="),
+    (lambda: beside([1.0, float("nan")]), "updater.scale="),
+    (lambda: beside(updater=partial(GRADIENT, mask_key="mine")), "updater.updater.mask_key='mine'"),
+    (lambda: beside(updater=lambda loss: loss), "updater.updater"),
+    (
+        lambda: pretrain_knode(KNODE(Quadrotor()).expand_(4), Quadrotor(), BOX, BOX),
+        "before it is given to 4 missions",
+    ),
+    (
+        lambda: pretrain_ensemble(ensemble(), Dubins(), BOX, BOX, samples=63, batch_size=64),
+        "dynamics.pretrain.samples=63",
+    ),
+    (lambda: fit_ensemble(ensemble(), rows(1)), "transitions=1"),
+    (lambda: collect(GymEnv("Pendulum-v1"), frames=0), "frames=0"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), REFUSED, ids=[message for _, message in REFUSED])
+def test_it_is_refused(make, message):
+    with pytest.raises(ConfigurationError, match=message) as caught:
+        make()
+    assert "\n" not in str(caught.value)
