@@ -2,6 +2,9 @@
 
 import copy
 import functools
+import json
+import os
+import re
 
 import pytest
 import torch
@@ -103,6 +106,35 @@ def trained_error(_trained_ensemble):
 def universal_flow():
     """The action flow of the ground robot, as it comes with the package."""
     return ActionFlow(LOW, HIGH)
+
+
+def _alike(found, stored):
+    """Compare what JSON holds; numbers to five digits, as other processors round otherwise."""
+    if isinstance(found, float) and isinstance(stored, float):
+        return found == pytest.approx(stored, rel=1e-5, abs=1e-9, nan_ok=True)
+    if type(found) is not type(stored) or not isinstance(found, dict | list):
+        return found == stored
+    keys = found if isinstance(found, dict) else range(len(found))
+    return len(found) == len(stored) and all(_alike(found[key], stored[key]) for key in keys)
+
+
+@pytest.fixture
+def golden(request):
+    """Compare with what is stored beside the test; ``RENEW=1 pytest FILE`` stores it anew."""
+    file = request.path.with_name("golden.json")
+
+    def compare(found):
+        stored = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
+        found = json.loads(json.dumps(found))
+        if os.environ.get("RENEW"):
+            stored[request.node.name] = found
+            text = json.dumps(stored, indent=1, ensure_ascii=False, sort_keys=True)
+            text = re.sub(r"\[[^][{}]*]", lambda row: re.sub(r"\s*\n\s*", " ", row[0]), text)
+            file.write_text(text + "\n", encoding="utf-8")
+        expected = stored.get(request.node.name)
+        assert _alike(found, expected) or found == expected
+
+    return compare
 
 
 @pytest.fixture

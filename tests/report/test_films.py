@@ -58,29 +58,6 @@ def artists(scene, kind):
     return [artist for artist in scene.moving if type(artist).__name__ == kind]
 
 
-def test_a_drive_is_shown_up_to_the_step(drive, ring):
-    scene = map_scene("title", {"oracle": drive}, ring)
-    scene.show(50)
-    cursor, before, changed, goal = artists(scene, "Line2D")
-    assert len(before.get_xdata()) == len(changed.get_xdata()) == 51
-    np.testing.assert_allclose(before.get_xydata()[-1], drive.loc[50, ["x", "y"]].astype(float))
-    np.testing.assert_allclose(goal.get_xydata()[0], drive.loc[50, ["goal_x", "goal_y"]].to_list())
-    assert np.isnan(changed.get_xdata()[:20]).all() and np.isfinite(changed.get_xdata()[22:]).all()
-    assert cursor.get_xdata() == [50, 50]
-    (said,) = artists(scene, "Text")
-    assert said.get_text() == "step 50: changed regime"
-
-
-def test_the_robot_points_where_it_heads(drive):
-    scene = map_scene("title", {"oracle": drive})
-    scene.show(25)
-    (robot,) = artists(scene, "Polygon")
-    nose, tail = robot.get_xy()[0], robot.get_xy()[2]
-    theta = drive.loc[25, "theta"]
-    direction = (nose - tail) / np.linalg.norm(nose - tail)
-    np.testing.assert_allclose(direction, [np.cos(theta), np.sin(theta)], atol=1e-6)
-
-
 def test_arrows_show_what_is_planned_and_what_is_executed(drive):
     drive = drive.assign(theta=0.0, planned_v=0.5, executed_v=-1.0, executed_omega=np.pi)
     scene = map_scene("title", {"oracle": drive})
@@ -90,39 +67,6 @@ def test_arrows_show_what_is_planned_and_what_is_executed(drive):
     )
     assert planned[0] > 0 and planned[1] == pytest.approx(0.0)
     np.testing.assert_allclose(executed, [0.0, -2 * planned[0]], atol=1e-9)  # a quarter turn
-
-
-def test_robots_in_one_film_move_together(make_results, ring):
-    missions, steps = make_results()
-    runs = {name: steps[steps["mission"] == k] for k, name in enumerate(missions["method"])}
-    scene = map_scene("title", runs, ring)
-    scene.show(150)
-    bodies = [polygon.get_xy().mean(0) for polygon in artists(scene, "Polygon")]
-    lengths = [len(line.get_xdata()) for line in artists(scene, "Line2D")[1::2]]
-    assert len(bodies) == 3 and lengths == [151, 120, 100]  # who has ended stays where it is
-    assert artists(scene, "Text")[0].get_text() == "step 150"
-    legend = [text.get_text() for text in scene.figure.legends[0].get_texts()]
-    assert legend == ["physics", "adaptive", "oracle"]
-    assert len({polygon.get_facecolor() for polygon in artists(scene, "Polygon")}) == 3
-
-
-def test_robots_with_other_actions_have_no_arrows(drive):
-    steps = drive.drop(columns=["theta", "planned_omega", "executed_omega"])
-    scene = map_scene("title", {"oracle": steps})
-    scene.show(3)
-    assert artists(scene, "FancyArrowPatch") == []
-
-
-def test_a_flight_is_shown_up_to_the_step():
-    steps = fly()[1]
-    scene = space_scene("title", steps)
-    scene.show(12)
-    path, goal, robot = artists(scene, "Line3D")
-    assert np.shape(path.get_data_3d()) == (3, 13)
-    np.testing.assert_allclose(np.ravel(robot.get_data_3d()), steps.loc[12, ["x", "y", "z"]])
-    assert np.ravel(goal.get_data_3d())[2] == 0.0
-    assert [line.get_xdata() for line in artists(scene, "Line2D")] == [[12, 12]] * 2
-    assert artists(scene, "Text")[0].get_text() == "step 12: changed regime, misaligned"
 
 
 def test_a_film_moves_and_its_background_does_not(drive, ring):

@@ -5,7 +5,6 @@ import pandas as pd
 import pytest
 
 from afm_rl.report import read_runs
-from afm_rl.report.comparison import draw_profile, draw_progress, ratios
 from afm_rl.report.figures import (
     read_excerpts,
     share_reached,
@@ -13,7 +12,6 @@ from afm_rl.report.figures import (
     traced_missions,
 )
 from afm_rl.report.statistics import count_budgets
-from afm_rl.report.style import method_styles
 
 
 @pytest.fixture
@@ -25,33 +23,6 @@ def joined(run_folder, laps):
         return count_budgets(runs.missions, laps), runs, *read_excerpts(runs)
 
     return make
-
-
-def test_the_profile_counts_missions_within_a_factor(joined, artists, laps):
-    missions, *_ = joined(seeds=2)
-    ratio = ratios(missions, laps.budget)
-    own = ratio.groupby(missions["method"]).agg(list)
-    assert own["oracle"] == [1.0, 1.0]
-    np.testing.assert_allclose(own["adaptive"], [120 / 100, 121 / 101])
-    assert own["physics"] == [np.inf] * 2
-    styles = method_styles(missions["method"])
-    (axes,) = draw_profile(missions, ratio, laps.budget, styles).axes
-    physics, adaptive, oracle = (line.get_ydata() for line in artists(axes, "profile"))
-    assert (physics == 0).all() and (oracle == 100).all()
-    assert adaptive[0] == 0 and adaptive[-1] == 100
-
-
-def test_progress_is_the_mean_share_of_targets(joined, artists, make_results):
-    missions, _, _, progress = joined(methods=["physics", "oracle"], seeds=2)
-    assert progress.loc["oracle"].shape == (2, 240)
-    (axes,) = draw_progress(progress, method_styles(missions["method"]), "targets").axes
-    physics, oracle = artists(axes, "progress")
-    _, steps = make_results(["oracle"])
-    reached = steps["reached"].to_numpy()
-    for step, share in zip(oracle.get_xdata(), oracle.get_ydata(), strict=True):
-        expected = 8 if step > steps["t"].max() else reached[int(step)]
-        assert share == pytest.approx(100 * expected / 8)
-    assert physics.get_ydata()[-1] == 25
 
 
 def test_before_the_first_step_logged_nothing_is_known_but_the_first():

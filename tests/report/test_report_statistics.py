@@ -24,7 +24,6 @@ from afm_rl.report.tables import (
     comparison_tables,
     missing_lines,
     missing_table,
-    scenario_table,
     summary_table,
 )
 from afm_rl.storage.measures import Measure, Measures
@@ -230,19 +229,6 @@ def test_a_cell_shared_without_a_seed_has_no_pairs(missions, laps):
     )
     assert table.shown.iloc[0, 1:4].tolist() == ["0", "-", "-"]
     assert table.shown.loc[0, "P(better)"] == "0.75"
-
-
-def test_cells_times_methods(missions, laps):
-    table = scenario_table(missions, laps)
-    assert table.shown.to_numpy().tolist() == [
-        ["a", "100 / 149", "75 / 349", "100 / 99"],
-        ["b", "75 / 449", "50 / 499", "75 / 349"],
-    ]
-    assert table.bold == {(0, 3), (1, 3)}
-    alone = scenario_table(
-        missions[(missions["method"] != "base") | (missions["scenario"] == "a")], laps
-    )
-    assert alone.shown.loc[1, "base"] == "-"
 
 
 def test_what_is_missing_is_counted():

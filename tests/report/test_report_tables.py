@@ -63,13 +63,6 @@ def test_a_terminal_gets_the_best_in_bold(four, laps, table, monkeypatch):
     assert better.count("\x1b[1m") == 3  # success, finished, steps; not seconds
 
 
-def test_cells_have_a_table_of_their_own_if_there_are_several(four, laps, table):
-    assert "v_gain" not in table(four, io.StringIO())
-    text = table(four.assign(v_gain=[-1.0, -1.0, 2.0, 2.0]), io.StringIO())
-    (row,) = (line for line in text.splitlines() if "v_gain = 2" in line)
-    assert row.split()[-6:] == ["75", "/", "300", "50", "/", "300"]
-
-
 def test_names_are_no_markup(four, laps, table):
     assert "[bold]x[/bold]" in table(four.replace("a", "[bold]x[/bold]"), io.StringIO())
 

@@ -132,35 +132,6 @@ def check_latex(text):
     assert not re.search(r"[_#$^~±∞]", re.sub(r"\\text\w+{}", "", prose))
 
 
-def test_tables_can_be_set_in_latex(run_folder, report):
-    folder, _ = report(
-        run_folder(seeds=2, v_gains=[-1.0, 2.0]),
-        run_folder("more", methods=["oracle"], v_gains=[3.0]),
-        figures=False,
-    )
-    names = sorted((folder / "tables").glob("*.tex"))
-    assert len(names) == 5
-    for path in names:
-        check_latex(path.read_text())
-    text = (folder / "tables" / "scenarios.tex").read_text()
-    assert r"v\_gain = -1" in text and r"\textbf{" in text
-
-
-def test_what_is_missing_is_said_three_times(run_folder, report):
-    folder, said = report(
-        run_folder("a", methods=["physics", "oracle"], seeds=2),
-        run_folder("b", methods=["oracle"], v_gains=[2.0]),
-        baselines=["physics", "online_pe"],
-    )
-    assert "missing: physics: 1 missions, seeds 0, scenarios ring, v_gain = 2" in said
-    assert "There are no missions of online_pe: comparisons with it are left out." in said
-    expected = [["physics", "ring, v_gain = 2", 0]]
-    assert pd.read_csv(folder / "missing.csv").to_numpy().tolist() == expected
-    page = Page((folder / "index.html").read_text())
-    assert "Missing missions" in page.texts
-    assert "ring, v_gain = 2" in page.texts
-
-
 def test_results_without_steps_make_tables_and_bars(run_folder, report):
     source = run_folder(seeds=2)
     (source / "steps.parquet").unlink()
@@ -208,13 +179,6 @@ def test_kinds_of_missions_do_not_mix(run_folder, make_results, report, rewards,
     missions = missions.assign(**{"return": 1.0, "after": 1.0, "recovery_steps": 1})
     with pytest.raises(ConfigurationError, match="hold missions of different kinds"):
         report(run_folder(), store("other", missions, steps, rewards))
-
-
-def test_budgets_are_said(run_folder, report):
-    folder, said = report(run_folder(), figures=False)
-    (line,) = (line for line in said if "did not finish" in line)
-    assert line.startswith("1 of 3 missions did not finish within their budget and count as 399")
-    assert line in Page((folder / "index.html").read_text()).texts
 
 
 def test_many_methods_fill_several_figures(run_folder, make_results, report):
