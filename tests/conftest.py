@@ -108,14 +108,15 @@ def universal_flow():
     return ActionFlow(LOW, HIGH)
 
 
-def _alike(found, stored):
-    """Compare what JSON holds; numbers to five digits, as other processors round otherwise."""
+def _alike(found, stored, near):
+    """Compare what JSON holds; numbers need be near, as other processors round otherwise."""
     if isinstance(found, float) and isinstance(stored, float):
-        return found == pytest.approx(stored, rel=1e-5, abs=1e-9, nan_ok=True)
+        return found == pytest.approx(stored, rel=1e-5, abs=near, nan_ok=True)
     if type(found) is not type(stored) or not isinstance(found, dict | list):
         return found == stored
     keys = found if isinstance(found, dict) else range(len(found))
-    return len(found) == len(stored) and all(_alike(found[key], stored[key]) for key in keys)
+    same = len(found) == len(stored) and set(keys) <= set(stored if keys is found else keys)
+    return same and all(_alike(found[key], stored[key], near) for key in keys)
 
 
 @pytest.fixture
@@ -123,7 +124,7 @@ def golden(request):
     """Compare with what is stored beside the test; ``RENEW=1 pytest FILE`` stores it anew."""
     file = request.path.with_name("golden.json")
 
-    def compare(found):
+    def compare(found, near=1e-9):
         stored = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
         found = json.loads(json.dumps(found))
         if os.environ.get("RENEW"):
@@ -132,7 +133,7 @@ def golden(request):
             text = re.sub(r"\[[^][{}]*]", lambda row: re.sub(r"\s*\n\s*", " ", row[0]), text)
             file.write_text(text + "\n", encoding="utf-8")
         expected = stored.get(request.node.name)
-        assert _alike(found, expected) or found == expected
+        assert _alike(found, expected, near) or found == expected
 
     return compare
 

@@ -22,6 +22,7 @@ def reversed_drive(sent):
     return -sent[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error:compile=true")
 def test_what_is_compiled_says_the_same_for_any_number_of_missions(
     line, drive, plans, tmp_path, traced

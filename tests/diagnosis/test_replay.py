@@ -123,6 +123,10 @@ def test_each_row_of_the_file_has_a_row(tmp_path):
 COLUMNS = ("command", "response", "afm", "std")
 
 
+def test_rows_are_those_that_were_stored(golden):
+    golden(replay(make(rows=40)).rows().to_dict("list"), near=2e-3)  # single precision
+
+
 def test_what_is_written_is_a_log_again(tmp_path):
     episode = np.arange(90) // 30
     log = make(rows=90, t=0.1 * (np.arange(90) % 30), episode=episode)

@@ -49,6 +49,15 @@ def test_what_a_run_leaves_behind(configure, tmp_path):
     assert compute["seconds"] > 0 and "seconds" not in pd.read_csv(tmp_path / "missions.csv")
 
 
+@pytest.mark.parametrize("method", ["physics", "afm_physics", "oracle"])
+def test_missions_are_those_that_were_stored(configure, tmp_path, golden, method):
+    change = [{"v_gain": -1.0, "omega_gain": 1.0}]
+    go(tmp_path, configure(method, budget=120, seeds=2, regimes=change))
+    missions = pd.read_csv(tmp_path / "missions.csv")
+    numbers = missions[["reached", "steps"]].astype(float).to_dict("list")
+    golden([list(missions), numbers], near=1.0)  # rounding may cost a step
+
+
 def test_a_finished_run_is_left_alone(configure, tmp_path):
     before = go(tmp_path, configure())
     assert not needs_run(tmp_path, configure(progress=False, threads=2, cache="elsewhere"))

@@ -125,7 +125,7 @@ def test_the_planner_that_is_given_stays_as_it_was():
     )
 
 
-@pytest.mark.parametrize("kind", [ActionFlow, LeastSquares])
+@pytest.mark.parametrize("kind", [pytest.param(ActionFlow, marks=pytest.mark.slow), LeastSquares])
 def test_what_an_export_traces_says_the_same_and_spoils_nothing(kind):
     def policy():
         return policy_of() if kind is ActionFlow else policy_of(LeastSquares(LOW, HIGH))
