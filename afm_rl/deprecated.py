@@ -18,6 +18,7 @@ NAMES = {
     "afm_rl.envs.Table": "afm_rl.envs.SampledReference",
     "afm_rl.play.Robot": "afm_rl.play.PlayedRobot",
     "afm_rl.learning.watching.Watching": "afm_rl.transforms.collect_then_fit.CollectThenFit",
+    "afm_rl.regimes.StaticRegime": "afm_rl.regimes.Regime",
     "afm_rl.report.check_video": "afm_rl.film.check_video",
 }
 """New names of parts, both with their package."""

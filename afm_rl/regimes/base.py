@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 
 import torch
@@ -80,7 +79,7 @@ def draw_between(
     return low + (high - low) * torch.rand(size, generator=generator)
 
 
-class Regime(ABC):
+class Regime:
     """A family of regimes: the effective action as a function of action and parameters.
 
     The same object serves the simulator, the oracle and the counterfactual generator. Its
@@ -108,7 +107,14 @@ class Regime(ABC):
     by_state: bool = False
     span: tuple[float, float]
 
-    @abstractmethod
+    effect_of: Callable[..., Tensor]
+    """``effect_of(action, parameters) -> Tensor``, in the place of :meth:`apply`. A family that
+    depends on the state, on previous actions, or on chance is given ``state``, ``past`` of D
+    actions, ``noise``, too, in this order; without the latter two an action stays what it is."""
+    command_for: Callable[..., Tensor]
+    """``command_for(effect, parameters) -> Tensor``, an action with an effect, in the box or not;
+    of a family that depends on the state also ``state``. In the place of :meth:`inverse`."""
+
     def apply(
         self,
         action: Tensor,
@@ -127,6 +133,11 @@ class Regime(ABC):
                 are not known: nothing is then delayed.
             noise: standard normal numbers, ``(*B, A)``; None for the mean effect.
         """
+        if (self.history and past is None) or (self.noisy and noise is None):
+            return action
+        before = past[..., : self.history, :] if self.history and past is not None else None
+        given = [state if self.by_state else None, before, noise if self.noisy else None]
+        return self.effect_of(action, parameters, *(x for x in given if x is not None))
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         """Draw parameters ``(*shape, F)`` from the family's prior: uniform in ``span``.
@@ -147,13 +158,21 @@ class Regime(ABC):
         r"""Return the action in the box whose effect is nearest to ``action``, ``(*B, A)``.
 
         :math:`\operatorname{argmin}_{u \in [l, h]} \|(\mathrm{apply}(u) - a) / (h - l)\|`, by a
-        search that narrows around the best of a grid of points; families with a closed form
-        override it.
+        search that narrows around the best of a grid of points, or by :attr:`command_for`.
         """
+        if not hasattr(self, "command_for"):
+            return self.search(action, parameters, state, low, high)
+        given = (state,) if self.by_state else ()
+        return self.command_for(action, parameters, *given).clamp(low, high)
+
+    def search(
+        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
+    ) -> Tensor:
+        """Return what :meth:`inverse` does, by effects alone: to 0.2 % of the box."""
         grid = torch.quasirandom.SobolEngine(len(low)).draw(64).to(low)
         centre, span = ((low + high) / 2).expand_as(action), high - low
         wide = [part.unsqueeze(-2) for part in (parameters, state)]
-        for shrink in range(8):  # to 0.2 % of the box
+        for shrink in range(8):
             reach = span * 0.45**shrink
             points = centre.unsqueeze(-2) + (grid - 0.5) * reach
             points = torch.cat([centre.unsqueeze(-2), points], -2)
@@ -166,7 +185,7 @@ class Regime(ABC):
     @property
     def closed_form(self) -> bool:
         """Whether :meth:`inverse` is a formula, which also serves an infinite box."""
-        return type(self).inverse is not Regime.inverse
+        return hasattr(self, "command_for") or type(self).inverse is not Regime.inverse
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
         """Return the parameter row ``(F,)`` with ``values`` and the rest nominal.
@@ -238,33 +257,6 @@ class Regime(ABC):
         return (parameters == nominal).all(-1)
 
 
-class StaticRegime(Regime):
-    """A regime in which neither the state, nor earlier actions, nor chance play a part."""
-
-    @abstractmethod
-    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
-        """Return the effects of actions, ``(*B, A)``."""
-
-    @abstractmethod
-    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
-        """Return the actions with an ``effect``, in the box or not, ``(*B, A)``."""
-
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        return self.effect_of(action, parameters)
-
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        return self.command_for(action, parameters).clamp(low, high)
-
-
 class DelayedRegime(Regime):
     """A regime that depends on the previous actions; without them the action stays what it is.
 
@@ -272,23 +264,6 @@ class DelayedRegime(Regime):
     the effect itself.
     """
 
-    @abstractmethod
-    def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
-        """Return the effects ``(*B, A)`` of actions after those of ``past`` ``(*B, D, A)``."""
-
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        if past is None:
-            return action
-        return self.effect_of(action, parameters, past[..., : self.history, :])
-
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        return action.clamp(low, high)
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Return the effect."""
+        return effect

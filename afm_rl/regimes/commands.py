@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes.base import HalfRange, StaticRegime, check_span
+from afm_rl.regimes.base import HalfRange, Regime, check_span
 
 
-class Saturation(StaticRegime):
+class Saturation(Regime):
     r"""Commands cut at a fraction of the half range, the same on all axes; 1 cuts nothing.
 
     .. math:: u_\mathrm{eff} = \mathrm{clamp}(u, -s, s)
@@ -43,7 +43,7 @@ class Saturation(StaticRegime):
         return self.effect_of(effect, parameters)
 
 
-class DeadZone(StaticRegime):
+class DeadZone(Regime):
     r"""A loss that has to be overcome first, the same on all axes; 0 loses nothing.
 
     .. math:: u_\mathrm{eff} = \mathrm{sign}(u) \max(|u| - d, 0)
@@ -76,7 +76,7 @@ class DeadZone(StaticRegime):
         return effect + effect.sign() * loss
 
 
-class Quantisation(StaticRegime):
+class Quantisation(Regime):
     r"""Commands rounded to multiples of a step q, the same on all axes; 0 rounds nothing.
 
     .. math:: u_\mathrm{eff} = q\,\mathrm{round}(u / q)
@@ -109,7 +109,7 @@ class Quantisation(StaticRegime):
         return self.effect_of(effect, parameters)
 
 
-class Permutation(StaticRegime):
+class Permutation(Regime):
     r"""Each actuator gets the command of another one: :math:`u_{\mathrm{eff}, i} = u_{p_i}`.
 
     u are actions in half ranges. The parameter of axis i is the index :math:`p_i`; in between, as
@@ -162,7 +162,7 @@ class Permutation(StaticRegime):
         return source, half / half[source]
 
 
-class Rotation(StaticRegime):
+class Rotation(Regime):
     r"""The action, in half ranges, turned by an angle: :math:`u_\mathrm{eff} = R(\phi)\,u`.
 
     Args:

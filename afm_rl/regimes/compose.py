@@ -113,7 +113,7 @@ class Compose(Regime):
             rows = torch.stack(slow).any(0).expand(action.shape[:-1])
             a, p, s = (part.expand(*rows.shape, -1)[rows] for part in (action, parameters, state))
             command = command.clone()
-            command[rows] = super().inverse(a, p, s, low, high)
+            command[rows] = self.search(a, p, s, low, high)
         return command
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:

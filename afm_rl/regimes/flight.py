@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from afm_rl.regimes.base import Regime, StaticRegime, check_span, draw_between
+from afm_rl.regimes.base import Regime, check_span, draw_between
 from afm_rl.regimes.compose import Compose
 from afm_rl.regimes.gains import ActionGain, divide
 from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix
@@ -19,7 +19,7 @@ from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix
 MOST = 100.0  # factors beyond are typing errors
 
 
-class _Divisor(StaticRegime):
+class _Divisor(Regime):
     """A factor that divides some components of the action."""
 
     identity = (1.0,)
@@ -74,7 +74,7 @@ class InertiaFactor(_Divisor):
     divided = (False, True, True, True)
 
 
-class MotorEfficiency(StaticRegime):
+class MotorEfficiency(Regime):
     r"""Motors of which each gives a share :math:`\eta_i` of its thrust and drag.
 
     .. math:: u_\mathrm{eff} = X\,\mathrm{diag}(\eta)\,X^{-1} u
@@ -110,7 +110,7 @@ class MotorEfficiency(StaticRegime):
         return effect + mix(divide(forces, parameters) - forces, self.body)
 
 
-class Payload(StaticRegime):
+class Payload(Regime):
     r"""A small load of mass p m, fixed at (x, y) in the plane of the rotors.
 
     The centre of mass moves to :math:`d = p / (1 + p)\,(x, y)`; the thrust has a moment about it:
@@ -163,7 +163,7 @@ class Payload(StaticRegime):
         return torch.cat([none, -moved * y, moved * x, none], -1)
 
 
-class Wind(StaticRegime):
+class Wind(Regime):
     """A steady wind, as an acceleration (m/s^2) in the world frame.
 
     No action does what it does, so :meth:`apply` leaves the action alone: simulators ask

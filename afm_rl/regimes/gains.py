@@ -10,12 +10,12 @@ from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.options import option, options
-from afm_rl.regimes.base import MOST, HalfRange, Regime, StaticRegime, check_span, draw_between
+from afm_rl.regimes.base import MOST, HalfRange, Regime, check_span, draw_between
 
 MOST_GAIN = 100.0  # gains beyond are typing errors
 
 
-class ActionGain(StaticRegime):
+class ActionGain(Regime):
     r"""Per-axis gains: :math:`a_\mathrm{eff} = g \odot a` (paper, section V-B).
 
     The prior draws each gain's size log-uniformly, its sign at random, and leaves an axis
@@ -74,7 +74,7 @@ def divide(action: Tensor, gains: Tensor) -> Tensor:
     return torch.where(gains == 0, 0.0, action / gains)
 
 
-class AsymmetricGain(StaticRegime):
+class AsymmetricGain(Regime):
     r"""One gain for commands above zero and another one for those below, on each axis.
 
     .. math:: a_\mathrm{eff} = \begin{cases} g^+ a & a > 0 \\ g^- a & \text{otherwise}\end{cases}
@@ -116,7 +116,7 @@ class AsymmetricGain(StaticRegime):
         return torch.where(action > 0, up, down)
 
 
-class DeadActuator(StaticRegime):
+class DeadActuator(Regime):
     r"""Loss of effectiveness: :math:`a_\mathrm{eff} = (1 - l) \odot a`; 1 is a dead actuator.
 
     The prior kills one axis and leaves the others nominal.
@@ -170,24 +170,15 @@ class GainNoise(Regime):
     def __init__(self, span: Sequence[float] = (0.1, 0.5)) -> None:
         self.span = check_span("span", span, 0.0, MOST)
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
-        return action if noise is None else action * (1 + parameters * noise)
+    def effect_of(self, action: Tensor, parameters: Tensor, noise: Tensor) -> Tensor:
+        return action * (1 + parameters * noise)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        """Clamp: the mean effect of an action is the action."""
-        return action.clamp(low, high)
+    def command_for(self, effect: Tensor, parameters: Tensor) -> Tensor:
+        """Return the effect: the mean effect of an action is the action."""
+        return effect
 
 
-class Bias(StaticRegime):
+class Bias(Regime):
     r"""Per-axis offsets: :math:`a_\mathrm{eff} = a + b \odot h`.
 
     Args:

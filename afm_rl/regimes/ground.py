@@ -10,14 +10,14 @@ from torch import Tensor
 
 from afm_rl.errors import check_number
 from afm_rl.options import option, options
-from afm_rl.regimes.base import MOST, HalfRange, Regime, StaticRegime, check_span, draw_between
+from afm_rl.regimes.base import MOST, HalfRange, Regime, check_span, draw_between
 from afm_rl.regimes.gains import MOST_GAIN, divide
 
 END = (2 * math.sqrt(2) / 3 - 1) / 2  # makes the starting point of `rising_load` exact at r = 0
 NEAR = 0.05  # so near to the peak the starting point is better than a step, which divides by zero
 
 
-class WheelSlip(StaticRegime):
+class WheelSlip(Regime):
     r"""Traction that peaks at a command c with the value m, the same on all axes.
 
     .. math:: u_\mathrm{eff} = m\,\frac{u}{c}\,e^{1 - |u| / c}
@@ -123,20 +123,11 @@ class Patches(Regime):
         least = check_number("span", check_span("span", span)[0], low=0.0, open_low=True)
         self.span = math.log(least), math.log(span[1])
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
+    def effect_of(self, action: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
         return action * self._gains(parameters, state)
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        return divide(action, self._gains(parameters, state)).clamp(low, high)
+    def command_for(self, effect: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
+        return divide(effect, self._gains(parameters, state))
 
     def sample(self, shape: tuple[int, ...], generator: torch.Generator | None = None) -> Tensor:
         first = -draw_between(self.span, (*shape, 1), generator).exp()

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.regimes.base import StaticRegime
+from afm_rl.regimes.base import Regime
 
 FACTORS: Mapping[str, tuple[float, float]] = {
     "mass": (0.5, 2.0),
@@ -25,7 +25,7 @@ ADDED: Mapping[str, tuple[float, float]] = {
 }
 
 
-class Physics(StaticRegime):
+class Physics(Regime):
     """Other physics; actions stay what they are.
 
     A world that knows these parameters moves differently, see

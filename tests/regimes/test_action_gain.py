@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import ActionGain
-from afm_rl.regimes.base import Regime
 
 STATE = torch.zeros(3)
 SMALL = st.floats(-3, 3)
@@ -50,7 +49,7 @@ def test_the_generic_search_agrees_with_the_closed_form(gains):
     states = torch.zeros(200, 3)
     exact = gains.inverse(wanted, rows, states, low, high)
     before = torch.get_rng_state()
-    found = Regime.inverse(gains, wanted, rows, states, low, high)
+    found = gains.search(wanted, rows, states, low, high)
     assert torch.equal(torch.get_rng_state(), before)
     assert (found >= low).all() and (found <= high).all()
     torch.testing.assert_close(rows * found, rows * exact, rtol=0, atol=1e-2)

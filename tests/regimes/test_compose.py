@@ -143,13 +143,13 @@ def test_the_inverse_chains_closed_forms(robot):
 
 def test_only_rows_with_a_family_without_a_closed_form_are_searched(gains, monkeypatch):
     family, searched = Compose([gains, Shift()]), []
-    search = Regime.inverse
+    search = Regime.search
 
     def watch(self, action, *others):
         searched.append(len(action))
         return search(self, action, *others)
 
-    monkeypatch.setattr(Regime, "inverse", watch)
+    monkeypatch.setattr(Regime, "search", watch)
     rows = torch.tensor([[2.0, 1.0, 0.0], [2.0, 1.0, 0.3], [-1.0, 0.5, 0.0]])
     wanted = torch.tensor([[0.6, -0.2]])
     found = family.inverse(wanted, rows, torch.zeros(3), LOW, HIGH)

@@ -73,22 +73,13 @@ class Sled(Regime):
     def __init__(self) -> None:
         self.limits = {"mass": (0.01, 100.0), "friction": (0.0, 100.0)}
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
+    def effect_of(self, action: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
         mass, friction = parameters.split(1, -1)
         return action / mass + (1 - friction / mass) * state[..., 2:]
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
+    def command_for(self, effect: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
         mass, friction = parameters.split(1, -1)
-        return (action * mass + (friction - mass) * state[..., 2:]).clamp(low, high)
+        return effect * mass + (friction - mass) * state[..., 2:]
 
 
 class Coefficients(Regime):
@@ -109,14 +100,7 @@ class Coefficients(Regime):
     identity = (NOMINAL, NOMINAL)
     span = COEFFICIENT[0]
 
-    def apply(
-        self,
-        action: Tensor,
-        parameters: Tensor,
-        state: Tensor,
-        past: Tensor | None = None,
-        noise: Tensor | None = None,
-    ) -> Tensor:
+    def effect_of(self, action: Tensor, parameters: Tensor) -> Tensor:
         number, (first, second) = torch.complex(*action.unbind(-1)), parameters.unbind(-1)
         wanted = (first * number + second * number**2) / NOMINAL
         root, ahead = (1 + 4 * wanted).sqrt(), 1 + 2 * number

@@ -76,10 +76,8 @@ class Gusts(Regime):
         moved = action + self._torque(parameters, state)
         return moved if noise is None else moved + parameters[..., :1] * NOISE * noise
 
-    def inverse(
-        self, action: Tensor, parameters: Tensor, state: Tensor, low: Tensor, high: Tensor
-    ) -> Tensor:
-        return (action - self._torque(parameters, state)).clamp(low, high)
+    def command_for(self, effect: Tensor, parameters: Tensor, state: Tensor) -> Tensor:
+        return effect - self._torque(parameters, state)
 
     def _torque(self, parameters: Tensor, state: Tensor) -> Tensor:
         """Return the mean torque from outside ``(*B, 1)``."""
