@@ -228,6 +228,8 @@ def check_settings(function: Any, settings: Mapping[str, Any]) -> None:
     afm_rl.errors.ConfigurationError: fit: setting='epoch': expected one of epochs
     """
     group, own, kinds, *_ = function.options
+    if not isinstance(settings, Mapping):
+        raise ConfigurationError(f"{group}={settings!r}: expected settings by name")
     for name, value in settings.items():
         check_choice(f"{group}: setting", name, own)
         own[name].check(f"{group}.{name}", kinds()[name], value)

@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from afm_rl.cli.error_messages import explain
 from afm_rl.cli.methods import check_had, jobs_of
 from afm_rl.envs import load_track
-from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag, check_number
+from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag
 from afm_rl.film import check_video
 from afm_rl.jobs.batch import run_batch
 from afm_rl.jobs.executor import Executor, JobsFailed, LocalExecutor
@@ -31,6 +31,7 @@ from afm_rl.jobs.run import SHOWN, Stop, begin, finish, needs_run
 from afm_rl.missions import Agent, build
 from afm_rl.missions.explained import explain_mission, planned_for
 from afm_rl.missions.run import Stopped
+from afm_rl.options import check_settings as check_options
 from afm_rl.report import (
     load_tracks,
     print_summary,
@@ -40,6 +41,7 @@ from afm_rl.report import (
     write_run,
 )
 from afm_rl.report.diagnosis import write_diagnosis
+from afm_rl.storage.artefacts import Checkpoints
 from afm_rl.storage.files import locked
 from afm_rl.storage.manifest import JOBS, extend_manifest, read_manifest, write_manifest
 from afm_rl.trust import check_targets
@@ -114,8 +116,7 @@ def check_settings(cfg: DictConfig) -> str | None:
         check_flag(name, cfg[name])
     if not isinstance(cfg.cache, str):
         raise ConfigurationError(f"cache={cfg.cache!r}: expected a folder")
-    check_number("checkpoints.every", cfg.checkpoints.every, low=0.0)
-    check_count("checkpoints.keep", cfg.checkpoints.keep)
+    check_options(Checkpoints.__init__, cfg.checkpoints)
     return check_video(cfg.video)
 
 

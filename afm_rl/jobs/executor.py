@@ -14,9 +14,10 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from afm_rl.errors import AFMError, ConfigurationError, check_choice, check_number
+from afm_rl.errors import AFMError, ConfigurationError
 from afm_rl.jobs.layout import LOG
 from afm_rl.jobs.process import PROGRESS, Job, is_done, last_words, needs, run, said, start
+from afm_rl.options import choice, option, options
 from afm_rl.progress import Bar
 from afm_rl.storage.manifest import UNFINISHED
 
@@ -191,7 +192,6 @@ class SubmititExecutor(Executor):
     are over; if the command is ended before, it stays, since the queue needs it.
 
     Args:
-        cluster: ``slurm``, or ``local`` for this machine.
         parameters: of ``submitit.AutoExecutor.update_parameters``; those that are None are left to
             the cluster.
 
@@ -199,8 +199,13 @@ class SubmititExecutor(Executor):
         ConfigurationError: for another cluster, or if submitit is not installed.
     """
 
-    def __init__(self, cluster: str = "slurm", parameters: Mapping[str, Any] | None = None) -> None:
-        self.cluster = check_choice("hydra.launcher.cluster", cluster, ("local", "slurm"))
+    @options("hydra.launcher")
+    def __init__(
+        self,
+        cluster: str = choice("slurm", slurm="", local="this machine"),
+        parameters: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.cluster = cluster
         given = {key: value for key, value in (parameters or {}).items() if value is not None}
         self.parameters = {"name": "afm-rl"} | given
         self.submitit = needs("submitit", "sweeps")
@@ -233,21 +238,20 @@ class RayExecutor(Executor):
     Args:
         address: of the cluster, as ``ray.init`` takes it; None for the one that ``RAY_ADDRESS``
             names, or else one of this machine that lasts as long as the command.
-        num_cpus: cores that a job takes up.
-        num_gpus: GPUs that a job takes up.
 
     Raises:
         ConfigurationError: for a negative number, or if Ray is not installed.
     """
 
+    @options("hydra.launcher")
     def __init__(
-        self, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0
+        self,
+        address: str | None = None,
+        num_cpus: float = option(1, "cores that a job takes up", ge=0),
+        num_gpus: float = option(0, "GPUs that a job takes up", ge=0),
     ) -> None:
         self.address = address
-        self.resources = {
-            "num_cpus": check_number("hydra.launcher.num_cpus", num_cpus, low=0),
-            "num_gpus": check_number("hydra.launcher.num_gpus", num_gpus, low=0),
-        }
+        self.resources = {"num_cpus": num_cpus, "num_gpus": num_gpus}
         self.ray = needs("ray", "ray")
 
     def start(self, jobs: Sequence[Job]) -> Sequence[Any]:

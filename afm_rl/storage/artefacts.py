@@ -13,7 +13,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from afm_rl.errors import ArtefactError, ConfigurationError, check_count, check_number
+from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.options import option, options
 from afm_rl.storage.files import locked, remove_parts, write_whole
 from afm_rl.storage.manifest import differences
 
@@ -131,11 +132,6 @@ class Checkpoints:
     Args:
         folder: where they are; made if it is not there.
         owner: whose state it is; a state of another owner is refused.
-        every: time between two of them (s); 0 writes one after each step.
-        keep: how many to keep.
-
-    Raises:
-        ConfigurationError: for settings that cannot be used.
 
     >>> import tempfile, torch
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -144,12 +140,15 @@ class Checkpoints:
     {'x': {0: tensor([1., 1.])}, 'name': 'ring'}
     """
 
+    @options("checkpoints")
     def __init__(
-        self, folder: str | Path, owner: Mapping[str, Any], every: float = 60.0, keep: int = 2
+        self,
+        folder: str | Path,
+        owner: Mapping[str, Any],
+        every: float = option(60.0, "seconds between two of them; 0: one after each step", ge=0),
+        keep: int = option(2, "how many are kept", ge=1),
     ) -> None:
-        self.folder, self.owner = Path(folder), dict(owner)
-        self.every = check_number("checkpoints.every", every, low=0.0)
-        self.keep = check_count("checkpoints.keep", keep)
+        self.folder, self.owner, self.every, self.keep = Path(folder), dict(owner), every, keep
         self._last = time.monotonic()
 
     @property

@@ -122,24 +122,6 @@ def test_a_study_of_one_method(afm_rl, asked, tmp_path):
     assert (list(methods(jobs)), pool.size) == (["mine"], 1)
 
 
-@pytest.mark.parametrize(
-    ("settings", "named"),
-    [
-        (["hydra.launcher.n_jobs=0"], "hydra.launcher.n_jobs=0"),
-        (["checkpoints.every=soon"], "checkpoints.every='soon'"),
-        (["checkpoints.keep=0"], "checkpoints.keep=0"),
-        (["study.workers=1"], "study.workers"),
-        (["study=nope"], "study/nope"),
-        (["budget=0"], "budget=0"),
-    ],
-)
-def test_mistakes_are_one_line(afm_rl, tmp_path, settings, named):
-    done = afm_rl(*TINY, f"hydra.run.dir={tmp_path}/run", *settings)
-    assert done.status == 2
-    assert named in done.err and done.err.count("\n") == 1
-    assert not any((tmp_path / "run").glob("*"))
-
-
 def test_damaged_files_are_one_line(afm_rl, tmp_path, monkeypatch):
     def damaged(*args, **how):
         raise ArtefactError("jobs.yaml: damaged")

@@ -20,6 +20,12 @@ physics         overwrite=perhaps                        overwrite='perhaps'
 physics         figures=3                                figures=3
 physics         video=avi                                video='avi' gif mp4
 physics         ~tensorboard                             tensorboard
+physics         checkpoints.every=soon                   checkpoints.every='soon'
+physics         checkpoints.keep=0                       checkpoints.keep=0
+physics         checkpoints=3                            checkpoints
+-               hydra.launcher.n_jobs=0                  hydra.launcher.n_jobs=0
+-               study=nope                               study/nope
+-               study=ugv,study.workers=1                study.workers
 physics         cache=null                               cache=None
 -               compare=[nope]                           method/nope afm_physics
 -               compare=physics                          compare=physics

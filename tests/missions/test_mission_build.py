@@ -116,7 +116,7 @@ def test_parts_that_do_not_fit_are_refused(configure, no_training, overrides, co
         ("physics", "robot.action_low", [1.0, 0.5], "action_low=.*expected less than action_high"),
         ("physics", "robot.env.dt", 0, "dynamics.dt=0: expected a finite number"),
         ("physics", "tracks", "nope", "tracks='nope': expected one of ethz_1, ethz_2"),
-        ("online_pe", "dynamics.pretrain", 3, "dynamics: 'int' object"),
+        ("online_pe", "dynamics.pretrain", 3, "dynamics.pretrain=3: expected settings"),
         ("online_pe", "dynamics.pretrain.epochs", 0, "dynamics.pretrain.epochs=0: expected"),
         ("online_pe", "updater.optimizer.lr", "abc", "updater.lr='abc': expected a finite"),
         ("online_pe", "updater.optimizer._target_", "torch.Nope", "updater.optimizer._target_="),
