@@ -103,14 +103,6 @@ def test_keys_are_declared_and_may_be_nested(planner, flow):
     assert torch.equal(out["next", "robot", "afm", "planned_action"], torch.ones(2))
 
 
-def test_it_may_only_watch(track, planner, flow):
-    policy = ActionFlowPolicy(Dubins(), planner.action_spec, flow, enabled=False)
-    agent = TensorDictSequential(planner, policy)
-    data = TransformedEnv(track(), primers(agent)).rollout(4, agent)
-    assert (data["next", "afm", "innovation"] > 5).any()
-    assert torch.equal(data["action"], data["next", "afm", "planned_action"])
-
-
 def test_the_corrector_is_owned_and_the_model_is_shared(planner, flow):
     policy = ActionFlowPolicy(Dubins(), planner.action_spec, flow)
     assert {name.partition(".")[0] for name in policy.state_dict()} == {"corrector"}

@@ -1,29 +1,17 @@
-"""A model is compared with an environment; and where it seems to be wrong, every shell says so."""
-
-import warnings
+"""A model is compared with an environment."""
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium.wrappers import NormalizeObservation
-from puck import Puck, play, push
-from tensordict import TensorDict
-from torchrl.data import Bounded
-from torchrl.envs import GymEnv, TransformedEnv
-from torchrl.envs.utils import step_mdp
+from puck import Puck, push
+from torchrl.envs import GymEnv
 
-from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper, check_model
-from afm_rl.correction import LeastSquares
-from afm_rl.dynamics import Dubins, KnownDynamics
+from afm_rl import check_model
+from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import KnownReward, PlanningEnv
-from afm_rl.spaces.manifold import Manifold
-from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
-
-LOW, HIGH = -torch.ones(2), torch.ones(2)
-MODEL = KnownDynamics(push, Manifold(4), 2)
 
 
 def test_an_environment_of_gymnasium():
@@ -81,50 +69,3 @@ def test_an_environment_of_torchrl(batch):
 def test_what_does_not_fit_is_refused(env, given, message):
     with pytest.raises(ConfigurationError, match=message):
         check_model(env(), **given)
-
-
-def wrapper(gain, corrector=None, enabled=True):
-    play(ActionFlowWrapper(Puck(gain=gain), push, corrector=corrector, enabled=enabled), 80)
-
-
-def vector(gain, **how):
-    envs = gymnasium.vector.SyncVectorEnv([lambda: Puck(gain=gain, ends=9)] * 2)
-    play(ActionFlowVectorWrapper(envs, push, **how), 80)
-
-
-def transform(gain, **how):
-    reward = KnownReward(lambda state, action, ahead: -ahead.square().sum(-1))
-    world = PlanningEnv(
-        KnownDynamics(lambda s, a: push(s, gain * a), Manifold(4), 2), reward, LOW, HIGH
-    )
-    env = TransformedEnv(world, ActionFlowTransform(MODEL, **how))
-    env.rollout(
-        80, auto_reset=False, tensordict=env.reset(TensorDict({"observation": torch.zeros(4)}))
-    )
-
-
-def policy(gain, **how):
-    act = ActionFlowPolicy(MODEL, Bounded(LOW, HIGH, (2,)), **how)
-    td = act.make_tensordict_primer()(TensorDict({"observation": torch.zeros(4)}))
-    for planned in torch.rand(80, 2, generator=torch.Generator().manual_seed(0)) - 0.5:
-        td = act(td.set("action", planned))
-        td = step_mdp(td.set(("next", "observation"), push(td["observation"], gain * td["action"])))
-
-
-@pytest.mark.parametrize("shell", [wrapper, vector, transform, policy])
-def test_every_shell_says_once_that_it_corrects_from_the_first_steps_on(shell):
-    for gain, how, count in ((0.5, {}, 1), (1.0, {}, 0), (0.5, {"enabled": False}, 0)):
-        with warnings.catch_warnings(record=True) as found:
-            warnings.simplefilter("always")
-            shell(gain, **how)
-        said = [str(w.message) for w in found if "were corrected" in str(w.message)]
-        assert len(said) == count
-        assert all("(gain 0.5 on all: dt or a unit of the model?)" in text for text in said)
-
-
-def test_what_is_said_of_the_cause():
-    cause = LeastSquares(LOW, HIGH)
-    with pytest.warns(UserWarning, match="gain -1 on all: a sign of the model"):
-        wrapper(-1.0, cause)
-    with pytest.warns(UserWarning, match="gain 1, -0.5: a sign of the model"):
-        wrapper(np.array([1.0, -0.5]))

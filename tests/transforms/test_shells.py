@@ -1,5 +1,8 @@
 """What holds in whichever shell the correction is: transform, policy, controller or wrapper."""
 
+import warnings
+
+import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -10,6 +13,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
+from afm_rl.correction import LeastSquares
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.errors import ConfigurationError
 from afm_rl.planning import KnownReward, PlanningEnv
@@ -27,43 +31,45 @@ def starts(dtype):
         yield torch.randn(4, generator=generator).to(dtype)
 
 
-def transform(plans, dtype, **settings):
-    actual = KnownDynamics(lambda s, a: push(s, -a), Manifold(4), 2)
+def transform(plans, dtype, gain=-1.0, ends=EPISODE, **settings):
+    actual = KnownDynamics(lambda s, a: push(s, gain * a), Manifold(4), 2)
     world = PlanningEnv(actual, KnownReward(lambda s, a, n: -n.square().sum(-1)), *BOX)
     model = KnownDynamics(push, Manifold(4), 2)
     env, start = TransformedEnv(world, ActionFlowTransform(model, **settings)), starts(dtype)
     for k, plan in enumerate(plans):
-        if k % EPISODE == 0:
+        if k % ends == 0:
             td = env.reset(TensorDict({"observation": next(start)}))
         td = step_mdp(env.step(td.set("action", plan)))
         yield td["afm", "executed_action"]
 
 
-def policy(plans, dtype, **settings):
+def policy(plans, dtype, gain=-1.0, ends=EPISODE, **settings):
     model = KnownDynamics(push, Manifold(4), 2)
     corrected, start = ActionFlowPolicy(model, Bounded(*BOX), **settings), starts(dtype)
     primer, td = corrected.make_tensordict_primer(), TensorDict()
     for k, plan in enumerate(plans):
-        if k % EPISODE == 0:
+        if k % ends == 0:
             td, state = primer(td), next(start)
         td = corrected(td.update({"observation": state, "action": plan}))
         executed, td = td["action"], step_mdp(td)
-        state = push(state.float(), -executed.float()).to(dtype)
+        state = push(state.float(), gain * executed.float()).to(dtype)
         yield executed
 
 
-def controller(plans, dtype, keep_memory_on_reset=False):
+def controller(plans, dtype, gain=-1.0, ends=EPISODE, keep_memory_on_reset=False, **settings):
     model = KnownDynamics(push, Manifold(4), 2)
-    corrected = ActionFlowPolicy(model, Bounded(*BOX), keep_memory_on_reset=keep_memory_on_reset)
+    corrected = ActionFlowPolicy(
+        model, Bounded(*BOX), keep_memory_on_reset=keep_memory_on_reset, **settings
+    )
     pure, start = Controller(None, corrected), starts(dtype)
     memory = torch.zeros(pure.sizes["memory"])
     for k, plan in enumerate(plans):
-        if k % EPISODE == 0:
+        if k % ends == 0:
             state = next(start)
             memory = memory.clone() if keep_memory_on_reset else torch.zeros_like(memory)
             memory[0] *= -1
         memory, executed = pure(memory, state, plan)
-        state = push(state.float(), -executed.float()).to(dtype)
+        state = push(state.float(), gain * executed.float()).to(dtype)
         yield executed
 
 
@@ -71,8 +77,8 @@ def numpy_of(dtype):
     return torch.zeros((), dtype=dtype).numpy().dtype
 
 
-def wrapper(plans, dtype, **settings):
-    env = ActionFlowWrapper(Puck(numpy_of(dtype), -1.0, EPISODE), push, **settings)
+def wrapper(plans, dtype, gain=-1.0, ends=EPISODE, **settings):
+    env = ActionFlowWrapper(Puck(numpy_of(dtype), gain, ends), push, **settings)
     env.reset(seed=0)
     for plan in plans:
         *_, over, _, info = env.step(plan)
@@ -82,8 +88,8 @@ def wrapper(plans, dtype, **settings):
 
 
 def vector(mode):
-    def run(plans, dtype, **settings):
-        makers = [lambda: Puck(numpy_of(dtype), -1.0, EPISODE)] * 2
+    def run(plans, dtype, gain=-1.0, ends=EPISODE, **settings):
+        makers = [lambda: Puck(numpy_of(dtype), gain, ends)] * 2
         env = SyncVectorEnv(makers, autoreset_mode=mode)
         env = ActionFlowVectorWrapper(env, push, **settings)
         env.reset(seed=0)
@@ -92,13 +98,21 @@ def vector(mode):
             if mode is AutoresetMode.DISABLED and over.any():
                 env.reset(options={"reset_mask": over})
             executed = torch.as_tensor(info["afm"]["executed"][0])
-            yield executed if info["_afm"][0] else -plan.detach()  # of a step that only resets
+            yield (
+                executed if info["_afm"][0] else gain * plan.detach()
+            )  # of a step that only resets
 
     return run
 
 
 SHELLS = {f.__name__: f for f in (transform, policy, controller, wrapper)}
 SHELLS |= {mode.value: vector(mode) for mode in AutoresetMode}
+
+
+@pytest.fixture(params=SHELLS)
+def shell(request):
+    """Run plans in a shell around pucks, whose actuators are reversed; yield what is executed."""
+    return SHELLS[request.param]
 
 
 def plans_of(count):
@@ -112,7 +126,6 @@ def missed(shell, plans, dtype=torch.float32, **settings):
     return (executed + torch.stack(list(plans)).detach().double()).abs().amax(-1)
 
 
-@pytest.mark.parametrize("shell", SHELLS.values(), ids=SHELLS)
 def test_what_was_learnt_outlasts_resets_if_it_shall(shell):
     plans = plans_of(80)
     assert (missed(shell, plans) > 0.1).double().mean() > 0.3
@@ -128,14 +141,12 @@ SIXTEEN = {
 
 
 @pytest.mark.parametrize("case", SIXTEEN)
-@pytest.mark.parametrize("shell", SHELLS.values(), ids=SHELLS)
 def test_gradients_and_16_bits_are_served(shell, case):
     change, dtype = SIXTEEN[case]
     assert (missed(shell, [change(plan) for plan in plans_of(EPISODE)], dtype)[4:] < 0.15).all()
 
 
 @pytest.mark.parametrize("when", ["reset", "step"])
-@pytest.mark.parametrize("shell", SHELLS.values(), ids=SHELLS)
 def test_a_default_type_of_16_bits_is_refused(shell, when):
     running = shell(plans_of(EPISODE), torch.float32)
     if when == "step":
@@ -146,6 +157,41 @@ def test_a_default_type_of_16_bits_is_refused(shell, when):
             next(running)
     finally:
         torch.set_default_dtype(torch.float32)
+
+
+def test_while_nothing_is_wrong_and_while_it_only_watches_plans_are_executed(shell):
+    plans = plans_of(20)
+    for how in ({"gain": 1.0}, {"enabled": False}):
+        torch.testing.assert_close(
+            torch.stack(list(shell(plans, torch.float32, ends=99, **how))), plans
+        )
+
+
+def test_a_correction_from_the_first_steps_on_is_said_once(shell):
+    plans = 0.5 * plans_of(80)
+    for how, count in (
+        ({"gain": 0.5}, 1),
+        ({"gain": 1.0}, 0),
+        ({"gain": 0.5, "enabled": False}, 0),
+    ):
+        with warnings.catch_warnings(record=True) as issued:
+            warnings.simplefilter("always")
+            list(shell(plans, torch.float32, ends=100, **how))
+        texts = [str(w.message) for w in issued if "were corrected" in str(w.message)]
+        assert len(texts) == count
+        assert all("(gain 0.5 on all: dt or a unit of the model?)" in text for text in texts)
+
+
+CAUSES = {
+    "gain -1 on all: a sign of the model": {"corrector": LeastSquares(*BOX)},
+    "gain 1, -0.5: a sign of the model": {"gain": np.array([1.0, -0.5])},
+}
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_the_cause_is_said(cause):
+    with pytest.warns(UserWarning, match=cause):
+        list(wrapper(plans_of(80), torch.float32, ends=100, **CAUSES[cause]))
 
 
 OLD = {
