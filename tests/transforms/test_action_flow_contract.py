@@ -21,7 +21,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from afm_rl.correction import ActionFlow, LeastSquares
+from afm_rl.correction import ActionFlow
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
@@ -201,29 +201,3 @@ def test_nothing_but_a_model_is_needed(box):
     flow = env.transform.corrector
     assert isinstance(flow, ActionFlow) and torch.equal(flow.scale, box[1])
     assert env.rollout(3)["next", "afm", "executed_action"].shape == (3, 2)
-
-
-def test_before_it_is_around_an_environment_the_box_is_not_known():
-    with pytest.raises(ConfigurationError, match="put the transform around an environment first"):
-        ActionFlowTransform(Dubins()).corrector  # noqa: B018
-
-
-def test_the_universal_flow_needs_a_box(box):
-    unbounded = PlanningEnv(Dubins(), GoalDistance(), *box)
-    unbounded.action_spec = Unbounded((2,))
-    with pytest.raises(ConfigurationError, match="expected the 2 finite bounds"):
-        TransformedEnv(unbounded, ActionFlowTransform(Dubins())).reset()
-
-
-def test_sizes_that_contradict_each_other_are_refused():
-    with pytest.raises(ConfigurationError, match="1 actions, but the dynamics model has 2"):
-        ActionFlowTransform(Dubins(), LeastSquares([-1.0], [1.0]))
-    with pytest.raises(ConfigurationError, match=r"\['goal'\]: of the shape \(2,\), .* has 3 num"):
-        TransformedEnv(track(), transform(in_keys=["goal"])).reset()
-
-
-def test_a_missing_key_is_named_with_what_there_is():
-    with pytest.raises(ConfigurationError, match=r"\['pos'\]: the environment has no .*'pose'"):
-        TransformedEnv(track(), transform(in_keys=["pos"])).reset()
-    with pytest.raises(ConfigurationError, match=r"\['act'\]: the environment has no .*'action'"):
-        TransformedEnv(track(), transform(in_keys_inv=["act"])).reset()

@@ -218,12 +218,6 @@ def test_planners_hear_of_more_only_if_they_may_and_the_model_can_foresee_it(nam
     torch.testing.assert_close(found[:, -1], bounds if wider else BOX.expand(4, 2, 2))
 
 
-def test_switches_are_flags():
-    for name in ("extend_action_box", "enabled"):
-        with pytest.raises(ConfigurationError, match=f"transform.{name}"):
-            env(Stub(), **{name: "yes"})
-
-
 def test_with_two_the_last_hears_the_planner_first():
     base = UGVTrack(batch_size=(4,))
     inner = ActionFlowTransform(Dubins(), Stub(lambda a: 0.5 * a), prefix="inner")

@@ -11,7 +11,6 @@ from torchrl.envs import GymEnv
 from afm_rl import check_model
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
-from afm_rl.errors import ConfigurationError
 
 
 def test_an_environment_of_gymnasium():
@@ -52,20 +51,3 @@ def test_an_environment_of_torchrl(batch):
     assert check_model(env, Dubins(), steps=60).right
     found = check_model(env, lambda s, a: Dubins()(s, a * torch.tensor([1.0, -1.0])), steps=60)
     assert found.cause == "acts on -1 times action[1] (signs, gains or units)"
-
-
-@pytest.mark.parametrize(
-    ("env", "given", "message"),
-    [
-        (Puck, {"model": "learn"}, "model='learn': there is no model yet"),
-        (Puck, {"model": Dubins()}, "the state has"),
-        (Puck, {"model": push, "steps": 0}, "steps=0"),
-        (Puck, {"model": push, "policy": lambda seen: seen}, "action: shape"),
-        (UGVTrack, {}, "has no MuJoCo model"),
-        (UGVTrack, {"model": "learn"}, "model='learn': expected 'mujoco', a step function"),
-        (UGVTrack, {"model": Dubins(), "state": "pos"}, "state='pos': the environment has no such"),
-    ],
-)
-def test_what_does_not_fit_is_refused(env, given, message):
-    with pytest.raises(ConfigurationError, match=message):
-        check_model(env(), **given)

@@ -136,13 +136,6 @@ def test_a_vector_that_does_not_say_when_it_resets_is_refused(given):
         ActionFlowVectorWrapper(envs, push)
 
 
-def test_actions_for_another_number_of_environments_are_refused():
-    envs = ActionFlowVectorWrapper(SyncVectorEnv(makers()), push)
-    envs.reset()
-    with pytest.raises(ConfigurationError, match=r"actions: shape \(2, 2\), expected \(3, 2\)"):
-        envs.step(np.zeros((2, 2)))
-
-
 def test_wrappers_in_threads_execute_what_they_do_in_one():
     def run(gain, into):
         steps = play(ActionFlowWrapper(Puck(gain=gain), push), 12)

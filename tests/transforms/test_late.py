@@ -15,9 +15,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
-from afm_rl.correction import ActionFlow, LeastSquares
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.errors import ConfigurationError
 from afm_rl.planning import KnownReward, PlanningEnv
 from afm_rl.regimes import Delay
 from afm_rl.spaces.manifold import Manifold
@@ -240,21 +238,3 @@ def test_a_policy_without_an_environment_is_told_the_same():
     )
     td = policy.make_tensordict_primer()(TensorDict({"observation": torch.zeros(4).double()}))
     assert policy.arrival()(td)["afm", "delay"].equal(torch.tensor(2))
-
-
-@pytest.mark.parametrize(
-    ("settings", "match"),
-    [
-        ({"delay": [1, 2, 3]}, "delay=.*one number of steps, or 2"),
-        ({"delay": -1}, "delay"),
-        ({"delay": 10**6}, "delay"),
-        ({"belief": True, "corrector": LeastSquares([-1.0] * 2, [1.0] * 2)}, "a ActionFlow"),
-        ({"belief": "yes"}, "belief='yes'"),
-        ({"delay_compensation": "yes"}, "delay_compensation='yes'"),
-        ({"delay": 2, "state": lambda env, seen: 2 * seen}, "observe="),
-        ({"delay": 2, "corrector": ActionFlow(-torch.ones(2), torch.ones(2))}, "corrector"),
-    ],
-)
-def test_what_cannot_be_used_is_said_at_once(settings, match):
-    with pytest.raises(ConfigurationError, match=match):
-        ActionFlowWrapper(Carts(), glide, **settings).reset()

@@ -18,7 +18,6 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 
 from afm_rl.correction import L1Augmentation
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.errors import ConfigurationError
 from afm_rl.planning import KnownReward, PlanningEnv
 from afm_rl.regimes import ActionGain, Delay, GainNoise, Regime
 from afm_rl.regimes import Compose as Regimes
@@ -205,13 +204,3 @@ def test_noise_depends_on_the_seed_only():
         effects.append(env.step(td)["next", "regime", "effective_action"])
     assert torch.equal(effects[0], effects[1]) and not torch.equal(effects[0], effects[2])
     assert effects[0][0] != effects[0][1]
-
-
-@pytest.mark.parametrize(
-    "phases, at",
-    [([{}], [3]), ([{}, {}], []), ([], []), (torch.ones(2, 2), [3]), (torch.ones(3, 1), [3])],
-    ids=["few", "many", "none", "wide", "long"],
-)
-def test_phases_that_do_not_fit_are_refused(phases, at):
-    with pytest.raises(ConfigurationError, match=r"phases=.*one more than at=.*torque"):
-        RegimeTransform(GAIN, phases, at=at)
