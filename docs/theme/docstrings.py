@@ -4,7 +4,7 @@ import pydoc
 import re
 import textwrap
 
-from griffe import Extension
+from griffe import Extension, Parameter, ParameterKind
 
 from afm_rl.options import options_of, with_arguments
 
@@ -35,9 +35,12 @@ class Docstrings(Extension):
         known = {}
         if any("options(" in str(each.value) for each in getattr(taking, "decorators", ())):
             known = options_of(pydoc.locate(obj.path))
-            for each in taking.parameters:
-                if each.name in known and each.default is not None:
-                    each.default = str(known[each.name].default)
+            for name, each in known.items():
+                if name not in taking.parameters:  # one of a base
+                    kind = ParameterKind.keyword_only
+                    taking.parameters.add(Parameter(name, kind=kind, default="None"))
+                if taking.parameters[name].default is not None:
+                    taking.parameters[name].default = str(each.default)
         if obj.docstring:
             text = with_arguments(obj.docstring.value, known)
             obj.docstring.value = as_markdown(text)
