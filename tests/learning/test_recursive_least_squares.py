@@ -110,6 +110,15 @@ def test_the_recursion_is_weighted_least_squares():
         )
 
 
+def test_a_fit_of_few_transitions_is_not_judged():
+    row, yes = torch.ones(1, 1, 1, 1).double(), torch.ones(1, 1).bool()
+    fit, ages = no_fit(1, 1, 1), []
+    for size in (10.0, -20.0, 10.0, -20.0):  # nothing explains these
+        fit = advance(fit, row, size * row, row, yes, torch.full((1, 1, 1), 1e6))
+        ages.append(int(fit.age))
+    assert ages == [1, 2, 3, 1]
+
+
 @pytest.mark.parametrize("regime", [{}, {"matrix": GAINS}], ids=["nominal", "changed"])
 def test_an_outlier_does_harm_for_a_few_steps(regime):
     world = World()
