@@ -92,6 +92,9 @@ HYPOTHESES = (
     Hypothesis("line", "linear", log_prior=None),
     Hypothesis("drift", "linear", log_prior=None),  # gain, and the newest offset
     Hypothesis("arx", "linear", log_prior=None),  # what goes on from row to row
+    # A gain of one, and an offset that goes on as it changes: for commands that are one sine, a
+    # disturbance, a delay and a gain look the same, and this explanation does no harm.
+    Hypothesis("trend", "linear", cause="a disturbance"),
     # In periodic motion coupling looks like a delay. These are of the present command, whatever
     # delay is believed, so that a wrong one can be rejected.
     Hypothesis("affine", "linear", follows_delay=False),

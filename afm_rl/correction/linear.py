@@ -71,8 +71,9 @@ def fit_lines(sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor) -> Line
     drift = (shift - gain_12 * mean)[..., :1] / mass[..., :1]
     arx, goes_on = _autoregressive(u, v, weight)
     one, none = torch.ones_like(arx), torch.zeros_like(gain)
-    gains = torch.cat([-one, one, one, gain[..., 1::2], slope[..., 2:], gain_12, arx], -1)
-    biases = [none[..., :1], offset[..., :2], none[..., :2], rest[..., 2:], drift, goes_on]
+    gains = torch.cat([-one, one, one, gain[..., 1::2], slope[..., 2:], gain_12, arx, one], -1)
+    trend = _extrapolate(v - u, weight)
+    biases = [none[..., :1], offset[..., :2], none[..., :2], rest[..., 2:], drift, goes_on, trend]
     affine, shift = fit_affine(sent.mT, v.mT, weight.mT)
     driven, rest = _driven(sent, v, weight, affine, shift.unsqueeze(-1))
     matrix = torch.cat([torch.diag_embed(gains.mT), torch.stack([affine, driven], 1)], 1)
@@ -149,6 +150,27 @@ def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tenso
     b, from_before, d = solve_positive(left, right).split([1, 2, 1], -2)  # (B, A, ., 1)
     goes_on = before[..., -1:, :] @ from_before
     return not_zero(1 + b).squeeze(-1), (goes_on + d).squeeze(-1)
+
+
+def _extrapolate(offset: Tensor, weight: Tensor) -> Tensor:
+    r"""Return the next offset ``(B, A, 1)`` of a disturbance that goes on as it changes.
+
+    .. math:: d_{k+1} = c\,d_k - d_{k-1},\qquad c = 2 \cos \omega
+
+    is a line (c = 2) or an oscillation; c is fitted to the newest rows of ``(B, A, M)``. The newest
+    offset where the one before it does not count, zero where neither does; at most half of the
+    largest action: what is larger is a fault.
+    """
+    counts = (weight > 0).to(offset)
+    offset = offset * counts
+    before, now, after = (offset[..., k : k - 2 or None] for k in range(3))
+    every = counts[..., :-2] * counts[..., 1:-1] * counts[..., 2:]
+    pull = every * now * 0.95 ** torch.arange(every.shape[-1] - 1, -1, -1, device=every.device)
+    c = (pull * (before + after)).sum(-1, keepdim=True) + 2 * PRIOR
+    c = (c / ((pull * now).sum(-1, keepdim=True) + PRIOR)).clamp(-2, 2)
+    before, newest = offset[..., -2:].split(1, -1)
+    both = counts[..., -2:].prod(-1, keepdim=True)
+    return (newest + both * ((c - 1) * newest - before)).clamp(-0.5, 0.5)
 
 
 def _driven(

@@ -84,10 +84,31 @@ def test_every_line_is_the_least_squares_solution_of_its_rows():
         "arx": (b, c * u[-1] + a * v[-1] + d),
         "affine": solved([u, one], v),
     }
-    assert {*wanted, "driven"} == set(LINEAR)
+    assert {*wanted, "trend", "driven"} == set(LINEAR)
     for name, (gain, offset) in wanted.items():
         assert float(found[name][0]) == pytest.approx(gain, abs=0.03), name
         assert float(found[name][1]) == pytest.approx(offset, abs=0.03), name
+
+
+@pytest.mark.parametrize("period", [6.0, 20.0, math.inf])
+def test_a_disturbance_goes_on_as_it_changes(period):
+    """It oscillates, or is a line, whatever the commands are."""
+    time = torch.arange(31.0)
+    oscillation = 0.3 * (2 * math.pi * time / period).sin()
+    disturbance = 0.1 + 0.01 * time if period == math.inf else oscillation
+    u = torch.rand(1, 30, 1, generator=torch.Generator().manual_seed(0))
+    came, weight = u + disturbance[:30].view(1, 30, 1), torch.ones(1, 30, 1)
+    weight[:, 10:14] = 0.0  # these are not known
+    came[:, 10:14] = 7.0
+    trend = LINEAR.index("trend")
+    lines = fit_lines(u, u, came, weight)
+    assert lines.matrix[0, trend] == 1.0
+    assert float(lines.bias[0, trend]) == pytest.approx(float(disturbance[-1]), abs=0.01)
+    weight[:, -2] = 0.0
+    newest = fit_lines(u, u, came, weight).bias[0, trend]
+    assert float(newest) == pytest.approx(float(disturbance[-2]))
+    assert fit_lines(u, u, came, 0 * weight).bias[0, trend] == 0.0
+    assert fit_lines(u, u, -u, weight + 1).bias[0, trend] >= -0.5  # more would be a fault
 
 
 def test_what_goes_on_is_learned_from_rows_that_follow_each_other():
