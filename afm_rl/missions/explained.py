@@ -105,7 +105,7 @@ def planned_for(agent: Agent) -> int | None:
     if agent.transform is None or not agent.transform.enabled:
         return None
     corrector = agent.transform.corrector
-    return corrector.delay + getattr(corrector, "most_late", 0)
+    return corrector.delay + getattr(corrector, "longest_delay", 0)
 
 
 def _made_up(

@@ -154,7 +154,7 @@ def test_a_thrust_that_cannot_be_negative_is_corrected_as_a_share_of_the_largest
             ["robot.usual_low=[0, 1, 1, 1]"],
             "robot.usual_low=.* expected 4 numbers each, low <",
         ),
-        (["robot.env.start=up"], "start='up': expected one of rest, moving"),
+        (["robot.env.start=up"], "start='up': expected one of moving, rest"),
         (["regimes=[{v_gain: 0.5}]"], "regimes: unknown parameter 'v_gain'"),
     ],
 )
