@@ -28,7 +28,7 @@ NOMINAL, REGIME, BAND = "#222222", "#d55e00", "#e69f00"  # before and after; und
 FAINT, GOOD, ROAD = "#888888", "#009e73", "#e4e4e4"
 
 FEW = 6  # methods in a figure
-COLOURS = ("#0072b2", "#009e73", "#cc79a7", "#000000", "#56b4e9", "#e69f00")
+COLOURS = ("#0072b2", "#009e73", "#cc79a7", "#000000", "#56b4e9", "#e69f00", "#8c510a")
 LINES: tuple[Any, ...] = (
     "-",
     (0, (5, 1.5)),
@@ -36,6 +36,7 @@ LINES: tuple[Any, ...] = (
     (0, (6, 1.5, 1.2, 1.5)),
     "-",
     (0, (3, 1)),
+    (0, (8, 2)),
 )
 
 BEFORE: Look = {"color": NOMINAL, "linewidth": 1.1}  # a path, and its stretch under the regime
@@ -91,10 +92,9 @@ def method_styles(methods: Iterable[str]) -> dict[str, Style]:
     >>> list(styles), styles["physics"].color
     (['physics', 'oracle'], '#0072b2')
     """
-    return {
-        method: Style(COLOURS[k % FEW], LINES[k % FEW], "osD^vP"[k % FEW], k % FEW)
-        for k, method in enumerate(dict.fromkeys(methods))
-    }
+    styles = list(zip(COLOURS, LINES, "osD^vPX", range(len(COLOURS)), strict=True))
+    names = dict.fromkeys(methods)
+    return {method: Style(*styles[k % len(styles)]) for k, method in enumerate(names)}
 
 
 def groups_of_methods(methods: Iterable[str]) -> list[list[str]]:
