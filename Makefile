@@ -34,9 +34,9 @@ demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and f
 # Tracing every line takes a quarter of the time.
 COVERED := --cov --cov-report=term-missing:skip-covered --cov-fail-under=95
 
-test: $(VENV)/.with-test ## Run the tests; ALL=1 adds those marked slow, and coverage (at least 95 %)
+test: $(VENV)/.with-test ## Run the tests; ALL=1 adds those marked slow, COVER=1 coverage (at least 95 %)
 	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --dist worksteal --durations=10 \
-		$(if $(ALL),$(COVERED),-m "not slow")
+		$(if $(ALL),,-m "not slow") $(if $(COVER),$(COVERED))
 
 lint: $(VENV)/.with-test ## Check style, format and spelling
 	@$(BIN)/ruff check --quiet . && $(BIN)/ruff format --quiet --check . && $(BIN)/codespell
@@ -56,7 +56,8 @@ typecheck: $(VENV)/.with-test build/package ## Check types
 		$(patsubst benchmarks/suites/%/__init__.py,--package %,$(wildcard benchmarks/suites/*/__init__.py))
 
 check: ALL := 1
-check: lint typecheck test ## All of lint, typecheck and test, the slow ones, too
+check: COVER := 1
+check: lint typecheck test ## All of lint, typecheck and test, the slow ones and coverage, too
 
 format: $(VENV)/.with-test ## Put the code in shape, and what options say into the comments of conf
 	@$(BIN)/ruff check --quiet --fix-only . && $(BIN)/ruff format .
