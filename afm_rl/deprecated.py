@@ -45,7 +45,7 @@ def lazy_package(package: str, file: str) -> tuple[Callable[[str], Any], Any, li
     load, list_names, names = lazy_loader.attach_stub(package, file)
 
     def get(name: str) -> Any:
-        return _new(package, name) if f"{package}.{name}" in NAMES else load(name)
+        return _new(package, name, level=4) if f"{package}.{name}" in NAMES else load(name)
 
     return get, list_names, names
 
@@ -103,15 +103,15 @@ def old_arguments(function: Function) -> Function:
     return call  # type: ignore[return-value]
 
 
-def _new(package: str, name: str) -> Any:
-    """Return what an old name stands for."""
+def _new(package: str, name: str, level: int = 3) -> Any:
+    """Return what an old name stands for; ``level``: of the caller, who is warned."""
     if f"{package}.{name}" not in NAMES:
         raise AttributeError(f"module {package!r} has no attribute {name!r}")
-    _warn(f"{package}.{name}", NAMES[f"{package}.{name}"])
+    _warn(f"{package}.{name}", NAMES[f"{package}.{name}"], level)
     module, _, part = NAMES[f"{package}.{name}"].rpartition(".")
     return getattr(import_module(module), part)
 
 
-def _warn(old: str, new: str) -> None:
+def _warn(old: str, new: str, level: int = 3) -> None:
     text = f"{old} is called {new} now; the old name goes with the next version"
-    warnings.warn(text, DeprecationWarning, stacklevel=3)
+    warnings.warn(text, DeprecationWarning, stacklevel=level)
