@@ -31,7 +31,8 @@ def print_diagnosis(diagnosis: Diagnosis, file: IO[str] | None = None) -> None:
 
     >>> wrist = Actuator(name="wrist", status="healthy", gain=1.0, gain_interval=(0.98, 1.02),
     ...                  offset=0.0, noise=0.01, unexplained=0.001, sentence="wrist: healthy")
-    >>> print_diagnosis(Diagnosis(actuators=(wrist,)))  # doctest: +NORMALIZE_WHITESPACE
+    >>> found = Diagnosis(actuators=(wrist,), step_s=0.02)
+    >>> print_diagnosis(found)  # doctest: +NORMALIZE_WHITESPACE
     <BLANKLINE>
      actuator  status   gain               offset  delay (s)  noise  unexplained (%)
      ───────────────────────────────────────────────────────────────────────────────
@@ -40,7 +41,8 @@ def print_diagnosis(diagnosis: Diagnosis, file: IO[str] | None = None) -> None:
     wrist: healthy
     """
     console, shown = terminal(file), _table(diagnosis)
-    always = ("actuator", "status", "gain", "offset", "delay (s)", "noise", "unexplained (%)")
+    always = ["actuator", "status", "gain", "offset", "noise", "unexplained (%)"]
+    always.append(f"delay ({_unit_of_time(diagnosis)})")
     shown = shown.loc[:, [name for name in shown if name in always or (shown[name] != "-").any()]]
     looks = [LOOKS[actuator.status] for actuator in diagnosis.actuators]
     console.print(grid_of(shown, lambda row, column: looks[row] if column < 2 else ""))
@@ -52,6 +54,7 @@ def print_diagnosis(diagnosis: Diagnosis, file: IO[str] | None = None) -> None:
 
 def _table(diagnosis: Diagnosis) -> pd.DataFrame:
     """Return the numbers as text, a dash where there is none."""
+    time = _unit_of_time(diagnosis)
     return pd.DataFrame(
         {
             "actuator": a.name,
@@ -61,16 +64,21 @@ def _table(diagnosis: Diagnosis) -> pd.DataFrame:
             "dead zone": _text(a.dead_zone or None),
             "saturation": _text(a.saturation),
             "backlash": _text(a.backlash or None),
-            "rate (1/s)": _text(a.rate),
-            "delay (s)": _text(a.delay_s),
-            "lag (s)": _text(a.lag_s or None),
+            f"rate (1/{time})": _text(a.rate),
+            f"delay ({time})": _text(a.delay_s),
+            f"lag ({time})": _text(a.lag_s or None),
             "driven by": a.driven_by or "-",
-            "changed at (s)": ", ".join(_text(change.t) for change in a.changes) or "-",
+            f"changed at ({time})": ", ".join(_text(change.t) for change in a.changes) or "-",
             "noise": _text(a.noise),
             "unexplained (%)": _text(100 * a.unexplained, 2),
         }
         for a in diagnosis.actuators
     )
+
+
+def _unit_of_time(diagnosis: Diagnosis) -> str:
+    """Return s, or rows where no time was logged."""
+    return "s" if diagnosis.step_s != 1.0 else "rows"
 
 
 def _text(value: float | None, digits: int = 3) -> str:
@@ -126,9 +134,9 @@ def _page(diagnosis: Diagnosis, log: Log, source: str, replayed: Replayed | None
     for place, actuator in enumerate(diagnosis.actuators):
         png = style.png_bytes(draw_actuator(diagnosis, log, place))
         figures.append(Picture(str(place), actuator.sentence, caption, png))
+    every = f", a row every {diagnosis.step_s:.4g} s" if _unit_of_time(diagnosis) == "s" else ""
     summary = (
-        f"{diagnosis.rows} rows of {len(diagnosis.actuators)} actuators, a row every "
-        f"{diagnosis.step_s:.4g} s, from {source}."
+        f"{diagnosis.rows} rows of {len(diagnosis.actuators)} actuators{every}, from {source}."
     )
     notes = [*diagnosis.notes, *(actuator.sentence for actuator in diagnosis.actuators)]
     if replayed is not None:
@@ -169,7 +177,8 @@ def draw_actuator(diagnosis: Diagnosis, log: Log, place: int, points: int = 3000
         for axes in (left, right):
             if axes is right or t[rows][0] <= change.t <= t[rows][-1]:
                 axes.axvline(change.t, color=style.REGIME, linewidth=1.0, linestyle=":")
-    labels = (("t (s)", ""), ("command", "response"), ("t (s)", "residual"))
+    time = f"t ({_unit_of_time(diagnosis)})"
+    labels = ((time, ""), ("command", "response"), (time, "residual"))
     for axes, (below, beside) in zip((left, middle, right), labels, strict=True):
         style.dress(axes, below, beside, "both")
     style.legend_above(figure, *left.get_legend_handles_labels())

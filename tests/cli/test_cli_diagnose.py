@@ -63,6 +63,14 @@ def test_a_log_becomes_a_table_a_file_and_a_page(call, log):
     assert "<b>" not in page and "http" not in page.replace("http-equiv", "")
 
 
+def test_without_a_time_there_are_no_seconds(call, log):
+    pd.read_csv(log).drop(columns="t").to_csv(log, index=False)
+    done = call(log)
+    assert "delay (rows)" in done.out and "(s)" not in done.out
+    page = Path("outputs", "log_diagnosis", "index.html").read_text()
+    assert "delay (rows)" in page and "(s)" not in page and " s," not in page
+
+
 def test_where_to_and_what_is_healthy(call, log, tmp_path):
     done = call(log, "--out", tmp_path / "there", "--delay", 0.04, "--no-page")
     assert "<b>elbow: reversed, 62 % of the command" in done.out.splitlines()

@@ -117,7 +117,7 @@ def test_pipes_in_a_data_set_are_skipped(tmp_path):
     (folder / "data" / "chunk-000" / "episode_000008.parquet").symlink_to("/dev/zero")
     log = read_log(folder)
     assert log.begins.sum() == 2 and log.notes == (
-        "skipped, no regular file: episode_000008.parquet, episode_000009.parquet",
+        "skipped, no regular file: 2 of 4 files, episode_000008.parquet, episode_000009.parquet",
     )
 
 

@@ -81,11 +81,15 @@ def test_bags_of_ros_2(tmp_path, storage):
     twist, vector = store.types["geometry_msgs/msg/Twist"], store.types["geometry_msgs/msg/Vector3"]
     joints, header = store.types["sensor_msgs/msg/JointState"], store.types["std_msgs/msg/Header"]
     stamp = store.types["builtin_interfaces/msg/Time"](0, 0)
+    odometry = store.types["nav_msgs/msg/Odometry"]
+    names = ("Pose", "PoseWithCovariance", "Point", "Quaternion")
+    pose, covered, point, quaternion = (store.types[f"geometry_msgs/msg/{n}"] for n in names)
     zero, none = vector(0.0, 0.0, 0.0), np.zeros(0)
     u = np.random.default_rng(0).uniform(-1, 1, 30)
     with Bag(tmp_path / "bag", version=8, storage_plugin=storage) as bag:
         sent = bag.add_connection("/cmd", twist.__msgtype__, typestore=store)
         seen = bag.add_connection("/joints", joints.__msgtype__, typestore=store)
+        turned = bag.add_connection("/odom", odometry.__msgtype__, typestore=store)
         for k, x in enumerate(u):
             data = store.serialize_cdr(twist(vector(x, 0.0, 0.0), zero), twist.__msgtype__)
             bag.write(sent, 10**8 * k, data)
@@ -94,6 +98,14 @@ def test_bags_of_ros_2(tmp_path, storage):
             message = joints(header(stamp, "base"), names, at, none, none)
             data = store.serialize_cdr(message, joints.__msgtype__)
             bag.write(seen, 10**8 * k + 1000, data)
+            turn = quaternion(0.0, 0.0, np.sin(x / 2), np.cos(x / 2))
+            at = covered(pose(point(0.0, 0.0, 0.0), turn), np.zeros(36))
+            moves = store.types["geometry_msgs/msg/TwistWithCovariance"](
+                twist(zero, zero), np.zeros(36)
+            )
+            message = odometry(header(stamp, "map"), "base", at, moves)
+            data = store.serialize_cdr(message, odometry.__msgtype__)
+            bag.write(turned, 10**8 * k + 2000, data)
     files = [tmp_path / "bag"]
     if storage is StoragePlugin.MCAP:
         files += sorted((tmp_path / "bag").glob("*.mcap"))  # also without the folder's metadata
@@ -101,6 +113,68 @@ def test_bags_of_ros_2(tmp_path, storage):
         log = read_log(file, ["/cmd.linear.x"], ["/joints.position[pan]"])
         np.testing.assert_allclose(log.response[:, 0], 0.5 * u)
         np.testing.assert_allclose(log.command[:, 0], u)
+        log = read_log(file, ["/cmd.linear.x"], ["/odom.pose.pose.orientation.yaw"])
+        np.testing.assert_allclose(log.response[:, 0], log.command[:, 0])
+
+
+POSE = """geometry_msgs/Pose pose
+================================================================================
+MSG: geometry_msgs/Pose
+Point position
+Quaternion orientation
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+"""
+
+
+def mcap_of(path, messages):
+    """Write an MCAP file of topics, encodings, names and texts of schemas, and messages."""
+    with path.open("wb") as file:
+        writer = Mcap(file)
+        writer.start()
+        for topic, encoding, name, text, contents in messages:
+            schema = writer.register_schema(name, "ros1msg" if text else "jsonschema", text)
+            channel = writer.register_channel(topic, encoding, schema)
+            for k, content in enumerate(contents):
+                writer.add_message(channel, 10**8 * k, content, 10**8 * k)
+        writer.finish()
+    return path
+
+
+def test_an_mcap_file_with_nested_messages(tmp_path):
+    """Motors in a list, as JSON; and a pose of ROS 1, whose angles are computed."""
+    yaw = np.random.default_rng(0).uniform(-1.5, 1.5, 40)
+    motors = [
+        json.dumps({"state": {"motors": [{"q": 0.0}, {"q": y, "load": {"w": 1.0}}]}}).encode()
+        for y in yaw
+    ]
+    half = 0.5 * yaw
+    numbers = np.column_stack([np.zeros((40, 5)), np.sin(half), np.cos(half)])
+    poses = [row.astype("<f8").tobytes() for row in numbers]
+    path = mcap_of(
+        tmp_path / "log.mcap",
+        [
+            ("/low", "json", "any", b"", motors),
+            ("/pose", "ros1", "geometry_msgs/PoseStamped", POSE.encode(), poses),
+        ],
+    )
+    log = read_log(path, ["yaw=/low.state.motors[1].q"], ["/pose.pose.orientation.yaw"])
+    assert log.names == ("yaw",) and log.step == pytest.approx(0.1)
+    np.testing.assert_allclose(log.response, log.command, atol=1e-12)
+    with pytest.raises(Unchosen) as unchosen:
+        read_log(path)
+    assert unchosen.value.listing[1].endswith(
+        "w, pose.orientation.roll, pose.orientation.pitch, pose.orientation.yaw"
+    )
 
 
 def test_a_ulog_of_px4():
@@ -113,6 +187,13 @@ def test_a_ulog_of_px4():
     assert log.step == pytest.approx(0.0105, abs=0.003)
     assert np.abs(log.response).max() < 0.01  # rad/s: at rest, whatever is commanded
     assert np.abs(log.command).max() > 0.5
+    topic, angles = "vehicle_attitude_setpoint", ("roll", "pitch", "yaw")
+    logged, computed = (
+        [f"{topic}.{form.format(angle)}" for angle in angles] for form in ("{}_body", "q_d.{}")
+    )
+    log = read_log(LOGS / "px4_disarmed.ulg", logged, computed)
+    assert log.response[0, 2] == pytest.approx(-0.646, abs=1e-3)
+    np.testing.assert_allclose(log.response, log.command, atol=1e-6)
 
 
 def test_the_packages_are_asked_for(monkeypatch):

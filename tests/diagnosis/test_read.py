@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
 from afm_rl.diagnosis import diagnose
-from afm_rl.diagnosis.readers import read_log
+from afm_rl.diagnosis.readers import Unchosen, read_log
 from afm_rl.errors import ConfigurationError
 
 
@@ -75,9 +76,61 @@ def test_rows_with_missing_numbers_are_dropped(table, tmp_path):
     log = read_log(tmp_path / "log.csv")
     assert log.notes == (
         "2 of 60 rows were dropped: numbers are missing or infinite",
-        "no column t: times are in rows",
+        "no column t, time or timestamp: times are in rows",
     )
     assert len(log.command) == 58 and log.seconds[4] == 5
+
+
+DATES = pd.date_range("2024-05-01 12:00:00.05", periods=60, freq="100ms", tz="UTC")
+
+
+@pytest.mark.parametrize(
+    ("column", "times", "note"),
+    [
+        ("time", 5 + 0.1 * np.arange(60), ()),
+        ("Timestamp", DATES.strftime("%Y-%m-%dT%H:%M:%S.%fZ"), ()),
+        ("time", DATES.tz_convert("Asia/Tokyo").map(str), ()),
+        ("timestamp", 1714564800.05 + 0.1 * np.arange(60), ()),
+        ("timestamp", 1714564800050 + 100 * np.arange(60), ("timestamp: read as ms",)),
+        ("%time", 1714564800050000000 + 10**8 * np.arange(60), ("%time: read as ns",)),
+        ("timestamp", 69_000_000 + 10**5 * np.arange(60), ("timestamp: read as us",)),
+        ("time [ms]", 100.0 * np.arange(60), ()),
+        ("time_us", 10**5 * np.arange(60), ()),
+    ],
+)
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_times_of_all_kinds(table, tmp_path, suffix, column, times, note):
+    path = tmp_path / f"log.{suffix}"
+    table = table.rename(columns={"t": column}).assign(**{column: times})
+    table.to_csv(path, index=False) if suffix == "csv" else table.to_parquet(path)
+    log = read_log(path)
+    assert log.step == pytest.approx(0.1, rel=1e-5) and log.notes == note
+    np.testing.assert_allclose(np.diff(log.seconds), 0.1, rtol=1e-4)
+
+
+def test_dates_of_a_parquet_file(table, tmp_path):
+    table.drop(columns="t").assign(timestamp=DATES).to_parquet(tmp_path / "log.parquet")
+    assert read_log(tmp_path / "log.parquet").step == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("names", ["qw qx qy qz", "q_w q_x q_y q_z", "q.w q.x q.y q.z"])
+def test_angles_of_quaternions(tmp_path, names):
+    angle = np.random.default_rng(0).uniform(-1.5, 1.5, (60, 3))
+    quaternion = Rotation.from_euler("ZYX", angle).as_quat()[:, [3, 0, 1, 2]]
+    table = pd.DataFrame(quaternion, columns=names.split()).assign(yaw_setpoint=angle[:, 0])
+    table.assign(roll_setpoint=angle[:, 2]).to_csv(tmp_path / "log.csv", index=False)
+    head = "q." if "." in names else ""
+    pairs = ["yaw_setpoint", "roll_setpoint"], [f"{head}yaw", f"{head}roll"]
+    log = read_log(tmp_path / "log.csv", *pairs)
+    np.testing.assert_allclose(log.response, log.command, atol=1e-9)
+
+
+@pytest.mark.parametrize("file", ["log.csv", "log.parquet", "log.mcap"])
+def test_pointers_of_git_lfs_are_named(tmp_path, file):
+    (tmp_path / file).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
+    with pytest.raises(ConfigurationError, match="a pointer of Git LFS.* git lfs pull") as error:
+        read_log(tmp_path / file)
+    assert "\n" not in str(error.value)
 
 
 def with_cell(table, name, value):
@@ -132,7 +185,6 @@ def test_files_that_cannot_be_used(tmp_path, name, content, message):
         (lambda d: (d / "meta" / "info.json").unlink(), "info.json: No such file"),
         (lambda d: (d / "meta" / "info.json").write_text("{}"), "damaged"),
         (lambda d: change_info(d, fps=10**400), "damaged"),
-        (lambda d: change_info(d, features={}), "no feature action or actions"),
         (lambda d: write_info(d, "[" * 100_000), "damaged"),
         (lambda d: change_names(d, [[["a", "b"]], {"x": ["c"]}]), "2 numbers per row, but 3 names"),
         (lambda d: change_names(d, ["one", "one"]), "two of the 2 names are the same"),
@@ -142,13 +194,79 @@ def test_files_that_cannot_be_used(tmp_path, name, content, message):
         (lambda d: [p.unlink() for p in d.glob("data/*/*")], r"no data/chunk-\*"),
         (lambda d: next(d.glob("data/*/*")).write_bytes(b""), "no parquet file"),
         (lambda d: spoil_column(d, action=1.0), "1 numbers per row, but 2 names"),
-        (lambda d: spoil_column(d, other=1.0, drop="action"), "no column action"),
+        (lambda d: spoil_column(d, other=1.0, drop="action"), "expected command.NAME and response"),
     ],
 )
 def test_data_sets_that_cannot_be_used(lerobot, spoil, message):
     spoil(lerobot)
     with pytest.raises(ConfigurationError, match=message):
         read_log(lerobot)
+
+
+KEYS = {"action": "actions.joint.target", "observation.state": "observation.states.joint.angle"}
+
+
+def test_data_sets_with_keys_of_their_own(lerobot):
+    for path in lerobot.glob("data/*/*"):
+        pd.read_parquet(path).rename(columns=KEYS).to_parquet(path)
+    info = json.loads((lerobot / "meta" / "info.json").read_text())
+    change_info(lerobot, features={KEYS[name]: f for name, f in info["features"].items()})
+    with pytest.raises(Unchosen, match="--command and --response") as error:
+        read_log(lerobot)
+    assert "actions.joint.target.pan.pos" in error.value.listing
+    log = read_log(lerobot, [KEYS["action"]], [KEYS["observation.state"]])
+    assert log.command.shape == (200, 2) and log.usual_delay == pytest.approx(1 / 30)
+    assert [a.status for a in diagnose(log).actuators] == ["healthy", "changed"]
+
+
+def freeze(table, first, last):
+    held = table.at[first, "observation.state"]
+    states = [held if first <= k < last else y for k, y in enumerate(table["observation.state"])]
+    return table.assign(**{"observation.state": states})
+
+
+@pytest.mark.parametrize(
+    ("spoil", "note"),
+    [
+        (
+            lambda t: freeze(t, 0, 100),
+            "responses are frozen while commands move in 1 of 4 episodes, which are left out: 2",
+        ),
+        (
+            lambda t: freeze(t, 30, 90),
+            "responses are frozen while commands move in 1 of 4 episodes, which are left out: 2",
+        ),
+        (lambda t: freeze(t, 30, 34), "3 frames repeat the responses before, while commands move"),
+        (lambda t: t.drop(index=[40, 41, 70]), "3 frames are missing, at 2 places"),
+        (lambda t: t[:80], "380 of 400 frames are there (total_frames in meta/info.json)"),
+        (lambda t: None, "missing episodes: 1 of 4, 2"),
+        (
+            lambda t: "",
+            "skipped, pointers of Git LFS (run git lfs pull): 1 of 4 files, episode_000002.parquet",
+        ),
+    ],
+)
+def test_what_a_data_set_lacks_is_said(tmp_path, spoil, note):
+    folder, rng = tmp_path / "data" / "chunk-000", np.random.default_rng(0)
+    folder.mkdir(parents=True)
+    (tmp_path / "meta").mkdir()
+    for episode in range(4):
+        u = rng.uniform(-1, 1, (100, 2))
+        y = np.concatenate([u[:1], u[:-1]]) + 1e-3 * rng.standard_normal(u.shape)
+        table = pd.DataFrame({"action": list(u), "observation.state": list(y)})
+        table = table.assign(episode_index=episode, timestamp=np.arange(100) / 30)
+        path = folder / f"episode_00000{episode}.parquet"
+        table = spoil(table) if episode == 2 else table
+        if isinstance(table, str):
+            path.write_text("version https://git-lfs.github.com/spec/v1\n")
+        elif table is not None:
+            table.to_parquet(path)
+    write_info(tmp_path, "{}")
+    change_info(tmp_path, fps=30, features={}, total_frames=400, total_episodes=4)
+    log = read_log(tmp_path)
+    assert note in log.notes
+    left_out = "left out" in note or "missing episodes" in note or "skipped" in note
+    assert log.begins.sum() == (3 if left_out else 4)
 
 
 def write_info(folder, text):

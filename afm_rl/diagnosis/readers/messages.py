@@ -127,7 +127,7 @@ def _get(message: Any, key: Any) -> Any:
 
 
 def open_mcap(path: Path) -> Source:
-    """Return the fields of an MCAP file whose messages are those of ROS 2, or JSON."""
+    """Return the fields of an MCAP file whose messages are those of ROS, or JSON."""
     try:
         from mcap.records import Channel, Message, Schema
     except ImportError as error:
@@ -242,17 +242,20 @@ def _decoder(schema: Any, encoding: str) -> Any:
     """Return what makes an object of a message's bytes, or None if nothing here can."""
     if encoding == "json":
         return json.loads
-    if encoding != "cdr" or schema is None:
+    if encoding not in ("cdr", "ros1") or schema is None:
         return None
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.EMPTY)
-    text = schema.data.decode()
+    text, name = schema.data.decode(), schema.name
+    if "/msg/" not in name:  # as ROS 1 has it
+        name = "/msg/".join(name.split("/", 1))
     if schema.encoding == "ros2idl":
         store.register(get_types_from_idl(text))
     else:
-        store.register(get_types_from_msg(text, schema.name))
-    return lambda data: store.deserialize_cdr(data, schema.name)
+        store.register(get_types_from_msg(text, name))
+    read = store.deserialize_cdr if encoding == "cdr" else store.deserialize_ros1
+    return lambda data: read(data, name)
 
 
 def open_ulog(path: Path) -> Source:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -17,8 +16,10 @@ import pyarrow.parquet as parquet
 
 from afm_rl.diagnosis.readers.source import (
     ACTIONS,
+    NAMES,
     STATES,
     WIDEST,
+    Pointer,
     Series,
     Source,
     blocks_of,
@@ -26,7 +27,9 @@ from afm_rl.diagnosis.readers.source import (
     check_regular,
     reading,
 )
-from afm_rl.diagnosis.readers.tables import EPISODE, TIME
+from afm_rl.diagnosis.readers.tables import EPISODE
+from afm_rl.diagnosis.readers.telemetry import listed
+from afm_rl.diagnosis.readers.times import TIME, numbers_of, time_among
 from afm_rl.errors import ConfigurationError, printable
 
 STAMP = "timestamp"
@@ -52,16 +55,14 @@ def open_parquet(path: Path) -> Source:
         else:
             names |= {f"{column}.{k}": (column, k) for k in range(width)}
     check_names(list(names))
-    # An episode of LeRobot's has the time (s) under another name.
-    time = STAMP if TIME not in columns and str(columns.get(STAMP)) in ("float", "double") else TIME
-    return source_of(path, [path], names, time)
+    return source_of(path, [path], names, time_among(list(names)))
 
 
 def source_of(
     path: Path,
     files: Sequence[Path],
     names: Mapping[str, tuple[str, int | None]],
-    time: str = TIME,
+    time: str | None,
     episode: str = EPISODE,
     frame: float = 0.0,
     notes: tuple[str, ...] = (),
@@ -123,13 +124,19 @@ def widths_of(file: Path, columns: Iterable[str]) -> dict[str, int | None]:
 
 def check_kind(column: str, kind: arrow.DataType) -> None:
     """Refuse a column of something else than numbers, and lists of them."""
-    if not _is_number(_innermost(kind)):
+    if not (_is_number(_innermost(kind)) or _is_date(kind) and TIME.fullmatch(column)):
         raise ConfigurationError(f"{printable(column)}: {kind}: expected numbers, or lists of them")
 
 
 def _is_number(kind: arrow.DataType) -> bool:
     types = arrow.types
     return types.is_integer(kind) or types.is_floating(kind) or types.is_boolean(kind)
+
+
+def _is_date(kind: arrow.DataType) -> bool:
+    types = arrow.types
+    text = types.is_string(kind) or types.is_large_string(kind)
+    return text or types.is_timestamp(kind) or types.is_date(kind)
 
 
 def _innermost(kind: arrow.DataType) -> arrow.DataType:
@@ -232,6 +239,8 @@ def _values(name: str, column: arrow.Array) -> np.ndarray:
                 "numbers: expected lists of numbers of one length"
             )
         return _values(name, column.flatten()).reshape(len(column), widths[0])
+    if _is_date(column.type):
+        return numbers_of(name, column.to_pandas())
     with np.errstate(invalid="ignore"):  # a signalling NaN
         return column.to_numpy(zero_copy_only=False).astype(float)
 
@@ -243,24 +252,25 @@ def _no_parquet(file: Path) -> str:
 def open_lerobot(folder: Path) -> Source:
     """Return actions and states of a data set: ``action.NAME``, ``observation.state.NAME``.
 
-    A state is read before the action is sent, so that a healthy robot is late by one frame.
+    A state is read before the action is sent, so that a healthy robot is late by one frame. Other
+    columns of numbers have names, too.
     """
-    features, fps = _info(check_regular(folder / INFO))
+    info, fps = _info(check_regular(folder / INFO))
     files, notes = _files(folder)
     for file in files:
         if EPISODE not in columns_of(file):
             raise ConfigurationError(f"{file}: no column {EPISODE}")
+        check_kind(EPISODE, columns_of(file)[EPISODE])
     columns = columns_of(files[0])
     names: dict[str, tuple[str, int | None]] = {}
-    for heads in (ACTIONS, STATES):
-        head = next((h for h in heads if h in features), None)
-        if head is None:
-            raise ConfigurationError(f"{INFO}: no feature {' or '.join(heads)}")
-        if head not in columns:
-            raise ConfigurationError(f"{files[0]}: no column {head}")
-        names |= _named(files[0], head, features[head])
+    numbers = [name for name, kind in columns.items() if _is_number(_innermost(kind))]
+    for column, width in widths_of(files[0], numbers).items():
+        names |= _named(column, width, info["features"].get(column))
+    check_names(list(names))
     every = all(STAMP in columns_of(file) for file in files)
-    names |= {name: (name, None) for name in (EPISODE, *((STAMP,) if every else ()))}
+    if not every:
+        names.pop(STAMP, None)
+    notes += _missing(files, info)
     source = source_of(folder, files, names, STAMP, EPISODE, 1 / fps, notes)
 
     def read(wanted: Sequence[str]) -> dict[str, Series]:
@@ -274,8 +284,27 @@ def open_lerobot(folder: Path) -> Source:
     return replace(source, read=read, time=STAMP)
 
 
+def _missing(files: Sequence[Path], info: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what must be said where there are fewer frames or episodes than a data set states."""
+    notes = []
+    rows, frames = sum(_rows(file) for file in files), info.get("total_frames")
+    if type(frames) is int and frames > rows:
+        notes.append(f"{rows:,} of {frames:,} frames are there (total_frames in {INFO})")
+    episodes = info.get("total_episodes")
+    if type(episodes) is int and 0 < episodes <= NAMES and rows <= DECODED // 10:
+        there: set[float] = set()
+        for file in files:
+            with reading(_no_parquet(file)):
+                for batch in parquet.ParquetFile(file).iter_batches(columns=[EPISODE]):
+                    there |= set(np.unique(_values(EPISODE, batch.column(0))))
+        missing = [number for number in range(episodes) if number not in there]
+        if len(there) < episodes:
+            notes.append(f"missing episodes: {len(missing)} of {episodes}, {listed(missing)}")
+    return tuple(notes)
+
+
 def _info(file: Path) -> tuple[dict[str, Any], float]:
-    """Return the features of a data set, and its rate (1/s)."""
+    """Return what a data set says of itself, and its rate (1/s)."""
     try:
         with file.open(encoding="utf-8") as text:
             info = json.loads(text.read(1 << 24))
@@ -285,38 +314,51 @@ def _info(file: Path) -> tuple[dict[str, Any], float]:
     except (ValueError, KeyError, TypeError, ArithmeticError, RecursionError) as error:
         reason = printable(repr(error), 60)
         raise ConfigurationError(
-            f"{INFO}: damaged: {reason}; expected fps, and features {ACTIONS[0]} and {STATES[0]}"
+            f"{INFO}: damaged: {reason}; expected fps, and features"
         ) from error
     if not SLOWEST <= fps <= FASTEST:
         raise ConfigurationError(
             f"{INFO}: fps={fps}: expected a rate between {SLOWEST:g} and {FASTEST:g}"
         )
-    return features, fps
+    return info, fps
 
 
 def _files(folder: Path) -> tuple[list[Path], tuple[str, ...]]:
-    """Return the parquet files of a data set, and a note of what was skipped."""
-    files = sorted(folder.glob("data/chunk-*/*.parquet"))
-    regular = [file for file in files if _is_regular(file)]
+    """Return the parquet files of a data set, and notes of what was skipped."""
+    files, others, pointers = sorted(folder.glob("data/chunk-*/*.parquet")), [], []
+    regular = []
+    for file in files:
+        try:
+            regular.append(check_regular(file))
+        except Pointer:
+            pointers.append(file)
+        except ConfigurationError:
+            others.append(file)
+    if pointers and not regular:
+        check_regular(pointers[0])
     if not regular:
         raise ConfigurationError("no data/chunk-*/*.parquet: expected at least one file")
-    skipped = [printable(file.name) for file in files if file not in set(regular)]
-    if not skipped:
-        return regular, ()
-    return regular, (f"skipped, no regular file: {', '.join(skipped[:8])}",)
+    skipped = {"no regular file": others, "pointers of Git LFS (run git lfs pull)": pointers}
+    return regular, tuple(
+        f"skipped, {what}: {len(some)} of {len(files)} files, {', '.join(shown)}"
+        for what, some in skipped.items()
+        if (shown := [printable(file.name) for file in some[:8]])
+    )
 
 
-def _is_regular(file: Path) -> bool:
-    try:
-        return stat.S_ISREG(file.stat().st_mode)
-    except OSError:
-        return False
+def _named(column: str, width: int | None, feature: Any) -> dict[str, tuple[str, int | None]]:
+    """Return the names of a column's numbers: as its feature has them, or their places.
 
-
-def _named(file: Path, head: str, feature: Any) -> dict[str, tuple[str, int | None]]:
-    """Return the names of a feature's numbers: as given, or their places."""
-    width = widths_of(file, [head])[head]  # one number is no list
-    check_width(head, width)
+    Raises:
+        ConfigurationError: for names of actions and states that cannot be used.
+    """
+    expected = column in (*ACTIONS, *STATES)
+    if width is None and not expected:  # one number is no list
+        return {column: (column, None)}
+    if expected:
+        check_width(column, width)
+    elif width is not None and width > WIDEST:
+        return {}
     places: list[int | None] = [None] if width is None else list(range(width))
     given = feature.get("names") if isinstance(feature, dict) else None
     if isinstance(given, dict) and all(type(place) is int for place in given.values()):
@@ -324,15 +366,16 @@ def _named(file: Path, head: str, feature: Any) -> dict[str, tuple[str, int | No
     try:
         names = list(_flat(given))
     except RecursionError as error:
-        raise ConfigurationError(f"{INFO}: {head}: names nested too deeply") from error
-    if names and len(names) != len(places):
+        raise ConfigurationError(f"{INFO}: {column}: names nested too deeply") from error
+    fits = len(names) == len(set(names)) == len(places)
+    if names and not fits and expected:
         raise ConfigurationError(
-            f"{head}: {len(places)} numbers per row, but {len(names)} names in {INFO}"
+            f"{INFO}: {column}: two of the {len(places)} names are the same"
+            if len(names) == len(places)
+            else f"{column}: {len(places)} numbers per row, but {len(names)} names in {INFO}"
         )
-    names = names or [str(place) for place in range(len(places))]
-    if len(set(names)) < len(places):
-        raise ConfigurationError(f"{INFO}: {head}: two of the {len(places)} names are the same")
-    return {f"{head}.{n}": (head, place) for n, place in zip(names, places, strict=True)}
+    names = names if fits else [str(place) for place in range(len(places))]
+    return {f"{column}.{n}": (column, place) for n, place in zip(names, places, strict=True)}
 
 
 def _flat(names: Any) -> Iterator[str]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from afm_rl.diagnosis.log import FEWEST, Log
 from afm_rl.diagnosis.readers import messages, parquet, tables
+from afm_rl.diagnosis.readers.angles import with_angles
 from afm_rl.diagnosis.readers.source import (
     Columns,
     Series,
@@ -21,10 +22,13 @@ from afm_rl.diagnosis.readers.source import (
     choose,
     thinned_note,
 )
+from afm_rl.diagnosis.readers.telemetry import frozen_episodes, frozen_rows, listed
+from afm_rl.diagnosis.readers.times import in_seconds
 from afm_rl.errors import ConfigurationError, printable
 
 PAIRS = ("command", "response")
 TRANSITIONS = ("action", "state")
+Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 LARGEST = 1e30  # squares of larger numbers leave single precision
 
 READERS: dict[str, Callable[[Path], Source]] = {
@@ -44,7 +48,11 @@ EXPECTED = (
 
 
 def open_source(path: Path) -> Source:
-    """Return what there is in a file or folder."""
+    """Return what there is in a file or folder, and angles that follow from it."""
+    return with_angles(_opened(path))
+
+
+def _opened(path: Path) -> Source:
     if path.is_dir():
         if (path / parquet.INFO).parent.exists():
             return parquet.open_lerobot(path)
@@ -167,11 +175,13 @@ def read_columns(
                     f"{printable(name)}: row {row}: expected numbers below {LARGEST:g}"
                 )
         first, second = (np.column_stack([columns[n].values for n in group]) for group in wanted)
-        time = columns[source.time].values if source.time else clock
+        time, assumed = columns[source.time].values if source.time else clock, tuple[str, ...]()
+        if source.time and time is not None and not source.frame:
+            time, assumed = in_seconds(source.time, time)
         border = columns[source.episode].values if source.episode else None
         leading = columns[wanted[0][0]]
         number = np.arange(len(first)) if leading.row is None else leading.row
-        notes = (*source.notes, *thinned_note(number, leading.rows), *notes)
+        notes = (*source.notes, *thinned_note(number, leading.rows), *assumed, *notes)
         done = _complete(source, names, first, second, number, time, border, notes)
         return replace(done, effort=_effort(source))
 
@@ -248,7 +258,7 @@ def _complete(
     rows = np.flatnonzero(sound)
     total, number = int(number[-1]) + 1, number[rows]
     if t is None:
-        notes += ("no column t: times are in rows",)
+        notes += ("no column t, time or timestamp: times are in rows",)
     time = number.astype(float) if t is None else t[rows]
     # Of a log that was read in blocks, each is an episode.
     apart = np.diff(number, prepend=number[0] - 1) > 1 + lost
@@ -259,13 +269,45 @@ def _complete(
     if len(back):
         row = int(number[back[0] + 1])
         raise ConfigurationError(
-            f"t goes from {time[back[0]]:.6g} to {time[back[0] + 1]:.6g} s at row {row}: expected "
-            "ascending times; sort the rows, or number episodes in a column episode_index"
+            f"{printable(source.time or 't')} goes from {time[back[0]]:.6g} to "
+            f"{time[back[0] + 1]:.6g} s at row {row}: expected ascending times, one each; sort the "
+            "rows, log parts of seconds, or number episodes in a column episode_index"
         )
     if border[-1] > len(rows) / 2:
         raise ConfigurationError(
             f"{source.episode}: {border[-1] + 1} episodes in {len(rows)} rows: expected some of "
             "several rows; leave the column out, or see --episode"
         )
-    complete = first[rows], second[rows], time, border, number, total
-    return Columns(names, *complete, source.frame, notes)
+    arrays: Arrays = (first[rows], second[rows], time, border, number)
+    if episode is not None:
+        arrays, lacking = _thawed(arrays, episode[rows], source.frame)
+        notes += lacking
+    return Columns(names, *arrays, total, source.frame, notes)
+
+
+def _thawed(arrays: Arrays, episode: np.ndarray, frame: float) -> tuple[Arrays, tuple[str, ...]]:
+    """Return the rows without episodes whose responses are frozen, and what is to be said.
+
+    Frames are a ``frame`` (s) apart, or, if it is 0, as far as rows are.
+    """
+    first, second, t, border, number = arrays
+    notes, inside = [], np.diff(border) == 0
+    steps = np.diff(t)[inside]
+    if frame:
+        gaps = np.round(steps / frame).clip(min=1) - 1
+        if gaps.any():
+            notes.append(f"{int(gaps.sum())} frames are missing, at {int((gaps > 0).sum())} places")
+    still = frozen_rows(first, second, border)
+    odd = frozen_episodes(still, border, float(np.median(steps)) if len(steps) else 1.0)
+    rows = ~np.isin(border, odd)
+    if odd and rows.sum() >= FEWEST:
+        numbers = np.unique(episode[~rows]).astype(int).tolist()
+        notes.append(
+            f"responses are frozen while commands move in {len(numbers)} of "
+            f"{len(np.unique(episode))} episodes, which are left out: {listed(numbers)}"
+        )
+        first, second, t, border, number = (array[rows] for array in arrays)
+    again = int((still[rows] > 0).sum())
+    if frame and again:
+        notes.append(f"{again} frames repeat the responses before, while commands move")
+    return (first, second, t, border, number), tuple(notes)

@@ -24,6 +24,7 @@ WIDEST = 1_000
 """Most numbers of a list in a table, or of a message, that have names."""
 NAMES = 100_000
 """Most names in a log."""
+POINTER = b"version https://git-lfs"
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Source:
         episode: name of the number of the episode among the names, or None.
         topics: of messages, how many there are of each topic; names begin with the topic.
         notes: what a reader must know.
+        computed: names of what can be computed from what was logged.
     """
 
     path: Path
@@ -50,6 +52,7 @@ class Source:
     episode: str | None = None
     topics: Mapping[str, int] | None = None
     notes: tuple[str, ...] = ()
+    computed: Sequence[str] = ()
 
     def listing(self) -> list[str]:
         """Return what there is: a line for each topic, or for each column.
@@ -59,10 +62,10 @@ class Source:
         ['/arm (5 messages): pos[0..1], mode']
         """
         if self.topics is None:
-            return [printable(name) for name in self.names]
-        lines = []
+            return [printable(name) for name in (*self.names, *self.computed)]
+        lines, names = [], [*self.names, *self.computed]
         for topic, count in sorted(self.topics.items()):
-            own = [name[len(topic) + 1 :] for name in self.names if name.startswith(f"{topic}.")]
+            own = [name[len(topic) + 1 :] for name in names if name.startswith(f"{topic}.")]
             fields = Counter(re.sub(r"\[\d+\]$", "[]", name) for name in own)
             shown = ", ".join(f.replace("[]", f"[0..{n - 1}]") for f, n in fields.items())
             lines.append(printable(f"{topic} ({count} messages): {shown}", 2000))
@@ -119,10 +122,18 @@ class Unchosen(ConfigurationError):
         self.listing = list(listing)
 
 
+class Pointer(ConfigurationError):
+    """A text of Git LFS stands in the place of a file."""
+
+
 def check_regular(path: Path) -> Path:
-    """Return a path if it leads to a file that ends."""
+    """Return a path if it leads to a file that ends, and not to a pointer of Git LFS."""
     try:
         kind = path.stat().st_mode
+        begin = b""
+        if stat.S_ISREG(kind):
+            with path.open("rb") as file:
+                begin = file.read(len(POINTER))
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise ConfigurationError(
@@ -132,6 +143,11 @@ def check_regular(path: Path) -> Path:
         raise ConfigurationError(
             f"{printable(str(path), 1000)}: no regular file, but a device, a pipe or a folder; "
             "expected a file"
+        )
+    if begin == POINTER:
+        raise Pointer(
+            f"{printable(str(path), 1000)}: a pointer of Git LFS, which stands for the file; run "
+            "git lfs pull in its repository"
         )
     return path
 
@@ -249,9 +265,10 @@ def choose(
     alone = sorted(set(first) - set(second)) or sorted(set(second) - set(first))
     if set(first) - set(second):
         alone = sorted(set(first) ^ set(second))
-        raise ConfigurationError(
+        raise Unchosen(
             f"{_some(alone)}: expected a command and a response of each actuator, under the same "
-            "name; or name them in pairs, with --command and --response"
+            "name; or name them in pairs, with --command and --response",
+            source.listing(),
         )
     notes = (f"responses without a command were left out: {_some(alone)}",) if alone else ()
     partner = dict(zip(second, groups[1], strict=True))
@@ -271,11 +288,12 @@ def _expanded(source: Source, option: str, given: Sequence[str]) -> Pairs:
     """Return the fields that were given, and what to call them."""
     fields: list[str] = []
     called: list[str | None] = []
+    single = {*source.names, *source.computed}
     for text in given:
         own, _, field = text.rpartition("=")
-        if text in source.names:
+        if text in single:
             own, field = "", text
-        matching = [field] if field in source.names else []
+        matching = [field] if field in single else []
         matching = matching or [n for n in source.names if n.startswith((f"{field}.", f"{field}["))]
         if not matching:
             short_names = [name for name in source.names[: NAMES // 10] if len(name) < 200]

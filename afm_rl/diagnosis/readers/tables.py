@@ -12,9 +12,10 @@ import numpy as np
 import pandas as pd
 
 from afm_rl.diagnosis.readers.source import Series, Source, blocks_of, check_names
+from afm_rl.diagnosis.readers.times import TIME, numbers_of, time_among
 from afm_rl.errors import ConfigurationError, printable
 
-TIME, EPISODE = "t", "episode_index"
+EPISODE = "episode_index"
 LINE = 1 << 20
 """Longest line (bytes)."""
 
@@ -36,7 +37,7 @@ def open_csv(path: Path) -> Source:
         path,
         names,
         lambda wanted: _read(path, names, wanted),
-        time=TIME if TIME in names else None,
+        time=time_among(names),
         episode=EPISODE if EPISODE in names else None,
     )
 
@@ -121,6 +122,8 @@ def _numbers(name: str, column: pd.Series) -> np.ndarray:
     cells = column.astype(str) if column.dtype == object else column
     numbers = pd.to_numeric(cells, errors="coerce")
     text = numbers.isna() & column.notna()
+    if text.any() and TIME.fullmatch(name):
+        return numbers_of(name, column)
     if text.any():
         row = int(np.flatnonzero(text)[0])
         cell = printable(repr(column.iloc[row]), 40)

@@ -1,0 +1,79 @@
+"""Times as people log them: in some unit, since 1970 or since some begin, or as dates."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from afm_rl.errors import ConfigurationError, printable
+
+TIME = re.compile(
+    r"%?(t|time|timestamp|stamp)(?:[ _]?[ _([](s|sec|ms|us|ns)[)\]]?)?", re.IGNORECASE
+)
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+EPOCH = (9e8, 4.2e9)  # s since 1970: from 1998 to 2103
+
+
+def time_among(names: Sequence[str]) -> str | None:
+    """Return the name of the time, ``t`` before others; None if there is none.
+
+    >>> time_among(["command.a", "timestamp_ms"]), time_among(["Time", "t"]), time_among(["torque"])
+    ('timestamp_ms', 't', None)
+    """
+    order = ("t", "time", "timestamp", "stamp")
+    ranks = {n: order.index(m[1].lower()) for n in names if (m := TIME.fullmatch(n))}
+    return min(ranks, key=ranks.__getitem__, default=None)
+
+
+def numbers_of(name: str, column: pd.Series) -> np.ndarray:
+    """Return dates as ISO 8601 writes them, or dates of a table, as seconds since 1970.
+
+    Raises:
+        ConfigurationError: naming the first cell that is something else.
+
+    >>> numbers_of("time", pd.Series(["1970-01-01T00:00:01.5Z", "1970-01-01 01:00:02+01:00", None]))
+    array([1.5, 2. , nan])
+    """
+    dates = pd.to_datetime(column, format="ISO8601", utc=True, errors="coerce")
+    odd = np.flatnonzero(dates.isna() & column.notna())
+    if len(odd):
+        cell = printable(repr(column.iloc[odd[0]]), 40)
+        raise ConfigurationError(
+            f"{printable(name)}: {cell} in row {odd[0]}: expected a number, as of seconds, or a "
+            "date of ISO 8601, as in 2024-05-01T12:00:00.25Z"
+        )
+    return (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy()
+
+
+def in_seconds(name: str, values: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return times in s, those since 1970 from the first row on; and what was assumed.
+
+    A unit in the name counts, and ``t`` is in s. Else whole numbers may be s, ms, us or ns: as a
+    date of this century says, or as steps of at most half a second do.
+
+    >>> in_seconds("time", np.array([1714564800020, 1714564800040]))
+    (array([0.  , 0.02]), ('time: read as ms',))
+    """
+    match, known = TIME.fullmatch(name), values[np.isfinite(values)]
+    unit = "s" if match is None else (match[2] or "").lower().replace("sec", "s")
+    if not len(known) or name == "t":
+        return values, ()
+    told, unit = bool(unit), unit or _unit_of(known)
+    seconds = values * UNITS[unit]
+    if EPOCH[0] < known[0] * UNITS[unit] < EPOCH[1]:
+        seconds = (values - known[0]) * UNITS[unit]
+    return seconds, () if told or unit == "s" else (f"{printable(name)}: read as {unit}",)
+
+
+def _unit_of(known: np.ndarray, longest: float = 0.5) -> str:
+    steps = np.diff(known)
+    step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    for unit, size in UNITS.items():
+        if EPOCH[0] < known[0] * size < EPOCH[1] and step * size < 10:
+            return unit
+    if step < 2 or (known != np.round(known)).any():
+        return "s"
+    return next((unit for unit, size in UNITS.items() if step * size <= longest), "ns")
