@@ -30,17 +30,18 @@ from torch import Tensor
 
 from afm_rl.errors import ConfigurationError
 
-ABSURD = 1e12  # in any unit: a reading beyond it is a fault, also where an angle would wrap it
 PATIENCE = 20  # repetitions in a row that count as a stale sensor
 
 
-def whole(reading: Tensor) -> Tensor:
+def whole(reading: Tensor, absurd: float = 1e12) -> Tensor:
     """Return whether readings ``(*B, S)`` are finite and of a possible size, ``(*B)``.
+
+    What is ``absurd`` in any unit is a fault, also where an angle would wrap it.
 
     >>> whole(torch.tensor([[1.0, 2.0], [1.0, torch.nan], [1e30, 0.0]]))
     tensor([ True, False, False])
     """
-    return (reading.abs() < ABSURD).all(-1)  # false for NaN
+    return (reading.abs() < absurd).all(-1)  # false for NaN
 
 
 def count_repeats(

@@ -72,8 +72,8 @@ class MissionState(nn.Module):
             return True  # without a look at the numbers, which would wait for the device
         if missions.shape == known.shape and torch.equal(missions, known):
             return True
-        found = bool(missions.dim() and known.dim() and torch.isin(missions, known).all())
-        if found:
+        among = bool(missions.dim() and known.dim() and torch.isin(missions, known).all())
+        if among:
             self.select_((missions.unsqueeze(-1) == known).int().argmax(-1))
         self.missions = missions.clone()  # not the model's own tensor: it may change in place
-        return found
+        return among

@@ -10,9 +10,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-BAR = "{desc}: {percentage:3.0f} %|{bar}| {elapsed} so far, {remaining} left{postfix}"
-LINE = "{desc}: {percentage:.0f} %, {elapsed} so far, {remaining} left{postfix}"
-
 
 class Bar(tqdm):
     """A tqdm bar that suits both terminals and log files.
@@ -43,7 +40,8 @@ class Bar(tqdm):
         self.main = main
         self.live, self.begun = sys.stderr.isatty() and Bar.listener is None, False
         often = 0.1 if self.live else 1.0 if Bar.listener else 10.0
-        form = BAR if self.live else LINE
+        share = "{percentage:3.0f} %|{bar}|" if self.live else "{percentage:.0f} %,"
+        form = f"{{desc}}: {share} {{elapsed}} so far, {{remaining}} left{{postfix}}"
         shown = shown or Bar.listener is not None
         own = {"mininterval": often, "miniters": 1, "bar_format": form, "leave": self.live}
         super().__init__(*args, disable=not shown, **own | settings)

@@ -7,8 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-_MIX = 0x9E3779B97F4A7C15  # spreads (salt, seed) over the 64-bit seed space
-
 
 class Streams:
     """Normal numbers from one generator per seed, drawn for a whole batch of missions.
@@ -45,7 +43,8 @@ class Streams:
         """Return the generator of one seed."""
         seed = self.seed if seed is None else seed
         if seed not in self._generators:
-            mixed = (seed * 2 + 1) * _MIX + self.salt * 0x632BE59BD9B4E019
+            # Odd factors spread both over the 64-bit seed space.
+            mixed = (seed * 2 + 1) * 0x9E3779B97F4A7C15 + self.salt * 0x632BE59BD9B4E019
             self._generators[seed] = torch.Generator().manual_seed(mixed & (2**63 - 1))
         return self._generators[seed]
 

@@ -29,8 +29,6 @@ ALLOWED = (
     *("afm_rl.planning", "afm_rl.regimes", "afm_rl.transforms"),
     "torch.optim",  # optimisers do no harm
 )
-MAKERS = ("afm_rl.missions.factories", "afm_rl.envs")
-"""Where functions may be called, too, and not only classes: other functions write files."""
 REMEDY = (
     "only parts of afm_rl and torch.optim are called; name a package that you trust on the "
     "command line: trust=[PACKAGE]"
@@ -276,7 +274,8 @@ def find_code(place: str, target: str) -> Any:
         raise ConfigurationError(f"{place}={target!r}: expected a class or a function")
     home = str(getattr(found, "__module__", None) or type(found).__module__)
     kind = found if isinstance(found, type) else type(found)
-    ours = _inside(kind.__module__, ALLOWED) or _inside(home, MAKERS)
+    makers = ("afm_rl.missions.factories", "afm_rl.envs")  # functions elsewhere may write files
+    ours = _inside(kind.__module__, ALLOWED) or _inside(home, makers)
     if restricted() and not ours and not _inside(home, map(name_of, trusted())):
         raise ConfigurationError(f"{place}={target!r}: is code of {home}; {REMEDY}")
     return found

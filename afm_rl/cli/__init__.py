@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import hydra
@@ -15,10 +13,9 @@ from omegaconf import DictConfig
 
 from afm_rl import conf
 from afm_rl._version import __version__
-from afm_rl.cli.error_messages import explain, one_line
+from afm_rl.cli.error_messages import errors_in_one_line
 from afm_rl.cli.launcher import register
 from afm_rl.cli.overrides import checked, relaxed, with_sweep_folder
-from afm_rl.jobs.executor import JobsFailed
 
 _launched: list[bool] = []
 """Whether Hydra is done with the settings."""
@@ -29,28 +26,11 @@ def _run(cfg: DictConfig) -> None:
     _launched.append(True)
     from afm_rl.cli.launch import launch  # torch takes seconds: `--help` need not wait for it
 
+    # The other jobs of a sweep go on; Hydra raises the first error again at the end.
     sweep = HydraConfig.get().mode == RunMode.MULTIRUN
-    with _explained(sweep):  # here, so that Hydra does not report the error once more
+    # Here, so that Hydra does not report the error once more.
+    with errors_in_one_line("afm-rl", again=sweep):
         launch(cfg)
-
-
-@contextmanager
-def _explained(sweep: bool = False) -> Iterator[None]:
-    try:
-        yield
-    except BrokenPipeError:  # nobody reads on, as in `afm-rl --help | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
-    except Exception as error:
-        message = explain(error)
-        if message is None and not _launched:  # what Hydra makes of settings
-            message = one_line(f"settings: {error}" if str(error) else f"settings: {error!r}")
-        if message is None:
-            raise
-        print(f"afm-rl: {message}", file=sys.stderr)
-        if sweep:
-            raise  # the other jobs go on; Hydra raises the first error again at the end
-        sys.exit(1 if isinstance(error, JobsFailed) else 2)
 
 
 def _chosen(arguments: list[str]) -> list[Path]:
@@ -70,6 +50,6 @@ def main() -> None:
         return
     _launched.clear()
     sys.argv[1:] = with_sweep_folder(relaxed(sys.argv[1:]))
-    with _explained(), checked(sys.argv[1:]):
+    with errors_in_one_line("afm-rl", _launched), checked(sys.argv[1:]):
         register()
         _run()

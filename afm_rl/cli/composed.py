@@ -61,14 +61,7 @@ PLUGINS = (
     "hydra._internal.core_plugins.basic_launcher.BasicLauncher",
     "hydra._internal.core_plugins.basic_sweeper.BasicSweeper",
 )
-PLUGGED = ("hydra.launcher._target_", "hydra.sweeper._target_")
-"""Where these launchers and this sweeper need no trust."""
-WRITTEN = (
-    *("multirun.yam[l]", "*.log", ".hydr[a]", ".hydr[a]/*"),
-    *("*/*.log", "*/.hydr[a]", "*/.hydr[a]/*"),
-)
-"""What Hydra writes into its folders, as patterns that links to nothing match, too."""
-SOURCES = ("afm_rl.conf", "hydra.conf")
+"""Launchers and the sweeper that need no trust."""
 
 
 def given_by(arguments: Sequence[str]) -> dict[str, Any]:
@@ -94,8 +87,9 @@ def check_sources(config: Any) -> None:
     """
     for path in OmegaConf.select(config, "hydra.searchpath") or ():
         scheme, _, package = str(path).partition("://")
-        if scheme == "pkg" and package.replace("/", ".").strip(".") not in SOURCES:
-            check_name("hydra.searchpath", package.replace("/", "."))
+        package = package.replace("/", ".")
+        if scheme == "pkg" and package.strip(".") not in ("afm_rl.conf", "hydra.conf"):
+            check_name("hydra.searchpath", package)
 
 
 def check_composed(cfg: DictConfig, overrides: Sequence[str], given: Mapping[str, Any]) -> None:
@@ -125,7 +119,8 @@ def check_composed(cfg: DictConfig, overrides: Sequence[str], given: Mapping[str
         called, text = place.startswith(CALLED), isinstance(value, str)
         if called and text and "${" in value:
             raise ConfigurationError(f"{place}={value!r}: expected a value")
-        if key == "_target_" and not (place in PLUGGED and value in PLUGINS):
+        plugged = place in ("hydra.launcher._target_", "hydra.sweeper._target_")
+        if key == "_target_" and not (plugged and value in PLUGINS):
             if called:
                 find_code(place, value)
             elif not (text and "${" in value):  # else it is judged once it is known
@@ -147,9 +142,12 @@ def check_composed(cfg: DictConfig, overrides: Sequence[str], given: Mapping[str
 
 def _check_links(cfg: DictConfig) -> None:
     """Check that what Hydra writes into its folders stays there."""
+    # Patterns, which links to nothing match, too.
+    inside = ("multirun.yam[l]", "*.log", ".hydr[a]", ".hydr[a]/*")
+    written = (*inside, *(f"*/{pattern}" for pattern in inside[1:]))
     for place in ("hydra.run.dir", "hydra.sweep.dir"):
         with suppress(OmegaConfBaseException):  # a folder that is known only later is a new one
             folder = Path(str(OmegaConf.select(cfg, place)))
-            for path in chain.from_iterable(map(folder.glob, WRITTEN)):
+            for path in chain.from_iterable(map(folder.glob, written)):
                 if path.is_symlink():
                     raise ConfigurationError(f"{place}={folder}: {path} is a link; remove it")

@@ -1,16 +1,4 @@
-"""The command ``afm-rl-diagnose``."""
-
-from __future__ import annotations
-
-import argparse
-from pathlib import Path
-
-from afm_rl.cli.error_messages import OneLineParser, told_by
-
-NAME = "afm-rl-diagnose"
-KINDS = ".csv, .parquet, .ulg, .mcap, .db3, .bag, or a folder of LeRobot or ROS"
-ABOUT = """\
-Say what the actuators of a robot do, from what it logged.
+"""Say what the actuators of a robot do, from what it logged.
 
   afm-rl-diagnose log.csv                          columns command.NAME, response.NAME, and t (s)
   afm-rl-diagnose log.parquet --out report         diagnosis.json and index.html in report/
@@ -29,18 +17,26 @@ lag, which other command drives it, noise; what changed on the way, and when. An
 healthy, changed, dead, or the log cannot tell.
 """
 
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
+
 
 def main() -> None:
     """Run ``afm-rl-diagnose``; a mistake ends in one line and exit status 2."""
-    parser = OneLineParser(NAME, ABOUT)
+    parser = OneLineParser("afm-rl-diagnose", __doc__)
     add = parser.add_argument
-    add("file", metavar="FILE", type=Path, help=f"a log: {KINDS}")
+    kinds = ".csv, .parquet, .ulg, .mcap, .db3, .bag, or a folder of LeRobot or ROS"
+    add("file", metavar="FILE", type=Path, help=f"a log: {kinds}")
     add("--out", metavar="DIR", type=Path, help="where to (outputs/FILE_diagnosis)")
     healthy = "delay and lag of the healthy robot (s): 0; one frame in LeRobot's data sets"
     add("--delay", metavar="SECONDS", type=float, help=healthy)
     for name, what in (("command", "commands"), ("response", "their responses, in that order")):
-        told = f"names of {what}, FIELD or NAME=FIELD, with commas; a topic stands for its fields"
-        add(f"--{name}", metavar="FIELDS", action="append", default=[], help=told)
+        names = f"names of {what}, FIELD or NAME=FIELD, with commas; a topic stands for its fields"
+        add(f"--{name}", metavar="FIELDS", action="append", default=[], help=names)
     episode = "the column in which episodes or windows are numbered (episode_index)"
     add("--episode", metavar="COLUMN", help=episode)
     replay = "also replay the log: what would a correction have predicted of each row?"
@@ -52,7 +48,7 @@ def main() -> None:
     add("--no-page", dest="page", action="store_false", help="write diagnosis.json only")
     options = parser.parse_args()
 
-    with told_by(NAME):
+    with errors_in_one_line(parser.prog):
         _run(options)
 
 
@@ -96,7 +92,7 @@ def _run(options: argparse.Namespace) -> None:
         raise
     if options.delay is not None:
         log = replace(log, usual_delay=check_number("--delay", options.delay, low=0.0))
-    found = diagnose(log)
+    diagnosis = diagnose(log)
     replayed = None
     if options.replay is not None:
         from afm_rl.diagnosis.replay import replay
@@ -106,11 +102,11 @@ def _run(options: argparse.Namespace) -> None:
         with Bar(total=1.0, desc="replaying", delay=3.0) as bar:  # s
             replayed = replay(log, lambda share: bar.update(share - bar.n))
     out = options.out or Path("outputs", f"{options.file.resolve().stem}_diagnosis")
-    print_diagnosis(found)
+    print_diagnosis(diagnosis)
     if replayed is not None:
         print_replay(replayed)
         print(f"wrote {write_replay(replayed, options.replay)}")
     source, page = printable(str(options.file)), options.page
-    found = replace(found, notes=(*notes, *found.notes))  # they were printed
-    for path in write_diagnosis(found, log, out, source, page, replayed):
+    diagnosis = replace(diagnosis, notes=(*notes, *diagnosis.notes))  # they were printed
+    for path in write_diagnosis(diagnosis, log, out, source, page, replayed):
         print(f"wrote {path}")

@@ -21,14 +21,18 @@ from yaml import YAMLError
 from afm_rl.deprecated import ARGUMENTS
 from afm_rl.errors import AFMError, causes, printable
 
-NOISE = ("Config search path:", "Set the env", "See https://")  # of no help here
-UNKNOWN = re.compile(r"Could not override '([^']+)'")  # Hydra's words for a misspelt setting
-MEMORY = ("not enough memory", "can't allocate memory", "out of memory")  # torch's words
-
 
 @contextmanager
-def told_by(name: str) -> Iterator[None]:
-    """Let a mistake end a command in one line that begins with its name, and exit status 2."""
+def errors_in_one_line(
+    name: str, launched: Sequence[bool] = (True,), again: bool = False
+) -> Iterator[None]:
+    """Let a mistake end a command in one line that begins with its name, and exit status 2.
+
+    Args:
+        name: of the command.
+        launched: empty as long as whatever is raised is a mistake in the settings.
+        again: raise it once more instead of exiting.
+    """
     try:
         yield
     except BrokenPipeError:  # nobody reads on, as in `afm-rl-report study | head`
@@ -36,16 +40,20 @@ def told_by(name: str) -> Iterator[None]:
         sys.exit(1)
     except Exception as error:
         message = explain(error)
+        if message is None and not launched:
+            message = f"settings: {error}" if str(error) else f"settings: {error!r}"
         if message is None:
             raise
         print(f"{name}: {printable(one_line(message), 4000)}", file=sys.stderr)
-        sys.exit(2)
+        if again:
+            raise
+        sys.exit(getattr(error, "status", 2))
 
 
 class OneLineParser(argparse.ArgumentParser):
     """Reads the arguments of a command; a mistake ends in one line and exit status 2."""
 
-    def __init__(self, name: str, about: str) -> None:
+    def __init__(self, name: str, about: str | None) -> None:
         raw = argparse.RawDescriptionHelpFormatter
         super().__init__(prog=name, description=about, formatter_class=raw)
 
@@ -69,14 +77,15 @@ def explain(error: BaseException) -> str | None:
             return one_line(str(cause))
     for cause in chain:
         if isinstance(cause, HydraException | OmegaConfBaseException | YAMLError):
-            unknown = UNKNOWN.search(str(cause))
+            unknown = re.search(r"Could not override '([^']+)'", str(cause))  # misspelt
             if unknown:
                 return _unknown(unknown[1], sys.argv[1:])
             merging = str(cause).startswith("Error merging")  # Hydra keeps the reason to itself
             return one_line(f"{cause}: {cause.__cause__}" if merging else str(cause))
         if isinstance(cause, OSError) and cause.strerror:
             return one_line(f"{cause.filename or 'files'}: {cause.strerror}")
-        if isinstance(cause, MemoryError) or any(words in str(cause) for words in MEMORY):
+        memory = re.search("not enough memory|can't allocate memory|out of memory", str(cause))
+        if isinstance(cause, MemoryError) or memory:
             return (
                 "not enough memory: choose fewer tracks, regimes or seeds at a time, a smaller "
                 "planner.population or a shorter planner.horizon"
@@ -103,11 +112,11 @@ def nearest(key: str, known: Sequence[str]) -> str | None:
     >>> nearest("xyz", ["planner.horizon", "budget"]) is None
     True
     """
-    found = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
-    if not found:  # the right name in the wrong place
+    matches = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+    if not matches:  # the right name in the wrong place
         last = [name for name in known if name.rpartition(".")[2] == key.rpartition(".")[2]]
-        found = difflib.get_close_matches(key, last, n=1, cutoff=0.0)
-    return found[0] if found else None
+        matches = difflib.get_close_matches(key, last, n=1, cutoff=0.0)
+    return matches[0] if matches else None
 
 
 def _known(overrides: Sequence[str]) -> list[str]:
@@ -138,8 +147,7 @@ def one_line(text: str) -> str:
     >>> one_line("Choose one of:\n\tcem\n\tmppi\nConfig search path:\n\tsomewhere")
     'Choose one of: cem, mppi'
     """
-    for noise in NOISE:
-        text = text.partition(noise)[0]
+    text = re.split("Config search path:|Set the env|See https://", text)[0]  # Hydra's advice
     joined = ""
     for line in filter(str.strip, text.splitlines()):
         item = line[0].isspace() and bool(joined) and not joined.endswith(":")

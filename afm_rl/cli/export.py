@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from afm_rl.cli.error_messages import told_by
+from afm_rl.cli.error_messages import errors_in_one_line
 from afm_rl.cli.overrides import checked
 
 NAME = "afm-rl-export"
@@ -30,7 +30,7 @@ def main() -> None:
     if not arguments or {"-h", "--help"} & set(arguments):
         print(ABOUT, end="")
         return
-    with told_by(NAME):
+    with errors_in_one_line(NAME):
         _run(arguments)
 
 

@@ -89,17 +89,17 @@ def sweep(
     for one, given in zip(configs, overrides, strict=True):
         swept = [text for text in given if text not in common]
         try:
-            found = jobs_of(one, one.hydra, swept)
-            for job in found.values():
+            composed = jobs_of(one, one.hydra, swept)
+            for job in composed.values():
                 check_targets(OmegaConf.to_container(job, resolve=True))
-            jobs |= found
+            jobs |= composed
         except (AFMError, HydraException, OmegaConfBaseException) as error:
             failures[" ".join(swept or given)] = explain(error) or str(error)
     check_had(sorted(set.union(*map(set, overrides))), jobs)
     folder = Path(cfg.hydra.sweep.dir).absolute()
     # As text: an override may hold an interpolation that leads nowhere.
-    asked = cast(list, OmegaConf.to_container(cfg.hydra.overrides.task, resolve=False))
-    failed = run_together(folder, jobs, executor, cfg, ["-m", *asked], failures)
+    written = cast(list, OmegaConf.to_container(cfg.hydra.overrides.task, resolve=False))
+    failed = run_together(folder, jobs, executor, cfg, ["-m", *written], failures)
     report(folder, cfg, film)
     if failed:
         raise failed
@@ -147,8 +147,8 @@ def run_together(
     command = shlex.join(["afm-rl", *overrides])
     how = {"command": command, "overwrite": cfg.overwrite, "progress": cfg.progress}
     with _interruptible(folder), handled(signal.default_int_handler, *ENDS):
-        found = run_batch(folder, jobs, executor, **how)
-    failures = {**(failures or {}), **found}
+        failed = run_batch(folder, jobs, executor, **how)
+    failures = {**(failures or {}), **failed}
     for name, reason in failures.items():
         print(f"afm-rl: {name}: failed: {reason}", file=sys.stderr)
     if not failures:
@@ -178,7 +178,7 @@ def show(folder: Path, cfg: DictConfig, agents: Sequence[Agent], film: str | Non
     runs = read_runs([folder])
     missions, steps, measures = runs.missions, runs.steps(), runs.measures
     roads = [getattr(agent.base_env, "tracks", ()) for agent in agents]  # flights have none
-    tracks = list({track.name: track for some in roads for track in some}.values())
+    tracks = list({track.name: track for road in roads for track in road}.values())
     with locked(folder):
         # What is drawn anew leaves the manifest first, so that this may be interrupted.
         names = [*read_manifest(folder)["files"]]
@@ -205,13 +205,13 @@ def _explain(
     first = missions.iloc[0]
     try:
         steps = steps[steps["mission"] == first["mission"]]
-        found, log = explain_mission(agent.robot, steps, late=planned_for(agent))
+        diagnosis, log = explain_mission(agent.robot, steps, late=planned_for(agent))
     except AFMError:  # such as a mission of a few steps
         return ""
     which = f"{first['method']}, {first['track']}, seed {first['seed']}"
     if page:
-        list(write_diagnosis(found, log, folder / "diagnosis", which))
-    return f"Actuators, by the steps of {which}:\n{found}\n"
+        list(write_diagnosis(diagnosis, log, folder / "diagnosis", which))
+    return f"Actuators, by the steps of {which}:\n{diagnosis}\n"
 
 
 def report(folder: Path, cfg: DictConfig, film: str | None) -> None:

@@ -19,8 +19,6 @@ from afm_rl.missions.explained import effective_log
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.trust import find_code, name_of, trusted, trusted_folders, trusting
 
-SIMULATED = 4000  # rows of a log that a simulator is asked about
-
 
 def model_of(name: str, trust: Sequence[str], columns: Columns) -> DynamicsModel:
     """Return the model of the robot that logged some columns.
@@ -56,10 +54,10 @@ def model_of(name: str, trust: Sequence[str], columns: Columns) -> DynamicsModel
     return KnownDynamics(found, Manifold(columns.second.shape[1]), columns.first.shape[1])
 
 
-def columns_of(model: DynamicsModel, columns: Columns) -> Columns:
+def columns_of(model: DynamicsModel, columns: Columns, most: int = 4000) -> Columns:
     """Return the columns of a log that a model names, in its order; all, if it names none.
 
-    Of a simulator, of which every step takes its time, the rows of some blocks.
+    Of a simulator, of which every step takes its time, ``most`` rows, in blocks.
 
     Raises:
         ConfigurationError: naming columns that are missing.
@@ -67,7 +65,7 @@ def columns_of(model: DynamicsModel, columns: Columns) -> Columns:
     states, actions = getattr(model, "names", columns.names[::-1])
     action = _chosen("action", actions, columns.names[0], columns.first)
     state = _chosen("state", states, columns.names[1], columns.second)
-    blocks = blocks_of(len(state), most=SIMULATED if model.stiff else len(state))
+    blocks = blocks_of(len(state), most=most if model.stiff else len(state))
     rows = np.concatenate([np.arange(first, last) for first, last in blocks])
     apart = (np.diff(columns.episode[rows]) != 0) | (np.diff(rows) > 1)
     return replace(

@@ -15,8 +15,6 @@ from afm_rl.missions.selection import select_seeds
 
 IN_TABLES = ("method", "label", "compare", "study", "seeds", "tracks", "regimes")
 """Settings whose effect the tables show: methods need not be named after them."""
-NAMED = ("method", "compare", "label")
-"""Settings whose effect is in the label already."""
 
 
 def jobs_of(cfg: DictConfig, hydra: DictConfig, swept: Sequence[str] = ()) -> dict[str, DictConfig]:
@@ -25,18 +23,19 @@ def jobs_of(cfg: DictConfig, hydra: DictConfig, swept: Sequence[str] = ()) -> di
     A job is one method; in a study, one method with one seed.
     """
     methods = _methods(cfg, hydra)
-    some = optional(swept)
+    loose = optional(swept)
     swept = [text.removeprefix(OPTIONAL) for text in swept]
     keys = {text: text.lstrip("+~").split("=")[0] for text in swept}
     jobs: dict[str, DictConfig] = {}
     for method in methods:
         parts = method.label.split("+")
-        parts += [text for text, key in keys.items() if key in some and not _has(method, key)]
+        parts += [text for text, key in keys.items() if key in loose and not _has(method, key)]
         extra = [t for t, key in keys.items() if key not in IN_TABLES and t not in parts]
         method.label = "+".join([method.label, *extra])
-        told = [t for t, key in keys.items() if key in IN_TABLES]
-        told = [t for t in told if keys[t] not in NAMED or (cfg.label and keys[t] == "method")]
-        name = "+".join([method.label, *told])
+        shown = [text for text, key in keys.items() if key in IN_TABLES]
+        labelled = ("compare", "label") if cfg.label else ("method", "compare", "label")
+        shown = [text for text in shown if keys[text] not in labelled]
+        name = "+".join([method.label, *shown])
         if cfg.get("study") is None:
             jobs[name] = method
             continue
@@ -85,10 +84,10 @@ def _methods(cfg: DictConfig, hydra: DictConfig) -> list[DictConfig]:
 
 def _fitted(overrides: Sequence[str], root: str) -> DictConfig:
     """Compose a method with those settings of its parts that it has."""
-    some = optional(overrides)
-    bare = compose(root, [text for text in overrides if text not in some.values()])
-    lacking = [text for key, text in some.items() if not _has(bare, key)]
-    return compose(root, [text for text in overrides if text not in lacking]) if some else bare
+    loose = optional(overrides)
+    bare = compose(root, [text for text in overrides if text not in loose.values()])
+    lacking = [text for key, text in loose.items() if not _has(bare, key)]
+    return compose(root, [text for text in overrides if text not in lacking]) if loose else bare
 
 
 def check_had(overrides: Sequence[str], methods: Mapping[str, DictConfig]) -> None:

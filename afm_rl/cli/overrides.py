@@ -22,11 +22,6 @@ from afm_rl.trust import check_trust, conf_folders, trusting
 
 PARTS = ("dynamics", "updater", "corrector")
 OPTIONAL = "++"  # how Hydra is told to take a setting whether it is there or not
-BESIDE = (
-    *("launcher", "progress", "overwrite", "cache", "threads", "figures", "video", "tensorboard"),
-    *("-m", "--multirun"),
-)
-"""What does not make a command another sweep."""
 _SETTING = re.compile(rf"(?:{'|'.join(PARTS)})\.[^=]+=")
 
 
@@ -70,10 +65,13 @@ def with_sweep_folder(arguments: Sequence[str]) -> list[str]:
     if any(key == "hydra.sweep.dir" for key, *_ in given):
         return list(arguments)
     own = [parts for parts in given if not parts[0].startswith(("hydra.", "hydra/"))]
-    asked = ["".join(parts).removeprefix(OPTIONAL) for parts in own if parts[0] not in BESIDE]
+    shown = ("progress", "figures", "video", "tensorboard")  # what makes no other sweep
+    done = ("launcher", "overwrite", "cache", "threads", "-m", "--multirun")
+    rest = [parts for parts in own if parts[0] not in (*shown, *done)]
+    settings = ["".join(parts).removeprefix(OPTIONAL) for parts in rest]
     bare = [(key, re.sub(r"\[.*]|\{.*}", "", value)) for key, _, value in own]  # lists do not sweep
     swept = [key.strip("+~") for key, value in bare if re.search(r"[,(]", value)]
-    name = "-".join([*swept, hashlib.sha256("\0".join(sorted(asked)).encode()).hexdigest()[:6]])
+    name = "-".join([*swept, hashlib.sha256("\0".join(sorted(settings)).encode()).hexdigest()[:6]])
     folder = f"hydra.sweep.dir=multirun/{re.sub(r'[^-.0-9A-Z_a-z]', '_', name[-60:])}"
     beside = max(
         (n for n, text in enumerate(arguments) if text[:1] != "-" and "=" in text), default=-1
@@ -122,8 +120,8 @@ def trusted_packages(arguments: Sequence[str]) -> list[str]:
     ['mine', 'my.models']
     """
     given = [text for text in arguments if re.match(r"\+{0,2}trust=", text)]
-    found = [each.value() for each in OverridesParser.create().parse_overrides(given)]
-    return [name for names in found for name in check_trust(names)]
+    values = [each.value() for each in OverridesParser.create().parse_overrides(given)]
+    return [name for names in values for name in check_trust(names)]
 
 
 @contextmanager

@@ -1,4 +1,9 @@
-"""The command ``afm-rl-play``."""
+"""A page in the browser to play with: the same policy on two robots, alone and with AFM.
+
+afm-rl-play                          a half cheetah
+afm-rl-play --robot hopper --open    another robot; the browser opens
+afm-rl-play --policy mine.safetensors   a policy of your own, in its own task
+"""
 
 from __future__ import annotations
 
@@ -7,28 +12,19 @@ import socket
 import webbrowser
 from pathlib import Path
 
-from afm_rl.cli.error_messages import OneLineParser, told_by
-
-NAME = "afm-rl-play"
-ABOUT = """\
-A page in the browser to play with: the same policy on two robots, alone and with AFM.
-
-  afm-rl-play                          a half cheetah
-  afm-rl-play --robot hopper --open    another robot; the browser opens
-  afm-rl-play --policy mine.safetensors   a policy of your own, in its own task
-"""
+from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
 
 
 def main() -> None:
     """Run ``afm-rl-play``; a mistake ends in one line and exit status 2."""
-    parser = OneLineParser(NAME, ABOUT)
+    parser = OneLineParser("afm-rl-play", __doc__)
     add = parser.add_argument
     add("--robot", help="half_cheetah (without anything said), hopper, ant, ugv, ...")
     add("--policy", metavar="FILE", type=Path, help="written by save_policy, with its task as id")
     add("--port", type=int, default=0, help="of 127.0.0.1; a free one")
     add("--open", action="store_true", help="open the browser")
     options = parser.parse_args()
-    with told_by(NAME):
+    with errors_in_one_line(parser.prog):
         _run(options)
 
 
@@ -47,7 +43,7 @@ def _run(options: argparse.Namespace) -> None:
     torch.set_num_threads(1)
     robot = make_robot(options.robot, options.policy)
     page = Page(World(robot), f"{robot.name}: alone and with AFM", port)
-    print(f"{NAME}: {robot.name} at {page.url}; Ctrl-C ends it", flush=True)
+    print(f"afm-rl-play: {robot.name} at {page.url}; Ctrl-C ends it", flush=True)
     if options.open:
         webbrowser.open(page.url)
     try:

@@ -1,15 +1,4 @@
-"""The command ``afm-rl-report``."""
-
-from __future__ import annotations
-
-from pathlib import Path
-
-from afm_rl.cli.error_messages import OneLineParser, told_by
-from afm_rl.errors import ArtefactError
-
-NAME = "afm-rl-report"
-ABOUT = """\
-Join the results of runs, sweeps and studies; write tables (CSV, LaTeX), figures and one HTML page.
+"""Join results of runs, sweeps and studies; write tables (CSV, LaTeX), figures and one HTML page.
 
   afm-rl-report outputs/demo                       one run: report in outputs/demo/report
   afm-rl-report multirun/NAME                      a sweep: methods named after what is swept
@@ -24,10 +13,17 @@ which methods, scenarios and seeds are missing (missing.csv). Where a job's fold
 says so and ends with status 2. Of a mission that stands in several folders, the last one counts.
 """
 
+from __future__ import annotations
+
+from pathlib import Path
+
+from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
+from afm_rl.errors import ArtefactError
+
 
 def main() -> None:
     """Run ``afm-rl-report``; a mistake ends in one line and exit status 2."""
-    parser = OneLineParser(NAME, ABOUT)
+    parser = OneLineParser("afm-rl-report", __doc__)
     add = parser.add_argument
     add("folders", metavar="FOLDER", nargs="+", type=Path, help="results of a run or a study")
     add("--out", metavar="DIR", type=Path, help="where to (FOLDER/report, of the first one)")
@@ -49,7 +45,7 @@ def main() -> None:
 
     out = options.out or options.folders[0] / "report"
     chosen = {"baselines": options.baselines, "oracle": options.oracle, "figures": options.figures}
-    with told_by(NAME):
+    with errors_in_one_line(parser.prog):
         form, runs = check_video(options.video or False), read_runs(options.folders)
         tracks = load_tracks(runs.missions["track"].unique(), load_track)
         if form:

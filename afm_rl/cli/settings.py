@@ -21,24 +21,23 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.options import options_of, parts_of
 from afm_rl.trust import find_code
 
-LINE = re.compile(r"( *)(\w+):((?: +[^ #][^#]*?)?)(?: +#.*)?")
-WORDS = {"None": "null", "True": "true", "False": "false"}
-
 
 def commented(path: Path) -> str:
     """Return the text of a settings file, with the comments of all options that are known."""
     text = path.read_text(encoding="utf-8")
     lines, around = [], [(-1, yaml.safe_load(text), _target(path))]
     for line in text.splitlines():
-        found = LINE.fullmatch(line)
-        if found:
-            indent, key, value = len(found[1]), found[2], found[3]
+        setting = re.fullmatch(r"( *)(\w+):((?: +[^ #][^#]*?)?)(?: +#.*)?", line)
+        if setting:
+            margin, key, value = setting.groups()
+            indent = len(margin)
             around = [each for each in around if each[0] < indent]
             _, settings, target = around[-1]
             known = options_of(target) if target else {}
             if key in known:
-                words = re.sub(r"\b(None|True|False)\b", lambda m: WORDS[m[0]], known[key].text)
-                line = f"{found[1]}{key}:{value} # {words}"
+                comment = re.sub(r"\b(True|False)\b", lambda m: m[0].lower(), known[key].text)
+                comment = re.sub(r"\bNone\b", "null", comment)
+                line = f"{margin}{key}:{value} # {comment}"
             inner = settings.get(key) if isinstance(settings, Mapping) else None
             if isinstance(inner, Mapping):
                 part = _named(inner) or _target(path, key) or parts_of(target).get(key)

@@ -26,7 +26,6 @@ from afm_rl.spaces.manifold import Manifold
 
 Stack = Sequence[Tensor]
 Parameters = tuple[Iterable[Tensor], Iterable[Tensor]]  # weights and biases, layer by layer
-INITS = {"uniform": uniform_layer, "sparse": sparse_layer}
 CHUNK = 2**18  # activations per layer and chunk: 1 MiB in float32, so that they stay in cache
 
 
@@ -116,7 +115,7 @@ class Ensemble(PerMissionModel):
         self._encoded_size = self._encoded(torch.zeros(manifold.size)).shape[-1]
         inputs, targets = self._encoded_size + action_size, manifold.tangent_size
         sizes = [inputs, *self.hidden, 2 * targets]
-        draw = INITS[init]
+        draw = {"uniform": uniform_layer, "sparse": sparse_layer}[init]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
             weight, bias = draw(members, fan_in, fan_out, self._generator)

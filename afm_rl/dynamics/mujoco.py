@@ -31,7 +31,6 @@ except ImportError:  # an extra
 STEP = 1e-4  # of finite differences, in half ranges and units of the state: far above the
 # tolerance of the contact solver, far below what bends a trajectory
 Change = Callable[[Any, tuple[float, ...]], Any]
-NOMINAL = dict(zip(Physics.names, Physics.identity, strict=True))
 
 
 class Simulator:
@@ -147,32 +146,36 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
         ),
         threads: int = option(0, "that simulate beside the calling one", ge=0),
         change: Change = changed_model,
-        physics: Mapping[str, float] = NOMINAL,
+        physics: Mapping[str, float] = dict(zip(Physics.names, Physics.identity, strict=True)),
         mix: Sequence[Sequence[float]] | None = None,
     ) -> None:
-        found, skip = read_model(model)
-        found.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+        mujoco_model, skip = read_model(model)
+        mujoco_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
         skip = skip if frame_skip is None else frame_skip
         nominal = tuple(physics.values())
-        simulator: Any = Simulator(found, skip, threads, change, nominal)
+        simulator: Any = Simulator(mujoco_model, skip, threads, change, nominal)
         if not isinstance(noise_std, int | float) and len(noise_std) == 2:
             position, velocity = noise_std
-            noise_std = [position] * found.nv + [velocity] * found.nv + [position] * found.na
+            noise_std = (
+                [position] * mujoco_model.nv
+                + [velocity] * mujoco_model.nv
+                + [position] * mujoco_model.na
+            )
         start = simulator.rest[None, simulator.state]
-        if not np.isfinite(simulator(start, np.zeros((1, 1, found.nu)))).all():
+        if not np.isfinite(simulator(start, np.zeros((1, 1, mujoco_model.nu)))).all():
             raise ConfigurationError(
                 f"dynamics.model={str(model)[:80]!r}: its first step leads to numbers that are not "
                 "finite; look at its time step, damping, stiffness, and contacts"
             )
-        size = found.nu if mix is None else len(mix[0])
-        super().__init__(simulator, space_of(found), size, noise_std)
+        size = mujoco_model.nu if mix is None else len(mix[0])
+        super().__init__(simulator, space_of(mujoco_model), size, noise_std)
         controls = None if mix is None else torch.tensor(mix, dtype=torch.float64)
         self.register_buffer("mix", controls, persistent=False)
         self._name_physics(physics)
-        self.mjcf = found
-        self.dt = skip * float(found.opt.timestep)
-        low, high = torch.as_tensor(found.actuator_ctrlrange).unbind(-1)
-        limited = torch.as_tensor(found.actuator_ctrllimited).bool()
+        self.mjcf = mujoco_model
+        self.dt = skip * float(mujoco_model.opt.timestep)
+        low, high = torch.as_tensor(mujoco_model.actuator_ctrlrange).unbind(-1)
+        limited = torch.as_tensor(mujoco_model.actuator_ctrllimited).bool()
         if mix is not None:  # no single actuator limits an action
             low = high = torch.zeros(self.action_size, dtype=torch.float64)
             limited = low.bool()

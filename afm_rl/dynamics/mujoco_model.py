@@ -145,16 +145,7 @@ def _parse(source: str | Path) -> Any:
         raise ConfigurationError(f"dynamics.model={text[:80]!r}: {reason}") from error
 
 
-NAMED = re.compile(rb"\b(file\w*|value|assetdir|meshdir|texturedir)\s*=\s*([\"'])")
-"""Attributes that name files or folders; plugins have a ``value``."""
-PACKED = re.compile(r"\.(zip|mjz|mjb)(/|$)", re.IGNORECASE)
-LETTER = re.compile(r"&(?:#x([0-9a-fA-F]{1,6})|#([0-9]{1,7})|(amp|lt|gt|quot|apos));")
-WORDS = {"amp": "&", "lt": "<", "gt": ">", "quot": '"', "apos": "'"}
-LARGEST = 1 << 31  # bytes of a file; MuJoCo reads no larger ones
-MOST = 300_000  # files that one model may name
-
-
-def check_files(place: str, source: str, trusted: Sequence[str] = ()) -> None:
+def check_files(place: str, source: str, trusted: Sequence[str] = (), most: int = 300_000) -> None:
     """Refuse an MJCF of others that may read files outside its folder, and outside trusted ones.
 
     Every value that could name a file counts, also in a comment, in each folder that is named; so
@@ -165,6 +156,7 @@ def check_files(place: str, source: str, trusted: Sequence[str] = ()) -> None:
         place: name of the setting.
         source: path of a file, or text that begins with ``<``; nothing else is looked at.
         trusted: folders.
+        most: files that one model may name.
 
     Raises:
         ConfigurationError: naming the file; also for archives, pipes and devices.
@@ -193,8 +185,9 @@ there, or say that you trust its folder, on the command line: trust=[/etc]
         if len(bases) + len(middles) + len(names) == known:
             continue  # as it is after most meshes
         known = len(bases) + len(middles) + len(names)
-        packed = next(filter(PACKED.search, names), None)
-        if packed or len(bases) * len(middles) * len(names) > MOST:
+        archives = re.compile(r"\.(zip|mjz|mjb)(/|$)", re.IGNORECASE)
+        packed = next(filter(archives.search, names), None)
+        if packed or len(bases) * len(middles) * len(names) > most:
             reason = f"{printable(packed)}, which is packed" if packed else "too many files"
             raise ConfigurationError(f"{place}: may read {reason}; expected plain files, and few")
         joined = {os.path.join(*parts) for parts in product(bases, middles, names)}
@@ -229,19 +222,22 @@ def _named(source: str | bytes) -> Iterator[tuple[str, str]]:
     [('file', 'a.xml'), ('file', 'a.xml')]
     """
     text = source
-    if isinstance(text, str):
-        text = Path(text).read_bytes() if os.path.getsize(text) < LARGEST else b""
-    for match in NAMED.finditer(text):
+    if isinstance(text, str):  # MuJoCo reads no larger files
+        text = Path(text).read_bytes() if os.path.getsize(text) < 1 << 31 else b""
+    # Plugins have a "value".
+    names = rb"\b(file\w*|value|assetdir|meshdir|texturedir)\s*=\s*([\"'])"
+    letters = re.compile(r"&(?:#x([0-9a-fA-F]{1,6})|#([0-9]{1,7})|(amp|lt|gt|quot|apos));")
+    for match in re.finditer(names, text):
         end = text.find(match[2], match.end())
         if end > 0:
-            value = LETTER.sub(_letter, os.fsdecode(text[match.end() : end]))
+            value = letters.sub(_letter, os.fsdecode(text[match.end() : end]))
             yield from ((match[1].decode(), v) for v in (value, value.replace("\\", "/")))
 
 
 def _letter(match: re.Match[str]) -> str:
     hexadecimal, decimal, word = match.groups()
     if word:
-        return WORDS[word]
+        return {"amp": "&", "lt": "<", "gt": ">", "quot": '"', "apos": "'"}[word]
     code = int(hexadecimal, 16) if hexadecimal else int(decimal)
     return chr(code) if code < 0x110000 else match[0]
 
@@ -290,9 +286,6 @@ def actuator_names(model: Any) -> list[str]:
     return names
 
 
-NAMES = Physics.names
-
-
 def changed_model(model: Any, row: tuple[float, ...]) -> Any:
     """Return a copy of an ``MjModel`` with other physics, a row of :attr:`Physics.names`.
 
@@ -303,33 +296,37 @@ def changed_model(model: Any, row: tuple[float, ...]) -> Any:
     """
     import mujoco
 
-    value = dict(zip(NAMES, row, strict=True))
-    found = copy.copy(model)
+    value = dict(zip(Physics.names, row, strict=True))
+    changed = copy.copy(model)
     heaviest = int(model.body_mass[1:].argmax()) + 1
     load = value["payload"] * model.body_mass[1:].sum() / model.body_mass[heaviest]
-    found.body_mass[:] *= value["mass"]
-    found.body_inertia[:] *= value["mass"]
-    found.body_mass[heaviest] *= 1 + load
-    for part in (found.geom_friction[:, 0], found.pair_friction[:, :2], found.dof_frictionloss):
+    changed.body_mass[:] *= value["mass"]
+    changed.body_inertia[:] *= value["mass"]
+    changed.body_mass[heaviest] *= 1 + load
+    for part in (
+        changed.geom_friction[:, 0],
+        changed.pair_friction[:, :2],
+        changed.dof_frictionloss,
+    ):
         part[:] *= value["friction"]
-    for part in (found.dof_damping, found.tendon_damping):
+    for part in (changed.dof_damping, changed.tendon_damping):
         part[:] *= value["damping"]
-    found.opt.gravity[:] *= value["gravity"]
-    found.opt.gravity[:2] += value["wind_x"], value["wind_y"]
+    changed.opt.gravity[:] *= value["gravity"]
+    changed.opt.gravity[:2] += value["wind_x"], value["wind_y"]
     links = _links(model)
     below = [body for body in range(1, model.nbody) if model.body_parentid[body] in links]
     geoms = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] in links]
     sites = [site for site in range(model.nsite) if model.site_bodyid[site] in links]
-    found.body_pos[below] *= value["length"]
-    found.body_ipos[links] *= value["length"]
-    found.body_inertia[links] *= value["length"] ** 2
-    found.geom_pos[geoms] *= value["length"]
-    found.site_pos[sites] *= value["length"]
+    changed.body_pos[below] *= value["length"]
+    changed.body_ipos[links] *= value["length"]
+    changed.body_inertia[links] *= value["length"] ** 2
+    changed.geom_pos[geoms] *= value["length"]
+    changed.site_pos[sites] *= value["length"]
     long = [geom for geom in geoms if model.geom_type[geom] in (3, 5)]  # capsules and cylinders
-    found.geom_size[long, 1] *= value["length"]  # half of it
-    found.tendon_range[:] *= value["length"]
-    mujoco.mj_setConst(found, mujoco.MjData(found))
-    return found
+    changed.geom_size[long, 1] *= value["length"]  # half of it
+    changed.tendon_range[:] *= value["length"]
+    mujoco.mj_setConst(changed, mujoco.MjData(changed))
+    return changed
 
 
 def _links(model: Any) -> list[int]:

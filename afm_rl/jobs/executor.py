@@ -53,9 +53,9 @@ class Board:
         line = f"[{self.done}/{self.count}] {job}: "
         line += f"failed: {failure}" if failure else "done"
         with suppress(OSError):
-            told = [] if failure else (job.folder / LOG).read_text().splitlines()
-            line = "\n".join([line, *(f"  {text}" for text in told if text not in self.told)])
-            self.told.update(told)
+            output = [] if failure else (job.folder / LOG).read_text().splitlines()
+            line = "\n".join([line, *(f"  {text}" for text in output if text not in self.told)])
+            self.told.update(output)
         (Bar.write if self.whole.live and not self.whole.disable else self.echo)(line)
 
     def look(self) -> None:
@@ -81,14 +81,16 @@ class Board:
     def _state(self, job: Job) -> tuple[str, float]:
         """Return what a job that runs says of itself; "" if it has not begun."""
         try:
-            told = json.loads((job.folder / UNFINISHED / PROGRESS).read_text())
-            return str(told["line"]), float(told["share"])
+            progress = json.loads((job.folder / UNFINISHED / PROGRESS).read_text())
+            return str(progress["line"]), float(progress["share"])
         except (OSError, ValueError):
             return "", 0.0
 
 
 class JobsFailed(AFMError):
     """Some jobs have no results."""
+
+    status = 1  # of the command
 
 
 class Executor(ABC):

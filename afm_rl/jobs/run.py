@@ -35,7 +35,6 @@ from afm_rl.storage.manifest import (
 
 READY = "ready"  # the folder of new results, inside that of unfinished ones
 SHOWN = ("diagnosis", "figures", "video", "tensorboard")  # folders drawn from the results
-FILES = (CONFIG, MISSIONS, STEPS, COMPUTE, measures.FILE)
 
 
 def needs_run(folder: Path, cfg: DictConfig, overwrite: bool = False) -> bool:
@@ -59,7 +58,8 @@ def needs_run(folder: Path, cfg: DictConfig, overwrite: bool = False) -> bool:
         _check_same(folder / CONFIG, cfg, read_manifest(folder)["version"])
         return False
     else:  # a run replaces all of these, so they must be those of a run
-        held = [name for name in (*FILES, *SHOWN) if (folder / name).exists()]
+        files = (CONFIG, MISSIONS, STEPS, COMPUTE, measures.FILE, *SHOWN)
+        held = [name for name in files if (folder / name).exists()]
         if held:
             raise ConfigurationError(
                 f"hydra.run.dir={folder}: holds {', '.join(held)} without {MANIFEST}; choose "

@@ -63,10 +63,10 @@ def decompose_error(
     (tensor([-0.5000, -0.2000]), tensor([ 0., 10.,  0.]))
     """
     half_range = half_range.to(action)
-    found = effective_action(model, state, action, next_state, half_range, quiet=-1.0)
-    ahead, noise = model.forecast(state, found.action)
+    best = effective_action(model, state, action, next_state, half_range, quiet=-1.0)
+    ahead, noise = model.forecast(state, best.action)
     error = model.manifold.difference(next_state, ahead) / noise
-    jacobian = (model.jacobian(state, found.action) * half_range / noise.unsqueeze(-1)).double()
+    jacobian = (model.jacobian(state, best.action) * half_range / noise.unsqueeze(-1)).double()
     gram = jacobian.mT @ jacobian
     ridge = 1e-6 * gram.diagonal(dim1=-2, dim2=-1).mean(-1).clamp_min(1e-12)
     gram.diagonal(dim1=-2, dim2=-1).add_(ridge.unsqueeze(-1))
@@ -75,8 +75,8 @@ def decompose_error(
     eye = torch.eye(noise.shape[-1], device=noise.device, dtype=matched.dtype)
     projection = (eye - matched).to(error)
     unmatched = (projection @ error.unsqueeze(-1)).squeeze(-1)
-    weight = (half_range / found.std).square()
-    effective = found.action / half_range
+    weight = (half_range / best.std).square()
+    effective = best.action / half_range
     if model.affine:  # exact but for the prior: undo its small pull towards the executed action
         effective = effective + (inverse @ error.unsqueeze(-1).double()).squeeze(-1).to(action)
     return ErrorParts(effective, weight, unmatched, projection, noise)

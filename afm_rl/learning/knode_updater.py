@@ -134,7 +134,7 @@ class KNODEUpdater(Learner):
         sound = super()._sound(tensordict)
         return sound if trace is None else sound & whole(trace).all(-1)
 
-    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+    def _learn(self, terms: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Gather rows; train and push a network when it is time."""
         rows = self._rows(transitions, learn)
         each = rows.counts.shape[-1]

@@ -58,20 +58,20 @@ class OnlineUpdater(Learner):
 
     def follow(self) -> None:
         """Forget the missions that have left the model, in the optimiser too."""
-        known, left = self.readings.missions, getattr(self.loss.model, "missions", None)
+        known, remaining = self.readings.missions, getattr(self.loss.model, "missions", None)
         super().follow()
-        if left is None or not known.dim() or self.readings.missions is known:
+        if remaining is None or not known.dim() or self.readings.missions is known:
             return
-        index = (left.unsqueeze(-1) == known).int().argmax(-1)
+        index = (remaining.unsqueeze(-1) == known).int().argmax(-1)
         for parameter, state in self.optimizer.state.items():
             for name, value in state.items():
                 if isinstance(value, Tensor) and value.shape == (len(known), *parameter.shape[1:]):
                     state[name] = value[index]
 
-    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+    def _learn(self, terms: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Take one step."""
         self.optimizer.zero_grad(set_to_none=True)
-        torch.where(learn, found["loss"], 0.0).sum().backward()
+        torch.where(learn, terms["loss"], 0.0).sum().backward()
         self.optimizer.step()
 
 
@@ -134,16 +134,16 @@ class StreamXUpdater(OnlineUpdater):
         target = self.loss.target(state, next_state).unsqueeze(-2)
         mean, log_variance = model.moments(state, action)
         loss = gaussian_nll(mean, log_variance, target).mean((-2, -1))
-        found = {"loss": loss, "error": target - mean, "log_variance": log_variance}
-        return {**found, "state": state, "action": action}
+        terms = {"loss": loss, "error": target - mean, "log_variance": log_variance}
+        return {**terms, "state": state, "action": action}
 
-    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+    def _learn(self, terms: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Take one step, or one for the mean and one for the log-variance."""
         model, optimizer = cast(Ensemble, self.loss.model), self.optimizer
         optimizer.param_groups[0]["lead_dims"] = len(model.lead) + 1
-        error = found["error"]
+        error = terms["error"]
         residual = error.detach() if self.form == "error" else error
-        likelihood = gaussian_nll(residual, found["log_variance"], torch.zeros_like(residual))
+        likelihood = gaussian_nll(residual, terms["log_variance"], torch.zeros_like(residual))
         spread = self._per_learner(likelihood.mean(-1), learn).sum()
         optimizer.zero_grad(set_to_none=True)
         if self.form == "error":
@@ -158,7 +158,7 @@ class StreamXUpdater(OnlineUpdater):
         else:
             spread.backward()
         optimizer.step()
-        model.observe_(found["state"], found["action"], learn)
+        model.observe_(terms["state"], terms["action"], learn)
 
     def _per_learner(self, values: Tensor, learn: Tensor) -> Tensor:
         """Average ``(*L, *N, E)`` over the transitions to learn from: ``(*L, E)``."""

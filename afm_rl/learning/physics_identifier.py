@@ -136,7 +136,7 @@ class PhysicsIdentifier(Learner):
         chosen = self.candidates[self.belief.parts.chosen]
         self.model.set_physics(chosen.reshape(*self.model.lead, -1))
 
-    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+    def _learn(self, terms: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Judge the candidates by the transitions that the present physics do not explain."""
         misfit, chosen = self.belief.parts
         rows = learn.flatten().nonzero().squeeze(-1)

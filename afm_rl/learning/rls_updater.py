@@ -193,7 +193,7 @@ class RLSUpdater(Learner):
         self.matched.keep(no_fit(missions, size, size + 1, device))
         self.unmatched.keep(no_fit(missions, 1, self.model.manifold.tangent_size, device))
 
-    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+    def _learn(self, terms: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Learn from transitions ``(*L, *N)``, where ``learn`` says so."""
         model, lead = self.model, self.model.lead
         valid = learn.reshape(math.prod(lead), -1)

@@ -158,21 +158,21 @@ class Learner(Updater, ABC):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.follow()
         batch = tensordict.batch_size
-        kept = tensordict.select(*self.loss.in_keys).detach()
+        transitions = tensordict.select(*self.loss.in_keys).detach()
         sound = self._sound(tensordict)
         with torch.set_grad_enabled(self.by_gradient):
-            found = self._measure(self._without(kept, sound))
-            fine = sound & found["loss"].isfinite()
+            terms = self._measure(self._without(transitions, sound))
+            fine = sound & terms["loss"].isfinite()
             if not bool(fine.all()):
                 self.refused += int((~fine).sum())
                 if not torch.equal(fine, sound):  # sound entries may still overflow
                     sound = fine
-                    found = self._measure(self._without(kept, sound))
+                    terms = self._measure(self._without(transitions, sound))
             learn = sound
             if self.mask_key is not None:
                 learn = sound & tensordict.get(self.mask_key).reshape(batch)
-            self._learn(found, tensordict, learn)
-        return TensorDict({"loss": torch.where(sound, found["loss"].detach(), torch.nan)}, batch)
+            self._learn(terms, tensordict, learn)
+        return TensorDict({"loss": torch.where(sound, terms["loss"].detach(), torch.nan)}, batch)
 
     def _sound(self, tensordict: TensorDictBase) -> Tensor:
         """Return which transitions are sound ``(*B)``; count repeats if no guard does."""
@@ -192,14 +192,14 @@ class Learner(Updater, ABC):
         return {"loss": self.loss(transitions)["loss_nll"]}
 
     @abstractmethod
-    def _learn(self, found: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
+    def _learn(self, terms: dict[str, Tensor], transitions: TensorDictBase, learn: Tensor) -> None:
         """Learn from transitions where ``learn`` ``(*B)`` says so; elsewhere they may be faulty."""
 
-    def _without(self, kept: TensorDictBase, sound: Tensor) -> TensorDictBase:
+    def _without(self, transitions: TensorDictBase, sound: Tensor) -> TensorDictBase:
         """Blank what is not sound before the loss: NaN times zero is NaN."""
-        blanked = kept.copy()
+        blanked = transitions.copy()
         for key in self.loss.in_keys:
-            blanked.set(key, torch.where(sound.unsqueeze(-1), kept.get(key), 0.0))
+            blanked.set(key, torch.where(sound.unsqueeze(-1), transitions.get(key), 0.0))
         return blanked
 
 

@@ -257,14 +257,14 @@ def prepare(
         description = {"name": part.title, "version": __version__, "settings": part.settings}
         description.update(getattr(part.module, "signature", {}))
         start = time.perf_counter()
-        known, found = cached(folder, part.module, description, partial(part.train, progress))
-        spent = "from the cache" if found else f"trained in {time.perf_counter() - start:.0f} s"
-        known = known if isinstance(known, Mapping) else {"error": known}
-        echo(f"{part.title}: held-out error {known['error']:.4f} {part.unit} ({spent})")
-        if "rms" in known:
-            pairs = zip(known["names"], known["rms"], strict=True)
+        report, hit = cached(folder, part.module, description, partial(part.train, progress))
+        spent = "from the cache" if hit else f"trained in {time.perf_counter() - start:.0f} s"
+        report = report if isinstance(report, Mapping) else {"error": report}
+        echo(f"{part.title}: held-out error {report['error']:.4f} {part.unit} ({spent})")
+        if "rms" in report:
+            pairs = zip(report["names"], report["rms"], strict=True)
             each = ", ".join(f"{name} {error:.2g}" for name, error in pairs)
             echo(f"{part.title}: root mean square error of a step: {each}")
-        if "rewards" in known:
-            rewards = ", ".join(f"{reward:.3g}" for reward in known["rewards"])
+        if "rewards" in report:
+            rewards = ", ".join(f"{reward:.3g}" for reward in report["rewards"])
             echo(f"{part.title}: reward per step of each round of data, random first: {rewards}")

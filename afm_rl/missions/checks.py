@@ -95,10 +95,10 @@ def check_cost(cost: Cost, env: EnvBase, stages: int | None = None) -> None:
     """
     spec = env.observation_spec
     for key, size in zip(cost.in_keys, cost.in_sizes, strict=True):
-        found = spec[key].shape[-1] if key in spec.keys(True, True) else "nothing"
-        if found != size:
+        given = spec[key].shape[-1] if key in spec.keys(True, True) else "nothing"
+        if given != size:
             raise ConfigurationError(
-                f"cost: reads {size} numbers from {key!r}, but the environment gives {found} there"
+                f"cost: reads {size} numbers from {key!r}, but the environment gives {given} there"
             )
         batch = env.observation_spec.shape
         rows = spec[key].shape[len(batch) : -1]

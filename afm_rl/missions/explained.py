@@ -51,13 +51,13 @@ def effective_log(
             f"{known.sum()} of {len(rows)} steps show what an action did: expected at least "
             f"{FEWEST}; is the model right?"
         )
-    kept = rows[known]
+    used = rows[known]
     return Log(
         names=names,
-        command=actions[kept],
+        command=actions[used],
         response=seen.action.double().numpy()[known],
-        t=kept.astype(float) if t is None else t[kept],
-        episode=border[kept],
+        t=used.astype(float) if t is None else t[used],
+        episode=border[used],
         computed=True,
         notes=("responses are effective actions, through the model of the healthy robot",),
     )
@@ -86,18 +86,18 @@ def explain_mission(
         raise ConfigurationError("steps that are not finite show nothing of the actuators")
     t = steps["t"].to_numpy(dtype=float) * (robot.dt or 1.0)
     log = effective_log(robot.model, tuple(robot.action_names), states, actions, t)
-    found = diagnose(log, Settings(shared=None))  # a delay is no part of the robot's model
+    diagnosis = diagnose(log, Settings(shared=None))  # a delay is no part of the robot's model
     if late is None:
-        return found, log
+        return diagnosis, log
     rows = np.searchsorted(t, log.seconds)
     planned = steps[[f"planned_{name}" for name in robot.action_names]].to_numpy(dtype=float)
     actuators = tuple(
         replace(actuator, made_up=True, sentence=f"{actuator.sentence}; made up for")
         if _made_up(actuator, planned[:, j], log.response[:, j], rows, log, late)
         else actuator
-        for j, actuator in enumerate(found.actuators)
+        for j, actuator in enumerate(diagnosis.actuators)
     )
-    return replace(found, actuators=actuators), log
+    return replace(diagnosis, actuators=actuators), log
 
 
 def planned_for(agent: Agent) -> int | None:

@@ -63,11 +63,11 @@ class Part(NamedTuple):
     """What its predictions before the missions depend on; None: on the nominal physics alone."""
 
 
-def as_part(group: str, found: Any, kind: type) -> Part:
+def as_part(group: str, made: Any, kind: type) -> Part:
     """Return what a maker gave as a part: a bare module needs no training."""
-    if isinstance(found, Part):
-        return found
-    return Part(check_instance(f"{group}: its maker", found, kind))
+    if isinstance(made, Part):
+        return made
+    return Part(check_instance(f"{group}: its maker", made, kind))
 
 
 def physics(robot: Robot) -> DynamicsModel:

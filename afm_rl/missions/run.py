@@ -77,8 +77,8 @@ def run(
     """
     with torch.random.fork_rng(devices=[]):  # policies that explore draw from the global one
         torch.manual_seed(0)
-        kept = None if checkpoint is None else Checkpoints(checkpoint, owner(agent), every, keep)
-        return _run(agent, progress, kept, stopped)
+        store = None if checkpoint is None else Checkpoints(checkpoint, owner(agent), every, keep)
+        return _run(agent, progress, store, stopped)
 
 
 def _run(

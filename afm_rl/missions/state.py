@@ -74,10 +74,6 @@ class StepLog:
         )
 
 
-PLAIN = (bool, int, float, str, type(None))
-TORCH = frozenset(vars(nn.Module()))  # attributes that every module has
-
-
 def whole(agent: Agent) -> nn.ModuleDict:
     """Return all modules of an agent as one; a module that is shared has one name."""
     parts = {"model": agent.model, "env": agent.env}
@@ -133,13 +129,18 @@ def restore(agent: Agent, loop: Loop, state: dict[str, Any]) -> None:
 
 def _holders(agent: Agent) -> Iterator[tuple[str, Callable[[], Any], Callable[[Any], Any]]]:
     """Yield all of an agent that has a state: its name, how it is read, and how it is written."""
+    common = vars(nn.Module())  # attributes that every module has
     for path, module in whole(agent).named_modules():
-        own = [(name, value) for name, value in vars(module).items() if name not in TORCH]
+        own = [(name, value) for name, value in vars(module).items() if name not in common]
         # An optimiser knows the parameters: only their data may change.
         places: list[tuple[str, Any, str]] = [
             *((name, p, "data") for name, p in module._parameters.items() if p is not None),
             *((name, module, name) for name in module._buffers),
-            *((name, module, name) for name, value in own if isinstance(value, PLAIN)),
+            *(
+                (name, module, name)
+                for name, value in own
+                if isinstance(value, bool | int | float | str | None)
+            ),
         ]
         for name, owner, leaf in places:
             write = partial(_set, agent.device, owner, leaf)

@@ -14,8 +14,6 @@ from afm_rl.missions.scores import ReturnScore
 from afm_rl.regimes import Compose, Physics, Regime, Schedule, actuator_regimes
 from afm_rl.trust import find_code
 
-"""Settings that may name a function."""
-
 
 class TaskRobot(Robot):
     """A robot of which a task says everything.
@@ -56,8 +54,8 @@ class TaskRobot(Robot):
         code = {
             key: settings[key] for key in ("reward", "step") if isinstance(settings.get(key), str)
         }
-        found = {key: find_code(f"robot.{key}", name) for key, name in code.items()}
-        task = source(**{**settings, **found})
+        functions = {key: find_code(f"robot.{key}", name) for key, name in code.items()}
+        task = source(**{**settings, **functions})
         model = copy.deepcopy(task.world) if model is None else model
         sizes = model.state_size, model.action_size
         wanted = len(task.state_names), len(task.low)

@@ -15,13 +15,6 @@ from afm_rl.options import option, options
 from afm_rl.planning.receding import SamplingPlanner, action_spec_of, moments
 from afm_rl.spaces.keys import as_key
 
-WITHOUT_NOISE = (
-    ExplorationType.DETERMINISTIC,
-    ExplorationType.MEAN,
-    ExplorationType.MODE,
-    ExplorationType.MEDIAN,
-)
-
 
 def coloured(noise: Tensor, beta: float) -> Tensor:
     r"""Colour white noise ``(*B, H, A)`` in time: spectrum :math:`\propto f^{-\beta}`, variance 1.
@@ -178,5 +171,5 @@ class ICEM(SamplingPlanner):
             few = torch.where(finite[..., None, None], chosen, best.unsqueeze(-3))
             few = few[..., : self.kept, :, :]
             elites, found = torch.where(here.unsqueeze(-3), few, elites), found | sound
-        plan = mean if exploration_type() in WITHOUT_NOISE else best
+        plan = best if exploration_type() in (None, ExplorationType.RANDOM) else mean
         return plan[..., 0, :], [mean, elites]

@@ -19,17 +19,6 @@ from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.planning.policies import StoredPolicy
 from afm_rl.storage.torch_files import LARGEST, OPERATIONS, BoundedZip, read_saved
 
-SETTINGS = 2**21  # bytes of a model's JSON
-
-# How the weights of an actor are called, hidden layers and last one; its usual activation; and
-# whether a tanh ends it.
-ACTORS = (
-    (("actor.latent_pi.", "actor.mu."), ("actor.mu.",), "relu", True),  # SAC, TQC, TD3, DDPG
-    (("mlp_extractor.shared_net.", "mlp_extractor.policy_net."), ("action_net.",), "tanh", False),
-    (("fc1.", "fc2."), ("fc_mean.", "fc_mu."), "relu", True),  # CleanRL's SAC, TD3, DDPG
-    (("actor_mean.",), ("actor_mean.",), "tanh", False),  # CleanRL's PPO
-)
-
 
 def policy_from_sb3(file: str | Path, normaliser: str | Path | None = None) -> StoredPolicy:
     """Return the deterministic policy of a model that Stable-Baselines3 saved.
@@ -49,7 +38,7 @@ def policy_from_sb3(file: str | Path, normaliser: str | Path | None = None) -> S
     content = _content(file)
     try:
         archive = BoundedZip(content)
-        data, weights = json.loads(archive.take("data", SETTINGS)), archive.take("policy.pth")
+        data, weights = json.loads(archive.take("data", 2**21)), archive.take("policy.pth")
         low, high = (_numbers(data["action_space"][end]) for end in ("low", "high"))
         chosen = dict(data.get("policy_kwargs") or {})
         limit = float(chosen.get("clip_mean", 2.0))
@@ -156,7 +145,16 @@ def _policy(
     state: Mapping[str, Tensor], low: Tensor, high: Tensor, about: dict[str, Any], file: str | Path
 ) -> StoredPolicy:
     names, own = [name for name in state if name.endswith(".weight")], []
-    for hidden, last, *usual in ACTORS:
+    # How the weights of an actor are called, hidden layers and last one; its usual activation; and
+    # whether a tanh ends it.
+    shared = ("mlp_extractor.shared_net.", "mlp_extractor.policy_net.")
+    actors = (
+        (("actor.latent_pi.", "actor.mu."), ("actor.mu.",), "relu", True),  # SAC, TQC, TD3, DDPG
+        (shared, ("action_net.",), "tanh", False),
+        (("fc1.", "fc2."), ("fc_mean.", "fc_mu."), "relu", True),  # CleanRL's SAC, TD3, DDPG
+        (("actor_mean.",), ("actor_mean.",), "tanh", False),  # CleanRL's PPO
+    )
+    for hidden, last, *usual in actors:
         if any(name.startswith(last) for name in names):
             own = [name for name in names if name.startswith(hidden + last)]
             about = {**dict(zip(("activation", "squash"), usual, strict=True)), **about}

@@ -13,9 +13,6 @@ from afm_rl.options import option, options
 from afm_rl.regimes.base import MOST, HalfRange, Regime, check_span, draw_between
 from afm_rl.regimes.gains import MOST_GAIN, divide
 
-END = (2 * math.sqrt(2) / 3 - 1) / 2  # makes the starting point of `rising_load` exact at r = 0
-NEAR = 0.05  # so near to the peak the starting point is better than a step, which divides by zero
-
 
 class WheelSlip(Regime):
     r"""Traction that peaks at a command c with the value m, the same on all axes.
@@ -82,9 +79,9 @@ def rising_load(share: Tensor) -> Tensor:
     tensor([0.0000, 0.5000, 1.0000])
     """
     p = (2 - 2 * share).sqrt()
-    q = p / (1 + p * (1 / 3 + END * p))
+    q = p / (1 + p * (1 / 3 + (2 * math.sqrt(2) / 3 - 1) / 2 * p))  # q = 1 at r = 0
     k = share * (-q).exp()
-    return torch.where(q > NEAR, k * q / (1 - k), 1 - q)
+    return torch.where(q > 0.05, k * q / (1 - k), 1 - q)  # a step near the peak divides by zero
 
 
 class Patches(Regime):

@@ -17,9 +17,6 @@ from afm_rl.errors import ConfigurationError
 if TYPE_CHECKING:
     import pandas as pd
 
-_FORMULA = re.compile(r"[=+\-@\t\r]")  # how a formula begins
-_QUOTED = re.compile(r"'(?=[=+\-@\t\r])")
-
 
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file so that readers see the old content or the new, never a part.
@@ -116,11 +113,11 @@ def plain_text(text: object) -> object:
     >>> plain_text("'=1+1"), plain_text("'tis")
     ('=1+1', "'tis")
     """
-    return text[1:] if isinstance(text, str) and _QUOTED.match(text) else text
+    return text[1:] if isinstance(text, str) and re.match(r"'[=+\-@\t\r]", text) else text
 
 
 def _quote(cell: object) -> object:
-    if not isinstance(cell, str) or not _FORMULA.match(cell):
+    if not isinstance(cell, str) or not re.match(r"[=+\-@\t\r]", cell):  # how a formula begins
         return cell
     try:
         float(cell)

@@ -16,11 +16,6 @@ MANIFEST, CONFIG, UNFINISHED = "manifest.json", "config.yaml", "unfinished"
 MISSIONS, STEPS, COMPUTE = "missions.csv", "steps.parquet", "compute.csv"
 JOBS, RECORD = "jobs", "jobs.yaml"
 _REMEDY = "restore it, or delete the folder and run the same command again"
-WITHOUT_INFLUENCE = (
-    *("progress", "figures", "video", "tensorboard", "overwrite", "cache", "threads", "device"),
-    *("compile", "compare", "study", "label", "trust", "checkpoints"),
-)
-"""Settings that change how a run is done, shown or called, but not its results."""
 
 
 def write_manifest(folder: str | Path, names: Iterable[str | Path] | None = None) -> None:
@@ -158,7 +153,9 @@ def influential(settings: Mapping[str, Any]) -> dict[str, Any]:
     >>> influential({"budget": 5, "progress": True})
     {'budget': 5}
     """
-    kept = {name: value for name, value in settings.items() if name not in WITHOUT_INFLUENCE}
+    shown = ("progress", "figures", "video", "tensorboard", "label", "compare", "study", "trust")
+    done = ("overwrite", "cache", "threads", "device", "compile", "checkpoints")
+    kept = {name: value for name, value in settings.items() if name not in (*shown, *done)}
     return json.loads(json.dumps(_without(kept, ("cache", "compile"))))
 
 

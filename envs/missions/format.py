@@ -201,7 +201,9 @@ class MissionNoise:
     """
 
     def __init__(self, kinds: Mapping[str, tuple[int, int]] | None = None) -> None:
-        kinds = UGV_NOISE if kinds is None else kinds
+        if kinds is None:  # those of a ground robot
+            kinds = {"start": (0x55475653, 3), "process": (0x55475650, 3)}
+            kinds |= {"actuator": (0x55475641, 2)}
         self.sizes = {name: size for name, (_, size) in kinds.items()}
         self.streams = {name: Streams(salt=salt) for name, (salt, _) in kinds.items()}
 
@@ -239,9 +241,6 @@ class MissionNoise:
     def load_state_dict(self, state: dict[str, dict[str, Tensor]]) -> None:
         for name, stream in self.streams.items():
             stream.load_state_dict(state[name])
-
-
-UGV_NOISE = {"start": (0x55475653, 3), "process": (0x55475650, 3), "actuator": (0x55475641, 2)}
 
 
 def flight_noise(between: int) -> MissionNoise:

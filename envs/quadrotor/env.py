@@ -29,8 +29,6 @@ from afm_rl.options import choice, option, options
 from afm_rl.regimes import Regime, Schedule, flight_regimes
 from afm_rl.spaces.airframe import QuadrotorBody
 
-ACTIONS = ("thrust (N)", "moment_x (N m)", "moment_y (N m)", "moment_z (N m)")
-
 
 class CrazyflieTrack(MissionEnv):
     r"""Quadrotors that follow position references, tick by tick, batched.
@@ -159,7 +157,8 @@ class CrazyflieTrack(MissionEnv):
         )
         pairs = zip((action_low, action_high), self.body.bounds, strict=True)
         low, high = (most if given is None else given for given, most in pairs)
-        self._complete(names, check_bounds(low, high, ACTIONS))
+        actions = ("thrust (N)", *(f"moment_{axis} (N m)" for axis in "xyz"))
+        self._complete(names, check_bounds(low, high, actions))
 
     def mission(
         self, *args: Any, times: Sequence[float] | None = None, **entries: Any

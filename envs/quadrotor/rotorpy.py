@@ -26,14 +26,6 @@ try:
 except ImportError:  # an extra
     quad_params = None
 
-CHANGES = (
-    MotorEfficiency,
-    Payload,
-    MassFactor,
-    InertiaFactor,
-    Wind,
-)  # of the plant, not the action
-
 
 def rotorpy_crazyflie() -> QuadrotorBody:
     """Return the Crazyflie of RotorPy, as far as our model knows one.
@@ -101,7 +93,7 @@ class RotorPySimulation(QuadrotorSimulation):
     def _split(self, parameters: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the parameters without changes of the plant, and these by the family's name."""
         names, left, changes = self.regime.names, parameters.clone(), {}
-        for family in CHANGES:
+        for family in (MotorEfficiency, Payload, MassFactor, InertiaFactor, Wind):
             nominal = parameters.new_tensor(family.identity)
             changes[family.__name__] = nominal.expand(*parameters.shape[:-1], -1)
             if set(family.names) <= set(names):

@@ -120,9 +120,6 @@ def _wrapped(pose: Tensor) -> Tensor:
     return torch.cat([pose[..., :2], wrap_angle(pose[..., 2:3]), pose[..., 3:]], -1)
 
 
-ACTIONS = ("v (m/s)", "omega (rad/s)")
-
-
 class UGVTrack(MissionEnv):
     r"""Dubins robots that drive along tracks, waypoint by waypoint, batched.
 
@@ -212,7 +209,7 @@ class UGVTrack(MissionEnv):
         names = [track.name for track in self.tracks]
         check_names("tracks", names)
         self.process_noise, self.noise = process_noise, MissionNoise()
-        bounds = check_bounds(action_low, action_high, ACTIONS)
+        bounds = check_bounds(action_low, action_high, ("v (m/s)", "omega (rad/s)"))
         schedule = Schedule() if schedule is None else schedule
         world = Dubins(dt) if world is None else world
         self.simulation = UGVSimulation(

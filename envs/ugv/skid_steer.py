@@ -13,7 +13,6 @@ from afm_rl.regimes import Physics
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 RADIUS = 0.098  # m, of a wheel
-WIDTH = 0.9  # m, distance of wheels on an axle that would turn like this without skidding
 STEP = 0.01  # s, of the simulation
 
 
@@ -24,6 +23,7 @@ def skid_steer(
         (2e-3, 2e-2), "how far the model is trusted per step, positions and velocities", gt=0
     ),
     threads: int = option(0, "that simulate beside the calling one", ge=0),
+    width: float = option(0.9, "of an axle that would turn like this without skidding, m", gt=0),
 ) -> MuJoCoDynamics:
     r"""Return a small robot with four wheels; actions are v (m/s) and omega (rad/s).
 
@@ -39,7 +39,7 @@ def skid_steer(
     tensor(True)
     """
     skip = round(dt / STEP)
-    turn = WIDTH / 2 / RADIUS
+    turn = width / 2 / RADIUS
     mix = [[1 / RADIUS, -turn], [1 / RADIUS, turn]] * 2
     return MuJoCoDynamics(
         Path(__file__).with_name("skid_steer.xml"),

@@ -15,12 +15,13 @@ from xml.etree import ElementTree
 from actuator_inversion.contexts import Span, body_regime, contexts_of
 from actuator_inversion.toys import SIGNS, TOYS
 from afm_rl.dynamics import KnownDynamics
-from afm_rl.dynamics.mujoco_model import NAMES, changed_model
+from afm_rl.dynamics.mujoco_model import changed_model
 from afm_rl.envs import dm_control_task
 from afm_rl.envs.task.own import Limits
 from afm_rl.envs.task.published import quiet
 from afm_rl.envs.task.task import Reward, Task, bound_noise
 from afm_rl.errors import check_choice, check_count
+from afm_rl.regimes import Physics
 
 LEGS = ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
 LOWER = ("bshin", "bfoot", "fshin", "ffoot")
@@ -39,7 +40,7 @@ def stretched(domain: str, model: Any, row: tuple[float, ...]) -> Any:
     import mujoco
     from dm_control.suite import common
 
-    value = dict(zip(NAMES, row, strict=True))
+    value = dict(zip(Physics.names, row, strict=True))
     root = ElementTree.fromstring(common.read_model(f"{domain}.xml"))
     for element, attribute, index in EDITS[domain](root):
         numbers = [float(word) for word in element.get(attribute).split()]
