@@ -11,10 +11,12 @@
                                                    state.NAME; the responses are the actions that
                                                    explain the states
   afm-rl-diagnose log.csv --model mine.step --trust mine
+  afm-rl-diagnose log.csv --calibration arm.json   numbers per joint, and what would undo them
+  afm-rl-diagnose log.csv --fail-on changed,dead   exit status 1 if an actuator is one of these
 
 Per actuator: gain with its 95 % interval, reversed, offset, dead zone, saturation, backlash, delay,
 lag, which other command drives it, noise; what changed on the way, and when. An actuator is
-healthy, changed, dead, or the log cannot tell.
+healthy, changed, dead, or the log cannot tell. Exit status: 0; 1 by --fail-on; 2 for a mistake.
 """
 
 from __future__ import annotations
@@ -26,7 +28,10 @@ from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
 
 
 def main() -> None:
-    """Run ``afm-rl-diagnose``; a mistake ends in one line and exit status 2."""
+    """Run ``afm-rl-diagnose``; a mistake ends in one line and exit status 2.
+
+    Exit status 1: an actuator has a status that ``--fail-on`` names.
+    """
     parser = OneLineParser("afm-rl-diagnose", __doc__)
     add = parser.add_argument
     kinds = ".csv, .parquet, .ulg, .mcap, .db3, .bag, or a folder of LeRobot or ROS"
@@ -45,17 +50,25 @@ def main() -> None:
     add("--model", metavar="MODEL", help=f"{model}, batched, in torch")
     trust = "a package whose function may be called, here or installed"
     add("--trust", metavar="PACKAGE", action="append", default=[], help=trust)
+    calibration = "sign, scale, offset, dead zone, delay, lag and rate of each, with intervals"
+    add("--calibration", metavar="FILE.json", type=Path, help=calibration)
+    fail = "with commas, such as changed,dead: exit status 1 if an actuator is one of these"
+    add("--fail-on", metavar="STATUSES", default="", help=fail)
     add("--no-page", dest="page", action="store_false", help="write diagnosis.json only")
     options = parser.parse_args()
 
     with errors_in_one_line(parser.prog):
-        _run(options)
+        failing = _run(options)
+    if failing:
+        parser.exit(1, f"{parser.prog}: --fail-on: {', '.join(failing)}\n")
 
 
-def _run(options: argparse.Namespace) -> None:
+def _run(options: argparse.Namespace) -> list[str]:
+    """Diagnose, and return the actuators by which the command fails."""
     from dataclasses import replace
 
-    from afm_rl.diagnosis import diagnose
+    from afm_rl.diagnosis import calibrate, diagnose
+    from afm_rl.diagnosis.findings import STATUSES
     from afm_rl.diagnosis.readers import (
         TRANSITIONS,
         Unchosen,
@@ -63,9 +76,13 @@ def _run(options: argparse.Namespace) -> None:
         read_columns,
         read_log,
     )
-    from afm_rl.errors import check_number, printable
-    from afm_rl.report.diagnosis import print_diagnosis, write_diagnosis
+    from afm_rl.errors import check_choice, check_number, printable
+    from afm_rl.report.diagnosis import calibration_table, print_diagnosis, write_diagnosis
+    from afm_rl.report.tables import grid_of, terminal
 
+    fail_on = [part.strip().replace("-", " ") for part in options.fail_on.split(",") if part]
+    for status in fail_on:
+        check_choice("--fail-on", status, STATUSES)
     command, response = (
         [field.strip() for text in given for field in text.split(",")]
         for given in (options.command, options.response)
@@ -90,6 +107,7 @@ def _run(options: argparse.Namespace) -> None:
     except Unchosen as error:
         print("\n".join(error.listing))
         raise
+    is_data_set = log.usual_delay > 0.0
     if options.delay is not None:
         log = replace(log, usual_delay=check_number("--delay", options.delay, low=0.0))
     diagnosis = diagnose(log)
@@ -103,10 +121,17 @@ def _run(options: argparse.Namespace) -> None:
             replayed = replay(log, lambda share: bar.update(share - bar.n))
     out = options.out or Path("outputs", f"{options.file.resolve().stem}_diagnosis")
     print_diagnosis(diagnosis)
+    calibration = calibrate(log, diagnosis) if is_data_set or options.calibration else None
+    if calibration is not None and is_data_set:
+        terminal(None).print(grid_of(calibration_table(calibration, frames=True).shown))
+    if calibration is not None and options.calibration:
+        calibration.write(options.calibration)
+        print(f"wrote {options.calibration}")
     if replayed is not None:
         print_replay(replayed)
         print(f"wrote {write_replay(replayed, options.replay)}")
     source, page = printable(str(options.file)), options.page
     diagnosis = replace(diagnosis, notes=(*notes, *diagnosis.notes))  # they were printed
-    for path in write_diagnosis(diagnosis, log, out, source, page, replayed):
+    for path in write_diagnosis(diagnosis, log, out, source, page, replayed, calibration):
         print(f"wrote {path}")
+    return [printable(a.name) for a in diagnosis.actuators if a.status in fail_on]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 Status = Literal["healthy", "changed", "dead", "cannot tell", "not measured", "not actuated"]
+STATUSES: tuple[str, ...] = get_args(Status)
 Interval = tuple[float, float]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
@@ -13,7 +13,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from rich.text import Text
 
-from afm_rl.diagnosis import Actuator, Diagnosis, Log
+from afm_rl.diagnosis import Actuator, Calibration, Diagnosis, Log
+from afm_rl.diagnosis.calibration import Estimate
 from afm_rl.diagnosis.replay import Replayed
 from afm_rl.diagnosis.replay.table import AFM, ALONE, SHARES
 from afm_rl.report import style
@@ -109,17 +110,69 @@ def write_diagnosis(
     source: str,
     page: bool = True,
     replayed: Replayed | None = None,
+    calibration: Calibration | None = None,
 ) -> Iterator[Path]:
     """Write ``diagnosis.json`` and ``index.html``; yield their paths as they are written."""
     text = json.dumps(diagnosis.as_dict(), indent=2, ensure_ascii=False)
     write_whole(out / "diagnosis.json", text.encode())
     yield out / "diagnosis.json"
     if page:
-        write_whole(out / "index.html", _page(diagnosis, log, source, replayed).encode())
+        write_whole(
+            out / "index.html", _page(diagnosis, log, source, replayed, calibration).encode()
+        )
         yield out / "index.html"
 
 
-def _page(diagnosis: Diagnosis, log: Log, source: str, replayed: Replayed | None) -> str:
+def calibration_table(calibration: Calibration, frames: bool = False) -> Table:
+    """Return the numbers of each joint with their intervals; those not determined in brackets.
+
+    Of a data set of ``frames``, the delay in these, and the gain of first order: the share of the
+    way to its command that a joint goes in a frame.
+    """
+    step, time = calibration.step, calibration.time
+    rows = []
+    for joint in calibration.joints:
+        row = {"joint": joint.name}
+        if frames:
+            row["delay (frames)"] = _estimate_text(joint.delay, lambda x: x / step)
+            row["gain per frame"] = _estimate_text(joint.lag, lambda x: -math.expm1(-step / x))
+            row["offset"] = _estimate_text(joint.offset)
+        else:
+            names = ("sign", "scale", "offset", "dead_zone", "delay", "lag", "rate")
+            heads = {"delay": f"delay ({time})", "lag": f"lag ({time})", "rate": f"rate (1/{time})"}
+            row |= {
+                heads.get(name, name.replace("_", " ")): _estimate_text(getattr(joint, name))
+                for name in names
+            }
+            row["command for u"] = joint.undo
+        rows.append(row)
+    note = "95 % intervals in brackets; ? where a number is not well determined."
+    shown = pd.DataFrame(rows)
+    return Table("calibration", "Calibration", note, shown, shown)
+
+
+def _estimate_text(estimate: Estimate, of: Callable[[float], float] = float) -> str:
+    """Return a number with its interval, through a function that is monotonic.
+
+    >>> _estimate_text(Estimate(0.1, (0.0, 0.2), False), lambda x: -math.expm1(-0.1 / x))
+    '0.63 [0.39, 1.00] ?'
+    """
+
+    def value(x: float) -> float:
+        return of(max(x, 1e-300) if x == 0.0 else x) + 0.0
+
+    ends = sorted(value(end) for end in estimate.interval)
+    unsure = "" if estimate.determined else " ?"
+    return f"{_with_interval(value(estimate.value), (ends[0], ends[1]))}{unsure}"
+
+
+def _page(
+    diagnosis: Diagnosis,
+    log: Log,
+    source: str,
+    replayed: Replayed | None,
+    calibration: Calibration | None,
+) -> str:
     shown = _table(diagnosis)
     note = (
         "95 % intervals in brackets. Gain: response per command. Offset, noise: in units of the "
@@ -130,6 +183,8 @@ def _page(diagnosis: Diagnosis, log: Log, source: str, replayed: Replayed | None
         "Left: an excerpt of command, response and fit. Middle: response against command; the line "
         "is a healthy actuator. Right: what the fit leaves, over the whole log."
     )
+    if calibration is not None:
+        tables.append(calibration_table(calibration))
     figures = []
     for place, actuator in enumerate(diagnosis.actuators):
         png = style.png_bytes(draw_actuator(diagnosis, log, place))

@@ -3,15 +3,20 @@
 import json
 import re
 import sys
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 
+import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 
 from afm_rl.cli import diagnose
+from afm_rl.diagnosis import Actuator, read_calibration
+from afm_rl.diagnosis.calibration import JointCalibration
+from afm_rl.diagnosis.findings import STATUSES
 from afm_rl.dynamics import MuJoCoDynamics
 
 
@@ -69,6 +74,45 @@ def test_without_a_time_there_are_no_seconds(call, log):
     assert "delay (rows)" in done.out and "(s)" not in done.out
     page = Path("outputs", "log_diagnosis", "index.html").read_text()
     assert "delay (rows)" in page and "(s)" not in page and " s," not in page
+
+
+SCHEMAS = Path(__file__).parents[2] / "docs" / "schemas"
+
+
+def test_files_for_programs_are_as_their_schemas_say(call, log):
+    done = call(log, "--calibration", "arm.json", "--no-page")
+    assert done.status == 0 and "wrote arm.json" in done.out
+    files = {"diagnosis": "outputs/log_diagnosis/diagnosis.json", "calibration": "arm.json"}
+    for name, file in files.items():
+        schema = json.loads((SCHEMAS / f"{name}.json").read_text())
+        jsonschema.Draft202012Validator.check_schema(schema)
+        jsonschema.validate(json.loads(Path(file).read_text()), schema)
+    pan, elbow = read_calibration("arm.json").joints
+    assert pan.undo == "u" and elbow.delay.value == pytest.approx(0.04, abs=0.002)
+    assert elbow.sign.value == -1 and elbow.scale.value == pytest.approx(0.62, abs=0.01)
+
+
+def test_schemas_name_what_there_is():
+    defined = {
+        name: json.loads((SCHEMAS / f"{name}.json").read_text())["$defs"]
+        for name in ("diagnosis", "calibration")
+    }
+    actuator, joint = defined["diagnosis"]["actuator"], defined["calibration"]["joint"]
+    for part in (actuator, joint):
+        assert tuple(part["properties"]["status"]["enum"]) == STATUSES
+    assert {*actuator["properties"]} <= {field.name for field in fields(Actuator)} | {"saturation"}
+    assert {*joint["properties"]} == {field.name for field in fields(JointCalibration)}
+
+
+@pytest.mark.parametrize(
+    ("statuses", "status"),
+    [("changed,dead", 1), ("dead", 0), ("cannot-tell, not measured", 0), ("healthy", 1), ("", 0)],
+)
+def test_the_exit_status_is_for_programs(call, log, statuses, status):
+    done = call(log, "--fail-on", statuses, "--no-page")
+    assert done.status == status and "wrote outputs" in done.out
+    name = "pan" if statuses == "healthy" else "<b>elbow"
+    assert done.err == (f"afm-rl-diagnose: --fail-on: {name}\n" if status else "")
 
 
 def test_where_to_and_what_is_healthy(call, log, tmp_path):
@@ -232,6 +276,7 @@ def test_fields_are_named(call, log, tmp_path):
         (["log.csv", "--episode", "run"], "log.csv: --episode run: there is no such name"),
         ([], "the following arguments are required: FILE"),
         (["nowhere.csv"], "nowhere.csv: no such file"),
+        (["log.csv", "--fail-on", "broken"], "--fail-on='broken': expected one of healthy, cha"),
         (["log.csv", "--delay", "-1"], "--delay=-1.0: expected a finite number"),
         (["cart.csv", "--model", "no.xml"], "dynamics.model=no.xml: no such file"),
         (["cart.csv", "--model", "os.system"], "--model os.system: expected a file .xml, or a"),

@@ -297,8 +297,9 @@ def _thawed(arrays: Arrays, episode: np.ndarray, frame: float) -> tuple[Arrays, 
         gaps = np.round(steps / frame).clip(min=1) - 1
         if gaps.any():
             notes.append(f"{int(gaps.sum())} frames are missing, at {int((gaps > 0).sum())} places")
-    still = frozen_rows(first, second, border)
-    odd = frozen_episodes(still, border, float(np.median(steps)) if len(steps) else 1.0)
+    rate = 1 / float(np.median(steps)) if len(steps) else 1.0
+    still = frozen_rows(first, second, border, delay=max(10, round(0.35 * rate)))
+    odd = frozen_episodes(still, border, 1.5 * rate if rate != 1.0 else np.inf)
     rows = ~np.isin(border, odd)
     if odd and rows.sum() >= FEWEST:
         numbers = np.unique(episode[~rows]).astype(int).tolist()

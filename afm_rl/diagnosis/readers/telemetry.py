@@ -12,15 +12,15 @@ def frozen_rows(
 ) -> np.ndarray:
     """Return how long responses stand still while commands move, in rows ``(N,)``; 0 elsewhere.
 
-    They stand still where all are exactly those of the row before, as no sensor has it; commands
-    move by at least a fiftieth of their ranges meanwhile. At the begin of an episode, they may
-    still wait for the first command, for up to ``delay`` rows.
+    They stand still where all are exactly those of the row before; commands move by a fiftieth of
+    their ranges meanwhile, in longer stretches by a tenth: friction holds a robot back, too. A
+    robot at rest waits for its commands, for up to ``delay`` rows.
 
     Args:
         command: ``(N, A)``.
         response: ``(N, A)``.
         border: number of the episode of each row, ``(N,)``, ascending.
-        delay: of a robot that was at rest.
+        delay: the longest one (rows).
 
     >>> u, y = np.arange(8.0)[:, None], np.array([0, 1, 2, 2, 2, 2, 3, 4.0])[:, None]
     >>> frozen_rows(u, y, np.zeros(8, dtype=int))
@@ -32,27 +32,28 @@ def frozen_rows(
     ranges = np.maximum(np.ptp(command, axis=0), 1e-300)
     length = np.zeros(len(border), dtype=int)
     for first, last in edges.reshape(-1, 2):
-        waits = (first < 2 or border[first - 2] < border[first]) and last - first <= delay
-        if not waits and (np.ptp(command[first - 1 : last], axis=0) > 0.02 * ranges).any():
+        begins = first < 2 or border[first - 2] < border[first]
+        before = command[first - 1 : max(last - delay, first + 1)]  # moves that must have acted
+        waits = begins and last - first <= delay
+        share = 0.02 if last - first <= delay else 0.1
+        if not waits and (np.ptp(before, axis=0) > share * ranges).any():
             length[first:last] = last - first
     return length
 
 
-def frozen_episodes(
-    length: np.ndarray, border: np.ndarray, step: float, longest: float = 1.5
-) -> list[int]:
-    """Return the numbers of the episodes whose responses are frozen.
+def frozen_episodes(length: np.ndarray, border: np.ndarray, longest: float) -> list[int]:
+    """Return the numbers of the episodes whose responses are frozen, by :func:`frozen_rows`.
 
-    That is, for longer than ``longest`` (s), which no robot waits, or half of the episode, and ten
+    That is, for more than ``longest`` rows, which no robot waits, or half of the episode, and ten
     rows at least. Where all are, the robot does not move, and none is left out.
 
-    >>> frozen_episodes(np.repeat([0, 40], 40), np.repeat([0, 1], 40), step=0.05)
+    >>> frozen_episodes(np.repeat([0, 40], 40), np.repeat([0, 1], 40), longest=30)
     [1]
     """
     numbers, sizes = np.unique(border, return_counts=True)
     most = np.zeros(len(numbers), dtype=int)
     np.maximum.at(most, np.searchsorted(numbers, border), length)
-    odd = most >= np.maximum(np.minimum(longest / step, 0.5 * sizes), 10)
+    odd = most >= np.maximum(np.minimum(longest, 0.5 * sizes), 10)
     return [] if odd.all() else [int(number) for number in numbers[odd]]
 
 

@@ -1,0 +1,177 @@
+"""A diagnosis that is written back: numbers, commands that make up for them, and a model."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from afm_rl.diagnosis import (
+    Log,
+    apply,
+    calibrate,
+    diagnose,
+    known_dynamics,
+    predict,
+    read_calibration,
+)
+from afm_rl.diagnosis.replay import replay
+from afm_rl.errors import ConfigurationError
+
+STEP = 0.02
+NOISE = 0.005
+
+
+def robot(command, gain, offset, delay=(), share=(), zone=(), noise=0.0):
+    """Return the responses of joints: gains, offsets, delays (rows), first-order gains, zones."""
+    size, rng = len(offset), np.random.default_rng(1)
+    delay, zone = delay or [0] * size, np.array(zone or [0.0] * size)
+    share, y = np.array(share or [1.0] * size), np.zeros((len(command) + 1, size))
+    y[0] = offset
+    for k in range(len(command)):
+        u = np.array([command[max(k - late, 0), j] for j, late in enumerate(delay)])
+        inner = np.sign(u) * np.maximum(np.abs(u) - zone, 0)
+        y[k + 1] = y[k] + share * (np.atleast_2d(gain) @ inner + offset - y[k])
+    return y[1:] + noise * rng.standard_normal(command.shape)
+
+
+def steps(size, rows=900, reach=1.0, hold=3, seed=0):
+    moves = np.random.default_rng(seed).uniform(-reach, reach, (rows // hold, size))
+    return np.repeat(moves, hold, axis=0)
+
+
+ROBOTS = {
+    "healthy": ([[1.0]], [0.0]),
+    "sign": ([[-1.0]], [0.0]),
+    "all": (np.diag([-0.6, 1.3, 0.8]), [0.2, -0.1, 0.0], [3, 0, 1], [1.0, 0.3, 1.0], [0, 0.1, 0]),
+    "swapped": ([[0.0, 1.0], [-0.7, 0.0]], [0.0, 0.2]),
+    "coupled": ([[1.0, 0.0], [0.3, 0.8]], [0.1, 0.0]),
+}
+
+
+def logged(name, **changes):
+    command = steps(len(ROBOTS[name][1]))
+    response = robot(command, *ROBOTS[name], noise=NOISE)
+    names = tuple("abc"[: command.shape[1]])
+    return Log(names, command, response, t=STEP * np.arange(len(command)), **changes)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_log_a_calibration_a_corrected_command_and_a_robot_that_obeys(name):
+    log = logged(name)
+    calibration = calibrate(log)
+    way = steps(len(log.names), reach=0.4, hold=12, seed=2)
+    corrected = apply(calibration, way, ahead=True)
+    moved = robot(corrected, *ROBOTS[name])
+    np.testing.assert_allclose(moved[12:-12], way[12:-12], atol=0.02)
+    again = Log(log.names, way, moved + NOISE * np.random.default_rng(3).standard_normal(way.shape))
+    assert diagnose(again).healthy
+    if name == "healthy":
+        np.testing.assert_array_equal(corrected, way)
+
+
+def test_one_command_is_corrected_at_a_time():
+    calibration = calibrate(logged("all"))
+    corrected = np.array([apply(calibration, u) for u in steps(3, reach=0.4, hold=30, seed=2)])
+    moved = robot(corrected, *ROBOTS["all"])
+    np.testing.assert_allclose(
+        moved[29::30], steps(3, reach=0.4, hold=30, seed=2)[29::30], atol=0.02
+    )
+    assert apply(calibration, np.zeros((2, 5, 3))).shape == (2, 5, 3)
+
+
+def test_the_numbers_are_those_of_the_robot():
+    a, b, c = calibrate(logged("all")).joints
+    found = {"sign": [-1, 1, 1], "scale": [0.6, 1.3, 0.8], "offset": [0.2, -0.1, 0.0]}
+    found |= {"dead_zone": [0.0, 0.1, 0.0], "delay": [0.06, 0.0, 0.02]}
+    found |= {"lag": [0.0, -STEP / np.log(0.7), 0.0]}
+    for number, truth in found.items():
+        for joint, true in zip((a, b, c), truth, strict=True):
+            estimate = getattr(joint, number)
+            low, high = estimate.interval
+            assert estimate.determined and low <= estimate.value <= high
+            assert estimate.value == pytest.approx(true, abs=2e-3)
+    assert all(joint.rate.value == np.inf and not joint.rate.determined for joint in (a, b, c))
+    assert a.undo == f"(u - {a.offset.value:.6g}) / -{a.scale.value:.6g}, 0.06 s earlier"
+    assert "more in its direction" in b.undo and c.undo.endswith(", 0.02 s earlier")
+
+
+def test_a_rate_limit_is_in_units_of_the_response():
+    u, y = steps(1, hold=30) * 100, np.zeros((900, 1))
+    for k in range(1, 900):
+        y[k] = y[k - 1] + np.clip(-0.5 * u[k] - y[k - 1], -8, 8)
+    y += 0.1 * np.random.default_rng(1).standard_normal(y.shape)
+    (joint,) = calibrate(Log(("a",), u, y, t=STEP * np.arange(900))).joints
+    low, high = joint.rate.interval
+    assert joint.rate.determined and low < 8 / STEP < high and high - low < 0.1 * high
+
+
+def test_what_cannot_be_told_is_not_determined_and_its_command_stays():
+    rng = np.random.default_rng(0)
+    u = np.column_stack([steps(1)[:, 0], 0.01 * steps(1)[:, 0], steps(1, seed=3)[:, 0]])
+    noise = 0.3 * rng.standard_normal((900, 3))
+    y = np.column_stack([-u[:, 0], u[:, 1] + noise[:, 1], 0.01 * noise[:, 2]])
+    calibration = calibrate(Log(("a", "idle", "dead"), u, y + 0.001 * noise))
+    assert [joint.usable for joint in calibration.joints] == [True, False, False]
+    assert calibration.time == "rows"
+    for joint in calibration.joints[1:]:
+        assert not joint.scale.determined and joint.undo == f"nothing: {joint.status}"
+    np.testing.assert_allclose(apply(calibration, [0.5, 0.5, 0.5]), [-0.5, 0.5, 0.5], atol=0.01)
+
+
+def test_the_model_and_the_predictions_are_those_of_the_log():
+    log = logged("all")
+    calibration = calibrate(log)
+    assert calibration.delay_steps == [3, 0, 1]
+    miss = log.response - predict(calibration, log)
+    assert (miss[20:].std(0) < 1.1 * NOISE).all()
+    model, rows = known_dynamics(calibration), np.arange(20, 899)
+    late = np.stack([log.command[rows + 1 - d, j] for j, d in enumerate([3, 0, 1])], -1)
+    ahead = model(torch.tensor(log.response[rows]), torch.tensor(late)).numpy()
+    assert ((log.response[rows + 1] - ahead).std(0) < 1.4 * NOISE).all()
+    assert calibrate(replace(log, usual_delay=STEP)).delay_steps == [2, 0, 0]
+
+
+def test_a_replay_of_what_was_predicted_has_nothing_to_remove():
+    log = logged("sign").part(slice(0, 150))
+    assert replay(log).removed["a"] > 0.9
+    known = replace(log, command=predict(calibrate(log), log))
+    assert replay(known).removed["a"] < 0.1
+
+
+@pytest.mark.parametrize("name", ["all", "swapped"])
+def test_what_is_written_is_read(tmp_path, name):
+    calibration = calibrate(logged(name))
+    calibration.write(tmp_path / "arm.json")
+    assert read_calibration(tmp_path / "arm.json") == calibration
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda text: "{",
+        lambda text: "[]",
+        lambda text: text.replace('"version": 1', '"version": 2'),
+        lambda text: text.replace('"sign"', '"sing"'),
+        lambda text: json.dumps(json.loads(text) | {"more": 1}),
+        lambda text: json.dumps(json.loads(text) | {"step": "x"}),
+    ],
+)
+def test_files_that_are_no_calibration(tmp_path, spoil):
+    path = tmp_path / "arm.json"
+    calibrate(logged("sign")).write(path)
+    path.write_text(spoil(path.read_text()))
+    with pytest.raises(ConfigurationError, match="no calibration, or a damaged one"):
+        read_calibration(path)
+    with pytest.raises(ConfigurationError, match="No such file"):
+        read_calibration(tmp_path / "none.json")
+
+
+def test_two_joints_on_one_command_cannot_be_undone():
+    u = steps(2)
+    log = Log(("a", "b"), u, u[:, [0, 0]] + NOISE * steps(2, seed=1))
+    with pytest.raises(ConfigurationError, match="expected one for each"):
+        apply(calibrate(log), [0.0, 0.0])
+    with pytest.raises(ConfigurationError, match="of 1 numbers, one per joint"):
+        apply(calibrate(logged("sign")), [0.0, 0.0])

@@ -1,0 +1,98 @@
+"""Leader and follower in LeRobot's data sets: delay, first-order gain, offset, frozen telemetry."""
+
+import json
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from afm_rl.cli import diagnose as command
+from afm_rl.diagnosis import calibrate
+from afm_rl.diagnosis.readers import read_log
+
+
+def write(folder, gain, late, offset, joints, seed, quantum=0.0):
+    """Write 50 episodes at 30 Hz, five of them frozen, and return the numbers of these.
+
+    Followers go a share ``gain`` of the way to what leaders did ``late`` frames ago.
+    """
+    rng, frames = np.random.default_rng(seed), 0
+    frozen = {int(episode): k for k, episode in enumerate(rng.choice(50, 5, replace=False))}
+    for episode in range(50):
+        rows = int(rng.integers(90, 130))
+        ways = np.repeat(rng.uniform(-60, 60, (rows // 12 + 2, joints)), 12, axis=0)[: rows + 11]
+        u = np.stack(
+            [np.convolve(way, np.hanning(12) / np.hanning(12).sum(), "valid") for way in ways.T], -1
+        )
+        u[: rows // 4] = u[rows // 4]  # a rest
+        y, place = np.empty_like(u), u[0]
+        for k in range(len(u)):
+            place = place + gain * (u[max(k - late, 0)] - place)
+            y[k] = place + offset
+        y += 0.05 * rng.standard_normal(y.shape)
+        if quantum:
+            y = quantum * np.round(y / quantum)
+        if episode in frozen:  # from the begin, or on the way
+            first = len(y) * frozen[episode] // 12
+            y[first:] = y[first]
+        table = pd.DataFrame(
+            {"action": list(u.astype(np.float32)), "observation.state": list(y.astype(np.float32))}
+        )
+        table = table.assign(episode_index=episode, timestamp=np.arange(len(u)) / 30)
+        path = folder / "data" / "chunk-000" / f"episode_{episode:06d}.parquet"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        table.to_parquet(path)
+        frames += len(u)
+    feature = {"dtype": "float32", "names": [f"joint_{k}.pos" for k in range(joints)]}
+    info = {"fps": 30, "total_frames": frames, "total_episodes": 50}
+    info["features"] = {"action": feature, "observation.state": feature}
+    (folder / "meta").mkdir()
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    return sorted(frozen)
+
+
+@pytest.mark.parametrize(
+    "robot",
+    [
+        {"gain": 0.25, "late": 4, "offset": -0.98, "joints": 2, "seed": 0},
+        {"gain": 0.5, "late": 2, "offset": 3.0, "joints": 1, "seed": 1},
+        {"gain": 0.15, "late": 7, "offset": 0.0, "joints": 1, "seed": 2},
+        {"gain": 1.0, "late": 1, "offset": -0.98, "joints": 2, "seed": 3, "quantum": 0.09},
+    ],
+)
+def test_followers_of_a_data_set(tmp_path, robot):
+    frozen = write(tmp_path, **robot)
+    log = read_log(tmp_path)
+    assert log.notes[0] == (
+        "responses are frozen while commands move in 5 of 50 episodes, which are left out: "
+        + ", ".join(map(str, frozen))
+    )
+    assert log.begins.sum() == 45
+    calibration = calibrate(log)
+    assert calibration.delay_steps == [robot["late"] - 1] * robot["joints"]  # one is healthy
+    for joint in calibration.joints:
+        assert joint.delay.value / calibration.step == pytest.approx(robot["late"], abs=0.5)
+        lag = joint.lag.value / calibration.step
+        assert (1 - np.exp(-1 / lag) if lag else 1.0) == pytest.approx(robot["gain"], abs=0.05)
+        assert joint.offset.value == pytest.approx(robot["offset"], abs=0.2)
+        assert joint.delay.determined and joint.lag.determined and joint.offset.determined
+
+
+def test_the_command_says_it_in_frames(tmp_path, monkeypatch, capsys):
+    frozen = write(tmp_path / "pick_cube", gain=0.25, late=4, offset=-0.98, joints=1, seed=0)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["afm-rl-diagnose", "pick_cube", "--no-page"])
+    command.main()
+    said = capsys.readouterr().out
+    assert f"left out: {', '.join(map(str, frozen))}" in said
+    head, _, row = (line.strip() for line in said[said.index(" joint ") :].splitlines()[:3])
+    assert [part.strip() for part in head.split("  ") if part] == [
+        "joint",
+        "delay (frames)",
+        "gain per frame",
+        "offset",
+    ]
+    name, *numbers = [part.strip().split(" [")[0] for part in row.split("  ") if part]
+    assert name == "joint_0.pos"
+    assert [float(number) for number in numbers] == pytest.approx([4, 0.25, -0.98], abs=0.1)
