@@ -110,7 +110,7 @@ class Wire:
 class Loop:
     """Robot and controller, tick by tick, with a clock that they share."""
 
-    def __init__(self, make=lambda: agents.Agent(drive, {"memory": 1}, 0.0, torch.float32)):
+    def __init__(self, make=lambda: agents.Agent(drive, {"memory": 1}, 0.0)):
         self.make, self.now = make, NOW
         self.actions = Inbox(2, WATCHDOG, lambda: self.now)
         self.states = Inbox(3, WATCHDOG, lambda: self.now)
@@ -214,7 +214,7 @@ def test_a_controller_that_hears_nothing_sends_the_safe_action_and_remembers_no_
         readings.append(reading[0].item())
         return memory, torch.tensor([0.5, 0.0])
 
-    loop = Loop(lambda: agents.Agent(policy, {"memory": 1}, 0.0, torch.float32))
+    loop = Loop(lambda: agents.Agent(policy, {"memory": 1}, 0.0))
     loop.tick(3)
     loop.driver.answer(None)
     loop.robot.tick()
@@ -420,7 +420,7 @@ def test_the_ros_2_node_acts_on_odometry_and_stops_without(ros2_node):
         given.append(reading.tolist())
         return memory, 0.1 * goal
 
-    agent = agents.Agent(policy, {"memory": 1}, 0.0, torch.float32)
+    agent = agents.Agent(policy, {"memory": 1}, 0.0)
     node, stand_in = ros2_node.ActionFlowNode(agent, 0.2), ros2_node.Odometry
 
     def tick(x=None):

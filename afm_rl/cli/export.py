@@ -9,17 +9,19 @@ from afm_rl.cli.overrides import checked
 
 NAME = "afm-rl-export"
 ABOUT = """\
-Write planner and correction of a method as machine code, which runs without this library.
+Write planner and correction of a method as a file that runs without this library: machine code
+(.pt2), which torch runs, or an ONNX graph (.onnx), which onnxruntime runs without torch.
 
+  afm-rl-export method=afm_physics out=policy.onnx
   afm-rl-export method=afm_physics out=policy.pt2
   afm-rl-export method=afm_physics planner.population=1000 out=policy.pt2
   afm-rl-export method=afm_physics out=policy.pt2 planner=null   the planned action is an input
 
 The settings are those of afm-rl. The file is a function of tensors: (memory, observation, the
 task's entries such as the goal, noise) -> (memory, action). A memory of zeros begins a mission; the
-file's metadata says how many numbers each argument has. It runs where it was made: on the same kind
-of processor, with the same version of torch, from Python or C++ (examples/deploy/cpp). It is a
-program: load it only where its SHA-256 is the one that is printed.
+file's metadata says how many numbers each argument has. Python and C++ run it (examples/deploy).
+Machine code runs on the same kind of processor, with the same version of torch, and is a program:
+load it only where its SHA-256 is the one that is printed.
 """
 ALONE = "planner=null"
 
@@ -48,7 +50,7 @@ def _run(arguments: list[str]) -> None:
 
     out = [text.removeprefix("out=") for text in arguments if text.startswith("out=")]
     if len(out) != 1:
-        raise ConfigurationError("out: expected one file to write, as in out=policy.pt2")
+        raise ConfigurationError("out: expected one file to write, as in out=policy.onnx")
     path, alone = check_exportable(out[0]), ALONE in arguments
     given = [text for text in arguments if text != ALONE and not text.startswith("out=")]
     GlobalHydra.instance().clear()
@@ -68,6 +70,7 @@ def _run(arguments: list[str]) -> None:
             "export: the model of this method changes at work, but an exported one cannot; "
             "choose a method that does not learn, such as afm_physics or afm_frozen_pe"
         )
+    check_exportable(path, None if alone else agent.planner)
     prepare(agent, cfg.cache, progress=bool(cfg.progress))
     agent.to(torch.device("cpu"))  # what is exported is for the processor
     transform, (low, high) = agent.transform, agent.robot.action_box
@@ -81,8 +84,8 @@ def _run(arguments: list[str]) -> None:
         transform.enabled,
         transform.extend_action_box,
     )
-    print("exporting: tracing, then compiling, which takes about six times as long", flush=True)
+    print("exporting: tracing, then writing, which takes several times as long", flush=True)
     controller = Controller(None if alone else agent.planner, policy)
     checksum = export_controller(controller, path)
     print(f"wrote {path}: " + ", ".join(f"{k} ({n})" for k, n in controller.sizes.items()))
-    print(f"sha256 {checksum}: whoever loads this program should ask for it")
+    print(f"sha256 {checksum}: whoever loads the file should ask for it")

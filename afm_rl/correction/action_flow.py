@@ -191,7 +191,10 @@ class ActionFlow(PairCorrector):
 
     def place_of(self, state: Tensor) -> Tensor:
         """Return where a state is, in the unit in which ground differs."""
-        return state[..., self.place] / self.place_scale if self.place else state[..., :0]
+        if not self.place:
+            return state[..., :0]
+        # One by one: a list of indices would be a constant, which no exported branch may hold.
+        return torch.stack([state[..., k] for k in self.place], -1) / self.place_scale
 
     def shapes(self, state_size: int) -> dict[str, tuple[int, ...]]:
         """Return names and shapes, with the belief; its noise is the last part."""

@@ -14,7 +14,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from afm_rl.compiling.machine_code import checksum_of, has_compiler, package, settings_for, trace
-from afm_rl.errors import ConfigurationError, check_instance
+from afm_rl.compiling.onnx_graph import as_onnx, load_runtime
+from afm_rl.errors import ConfigurationError, causes, check_instance
+from afm_rl.planning.icem import ICEM
+from afm_rl.planning.mppi import MPPI
 from afm_rl.planning.receding import SamplingPlanner
 from afm_rl.storage.files import write_whole
 from afm_rl.streams import Streams
@@ -22,6 +25,16 @@ from afm_rl.transforms.policy import ActionFlowPolicy
 
 Draw = tuple[tuple[int, ...], float | None]
 """Shape and bound of normal numbers."""
+
+RETURNED = ("next_memory", "executed_action")
+MEANINGS = {
+    "memory": "what is remembered; zeros begin a mission, then next_memory of the tick before",
+    "observation": "the state, as it was measured; not a number where there is no reading",
+    "action": "the planned action, in the robot's units",
+    "noise": "standard normal numbers, fresh ones at each tick, none beyond noise_bound",
+    "next_memory": "the memory of the next tick",
+    "executed_action": "what to send to the robot, in its units, within its limits",
+}
 
 
 class Controller(nn.Module):
@@ -177,38 +190,53 @@ class _Given(Streams):
         return self.numbers[used : used + math.prod(shape)].view(shape).clone()
 
 
-def check_exportable(path: str | Path) -> Path:
+def check_exportable(path: str | Path, planner: Any = None) -> Path:
     """Return the file to export to.
 
+    Args:
+        path: the file.
+        planner: that is to be exported, if there is one.
+
     Raises:
-        ConfigurationError: if it cannot be written, or there is no compiler.
+        ConfigurationError: if it cannot be written, or there is nothing to write it with.
     """
     path = Path(path)
-    if path.suffix != ".pt2" or not path.parent.is_dir():
-        raise ConfigurationError(f"out={path}: expected a file NAME.pt2 in a folder that exists")
-    if not has_compiler():
+    if path.suffix not in (".pt2", ".onnx") or not path.parent.is_dir():
+        raise ConfigurationError(
+            f"out={path}: expected a file NAME.pt2 or NAME.onnx in a folder that exists"
+        )
+    if path.suffix == ".onnx":
+        load_runtime()
+        if not isinstance(planner, MPPI | ICEM | None):
+            raise ConfigurationError(
+                f"out={path.name}: {type(planner).__name__} cannot be written as ONNX; expected "
+                "MPPI or ICEM, or planner=null for the correction alone"
+            )
+    elif not has_compiler():
         raise ConfigurationError("export: no C++ compiler was found; install one, such as g++")
     return path
 
 
 def export_controller(controller: Controller, path: str | Path) -> str:
-    """Write a controller as machine code (``.pt2``), which torch runs without this library.
+    """Write a controller as a file that runs without this library.
 
-    Its metadata names the arguments and their sizes (``memory:982 observation:3 ...``) and the
-    bound of the noise. It takes a minute or two of one core, and a C++ compiler. The file is a
-    program: who loads it should ask for the checksum that is returned.
+    As machine code (``.pt2``), which torch runs, or as an ONNX graph (``.onnx``), which runs where
+    there is no torch. Its metadata names the arguments and their sizes (``memory:982 observation:3
+    ...``), the bound of the noise, and in a graph what each argument means. It takes a minute or
+    two of one core, and for machine code a C++ compiler. Machine code is a program: who loads it
+    should ask for the checksum that is returned.
 
     Args:
         controller: what to export, with weights and settings as they are now.
-        path: the file, ``.pt2``.
+        path: the file.
 
     Returns:
         The SHA-256 of the file.
 
     Raises:
-        ConfigurationError: where there is no compiler, or a part cannot be exported.
+        ConfigurationError: where a compiler or package is missing, or a part cannot be exported.
     """
-    path = check_exportable(path)
+    path = check_exportable(path, controller.planner)
     example = [torch.zeros(n).to(controller.start) for n in controller.sizes.values()]
     about = {
         "arguments": " ".join(f"{name}:{size}" for name, size in controller.sizes.items()),
@@ -217,13 +245,20 @@ def export_controller(controller: Controller, path: str | Path) -> str:
     }
     try:
         traced = trace(controller, example)
+        if path.suffix == ".onnx":
+            names = [*controller.sizes]
+            meanings = {name: MEANINGS.get(name, "entry of the task") for name in names}
+            meanings |= {name: MEANINGS[name] for name in RETURNED}
+            code = as_onnx(traced, names, RETURNED, about | meanings)
     except Exception as error:  # it says in many ways that code cannot be traced
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        *_, first = causes(error)
+        reason = str(first).splitlines()[0] if str(first) else type(first).__name__
         raise ConfigurationError(
             "export: planner, model or corrector decide by numbers or leave torch, so they "
             f"cannot be exported: {reason}"
         ) from error
-    settings = settings_for([controller.policy.action_spec.zero()])
-    code = package(traced, {"aot_inductor.metadata": about, **settings})
+    if path.suffix == ".pt2":
+        settings = settings_for([controller.policy.action_spec.zero()])
+        code = package(traced, {"aot_inductor.metadata": about, **settings})
     write_whole(path, code)
     return checksum_of(code)

@@ -8,29 +8,34 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
 
 STATES = 3  # x (m), y (m), heading (rad)
-Policy = Callable[..., tuple[Tensor, Tensor]]
+Policy = Callable[..., Sequence[np.ndarray]]
 
 
 class Agent:
     """A policy and its memory.
 
     Args:
-        policy: (memory, state, goal, noise) -> (memory, action).
+        policy: (memory, state, goal, noise) -> (memory, action), of arrays.
         sizes: how many numbers each of these has.
         noise_bound: the largest noise, in standard deviations.
-        kind: of all its numbers.
+        kind: of all its numbers, float32 or float64.
     """
 
     def __init__(
-        self, policy: Policy, sizes: dict[str, int], noise_bound: float, kind: torch.dtype
+        self, policy: Policy, sizes: dict[str, int], noise_bound: float, kind: str = "float32"
     ) -> None:
         self.policy, self.sizes, self.bound, self.kind = policy, sizes, noise_bound, kind
-        self.memory = torch.zeros(sizes["memory"], dtype=kind)  # a memory of zeros begins a mission
+        self.random = np.random.default_rng()
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget everything: a memory of zeros begins a mission."""
+        self.memory = np.zeros(self.sizes["memory"], self.kind)
 
     def act(self, state: Sequence[float], goal: Sequence[float], follows: bool) -> list[float]:
         """Return the action to execute.
@@ -45,20 +50,25 @@ class Agent:
             self._tick([math.nan] * len(state), goal)
         return self._tick(state, goal)
 
-    @torch.no_grad()
     def _tick(self, state: Sequence[float], goal: Sequence[float]) -> list[float]:
-        given = [torch.tensor(numbers, dtype=self.kind) for numbers in (state, goal)]
+        given = [np.array(numbers, self.kind) for numbers in (state, goal)]
         if "noise" in self.sizes:
-            noise = torch.empty(self.sizes["noise"], dtype=self.kind)
-            given.append(torch.nn.init.trunc_normal_(noise, a=-self.bound, b=self.bound))
+            given.append(self._noise().astype(self.kind))
         self.memory, action = self.policy(self.memory, *given)
         return action.tolist()
 
+    def _noise(self) -> np.ndarray:
+        numbers = self.random.standard_normal(self.sizes["noise"])
+        while (far := np.abs(numbers) > self.bound).any():
+            numbers[far] = self.random.standard_normal(far.sum())
+        return numbers
+
 
 def load(path: str, sha256: str | None) -> Agent:
-    """Return what ``afm-rl-export`` wrote, if it is that; it needs torch alone.
+    """Return what ``afm-rl-export`` wrote, if it is that.
 
-    The file is a program. Only the bytes whose checksum was asked for are loaded.
+    It needs onnxruntime and NumPy for a graph (``.onnx``), torch for machine code (``.pt2``), which
+    is a program. Only the bytes whose checksum was asked for are loaded.
     """
     code = Path(path).read_bytes()
     found = hashlib.sha256(code).hexdigest()
@@ -67,14 +77,48 @@ def load(path: str, sha256: str | None) -> Agent:
             f"{path}: its sha256 is {found}, expected {sha256}; give --sha256 as afm-rl-export "
             "printed it"
         )
-    policy = torch._inductor.aoti_load_package(io.BytesIO(code))
-    about = policy.loader.get_metadata()
+    policy, about = (graph if path.endswith(".onnx") else program)(code)
     sizes = {name: int(n) for name, n in (s.rsplit(":", 1) for s in about["arguments"].split())}
-    return Agent(policy, sizes, float(about["noise_bound"]), getattr(torch, about["dtype"]))
+    return Agent(policy, sizes, float(about["noise_bound"]), about["dtype"])
+
+
+def graph(code: bytes) -> tuple[Policy, dict[str, str]]:
+    """Return the function of an ONNX file, and its metadata."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1  # the work is many small steps
+    session = onnxruntime.InferenceSession(code, options, providers=["CPUExecutionProvider"])
+    names = [entry.name for entry in session.get_inputs()]
+    about = session.get_modelmeta().custom_metadata_map
+    return lambda *given: session.run(None, dict(zip(names, given, strict=True))), about
+
+
+def program(code: bytes) -> tuple[Policy, dict[str, str]]:
+    """Return the function of machine code, and its metadata."""
+    import torch
+
+    policy = torch._inductor.aoti_load_package(io.BytesIO(code))
+    return of_tensors(policy), policy.loader.get_metadata()
+
+
+def of_tensors(function: Callable[..., Any]) -> Policy:
+    """Return a function of tensors as one of arrays."""
+    import torch
+
+    torch.set_num_threads(1)
+
+    @torch.no_grad()
+    def policy(*given: np.ndarray) -> list[np.ndarray]:
+        return [found.numpy() for found in function(*map(torch.from_numpy, given))]
+
+    return policy
 
 
 def make() -> Agent:
     """Return MPPI over the nominal physics, and the correction."""
+    import torch
+
     from afm_rl.dynamics import Dubins
     from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
     from afm_rl.transforms import ActionFlowPolicy
@@ -86,4 +130,4 @@ def make() -> Agent:
     world = PlanningEnv(model, GoalDistance(), low, high)
     planner = MPPI(world, box_key=("afm", "effect_bounds"))
     controller = Controller(planner, ActionFlowPolicy(model, planner.action_spec))
-    return Agent(controller, controller.sizes, controller.noise_bound, torch.float32)
+    return Agent(of_tensors(controller), controller.sizes, controller.noise_bound)

@@ -1,9 +1,9 @@
 """Planner and action flow matching in a process of their own: a state comes in, an action goes out.
 
-    python examples/deploy/controller.py --policy policy.pt2 --sha256 CHECKSUM
+    python examples/deploy/controller.py --policy policy.onnx --sha256 CHECKSUM
 
 Start robot.py first, or later. Without ``--policy`` planner and correction are made here; a file is
-one of ``afm-rl-export method=afm_physics out=policy.pt2``, which prints its checksum. Without a
+one of ``afm-rl-export method=afm_physics out=policy.onnx``, which prints its checksum. Without a
 state for WATCHDOG ticks the action is SAFE. A transition across a gap teaches nothing: the robot
 says which action it obeyed. It runs until it is ended (Ctrl-C, SIGTERM), then sends SAFE, writes a
 row per tick to ``--out`` and prints how well it kept time.
@@ -19,7 +19,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import torch
 from agent import STATES, Agent, load, make
 from link import SAFE, WATCHDOG, Inbox, Link, Message, options, settings, spread
 
@@ -76,10 +75,9 @@ def main() -> None:
     ended = threading.Event()
     for ending in (signal.SIGTERM, signal.SIGINT):
         signal.signal(ending, lambda *_: ended.set())
-    torch.set_num_threads(1)
     agent = load(asked.policy, asked.sha256) if asked.policy else make()
     agent.act([0.0] * STATES, goal_at(1), follows=False)  # the first tick is the slowest
-    agent.memory = torch.zeros_like(agent.memory)
+    agent.begin()
     patience = WATCHDOG * asked.tick
     inbox, config = Inbox(STATES, patience), settings("connect", asked.connect, asked.keys)
     link = Link(config, "robot/action", "robot/state", inbox)

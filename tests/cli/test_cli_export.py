@@ -53,7 +53,7 @@ def test_it_exports_the_correction_alone(run, tmp_path):
     ("arguments", "words"),
     [
         (["method=afm_physics"], "out: expected one file"),
-        (["method=afm_physics", "out=policy.onnx"], "expected a file NAME.pt2"),
+        (["method=afm_physics", "out=policy.txt"], "expected a file NAME.pt2 or NAME.onnx"),
         (["method=physics", "out=policy.pt2"], "corrector=none: nothing to export"),
         (["method=online_pe", "corrector=afm", "out=policy.pt2"], "changes at work"),
         (["method=afm_physic", "out=policy.pt2"], "Could not find 'method/afm_physic'"),

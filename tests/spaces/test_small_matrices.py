@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from afm_rl.spaces.small_matrices import FEW, eliminate, invert_positive, solve_positive
+from afm_rl.spaces.small_matrices import eliminate, invert_positive, solve_positive
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, FEW, FEW + 2])
+@pytest.mark.parametrize("size", [1, 2, 3, 5, 7])
 @pytest.mark.parametrize("function", [eliminate, solve_positive])
 def test_solutions_solve(size, function):
     root = torch.randn(4, 3, size, size, dtype=torch.float64)
@@ -17,14 +17,13 @@ def test_solutions_solve(size, function):
     torch.testing.assert_close(invert_positive(matrix) @ matrix, whole, atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize(("size", "calls"), [(2, 0), (FEW, 0), (FEW + 1, 2)])
-def test_what_is_exported_calls_lapack_for_many_equations_only(size, calls):
+@pytest.mark.parametrize("size", [2, 7])
+def test_what_is_exported_calls_no_lapack(size):
     class Both(torch.nn.Module):
         def forward(self, matrix):
             return invert_positive(matrix) + solve_positive(matrix, matrix)
 
-    matrix = 2 * torch.eye(size)
+    matrix = 2 * torch.eye(size).expand(3, -1, -1)
     program = torch.export.export(Both(), (matrix,))
-    names = [str(node.target) for node in program.graph.nodes]
-    assert sum("solve_ex" in name or "cholesky_ex" in name for name in names) == calls
-    torch.testing.assert_close(program.module()(matrix), torch.eye(size) * 1.5)
+    assert not [n for n in program.graph.nodes if "linalg" in str(n.target)]
+    torch.testing.assert_close(program.module()(matrix), torch.eye(size).expand(3, -1, -1) * 1.5)

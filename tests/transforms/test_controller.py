@@ -19,9 +19,9 @@ from afm_rl.correction import ActionFlow, LeastSquares, linear
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv
+from afm_rl.planning import CEM, ICEM, MPPI, GoalDistance, KnownReward, PlanningEnv
 from afm_rl.transforms import ActionFlowPolicy
-from afm_rl.transforms.controller import Controller, export_controller
+from afm_rl.transforms.controller import Controller, check_exportable, export_controller
 
 LOW, HIGH = torch.tensor([-1.0, -1.5]).double(), torch.tensor([1.0, 1.5]).double()
 GOALS = torch.tensor([[2.0, 1.0], [-1.0, 3.0]]).double()
@@ -149,8 +149,8 @@ def test_parts_that_cannot_be_used_are_refused(tmp_path, monkeypatch):
     with pytest.raises(ConfigurationError, match="controller.policy: expected a ActionFlowPolicy"):
         Controller(planner_of(), planner_of())
     controller = Controller(None, policy_of())
-    for name in ("policy.txt", "nowhere/policy.pt2"):
-        with pytest.raises(ConfigurationError, match=r"out=.*: expected a file NAME.pt2"):
+    for name in ("policy.txt", "nowhere/policy.pt2", "nowhere/policy.onnx"):
+        with pytest.raises(ConfigurationError, match=r"out=.*: expected a file NAME.pt2 or NAME"):
             export_controller(controller, tmp_path / name)
     monkeypatch.setattr("afm_rl.transforms.controller.has_compiler", lambda: False)
     with pytest.raises(ConfigurationError, match="no C.. compiler was found"):
@@ -168,17 +168,52 @@ def test_a_cost_that_decides_by_numbers_is_refused(tmp_path):
 
 
 ALONE = """
-import sys, torch
+import sys
 sys.path.insert(0, sys.argv[3])
 from agent import load
-torch.set_num_threads(1)
 agent = load(sys.argv[1], sys.argv[2])
 for line in sys.stdin:
-    row = torch.tensor([float(x) for x in line.split()]).double()
-    agent.memory, action = agent.policy(agent.memory, row[:3], row[3:])
-    print(*action.tolist())
-assert "afm_rl" not in sys.modules
+    row = [float(x) for x in line.split()]
+    print(*agent.act(row[:3], row[3:], follows=True))
+assert not {"afm_rl", *sys.argv[4:]} & set(sys.modules)
 """
+PLAN = torch.tensor([0.4, -0.3]).double()
+
+
+def lines_of(path):
+    """Return what a program is given of a drive, a line a tick."""
+    rows = [[*state.tolist(), *(PLAN * goal.sign()).tolist()] for state, goal, _ in path]
+    return "".join(" ".join(repr(x) for x in row) + "\n" for row in rows)
+
+
+def check_runs(run, path_driven, folder):
+    """Check that a program of its own answers as the controller did."""
+    out = subprocess.run(
+        list(map(str, run)),
+        input=lines_of(path_driven),
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=folder,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    found = torch.tensor([[float(x) for x in line.split()] for line in out.stdout.splitlines()])
+    torch.testing.assert_close(found.double(), actions(path_driven), atol=1e-5, rtol=0)
+
+
+def corrected_alone(corrector, ticks=24):
+    """Return the correction of a planned action as a controller, and a drive with it."""
+    controller = Controller(None, policy_of(corrector))
+    kept = torch.zeros(controller.sizes["memory"]).double()
+
+    def act(state, goal):
+        nonlocal kept
+        kept, action = controller(kept, state, PLAN * goal.sign())
+        return action
+
+    path = driven(act, ticks)
+    assert (actions(path)[-1] * PLAN < 0).any()  # it was corrected
+    return controller, path
 
 
 @pytest.mark.slow
@@ -187,41 +222,65 @@ assert "afm_rl" not in sys.modules
 def test_a_file_acts_the_same_without_this_library(tmp_path):
     """In a Python process of its own, and in the C++ program."""
     # What an ActionFlow computes is traced above; a small program is compiled as fast as any.
-    controller = Controller(None, policy_of(LeastSquares(LOW, HIGH)))
+    controller, path_driven = corrected_alone(LeastSquares(LOW, HIGH))
     path = tmp_path / "policy.pt2"
     checksum = export_controller(controller, path)
     assert sha256(path.read_bytes()).hexdigest() == checksum
-    plan = torch.tensor([0.4, -0.3]).double()
-    kept = torch.zeros(controller.sizes["memory"]).double()
-
-    def act(state, goal):
-        nonlocal kept
-        kept, action = controller(kept, state, plan * goal.sign())
-        return action
-
-    path_driven = driven(act, 24)
-    expected = actions(path_driven)
-    assert (expected[-1] * plan < 0).any()  # it was corrected
-    lines = "".join(
-        " ".join(repr(x) for x in [*state.tolist(), *(plan * goal.sign()).tolist()]) + "\n"
-        for state, goal, _ in path_driven
-    )
-    runs = [[sys.executable, "-c", ALONE, str(path), checksum, str(PROGRAM.parent)]]
+    check_runs([sys.executable, "-c", ALONE, path, checksum, PROGRAM.parent], path_driven, tmp_path)
     if shutil.which("cmake"):
         build = tmp_path / "build"
         prefix = f"-DCMAKE_PREFIX_PATH={torch.utils.cmake_prefix_path}"
         for step in (["-S", str(PROGRAM), "-B", str(build), prefix], ["--build", str(build)]):
             subprocess.run(["cmake", *step], check=True, capture_output=True)
-        runs.append([str(build / "run_policy"), str(path)])
-    for run in runs:
-        out = subprocess.run(
-            run,
-            input=lines,
-            capture_output=True,
-            text=True,
-            check=True,
-            cwd=tmp_path,
-            env=os.environ | {"OMP_NUM_THREADS": "1"},
-        )
-        found = torch.tensor([[float(x) for x in line.split()] for line in out.stdout.splitlines()])
-        torch.testing.assert_close(found.double(), expected, atol=1e-5, rtol=0)
+        check_runs([build / "run_policy", path], path_driven, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "flow", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["LeastSquares", "ActionFlow"]
+)
+def test_a_graph_acts_the_same_without_torch(tmp_path, flow):
+    # Some seconds, most of them torch's exporter; the only such test that is not slow.
+    onnx = pytest.importorskip("onnx")
+    controller, path_driven = corrected_alone(None if flow else LeastSquares(LOW, HIGH))
+    path = tmp_path / "policy.onnx"
+    checksum = export_controller(controller, path)
+    assert path.stat().st_size < 2e6
+    run = [sys.executable, "-c", ALONE, path, checksum, PROGRAM.parent, "torch"]
+    check_runs(run, path_driven, tmp_path)
+    model = onnx.load(path)
+    assert [node.op_type for node in model.graph.node].count("If") == 1  # only one side is computed
+    about = {entry.key: entry.value for entry in model.metadata_props}
+    assert about["arguments"] == f"memory:{controller.sizes['memory']} observation:3 action:2"
+    for entry in (*model.graph.input, *model.graph.output):
+        assert len(about[entry.name]) > 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [MPPI, ICEM])
+def test_a_graph_plans_the_same(tmp_path, kind):
+    runtime = pytest.importorskip("onnxruntime")
+    controller = Controller(planner_of(kind), policy_of(LeastSquares(LOW, HIGH)))
+    export_controller(controller, tmp_path / "policy.onnx")
+    session = runtime.InferenceSession(tmp_path / "policy.onnx")
+
+    def run(*given):
+        names = controller.sizes
+        found = session.run(None, {k: x.numpy() for k, x in zip(names, given, strict=True)})
+        return map(torch.from_numpy, found)
+
+    expected = driven(as_function(controller, controller))
+    controller = Controller(planner_of(kind), policy_of(LeastSquares(LOW, HIGH)))
+    found = driven(as_function(run, controller))
+    torch.testing.assert_close(actions(found), actions(expected), atol=1e-6, rtol=0)
+
+
+def test_a_planner_of_another_kind_is_no_graph(tmp_path):
+    pytest.importorskip("onnxruntime")
+    with pytest.raises(ConfigurationError, match=r"policy.onnx: CEM cannot be .* MPPI or ICEM"):
+        check_exportable(tmp_path / "policy.onnx", planner_of(CEM))
+
+
+def test_without_the_packages_it_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ConfigurationError, match=r"onnxruntime is missing: pip install 'afm-rl"):
+        check_exportable(tmp_path / "policy.onnx")

@@ -1,0 +1,102 @@
+"""A traced function as an ONNX graph, which runs where neither torch nor this library is."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from afm_rl.compiling.machine_code import Trace
+from afm_rl.errors import ConfigurationError
+from afm_rl.progress import waiting
+
+aten = torch.ops.aten
+
+
+def _choose(which: Tensor, one: Tensor, other: Tensor) -> Tensor:
+    if one.dtype != torch.bool or other.dtype != torch.bool:
+        return NotImplemented
+    return (which & one) | (~which & other)
+
+
+# What onnxruntime lacks, by what it has.
+WRITTEN_OTHERWISE: dict[Any, Callable] = {
+    aten.copysign.Tensor: lambda size, sign: torch.where(sign < 0, -size.abs(), size.abs()),
+    aten.fmax.default: lambda a, b: torch.where((a > b) | b.isnan(), a, b),
+    aten.fmin.default: lambda a, b: torch.where((a < b) | b.isnan(), a, b),
+    aten.hypot.default: lambda a, b: (a * a + b * b).sqrt(),
+    aten.where.self: _choose,
+}
+
+
+def load_runtime() -> Any:
+    """Return the package onnxruntime.
+
+    Raises:
+        ConfigurationError: if it, or what writes graphs, is missing.
+    """
+    try:
+        import onnx  # noqa: F401
+        import onnxruntime
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise ConfigurationError(
+            f"ONNX: {error.name} is missing: pip install 'afm-rl[onnx]'"
+        ) from error
+    return onnxruntime
+
+
+def as_onnx(
+    traced: Trace, inputs: Sequence[str], outputs: Sequence[str], about: Mapping[str, str]
+) -> bytes:
+    """Return a traced function as the bytes of an ONNX file.
+
+    Branches (``torch.cond``) become ``If``, of which one side is computed.
+
+    Args:
+        traced: the function.
+        inputs: names of its arguments.
+        outputs: names of what it returns; no input's.
+        about: the file's metadata.
+
+    Raises:
+        Exception: of torch or onnxruntime, where an operation has no counterpart.
+        RuntimeError: if the graph computes something else.
+    """
+    runtime, given = load_runtime(), traced.program.example_inputs[0]
+    from onnx_ir.passes.common import RemoveUnusedNodesPass
+
+    with torch.no_grad(), warnings.catch_warnings(), _quiet(), waiting("writing", 3 * traced.took):
+        warnings.simplefilter("ignore")
+        expected = traced.program.module()(*given)  # what follows spoils its constants
+        program = traced.program.run_decompositions(WRITTEN_OTHERWISE)
+        made: Any = torch.onnx.export(
+            program, dynamo=True, input_names=inputs, output_names=outputs, verbose=False
+        )
+        RemoveUnusedNodesPass()(made.model)
+        for node in made.model.graph.all_nodes():
+            node.metadata_props.clear()  # where in our sources it came from: most of the file
+        made.model.metadata_props.update(about)
+        code = made.model_proto.SerializeToString()
+    session = runtime.InferenceSession(code, providers=["CPUExecutionProvider"])
+    found = session.run(outputs, {k: x.numpy() for k, x in zip(inputs, given, strict=True)})
+    for one, other in zip(map(torch.from_numpy, found), expected, strict=True):
+        if not torch.allclose(one, other, rtol=1e-2, atol=1e-2, equal_nan=True):
+            raise RuntimeError("the graph says something else")
+    return code
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep remarks of the exporter about itself off the terminal."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(before)
