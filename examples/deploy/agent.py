@@ -64,7 +64,7 @@ class Agent:
         return numbers
 
 
-def load(path: str, sha256: str | None) -> Agent:
+def load(path: str | Path, sha256: str | None) -> Agent:
     """Return what ``afm-rl-export`` wrote, if it is that.
 
     It needs onnxruntime and NumPy for a graph (``.onnx``), torch for machine code (``.pt2``), which
@@ -77,7 +77,7 @@ def load(path: str, sha256: str | None) -> Agent:
             f"{path}: its sha256 is {found}, expected {sha256}; give --sha256 as afm-rl-export "
             "printed it"
         )
-    policy, about = (graph if path.endswith(".onnx") else program)(code)
+    policy, about = (graph if Path(path).suffix == ".onnx" else program)(code)
     sizes = {name: int(n) for name, n in (s.rsplit(":", 1) for s in about["arguments"].split())}
     return Agent(policy, sizes, float(about["noise_bound"]), about["dtype"])
 

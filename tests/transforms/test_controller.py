@@ -277,7 +277,7 @@ def test_a_graph_plans_the_same(tmp_path, kind):
 def test_a_planner_of_another_kind_is_no_graph(tmp_path):
     pytest.importorskip("onnxruntime")
     with pytest.raises(ConfigurationError, match=r"policy.onnx: CEM cannot be .* MPPI or ICEM"):
-        check_exportable(tmp_path / "policy.onnx", planner_of(CEM))
+        check_exportable(tmp_path / "policy.onnx", planner_of(CEM, elites=3))
 
 
 def test_without_the_packages_it_says_what_to_install(tmp_path, monkeypatch):
