@@ -242,6 +242,7 @@ def export_controller(controller: Controller, path: str | Path) -> str:
         "arguments": " ".join(f"{name}:{size}" for name, size in controller.sizes.items()),
         "noise_bound": str(controller.noise_bound),
         "dtype": str(controller.start.dtype).removeprefix("torch."),
+        "actions": str(controller.policy.action_spec.shape[-1]),
     }
     try:
         traced = trace(controller, example)

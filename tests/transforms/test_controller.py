@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -239,6 +240,7 @@ def test_a_file_acts_the_same_without_this_library(tmp_path):
     "flow", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["LeastSquares", "ActionFlow"]
 )
 def test_a_graph_acts_the_same_without_torch(tmp_path, flow):
+    """In a Python process of its own, and in the C++ program."""
     # Some seconds, most of them torch's exporter; the only such test that is not slow.
     onnx = pytest.importorskip("onnx")
     controller, path_driven = corrected_alone(None if flow else LeastSquares(LOW, HIGH))
@@ -247,6 +249,12 @@ def test_a_graph_acts_the_same_without_torch(tmp_path, flow):
     assert path.stat().st_size < 2e6
     run = [sys.executable, "-c", ALONE, path, checksum, PROGRAM.parent, "torch"]
     check_runs(run, path_driven, tmp_path)
+    if has_compiler():
+        folder = Path(find_spec("onnxruntime").origin).parent / "capi"
+        for library in folder.glob("libonnxruntime.so.*"):
+            build = ["c++", "-std=c++17", PROGRAM / "run_onnx.cpp", "-o", tmp_path / "run", "-ldl"]
+            subprocess.run(build, check=True)
+            check_runs([tmp_path / "run", library, path], path_driven, tmp_path)
     model = onnx.load(path)
     assert [node.op_type for node in model.graph.node].count("If") == 1  # only one side is computed
     about = {entry.key: entry.value for entry in model.metadata_props}
