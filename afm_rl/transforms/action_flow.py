@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -30,10 +31,11 @@ class ActionFlowTransform(Shell, StatefulTransform):
     r"""Action Flow Matching: the planned action goes in, the action that does it comes out.
 
     A view of the :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``,
-    ``enabled``, ``delay``, ``delay_compensation``, ``belief``, ``keep_memory_on_reset`` and
-    ``extend_action_box``. On the way to the environment the planned action is corrected; on the way
-    back the transition enters the memory. The dynamics model is shared with planner and updater; of
-    one that learns, the *present* one is asked about the newest transitions again.
+    ``enabled``, ``delay``, ``delay_compensation``, ``belief``, ``keep_memory_on_reset``,
+    ``extend_action_box`` and ``record``. On the way to the environment the planned action is
+    corrected; on the way back the transition enters the memory. The dynamics model is shared with
+    planner and updater; of one that learns, the *present* one is asked about the newest transitions
+    again.
 
     Every mission of a batch has a memory of its own, which a reset empties. Under ``prefix`` are
     the entries of the loop (the root action stays the planned one, which losses of policies need;
@@ -100,6 +102,7 @@ class ActionFlowTransform(Shell, StatefulTransform):
         belief: bool = False,
         carry_memory: bool = False,
         keep_memory_on_reset: bool = False,
+        record: str | Path | None = None,
     ) -> None:
         state, known = "observation", None
         if isinstance(model, str):
@@ -122,6 +125,7 @@ class ActionFlowTransform(Shell, StatefulTransform):
             belief=belief,
             keep_memory_on_reset=keep_memory_on_reset,
             extend_action_box=extend_action_box,
+            record=record,
         )
         self._loop = loop if corrector is None or known is None else loop.complete()
         self._corrector = corrector  # registered here

@@ -72,6 +72,11 @@ class Controller(nn.Module):
     def __init__(self, planner: TensorDictModuleBase | None, policy: ActionFlowPolicy) -> None:
         super().__init__()
         self.policy = check_instance("controller.policy", policy, ActionFlowPolicy)
+        if policy.loop.record is not None:
+            raise ConfigurationError(
+                "controller.policy: record=...: a controller is a pure function, which writes no "
+                "file; give a policy without"
+            )
         self.planner, self.streams = copy.copy(planner), Streams()
         self.task: dict[NestedKey, int] = {policy.action_key: policy.action_spec.shape[-1]}
         first = policy.make_tensordict_primer()(TensorDict())

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import gymnasium
@@ -65,10 +66,11 @@ class GymnasiumShell:
         delay: int | Sequence[int] | None = None,
         belief: bool = False,
         keep_memory_on_reset: bool = False,
+        record: str | Path | None = None,
     ) -> None:
         options: Any = {"corrector": corrector, "enabled": enabled, "delay": delay}
         options |= {"delay_compensation": delay_compensation, "belief": belief}
-        options |= {"keep_memory_on_reset": keep_memory_on_reset}
+        options |= {"keep_memory_on_reset": keep_memory_on_reset, "record": record}
         given: Any = {"model": model, "state": state, "observe": observe, **options}
         RecordConstructorArgs.__init__(self, **given)  # type: ignore[arg-type]
         super().__init__(env)  # type: ignore[call-arg]
@@ -270,7 +272,7 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
     as it is, brought into the action space; when it does not, the corrector's answer is. Seeds,
     rewards, ends and observations are the environment's own. It is a view of the
     :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``, ``enabled``,
-    ``delay_compensation``, ``delay``, ``belief`` and ``keep_memory_on_reset``.
+    ``delay_compensation``, ``delay``, ``belief``, ``keep_memory_on_reset`` and ``record``.
 
     ``info["afm"]`` has, after each step, ``planned``, ``executed`` and ``predicted`` ``(A,)``, the
     last being the effect that the executed action is expected to have; ``corrects``, whether the

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -62,6 +63,8 @@ class CorrectionLoop:
             begins with an empty memory.
         extend_action_box: let planners know of effects beyond the action box, if the model can
             predict them.
+        record: a new file, ``.csv``, to which planned, executed and effective action and the state
+            of each step are appended, as ``afm-rl-diagnose`` reads them.
 
     Raises:
         ConfigurationError: for options that cannot be used, or parts that do not fit each other.
@@ -88,12 +91,17 @@ class CorrectionLoop:
     belief: bool = False
     keep_memory_on_reset: bool = False
     extend_action_box: bool = True
+    record: Any = None
 
     def __post_init__(self) -> None:
-        """Check what is true or false."""
+        """Check what is true or false, and where to record."""
         for name, value in vars(self).items():
             if isinstance(getattr(CorrectionLoop, name, None), bool):
                 check_flag(f"{self.owner}.{name}", value)
+        if isinstance(self.record, str | Path):
+            from afm_rl.transforms.record import Recorder
+
+            object.__setattr__(self, "record", Recorder(self.record))
 
     def complete(
         self, model: DynamicsModel | None = None, action_spec: TensorSpec | None = None
@@ -225,6 +233,8 @@ class CorrectionLoop:
         }
         entries = {name: value.to(action_spec.dtype) for name, value in entries.items()}
         entries |= {"misaligned": answer.misaligned, "memory": memory}
+        if self.record is not None:
+            self.record.acted(corrector.latest(memory)[0], plan, entries["executed_action"])
         return self._with_belief(TensorDict(entries, planned.shape[:-1], device=planned.device))
 
     @torch.no_grad()
@@ -235,7 +245,10 @@ class CorrectionLoop:
             ConfigurationError: for anything but real numbers of this shape.
         """
         state = check_numbers(key, state, (*memory.shape[:-1], self.model.state_size))
-        return self.corrector.observe(memory, state.to(memory.dtype))
+        state = state.to(memory.dtype)
+        if self.record is not None:
+            self.record.observed(self.model, self.corrector.scale, state)
+        return self.corrector.observe(memory, state)
 
     def arrival(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Return the state ``(*B, S)`` in which the next action acts, and in how many steps.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -27,12 +28,12 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
     Put it after a planner in a ``TensorDictSequential``: a state goes in, the action to execute
     comes out under ``action_key``, as a robot wants it that is no environment. It is a view of the
     :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``, ``enabled``,
-    ``extend_action_box``, ``delay`` and ``keep_memory_on_reset``. Under ``prefix`` are its entries,
-    with the memory as ``"_memory"``, which collectors leave out; the next ones go to ``("next",
-    prefix)``, as planners have it. Prime the first tensordict with :meth:`make_tensordict_primer`
-    (or append that to an environment), which keeps what was learnt of the last step, or of the
-    tensordict that it is given; and carry ``"next"`` on (``step_mdp`` does). Actions are the same
-    as the transform's.
+    ``extend_action_box``, ``delay``, ``keep_memory_on_reset`` and ``record``. Under ``prefix`` are
+    its entries, with the memory as ``"_memory"``, which collectors leave out; the next ones go to
+    ``("next", prefix)``, as planners have it. Prime the first tensordict with
+    :meth:`make_tensordict_primer` (or append that to an environment), which keeps what was learnt
+    of the last step, or of the tensordict that it is given; and carry ``"next"`` on (``step_mdp``
+    does). Actions are the same as the transform's.
 
     Args:
         model: dynamics model, shared with the planner (it does not become part of the state dict).
@@ -73,6 +74,7 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
         extend_action_box: bool = True,
         delay: int | Sequence[int] | None = None,
         keep_memory_on_reset: bool = False,
+        record: str | Path | None = None,
     ) -> None:
         super().__init__()
         self.action_spec = check_instance("policy.action_spec", action_spec, Bounded)
@@ -84,6 +86,7 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
             delay=delay,
             keep_memory_on_reset=keep_memory_on_reset,
             extend_action_box=extend_action_box,
+            record=record,
         )
         self._loop = loop.complete(action_spec=action_spec)
         self.corrector = self._loop.corrector  # registered here; the model is not

@@ -26,6 +26,7 @@ def test_a_correction_loads_what_it_needs_and_nothing_else(name):
     loaded = house["run"](house[name])["loaded"]
     assert house["rooms"](loaded).isdisjoint(BEYOND)
     assert "afm_rl/correction/tick.py" in loaded
+    assert "afm_rl/transforms/record.py" not in loaded  # nothing is recorded
 
 
 def test_a_diagnosis_needs_no_torch():

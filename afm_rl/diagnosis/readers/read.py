@@ -15,6 +15,7 @@ from afm_rl.diagnosis.log import FEWEST, Log
 from afm_rl.diagnosis.readers import messages, parquet, tables
 from afm_rl.diagnosis.readers.angles import with_angles
 from afm_rl.diagnosis.readers.source import (
+    EFFECTIVE,
     Columns,
     Series,
     Source,
@@ -145,6 +146,7 @@ def read_log(
             read_from=columns.read_from,
             notes=columns.notes,
             effort=columns.effort,
+            computed=columns.computed,
         )
 
 
@@ -182,8 +184,23 @@ def read_columns(
         leading = columns[wanted[0][0]]
         number = np.arange(len(first)) if leading.row is None else leading.row
         notes = (*source.notes, *thinned_note(number, leading.rows), *assumed, *notes)
+        if border is not None and len(number) > number[-1] and _take_turns(border):
+            order = np.argsort(border, kind="stable")
+            first, second, border = first[order], second[order], border[order]
+            time = None if time is None else time[order]
         done = _complete(source, names, first, second, number, time, border, notes)
-        return replace(done, effort=_effort(source))
+        computed = all(name.startswith(f"{EFFECTIVE}.") for name in wanted[1])
+        return replace(done, effort=_effort(source), computed=computed)
+
+
+def _take_turns(episode: np.ndarray) -> bool:
+    """Return whether episodes take turns, as robots do that are logged side by side.
+
+    >>> _take_turns(np.array([0, 1, 0, 1, 0, 1])), _take_turns(np.arange(6))
+    (True, False)
+    """
+    turns = int((np.diff(episode) != 0).sum())
+    return turns > len(episode) / 2 and len(np.unique(episode)) <= len(episode) / 2
 
 
 @contextmanager

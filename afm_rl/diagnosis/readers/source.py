@@ -20,6 +20,8 @@ Pairs = tuple[list[str], list[str]]
 
 ACTIONS = ("action", "actions")  # LeRobot's words, and older ones
 STATES = ("observation.state", "state", "states", "observation.states")
+EFFECTIVE = "effective"
+"""Responses that were computed: actions that have the measured effects."""
 WIDEST = 1_000
 """Most numbers of a list in a table, or of a message, that have names."""
 NAMES = 100_000
@@ -100,6 +102,7 @@ class Columns:
         frame: time between command and response of a healthy robot (s).
         notes: what a reader must know.
         effort: how hard the motors were driven, ``(M,)`` each.
+        computed: were responses computed, and not measured?
     """
 
     names: tuple[Sequence[str], Sequence[str]]
@@ -112,6 +115,7 @@ class Columns:
     frame: float = 0.0
     notes: tuple[str, ...] = ()
     effort: Mapping[str, np.ndarray] = field(default_factory=dict)
+    computed: bool = False
 
 
 class Unchosen(ConfigurationError):
@@ -245,6 +249,9 @@ def choose(
         return (read_first, read_second), (first, first if paired else second), ()
     groups = [[n for n in source.names if n.startswith(f"{kind}.")] for kind in kinds]
     heads = list(kinds)
+    if paired and groups[0] and not groups[1]:  # as corrections record it
+        heads[1] = EFFECTIVE
+        groups[1] = [n for n in source.names if n.startswith(f"{EFFECTIVE}.")]
     if not all(groups):
         groups, heads = map(list, zip(*(_group(source, h) for h in (ACTIONS, STATES)), strict=True))
     if not all(groups):

@@ -1,0 +1,126 @@
+"""What a correction was asked, what it did, and what was measured, as a log on disk."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from afm_rl.dynamics.inverse import effective_action
+from afm_rl.errors import ConfigurationError
+
+
+class Recorder:
+    """Appends a line for each step of each mission to a CSV file, which ``afm-rl-diagnose`` reads.
+
+    Its columns are ``episode_index``; ``t`` (s), if the model knows its step; ``planned.NAME`` and
+    ``command.NAME``, the executed action; ``effective.NAME``, the action that has the measured
+    effect through the model, empty where the step does not show it; and ``state.NAME``, the state
+    before. Each line is handed to the system as a whole, so that the file can be read after a kill.
+
+    Args:
+        file: a new one, ``.csv``.
+
+    Raises:
+        ConfigurationError: if the file is there already, or cannot be written.
+    """
+
+    def __init__(self, file: str | Path) -> None:
+        self.file = Path(file)
+        if self.file.suffix != ".csv":
+            raise ConfigurationError(f"record={str(file)!r}: expected a file .csv")
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise self._refusal(f"cannot be written: {error.strerror}") from error
+        if self.file.exists():
+            raise self._refusal("is there already")
+        self._handle: Any = None
+        self._acted: Any = None  # state, planned and executed action of the newest step
+        self._next: Tensor | None = None  # the states that these led to
+        self._episode = np.zeros(0, dtype=int)
+        self._steps = np.zeros(0, dtype=int)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_handle": None}
+
+    def acted(self, state: Tensor, planned: Tensor, executed: Tensor) -> None:
+        """Note what was planned and executed ``(*B, A)`` in a state ``(*B, S)``."""
+        self._acted = state, planned, executed
+
+    def observed(self, model: Any, scale: Tensor, state: Tensor) -> None:
+        """Write what the actions led to, a state ``(*B, S)`` of a model.
+
+        Args:
+            model: by which effects are understood.
+            scale: half ranges of the actions, ``(A,)``.
+            state: the measured one.
+        """
+        if self._acted is None or self._acted[0].shape != state.shape:
+            return
+        parts = (part.to(state) for part in self._acted)
+        before, planned, executed = (part.reshape(-1, part.shape[-1]) for part in parts)
+        self._acted, after = None, state.reshape(-1, state.shape[-1])
+        begins = torch.ones(len(after), dtype=torch.bool)
+        if self._next is not None and self._next.shape == after.shape:
+            begins = (self._next != before).any(-1).cpu()
+        elif len(self._episode) != len(after):
+            first = int(self._episode.max(initial=-1))
+            self._episode = first + np.arange(len(after)) - len(after) + 1
+            self._steps = np.zeros(len(after), dtype=int)
+        self._next = after
+        new = begins.numpy()
+        self._episode[new] = self._episode.max() + 1 + np.arange(new.sum())
+        self._steps = np.where(new, 0, self._steps + 1)
+        seen = effective_action(model, before, executed, after, scale.to(executed), quiet=-1.0)
+        effective = torch.where(seen.std < scale.to(executed), seen.action, torch.nan)
+        sound = (before.isfinite().all(-1) & after.isfinite().all(-1)).cpu().numpy()
+        table = torch.cat([planned, executed, effective, before], -1).double().cpu().numpy()
+        lines, dt = [], getattr(model, "dt", None)
+        for episode, step, row in zip(
+            self._episode[sound], self._steps[sound], table[sound], strict=True
+        ):
+            times = [] if dt is None else [f"{step * dt:.9g}"]
+            numbers = ("" if np.isnan(number) else f"{number:.9g}" for number in row)
+            lines.append(",".join([str(episode), *times, *numbers]) + "\n")
+        if lines:
+            self._append("".join(lines), model)
+
+    def _append(self, text: str, model: Any) -> None:
+        try:
+            if self._handle is None:
+                how = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
+                self._handle = os.open(self.file, how, 0o644)
+                text = _head(model) + text
+            os.write(self._handle, text.encode())
+        except FileExistsError as error:
+            raise self._refusal("is there already, maybe of another process") from error
+        except OSError as error:
+            raise self._refusal(f"cannot be written: {error.strerror}") from error
+
+    def _refusal(self, what: str) -> ConfigurationError:
+        return ConfigurationError(
+            f"record={str(self.file)!r}: {what}; expected a new file: name another, or move it"
+        )
+
+    def __del__(self) -> None:
+        if (handle := getattr(self, "_handle", None)) is not None:
+            os.close(handle)
+
+
+def _head(model: Any) -> str:
+    """Return the line of names: those of the model, or numbers."""
+    sizes = (model.state_size, model.action_size)
+    states, actions = getattr(model, "names", None) or (range(size) for size in sizes)
+    actions = list(actions)
+    names = ["episode_index", *(["t"] if hasattr(model, "dt") else [])]
+    names += [f"{kind}.{x}" for kind in ("planned", "command", "effective") for x in actions]
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerow([*names, *(f"state.{x}" for x in states)])
+    return text.getvalue()
