@@ -3,6 +3,7 @@
 afm-rl-play                          a half cheetah
 afm-rl-play --robot hopper --open    another robot; the browser opens
 afm-rl-play --policy mine.safetensors   a policy of your own, in its own task
+afm-rl-play --robot hopper --policy mine.onnx   one of any origin, for this robot
 """
 
 from __future__ import annotations
@@ -20,7 +21,12 @@ def main() -> None:
     parser = OneLineParser("afm-rl-play", __doc__)
     add = parser.add_argument
     add("--robot", help="half_cheetah (without anything said), hopper, ant, ugv, ...")
-    add("--policy", metavar="FILE", type=Path, help="written by save_policy, with its task as id")
+    add(
+        "--policy",
+        metavar="FILE",
+        type=Path,
+        help="written by save_policy, with its task as id; or ONNX",
+    )
     add("--port", type=int, default=0, help="of 127.0.0.1; a free one")
     add("--open", action="store_true", help="open the browser")
     options = parser.parse_args()

@@ -12,6 +12,7 @@ from .imported_policy import (
 )
 from .mpc import MPC as MPC
 from .mppi import MPPI as MPPI
+from .onnx_policy import policy_from_onnx as policy_from_onnx
 from .planning_env import PlanningEnv as PlanningEnv
 from .policies import (
     LawPlanner as LawPlanner,

@@ -19,8 +19,16 @@ from torchrl.envs.utils import step_mdp
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins, MuJoCoDynamics, Quadrotor
 from afm_rl.envs.task.rewards import pendulum_step
-from afm_rl.errors import ConfigurationError, check_choice
-from afm_rl.planning import MPC, MPPI, GoalDistance, PlanningEnv, TrackingCost, load_policy
+from afm_rl.errors import AFMError, ConfigurationError, check_choice
+from afm_rl.planning import (
+    MPC,
+    MPPI,
+    GoalDistance,
+    PlanningEnv,
+    TrackingCost,
+    load_policy,
+    policy_from_onnx,
+)
 from afm_rl.planning.riccati import stationary_value
 
 Acting = Callable[[np.ndarray], np.ndarray]
@@ -61,7 +69,7 @@ def make_robot(name: str | None = None, file: str | Path | None = None) -> Playe
     Args:
         name: of the robot; ``half_cheetah`` without name and file.
         file: what :func:`~afm_rl.planning.save_policy` wrote, with a task of gymnasium as ``id``
-            and, if it has any, numbers as its ``settings``.
+            and, if it has any, numbers as its ``settings``; or an ONNX file, for the named robot.
 
     Raises:
         ConfigurationError: for an unknown name, or a file that does not fit it.
@@ -69,11 +77,22 @@ def make_robot(name: str | None = None, file: str | Path | None = None) -> Playe
     """
     if file is None:
         return ROBOTS[check_choice("--robot", name or "half_cheetah", ROBOTS)]()
+    graph = Path(file).suffix == ".onnx"
+    if name is None and graph:
+        raise ConfigurationError(
+            f"--policy={file}: a graph does not say in which task it acts; name the robot, too, "
+            "such as --robot half_cheetah"
+        )
     if name is None:
         return _stored(Path(file))
-    own, robot = ROBOTS[check_choice("--robot", name, ROBOTS)](), _stored(Path(file))
+    own = ROBOTS[check_choice("--robot", name, ROBOTS)]()
     if own.task is None:
         raise ConfigurationError(f"--policy={file}: {name} has a controller; leave --policy out")
+    if graph:
+        policy = policy_from_onnx(file)
+        _check_fits(file, own, (policy.observation_size, policy.action_size))
+        return replace(own, policy=lambda: _acting(policy))
+    robot = _stored(Path(file))
     if own.task != robot.task:
         raise ConfigurationError(
             f"--robot={name}: the policy in {file} acts in {robot.name}; leave --robot out"
@@ -90,21 +109,29 @@ def _stored(file: Path, name: str | None = None) -> PlayedRobot:
     if not isinstance(settings, dict) or not all(map(_numeric, settings.values())):
         raise ConfigurationError(f"{file}: settings={settings!r:.80}: expected numbers, by name")
 
-    def act(seen: np.ndarray) -> np.ndarray:
-        return policy(torch.as_tensor(seen, dtype=torch.float32)).numpy()
-
     try:
-        robot = _gymnasium(name or task, task, lambda: act, settings)
-        env = robot.make()
-        shapes = env.observation_space.shape, env.action_space.shape
+        robot = _gymnasium(name or task, task, lambda: _acting(policy), settings)
+        _check_fits(file, robot, (policy.observation_size, len(policy.low)))
+    except AFMError:
+        raise
     except Exception as error:  # gymnasium and its tasks raise anything
         raise ConfigurationError(f"{file}: {task} cannot be played: {error}") from error
-    if shapes != ((policy.observation_size,), tuple(policy.low.shape)):
-        raise ConfigurationError(
-            f"{file}: a policy of {policy.observation_size} observations and {len(policy.low)} "
-            f"actions; {task} has {shapes[0]} and {shapes[1]}"
-        )
     return robot
+
+
+def _acting(policy: Callable[[torch.Tensor], torch.Tensor]) -> Acting:
+    return lambda seen: policy(torch.as_tensor(seen, dtype=torch.float32)).numpy()
+
+
+def _check_fits(file: str | Path, robot: PlayedRobot, sizes: tuple[int, int]) -> None:
+    """Check that a policy has as many observations and actions as the robot."""
+    env = robot.make()
+    shapes = env.observation_space.shape, env.action_space.shape
+    if shapes != ((sizes[0],), (sizes[1],)):
+        raise ConfigurationError(
+            f"{file}: a policy of {sizes[0]} observations and {sizes[1]} actions; {robot.name} has "
+            f"{shapes[0]} and {shapes[1]}"
+        )
 
 
 def _numeric(value: Any) -> bool:

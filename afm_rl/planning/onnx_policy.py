@@ -1,0 +1,205 @@
+"""A policy that somebody exported as ONNX, trusted with tensors alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from afm_rl.compiling.onnx_graph import load_runtime
+from afm_rl.errors import AFMError, ArtefactError, ConfigurationError, printable
+from afm_rl.storage.torch_files import LARGEST
+
+DOMAINS = ("", "ai.onnx", "ai.onnx.ml")  # of operators; all others are somebody's own
+MOST = 2**24  # numbers that a policy computes
+
+
+class GraphPolicy(nn.Module):
+    """A policy as an ONNX graph; made by :func:`policy_from_onnx`.
+
+    Args:
+        session: runs the graph.
+        inputs: the graph's inputs, with shape and type, in the order of an observation's numbers.
+        output: the graph's output with the action.
+    """
+
+    def __init__(self, session: Any, inputs: dict[str, tuple[Sequence[int], Any]], output: str):
+        super().__init__()
+        self.__dict__["session"] = session
+        self.inputs, self.output = inputs, output
+        self.sizes = [math.prod(shape) for shape, _ in inputs.values()]
+        self.observation_size = sum(self.sizes)
+        self.action_size = len(self(torch.zeros(self.observation_size)))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the action ``(*B, A)`` for an observation ``(*B, O)``, row by row."""
+        rows = observation.detach().reshape(-1, self.observation_size).cpu()
+        actions = []
+        for row in rows:
+            given = {}
+            for part, (name, (shape, kind)) in zip(
+                row.split(self.sizes), self.inputs.items(), strict=True
+            ):
+                given[name] = part.numpy().astype(kind).reshape(shape)
+            actions.append(torch.as_tensor(self.session.run([self.output], given)[0]).flatten())
+        found = torch.stack(actions).to(observation)
+        return found.view(*observation.shape[:-1], -1)
+
+
+def policy_from_onnx(
+    path: str | Path, inputs: Sequence[str] | None = None, output: str | None = None
+) -> GraphPolicy:
+    """Return the policy in an ONNX file, a function of observations ``(*B, O)``.
+
+    The file is trusted with tensors alone: operators are those of ONNX, none of them a loop, a
+    branch or somebody's own, weights are in the file or in files of its folder, and every result
+    has a size that is known and no larger than 2^24 numbers.
+
+    Args:
+        path: the file.
+        inputs: names of its inputs, in the order in which an observation has their numbers; needed
+            where there are several.
+        output: the one that is the action; None: the first.
+
+    Raises:
+        ConfigurationError: if there is no such file, input or output, or onnxruntime is missing.
+        ArtefactError: if it holds no such policy.
+
+    Example::
+
+        policy = policy_from_onnx("go1_policy.onnx")
+        action = policy(observation)
+    """
+    runtime, path = load_runtime(), Path(path)
+    if not path.is_file():
+        raise ConfigurationError(f"{path}: no such file")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads, options.log_severity_level = 1, 4
+    try:
+        model = _model(path)
+        named = _inputs(path, model, inputs)
+        outputs = [entry.name for entry in model.graph.output]
+        if output is not None and output not in outputs:
+            raise ConfigurationError(f"{path}: output={output!r}: expected one of {_list(outputs)}")
+        _check_sizes(path, model)
+        session = runtime.InferenceSession(
+            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
+        return GraphPolicy(session, named, output or outputs[0])
+    except AFMError:
+        raise
+    except Exception as error:  # files of others hold anything
+        raise ArtefactError(
+            f"{path}: no policy that onnxruntime can run ({printable(str(error), 200)})"
+        ) from error
+
+
+def _model(path: Path) -> Any:
+    """Return the model of a file, with its weights, if it has nothing but operators and tensors."""
+    import onnx
+
+    if path.stat().st_size > LARGEST:
+        raise ArtefactError(f"{path}: larger than {LARGEST} bytes, which no such policy is")
+    model = onnx.load_model_from_string(path.read_bytes())
+    graph, own = model.graph, {entry.domain for entry in model.opset_import}
+    own |= {node.domain for node in graph.node}
+    if own := own - {*DOMAINS} or {function.name for function in model.functions}:
+        raise ArtefactError(
+            f"{path}: operators of {_list(sorted(own))}; expected those of ONNX alone"
+        )
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("g") or attribute.graphs:
+                raise ArtefactError(
+                    f"{path}: control flow, {printable(node.op_type)}, which no such policy needs; "
+                    "export it without loops and branches"
+                )
+            if attribute.HasField("sparse_tensor") or attribute.t.external_data:
+                raise ArtefactError(f"{path}: a constant that is sparse or in another file")
+    if graph.sparse_initializer:
+        raise ArtefactError(f"{path}: sparse weights; expected whole ones")
+    _read_weights(path, graph.initializer)
+    return model
+
+
+def _read_weights(path: Path, weights: Iterable[Any]) -> None:
+    """Read weights that are in other files of the folder."""
+    from onnx.external_data_helper import load_external_data_for_tensor, uses_external_data
+
+    folder, left = path.parent.resolve(), LARGEST
+    for weight in weights:
+        if not uses_external_data(weight):
+            continue
+        about = {entry.key: entry.value for entry in weight.external_data}
+        file = (folder / about.get("location", "")).resolve()
+        if not file.is_relative_to(folder) or not file.is_file():
+            raise ArtefactError(
+                f"{path}: weights in {printable(about.get('location', ''))!r}; expected a file of "
+                "its folder"
+            )
+        left -= int(about.get("length", file.stat().st_size))
+        if left < 0:
+            raise ArtefactError(f"{path}: more than {LARGEST} bytes of weights")
+        load_external_data_for_tensor(weight, str(folder))
+        weight.ClearField("external_data")
+        weight.data_location = 0
+
+
+def _inputs(path: Path, model: Any, names: Sequence[str] | None) -> dict[str, tuple[list, Any]]:
+    """Return shape and type of the inputs in order, each for one observation."""
+    from onnx.helper import tensor_dtype_to_np_dtype
+
+    weights, found = {weight.name for weight in model.graph.initializer}, {}
+    for entry in model.graph.input:
+        if entry.name in weights:
+            continue
+        kind, dims = entry.type.tensor_type, entry.type.tensor_type.shape.dim
+        if dims and not dims[0].dim_value:
+            dims[0].dim_value = 1  # how many observations there are
+        shape = [dim.dim_value for dim in dims]
+        if not 0 < math.prod(shape) <= MOST or kind.elem_type not in (1, 10, 11):
+            raise ArtefactError(
+                f"{path}: input {printable(entry.name)!r} of the shape {shape!s:.80}: expected "
+                "real numbers, as many as an observation has"
+            )
+        found[entry.name] = (shape, tensor_dtype_to_np_dtype(kind.elem_type))
+    sizes = [f"{name} ({math.prod(shape)})" for name, (shape, _) in found.items()]
+    if names is None and len(found) == 1:
+        return found
+    if names is None or sorted(names) != sorted(found):
+        raise ConfigurationError(
+            f"{path}: inputs={names!r}: expected the names of {_list(sizes)}, in the order in "
+            "which an observation has their numbers"
+        )
+    return {name: found[name] for name in names}
+
+
+def _check_sizes(path: Path, model: Any) -> None:
+    """Refuse a graph that computes too many numbers, or nobody knows how many."""
+    import onnx
+
+    del model.graph.value_info[:]  # what the file says of sizes is no more than a word
+    for entry in model.graph.output:
+        entry.type.tensor_type.ClearField("shape")
+    graph = onnx.shape_inference.infer_shapes(model, strict_mode=True, data_prop=True).graph
+    types = {x.name: x.type.tensor_type for x in (*graph.value_info, *graph.output)}
+    total = 0
+    for node in graph.node:
+        for kind in (types.get(name) for name in node.output if name):
+            dims = [dim.dim_value for dim in kind.shape.dim] if kind else []
+            if kind is None or not kind.HasField("shape") or min(dims, default=1) < 1:
+                raise ArtefactError(
+                    f"{path}: it is not known how many numbers {printable(node.op_type)} returns; "
+                    "export it with fixed shapes, for one observation"
+                )
+            total += math.prod(dims)
+    if total > MOST:
+        raise ArtefactError(f"{path}: {total} numbers to compute, more than {MOST}")
+
+
+def _list(names: Iterable[str]) -> str:
+    return ", ".join(printable(name) for name in list(names)[:8])

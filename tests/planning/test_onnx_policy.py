@@ -1,0 +1,189 @@
+"""Policies that others exported as ONNX: what they say, and what is refused."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+
+from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.planning import policy_from_onnx
+from afm_rl.play import make_robot
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+helper, FLOAT = onnx.helper, onnx.TensorProto.FLOAT
+WEIGHT = np.arange(6, dtype=np.float32).reshape(3, 2) / 10
+
+
+def entry(name, shape, kind=FLOAT):
+    return helper.make_tensor_value_info(name, kind, shape)
+
+
+def graph(nodes, weights=(), inputs=(("obs", [1, 3]),), outputs=(("act", [1, 2]),), **model):
+    """Return a model of such nodes."""
+    tensors = [onnx.numpy_helper.from_array(np.asarray(x), name) for name, x in weights]
+    entries = [[entry(name, shape) for name, shape in ends] for ends in (inputs, outputs)]
+    made = helper.make_graph(nodes, "policy", *entries, tensors)
+    opsets = [helper.make_opsetid(domain, 18) for domain in model.pop("domains", [""])]
+    return helper.make_model(made, opset_imports=opsets, ir_version=9, **model)
+
+
+def node(kind, *names, **settings):
+    """Return a node; the last name is its output."""
+    return helper.make_node(kind, names[:-1], names[-1:], **settings)
+
+
+def layer(inputs=(("obs", [1, 3]),)):
+    """Return tanh(x W), of one input or more behind one another."""
+    joined = node("Concat", *(name for name, _ in inputs), "x", axis=-1)
+    nodes = [joined, node("MatMul", "x", "W", "y"), node("Tanh", "y", "act")]
+    return graph(nodes, [("W", WEIGHT)], inputs)
+
+
+def saved(tmp_path, model):
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+@pytest.mark.parametrize("batch", [1, "batch"])
+def test_a_policy_acts_on_rows_of_observations(tmp_path, batch):
+    policy = policy_from_onnx(saved(tmp_path, layer([("obs", [batch, 3])])))
+    assert (policy.observation_size, policy.action_size) == (3, 2)
+    seen = torch.randn(4, 5, 3, dtype=torch.float64)
+    expected = (seen @ torch.from_numpy(WEIGHT).double()).tanh()
+    torch.testing.assert_close(policy(seen), expected, atol=1e-6, rtol=0)
+    assert torch.equal(policy(seen[0, 0]), policy(seen)[0, 0])
+
+
+def test_several_inputs_are_named_in_the_order_of_the_observation(tmp_path):
+    path = saved(tmp_path, layer([("command", [1, 1]), ("body", [1, 2])]))
+    policy, seen = policy_from_onnx(path, inputs=["body", "command"]), torch.tensor([1.0, 2.0, 3.0])
+    expected = (seen[[2, 0, 1]] @ torch.from_numpy(WEIGHT)).tanh()
+    torch.testing.assert_close(policy(seen), expected)
+    for names in (None, ["body"], ["body", "goal"]):
+        with pytest.raises(ConfigurationError, match=r"names of command \(1\), body \(2\), in the"):
+            policy_from_onnx(path, names)
+    with pytest.raises(ConfigurationError, match="output='value': expected one of act"):
+        policy_from_onnx(path, ["body", "command"], "value")
+
+
+def elsewhere(model, location):
+    """Put the weights into another file."""
+    (weight,) = model.graph.initializer
+    weight.ClearField("raw_data")
+    weight.data_location = onnx.TensorProto.EXTERNAL
+    weight.external_data.add(key="location", value=location)
+    return model
+
+
+def test_weights_may_be_in_another_file_of_the_folder(tmp_path):
+    (tmp_path / "weights").write_bytes(WEIGHT.tobytes())
+    policy = policy_from_onnx(saved(tmp_path, elsewhere(layer(), "weights")))
+    assert policy(torch.ones(3)).shape == (2,)
+
+
+def forever():
+    body = helper.make_graph(
+        [node("Identity", "go", "on"), node("Identity", "x", "y")],
+        "body",
+        [entry("i", [], 7), entry("go", [], 9), entry("x", [1, 3])],
+        [entry("on", [], 9), entry("y", [1, 3])],
+    )
+    return graph([node("Loop", "", "true", "obs", "act", body=body)], [("true", np.array(True))])
+
+
+def large(*shape):
+    """Return a graph that makes ever so many numbers of a few bytes, and declares none of it."""
+    nodes = [node("ConstantOfShape", "shape", "x"), node("ReduceSum", "x", "y", keepdims=0)]
+    made = graph([*nodes, node("Add", "obs", "y", "act")], [("shape", np.array(shape))])
+    made.graph.value_info.append(entry("x", [1]))
+    return made
+
+
+def doubling():
+    nodes = [node("Concat", *[f"x{k}"] * 8, f"x{k + 1}", axis=0) for k in range(9)]
+    return graph([node("Identity", "obs", "x0"), *nodes, node("Identity", "x9", "act")])
+
+
+REFUSED = {
+    "a loop": (forever, "control flow, Loop"),
+    "an operator of somebody's own": (
+        lambda: graph([node("Harm", "obs", "act", domain="mine")], domains=["", "mine"]),
+        "operators of mine; expected those of ONNX",
+    ),
+    "weights anywhere": (
+        lambda: elsewhere(layer(), "/etc/passwd"),
+        "expected a file of its folder",
+    ),
+    "weights above": (lambda: elsewhere(layer(), "../policy"), "expected a file of its folder"),
+    "weights by a link": (lambda: elsewhere(layer(), "link"), "expected a file of its folder"),
+    "too many numbers": (lambda: large(2**20, 2**20), "numbers to compute, more than"),
+    "ever more of them": (doubling, "numbers to compute, more than"),
+    "an unknown number": (
+        lambda: graph([node("NonZero", "obs", "x"), node("Cast", "x", "act", to=FLOAT)]),
+        "not known how many numbers NonZero",
+    ),
+    "words": (
+        lambda: graph([node("Identity", "obs", "act")], inputs=[("obs", [1, "n"])]),
+        "expected real numbers, as many as an observation has",
+    ),
+    "shapes that do not fit": (
+        lambda: graph([node("MatMul", "obs", "W", "act")], [("W", WEIGHT.T)]),
+        "no policy that onnxruntime can run",
+    ),
+    "an unknown operator": (lambda: graph([node("Harm", "obs", "act")]), "numbers Harm returns"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_more_than_tensors_is_refused_in_one_line(tmp_path, name):
+    (tmp_path / "link").symlink_to("/etc/hostname")
+    make, words = REFUSED[name]
+    path = saved(tmp_path, make())
+    tracemalloc.start()
+    with pytest.raises(ArtefactError) as refused:
+        policy_from_onnx(path)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    message = str(refused.value)
+    assert message.startswith(f"{path}: ") and words in message and "\n" not in message
+    assert most < 10**8
+
+
+def test_300_damaged_files_are_read_or_refused(tmp_path):
+    random, sound, read = np.random.default_rng(0), layer().SerializeToString(), 0
+    path = tmp_path / "policy.onnx"
+    for number in range(300):
+        content = bytearray(sound)
+        place, length = (int(x) for x in random.integers(0, (len(sound), 9)))
+        if number % 2:
+            del content[place:]
+        else:
+            content[place : place + length] = random.bytes(length + 1)
+        path.write_bytes(content)
+        try:
+            policy = policy_from_onnx(path)
+        except (ArtefactError, ConfigurationError) as error:
+            assert "\n" not in str(error)
+        else:
+            read += policy(torch.ones(policy.observation_size)).shape == (policy.action_size,)
+    assert read < 150
+    with pytest.raises(ConfigurationError, match="no such file"):
+        policy_from_onnx(tmp_path / "nothing.onnx")
+
+
+def test_the_page_plays_it_in_the_robot_that_is_named(tmp_path):
+    pytest.importorskip("mujoco")
+    path = saved(tmp_path, layer())
+    with pytest.raises(ConfigurationError, match="name the robot"):
+        make_robot(file=path)
+    with pytest.raises(ConfigurationError, match="cart_pole has a controller"):
+        make_robot("cart_pole", path)
+    with pytest.raises(ConfigurationError, match=r"3 observations and 2 actions; pendulum has \(3"):
+        make_robot("pendulum", path)
+    nodes = [node("MatMul", "obs", "W", "act")]
+    path = saved(tmp_path, graph(nodes, [("W", WEIGHT[:, :1])], outputs=[("act", [1, 1])]))
+    robot = make_robot("pendulum", path)
+    assert robot.policy()(np.ones(3)).shape == (1,)
