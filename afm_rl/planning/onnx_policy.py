@@ -27,7 +27,9 @@ class GraphPolicy(nn.Module):
         output: the graph's output with the action.
     """
 
-    def __init__(self, session: Any, inputs: dict[str, tuple[Sequence[int], Any]], output: str):
+    session: Any
+
+    def __init__(self, session: Any, inputs: dict[str, tuple[list[int], Any]], output: str):
         super().__init__()
         self.__dict__["session"] = session
         self.inputs, self.output = inputs, output
@@ -149,7 +151,7 @@ def _read_weights(path: Path, weights: Iterable[Any]) -> None:
         weight.data_location = 0
 
 
-def _inputs(path: Path, model: Any, names: Sequence[str] | None) -> dict[str, tuple[list, Any]]:
+def _inputs(path: Path, model: Any, names: Sequence[str] | None) -> dict[str, tuple[list[int], Any]]:
     """Return shape and type of the inputs in order, each for one observation."""
     from onnx.helper import tensor_dtype_to_np_dtype
 
