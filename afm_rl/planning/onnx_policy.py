@@ -151,7 +151,9 @@ def _read_weights(path: Path, weights: Iterable[Any]) -> None:
         weight.data_location = 0
 
 
-def _inputs(path: Path, model: Any, names: Sequence[str] | None) -> dict[str, tuple[list[int], Any]]:
+def _inputs(
+    path: Path, model: Any, names: Sequence[str] | None
+) -> dict[str, tuple[list[int], Any]]:
     """Return shape and type of the inputs in order, each for one observation."""
     from onnx.helper import tensor_dtype_to_np_dtype
 
