@@ -42,11 +42,8 @@ def find_doubts(
                 "not measured",
                 "its response is its command, digit by digit; log what a sensor reads",
             )
-        elif lead.left > 0.1 and _causes(log, y, u) and not _causes(log, u, y):
-            doubts[j] = (
-                "not actuated",
-                "its command answers its response, and not the other way round; is it armed?",
-            )
+        elif lead.left > 0.1 and (answer := _answer(log, u, y, lead.left)):
+            doubts[j] = answer
         elif ranges[j] < settings.moves * usual:
             share = 100 * ranges[j] / usual
             doubts[j] = "cannot tell", f"its command moves by {share:.1g} % of the usual; move it"
@@ -120,6 +117,37 @@ def copies_of(command: np.ndarray, alike_from: float = 0.999) -> list[list[int]]
     return [[int(i) for i in np.flatnonzero(row > alike_from)] for row in alike]
 
 
+def _answer(log: Log, u: np.ndarray, y: np.ndarray, left: float) -> Doubt | None:
+    """Return what a command that answers its response leaves to say, if it does.
+
+    A loop that hovers looks like one that is not armed. But its command has moves of its own, from
+    sensors that are not logged: in a quarter of a tenth of its spread and more.
+    """
+    if not _causes(log, y, u):
+        return None
+    acts = _causes(log, u, y)
+    rows, own, other = _pasts(log, u, y)
+    design = np.column_stack([np.ones(len(rows)), own, other, y[rows]])
+    moves = u[rows] - design @ np.linalg.lstsq(design, u[rows], rcond=None)[0]
+    if not acts and moves.std() < 0.025 * u.std():
+        text = "its command answers its response, and not the other way round; is it armed?"
+        return "not actuated", text
+    if not acts or left > 0.3:
+        return "cannot tell", "its command answers its response, as of a loop that holds; excite it"
+    return None
+
+
+def _pasts(
+    log: Log, one: np.ndarray, other: np.ndarray, every: int = 1, past: int = 8
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rows that have a past, and both series in it, ``(M, past)`` each."""
+    rows = np.arange(len(one))
+    place = rows - np.maximum.accumulate(np.where(log.begins, rows, 0))
+    rows = np.flatnonzero(place >= past * every)
+    late = rows[:, None] - np.arange(1, past + 1) * every
+    return rows, one[late], other[late]
+
+
 def _causes(log: Log, cause: np.ndarray, effect: np.ndarray, past: int = 8) -> bool:
     """Return whether the past of one series predicts another beyond its own past (Granger 1969).
 
@@ -129,16 +157,11 @@ def _causes(log: Log, cause: np.ndarray, effect: np.ndarray, past: int = 8) -> b
     if not (np.ptp(cause) > 0 and np.ptp(effect) > 0):
         return False
     cause, effect = ((x - x.mean()) / x.std() for x in (cause, effect))
-    place = np.arange(len(effect)) - np.maximum.accumulate(
-        np.where(log.begins, np.arange(len(effect)), 0)
-    )
     shares = []
     for every in (1, 5):
-        rows = np.flatnonzero(place >= past * every)
+        rows, own, other = _pasts(log, effect, cause, every, past)
         if len(rows) < 20 * past:
             continue
-        late = np.arange(1, past + 1) * every
-        own, other = (series[rows[:, None] - late] for series in (effect, cause))
         alone = np.column_stack([np.ones(len(rows)), own])
         before, after = (
             missed(x, effect[rows], 1e-9) for x in (alone, np.column_stack([alone, other]))

@@ -33,10 +33,15 @@ class Actuator:
     """Response per negative command, where ``gain`` is that of positive ones alone."""
     reversed: bool = False
     offset: float = math.nan
-    """b, in units of the response; where all commands are far from 0, at the ``centre`` of them."""
+    """b at the command ``centre``: what is left there of a healthy response,
+    ``zero + unit * centre``, in units of the response."""
     offset_interval: Interval = (-math.inf, math.inf)
     centre: float = 0.0
-    """The command at which the offset is meant."""
+    """The command at which the offset is meant: 0, or the middle of the range where commands are
+    far from 0, or where a healthy actuator and this one meet there."""
+    level: float = math.nan
+    """The response to a command in the middle of its range."""
+    level_interval: Interval = (-math.inf, math.inf)
     dead_zone: float = 0.0
     """Size of commands up to which nothing happens, in units of the command; 0: none was seen."""
     limits: Interval | None = None
@@ -87,6 +92,8 @@ class Actuator:
     """Of command and response, as text; empty if they are not known."""
     unit: float = 1.0
     """Gain of a healthy actuator: pi / 180 where commands are degrees and responses radians."""
+    zero: float = 0.0
+    """Response of a healthy actuator to the command 0: 2048 where all count from there."""
     drift: Mapping[str, Interval] = field(default_factory=dict)
     """``gain`` or ``offset`` at begin and end of the log, where it changes little by little."""
     changes: tuple[Change, ...] = ()
@@ -105,6 +112,11 @@ class Actuator:
         """Half of the range of commands."""
         low, high = self.command_range
         return 0.5 * (high - low)
+
+    @property
+    def middle(self) -> float:
+        """The middle of the range of commands."""
+        return 0.5 * sum(self.command_range)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,7 +148,8 @@ class Diagnosis:
     """Responses by the fits, ``(N, A)``, for figures."""
 
     def __str__(self) -> str:
-        return "\n".join(actuator.sentence for actuator in self.actuators)
+        notes = [f"Note: {note}" for note in self.notes]
+        return "\n".join([*notes, *(actuator.sentence for actuator in self.actuators)])
 
     @property
     def healthy(self) -> bool:

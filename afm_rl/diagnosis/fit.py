@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from operator import attrgetter
 from typing import Any
 
@@ -24,7 +25,7 @@ from afm_rl.diagnosis.model import (
     scale_of,
     weight_of,
 )
-from afm_rl.diagnosis.response import Shape, respond
+from afm_rl.diagnosis.response import Shape, look_back, respond
 from afm_rl.diagnosis.settings import Settings
 
 FLOOR = 1e-7  # share of the variance: better fits are all the same
@@ -46,9 +47,11 @@ def fit_response(
         large = problem
     model = _simplest(large, options, settings)
     added = 0
-    for step in (larger, _with_drift):  # a drift last, since it explains a little of everything
+    # A drift last, since it explains a little of everything.
+    for steps in ((larger, _with_another), (_with_drift,)):
         while added < settings.most:
-            refined = [refine(large, other) for other in step(problem, model)]
+            larger_ones = chain.from_iterable(step(problem, model) for step in steps)
+            refined = [refine(large, other) for other in larger_ones]
             better = min(refined, key=COST, default=model)
             if not (
                 needed(large, better, model, settings) and _visible(large, better, model, settings)
@@ -138,7 +141,7 @@ def _with_drift(problem: Problem, model: Model) -> Iterator[Model]:
 
 
 def larger(problem: Problem, model: Model, tried: int = 3) -> Iterator[Model]:
-    """Yield the best models with one number more, each with a good beginning for it."""
+    """Yield the best models of the own command with one number more, from a good beginning."""
     own, shape = problem.u[:, model.driver], model.shape
     models = []
     for names, options in _beginnings(own, shape).items():
@@ -154,7 +157,6 @@ def larger(problem: Problem, model: Model, tried: int = 3) -> Iterator[Model]:
                 near = getattr(best.shape, name) * np.linspace(1 - width, 1 + width, 9)
                 best = min(best, _best(problem, best, [{name: float(x)} for x in near]), key=COST)
         yield best
-    yield from _with_another(problem, model)
 
 
 def _beginnings(own: np.ndarray, shape: Shape) -> dict[str, list[dict[str, Any]]]:
@@ -216,14 +218,21 @@ def _best(problem: Problem, model: Model, options: Sequence[dict[str, Any]]) -> 
 def _with_another(
     problem: Problem, model: Model, clear: float = 4.5, coupled: float = 0.05
 ) -> Iterator[Model]:
-    """Yield the model with the other command that shows best in what is left."""
-    linear = model.shape.linear
+    """Yield the model with the other command that shows best in what is left.
+
+    What the own command may explain a few steps earlier or later does not count: neighbours that
+    are commanded alike would stand in for dynamics that are not known.
+    """
+    linear, around = model.shape.linear, (-2, -1, 0, 1, 2, 4, 8)  # steps
     rest = [i for i in range(problem.u.shape[1]) if i not in (model.driver, *model.others)]
     rest = [i for i in rest if problem.u[:, i].std() > 0]
     if not rest:
         return
     use = problem.use
     parts = [x[use] for x in model.parts(problem)]
+    own = problem.u[:, model.driver]
+    late = [linear._replace(delay=linear.delay + k) for k in around]
+    parts += [look_back(problem.clock, own, shape)[use] for shape in late]
     design = np.column_stack([*parts, np.ones(use.sum())])
     others = np.column_stack([respond(problem.clock, problem.u[:, i], linear)[use] for i in rest])
     residual = problem.y[use] - model.predict(problem)[use]
@@ -233,7 +242,7 @@ def _with_another(
     power = (others**2).sum(0)
     slope = residual @ others / np.maximum(power, 1e-300)
     spread = problem.u[:, rest].std(0)
-    independent = power / len(residual) > 1e-4 * spread**2  # not a copy of the driver
+    independent = power / len(residual) > 0.02 * spread**2  # hardly a copy
     influence = np.abs(slope) * spread
     main = abs(model.gain) * parts[0].std()
     remaining = residual[:, None] - slope * others  # of each, were it the one

@@ -10,6 +10,7 @@ from scipy.special import stdtrit
 
 from afm_rl.diagnosis.findings import Actuator, Diagnosis
 from afm_rl.diagnosis.settings import Settings
+from afm_rl.diagnosis.together import in_units
 from afm_rl.diagnosis.words import judge
 from afm_rl.errors import ConfigurationError
 
@@ -68,8 +69,10 @@ def explain(
     late = np.zeros((delays, *u.shape))
     for delay in range(delays):
         late[delay, delay:] = u[: len(u) - delay]
-    shown = [_fit(late, y[:, j], weight[:, j], j, names, step, fewest) for j in range(size)]
-    return Diagnosis(actuators=tuple(shown), step_s=step, rows=len(u))
+    fits = [[_fit(late, y[:, j], weight[:, j], j, names, step, fewest)] for j in range(size)]
+    actuators, notes = in_units(fits, Settings())
+    judged = tuple(judge(actuator, step) for (actuator,) in actuators)
+    return Diagnosis(actuators=judged, step_s=step, rows=len(u), notes=notes)
 
 
 def describe(
@@ -84,7 +87,7 @@ def describe(
 
     Args:
         pairs: executed and effective actions and the standard deviations of these, side by side,
-            ``(K, 3 A)``, oldest first; None where nothing has changed.
+            ``(K, 3 A)``, oldest first, in the unit of the actions; None where nothing has changed.
         names: of the A actuators.
         step: time of a step (s).
         delay: steps from an action to its effect.
@@ -167,19 +170,27 @@ def _fit(
     inflation = (1 + min(alike, 0.9)) / (1 - min(alike, 0.9))
     scale = (weight * residual**2).sum() / freedom * inflation
     times = stdtrit(max(freedom / inflation, 2.0), 0.975)
-    width = 1.25 * times * np.sqrt(scale * covariance.diagonal())
     least, most = float(x[:, driver].min()), float(x[:, driver].max())
+    middle = 0.5 * (least + most)
+    # of the gain, and of the responses to the commands 0 and in the middle
+    three = np.zeros((3, len(gram)))
+    three[0, 0] = three[1, -1] = three[2, -1] = 1.0
+    three[2, 0] = middle
+    width = 1.25 * times * np.sqrt(scale * (three @ covariance * three).sum(1))
     if not most > least:
         width = np.full_like(width, np.inf)
+    level = gain * middle + offset
     others = max(coupling, key=lambda name: abs(coupling[name])) if coupling else None
     total = y.var()
-    actuator = Actuator(
+    return Actuator(
         name=names[own],
         gain=float(gain),
         gain_interval=(float(gain - width[0]), float(gain + width[0])),
         reversed=bool(gain + width[0] < 0),
         offset=float(offset),
-        offset_interval=(float(offset - width[-1]), float(offset + width[-1])),
+        offset_interval=(float(offset - width[1]), float(offset + width[1])),
+        level=float(level),
+        level_interval=(float(level - width[2]), float(level + width[2])),
         delay_s=delay * step,
         driven_by=others if driver == own else names[driver],
         coupling=coupling,
@@ -188,7 +199,6 @@ def _fit(
         command_range=(least, most),
         rows=len(x),
     )
-    return judge(actuator, step)
 
 
 def _line(

@@ -235,11 +235,11 @@ def slopes(problem: Problem, model: Model, central: bool = True) -> np.ndarray:
     return np.column_stack(columns)
 
 
-def interval_widths(problem: Problem, model: Model, centre: float = 0.0) -> np.ndarray:
-    """Return half widths of the 95 % intervals of three numbers, ``(3,)``.
+def interval_widths(problem: Problem, model: Model, middle: float = 0.0) -> np.ndarray:
+    """Return half widths of the 95 % intervals of four numbers, ``(4,)``.
 
-    These are the gain, the response to the command ``centre``, and delay and lag together (steps).
-    The uncertainty of a delay that was found to be none counts, too.
+    These are the gain, the responses to the commands 0 and ``middle``, and delay and lag together
+    (steps). The uncertainty of a delay that was found to be none counts, too.
     """
     if not {"delay", "keep"} & set(model.active):
         model = replace(model, active=(*model.active, "delay"))
@@ -263,5 +263,6 @@ def interval_widths(problem: Problem, model: Model, centre: float = 0.0) -> np.n
         keep = model.shape.keep
         by = {"delay": 1.0, "keep": 1 / (max(keep, 0.05) * math.log(max(keep, 0.05)) ** 2)}
         late += by.get(name, 0.0) * influence[:, place]
-    three = (influence[:, 0], influence[:, 1] + centre * influence[:, 0], late)
-    return half_widths(np.column_stack(three)) * freedom
+    gain, offset = influence[:, 0], influence[:, 1]
+    four = np.column_stack([gain, offset, offset + middle * gain, late])
+    return half_widths(four) * freedom

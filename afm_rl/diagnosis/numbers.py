@@ -28,11 +28,12 @@ from afm_rl.diagnosis.settings import Settings
 
 
 def likely_intervals(
-    problem: Problem, model: Model, part: Part, centre: float, settings: Settings
+    problem: Problem, model: Model, part: Part, middle: float, settings: Settings
 ) -> np.ndarray:
-    """Return the 95 % intervals of the gain, of a response, and of the time it takes.
+    """Return the 95 % intervals of the gain, of two responses, and of the time they take.
 
-    ``(3, 2)``, the time is delay and lag together, in steps.
+    ``(4, 2)``: the responses are those to the commands 0 and ``middle``, the time is delay and lag
+    together, in steps.
 
     They span those of every mixture of delay and lag that explains the response about as well, and
     of a model with one number more that explains it a little better: what was left out because it
@@ -47,9 +48,9 @@ def likely_intervals(
             late = max(likely.shape.delay, 0.0)
             if likely.shape.keep > 1e-6:
                 late -= 1 / math.log(likely.shape.keep)
-            middle = np.array([gain, offset + centre * gain, late])
-            widths = interval_widths(problem, likely, centre)
-            ends.append([middle - widths, middle + widths])
+            best = np.array([gain, offset, offset + middle * gain, late])
+            widths = interval_widths(problem, likely, middle)
+            ends.append([best - widths, best + widths])
     lows, highs = np.moveaxis(np.array(ends), 1, 0)
     return np.stack([lows.min(0), highs.max(0)], -1)
 
@@ -82,17 +83,18 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
     scale = spread[j] / unit
     command = log.command[:, model.driver]
     low, high = (float(end[0]) for end in ends_of(command[:, None]))
-    centre = middle_of(command)
-    intervals = likely_intervals(problem, model, part, centre / unit, settings)
+    middle = 0.5 * (low + high)
+    intervals = likely_intervals(problem, model, part, middle / unit, settings)
     extra = dict(zip(model.others, model.gains, strict=True))
     usual = sum(g * middle_of(log.command[:, i]) / reach[i] for i, g in extra.items() if i >= 0)
-    gain, offset = model.gain * scale, (model.offset + model.gain * centre / unit) * spread[j]
+    gain, offset = model.gain * scale, (model.offset + usual) * spread[j]
     gains, offsets = intervals[0] * scale, (intervals[1] + usual) * spread[j]
-    offset += usual * spread[j]
+    level, levels = offset + gain * middle, (intervals[2] + usual) * spread[j]
     away = np.abs(log.response[part.rows, j] - command[part.rows])
     held = command[part.rows].std() < 0.1 * unit and away.max() < settings.matters * unit
     if held:  # as a healthy one would
-        gain, offset, gains, offsets = 1.0, centre, np.ones(2), np.full(2, centre)
+        gain, offset, gains, offsets = 1.0, 0.0, np.ones(2), np.zeros(2)
+        level, levels = middle, np.full(2, middle)
     y = problem.y[problem.use]
     residual = y - model.predict(problem)[problem.use]
     rows = np.flatnonzero(problem_of(scaled.log, j, part, settings).use)
@@ -107,7 +109,7 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
     largest = max(coupling, key=lambda name: abs(coupling[name]), default=None)
     dead_zone = shape.dead_zone or shape.jump
     for end, beyond, sign in ((shape.low, low, 1), (-shape.high, -high, -1)):
-        if math.isfinite(end) and 0 < end and -0.1 * end * unit < beyond and not centre:
+        if math.isfinite(end) and 0 < end and -0.1 * end * unit < beyond and not middle_of(command):
             # One direction only: what is not followed are the small commands.
             shift = sign * gain * end * unit
             dead_zone, offset, offsets = end, offset + shift, offsets + shift
@@ -129,7 +131,8 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
         reversed=bool(gains[1] < 0 and model.gain + extra.get(DOWN, 0.0) < 0),
         offset=float(offset),
         offset_interval=(float(offsets[0]), float(offsets[1])),
-        centre=centre,
+        level=float(level),
+        level_interval=(float(levels[0]), float(levels[1])),
         dead_zone=float(dead_zone * unit),
         limits=(float(min(ends)), float(max(ends))) if ends else None,
         backlash=float(shape.play * unit),
@@ -137,7 +140,7 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
         rate=float(abs(gain) * shape.rate * unit / log.step) if shape.rate < math.inf else None,
         every=shape.hold,
         delay_s=shape.delay * log.step,
-        time_interval=(float(intervals[2, 0] * log.step), float(intervals[2, 1] * log.step)),
+        time_interval=(float(intervals[3, 0] * log.step), float(intervals[3, 1] * log.step)),
         lag_s=-log.step / math.log(shape.keep) if shape.keep > 1e-6 else 0.0,
         driven_by=log.names[model.driver] if model.driver != j else largest,
         coupling=coupling,

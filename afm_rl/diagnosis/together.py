@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from afm_rl.diagnosis.changes import Part, problem_of
-from afm_rl.diagnosis.findings import Actuator
+from afm_rl.diagnosis.findings import Actuator, Interval
 from afm_rl.diagnosis.fit import FLOOR
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.model import Model, Problem, refine
+from afm_rl.diagnosis.model import Model, Problem, interval_widths, refine
 from afm_rl.diagnosis.settings import Settings
-from afm_rl.diagnosis.words import UNITS
+from afm_rl.diagnosis.words import UNITS, is_far, known_unit
 
 WEAK = {"delay": 0.1, "keep": 0.05, "rate": 2.0, "dead_zone": 0.01, "play": 0.01, "cut": 1.0}
 WEAK |= {"low": -1.0, "high": 1.0}
@@ -62,7 +62,8 @@ def agree(
     """Return the parts of all actuators, those of one kind with the same numbers.
 
     Of the sets of numbers that the members were found to need, the one that is best for all of them
-    together (BIC) is fitted to each. Members that changed, or follow another command, stay.
+    together (BIC) is fitted to each. Members that changed, or follow another command, stay, and so
+    does who is clearly worse explained, or less certain, with the numbers of all.
     """
     kinds = defaultdict(list)
     for j, parts in parts_of.items():
@@ -88,7 +89,13 @@ def agree(
         rates = [models[j].shape.rate * reach[j] for j in members]
         if max(rates) > 2 * min(rates):  # a limit that another one exceeds is none
             models = {j: _without_rate(problems[j], model) for j, model in models.items()}
-        better |= {j: [replace(parts_of[j][0], model=model)] for j, model in models.items()}
+        for j, model in models.items():
+            (part,) = parts_of[j]
+            lost = rows[j] * math.log((model.cost + FLOOR) / (part.model.cost + FLOOR))
+            own, shared = (interval_widths(problems[j], m)[0] for m in (part.model, model))
+            blurred = shared > max(1.5 * own, settings.matters * abs(model.gain))
+            if lost < settings.price(rows[j]) and not blurred:
+                better[j] = [replace(part, model=model)]
     return better
 
 
@@ -116,32 +123,99 @@ def _like(problem: Problem, own: Model, pattern: Model) -> Model:
     )
 
 
-def unit_of(actuators: Sequence[Sequence[Actuator]]) -> list[list[Actuator]]:
-    """Return the parts of all actuators with the gain of a healthy one.
+def in_units(
+    actuators: Sequence[Sequence[Actuator]], settings: Settings
+) -> tuple[list[list[Actuator]], tuple[str, ...]]:
+    """Return the parts of all actuators beside healthy ones in the unit of the log, and its name.
 
-    That is 1, or that of two known units if most have it.
+    A healthy gain is 1, or that of two known units if the intervals of at least half of the
+    actuators hold it, or what more than half have in common if it is so large or small that no
+    actuator is to blame. Where they have an offset in common as well, responses are counted from
+    there.
     """
-    last = [parts[-1] for parts in actuators]
-    gains = np.array([abs(a.gain) for a in last])
-    clear = [a.gain_interval[0] * a.gain_interval[1] > 0 and abs(a.gain) > 1e-4 for a in last]
-    unit = 1.0
-    if any(clear):
-        middle = float(np.median(gains[clear]))
-        unit = next((gain for gain in UNITS.values() if abs(middle / gain - 1) < 0.1), 1.0)
-    return [[_in_unit(part, unit) for part in parts] for parts in actuators]
+    clear = [a for (*_, a) in actuators if a.gain_interval[0] * a.gain_interval[1] > 0]
+    units = Counter(known_unit(a.gain_interval, settings) for a in clear)
+    name = max(("", *UNITS), key=lambda name: units[name])
+    gains = [abs(a.gain) for a in clear]
+    alike = _alike(gains, [settings.matters * gain for gain in gains])
+    shared = float(np.median(alike)) if len(alike) > 1 else 1.0
+    unit, zero, note = 1.0, 0.0, ""
+    if name and 2 * units[name] >= len(clear):
+        unit, note = UNITS[name], f"all responses are in {name}"
+    elif is_far(shared):
+        unit, note = shared, "all responses are in another unit"
+    if note:
+        command, response = clear[0].units
+        of = f" {response} per {command}" if command else " per unit of the command"
+        note += f": {unit:.4g}{of}"
+        offsets = [_deviation(a, _usual_centre(a), unit)[0] for a in clear]
+        sizes = [settings.matters * unit * a.reach for a in clear]
+        alike = _alike(offsets, sizes)
+        if len(alike) > 1 and abs(np.median(alike)) > max(sizes):
+            zero = float(np.median(alike))
+            note += f", counted from {zero:.4g}"
+    parts = [[_in_unit(part, unit, zero, settings) for part in parts] for parts in actuators]
+    return parts, (note,) if note else ()
 
 
-def _in_unit(actuator: Actuator, unit: float) -> Actuator:
-    """Return the actuator with its healthy gain, and the offset from a healthy response."""
-    usual = unit * actuator.centre
-    low, high = actuator.offset_interval
+def _alike(values: Sequence[float], apart: Sequence[float]) -> list[float]:
+    """Return the values around one of them that are more than half of all; none if there are none.
+
+    >>> _alike([1.0, 1.1, 9.0], [0.2, 0.2, 0.2]), _alike([1.0, 9.0], [0.2, 0.2])
+    ([1.0, 1.1], [])
+    """
+    near = [
+        [value for value in values if abs(value - one) <= size]
+        for one, size in zip(values, apart, strict=True)
+    ]
+    most = max(near, key=len, default=[])
+    return most if 2 * len(most) > len(values) else []
+
+
+def _usual_centre(actuator: Actuator) -> float:
+    """Return where an offset is meant: at 0, or in the middle of commands that are far from it."""
+    low, high = actuator.command_range
+    near = 0.1 * (high - low)
+    return 0.0 if low - near <= 0.0 <= high + near else actuator.middle
+
+
+def _deviation(actuator: Actuator, centre: float, healthy: float) -> tuple[float, Interval]:
+    """Return how far the response at 0, or in the middle, is from ``healthy * centre``."""
+    response, ends = actuator.offset, actuator.offset_interval
+    if centre:
+        response, ends = actuator.level, actuator.level_interval
+    return response - healthy * centre, (ends[0] - healthy * centre, ends[1] - healthy * centre)
+
+
+def _in_unit(actuator: Actuator, unit: float, zero: float, settings: Settings) -> Actuator:
+    """Return the actuator with its healthy gain, and the offset from a healthy response.
+
+    The offset is that at 0 or in the middle of the commands, wherever it is smaller: a gripper that
+    answers 100 - u to commands of 0 to 100 is reversed about its middle.
+    """
+    centre, middle = _usual_centre(actuator), actuator.middle
+    offset, ends = _deviation(actuator, centre, unit)
+    if abs(middle) > 0.25 * actuator.reach:
+        other = 0.0 if centre else middle
+        instead, ends_instead = _deviation(actuator, other, unit)
+        if abs(offset - zero) > max(
+            settings.matters * unit * actuator.reach, 2 * abs(instead - zero)
+        ):
+            centre, offset, ends = other, instead, ends_instead
+    if actuator.reversed and centre:  # the ends of its range are known by the commands alone
+        met = centre + (offset - zero) / (unit - actuator.gain)
+        if abs(met - centre) < 2 * settings.matters * actuator.reach:
+            centre, ends, offset = met, (ends[0] - offset + zero, ends[1] - offset + zero), zero
+    shift = offset - zero - actuator.offset
     return replace(
         actuator,
         unit=unit,
-        offset=actuator.offset - usual,
-        offset_interval=(low - usual, high - usual),
+        zero=zero,
+        centre=centre,
+        offset=offset - zero,
+        offset_interval=(ends[0] - zero, ends[1] - zero),
         drift={
-            name: (a - usual, b - usual) if name == "offset" else (a, b)
+            name: (a + shift, b + shift) if name == "offset" else (a, b)
             for name, (a, b) in actuator.drift.items()
         },
     )

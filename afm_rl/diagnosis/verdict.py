@@ -17,7 +17,7 @@ from afm_rl.diagnosis.residuals import without_lost
 from afm_rl.diagnosis.scale import Scaled, scale, unwrapped
 from afm_rl.diagnosis.search import find_leads, only, rows_enough
 from afm_rl.diagnosis.settings import Settings
-from afm_rl.diagnosis.together import agree, shared_delay, small_twins, unit_of, with_basis
+from afm_rl.diagnosis.together import agree, in_units, shared_delay, small_twins, with_basis
 from afm_rl.diagnosis.words import judge
 
 Parts = dict[int, Sequence[Part]]
@@ -58,7 +58,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         actuators.append([replace(actuator, lost=lost, **how) for actuator in numbers])
         for part in own:
             fitted[part.rows, j] = part.predict(clean, j)[part.rows] * scaled.spread[j]
-    actuators = unit_of(actuators)
+    actuators, units = in_units(actuators, settings)
     if all(len(own) == 1 for own in actuators):
         actuators = [[actuator] for actuator in with_basis([one for (one,) in actuators], settings)]
     usual, shared = shared_delay([own[-1] for own in actuators], log, settings)
@@ -71,7 +71,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         actuators=_judged(actuators, times, doubts, usual, scaled, log.step, settings),
         step_s=log.step,
         rows=len(log.command),
-        notes=(*log.notes, *shared, *effort_notes(log), *notes),
+        notes=(*log.notes, *units, *shared, *effort_notes(log), *notes),
         fitted=fitted[np.searchsorted(rows, np.arange(len(log.command)), side="right") - 1],
     )
 

@@ -22,6 +22,29 @@ UNITS = {
 NO_FAULT = "no known fault"
 
 
+def is_far(gain: float) -> bool:
+    """Is a gain so large or small that another unit is to blame, and no actuator?"""
+    return not 1 / 30 < gain < 30
+
+
+def known_unit(interval: Interval, settings: Settings) -> str:
+    """Return the name of the unit whose gain an interval holds; empty if it may be 1, or is none.
+
+    A gain near 1 / 30 to 30 that is not known to 5 % may be an actuator's own.
+
+    >>> known_unit((57.0, 57.5), Settings()), known_unit((9.98, 10.01), Settings())
+    ('degrees for radians', '')
+    """
+    low, high = sorted(abs(end) for end in widened(interval, settings))
+    if low <= 1.0 + settings.matters and high >= 1.0 - settings.matters:
+        return ""
+    for name, gain in UNITS.items():
+        known = settings.vague if is_far(gain) else settings.matters
+        if low <= gain <= high and high - low < 2 * known * gain:
+            return name
+    return ""
+
+
 def judge(
     actuator: Actuator,
     step: float = 1.0,
@@ -84,18 +107,21 @@ def _judged(
     follows = unexplained < 0.6  # of the variance: that little is the command, for certain
     if doubt:
         return doubt[0], [f"{doubt[0]}: {doubt[1]}"]
-    if actuator.misfit > 0.1 or noticed and unexplained > s.unknown:
-        closest = "" if unclear or not width < s.vague * max(1.0, size) else _closest(faults)
+    vague = not width < s.vague * max(1.0, size)
+    own = any(name in actuator.pattern for name in OWN)
+    excited = own or not vague or max(-low, high) < actuator.unit  # or it may as well be healthy
+    if excited and (actuator.misfit > 0.1 or noticed and unexplained > s.unknown):
+        closest = "" if unclear or vague else _closest(faults)
         return "changed", [f"{NO_FAULT}: {_rest(actuator)}{closest}"]
     if (
         max(-low, high) < (s.vague if unclear or unexplained > 0.9 else s.dead) * actuator.unit
         and actuator.driven_by is None
         and actuator.gain_down is None
         and not (outside(widened((low, high), s)) and follows)
-        and not any(name in actuator.pattern for name in OWN)
+        and not own
     ):
         return "dead", ["does not answer its command"]
-    if not width < s.vague * max(1.0, size):
+    if vague:
         return "cannot tell", [f"cannot tell: {_reason(actuator)}"]
     if not faults and not noticed:
         return "healthy", ["healthy", _rest(actuator)] if unexplained > s.left else []
@@ -157,8 +183,12 @@ def _faults(
     other = actuator.driven_by
     if other is not None and other not in actuator.coupling:
         yield f"follows the command of {other}"
+    shifted = outside(widened(actuator.offset_interval, s)) and (
+        abs(actuator.offset) > s.matters * unit * reach
+    )
     if actuator.reversed:
-        yield "reversed"
+        about = actuator.centre and not shifted
+        yield f"reversed about its middle ({actuator.centre:.3g}{command})" if about else "reversed"
         low, high = -high, -low
     ends = actuator.limits
     switches = ends is not None and ends[1] > ends[0] and ends[1] - ends[0] < 0.4 * reach
@@ -178,18 +208,12 @@ def _faults(
         p, q = 100 * p / unit, 100 * q / unit
         yield f"with {name} as one: {p:.0f} % {what[0]}, {q:.0f} % {what[1]}"
     elif not low <= 1.0 <= high and abs(share - 1.0) > s.matters:
-        odd = [name for name, gain in UNITS.items() if abs(share / gain - 1.0) < s.matters]
-        yield (
-            f"{share:.3g} times its command: {odd[0]}" if odd else f"{100 * share:.0f} % of {moves}"
-        )
+        odd = known_unit((actuator.gain_interval[0] / unit, actuator.gain_interval[1] / unit), s)
+        times = f"{share:.3g} times {moves}" + f": {odd}" * bool(odd)
+        yield times if odd or share > 3 else f"{100 * share:.0f} % of {moves}"
     for name, gain in actuator.coupling.items() if actuator.basis is None else ():
         yield f"takes in {100 * gain / unit:+.0f} % of the command of {name}"
-    if (
-        "offset" not in actuator.drift
-        and not switches
-        and outside(widened(actuator.offset_interval, s))
-        and abs(actuator.offset) > s.matters * unit * reach
-    ):
+    if shifted and not switches and "offset" not in actuator.drift:
         at = f" at {actuator.centre:.3g}{command}" if actuator.centre else ""
         range_ = 100 * abs(actuator.offset) / (2 * reach * unit)
         yield f"offset {actuator.offset:+.3g}{response} ({range_:.0f} % of its range){at}"

@@ -236,7 +236,8 @@ class GymnasiumShell:
         if changed and isinstance(corrector, PairCorrector):
             size = 3 * len(self._names)
             rows = corrector.unpack(memory, self._states.shape[-1])["pairs"]
-            pairs = rows[rows[:, size] > 0, :size].numpy()
+            parts = rows[rows[:, size] > 0, :size].unflatten(-1, (3, -1))
+            pairs = corrector.denormalise(parts).flatten(-2).numpy()
         how: Any = {"delay": delay, "known": corrector.delay}
         how["compensated"] = self._loop.delay_compensation and self._observed_in is not None
         how["compensated"] &= self._loop.enabled
