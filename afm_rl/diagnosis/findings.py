@@ -144,11 +144,13 @@ class Diagnosis:
     rows: int = 0
     notes: tuple[str, ...] = ()
     """What a reader must know of the log."""
+    common: tuple[str, ...] = ()
+    """Of the notes, what all actuators have in common: another unit, a delay."""
     fitted: np.ndarray | None = field(default=None, repr=False, compare=False)
     """Responses by the fits, ``(N, A)``, for figures."""
 
     def __str__(self) -> str:
-        notes = [f"Note: {note}" for note in self.notes]
+        notes = [f"Note: {note}" for note in self.common]
         return "\n".join([*notes, *(actuator.sentence for actuator in self.actuators)])
 
     @property

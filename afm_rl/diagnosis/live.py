@@ -72,7 +72,7 @@ def explain(
     fits = [[_fit(late, y[:, j], weight[:, j], j, names, step, fewest)] for j in range(size)]
     actuators, notes = in_units(fits, Settings())
     judged = tuple(judge(actuator, step) for (actuator,) in actuators)
-    return Diagnosis(actuators=judged, step_s=step, rows=len(u), notes=notes)
+    return Diagnosis(actuators=judged, step_s=step, rows=len(u), notes=notes, common=notes)
 
 
 def describe(

@@ -71,6 +71,7 @@ def diagnose(log: Log, settings: Settings | None = None) -> Diagnosis:
         actuators=_judged(actuators, times, doubts, usual, scaled, log.step, settings),
         step_s=log.step,
         rows=len(log.command),
+        common=(*units, *shared),
         notes=(*log.notes, *units, *shared, *effort_notes(log), *notes),
         fitted=fitted[np.searchsorted(rows, np.arange(len(log.command)), side="right") - 1],
     )
