@@ -84,6 +84,16 @@ class JointCalibration:
         zone = self.dead_zone.value if self.dead_zone.interval[0] > 0.0 else 0.0
         return gain, 0.0 if low <= 0.0 <= high else self.offset.value, zone
 
+    @property
+    def supposed(self) -> JointCalibration:
+        """The joint itself, or, where nothing is known of it, a healthy one."""
+        if self.status in ("healthy", "changed", "dead") and math.isfinite(self.offset.value):
+            return self
+        healthy = {"sign": 1.0, "scale": self.unit, "offset": 0.0, "dead_zone": 0.0}
+        healthy |= {"delay": 0.0, "lag": 0.0, "rate": math.inf}
+        numbers: Any = {n: getattr(self, n)._replace(value=value) for n, value in healthy.items()}
+        return replace(self, follows=self.name, scale_down=None, coupling={}, **numbers)
+
     def scaled(self, command: np.ndarray) -> np.ndarray:
         """Return the response to commands ``(N,)`` outside the dead zone, without offset."""
         down = self.scale.value if self.scale_down is None else self.scale_down
@@ -154,8 +164,9 @@ def read_calibration(path: str | Path) -> Calibration:
 def _joint(part: dict[str, Any]) -> JointCalibration:
     for name in ("sign", "scale", "offset", "dead_zone", "delay", "lag", "rate"):
         value, interval, determined = part[name].values()
-        value = math.inf if value is None and name == "rate" else float(value)
-        part[name] = Estimate(value, _ends(interval), bool(determined))
+        if value is None:
+            value = math.inf if name == "rate" else math.nan
+        part[name] = Estimate(float(value), _ends(interval), bool(determined))
     return JointCalibration(**part | {"limits": _ends(part["limits"])})
 
 
@@ -208,7 +219,7 @@ def _calibrated(log: Log, j: int, a: Actuator, s: Settings) -> JointCalibration:
     sign = math.copysign(1.0, a.gain)
     ends = {"scale": tuple(sorted(sign * end for end in a.gain_interval))}
     at_zero = (a.unit - a.gain) * a.centre  # offsets are those from a healthy response at centre
-    slack = abs(a.centre) * 0.5 * (a.gain_interval[1] - a.gain_interval[0])
+    slack = abs(a.centre) * 0.5 * (a.gain_interval[1] - a.gain_interval[0]) if a.centre else 0.0
     ends["offset"] = (
         a.offset_interval[0] + at_zero - slack,
         a.offset_interval[1] + at_zero + slack,
@@ -309,8 +320,11 @@ def _response(log: Log, clock: Clock, joint: JointCalibration) -> np.ndarray:
 
 
 def predict(calibration: Calibration, log: Log) -> np.ndarray:
-    """Return the responses to the commands of a log, ``(N, A)``, of joints in the log's order."""
-    pairs = enumerate(calibration.joints)
+    """Return the responses to the commands of a log, ``(N, A)``, of joints in the log's order.
+
+    Joints of which nothing is known count as healthy.
+    """
+    pairs = enumerate(joint.supposed for joint in calibration.joints)
     responses = [_response(log, _clock_of(log, j, joint), joint) for j, joint in pairs]
     return np.column_stack(responses)
 
@@ -384,6 +398,7 @@ def known_dynamics(calibration: Calibration) -> KnownDynamics:
     .. math:: y' = y + \mathrm{clip}((1 - e^{-\Delta/\tau})(g z(u) + b - y), \pm R \Delta)
 
     Delays are no part of it: a correction is told of them by ``delay=calibration.delay_steps``.
+    Joints of which nothing is known count as healthy.
 
     >>> u = np.random.default_rng(0).uniform(-1, 1, (300, 1))
     >>> model = known_dynamics(calibrate(Log(("elbow",), u, 0.2 - 0.5 * u)))
@@ -396,7 +411,7 @@ def known_dynamics(calibration: Calibration) -> KnownDynamics:
     from afm_rl.dynamics import KnownDynamics
     from afm_rl.spaces.manifold import Manifold
 
-    joints, step = calibration.joints, calibration.step
+    joints, step = [joint.supposed for joint in calibration.joints], calibration.step
     names = [joint.name for joint in joints]
     drivers = [names.index(joint.follows) for joint in joints]
 

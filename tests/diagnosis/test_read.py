@@ -96,6 +96,13 @@ DATES = pd.date_range("2024-05-01 12:00:00.05", periods=60, freq="100ms", tz="UT
         ("timestamp", 69_000_000 + 10**5 * np.arange(60), ("timestamp: read as us",)),
         ("time [ms]", 100.0 * np.arange(60), ()),
         ("time_us", 10**5 * np.arange(60), ()),
+        ("Time (seconds)", 0.1 * np.arange(60), ()),
+        ("timestamp_nanosec", 10**8 * np.arange(60), ()),
+        (
+            "time",
+            DATES.strftime("%Y%m%dT%H%M%S"),
+            ("time is coarse, several rows each: rows are taken as even",),
+        ),
     ],
 )
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])

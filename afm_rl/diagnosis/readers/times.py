@@ -10,8 +10,9 @@ import pandas as pd
 
 from afm_rl.errors import ConfigurationError, printable
 
+UNIT = r"s|sec\w*|[mun]s\w*|(?:milli|micro|nano)s\w*"
 TIME = re.compile(
-    r"%?(t|time|timestamp|stamp)(?:[ _]?[ _([](s|sec|ms|us|ns)[)\]]?)?", re.IGNORECASE
+    rf"%?(t|time|timestamp|datetime|stamp)(?:[ _]?[ _([]({UNIT})[)\]]?)?", re.IGNORECASE
 )
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 EPOCH = (9e8, 4.2e9)  # s since 1970: from 1998 to 2103
@@ -23,7 +24,7 @@ def time_among(names: Sequence[str]) -> str | None:
     >>> time_among(["command.a", "timestamp_ms"]), time_among(["Time", "t"]), time_among(["torque"])
     ('timestamp_ms', 't', None)
     """
-    order = ("t", "time", "timestamp", "stamp")
+    order = ("t", "time", "timestamp", "datetime", "stamp")
     ranks = {n: order.index(m[1].lower()) for n in names if (m := TIME.fullmatch(n))}
     return min(ranks, key=ranks.__getitem__, default=None)
 
@@ -58,14 +59,22 @@ def in_seconds(name: str, values: np.ndarray) -> tuple[np.ndarray, tuple[str, ..
     (array([0.  , 0.02]), ('time: read as ms',))
     """
     match, known = TIME.fullmatch(name), values[np.isfinite(values)]
-    unit = "s" if match is None else (match[2] or "").lower().replace("sec", "s")
-    if not len(known) or name == "t":
+    if match is None or not len(known) or name == "t":
         return values, ()
-    told, unit = bool(unit), unit or _unit_of(known)
-    seconds = values * UNITS[unit]
-    if EPOCH[0] < known[0] * UNITS[unit] < EPOCH[1]:
-        seconds = (values - known[0]) * UNITS[unit]
-    return seconds, () if told or unit == "s" else (f"{printable(name)}: read as {unit}",)
+    word, notes = (match[2] or "").lower(), []
+    unit = {"s": "s", "mil": "ms", "mic": "us", "n": "ns", "m": "ms", "u": "us"}.get(
+        word[:3] if word[:2] == "mi" else word[:1]
+    )
+    if unit is None:
+        unit = _unit_of(known)
+        notes += [f"{printable(name)}: read as {unit}"] * (unit != "s")
+    since = known[0] if EPOCH[0] < known[0] * UNITS[unit] < EPOCH[1] else 0.0
+    seconds, steps = (values - since) * UNITS[unit], np.diff(known)
+    if len(steps) and (steps >= 0).all() and (steps == 0).mean() > 0.2:
+        whole = float(np.ptp(known) + np.median(steps[steps > 0])) if steps.any() else 0.0
+        seconds = seconds[0] + np.arange(len(seconds)) * whole * UNITS[unit] / len(seconds)
+        notes.append(f"{printable(name)} is coarse, several rows each: rows are taken as even")
+    return seconds, tuple(notes)
 
 
 def _unit_of(known: np.ndarray, longest: float = 0.5) -> str:
