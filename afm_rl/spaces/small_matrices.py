@@ -55,8 +55,11 @@ def eliminate(matrix: Tensor, right: Tensor) -> Tensor:
     tensor([[1.],
             [1.]])
     """
-    rows = torch.cat([matrix, right], -1)
-    for _ in range(matrix.shape[-1]):
-        row = rows[..., :1, 1:] / rows[..., :1, :1]
-        rows = torch.cat([rows[..., 1:, 1:] - rows[..., 1:, :1] * row, row], -2)
+    size, rows = matrix.shape[-1], torch.cat([matrix, right], -1)
+    for _ in range(size):
+        (pivot, row), (below, rest) = (
+            part.split([1, part.shape[-1] - 1], -1) for part in rows.split([1, size - 1], -2)
+        )
+        row = row / pivot
+        rows = torch.cat([rest - below * row, row], -2)
     return rows
