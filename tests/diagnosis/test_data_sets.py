@@ -8,18 +8,18 @@ import pandas as pd
 import pytest
 
 from afm_rl.cli import diagnose as command
-from afm_rl.diagnosis import calibrate
+from afm_rl.diagnosis import calibrate, diagnose
 from afm_rl.diagnosis.readers import read_log
 
 
-def write(folder, gain, late, offset, joints, seed, quantum=0.0):
-    """Write 50 episodes at 30 Hz, five of them frozen, and return the numbers of these.
+def write(folder, gain, late, offset, joints, seed, quantum=0.0, noise=0.05, episodes=50, odd=5):
+    """Write episodes at 30 Hz, ``odd`` ones of them frozen, and return the numbers of these.
 
     Followers go a share ``gain`` of the way to what leaders did ``late`` frames ago.
     """
     rng, frames = np.random.default_rng(seed), 0
-    frozen = {int(episode): k for k, episode in enumerate(rng.choice(50, 5, replace=False))}
-    for episode in range(50):
+    frozen = {int(number): k for k, number in enumerate(rng.choice(episodes, odd, replace=False))}
+    for episode in range(episodes):
         rows = int(rng.integers(90, 130))
         ways = np.repeat(rng.uniform(-60, 60, (rows // 12 + 2, joints)), 12, axis=0)[: rows + 11]
         u = np.stack(
@@ -30,7 +30,7 @@ def write(folder, gain, late, offset, joints, seed, quantum=0.0):
         for k in range(len(u)):
             place = place + gain * (u[max(k - late, 0)] - place)
             y[k] = place + offset
-        y += 0.05 * rng.standard_normal(y.shape)
+        y = y.clip(-55, 55) + noise * rng.standard_normal(y.shape)
         if quantum:
             y = quantum * np.round(y / quantum)
         if episode in frozen:  # from the begin, or on the way
@@ -45,7 +45,7 @@ def write(folder, gain, late, offset, joints, seed, quantum=0.0):
         table.to_parquet(path)
         frames += len(u)
     feature = {"dtype": "float32", "names": [f"joint_{k}.pos" for k in range(joints)]}
-    info = {"fps": 30, "total_frames": frames, "total_episodes": 50}
+    info = {"fps": 30, "total_frames": frames, "total_episodes": episodes}
     info["features"] = {"action": feature, "observation.state": feature}
     (folder / "meta").mkdir()
     (folder / "meta" / "info.json").write_text(json.dumps(info))
@@ -96,3 +96,14 @@ def test_the_command_says_it_in_frames(tmp_path, monkeypatch, capsys):
     name, *numbers = [part.strip().split(" [")[0] for part in row.split("  ") if part]
     assert name == "joint_0.pos"
     assert [float(number) for number in numbers] == pytest.approx([4, 0.25, -0.98], abs=0.1)
+
+
+@pytest.mark.slow  # eight data sets of six joints
+def test_no_healthy_joint_is_accused(tmp_path):
+    rng = np.random.default_rng(0)
+    for number in range(8):
+        folder = tmp_path / str(number)
+        robot = {"gain": rng.choice([0.25, 0.4, 0.7, 1.0]), "late": int(rng.integers(1, 5))}
+        robot |= {"noise": rng.choice([0.03, 0.1, 0.3]), "quantum": rng.choice([0.0, 0.088])}
+        write(folder, offset=0.0, joints=6, seed=number, episodes=12, odd=0, **robot)
+        assert {actuator.status for actuator in diagnose(read_log(folder)).actuators} == {"healthy"}

@@ -56,7 +56,7 @@ def test_what_is_there_is_listed(drive):
     assert found.value.listing == [
         "/cmd_vel (40 messages): linear.x, angular.z",
         "/odom (90 messages): v, w[0..1]",
-        "/text (1 messages): ",
+        "/text (1 messages): no numbers that can be read",
     ]
 
 
@@ -165,6 +165,7 @@ def test_an_mcap_file_with_nested_messages(tmp_path):
         [
             ("/low", "json", "any", b"", motors),
             ("/pose", "ros1", "geometry_msgs/PoseStamped", POSE.encode(), poses),
+            ("/radio", "protobuf", "radio.Packet", b"?", [b"?"]),
         ],
     )
     log = read_log(path, ["yaw=/low.state.motors[1].q"], ["/pose.pose.orientation.yaw"])
@@ -172,6 +173,7 @@ def test_an_mcap_file_with_nested_messages(tmp_path):
     np.testing.assert_allclose(log.response, log.command, atol=1e-12)
     with pytest.raises(Unchosen) as unchosen:
         read_log(path)
+    assert unchosen.value.listing[2] == "/radio (1 messages): no numbers that can be read"
     assert unchosen.value.listing[1].endswith(
         "w, pose.orientation.roll, pose.orientation.pitch, pose.orientation.yaw"
     )

@@ -243,8 +243,11 @@ def freeze(table, first, last):
             lambda t: freeze(t, 30, 90),
             "responses are frozen while commands move in 1 of 4 episodes, which are left out: 2",
         ),
-        (lambda t: freeze(t, 30, 34), "3 frames repeat the responses before, while commands move"),
-        (lambda t: t.drop(index=[40, 41, 70]), "3 frames are missing, at 2 places"),
+        (
+            lambda t: freeze(t, 30, 34),
+            "frames that repeat the responses before, while commands move: 3",
+        ),
+        (lambda t: t.drop(index=[40, 41, 70]), "missing frames: 3, at 2 places"),
         (lambda t: t[:80], "380 of 400 frames are there (total_frames in meta/info.json)"),
         (lambda t: None, "missing episodes: 1 of 4, 2"),
         (

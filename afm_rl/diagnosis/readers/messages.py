@@ -145,8 +145,8 @@ def open_mcap(path: Path) -> Source:
                     channels[record.id] = record.topic, decode
                 elif isinstance(record, Message):
                     topic, decode = channels[record.channel_id]
-                    if decode is not None and (topics is None or topic in topics):
-                        yield topic, record.log_time / 1e9, decode(record.data)
+                    if topics is None or topic in topics:  # of what cannot be decoded, no fields
+                        yield topic, record.log_time / 1e9, decode(record.data) if decode else {}
 
     return _source(path, messages)
 

@@ -313,7 +313,10 @@ def _thawed(arrays: Arrays, episode: np.ndarray, frame: float) -> tuple[Arrays, 
     if frame:
         gaps = np.round(steps / frame).clip(min=1) - 1
         if gaps.any():
-            notes.append(f"{int(gaps.sum())} frames are missing, at {int((gaps > 0).sum())} places")
+            places = int((gaps > 0).sum())
+            notes.append(
+                f"missing frames: {int(gaps.sum())}, at {places} place{'s' * (places > 1)}"
+            )
     rate = 1 / float(np.median(steps)) if len(steps) else 1.0
     still = frozen_rows(first, second, border, delay=max(10, round(0.35 * rate)))
     odd = frozen_episodes(still, border, 1.5 * rate if rate != 1.0 else np.inf)
@@ -327,5 +330,5 @@ def _thawed(arrays: Arrays, episode: np.ndarray, frame: float) -> tuple[Arrays, 
         first, second, t, border, number = (array[rows] for array in arrays)
     again = int((still[rows] > 0).sum())
     if frame and again:
-        notes.append(f"{again} frames repeat the responses before, while commands move")
+        notes.append(f"frames that repeat the responses before, while commands move: {again}")
     return (first, second, t, border, number), tuple(notes)

@@ -70,6 +70,7 @@ class Source:
             own = [name[len(topic) + 1 :] for name in names if name.startswith(f"{topic}.")]
             fields = Counter(re.sub(r"\[\d+\]$", "[]", name) for name in own)
             shown = ", ".join(f.replace("[]", f"[0..{n - 1}]") for f, n in fields.items())
+            shown = shown or "no numbers that can be read"
             lines.append(printable(f"{topic} ({count} messages): {shown}", 2000))
         return lines
 
