@@ -26,11 +26,12 @@ def write(folder, gain, late, offset, joints, seed, quantum=0.0, noise=0.05, epi
             [np.convolve(way, np.hanning(12) / np.hanning(12).sum(), "valid") for way in ways.T], -1
         )
         u[: rows // 4] = u[rows // 4]  # a rest
+        u = u.clip(-55, 55)
         y, place = np.empty_like(u), u[0]
         for k in range(len(u)):
             place = place + gain * (u[max(k - late, 0)] - place)
             y[k] = place + offset
-        y = y.clip(-55, 55) + noise * rng.standard_normal(y.shape)
+        y += noise * rng.standard_normal(y.shape)
         if quantum:
             y = quantum * np.round(y / quantum)
         if episode in frozen:  # from the begin, or on the way
