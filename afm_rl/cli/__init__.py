@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 from afm_rl import conf
 from afm_rl._version import __version__
 from afm_rl.cli.error_messages import errors_in_one_line
+from afm_rl.cli.imports import without_collection
 from afm_rl.cli.launcher import register
 from afm_rl.cli.overrides import checked, relaxed, with_sweep_folder
 
@@ -24,7 +25,8 @@ _launched: list[bool] = []
 @hydra.main(version_base="1.3", config_path="pkg://afm_rl.conf", config_name="config")
 def _run(cfg: DictConfig) -> None:
     _launched.append(True)
-    from afm_rl.cli.launch import launch  # torch takes seconds: `--help` need not wait for it
+    with without_collection():  # torch takes seconds: `--help` need not wait for it
+        from afm_rl.cli.launch import launch
 
     # The other jobs of a sweep go on; Hydra raises the first error again at the end.
     sweep = HydraConfig.get().mode == RunMode.MULTIRUN

@@ -22,9 +22,12 @@ healthy, changed, dead, or the log cannot tell. Exit status: 0; 1 by --fail-on; 
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
+from afm_rl.cli.imports import without_collection
+from afm_rl.errors import check_choice, check_number, printable
 
 
 def main() -> None:
@@ -65,20 +68,18 @@ def main() -> None:
 
 def _run(options: argparse.Namespace) -> list[str]:
     """Diagnose, and return the actuators by which the command fails."""
-    from dataclasses import replace
-
-    from afm_rl.diagnosis import calibrate, diagnose
-    from afm_rl.diagnosis.findings import STATUSES
-    from afm_rl.diagnosis.readers import (
-        TRANSITIONS,
-        Unchosen,
-        bounded_memory,
-        read_columns,
-        read_log,
-    )
-    from afm_rl.errors import check_choice, check_number, printable
-    from afm_rl.report.diagnosis import calibration_table, print_diagnosis, write_diagnosis
-    from afm_rl.report.tables import grid_of, terminal
+    with without_collection():
+        from afm_rl.diagnosis import calibrate, diagnose
+        from afm_rl.diagnosis.findings import STATUSES
+        from afm_rl.diagnosis.readers import (
+            TRANSITIONS,
+            Unchosen,
+            bounded_memory,
+            read_columns,
+            read_log,
+        )
+        from afm_rl.report.diagnosis import calibration_table, print_diagnosis, write_diagnosis
+        from afm_rl.report.tables import grid_of, terminal
 
     fail_on = [part.strip().replace("-", " ") for part in options.fail_on.split(",") if part]
     for status in fail_on:

@@ -15,6 +15,7 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
+from afm_rl.cli.imports import without_collection
 from afm_rl.errors import check_choice
 from afm_rl.jobs.executor import LocalExecutor, RayExecutor, SubmititExecutor
 
@@ -51,7 +52,8 @@ class JobLauncher(Launcher):
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
         """Run the jobs of a sweep and report on them, see :func:`afm_rl.cli.launch.sweep`."""
-        from afm_rl.cli.launch import sweep  # with torch, which takes seconds
+        with without_collection():  # with torch, which takes seconds
+            from afm_rl.cli.launch import sweep
 
         setup_globals()
         overrides = [list(each) for each in job_overrides]

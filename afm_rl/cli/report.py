@@ -18,6 +18,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
+from afm_rl.cli.imports import without_collection
 from afm_rl.errors import ArtefactError
 
 
@@ -39,9 +40,10 @@ def main() -> None:
     add("--video", choices=("gif", "mp4"), help=films)
     options = parser.parse_args()
 
-    from afm_rl.envs import load_track  # torch takes seconds: `--help` need not wait
-    from afm_rl.film import check_video
-    from afm_rl.report import load_tracks, read_runs, write_films, write_report
+    with without_collection():  # torch takes seconds: `--help` need not wait
+        from afm_rl.envs import load_track
+        from afm_rl.film import check_video
+        from afm_rl.report import load_tracks, read_runs, write_films, write_report
 
     out = options.out or options.folders[0] / "report"
     chosen = {"baselines": options.baselines, "oracle": options.oracle, "figures": options.figures}

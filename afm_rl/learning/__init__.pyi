@@ -19,9 +19,5 @@ from .online_updater import (
 from .optimisers import ObGD as ObGD, ResetAdam as ResetAdam
 from .physics_identifier import PhysicsIdentifier as PhysicsIdentifier
 from .rls_updater import RLSUpdater as RLSUpdater
-from .updater import (
-    Learner as Learner,
-    OracleUpdater as OracleUpdater,
-    Updater as Updater,
-    UpdaterHook as UpdaterHook,
-)
+from .updater import Learner as Learner, OracleUpdater as OracleUpdater, Updater as Updater
+from .updater_hook import UpdaterHook as UpdaterHook

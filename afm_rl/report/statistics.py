@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
-from scipy.stats import bootstrap, trim_mean
 
 from afm_rl.report.runs import outcome, with_scenarios
 from afm_rl.storage.measures import Measures
@@ -22,6 +21,8 @@ def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
     >>> float(interquartile_mean(np.array([0.0, 1.0, 2.0, 99.0])))
     1.5
     """
+    from scipy.stats import trim_mean  # slow to import, and not needed for a mission alone
+
     return trim_mean(values, 0.25, axis=axis)
 
 
@@ -108,6 +109,8 @@ def resampled_bounds(
         for k, part in zip(drawn, parts, strict=True):
             every[k] = part
         return statistic(every)
+
+    from scipy.stats import bootstrap  # slow to import, and not needed for a mission alone
 
     size = work * sum(sample.size for sample in samples)
     result = bootstrap(

@@ -9,7 +9,6 @@ from functools import partial
 
 import numpy as np
 import pandas as pd
-from scipy.signal import lfilter
 
 from afm_rl.diagnosis.log import Log
 
@@ -36,6 +35,8 @@ def running_gain(
     >>> running_gain(u, -u, np.zeros(3, bool)).round(6).tolist()  # reversed: row 0 cannot know
     [[1.0], [-2.0], [-3.0]]
     """
+    from scipy.signal import lfilter  # slow to import, and only needed here
+
     window = np.r_[0.0, np.ones(rows)]
     # Until something was commanded, the gain is 1.
     small = 1e-12 * np.maximum.accumulate(np.square(command).clip(1e-30))
@@ -63,6 +64,7 @@ def arx(
 ) -> np.ndarray:
     r"""Return :math:`y_k = a y_{k-1} + b u_k + c u_{k-1} + d` by least squares, per actuator.
 
+    >>> from scipy.signal import lfilter
     >>> u = np.random.default_rng(0).uniform(-1, 1, (80, 1))
     >>> y = lfilter([0.5], [1.0, -0.5], u, axis=0)  # a lag
     >>> bool(np.abs(arx(u, y, np.zeros(len(u), bool)) - y)[40:].max() < 0.03)
@@ -99,6 +101,8 @@ def _least_squares(
     ridge: float = 0.1,
 ) -> np.ndarray:
     """Return each actuator's prediction by its columns ``(N, F)``, fitted to earlier rows."""
+    from scipy.signal import lfilter  # slow to import, and only needed here
+
     earlier = partial(lfilter, [0.0, 1.0], [1.0, -forgetting], axis=0)
     predictions = np.empty_like(command)
     for j, x in enumerate(columns):
