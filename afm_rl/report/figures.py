@@ -191,13 +191,13 @@ def read_excerpts(runs: Runs, points: int = 240) -> tuple[pd.DataFrame, pd.DataF
     grid, times, keys, rows = np.linspace(0, last, points), [], [], []
     columns = [*MEASURES, "regime_active", *(progress or ())[:1]]
     for method, missions in known.groupby("method", sort=False):
-        steps = dict(iter(runs.steps(missions, columns).groupby("mission")))
-        own = missions[missions["mission"].isin(list(steps))].set_index("mission")
-        for number, mission in own.iterrows():
-            times.append(recovery_times(steps[number]).assign(method=method))
-            if progress:
-                keys.append((method, mission["scenario"]))
-                rows.append(share_reached(steps[number], mission, grid, progress))
+        steps = runs.steps(missions, columns)
+        times.append(recovery_times(steps).assign(method=method))
+        if progress:
+            parts = dict(iter(steps.groupby("mission")))
+            own = missions[missions["mission"].isin(list(parts))].set_index("mission")
+            keys += [(method, scenario) for scenario in own["scenario"]]
+            rows += [share_reached(parts[n], each, grid, progress) for n, each in own.iterrows()]
     index = pd.MultiIndex.from_tuples(keys, names=["method", "scenario"])
     shares = pd.DataFrame(rows, index, grid)
     return pd.concat(times) if times else recovery_times(pd.DataFrame()), shares

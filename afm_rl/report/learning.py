@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from textwrap import wrap
 
 import numpy as np
@@ -122,7 +123,7 @@ def _scale(axes: Axes, name: str, values: pd.Series, linear: float = 10.0) -> No
     """Give axes a scale that shows these distances (positive), or losses (of either sign)."""
     if name != "loss":
         if (values > 0).any():
-            axes.set_yscale("log", nonpositive="mask")
+            axes.set_yscale("log", nonpositive="mask", subs=[])  # minor ticks take a third of it
     elif (values[np.isfinite(values)].abs() > linear).any():
         axes.set_yscale("symlog", linthresh=linear)
 
@@ -152,19 +153,25 @@ def recovery_times(steps: pd.DataFrame) -> pd.DataFrame:
     shows no nominal level.
 
     Args:
-        steps: one mission's steps, in order; a column that is missing is left out.
+        steps: of one mission, in order, or of several, one after the other, told apart by their
+            number ``mission``; a column that is missing is left out.
 
     >>> active, error = [0] * 30 + [1] * 50, [1e-3] * 30 + [1] * 7 + [1e-3] * 43
     >>> steps = pd.DataFrame({"regime_active": active, "error": error})
     >>> recovery_times(steps).to_dict("records")
     [{'of': 'model', 'change': 1, 'first': 7.0, 'time': 7.0}]
     """
-    active = steps["regime_active"].to_numpy() if len(steps) else []
-    changes, rows = np.flatnonzero(np.diff(active)) + 1, []
-    for column, of in MEASURES.items():
-        if len(changes) and column in steps and steps[column].notna().all():
-            times = _times(steps[column].to_numpy(dtype=float), changes)
-            rows += [(of, *row) for row in times]
+    active = steps["regime_active"].to_numpy() if len(steps) else np.zeros(0)
+    errors = {
+        of: steps[name].to_numpy(dtype=float) for name, of in MEASURES.items() if name in steps
+    }
+    number = steps["mission"].to_numpy() if "mission" in steps else np.zeros(len(active))
+    borders, rows = [0, *np.flatnonzero(np.diff(number)) + 1, len(active)], []
+    for begin, end in pairwise(borders):
+        changes = np.flatnonzero(np.diff(active[begin:end])) + 1
+        for of, error in errors.items():
+            if len(changes) and not np.isnan(error[begin:end]).any():
+                rows += [(of, *row) for row in _times(error[begin:end], changes)]
     table = pd.DataFrame(rows, columns=["of", "change", "first", "time"])
     kinds = {"change": int, "first": float, "time": float}
     return table.astype(kinds)  # also without rows: tables are joined

@@ -53,6 +53,10 @@ def test_missions_without_times_may_come_first():
     parts = [mission((0, LOW, 50)), mission((0, LOW, 50), (1, HIGH, 5), (1, LOW, STAY))]
     joined = pd.concat([recovery_times(part).assign(method="a") for part in parts])
     assert recovery_table(joined).numbers["median"].tolist() == [5]
+    together = pd.concat([part.assign(mission=n) for n, part in enumerate(parts)])
+    pd.testing.assert_frame_equal(
+        recovery_times(together), joined.drop(columns="method"), check_dtype=False
+    )
 
 
 def test_motion_and_agent_are_measured_where_they_were_logged():

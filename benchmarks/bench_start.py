@@ -1,0 +1,140 @@
+"""What commands take from a cold start, each beside its limit.
+
+    python benchmarks/bench_start.py
+    python benchmarks/bench_start.py wrapper steps
+
+Processor time (s) of a process and its children, one thread, the least of some rounds; of the demo
+the time on a clock, on two cores. Times grow on a busy machine: those of
+``import torchrl.data`` tell by how much, and the last column counts in them. There the limit is
+that of a quiet machine, on which ``import torchrl.data`` takes 2.6 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+
+from afm_rl.storage.files import csv_text
+from afm_rl.storage.manifest import write_manifest
+
+HERE, BIN = Path(__file__).parents[1], Path(sys.executable).parent
+WRAPPER = """
+import gymnasium
+from afm_rl import ActionFlowWrapper
+env = ActionFlowWrapper(gymnasium.make("InvertedPendulum-v5"), model="mujoco")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+"""
+
+
+def processor_time(*command: str | Path) -> float:
+    """Return the processor time of a command (s)."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    settings = {**os.environ, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    out, err = subprocess.PIPE, subprocess.PIPE
+    with tempfile.TemporaryDirectory() as folder:
+        done = subprocess.run(command, cwd=folder, env=settings, stdout=out, stderr=err, text=True)
+    if done.returncode:
+        raise SystemExit(f"{command}: {done.stderr}")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def python(code: str) -> float:
+    """Return the processor time of a program (s)."""
+    return processor_time(sys.executable, "-c", code)
+
+
+def diagnose() -> float:
+    log = HERE / "examples" / "real_logs" / "warthog_ice.csv"
+    return processor_time(BIN / "afm-rl-diagnose", log, "--no-page")
+
+
+def report(methods: int = 4, copies: int = 23) -> float:
+    """Return the time of a report: 22 missions, copied for 23 seeds of each of 4 methods."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder, "one")
+        settings = ["regimes=paper", "tracks=all", "budget=400"]
+        shown = ["figures=false", "tensorboard=false", f"hydra.run.dir={run}"]
+        processor_time(BIN / "afm-rl", "method=afm_physics", *settings, *shown)
+        missions, steps = pd.read_csv(run / "missions.csv"), pd.read_parquet(run / "steps.parquet")
+        number, copied = len(missions), range(copies)
+        steps = pd.concat([steps.assign(mission=steps["mission"] + number * k) for k in copied])
+        seeds = [missions.assign(seed=k, mission=missions["mission"] + number * k) for k in copied]
+        folders = []
+        for method in range(methods):
+            own = Path(folder, f"method_{method}")
+            own.mkdir()
+            (own / "measures.json").symlink_to(run / "measures.json")
+            (own / "missions.csv").write_text(csv_text(pd.concat(seeds).assign(method=own.name)))
+            steps.to_parquet(own / "steps.parquet", index=False)
+            write_manifest(own)
+            folders.append(own)
+        return processor_time(BIN / "afm-rl-report", *folders, "--out", Path(folder, "report"))
+
+
+def ensemble() -> float:
+    """Return the time that the demo's ensemble is trained for; say its held-out error."""
+    with tempfile.TemporaryDirectory() as folder:
+        steps = ["budget=1", "figures=false", "tensorboard=false", f"hydra.run.dir={folder}"]
+        command = [BIN / "afm-rl", "method=online_pe", f"cache={folder}/cache", *steps]
+        first = subprocess.check_output(
+            command, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
+        )
+        error, seconds = re.search(r"error ([\d.]+) .*trained in (\d+) s", first).groups()
+    print(f"held-out error of the ensemble: {error} standard deviations, at most 0.004")
+    return float(seconds)
+
+
+def demo() -> float:
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        settings = [f"cache={folder}/cache", "budget=400", "video=gif"]
+        processor_time(BIN / "afm-rl", f"hydra.run.dir={folder}/demo", *settings)
+        return time.perf_counter() - start
+
+
+ROWS: dict[str, tuple[str, float, int, Callable[[], float]]] = {
+    "wrapper": ("wrapper: import, reset, first step", 1.3 * 2.6, 3, lambda: python(WRAPPER)),
+    "settings": (
+        "afm-rl --cfg job",
+        0.7,
+        3,
+        lambda: processor_time(BIN / "afm-rl", "--cfg", "job"),
+    ),
+    "steps": (
+        *("afm-rl method=afm_physics budget=50", 4.5, 3),
+        lambda: processor_time(BIN / "afm-rl", "method=afm_physics", "budget=50"),
+    ),
+    "diagnose": ("afm-rl-diagnose of a real log, no page", 2.5, 3, diagnose),
+    "report": ("report of 2,024 missions", 8.0, 1, report),
+    "ensemble": ("ensemble of the demo", 8.0, 1, ensemble),
+    "demo": ("make demo, after set-up", 20.0, 1, demo),
+}
+"""By name: what it is, its limit (s), how many rounds, and what measures it."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("rows", nargs="*", choices=[[], *ROWS], default=list(ROWS))
+    unit = min(python("import torchrl.data") for _ in range(3))
+    print(f"import torchrl.data: {unit:.2f} s\n")
+    print("| | s | at most, quiet | in imports of torchrl.data | at most |\n|---|---|---|---|---|")
+    for name in parser.parse_args().rows:
+        what, limit, rounds, measure = ROWS[name]
+        spent = min(measure() for _ in range(rounds))
+        print(f"| {what} | {spent:.2f} | {limit:.2f} | {spent / unit:.2f} | {limit / 2.6:.2f} |")
+
+
+if __name__ == "__main__":
+    main()
