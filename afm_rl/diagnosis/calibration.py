@@ -448,11 +448,12 @@ def _in_words(joint: JointCalibration, calibration: Calibration) -> str:
     if not joint.usable:
         return f"nothing: {joint.status}"
     gain, offset, zone = joint.matters
-    text = "u" if joint.unit == 1.0 else f"{joint.unit:.6g} * u"
+    same = gain == joint.unit and not offset
+    text = "u" if same or joint.unit == 1.0 else f"{joint.unit:.6g} * u"
     if offset:
         text = f"({text} {'-' if offset > 0 else '+'} {abs(offset):.6g})"
-    if gain != 1.0:
-        text = "-" * (gain < 0) + text if abs(gain) == 1.0 else f"{text} / {gain:.6g}"
+    if not same and gain != 1.0:
+        text = f"-{text}" if gain == -1.0 else f"{text} / {gain:.6g}"
     if zone:
         text += f", and {zone:.6g} more in its direction"
     if joint.follows != joint.name:

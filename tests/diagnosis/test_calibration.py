@@ -1,6 +1,7 @@
 """A diagnosis that is written back: numbers, commands that make up for them, and a model."""
 
 import json
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -100,6 +101,32 @@ def test_the_numbers_are_those_of_the_robot():
     assert all(joint.rate.value == np.inf and not joint.rate.determined for joint in (a, b, c))
     assert a.undo == f"(u - {a.offset.value:.6g}) / -{a.scale.value:.6g}, 0.06 s earlier"
     assert "more in its direction" in b.undo and c.undo.endswith(", 0.02 s earlier")
+
+
+@pytest.mark.parametrize(
+    ("reach", "offset", "effect", "undo"),
+    [
+        (1.0, 0.0, lambda u: u, "u"),
+        (1.0, 0.0, lambda u: -u, "-u"),
+        (90.0, 0.0, np.radians, "u"),  # degrees in, radians out
+        (50.0, 50.0, lambda u: 100 - u, "-(u - 100)"),  # a gripper
+        (50.0, 100.0, lambda u: u + 7, "(u - 7)"),
+        (1.0, 0.0, lambda u: np.where(u > 0, 0.5 * u, u), "u / 0.5; negative ones by 1"),
+        (1.0, 0.0, lambda u: 0.5 * u.clip(-0.6, 0.6), "u / 0.5"),
+    ],
+)
+def test_what_would_undo_it_in_words_and_numbers(reach, offset, effect, undo):
+    u = offset + reach * np.round(steps(1), 2)
+    size = np.ptp(effect(u))
+    log = Log(
+        ("a",), u, effect(u) + 1e-4 * size * np.random.default_rng(0).standard_normal(u.shape)
+    )
+    (joint,) = calibrate(log).joints
+    rounded = re.sub(r"[\d.]+", lambda number: f"{round(float(number[0]), 2):g}", joint.undo)
+    assert rounded == undo
+    way = offset + 0.25 * reach * steps(1, seed=2)
+    moved = effect(apply(calibrate(log), way))
+    np.testing.assert_allclose(moved, joint.unit * way, atol=0.01 * size)
 
 
 def test_a_rate_limit_is_in_units_of_the_response():
