@@ -201,7 +201,10 @@ def test_files_that_cannot_be_used(tmp_path, name, content, message):
         (lambda d: [p.unlink() for p in d.glob("data/*/*")], r"no data/chunk-\*"),
         (lambda d: next(d.glob("data/*/*")).write_bytes(b""), "no parquet file"),
         (lambda d: spoil_column(d, action=1.0), "1 numbers per row, but 2 names"),
-        (lambda d: spoil_column(d, other=1.0, drop="action"), "expected command.NAME and response"),
+        (
+            lambda d: spoil_column(d, other=1.0, drop="action"),
+            "expected action and observation.sta",
+        ),
     ],
 )
 def test_data_sets_that_cannot_be_used(lerobot, spoil, message):

@@ -262,9 +262,12 @@ def choose(
                 "responses, with --command TOPIC.FIELD --response TOPIC.FIELD",
                 source.listing(),
             )
+        expected = f"{kinds[0]}.NAME and {kinds[1]}.NAME; rename them, or"
+        if source.frame:  # a data set of LeRobot's
+            expected = f"{ACTIONS[0]} and {STATES[0]};"
         raise Unchosen(
-            f"columns {_some(source.names) or 'none'}: expected {kinds[0]}.NAME and "
-            f"{kinds[1]}.NAME; rename them, or name what is there with --command and --response",
+            f"columns {_some(source.names) or 'none'}: expected {expected} name what is there with "
+            "--command and --response",
             source.listing(),
         )
     first, second = ([n[len(h) + 1 :] for n in g] for g, h in zip(groups, heads, strict=True))
