@@ -26,6 +26,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "examples" / "deploy"
 sys.path.insert(0, str(FOLDER))
 import agent as agents  # noqa: E402
 import controller  # noqa: E402
+import lerobot_arm  # noqa: E402
 import link  # noqa: E402
 import robot as robots  # noqa: E402
 import zenoh  # noqa: E402
@@ -443,3 +444,72 @@ def test_the_ros_2_node_acts_on_odometry_and_stops_without(ros2_node):
     assert len(tick(1.1)) == 1 and len(given) == 3
     assert tick() == [] and tick() == [SAFE] and tick(math.nan) == [SAFE]
     assert len(tick(1.2)) == 1 and math.isnan(given[3][0]) and len(given) == 5
+
+
+LEROBOT = [  # of lerobot.robots.Robot, version 0.4
+    *("observation_features", "action_features", "is_connected", "connect", "is_calibrated"),
+    *("calibrate", "configure", "get_observation", "send_action", "disconnect"),
+]
+
+
+class Arm:
+    """Six servos with the interface of LeRobot's robots; the first is reversed later on."""
+
+    is_connected = is_calibrated = True
+
+    def __init__(self):
+        self.places, self.step, self.clip = dict.fromkeys(lerobot_arm.JOINTS, 0.0), 0, math.inf
+
+    def __getattr__(self, name):
+        if name not in LEROBOT:
+            raise AttributeError(name)
+        return lambda: None
+
+    def get_observation(self):
+        return {**self.places, "camera": None}
+
+    def send_action(self, action):
+        self.step += 1
+        action = {name: min(goal, self.clip) for name, goal in action.items()}
+        for name, goal in action.items():
+            reversed_now = self.step > 30 and name == lerobot_arm.JOINTS[0]
+            self.places[name] += 0.5 * ((-goal if reversed_now else goal) - self.places[name])
+        return action
+
+
+def test_an_arm_of_lerobot_moves_as_planned_when_a_joint_is_reversed():
+    controller, errors = lerobot_arm.correction(), []
+    agent = agents.Agent(agents.of_tensors(controller), controller.sizes, controller.noise_bound)
+    with lerobot_arm.CorrectedRobot(Arm(), agent) as arm:
+        for step in range(65):
+            before = arm.get_observation()
+            goals = [40 * math.sin(0.13 * step + k) for k in range(5)] + [50.0]
+            sent = arm.send_action(dict(zip(lerobot_arm.JOINTS, goals, strict=True)))
+            for name, goal in zip(lerobot_arm.JOINTS, goals, strict=True):
+                wanted = before[name] + 0.5 * (goal - before[name])
+                errors.append(abs(arm.places[name] - wanted))
+    assert set(sent) == set(lerobot_arm.JOINTS) and "camera" in before
+    assert max(errors[-6 * 20 :]) < 0.2 and max(errors) > 10
+
+
+def test_the_wrapper_of_lerobot_has_its_interface_and_forgets_what_was_clipped():
+    readings = []
+
+    def policy(memory, state, planned):
+        readings.append(state[0].item())
+        return memory, planned
+
+    arm = lerobot_arm.CorrectedRobot(Arm(), agents.Agent(policy, {"memory": 1}, 0.0))
+    assert all(hasattr(arm, name) for name in LEROBOT)
+    goals = dict.fromkeys(lerobot_arm.JOINTS, 10.0)
+    for arm.robot.clip in (math.inf, 1.0, math.inf, math.inf):
+        arm.get_observation()
+        assert arm.send_action(goals) == dict.fromkeys(goals, min(10.0, arm.robot.clip))
+    arm.send_action(goals)  # without an observation
+    # Not a number: before the first, after the clipped one, and without an observation.
+    assert [k for k, x in enumerate(readings) if math.isnan(x)] == [0, 3, 6]
+
+
+def test_lerobot_asks_for_no_more():
+    robots = pytest.importorskip("lerobot.robots")
+    assert robots.Robot.__abstractmethods__ == set(LEROBOT)

@@ -236,6 +236,7 @@ def test_a_file_acts_the_same_without_this_library(tmp_path):
         check_runs([build / "run_policy", path], path_driven, tmp_path)
 
 
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize(
     "flow", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["LeastSquares", "ActionFlow"]
 )
@@ -264,6 +265,7 @@ def test_a_graph_acts_the_same_without_torch(tmp_path, flow):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 @pytest.mark.parametrize("kind", [MPPI, ICEM])
 def test_a_graph_plans_the_same(tmp_path, kind):
     runtime = pytest.importorskip("onnxruntime")
@@ -279,7 +281,7 @@ def test_a_graph_plans_the_same(tmp_path, kind):
     expected = driven(as_function(controller, controller))
     controller = Controller(planner_of(kind), policy_of(LeastSquares(LOW, HIGH)))
     found = driven(as_function(run, controller))
-    torch.testing.assert_close(actions(found), actions(expected), atol=1e-6, rtol=0)
+    torch.testing.assert_close(actions(found), actions(expected), atol=1e-5, rtol=0)
 
 
 def test_a_planner_of_another_kind_is_no_graph(tmp_path):
