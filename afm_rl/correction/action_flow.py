@@ -386,11 +386,12 @@ class ActionFlow(PairCorrector):
             model: the dynamics model as it is now.
         """
         with torch.no_grad():
-            memory = self._with_forecasts(self.pack(self.measure(memory, model)), action)
-            parts = self.unpack(memory, model.state_size)
-            weights = self.weights(parts)
-            mean, std = mean_and_std(parts["forecasts"], weights)
-            return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))
+            parts = self.measure(memory, model)
+            forecasts, _, variances = self._forecasts(self.pack(parts), action)
+            weights, noise = self.weights(parts), parts["noise"]
+            mean, std = mean_and_std(forecasts, weights)
+            noise = noise * (1 + (weights * variances).sum(-2)).sqrt()
+            return self.denormalise(mean), self.denormalise(torch.hypot(std, noise))
 
     def executing(
         self, memory: Tensor, planned: Tensor, executed: Tensor, misaligned: Tensor | None = None
@@ -412,6 +413,12 @@ class ActionFlow(PairCorrector):
     @torch.no_grad()
     def _with_forecasts(self, memory: Tensor, executed: Tensor) -> Tensor:
         """Return the memory with forecasts of what is executed, of all models if misaligned."""
+        forecasts, under_way, _ = self._forecasts(memory, executed)
+        parts = self.unpack(memory, self.states_in(memory))
+        return self.pack({**parts, "forecasts": forecasts, "under_way": under_way})
+
+    def _forecasts(self, memory: Tensor, executed: Tensor) -> Sequence[Tensor]:
+        """Return forecasts of what is executed, what is under way, and the forecasts' variances."""
         parts = self.unpack(memory, self.states_in(memory))
         misaligned = parts["misaligned"].squeeze(-1) == 1.0
         idle = self.forecast_unchanged(parts, executed)
@@ -419,12 +426,11 @@ class ActionFlow(PairCorrector):
         def by_models(memory: Tensor, executed: Tensor) -> Sequence[Tensor]:
             return self.forecast(self.unpack(memory, self.states_in(memory)), executed)
 
-        unchanged = [idle["forecasts"], idle["under_way"]]
-        forecasts, under_way = somewhere(misaligned, by_models, unchanged, memory, executed)
-        return self.pack({**parts, "forecasts": forecasts, "under_way": under_way})
+        unchanged = [idle["forecasts"], idle["under_way"], torch.zeros_like(idle["forecasts"])]
+        return somewhere(misaligned, by_models, unchanged, memory, executed)
 
-    def forecast(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the forecasts of all models, and what is under way."""
+    def forecast(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the forecasts of all models, what is under way, and the forecasts' variances."""
         ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
         evidence = *self._evidence(parts, self.weights(parts)), self.normalise(ahead)
         batch, delay = executed.shape[:-1], parts["delay"].reshape(-1).long()
@@ -433,8 +439,10 @@ class ActionFlow(PairCorrector):
         )
         fits = self.tick.fit(pairs, noise, place, delay)
         effects = self.tick.forecast(fits, weights, delay, pairs, unit.to(pairs))
-        forecasts, under_way = (x.view(*batch, *x.shape[1:]).to(executed) for x in effects)
-        return forecasts, under_way
+        forecasts, under_way, variances = (
+            x.view(*batch, *x.shape[1:]).to(executed) for x in effects
+        )
+        return forecasts, under_way, variances
 
     def _evidence(self, parts: Fields, weights: Tensor) -> list[Tensor]:
         evidence = parts["pairs"], weights, parts["noise"], self.place_of(parts["state"])

@@ -9,7 +9,14 @@ from torch import Tensor
 
 from afm_rl.compiling.tracing import cached
 from afm_rl.correction.achievable import LIMIT, saturate
-from afm_rl.correction.least_squares import OUTLIER, moments_of, not_zero, solve_line
+from afm_rl.correction.least_squares import (
+    OUTLIER,
+    moments_of,
+    not_zero,
+    quadratic,
+    solve_line,
+    variance_of_line,
+)
 
 NOISE = 0.1  # half ranges: a pair with this standard deviation counts half
 LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
@@ -61,6 +68,9 @@ class Experts(NamedTuple):
     """Their effective actions, ``(N, A, 1, K)``."""
     trust: Tensor
     """Logarithm of their weights, ``(N, A, 1, K)``."""
+    spread: Tensor
+    """Variance of the effect by each fit, :math:`c_0 + c_1 u + c_2 u^2` in units of the noise:
+    c, ``(N, A, 3, 3)``, by powers and fits."""
 
     def execute(self, planned: Tensor, mode: str) -> Tensor:
         """Return answers ``(N, A, C, 5)`` to plans ``(N, C, A)``.
@@ -87,6 +97,15 @@ class Experts(NamedTuple):
         fits = self.gain * unit + self.offset
         return torch.cat([fits, nearest, nearness], -1).clamp(-LIMIT, LIMIT)
 
+    def variance(self, executed: Tensor, nearness: Tensor) -> Tensor:
+        """Return the variances ``(N, A, C, 4)`` of answers about actions ``(N, C, A)``.
+
+        In units of the noise; of the nearest pairs, as if one were so near, ``(N, A, C, 1)``.
+        """
+        unit = executed.mT.unsqueeze(-1)
+        c0, c1, c2 = self.spread.split(1, -2)
+        return torch.cat([c0 + unit * (c1 + unit * c2), 1 / nearness.clamp_min(LEAST_MISS)], -1)
+
     def _likeness(self, among: Tensor, unit: Tensor) -> Tensor:
         """Return the log-weight of each row for ``unit`` ``(N, A, C, 1)``, ``(N, A, C, K)``."""
         return self.trust - ((among - unit) / NEAR).square()
@@ -101,18 +120,21 @@ def fit_experts(rows: Rows) -> Experts:
     gains = cross / square
     slope, offset = solve_line(*(part[..., 1:] for part in (square, mean, mass, cross, shift)))
     miss = (e - slope * u - offset).unsqueeze(-2)
-    slope, offset = solve_line(*moments_of(long / (1 + (miss / OUTLIER).square()), u, e))
+    moments = moments_of(long / (1 + (miss / OUTLIER).square()), u, e)
+    slope, offset = solve_line(*moments)
+    line = variance_of_line(*moments[:3])  # (N, A, 1, 3)
+    spread = torch.cat([quadratic(1 / square, 2), line], -2).mT
     gain = not_zero(torch.cat([gains, slope], -1)).unsqueeze(-2)  # (N, A, 1, 3)
     offset = torch.cat([torch.zeros_like(gains), offset], -1).unsqueeze(-2)
     residuals = e.unsqueeze(-1) - gain * u.unsqueeze(-1) - offset
     left = weights @ residuals.square() / weights.sum(-1, keepdim=True).clamp_min(LEAST_MISS)
     left = torch.cat([left[..., :1, :1], left[..., 1:, 1:]], -1)
     misses, trust = (left.sqrt() + LEAST_MISS).log(), long.clamp_min(LEAST_MISS**2).log()
-    gain, offset, residuals, misses, trust = (
-        part.to(rows.executed) for part in (gain, offset, residuals, misses, trust)
+    gain, offset, residuals, misses, trust, spread = (
+        part.to(rows.executed) for part in (gain, offset, residuals, misses, trust, spread)
     )
     executed, effective = (part.mT.unsqueeze(-2) for part in rows[:2])
-    return Experts(gain, offset, residuals, misses, executed, effective, trust)
+    return Experts(gain, offset, residuals, misses, executed, effective, trust, spread)
 
 
 @cached(maxsize=16)

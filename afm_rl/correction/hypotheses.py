@@ -105,6 +105,7 @@ HYPOTHESES = (
     *_slow("delayed gain", "gain_"),
     Hypothesis("rate limit", "healthy", cause="rate limit"),
     Hypothesis("sensor noise", "healthy", cause="sensor noise"),
+    Hypothesis("stiction", "healthy", log_prior=-3.0, cause="stiction"),
 )
 """All of them, kind by kind in the order of :data:`KINDS`. The prior of the first is a setting,
 ``odds``, and those with a delayed gain share one."""

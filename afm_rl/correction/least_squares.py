@@ -107,6 +107,26 @@ def solve_line(
     return slope, (square * shift - mean * cross) / determinant
 
 
+def variance_of_line(square: Tensor, mean: Tensor, mass: Tensor) -> Tensor:
+    r"""Return the variance of a line's prediction, in units of the noise, by its moments ``(*B)``.
+
+    Bayesian linear regression: :math:`x^T (X^T W X + \rho)^{-1} x` with x = (u, 1), as
+    :math:`c_0 + c_1 u + c_2 u^2`, ``(*B, 3)``.
+
+    >>> u = torch.tensor([1.0, -1.0])
+    >>> square, mean, mass, _, _ = moments_of(torch.ones(1, 2), u, u)
+    >>> variance_of_line(square, mean, mass).round(decimals=2)
+    tensor([[0.5000, 0.0000, 0.5000]])
+    """
+    determinant = (square * mass - mean * mean).clamp_min(PRIOR**2)
+    return torch.stack([square, -2 * mean, mass], -1) / determinant.unsqueeze(-1)
+
+
+def quadratic(coefficient: Tensor, power: int) -> Tensor:
+    """Return the coefficients ``(*B, 3)`` of a polynomial with one term, of ``(*B)``."""
+    return torch.nn.functional.pad(coefficient.unsqueeze(-1), (power, 2 - power))
+
+
 def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     r"""Fit :math:`u_\mathrm{eff} = D u + b` with a weak prior D = 1, b = 0.
 

@@ -17,9 +17,11 @@ from afm_rl.correction.least_squares import (
     invert_affine,
     moments_of,
     not_zero,
+    quadratic,
     solve_line,
+    variance_of_line,
 )
-from afm_rl.spaces.small_matrices import add_diagonal, solve_positive
+from afm_rl.spaces.small_matrices import add_diagonal, invert_positive
 
 EXACT = 0.02  # a fit that misses by less explains all rows
 LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
@@ -28,12 +30,39 @@ RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for
 
 
 class Lines(NamedTuple):
-    """L linear models of B missions, :math:`T(u) = D u + b`, shares of the largest action."""
+    r"""L linear models of B missions, :math:`T(u) = D u + b`, shares of the largest action.
+
+    How unsure a fit is of the effect of an action says Bayesian linear regression, in units of the
+    noise: of one axis :math:`c_0 + c_1 u + c_2 u^2`, of an affine map :math:`x^T Q x`, x = (u, 1).
+    """
 
     matrix: Tensor
     """D, ``(B, L, A, A)``."""
     bias: Tensor
     """b, ``(B, L, A)``."""
+    spread: Tensor
+    """c, ``(B, L, 3, A)``."""
+    leverage: Tensor
+    """Q of the affine map, ``(B, A + 1, A + 1)``."""
+    driver: Tensor
+    """What the square of each command adds to the variance where an axis is driven by another
+    one, ``(B, A, A)``."""
+
+    def variance(self, actions: Tensor, mixing: Tensor) -> Tensor:
+        """Return the variances ``(B, L, C, A)`` of the effects of actions ``(B, C, A)``.
+
+        Args:
+            actions: shares of the largest action.
+            mixing: which models mix axes, ``(L, 1)``: the affine map, then the driven axes.
+        """
+        u = actions.unsqueeze(1)
+        c0, c1, c2 = self.spread.unsqueeze(3).unbind(2)
+        inputs = torch.nn.functional.pad(actions, (0, 1), value=1.0)
+        affine = ((inputs @ self.leverage) * inputs).sum(-1, keepdim=True).expand_as(actions)
+        driven = actions.square() @ self.driver.mT
+        of_mixing = torch.stack([affine, torch.where(driven > 0, driven, affine)], 1)
+        rows = mixing.squeeze(-1).cumsum(0).clamp_max(2).sub(1).clamp_min(0)
+        return torch.where(mixing.unsqueeze(-1), of_mixing[:, rows], c0 + u * (c1 + u * c2))
 
     def effect(self, actions: Tensor) -> Tensor:
         """Return the effects ``(B, L, C, A)`` of actions ``(B, C, A)``, or ``(B, L, C, A)``."""
@@ -69,16 +98,33 @@ def fit_lines(sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor) -> Line
     slope, rest = solve_line(square, mean, mass, cross, shift)
     gain_12 = gain[..., 2:3]
     drift = (shift - gain_12 * mean)[..., :1] / mass[..., :1]
-    arx, goes_on = _autoregressive(u, v, weight)
+    arx, goes_on, arx_spread = _autoregressive(u, v, weight)
     one, none = torch.ones_like(arx), torch.zeros_like(gain)
     gains = torch.cat([-one, one, one, gain[..., 1::2], slope[..., 2:], gain_12, arx, one], -1)
     trend = _extrapolate(v - u, weight)
     biases = [none[..., :1], offset[..., :2], none[..., :2], rest[..., 2:], drift, goes_on, trend]
     affine, shift = fit_affine(sent.mT, v.mT, weight.mT)
-    driven, rest = _driven(sent, v, weight, affine, shift.unsqueeze(-1))
+    driven, rest, driver = _driven(sent, v, weight, affine, shift.unsqueeze(-1))
     matrix = torch.cat([torch.diag_embed(gains.mT), torch.stack([affine, driven], 1)], 1)
     bias = torch.cat([*biases, shift.unsqueeze(-1), rest], -1).mT
-    return Lines(matrix.to(came), bias.to(came))
+    certain = none.unsqueeze(-1).expand(*none.shape, 3)  # (B, A, W, 3)
+    constant, slopes = quadratic(1 / mass, 0), quadratic(1 / square, 2)
+    drifting = slopes[..., 2:3, :] + constant[..., :1, :]
+    spread = [
+        certain[..., :1, :],  # reversed
+        constant[..., :2, :],
+        slopes[..., 1::2, :],
+        variance_of_line(square, mean, mass)[..., 2:, :],
+        drifting,
+        arx_spread.unsqueeze(-2),
+        quadratic(5 + none[..., :1], 0),  # an extrapolated line: two squared, and one
+        certain[..., :3, :],  # in the leverage, and of delayed commands
+    ]
+    spread = torch.cat(spread, -2)[..., : matrix.shape[1], :].permute(0, 2, 3, 1)
+    inputs = torch.nn.functional.pad(sent.mT, (0, 1), value=1.0)
+    rows = weight.mean(1).unsqueeze(-1) * inputs
+    leverage = invert_positive(add_diagonal(rows.mT @ inputs, PRIOR))
+    return Lines(*(x.to(came) for x in (matrix, bias, spread, leverage, driver)))
 
 
 @cached(maxsize=16)
@@ -130,8 +176,35 @@ def within_rate(came: Tensor, valid: Tensor, rows: int = 12, least: float = 0.05
     return torch.cat([torch.where(known, now + k * rate, k * torch.inf) for k in (-1, 1)], 1)
 
 
-def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+def at_rest(
+    came: Tensor, acts: Tensor, sent: Tensor, valid: Tensor, rows: int = 20, most: float = 0.2
+) -> Tensor:
+    """Return the next effect ``(B, 1, A)`` of actuators that stick.
+
+    One that rests does so until a command is farther from it than any in which it rested, of the
+    newest ``rows``, but ``most`` at most; then it does as commanded.
+
+    Args:
+        came: effects, the oldest first, ``(B, M, A)``.
+        acts: the command that acts now, ``(B, 1, A)``.
+        sent: commands that acted, ``(B, M, A)``.
+        valid: which rows count, ``(B, M, 1)``, 0 or 1.
+
+    >>> came, sent = torch.zeros(1, 3, 1), torch.full((1, 3, 1), 0.1)
+    >>> at_rest(came, torch.tensor([[[0.05]]]), sent, torch.ones(1, 3, 1)).item()
+    0.0
+    """
+    came, sent, valid = came[:, -rows:], sent[:, -rows:], valid[:, -rows:]
+    rests = valid[:, 1:] * valid[:, :-1] * (came.diff(dim=1).abs() < 0.005)
+    band = (rests * (sent - came).abs()[:, 1:]).amax(1, keepdim=True).clamp_max(most)
+    now = came[:, -1:]
+    return torch.where((acts - now).abs() <= 1.05 * band, now, acts)
+
+
+def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     r"""Return gain and offset ``(B, A, 1)`` of :math:`v_k = b u_k + c u_{k-1} + a v_{k-1} + d`.
+
+    And the variance of v_k as a polynomial of u_k, ``(B, A, 3)``, in units of the noise.
 
     The row before is known, so this is a line in u. Rows after one that does not count do not.
 
@@ -147,9 +220,14 @@ def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tenso
     pull = (weight[..., 1:] * sound[..., :-1]).unsqueeze(-1) * x
     left = add_diagonal(pull.mT @ x, RIDGE)
     right = pull.mT @ (v - u)[..., 1:].unsqueeze(-1)
-    b, from_before, d = solve_positive(left, right).split([1, 2, 1], -2)  # (B, A, ., 1)
+    covariance = invert_positive(left)
+    b, from_before, d = (covariance @ right).split([1, 2, 1], -2)  # (B, A, ., 1)
     goes_on = before[..., -1:, :] @ from_before
-    return not_zero(1 + b).squeeze(-1), (goes_on + d).squeeze(-1)
+    rest = torch.nn.functional.pad(before[..., -1, :], (0, 1), value=1.0).unsqueeze(-1)
+    shared = covariance[..., 1:, :] * rest  # (B, A, 3, 4)
+    c0 = (shared[..., 1:] * rest.mT).sum((-2, -1))
+    spread = torch.stack([c0, 2 * shared[..., 0].sum(-1), covariance[..., 0, 0]], -1)
+    return not_zero(1 + b).squeeze(-1), (goes_on + d).squeeze(-1), spread
 
 
 def _extrapolate(offset: Tensor, weight: Tensor) -> Tensor:
@@ -158,25 +236,29 @@ def _extrapolate(offset: Tensor, weight: Tensor) -> Tensor:
     .. math:: d_{k+1} = c\,d_k - d_{k-1},\qquad c = 2 \cos \omega
 
     is a line (c = 2) or an oscillation; c is fitted to the newest rows of ``(B, A, M)``. The newest
-    offset where the one before it does not count, zero where neither does; at most half of the
-    largest action: what is larger is a fault.
+    offset where the one before it does not count, zero where neither does.
     """
     counts = (weight > 0).to(offset)
     offset = offset * counts
     before, now, after = (offset[..., k : k - 2 or None] for k in range(3))
     every = counts[..., :-2] * counts[..., 1:-1] * counts[..., 2:]
-    pull = every * now * 0.95 ** torch.arange(every.shape[-1] - 1, -1, -1, device=every.device)
-    c = (pull * (before + after)).sum(-1, keepdim=True) + 2 * PRIOR
-    c = (c / ((pull * now).sum(-1, keepdim=True) + PRIOR)).clamp(-2, 2)
+    every = every * 0.95 ** torch.arange(every.shape[-1] - 1, -1, -1, device=every.device)
+    pull = every * now
+    c = ((pull * (before + after)).sum(-1, keepdim=True) + 2 * PRIOR) / (
+        (pull * now).sum(-1, keepdim=True) + PRIOR
+    )
     before, newest = offset[..., -2:].split(1, -1)
     both = counts[..., -2:].prod(-1, keepdim=True)
-    return (newest + both * ((c - 1) * newest - before)).clamp(-0.5, 0.5)
+    # A disturbance that is larger than half of the largest action would not be one.
+    return (newest + both * ((c.clamp(-2, 2) - 1) * newest - before)).clamp(-0.5, 0.5)
 
 
 def _driven(
     u: Tensor, v: Tensor, weight: Tensor, else_matrix: Tensor, else_bias: Tensor
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return matrix ``(B, A, A)`` and offset ``(B, A, 1)`` of axes that another command drives.
+
+    And what the square of each command adds to the variance of an axis, ``(B, A, A)``.
 
     Of many axes an affine map needs many rows, and a gait that repeats itself shows only a few; but
     swapped cables need no more than gains. It stands where one explains all rows.
@@ -191,11 +273,15 @@ def _driven(
     other = 1 - torch.eye(u.shape[-2], device=u.device, dtype=u.dtype)
     pull, mass = weight * v, weight.sum(-1, keepdim=True)
     cross = pull @ u.mT + PRIOR * (1 - other)
-    gain = cross / (weight @ u.square().mT + PRIOR)
+    square = weight @ u.square().mT + PRIOR
+    gain = cross / square
     left = ((pull * v).sum(-1, keepdim=True) - gain * cross) / (mass + PRIOR)
     # An axis that its own command explains is driven by it, whatever else fits by chance.
     left, driver = (left + EXACT**2 * other).min(-1, keepdim=True)
     swapped = other.expand_as(gain).gather(-1, driver) > 0
     explained = swapped & (left < 2 * EXACT**2) & (mass > LEAST_ROWS)
-    chosen = torch.zeros_like(gain).scatter(-1, driver, gain.gather(-1, driver))
-    return torch.where(explained, chosen, else_matrix), torch.where(explained, 0.0, else_bias)
+    nothing = torch.zeros_like(gain)
+    chosen = nothing.scatter(-1, driver, gain.gather(-1, driver))
+    variance = nothing.scatter(-1, driver, explained / square.gather(-1, driver))
+    matrix = torch.where(explained, chosen, else_matrix)
+    return matrix, torch.where(explained, 0.0, else_bias), variance

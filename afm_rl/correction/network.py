@@ -183,23 +183,35 @@ class AxisNetwork(nn.Module):
         else:
             time, left = tau, max(1 - tau, LEAST_TIME)
         hidden = asked.hidden + at * self.point_weight + time * self.time_weight
-        return self._blend(self.plan_head(hidden.relu()), (asked.answers - at) / left)
+        own, shares = self._mixture(self.plan_head(hidden.relu()))
+        return (shares * torch.cat([own, (asked.answers - at) / left], -1)).sum(-1).mT
 
     def effect(self, encoded: Encoded, executed: Tensor) -> Tensor:
         """Return the effects ``(N, C, A)`` that actions ``(N, C, A)`` are predicted to have."""
+        return self.forecast(encoded, executed)[0]
+
+    def forecast(self, encoded: Encoded, executed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the effects of actions ``(N, C, A)``, and their variances in units of the noise.
+
+        Those of the fits that are mixed; the own answer is as sure as the line. ``(N, C, A)`` each.
+        """
         answers = encoded.experts.effect(executed)
         misses = encoded.experts.misses.expand(*answers.shape[:-1], -1)
         asked = torch.cat([executed.mT.unsqueeze(-1), answers, misses], -1)
         hidden = (encoded.effect + self.effect_query(asked)).relu()
-        return self._blend(self.effect_head(hidden), answers[..., :EXPERTS])
+        own, shares = self._mixture(self.effect_head(hidden))
+        variances = encoded.experts.variance(executed, answers[..., EXPERTS:])
+        line = variances[..., MISSES - 1 : MISSES]
+        each = torch.cat([own, answers[..., :EXPERTS]], -1), torch.cat([line, variances], -1)
+        effect, variance = ((shares * part).sum(-1).mT for part in each)
+        return effect, variance
 
-    def _blend(self, output: Tensor, answers: Tensor) -> Tensor:
-        """Return the mixture of the own answer and the experts', ``(N, C, A)``."""
+    def _mixture(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the own answers ``(N, A, C, 1)``, and the shares of these and of the experts."""
         own, logits = output.split([1, EXPERTS + 1], -1)
-        if not self.experts:
-            return own.squeeze(-1).mT
-        shares = (SHARPNESS * logits).softmax(-1)
-        return (shares * torch.cat([own, answers], -1)).sum(-1).mT
+        if self.experts:
+            return own, (SHARPNESS * logits).softmax(-1)
+        return own, torch.nn.functional.pad(torch.ones_like(own), (0, EXPERTS))
 
     def _cells(self, rows: Rows, experts: Experts) -> Tensor:
         """Return the features of every axis and row, ``(N, A, K, F)``."""

@@ -16,14 +16,18 @@ from afm_rl.correction.context_windows import ContextWindows
 from afm_rl.correction.delay import align, command_acting
 from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.hypotheses import KINDS, Hypothesis, acting_of
-from afm_rl.correction.least_squares import fit_gain, precision_of
+from afm_rl.correction.least_squares import PRIOR, fit_gain, precision_of, quadratic
 from afm_rl.correction.linear import (
     Lines,
     fit_lines,
+    at_rest,
     sensor_noise,
     within_rate,
 )
 from afm_rl.correction.network import AxisNetwork, Encoded, midpoint
+
+
+MAJORITY = 2 / 3
 
 
 class Answer(NamedTuple):
@@ -55,10 +59,13 @@ class Fits(NamedTuple):
     """The linear models."""
     gains: Tensor
     """Of commands that are delayed in W ways, ``(B, W, A)``."""
+    gain_variances: Tensor
+    """Of these gains, in units of the noise, ``(B, W, A)``."""
     sensor_noise: Tensor
     """What sensor noise adds to the next effect, ``(B, 1, A)``."""
     rate_limits: Tensor
     """Lowest and highest effect at the rate seen recently, ``(B, 2, A)``."""
+    recent: tuple[Tensor, Tensor, Tensor]
 
 
 class Models(NamedTuple):
@@ -89,6 +96,7 @@ class Tick(nn.Module):
     filters: Tensor
     filter_of_model: Tensor
     mixing: Tensor
+    mixing_lines: Tensor
     acting: Tensor
     windows: Tensor
 
@@ -123,6 +131,9 @@ class Tick(nn.Module):
             "filters": filters,
             "filter_of_model": torch.nn.functional.one_hot(which).T.to(scale),
             "mixing": torch.tensor([row.mixes_axes for row in kinds["linear"]]).unsqueeze(-1),
+            "mixing_lines": torch.tensor(
+                [*(row.mixes_axes for row in kinds["linear"]), False]
+            ).unsqueeze(-1),
             "windows": torch.arange(rows).unsqueeze(-1) + torch.arange(acting.shape[-1]),
             "acting": acting,
         }
@@ -156,18 +167,18 @@ class Tick(nn.Module):
         fits = self.fit(pairs, noise, place, delay)
         models = self.most_likely(fits, weights)
         proposals, spread = self.propose(models, unit, ends)
-        expected = self.expect(models, proposals)
+        expected, variances = self.expect(models, proposals)
         reach = self.reach(models, expected)
         low, high = reach.unbind(-2)
         wanted = attainable(unit, low, high, self.saturation)
         sent = pairs[..., : len(self.scale)]
         bounds = extend(reach, ends, sent.amax(1) - sent.amin(1))
-        action, effects = self.decide(models, proposals, expected, wanted, noise)
+        action, effects = self.decide(models, proposals, (expected, variances), wanted, noise)
         lag = (self.filter_of_model.to(weights) @ weights).argmax(1)  # the most probable one
 
         def against_lag() -> tuple[Tensor, Tensor]:
             command, acts = self.lead(action, lag, torch.cat([sent, waiting], 1), ends)
-            return command, self.expect(models, acts.unsqueeze(1)).squeeze(2)
+            return command, self.expect(models, acts.unsqueeze(1))[0].squeeze(2)
 
         action, effects = somewhere((lag > 0).any(-1), against_lag, [action, effects])
         healthy = weights[:, 0] + weights[:, -self.counts[-1] :].sum(1)
@@ -177,7 +188,7 @@ class Tick(nn.Module):
         effects = torch.where(corrects.unsqueeze(1), effects, expected[:, :, 0])
         predicted = (models.weights * effects).sum(1)
         ahead = torch.cat([waiting, action.unsqueeze(1)], 1)
-        forecasts, under_way = self.forecast(fits, weights, delay, pairs, ahead)
+        forecasts, under_way, _ = self.forecast(fits, weights, delay, pairs, ahead)
         return Answer(
             action * self.scale,
             predicted * self.scale,
@@ -203,17 +214,24 @@ class Tick(nn.Module):
         delayed = (self.acting @ newest[:, self.windows]).transpose(1, 2)  # (B, W, K, A)
         last = slice(-self.rows, None)
         gains = fit_gain(delayed, effect[:, None, last], weight[:, None, last])
+        square = (weight[:, None, last] * delayed.square()).sum(-2) + PRIOR
         lines = fit_lines(pairs[..., :size], acted, effect, weight)
         limits = within_rate(effect, recent)
-        return Fits(encoded, lines, gains, sensor_noise(acted, effect, recent), limits)
+        healthy = sensor_noise(acted, effect, recent), limits, (effect, acted, recent)
+        return Fits(encoded, lines, gains, square.reciprocal(), *healthy)
 
     def most_likely(self, fits: Fits, weights: Tensor) -> Models:
         """Return the models of which an action is chosen."""
         nominal, network, linear, delay, gain, healthy = weights.split(self.counts, 1)
         encoded = fits.encoded.choose((network * self.tie_break).argmax(1))
-        delayed = fits.gains.gather(1, gain.argmax(1, keepdim=True))  # (B, 1, A)
-        matrix = torch.cat([fits.lines.matrix, torch.diag_embed(delayed)], 1)
-        lines = Lines(matrix, torch.nn.functional.pad(fits.lines.bias, (0, 0, 0, 1)))
+        way = gain.argmax(1, keepdim=True)
+        delayed = torch.diag_embed(fits.gains.gather(1, way))  # (B, 1, A, A)
+        spread = quadratic(fits.gain_variances.gather(1, way), 2).mT
+        lines = fits.lines._replace(
+            matrix=torch.cat([fits.lines.matrix, delayed], 1),
+            bias=torch.nn.functional.pad(fits.lines.bias, (0, 0, 0, 1)),
+            spread=torch.cat([fits.lines.spread, spread], 1),
+        )
         nominal = torch.cat([nominal, delay, healthy], 1).sum(1, keepdim=True)
         network, gain = (part.sum(1, keepdim=True) for part in (network, gain))
         return Models(encoded, lines, torch.cat([nominal, network, linear, gain], 1))
@@ -234,10 +252,18 @@ class Tick(nn.Module):
         proposals = [plan, mean, ends, exact, models.lines.invert(planned), probes]
         return torch.cat(proposals, 1).clamp(least, most), spread
 
-    def expect(self, models: Models, actions: Tensor) -> Tensor:
-        """Return the effects ``(B, 2 + L, C, A)`` of actions ``(B, C, A)`` by every model."""
-        network = self.network.effect(models.encoded, actions).unsqueeze(1)
-        return torch.cat([actions.unsqueeze(1), network, models.lines.effect(actions)], 1)
+    def expect(self, models: Models, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the effects of actions ``(B, C, A)`` by every model, and their variances.
+
+        In units of the noise, as the fits know them; ``(B, 2 + L, C, A)`` each.
+        """
+        effect, variance = (
+            part.unsqueeze(1) for part in self.network.forecast(models.encoded, actions)
+        )
+        sure, lines = torch.zeros_like(effect), models.lines
+        effects = [actions.unsqueeze(1), effect, lines.effect(actions)]
+        variances = [sure, variance, lines.variance(actions, self.mixing_lines)]
+        return torch.cat(effects, 1), torch.cat(variances, 1)
 
     def reach(self, models: Models, effects: Tensor) -> Tensor:
         """Return the lowest and highest effects that actions may have, ``(B, 2, A)``.
@@ -250,7 +276,12 @@ class Tick(nn.Module):
         return torch.stack([(mean - std).amin(1), (mean + std).amax(1)], 1)
 
     def decide(
-        self, models: Models, proposals: Tensor, expected: Tensor, wanted: Tensor, noise: Tensor
+        self,
+        models: Models,
+        proposals: Tensor,
+        forecasts: tuple[Tensor, Tensor],
+        wanted: Tensor,
+        noise: Tensor,
     ) -> tuple[Tensor, Tensor]:
         r"""Return the actions ``(B, A)`` with the least expected loss, and what models expect.
 
@@ -263,26 +294,59 @@ class Tick(nn.Module):
         more: half of two opposite answers would do nothing, and tell nothing. So would small
         actions in noise: the plan is kept where they save less than .02 of expected loss.
         """
-        cost = self.loss(models, expected, wanted, noise)  # (B, C, A)
+        cost, axis, whole = self.rate(models, proposals, forecasts, wanted, noise)  # (B, C, A)
         cost = torch.cat([cost[:, :1] - 0.02, cost[:, 1:]], 1)
-        each = cost.argmin(1, keepdim=True)
-        joint = cost.sum(-1).argmin(1)[:, None, None].expand_as(each)
-        action, least = proposals.gather(1, joint), cost.gather(1, joint)
-        effect = expected.gather(2, joint.unsqueeze(1).expand_as(expected[:, :, :1]))
+        each = torch.where(axis, cost, torch.inf).argmin(1, keepdim=True)
+        total = torch.where(whole, cost.sum(-1, keepdim=True), torch.inf)
+        least, joint = total.min(1, keepdim=True)
+        joint = joint.expand_as(each)
+        action = proposals.gather(1, joint)
+        effect = forecasts[0].gather(2, joint.unsqueeze(1).expand_as(forecasts[0][:, :, :1]))
 
         def by_axis() -> tuple[Tensor, Tensor]:
-            other = proposals.gather(1, each)
-            effects = self.expect(models, other)
-            loss = self.loss(models, effects, wanted, noise).sum(-1, keepdim=True)
-            better = loss <= least.sum(-1, keepdim=True) + 1e-6
+            other = torch.cat([proposals[:, :1], proposals.gather(1, each)], 1)
+            forecasts = self.expect(models, other)
+            loss, axis, whole = (
+                part[:, 1:] for part in self.rate(models, other, forecasts, wanted, noise)
+            )
+            better = loss.sum(-1, keepdim=True) <= least + 1e-6
+            better = better & whole
             return (
-                torch.where(better, other, action),
-                torch.where(better.unsqueeze(1), effects, effect),
+                torch.where(better, other[:, 1:], action),
+                torch.where(better.unsqueeze(1), forecasts[0][:, :, 1:], effect),
             )
 
         differ = (each != joint).flatten(1).any(-1)
         action, effect = somewhere(differ, by_axis, [action, effect])
         return action.squeeze(1), effect.squeeze(2)
+
+    def rate(
+        self,
+        models: Models,
+        actions: Tensor,
+        forecasts: tuple[Tensor, Tensor],
+        wanted: Tensor,
+        noise: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        r"""Return the expected loss of actions ``(B, C, A)``, and whether the evidence reaches them.
+
+        .. math:: \sum_h w_{ha} \big[\sigma_{ha}(u) \le \tfrac12 \big(|T_{ha}(u^*) - u^*_a|
+                  - |T_{ha}(u) - u^*_a|\big)\big] \ge \tfrac12
+
+        More probably than not, the deviation of a fit is at most half of what it promises over the
+        first action, the plan; axis by axis, and as a whole ``(B, C, 1)``.
+        """
+        (effects, variances), weights = forecasts, models.weights.unsqueeze(2)  # (B, 2 + L, 1, A)
+        square = noise[:, None, None].square()
+        misses = (effects - wanted[:, None, None]).abs()
+        loss = (weights * (misses.square() / square).log1p()).sum(1)
+        std = (variances * square).sqrt()
+        gain = misses[:, :, :1] - misses
+        share = (weights * (std <= 0.5 * gain + 1e-6)).sum(1) / weights.sum(1)
+        moved = (actions - actions[:, :1]).abs()
+        axis = (moved == 0) | (share >= MAJORITY)
+        whole = ((share - MAJORITY) * moved).sum(-1, keepdim=True) >= 0
+        return loss, axis, whole
 
     def lead(self, acts: Tensor, lag: Tensor, sent: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
         r"""Return the commands ``(B, A)`` after which ``acts`` acts, and what acts after them.
@@ -304,18 +368,14 @@ class Tick(nn.Module):
         action = ((acts - rest) / share).clamp(box[:, 0], box[:, 1])
         return action, share * action + rest
 
-    def loss(self, models: Models, expected: Tensor, wanted: Tensor, noise: Tensor) -> Tensor:
-        """Return the expected loss ``(B, C, A)`` of effects ``(B, 2 + L, C, A)``."""
-        miss = (expected - wanted[:, None, None]).square() / noise[:, None, None].square()
-        return (models.weights.unsqueeze(2) * miss.log1p()).sum(1)
-
     def forecast(
         self, fits: Fits, weights: Tensor, delay: Tensor, pairs: Tensor, ahead: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now.
 
         And those ``(B, K + D, A)`` that the newest commands have or will have, by the models with
-        the present delay; the commands themselves where none is to come.
+        the present delay; the commands themselves where none is to come. Last, the variances of the
+        forecasts in units of the noise, ``(B, M + 1, A)``.
 
         Args:
             fits: all models.
@@ -331,20 +391,29 @@ class Tick(nn.Module):
         newest = commands[:, commands.shape[1] - self.longest_delay - ahead.shape[1] + 1 :]
         shape = -1, self.counts[1], acts.shape[-1]
         each = acts.expand(shape).flatten(0, 1).unsqueeze(1)
-        network = self.network.effect(fits.encoded, each).view(shape)
+        network, variance = (x.view(shape) for x in self.network.forecast(fits.encoded, each))
         each = torch.where(self.mixing, now, acts).unsqueeze(2)  # (B, L, 1, A)
         linear = fits.lines.effect(each).squeeze(2)
+        of_lines = torch.where(
+            self.mixing,
+            fits.lines.variance(now, self.mixing).squeeze(2),
+            fits.lines.variance(acts, self.mixing).squeeze(2),
+        )
+        of_gains, sure = fits.gain_variances * delayed.square(), torch.zeros_like(delayed)
+        variances = [sure[:, :1], variance, of_lines, sure[:, 1:], of_gains, *[sure[:, :1]] * 3]
         healthy = [acts.clamp(*fits.rate_limits.split(1, 1)), acts + fits.sensor_noise]
+        came, before, recent = fits.recent
+        healthy.append(at_rest(came, acts, before, recent))
         forecasts = [now, network, linear, delayed[:, 1:], fits.gains * delayed, *healthy]
 
         def under_way() -> list[Tensor]:
             has_delay = ((self.delays < 0) | (self.delays == delay.unsqueeze(-1))).unsqueeze(-1)
             models = self.most_likely(fits, torch.where(has_delay, weights.clamp_min(1e-9), 0.0))
             shares = models.weights / models.weights.sum(1, keepdim=True)
-            return [(shares.unsqueeze(2) * self.expect(models, newest)).sum(1)]
+            return [(shares.unsqueeze(2) * self.expect(models, newest)[0]).sum(1)]
 
         (newest,) = somewhere(delay + ahead.shape[1] > 1, under_way, [newest])
-        return torch.cat(forecasts, 1), newest
+        return torch.cat(forecasts, 1), newest, torch.cat(variances, 1)
 
 
 def filters_of(acting: Tensor) -> tuple[Tensor, Tensor]:

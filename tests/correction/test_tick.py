@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from afm_rl.correction import ActionFlow
-from afm_rl.correction.linear import Lines
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.tick import Models
 
@@ -25,7 +24,13 @@ def models_of(flow, matrix):
     certain[:, flow.models.index("affine")] = 1.0
     found = flow.tick.most_likely(read, certain)
     matrix = torch.tensor(matrix).expand_as(found.lines.matrix)
-    return found._replace(lines=Lines(matrix, torch.zeros_like(found.lines.bias)))
+    lines = found.lines._replace(matrix=matrix, bias=torch.zeros_like(found.lines.bias))
+    return found._replace(lines=lines._replace(leverage=torch.zeros_like(lines.leverage)))
+
+
+def sure(effects):
+    """Return forecasts of certain models."""
+    return effects, torch.zeros_like(effects)
 
 
 @pytest.mark.parametrize(("miss", "action"), [(0.1, 0.5), (0.2, 0.3)])
@@ -34,7 +39,7 @@ def test_an_action_must_promise_more_than_the_plan(miss, action):
     models = Models(None, None, torch.ones(1, 1, 1))
     proposals, expected = torch.tensor([[[0.5], [0.3]]]), torch.tensor([[[[miss], [0.0]]]])
     nothing = torch.zeros(1, 1)
-    found, effect = flow_of().tick.decide(models, proposals, expected, nothing, 1 + nothing)
+    found, effect = flow_of().tick.decide(models, proposals, sure(expected), nothing, 1 + nothing)
     assert found == action and effect == expected[0, 0, [0.5, 0.3].index(action)]
 
 
@@ -57,10 +62,30 @@ def test_axes_choose_apart_only_if_that_is_no_worse_together():
     )
 
 
-def test_as_far_as_models_differ_the_best_is_hoped_for():
+def test_bounds_are_optimistic_where_models_differ():
     foreseen = torch.tensor([[[[1.0], [0.5]], [[-1.0], [0.5]]]])  # of two models, for two actions
     reach = flow_of().tick.reach(Models(None, None, torch.full((1, 2, 1), 0.5)), foreseen)
     assert reach.flatten().tolist() == [-1.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("effects", "variances", "action"),
+    [
+        ([[0.5, -0.5], [0.5, -0.5]], [[0.0, 0.0], [0.0, 0.0]], -1.0),
+        ([[0.5, -0.5], [0.5, 0.5]], [[0.0, 0.0], [0.0, 0.0]], 1.0),  # one says that it is worse
+        ([[0.5, -0.5], [0.5, -1.5]], [[0.0, 0.0], [0.0, 0.0]], 1.0),  # by as much, beyond
+        ([[0.5, -0.5], [0.5, -0.4]], [[0.0, 0.0], [0.0, 0.0]], -1.0),  # all say that it is better
+        ([[0.5, -0.5], [0.5, -0.5]], [[0.0, 20.0], [0.0, 20.0]], -1.0),
+        ([[0.5, -0.5], [0.5, -0.5]], [[0.0, 30.0], [0.0, 30.0]], 1.0),  # .1 * 30 ** .5 > .5
+    ],
+)
+def test_no_command_is_farther_from_the_plan_than_the_evidence_reaches(effects, variances, action):
+    """The plan 1 has the effect .5, where -.5 is wanted; -1 promises an improvement of 1."""
+    forecasts = [torch.tensor(part).view(1, 2, 2, 1) for part in (effects, variances)]
+    models = Models(None, None, torch.full((1, 2, 1), 0.5))
+    proposals, one = torch.tensor([[[1.0], [-1.0]]]), torch.ones(1, 1)
+    executed, _ = flow_of().tick.decide(models, proposals, forecasts, -0.5 * one, 0.1 * one)
+    assert executed == action
 
 
 @pytest.mark.parametrize(("acts", "command"), [(0.3, None), (0.9, 1.0), (-0.9, -1.0)])
@@ -76,7 +101,7 @@ def test_a_slow_actuator_is_led_as_far_as_the_box_allows(acts, command):
     torch.testing.assert_close(led_to, torch.tensor([[share * expected + (1 - share) * 0.1]]))
 
 
-@pytest.mark.parametrize(("healthy", "executed"), [(0.6, 0.5), (0.4, -0.5)])
+@pytest.mark.parametrize(("healthy", "executed"), [(0.6, 0.5), (0.4, 0.5), (0.1, -0.5)])
 def test_models_by_which_nothing_is_wrong_keep_the_plan(healthy, executed):
     flow, plan = flow_of(), torch.tensor([[0.5]])
     weights = torch.zeros(1, len(flow.models), 1)
@@ -95,7 +120,7 @@ def test_maps_that_mix_axes_are_of_the_present_command_whatever_delay_is_believe
     parts["pairs"][-2:, :2] = torch.tensor([[0.1, 0.2], [0.3, 0.4]])
     parts["delay"] = torch.tensor([2.0])
     now = torch.tensor([0.7, 0.8])
-    forecasts, _ = flow.forecast(parts, now)
+    forecasts, *_ = flow.forecast(parts, now)
     of = dict(zip(flow.models, forecasts, strict=True))  # nothing is known: every fit is nominal
     for name, command in (("affine", now), ("driven", now), ("gain", torch.tensor([0.1, 0.2]))):
         torch.testing.assert_close(of[name], command)

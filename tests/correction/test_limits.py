@@ -1,0 +1,127 @@
+"""Where no model describes the robot: commands stay as near to the plan as the evidence demands."""
+
+import pytest
+import torch
+
+from afm_rl.correction import ActionFlow
+from afm_rl.correction.tick import Tick
+from afm_rl.dynamics import KnownDynamics
+from afm_rl.spaces.manifold import Manifold
+
+
+@torch.no_grad()
+def episode(corrector, model, plan, world, state, steps):
+    """Return states ``(T, B, S)``, plans and executed actions ``(T, B, A)``."""
+    size = model.action_size
+    box = torch.stack([corrector.denormalise(x) for x in (corrector.lowest, corrector.highest)])
+    box, memory, rows = box.expand(len(state), 2, size), corrector.begin(state), []
+    for step in range(steps):
+        planned = plan(state, step)
+        memory, correction = corrector.correct(memory, planned, model, box)
+        state = world(state, correction.executed, step)
+        memory = corrector.observe(memory, state)
+        rows.append((state, planned, correction.executed))
+    return [torch.stack(part) for part in zip(*rows, strict=True)]
+
+
+class Alone(ActionFlow):
+    """Executes the plan."""
+
+    def correct(self, memory, planned, model, box):
+        correction = self.unchanged(planned, torch.zeros(len(planned)), box)
+        return self.executing(memory, planned, planned), correction
+
+
+def pendulum(state, torque, push=0.0):
+    """Return the next angle and speed of an upright pendulum, whose speed may be pushed."""
+    angle, speed = state.split(1, -1)
+    speed = speed + 0.05 * (15 * angle.sin() + 3 * torque + 3 * push)
+    return torch.cat([angle + 0.05 * speed, speed], -1)
+
+
+def test_an_oscillating_force_is_no_delay():
+    """Commands that are one sine cannot tell them apart; alone the pendulum stands it well."""
+    force = torch.tensor([0.6, 0.8, 0.6, 0.4]).unsqueeze(-1)
+    frequency = torch.tensor([0.1, 0.07, 0.2, 0.4]).unsqueeze(-1)
+
+    def balance(state, step):
+        return (-12 * state[:, :1] - 3 * state[:, 1:]).clamp(-2, 2)
+
+    def world(state, torque, step):
+        return pendulum(state, torque, force * (frequency * step).sin())
+
+    model, start = KnownDynamics(pendulum, Manifold(2), 1), torch.tensor([[0.1, 0.0]]).expand(4, 2)
+    limit = torch.tensor([2.0])
+    costs = [
+        episode(kind(-limit, limit), model, balance, world, start, 200)[0][60:]
+        .square()
+        .mean((0, 2))
+        for kind in (ActionFlow, Alone)
+    ]
+    assert (costs[0] < costs[1]).all()
+
+
+@pytest.mark.parametrize("joints", [1, 6])
+def test_servos_that_stick_err_at_most_twice_as_far_as_alone(joints):
+    band = torch.tensor([0.06, 0.12]).repeat_interleave(3).unsqueeze(-1)
+
+    def world(position, command, step):
+        away = command - position
+        return position + 0.5 * torch.where(away.abs() < band, 0.0, away)
+
+    phase = torch.arange(6.0).unsqueeze(-1) + 1.3 * torch.arange(joints)
+    speed = 0.03 * (1 + 0.3 * torch.arange(joints))
+
+    def reference(step):
+        time = speed * step + phase
+        return 0.5 * time.sin() + 0.15 * (2.7 * time).sin()
+
+    def follow(position, step):
+        return 2 * reference(step + 1) - reference(step)
+
+    model = KnownDynamics(lambda q, u: q + 0.5 * (u - q), Manifold(joints), joints)
+    one, wanted = torch.ones(joints), torch.stack([reference(step + 1) for step in range(200)])
+    errors = [
+        (episode(kind(-one, one), model, follow, world, reference(0), 200)[0] - wanted).abs()
+        for kind in (ActionFlow, Alone)
+    ]
+    corrected, alone = (error.amax((0, 2)).view(2, 3).amax(-1) for error in errors)
+    assert (corrected <= 2 * alone).all()
+
+
+def test_of_a_thousand_memories_none_leads_farther_than_its_evidence_reaches(monkeypatch):
+    """Gains, offsets, dead zones, stiction and noise of all sizes, in random order."""
+    generator, count = torch.Generator().manual_seed(0), 1000
+    gain, offset, zone, noise, keep = torch.rand(5, count, 1, generator=generator)
+    gain, offset, zone, noise = 4 * gain - 2, 0.6 * offset - 0.3, 0.3 * zone, 0.1 * noise**2
+    last = torch.zeros(count, 1)
+
+    def world(state, action, step):
+        nonlocal last
+        moved = (action.abs() > zone) & ((action - last).abs() > zone * keep)
+        effect = torch.where(moved, gain * action + offset, 0.0) if step > 5 else action
+        last = action
+        return state + effect + noise * torch.randn(count, 1, generator=generator)
+
+    seen = []
+
+    def spy(tick, models, proposals, forecasts, wanted, noise):
+        action, effect = decide(tick, models, proposals, forecasts, wanted, noise)
+        both = torch.stack([proposals[:, 0], action], 1)
+        effects, variances = tick.expect(models, both)
+        weights, miss = models.weights.unsqueeze(2), (effects - wanted[:, None, None]).abs()
+        mean = ((weights * effects).sum(1) - wanted.unsqueeze(1)).abs()
+        short = (miss - mean.unsqueeze(1)).clamp_min(0).square()
+        deviation = (weights * (short + variances * noise[:, None, None] ** 2)).sum(1).sqrt()
+        away = (action != proposals[:, 0]).squeeze(-1)
+        seen.append((deviation[:, 1] - 0.5 * (mean[:, 0] - mean[:, 1]))[away])
+        return action, effect
+
+    decide = Tick.decide
+    monkeypatch.setattr(Tick, "decide", spy)
+    plans = 2 * torch.rand(20, count, 1, generator=generator) - 1
+    model = KnownDynamics(lambda s, u: s + u, Manifold(1), 1)
+    flow = ActionFlow(-torch.ones(1), torch.ones(1))
+    episode(flow, model, lambda state, step: plans[step], world, torch.zeros(count, 1), 20)
+    excess = torch.cat(seen)
+    assert len(excess) > 2000 and excess.max() < 1e-4
