@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -387,9 +388,10 @@ class ActionFlow(PairCorrector):
         """
         with torch.no_grad():
             parts = self.measure(memory, model)
-            forecasts, _, variances = self._forecasts(self.pack(parts), action)
             weights, noise = self.weights(parts), parts["noise"]
-            mean, std = mean_and_std(forecasts, weights)
+            memory = self._with_forecasts(self.pack(parts), action)
+            mean, std = mean_and_std(self.unpack(memory, model.state_size)["forecasts"], weights)
+            variances = self.variances(parts, action) * (parts["misaligned"] == 1.0).unsqueeze(-1)
             noise = noise * (1 + (weights * variances).sum(-2)).sqrt()
             return self.denormalise(mean), self.denormalise(torch.hypot(std, noise))
 
@@ -413,12 +415,6 @@ class ActionFlow(PairCorrector):
     @torch.no_grad()
     def _with_forecasts(self, memory: Tensor, executed: Tensor) -> Tensor:
         """Return the memory with forecasts of what is executed, of all models if misaligned."""
-        forecasts, under_way, _ = self._forecasts(memory, executed)
-        parts = self.unpack(memory, self.states_in(memory))
-        return self.pack({**parts, "forecasts": forecasts, "under_way": under_way})
-
-    def _forecasts(self, memory: Tensor, executed: Tensor) -> Sequence[Tensor]:
-        """Return forecasts of what is executed, what is under way, and the forecasts' variances."""
         parts = self.unpack(memory, self.states_in(memory))
         misaligned = parts["misaligned"].squeeze(-1) == 1.0
         idle = self.forecast_unchanged(parts, executed)
@@ -426,11 +422,27 @@ class ActionFlow(PairCorrector):
         def by_models(memory: Tensor, executed: Tensor) -> Sequence[Tensor]:
             return self.forecast(self.unpack(memory, self.states_in(memory)), executed)
 
-        unchanged = [idle["forecasts"], idle["under_way"], torch.zeros_like(idle["forecasts"])]
-        return somewhere(misaligned, by_models, unchanged, memory, executed)
+        unchanged = [idle["forecasts"], idle["under_way"]]
+        forecasts, under_way = somewhere(misaligned, by_models, unchanged, memory, executed)
+        return self.pack({**parts, "forecasts": forecasts, "under_way": under_way})
 
-    def forecast(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the forecasts of all models, what is under way, and the forecasts' variances."""
+    def forecast(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the forecasts of all models, and what is under way."""
+        weights, fits, *commands = self._fits(parts, executed)
+        forecasts, under_way = self.tick.forecast(fits, weights, *commands)
+        batch = executed.shape[:-1]
+        forecasts, under_way = (
+            x.view(*batch, *x.shape[1:]).to(executed) for x in (forecasts, under_way)
+        )
+        return forecasts, under_way
+
+    def variances(self, parts: Fields, executed: Tensor) -> Tensor:
+        """Return the variances ``(*B, M, A)`` of these forecasts, in units of the noise."""
+        _, fits, *commands = self._fits(parts, executed)
+        return self.tick.variances(fits, *commands).view(parts["forecasts"].shape).to(executed)
+
+    def _fits(self, parts: Fields, executed: Tensor) -> tuple[Any, ...]:
+        """Return weights, fits, delay, pairs and commands ahead, of B missions."""
         ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
         evidence = *self._evidence(parts, self.weights(parts)), self.normalise(ahead)
         batch, delay = executed.shape[:-1], parts["delay"].reshape(-1).long()
@@ -438,11 +450,7 @@ class ActionFlow(PairCorrector):
             x.reshape(len(delay), *x.shape[len(batch) :]) for x in evidence
         )
         fits = self.tick.fit(pairs, noise, place, delay)
-        effects = self.tick.forecast(fits, weights, delay, pairs, unit.to(pairs))
-        forecasts, under_way, variances = (
-            x.view(*batch, *x.shape[1:]).to(executed) for x in effects
-        )
-        return forecasts, under_way, variances
+        return weights, fits, delay, pairs, unit.to(pairs)
 
     def _evidence(self, parts: Fields, weights: Tensor) -> list[Tensor]:
         evidence = parts["pairs"], weights, parts["noise"], self.place_of(parts["state"])

@@ -32,8 +32,9 @@ RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for
 class Lines(NamedTuple):
     r"""L linear models of B missions, :math:`T(u) = D u + b`, shares of the largest action.
 
-    How unsure a fit is of the effect of an action says Bayesian linear regression, in units of the
-    noise: of one axis :math:`c_0 + c_1 u + c_2 u^2`, of an affine map :math:`x^T Q x`, x = (u, 1).
+    How unsure a fit is of the effect of an action says Bayesian linear regression,
+    :math:`x^T (X^T W X + \rho)^{-1} x` in units of the noise: of a model of one axis
+    :math:`c_0 + c_1 u + c_2 u^2`. The last two mix axes.
     """
 
     matrix: Tensor
@@ -41,28 +42,26 @@ class Lines(NamedTuple):
     bias: Tensor
     """b, ``(B, L, A)``."""
     spread: Tensor
-    """c, ``(B, L, 3, A)``."""
+    """c of those of one axis, ``(B, L - 2, 3, A)``."""
     leverage: Tensor
-    """Q of the affine map, ``(B, A + 1, A + 1)``."""
+    """:math:`(X^T W X + \rho)^{-1}` of the affine map, x = (u, 1), ``(B, A + 1, A + 1)``."""
     driver: Tensor
-    """What the square of each command adds to the variance where an axis is driven by another
-    one, ``(B, A, A)``."""
+    """The same of a gain, where the command of another axis drives one, else 0, ``(B, A, A)``."""
 
-    def variance(self, actions: Tensor, mixing: Tensor) -> Tensor:
+    def variance(self, actions: Tensor, commands: Tensor | None = None) -> Tensor:
         """Return the variances ``(B, L, C, A)`` of the effects of actions ``(B, C, A)``.
 
         Args:
-            actions: shares of the largest action.
-            mixing: which models mix axes, ``(L, 1)``: the affine map, then the driven axes.
+            actions: what acts.
+            commands: what acts by models that mix axes; the actions if None.
         """
-        u = actions.unsqueeze(1)
+        u, commands = actions.unsqueeze(1), actions if commands is None else commands
         c0, c1, c2 = self.spread.unsqueeze(3).unbind(2)
-        inputs = torch.nn.functional.pad(actions, (0, 1), value=1.0)
-        affine = ((inputs @ self.leverage) * inputs).sum(-1, keepdim=True).expand_as(actions)
-        driven = actions.square() @ self.driver.mT
-        of_mixing = torch.stack([affine, torch.where(driven > 0, driven, affine)], 1)
-        rows = mixing.squeeze(-1).cumsum(0).clamp_max(2).sub(1).clamp_min(0)
-        return torch.where(mixing.unsqueeze(-1), of_mixing[:, rows], c0 + u * (c1 + u * c2))
+        inputs = torch.nn.functional.pad(commands, (0, 1), value=1.0)
+        affine = ((inputs @ self.leverage) * inputs).sum(-1, keepdim=True).expand_as(commands)
+        driven = commands.square() @ self.driver.mT
+        mixing = torch.stack([affine, torch.where(driven > 0, driven, affine)], 1)
+        return torch.cat([c0 + u * (c1 + u * c2), mixing], 1)
 
     def effect(self, actions: Tensor) -> Tensor:
         """Return the effects ``(B, L, C, A)`` of actions ``(B, C, A)``, or ``(B, L, C, A)``."""
@@ -107,20 +106,17 @@ def fit_lines(sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor) -> Line
     driven, rest, driver = _driven(sent, v, weight, affine, shift.unsqueeze(-1))
     matrix = torch.cat([torch.diag_embed(gains.mT), torch.stack([affine, driven], 1)], 1)
     bias = torch.cat([*biases, shift.unsqueeze(-1), rest], -1).mT
-    certain = none.unsqueeze(-1).expand(*none.shape, 3)  # (B, A, W, 3)
-    constant, slopes = quadratic(1 / mass, 0), quadratic(1 / square, 2)
-    drifting = slopes[..., 2:3, :] + constant[..., :1, :]
+    constant, slopes = quadratic(1 / mass, 0), quadratic(1 / square, 2)  # (B, A, W, 3)
     spread = [
-        certain[..., :1, :],  # reversed
+        quadratic(none[..., :1], 0),  # reversed: there is nothing that could be unsure
         constant[..., :2, :],
         slopes[..., 1::2, :],
         variance_of_line(square, mean, mass)[..., 2:, :],
-        drifting,
+        slopes[..., 2:3, :] + constant[..., :1, :],
         arx_spread.unsqueeze(-2),
-        quadratic(5 + none[..., :1], 0),  # an extrapolated line: two squared, and one
-        certain[..., :3, :],  # in the leverage, and of delayed commands
+        quadratic(5 + none[..., :1], 0),  # the trend: of two squared, and of one offset
     ]
-    spread = torch.cat(spread, -2)[..., : matrix.shape[1], :].permute(0, 2, 3, 1)
+    spread = torch.cat(spread, -2).permute(0, 2, 3, 1)
     inputs = torch.nn.functional.pad(sent.mT, (0, 1), value=1.0)
     rows = weight.mean(1).unsqueeze(-1) * inputs
     leverage = invert_positive(add_diagonal(rows.mT @ inputs, PRIOR))
@@ -177,26 +173,28 @@ def within_rate(came: Tensor, valid: Tensor, rows: int = 12, least: float = 0.05
 
 
 def at_rest(
-    came: Tensor, acts: Tensor, sent: Tensor, valid: Tensor, rows: int = 20, most: float = 0.2
+    acts: Tensor, sent: Tensor, came: Tensor, valid: Tensor, rows: int = 20, widest: float = 0.2
 ) -> Tensor:
     """Return the next effect ``(B, 1, A)`` of actuators that stick.
 
-    One that rests does so until a command is farther from it than any in which it rested, of the
-    newest ``rows``, but ``most`` at most; then it does as commanded.
+    One that rests does so until a command is farther from it than any at which it rested before, of
+    the newest ``rows``; then it does as commanded.
 
     Args:
-        came: effects, the oldest first, ``(B, M, A)``.
         acts: the command that acts now, ``(B, 1, A)``.
-        sent: commands that acted, ``(B, M, A)``.
+        sent: commands that acted, the oldest first, ``(B, M, A)``.
+        came: their effects.
         valid: which rows count, ``(B, M, 1)``, 0 or 1.
+        widest: band within which actuators may stick.
 
-    >>> came, sent = torch.zeros(1, 3, 1), torch.full((1, 3, 1), 0.1)
-    >>> at_rest(came, torch.tensor([[[0.05]]]), sent, torch.ones(1, 3, 1)).item()
-    0.0
+    >>> sent, rests = torch.full((1, 3, 1), 0.1), torch.zeros(1, 3, 1)
+    >>> acts = torch.tensor([[[0.05, 0.3]]])
+    >>> at_rest(acts, sent, rests, torch.ones(1, 3, 1)).flatten()
+    tensor([0.0000, 0.3000])
     """
-    came, sent, valid = came[:, -rows:], sent[:, -rows:], valid[:, -rows:]
-    rests = valid[:, 1:] * valid[:, :-1] * (came.diff(dim=1).abs() < 0.005)
-    band = (rests * (sent - came).abs()[:, 1:]).amax(1, keepdim=True).clamp_max(most)
+    sent, came, valid = (rows_of[:, -rows:] for rows_of in (sent, came, valid))
+    rests = valid[:, 1:] * valid[:, :-1] * (came.diff(dim=1).abs() < EXACT / 4)
+    band = (rests * (sent - came).abs()[:, 1:]).amax(1, keepdim=True).clamp_max(widest)
     now = came[:, -1:]
     return torch.where((acts - now).abs() <= 1.05 * band, now, acts)
 
@@ -236,21 +234,19 @@ def _extrapolate(offset: Tensor, weight: Tensor) -> Tensor:
     .. math:: d_{k+1} = c\,d_k - d_{k-1},\qquad c = 2 \cos \omega
 
     is a line (c = 2) or an oscillation; c is fitted to the newest rows of ``(B, A, M)``. The newest
-    offset where the one before it does not count, zero where neither does.
+    offset where the one before it does not count, zero where neither does; at most half of the
+    largest action: what is larger is a fault.
     """
     counts = (weight > 0).to(offset)
     offset = offset * counts
     before, now, after = (offset[..., k : k - 2 or None] for k in range(3))
     every = counts[..., :-2] * counts[..., 1:-1] * counts[..., 2:]
-    every = every * 0.95 ** torch.arange(every.shape[-1] - 1, -1, -1, device=every.device)
-    pull = every * now
-    c = ((pull * (before + after)).sum(-1, keepdim=True) + 2 * PRIOR) / (
-        (pull * now).sum(-1, keepdim=True) + PRIOR
-    )
+    pull = every * now * 0.95 ** torch.arange(every.shape[-1] - 1, -1, -1, device=every.device)
+    c = (pull * (before + after)).sum(-1, keepdim=True) + 2 * PRIOR
+    c = (c / ((pull * now).sum(-1, keepdim=True) + PRIOR)).clamp(-2, 2)
     before, newest = offset[..., -2:].split(1, -1)
     both = counts[..., -2:].prod(-1, keepdim=True)
-    # A disturbance that is larger than half of the largest action would not be one.
-    return (newest + both * ((c.clamp(-2, 2) - 1) * newest - before)).clamp(-0.5, 0.5)
+    return (newest + both * ((c - 1) * newest - before)).clamp(-0.5, 0.5)
 
 
 def _driven(

@@ -19,15 +19,14 @@ from afm_rl.correction.hypotheses import KINDS, Hypothesis, acting_of
 from afm_rl.correction.least_squares import PRIOR, fit_gain, precision_of, quadratic
 from afm_rl.correction.linear import (
     Lines,
-    fit_lines,
     at_rest,
+    fit_lines,
     sensor_noise,
     within_rate,
 )
 from afm_rl.correction.network import AxisNetwork, Encoded, midpoint
 
-
-MAJORITY = 2 / 3
+MAJORITY = 2 / 3  # of the probability, for whom the evidence must reach a command
 
 
 class Answer(NamedTuple):
@@ -65,7 +64,8 @@ class Fits(NamedTuple):
     """What sensor noise adds to the next effect, ``(B, 1, A)``."""
     rate_limits: Tensor
     """Lowest and highest effect at the rate seen recently, ``(B, 2, A)``."""
-    recent: tuple[Tensor, Tensor, Tensor]
+    series: tuple[Tensor, Tensor, Tensor]
+    """Commands that acted, their effects, and which of them count, the oldest first."""
 
 
 class Models(NamedTuple):
@@ -74,10 +74,19 @@ class Models(NamedTuple):
     encoded: Encoded
     """The most likely context window of every axis."""
     lines: Lines
-    """The linear models, the last one a gain of delayed commands."""
+    """The linear models, the first one a gain of delayed commands."""
     weights: Tensor
     """Probabilities ``(B, 2 + L, A)``: that actions have their nominal effect, delayed or not; of
     the network; of the linear models."""
+
+
+class Forecast(NamedTuple):
+    """What every model of :class:`Models` expects of C actions, ``(B, 2 + L, C, A)`` each."""
+
+    effect: Tensor
+    """Shares of the largest action."""
+    variance: Tensor
+    """Of the fits, in units of the noise."""
 
 
 class Tick(nn.Module):
@@ -96,7 +105,6 @@ class Tick(nn.Module):
     filters: Tensor
     filter_of_model: Tensor
     mixing: Tensor
-    mixing_lines: Tensor
     acting: Tensor
     windows: Tensor
 
@@ -131,9 +139,6 @@ class Tick(nn.Module):
             "filters": filters,
             "filter_of_model": torch.nn.functional.one_hot(which).T.to(scale),
             "mixing": torch.tensor([row.mixes_axes for row in kinds["linear"]]).unsqueeze(-1),
-            "mixing_lines": torch.tensor(
-                [*(row.mixes_axes for row in kinds["linear"]), False]
-            ).unsqueeze(-1),
             "windows": torch.arange(rows).unsqueeze(-1) + torch.arange(acting.shape[-1]),
             "acting": acting,
         }
@@ -167,28 +172,28 @@ class Tick(nn.Module):
         fits = self.fit(pairs, noise, place, delay)
         models = self.most_likely(fits, weights)
         proposals, spread = self.propose(models, unit, ends)
-        expected, variances = self.expect(models, proposals)
-        reach = self.reach(models, expected)
+        expected = self.expect(models, proposals)
+        reach = self.reach(models, expected.effect)
         low, high = reach.unbind(-2)
         wanted = attainable(unit, low, high, self.saturation)
         sent = pairs[..., : len(self.scale)]
         bounds = extend(reach, ends, sent.amax(1) - sent.amin(1))
-        action, effects = self.decide(models, proposals, (expected, variances), wanted, noise)
+        action, effects = self.decide(models, proposals, expected, wanted, noise)
         lag = (self.filter_of_model.to(weights) @ weights).argmax(1)  # the most probable one
 
         def against_lag() -> tuple[Tensor, Tensor]:
             command, acts = self.lead(action, lag, torch.cat([sent, waiting], 1), ends)
-            return command, self.expect(models, acts.unsqueeze(1))[0].squeeze(2)
+            return command, self.expect(models, acts.unsqueeze(1)).effect.squeeze(2)
 
         action, effects = somewhere((lag > 0).any(-1), against_lag, [action, effects])
         healthy = weights[:, 0] + weights[:, -self.counts[-1] :].sum(1)
         changed = healthy < 0.5  # else the plan, to the bit
         corrects = changed & action.isfinite().all(-1, True)
         action = torch.where(corrects, action, proposals[:, 0])
-        effects = torch.where(corrects.unsqueeze(1), effects, expected[:, :, 0])
+        effects = torch.where(corrects.unsqueeze(1), effects, expected.effect[:, :, 0])
         predicted = (models.weights * effects).sum(1)
         ahead = torch.cat([waiting, action.unsqueeze(1)], 1)
-        forecasts, under_way, _ = self.forecast(fits, weights, delay, pairs, ahead)
+        forecasts, under_way = self.forecast(fits, weights, delay, pairs, ahead)
         return Answer(
             action * self.scale,
             predicted * self.scale,
@@ -217,8 +222,9 @@ class Tick(nn.Module):
         square = (weight[:, None, last] * delayed.square()).sum(-2) + PRIOR
         lines = fit_lines(pairs[..., :size], acted, effect, weight)
         limits = within_rate(effect, recent)
-        healthy = sensor_noise(acted, effect, recent), limits, (effect, acted, recent)
-        return Fits(encoded, lines, gains, square.reciprocal(), *healthy)
+        series = acted, effect, recent
+        errors = sensor_noise(*series)
+        return Fits(encoded, lines, gains, square.reciprocal(), errors, limits, series)
 
     def most_likely(self, fits: Fits, weights: Tensor) -> Models:
         """Return the models of which an action is chosen."""
@@ -228,13 +234,13 @@ class Tick(nn.Module):
         delayed = torch.diag_embed(fits.gains.gather(1, way))  # (B, 1, A, A)
         spread = quadratic(fits.gain_variances.gather(1, way), 2).mT
         lines = fits.lines._replace(
-            matrix=torch.cat([fits.lines.matrix, delayed], 1),
-            bias=torch.nn.functional.pad(fits.lines.bias, (0, 0, 0, 1)),
-            spread=torch.cat([fits.lines.spread, spread], 1),
+            matrix=torch.cat([delayed, fits.lines.matrix], 1),
+            bias=torch.nn.functional.pad(fits.lines.bias, (0, 0, 1, 0)),
+            spread=torch.cat([spread, fits.lines.spread], 1),
         )
         nominal = torch.cat([nominal, delay, healthy], 1).sum(1, keepdim=True)
         network, gain = (part.sum(1, keepdim=True) for part in (network, gain))
-        return Models(encoded, lines, torch.cat([nominal, network, linear, gain], 1))
+        return Models(encoded, lines, torch.cat([nominal, network, gain, linear], 1))
 
     def propose(self, models: Models, planned: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
         """Return actions ``(B, C, A)``, the first the planned one, and the samples' deviation.
@@ -252,18 +258,13 @@ class Tick(nn.Module):
         proposals = [plan, mean, ends, exact, models.lines.invert(planned), probes]
         return torch.cat(proposals, 1).clamp(least, most), spread
 
-    def expect(self, models: Models, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the effects of actions ``(B, C, A)`` by every model, and their variances.
-
-        In units of the noise, as the fits know them; ``(B, 2 + L, C, A)`` each.
-        """
-        effect, variance = (
-            part.unsqueeze(1) for part in self.network.forecast(models.encoded, actions)
-        )
-        sure, lines = torch.zeros_like(effect), models.lines
-        effects = [actions.unsqueeze(1), effect, lines.effect(actions)]
-        variances = [sure, variance, lines.variance(actions, self.mixing_lines)]
-        return torch.cat(effects, 1), torch.cat(variances, 1)
+    def expect(self, models: Models, actions: Tensor) -> Forecast:
+        """Return what every model expects of actions ``(B, C, A)``."""
+        effect, variance = self.network.forecast(models.encoded, actions)
+        effects = [actions.unsqueeze(1), effect.unsqueeze(1), models.lines.effect(actions)]
+        spread = [variance.unsqueeze(1), models.lines.variance(actions)]
+        sure = torch.zeros_like(effects[0])  # that commands do as they say
+        return Forecast(torch.cat(effects, 1), torch.cat([sure, *spread], 1))
 
     def reach(self, models: Models, effects: Tensor) -> Tensor:
         """Return the lowest and highest effects that actions may have, ``(B, 2, A)``.
@@ -279,7 +280,7 @@ class Tick(nn.Module):
         self,
         models: Models,
         proposals: Tensor,
-        forecasts: tuple[Tensor, Tensor],
+        expected: Forecast,
         wanted: Tensor,
         noise: Tensor,
     ) -> tuple[Tensor, Tensor]:
@@ -288,32 +289,30 @@ class Tick(nn.Module):
         .. math:: u_a = \operatorname{argmin}_u \sum_h w_{ha}
                   \log\Big(1 + \frac{(T_{ha}(u) - u^*_a)^2}{s_a^2}\Big)
 
-        over the proposals, axis by axis, if these actions together are no worse than the best
-        proposal as a whole, as they may be where one command moves several axes. The loss averages
-        models that differ by less than the noise s, and decides between those that differ by
-        more: half of two opposite answers would do nothing, and tell nothing. So would small
-        actions in noise: the plan is kept where they save less than .02 of expected loss.
+        over the proposals that the evidence reaches (:meth:`rate`), axis by axis, if these actions
+        together are no worse than the best proposal as a whole, as they may be where one command
+        moves several axes. The loss averages models that differ by less than the noise s, and
+        decides between those that differ by more: half of two opposite answers would do nothing,
+        and tell nothing. So would small actions in noise: the plan is kept where they save less
+        than .02 of expected loss.
         """
-        cost, axis, whole = self.rate(models, proposals, forecasts, wanted, noise)  # (B, C, A)
+        cost, axis, whole = self.rate(models, proposals, expected, wanted, noise)  # (B, C, A)
         cost = torch.cat([cost[:, :1] - 0.02, cost[:, 1:]], 1)
         each = torch.where(axis, cost, torch.inf).argmin(1, keepdim=True)
         total = torch.where(whole, cost.sum(-1, keepdim=True), torch.inf)
         least, joint = total.min(1, keepdim=True)
         joint = joint.expand_as(each)
         action = proposals.gather(1, joint)
-        effect = forecasts[0].gather(2, joint.unsqueeze(1).expand_as(forecasts[0][:, :, :1]))
+        effect = expected.effect.gather(2, joint.unsqueeze(1).expand_as(expected.effect[:, :, :1]))
 
         def by_axis() -> tuple[Tensor, Tensor]:
             other = torch.cat([proposals[:, :1], proposals.gather(1, each)], 1)
-            forecasts = self.expect(models, other)
-            loss, axis, whole = (
-                part[:, 1:] for part in self.rate(models, other, forecasts, wanted, noise)
-            )
-            better = loss.sum(-1, keepdim=True) <= least + 1e-6
-            better = better & whole
+            forecast = self.expect(models, other)
+            loss, _, whole = self.rate(models, other, forecast, wanted, noise)
+            better = whole[:, 1:] & (loss[:, 1:].sum(-1, keepdim=True) <= least + 1e-6)
             return (
                 torch.where(better, other[:, 1:], action),
-                torch.where(better.unsqueeze(1), forecasts[0][:, :, 1:], effect),
+                torch.where(better.unsqueeze(1), forecast.effect[:, :, 1:], effect),
             )
 
         differ = (each != joint).flatten(1).any(-1)
@@ -321,32 +320,30 @@ class Tick(nn.Module):
         return action.squeeze(1), effect.squeeze(2)
 
     def rate(
-        self,
-        models: Models,
-        actions: Tensor,
-        forecasts: tuple[Tensor, Tensor],
-        wanted: Tensor,
-        noise: Tensor,
+        self, models: Models, actions: Tensor, expected: Forecast, wanted: Tensor, noise: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Return the expected loss of actions ``(B, C, A)``, and whether the evidence reaches them.
+        r"""Return the expected loss of actions ``(B, C, A)``, and which the evidence reaches.
 
-        .. math:: \sum_h w_{ha} \big[\sigma_{ha}(u) \le \tfrac12 \big(|T_{ha}(u^*) - u^*_a|
-                  - |T_{ha}(u) - u^*_a|\big)\big] \ge \tfrac12
+        It does if two thirds of the probability are with models that promise at least twice their
+        standard deviation :math:`\sigma`: that the miss is so much less than that of the first
+        action, which is the plan :math:`u^*`,
 
-        More probably than not, the deviation of a fit is at most half of what it promises over the
-        first action, the plan; axis by axis, and as a whole ``(B, C, 1)``.
+        .. math:: \sum_h w_{ha} \big[\,|T_{ha}(u^*) - u^*_a| - |T_{ha}(u) - u^*_a|
+                  \ge 2 \sigma_{ha}(u)\big] \ge \tfrac23 \sum_h w_{ha},
+
+        axis by axis ``(B, C, A)``; and as a whole ``(B, C, 1)``, where axes count as far as they
+        move away from the plan. A line through commands that were nearly alike explains them, and
+        knows nothing of others: where :math:`\sigma` is half of the largest action, a model has no
+        part in the sums.
         """
-        (effects, variances), weights = forecasts, models.weights.unsqueeze(2)  # (B, 2 + L, 1, A)
-        square = noise[:, None, None].square()
-        misses = (effects - wanted[:, None, None]).abs()
-        loss = (weights * (misses.square() / square).log1p()).sum(1)
-        std = (variances * square).sqrt()
-        gain = misses[:, :, :1] - misses
-        share = (weights * (std <= 0.5 * gain + 1e-6)).sum(1) / weights.sum(1)
-        moved = (actions - actions[:, :1]).abs()
-        axis = (moved == 0) | (share >= MAJORITY)
-        whole = ((share - MAJORITY) * moved).sum(-1, keepdim=True) >= 0
-        return loss, axis, whole
+        weights, square = models.weights.unsqueeze(2), noise[:, None, None].square()
+        misses = (expected.effect - wanted[:, None, None]).square()
+        loss = (weights * (misses / square).log1p()).sum(1)
+        misses, std = misses.sqrt(), (expected.variance * square).sqrt()
+        promised = misses[:, :, :1] - misses >= 2 * std - 1e-6
+        excess = weights * (std < 0.5) * (promised.to(weights) - MAJORITY)
+        excess, moved = excess.sum(1) - 1e-6, (actions - actions[:, :1]).abs()
+        return loss, (excess > 0) | (moved == 0), (excess * moved).sum(-1, keepdim=True) >= 0
 
     def lead(self, acts: Tensor, lag: Tensor, sent: Tensor, box: Tensor) -> tuple[Tensor, Tensor]:
         r"""Return the commands ``(B, A)`` after which ``acts`` acts, and what acts after them.
@@ -370,12 +367,11 @@ class Tick(nn.Module):
 
     def forecast(
         self, fits: Fits, weights: Tensor, delay: Tensor, pairs: Tensor, ahead: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor]:
         """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now.
 
         And those ``(B, K + D, A)`` that the newest commands have or will have, by the models with
-        the present delay; the commands themselves where none is to come. Last, the variances of the
-        forecasts in units of the noise, ``(B, M + 1, A)``.
+        the present delay; the commands themselves where none is to come.
 
         Args:
             fits: all models.
@@ -384,36 +380,49 @@ class Tick(nn.Module):
             pairs: what is remembered.
             ahead: commands that wait, and the present one, ``(B, D + 1, A)``.
         """
-        commands, now = torch.cat([pairs[..., : len(self.scale)], ahead], 1), ahead[:, :1]
-        acted = commands[:, : pairs.shape[1] + 1]
-        acts = command_acting(acted, delay).unsqueeze(1)
-        delayed = self.acting @ acted[:, -self.acting.shape[-1] :]  # (B, W, A)
+        commands, acts, delayed = self.commands(delay, pairs, ahead)
         newest = commands[:, commands.shape[1] - self.longest_delay - ahead.shape[1] + 1 :]
-        shape = -1, self.counts[1], acts.shape[-1]
-        each = acts.expand(shape).flatten(0, 1).unsqueeze(1)
-        network, variance = (x.view(shape) for x in self.network.forecast(fits.encoded, each))
-        each = torch.where(self.mixing, now, acts).unsqueeze(2)  # (B, L, 1, A)
+        network, _ = self.by_network(fits, acts)
+        each = torch.where(self.mixing, ahead[:, :1], acts).unsqueeze(2)  # (B, L, 1, A)
         linear = fits.lines.effect(each).squeeze(2)
-        of_lines = torch.where(
-            self.mixing,
-            fits.lines.variance(now, self.mixing).squeeze(2),
-            fits.lines.variance(acts, self.mixing).squeeze(2),
-        )
-        of_gains, sure = fits.gain_variances * delayed.square(), torch.zeros_like(delayed)
-        variances = [sure[:, :1], variance, of_lines, sure[:, 1:], of_gains, *[sure[:, :1]] * 3]
-        healthy = [acts.clamp(*fits.rate_limits.split(1, 1)), acts + fits.sensor_noise]
-        came, before, recent = fits.recent
-        healthy.append(at_rest(came, acts, before, recent))
-        forecasts = [now, network, linear, delayed[:, 1:], fits.gains * delayed, *healthy]
+        healthy = [
+            acts.clamp(*fits.rate_limits.split(1, 1)),
+            acts + fits.sensor_noise,
+            at_rest(acts, *fits.series),
+        ]
+        forecasts = [ahead[:, :1], network, linear, delayed[:, 1:], fits.gains * delayed, *healthy]
 
         def under_way() -> list[Tensor]:
             has_delay = ((self.delays < 0) | (self.delays == delay.unsqueeze(-1))).unsqueeze(-1)
             models = self.most_likely(fits, torch.where(has_delay, weights.clamp_min(1e-9), 0.0))
             shares = models.weights / models.weights.sum(1, keepdim=True)
-            return [(shares.unsqueeze(2) * self.expect(models, newest)[0]).sum(1)]
+            return [(shares.unsqueeze(2) * self.expect(models, newest).effect).sum(1)]
 
         (newest,) = somewhere(delay + ahead.shape[1] > 1, under_way, [newest])
-        return torch.cat(forecasts, 1), newest, torch.cat(variances, 1)
+        return torch.cat(forecasts, 1), newest
+
+    def variances(self, fits: Fits, delay: Tensor, pairs: Tensor, ahead: Tensor) -> Tensor:
+        """Return those of the forecasts, in units of the noise, ``(B, M + 1, A)``."""
+        _, acts, delayed = self.commands(delay, pairs, ahead)
+        _, network = self.by_network(fits, acts)
+        lines = fits.lines.variance(acts, ahead[:, :1]).squeeze(2)
+        gains, sure = fits.gain_variances * delayed.square(), torch.zeros_like(delayed)
+        healthy = sure[:, : self.counts[-1]]
+        return torch.cat([sure[:, :1], network, lines, sure[:, 1:], gains, healthy], 1)
+
+    def commands(self, delay: Tensor, pairs: Tensor, ahead: Tensor) -> tuple[Tensor, ...]:
+        """Return all commands; the one that acts now; and those of W delays, ``(B, ., A)`` each."""
+        commands = torch.cat([pairs[..., : len(self.scale)], ahead], 1)
+        acted = commands[:, : pairs.shape[1] + 1]
+        delayed = self.acting @ acted[:, -self.acting.shape[-1] :]
+        return commands, command_acting(acted, delay).unsqueeze(1), delayed
+
+    def by_network(self, fits: Fits, acts: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the effects of what acts ``(B, 1, A)`` by each context window, and variances."""
+        shape = -1, self.counts[1], acts.shape[-1]
+        each = acts.expand(shape).flatten(0, 1).unsqueeze(1)
+        effect, variance = self.network.forecast(fits.encoded, each)
+        return effect.view(shape), variance.view(shape)
 
 
 def filters_of(acting: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,8 +1,10 @@
-"""What looks like a fault of the actuators, and is none."""
+"""What looks like a fault of the actuators, and is none; where no model describes the robot."""
 
+import pytest
 import torch
 
 from afm_rl.correction import ActionFlow
+from afm_rl.correction.tick import Tick
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.spaces.manifold import Manifold
 
@@ -57,3 +59,65 @@ def test_an_oscillating_force_is_no_delay():
         for kind in (ActionFlow, Alone)
     ]
     assert (costs[0] < costs[1]).all()
+
+
+@pytest.mark.parametrize("joints", [1, 6])
+def test_servos_that_stick_err_at_most_twice_as_far_as_alone(joints):
+    band = torch.tensor([0.03, 0.06]).repeat_interleave(3).unsqueeze(-1)
+
+    def world(position, command, step):
+        away = command - position
+        return position + 0.5 * torch.where(away.abs() < band, 0.0, away)
+
+    phase = 0.7 * torch.arange(6.0).unsqueeze(-1) + 1.3 * torch.arange(joints)
+    speed = 0.03 * (1 + 0.3 * torch.arange(joints))
+
+    def reference(step):
+        time = speed * step + phase
+        return 0.5 * time.sin() + 0.15 * (2.7 * time).sin()
+
+    model = KnownDynamics(lambda q, u: q + 0.5 * (u - q), Manifold(joints), joints)
+    one, wanted = torch.ones(joints), torch.stack([reference(step) for step in range(300)])
+    errors = [
+        episode(kind(-one, one), model, lambda q, k: reference(k + 1), world, reference(0), 300)[0]
+        - wanted
+        for kind in (ActionFlow, Alone)
+    ]
+    corrected, alone = (error.abs().amax((0, 2)).view(2, 3).amax(-1) for error in errors)
+    assert (corrected <= 2 * alone).all()
+
+
+def test_of_a_thousand_memories_none_leads_farther_than_its_evidence_reaches(monkeypatch):
+    """Gains, offsets, dead zones, stiction and noise of all sizes, in random order."""
+    generator, count = torch.Generator().manual_seed(0), 1000
+    gain, offset, zone, noise, keep = torch.rand(5, count, 1, generator=generator)
+    gain, offset, zone, noise = 4 * gain - 2, 0.6 * offset - 0.3, 0.3 * zone, 0.1 * noise**2
+    last = torch.zeros(count, 1)
+
+    def world(state, action, step):
+        nonlocal last
+        moved = (action.abs() > zone) & ((action - last).abs() > zone * keep)
+        effect = torch.where(moved, gain * action + offset, 0.0) if step > 5 else action
+        last = action
+        return state + effect + noise * torch.randn(count, 1, generator=generator)
+
+    agreed = []
+
+    def spy(tick, models, proposals, forecast, wanted, noise):
+        action, effect = decide(tick, models, proposals, forecast, wanted, noise)
+        expected = tick.expect(models, torch.stack([proposals[:, 0], action], 1))
+        before, after = (expected.effect - wanted[:, None, None]).abs().unbind(2)
+        std = expected.variance[:, :, 1].sqrt() * noise.unsqueeze(1)
+        knows = models.weights * (std < 0.5)
+        share = (knows * (std <= 0.5 * (before - after) + 1e-4)).sum(1) / knows.sum(1)
+        agreed.append(share[action != proposals[:, 0]])
+        return action, effect
+
+    decide = Tick.decide
+    monkeypatch.setattr(Tick, "decide", spy)
+    plans = 2 * torch.rand(20, count, 1, generator=generator) - 1
+    model = KnownDynamics(lambda s, u: s + u, Manifold(1), 1)
+    flow = ActionFlow(-torch.ones(1), torch.ones(1))
+    episode(flow, model, lambda state, step: plans[step], world, torch.zeros(count, 1), 20)
+    agreed = torch.cat(agreed)
+    assert len(agreed) > 2000 and agreed.min() > 0.66

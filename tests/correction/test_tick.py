@@ -7,7 +7,7 @@ import torch
 
 from afm_rl.correction import ActionFlow
 from afm_rl.correction.network import AxisNetwork
-from afm_rl.correction.tick import Models
+from afm_rl.correction.tick import Forecast, Models
 
 
 def flow_of(size=1, **settings):
@@ -29,8 +29,8 @@ def models_of(flow, matrix):
 
 
 def sure(effects):
-    """Return forecasts of certain models."""
-    return effects, torch.zeros_like(effects)
+    """Return the forecast of certain models."""
+    return Forecast(effects, torch.zeros_like(effects))
 
 
 @pytest.mark.parametrize(("miss", "action"), [(0.1, 0.5), (0.2, 0.3)])
@@ -69,23 +69,41 @@ def test_bounds_are_optimistic_where_models_differ():
 
 
 @pytest.mark.parametrize(
-    ("effects", "variances", "action"),
+    ("effects", "variances", "weight", "action"),
     [
-        ([[0.5, -0.5], [0.5, -0.5]], [[0.0, 0.0], [0.0, 0.0]], -1.0),
-        ([[0.5, -0.5], [0.5, 0.5]], [[0.0, 0.0], [0.0, 0.0]], 1.0),  # one says that it is worse
-        ([[0.5, -0.5], [0.5, -1.5]], [[0.0, 0.0], [0.0, 0.0]], 1.0),  # by as much, beyond
-        ([[0.5, -0.5], [0.5, -0.4]], [[0.0, 0.0], [0.0, 0.0]], -1.0),  # all say that it is better
-        ([[0.5, -0.5], [0.5, -0.5]], [[0.0, 20.0], [0.0, 20.0]], -1.0),
-        ([[0.5, -0.5], [0.5, -0.5]], [[0.0, 30.0], [0.0, 30.0]], 1.0),  # .1 * 30 ** .5 > .5
+        ([[0.5, -0.5], [0.5, -0.5]], [0.0, 0.0], 0.5, -1.0),
+        ([[0.5, -0.5], [0.5, 0.6]], [0.0, 0.0], 0.66, 1.0),  # a third says that it is worse
+        ([[0.5, -0.5], [0.5, 0.6]], [0.0, 0.0], 0.67, -1.0),
+        ([[0.5, -0.5], [0.5, -1.4]], [0.0, 0.0], 0.5, -1.0),  # both: it is better
+        ([[0.5, -0.5], [0.5, -1.6]], [0.0, 0.0], 0.5, 1.0),
+        ([[0.5, -0.5], [0.5, -0.5]], [24.9, 24.9], 0.5, -1.0),  # .1 * 25 ** .5 = .5
+        ([[0.5, -0.5], [0.5, -0.5]], [25.1, 25.1], 0.5, 1.0),
+        ([[0.5, -0.5], [0.5, 3.0]], [0.0, 25.1], 0.5, -1.0),  # what knows nothing says nothing
     ],
 )
-def test_no_command_is_farther_from_the_plan_than_the_evidence_reaches(effects, variances, action):
+def test_no_command_is_farther_from_the_plan_than_the_evidence_reaches(
+    effects, variances, weight, action
+):
     """The plan 1 has the effect .5, where -.5 is wanted; -1 promises an improvement of 1."""
-    forecasts = [torch.tensor(part).view(1, 2, 2, 1) for part in (effects, variances)]
-    models = Models(None, None, torch.full((1, 2, 1), 0.5))
+    forecast = Forecast(
+        torch.tensor(effects).view(1, 2, 2, 1),
+        torch.tensor([[0.0, x] for x in variances]).view(1, 2, 2, 1),
+    )
+    models = Models(None, None, torch.tensor([weight, 1 - weight]).view(1, 2, 1))
     proposals, one = torch.tensor([[[1.0], [-1.0]]]), torch.ones(1, 1)
-    executed, _ = flow_of().tick.decide(models, proposals, forecasts, -0.5 * one, 0.1 * one)
+    executed, _ = flow_of().tick.decide(models, proposals, forecast, -0.5 * one, 0.1 * one)
     assert executed == action
+
+
+def test_an_axis_that_hardly_moves_does_not_keep_the_others_from_it():
+    """Together they do better, although the second, which moves by .01, does worse."""
+    effects = torch.tensor([[[[0.5, 0.0], [0.0, 0.01]]]])
+    models = Models(None, None, torch.ones(1, 1, 2))
+    actions = torch.tensor([[[0.5, 0.0], [-0.5, 0.01]]])
+    nothing = torch.zeros(1, 2)
+    _, axis, whole = flow_of().tick.rate(models, actions, sure(effects), nothing, 0.1 + nothing)
+    assert axis[0].tolist() == [[True, True], [True, False]]
+    assert whole[0].flatten().tolist() == [True, True]
 
 
 @pytest.mark.parametrize(("acts", "command"), [(0.3, None), (0.9, 1.0), (-0.9, -1.0)])
@@ -101,7 +119,7 @@ def test_a_slow_actuator_is_led_as_far_as_the_box_allows(acts, command):
     torch.testing.assert_close(led_to, torch.tensor([[share * expected + (1 - share) * 0.1]]))
 
 
-@pytest.mark.parametrize(("healthy", "executed"), [(0.6, 0.5), (0.4, 0.5), (0.1, -0.5)])
+@pytest.mark.parametrize(("healthy", "executed"), [(0.6, 0.5), (0.4, 0.5), (0.3, -0.5)])
 def test_models_by_which_nothing_is_wrong_keep_the_plan(healthy, executed):
     flow, plan = flow_of(), torch.tensor([[0.5]])
     weights = torch.zeros(1, len(flow.models), 1)
@@ -120,7 +138,7 @@ def test_maps_that_mix_axes_are_of_the_present_command_whatever_delay_is_believe
     parts["pairs"][-2:, :2] = torch.tensor([[0.1, 0.2], [0.3, 0.4]])
     parts["delay"] = torch.tensor([2.0])
     now = torch.tensor([0.7, 0.8])
-    forecasts, *_ = flow.forecast(parts, now)
+    forecasts, _ = flow.forecast(parts, now)
     of = dict(zip(flow.models, forecasts, strict=True))  # nothing is known: every fit is nominal
     for name, command in (("affine", now), ("driven", now), ("gain", torch.tensor([0.1, 0.2]))):
         torch.testing.assert_close(of[name], command)
