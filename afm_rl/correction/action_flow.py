@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -387,13 +386,11 @@ class ActionFlow(PairCorrector):
             model: the dynamics model as it is now.
         """
         with torch.no_grad():
-            parts = self.measure(memory, model)
-            weights, noise = self.weights(parts), parts["noise"]
-            memory = self._with_forecasts(self.pack(parts), action)
-            mean, std = mean_and_std(self.unpack(memory, model.state_size)["forecasts"], weights)
-            variances = self.variances(parts, action) * (parts["misaligned"] == 1.0).unsqueeze(-1)
-            noise = noise * (1 + (weights * variances).sum(-2)).sqrt()
-            return self.denormalise(mean), self.denormalise(torch.hypot(std, noise))
+            memory = self._with_forecasts(self.pack(self.measure(memory, model)), action)
+            parts = self.unpack(memory, model.state_size)
+            weights = self.weights(parts)
+            mean, std = mean_and_std(parts["forecasts"], weights)
+            return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))
 
     def executing(
         self, memory: Tensor, planned: Tensor, executed: Tensor, misaligned: Tensor | None = None
@@ -428,21 +425,6 @@ class ActionFlow(PairCorrector):
 
     def forecast(self, parts: Fields, executed: Tensor) -> tuple[Tensor, Tensor]:
         """Return the forecasts of all models, and what is under way."""
-        weights, fits, *commands = self._fits(parts, executed)
-        forecasts, under_way = self.tick.forecast(fits, weights, *commands)
-        batch = executed.shape[:-1]
-        forecasts, under_way = (
-            x.view(*batch, *x.shape[1:]).to(executed) for x in (forecasts, under_way)
-        )
-        return forecasts, under_way
-
-    def variances(self, parts: Fields, executed: Tensor) -> Tensor:
-        """Return the variances ``(*B, M, A)`` of these forecasts, in units of the noise."""
-        _, fits, *commands = self._fits(parts, executed)
-        return self.tick.variances(fits, *commands).view(parts["forecasts"].shape).to(executed)
-
-    def _fits(self, parts: Fields, executed: Tensor) -> tuple[Any, ...]:
-        """Return weights, fits, delay, pairs and commands ahead, of B missions."""
         ahead = torch.cat([parts["sent"], executed.unsqueeze(-2)], -2)
         evidence = *self._evidence(parts, self.weights(parts)), self.normalise(ahead)
         batch, delay = executed.shape[:-1], parts["delay"].reshape(-1).long()
@@ -450,7 +432,9 @@ class ActionFlow(PairCorrector):
             x.reshape(len(delay), *x.shape[len(batch) :]) for x in evidence
         )
         fits = self.tick.fit(pairs, noise, place, delay)
-        return weights, fits, delay, pairs, unit.to(pairs)
+        effects = self.tick.forecast(fits, weights, delay, pairs, unit.to(pairs))
+        forecasts, under_way = (x.view(*batch, *x.shape[1:]).to(executed) for x in effects)
+        return forecasts, under_way
 
     def _evidence(self, parts: Fields, weights: Tensor) -> list[Tensor]:
         evidence = parts["pairs"], weights, parts["noise"], self.place_of(parts["state"])

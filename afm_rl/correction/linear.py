@@ -48,18 +48,13 @@ class Lines(NamedTuple):
     driver: Tensor
     """The same of a gain, where the command of another axis drives one, else 0, ``(B, A, A)``."""
 
-    def variance(self, actions: Tensor, commands: Tensor | None = None) -> Tensor:
-        """Return the variances ``(B, L, C, A)`` of the effects of actions ``(B, C, A)``.
-
-        Args:
-            actions: what acts.
-            commands: what acts by models that mix axes; the actions if None.
-        """
-        u, commands = actions.unsqueeze(1), actions if commands is None else commands
+    def variance(self, actions: Tensor) -> Tensor:
+        """Return the variances ``(B, L, C, A)`` of the effects of actions ``(B, C, A)``."""
+        u = actions.unsqueeze(1)
         c0, c1, c2 = self.spread.unsqueeze(3).unbind(2)
-        inputs = torch.nn.functional.pad(commands, (0, 1), value=1.0)
-        affine = ((inputs @ self.leverage) * inputs).sum(-1, keepdim=True).expand_as(commands)
-        driven = commands.square() @ self.driver.mT
+        inputs = torch.nn.functional.pad(actions, (0, 1), value=1.0)
+        affine = ((inputs @ self.leverage) * inputs).sum(-1, keepdim=True).expand_as(actions)
+        driven = actions.square() @ self.driver.mT
         mixing = torch.stack([affine, torch.where(driven > 0, driven, affine)], 1)
         return torch.cat([c0 + u * (c1 + u * c2), mixing], 1)
 

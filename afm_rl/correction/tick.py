@@ -26,8 +26,6 @@ from afm_rl.correction.linear import (
 )
 from afm_rl.correction.network import AxisNetwork, Encoded, midpoint
 
-MAJORITY = 2 / 3  # of the probability, for whom the evidence must reach a command
-
 
 class Answer(NamedTuple):
     """What the models make of plans, in units of the action."""
@@ -324,12 +322,12 @@ class Tick(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         r"""Return the expected loss of actions ``(B, C, A)``, and which the evidence reaches.
 
-        It does if two thirds of the probability are with models that promise at least twice their
-        standard deviation :math:`\sigma`: that the miss is so much less than that of the first
+        It does if half of the probability is with models that promise at least twice their standard
+        deviation :math:`\sigma`: that the miss is so much less than that of the first
         action, which is the plan :math:`u^*`,
 
         .. math:: \sum_h w_{ha} \big[\,|T_{ha}(u^*) - u^*_a| - |T_{ha}(u) - u^*_a|
-                  \ge 2 \sigma_{ha}(u)\big] \ge \tfrac23 \sum_h w_{ha},
+                  \ge 2 \sigma_{ha}(u)\big] \ge \tfrac12 \sum_h w_{ha},
 
         axis by axis ``(B, C, A)``; and as a whole ``(B, C, 1)``, where axes count as far as they
         move away from the plan. A line through commands that were nearly alike explains them, and
@@ -341,7 +339,7 @@ class Tick(nn.Module):
         loss = (weights * (misses / square).log1p()).sum(1)
         misses, std = misses.sqrt(), (expected.variance * square).sqrt()
         promised = misses[:, :, :1] - misses >= 2 * std - 1e-6
-        excess = weights * (std < 0.5) * (promised.to(weights) - MAJORITY)
+        excess = weights * (std < 0.5) * (promised.to(weights) - 0.5)
         excess, moved = excess.sum(1) - 1e-6, (actions - actions[:, :1]).abs()
         return loss, (excess > 0) | (moved == 0), (excess * moved).sum(-1, keepdim=True) >= 0
 
@@ -380,17 +378,22 @@ class Tick(nn.Module):
             pairs: what is remembered.
             ahead: commands that wait, and the present one, ``(B, D + 1, A)``.
         """
-        commands, acts, delayed = self.commands(delay, pairs, ahead)
+        commands, now = torch.cat([pairs[..., : len(self.scale)], ahead], 1), ahead[:, :1]
+        acted = commands[:, : pairs.shape[1] + 1]
+        acts = command_acting(acted, delay).unsqueeze(1)
+        delayed = self.acting @ acted[:, -self.acting.shape[-1] :]  # (B, W, A)
         newest = commands[:, commands.shape[1] - self.longest_delay - ahead.shape[1] + 1 :]
-        network, _ = self.by_network(fits, acts)
-        each = torch.where(self.mixing, ahead[:, :1], acts).unsqueeze(2)  # (B, L, 1, A)
+        shape = -1, self.counts[1], acts.shape[-1]
+        each = acts.expand(shape).flatten(0, 1).unsqueeze(1)
+        network = self.network.effect(fits.encoded, each).view(shape)
+        each = torch.where(self.mixing, now, acts).unsqueeze(2)  # (B, L, 1, A)
         linear = fits.lines.effect(each).squeeze(2)
         healthy = [
             acts.clamp(*fits.rate_limits.split(1, 1)),
             acts + fits.sensor_noise,
             at_rest(acts, *fits.series),
         ]
-        forecasts = [ahead[:, :1], network, linear, delayed[:, 1:], fits.gains * delayed, *healthy]
+        forecasts = [now, network, linear, delayed[:, 1:], fits.gains * delayed, *healthy]
 
         def under_way() -> list[Tensor]:
             has_delay = ((self.delays < 0) | (self.delays == delay.unsqueeze(-1))).unsqueeze(-1)
@@ -400,29 +403,6 @@ class Tick(nn.Module):
 
         (newest,) = somewhere(delay + ahead.shape[1] > 1, under_way, [newest])
         return torch.cat(forecasts, 1), newest
-
-    def variances(self, fits: Fits, delay: Tensor, pairs: Tensor, ahead: Tensor) -> Tensor:
-        """Return those of the forecasts, in units of the noise, ``(B, M + 1, A)``."""
-        _, acts, delayed = self.commands(delay, pairs, ahead)
-        _, network = self.by_network(fits, acts)
-        lines = fits.lines.variance(acts, ahead[:, :1]).squeeze(2)
-        gains, sure = fits.gain_variances * delayed.square(), torch.zeros_like(delayed)
-        healthy = sure[:, : self.counts[-1]]
-        return torch.cat([sure[:, :1], network, lines, sure[:, 1:], gains, healthy], 1)
-
-    def commands(self, delay: Tensor, pairs: Tensor, ahead: Tensor) -> tuple[Tensor, ...]:
-        """Return all commands; the one that acts now; and those of W delays, ``(B, ., A)`` each."""
-        commands = torch.cat([pairs[..., : len(self.scale)], ahead], 1)
-        acted = commands[:, : pairs.shape[1] + 1]
-        delayed = self.acting @ acted[:, -self.acting.shape[-1] :]
-        return commands, command_acting(acted, delay).unsqueeze(1), delayed
-
-    def by_network(self, fits: Fits, acts: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the effects of what acts ``(B, 1, A)`` by each context window, and variances."""
-        shape = -1, self.counts[1], acts.shape[-1]
-        each = acts.expand(shape).flatten(0, 1).unsqueeze(1)
-        effect, variance = self.network.forecast(fits.encoded, each)
-        return effect.view(shape), variance.view(shape)
 
 
 def filters_of(acting: Tensor) -> tuple[Tensor, Tensor]:

@@ -72,8 +72,8 @@ def test_bounds_are_optimistic_where_models_differ():
     ("effects", "variances", "weight", "action"),
     [
         ([[0.5, -0.5], [0.5, -0.5]], [0.0, 0.0], 0.5, -1.0),
-        ([[0.5, -0.5], [0.5, 0.6]], [0.0, 0.0], 0.66, 1.0),  # a third says that it is worse
-        ([[0.5, -0.5], [0.5, 0.6]], [0.0, 0.0], 0.67, -1.0),
+        ([[0.5, -0.5], [0.5, 0.6]], [0.0, 0.0], 0.49, 1.0),  # more than half says that it is worse
+        ([[0.5, -0.5], [0.5, 0.6]], [0.0, 0.0], 0.51, -1.0),
         ([[0.5, -0.5], [0.5, -1.4]], [0.0, 0.0], 0.5, -1.0),  # both: it is better
         ([[0.5, -0.5], [0.5, -1.6]], [0.0, 0.0], 0.5, 1.0),
         ([[0.5, -0.5], [0.5, -0.5]], [24.9, 24.9], 0.5, -1.0),  # .1 * 25 ** .5 = .5
@@ -119,7 +119,7 @@ def test_a_slow_actuator_is_led_as_far_as_the_box_allows(acts, command):
     torch.testing.assert_close(led_to, torch.tensor([[share * expected + (1 - share) * 0.1]]))
 
 
-@pytest.mark.parametrize(("healthy", "executed"), [(0.6, 0.5), (0.4, 0.5), (0.3, -0.5)])
+@pytest.mark.parametrize(("healthy", "executed"), [(0.6, 0.5), (0.4, -0.5)])
 def test_models_by_which_nothing_is_wrong_keep_the_plan(healthy, executed):
     flow, plan = flow_of(), torch.tensor([[0.5]])
     weights = torch.zeros(1, len(flow.models), 1)
