@@ -102,7 +102,7 @@ def fit_lines(sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor) -> Line
     matrix = torch.cat([torch.diag_embed(gains.mT), torch.stack([affine, driven], 1)], 1)
     bias = torch.cat([*biases, shift.unsqueeze(-1), rest], -1).mT
     constant, slopes = quadratic(1 / mass, 0), quadratic(1 / square, 2)  # (B, A, W, 3)
-    spread = [
+    spreads = [
         quadratic(none[..., :1], 0),  # reversed: there is nothing that could be unsure
         constant[..., :2, :],
         slopes[..., 1::2, :],
@@ -111,7 +111,7 @@ def fit_lines(sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor) -> Line
         arx_spread.unsqueeze(-2),
         quadratic(5 + none[..., :1], 0),  # the trend: of two squared, and of one offset
     ]
-    spread = torch.cat(spread, -2).permute(0, 2, 3, 1)
+    spread = torch.cat(spreads, -2).permute(0, 2, 3, 1)
     inputs = torch.nn.functional.pad(sent.mT, (0, 1), value=1.0)
     rows = weight.mean(1).unsqueeze(-1) * inputs
     leverage = invert_positive(add_diagonal(rows.mT @ inputs, PRIOR))
