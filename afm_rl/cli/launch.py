@@ -191,7 +191,7 @@ def show(folder: Path, cfg: DictConfig, agents: Sequence[Agent], film: str | Non
                 write_films(folder / "video", runs, tracks, film, draw=draw)
             except ConfigurationError as error:  # such as a robot that cannot be drawn
                 print(f"afm-rl: no film: {error}", file=sys.stderr)
-        explained = _explain(folder, cfg.figures, missions, steps, agents[0])
+        explained = _explain(folder, cfg.figures, missions, steps, agents)
         extend_manifest(folder, [name for name in SHOWN if (folder / name).is_dir()])
     print_summary(missions, measures)
     print(explained, end="")
@@ -199,19 +199,27 @@ def show(folder: Path, cfg: DictConfig, agents: Sequence[Agent], film: str | Non
 
 
 def _explain(
-    folder: Path, page: bool, missions: pd.DataFrame, steps: pd.DataFrame, agent: Agent
+    folder: Path, page: bool, missions: pd.DataFrame, steps: pd.DataFrame, agents: Sequence[Agent]
 ) -> str:
-    """Return what the first mission shows of the actuators, one line each; write the page."""
-    first = missions.iloc[0]
+    """Return what a mission shows of the actuators, one line each; write the page.
+
+    Of several methods the first that corrects is asked, and none if none does: what a planner
+    without correction runs into shows little of the actuators.
+    """
+    asked = [agent for agent in agents if planned_for(agent) is not None or len(agents) == 1]
+    own = [missions[missions["method"] == agent.label] for agent in asked[:1]]
+    if not own or own[0].empty:
+        return ""
+    agent, first = asked[0], own[0].iloc[0]
     try:
         steps = steps[steps["mission"] == first["mission"]]
-        diagnosis, log = explain_mission(agent.robot, steps, late=planned_for(agent))
+        found, log = explain_mission(agent.robot, steps, late=planned_for(agent))
     except AFMError:  # such as a mission of a few steps
         return ""
     which = f"{first['method']}, {first['track']}, seed {first['seed']}"
     if page:
-        list(write_diagnosis(diagnosis, log, folder / "diagnosis", which))
-    return f"Actuators, by the steps of {which}:\n{diagnosis}\n"
+        list(write_diagnosis(found, log, folder / "diagnosis", which))
+    return f"Actuators, by the steps of {which}:\n{found}\n"
 
 
 def report(folder: Path, cfg: DictConfig, film: str | None) -> None:

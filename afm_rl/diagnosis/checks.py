@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from afm_rl.diagnosis.findings import Status
 from afm_rl.diagnosis.lines import missed
 from afm_rl.diagnosis.log import Log
-from afm_rl.diagnosis.response import follow_with_stiction
-from afm_rl.diagnosis.search import Lead, find_leads, without_outliers
+from afm_rl.diagnosis.response import Shape, follow_with_stiction, respond
+from afm_rl.diagnosis.search import Lead, beginning
 from afm_rl.diagnosis.settings import Settings
 
 Doubt = tuple[Status, str]
@@ -27,7 +26,7 @@ def find_doubts(
     """Return why nothing can be said of some actuators, by number."""
     doubts: dict[int, Doubt] = {}
     idle = bool(log.effort) and all(np.ptp(values) == 0 for values in log.effort.values())
-    summed = _summed(log, leads, settings)
+    summed = _summed(log, leads)
     ranges = reach * (np.ptp(log.command, axis=0) > 0)
     usual = float(np.median(ranges[ranges > 0])) if len(ranges) > 2 and ranges.any() else 0.0
     for j, lead in enumerate(leads):
@@ -170,18 +169,39 @@ def _causes(log: Log, cause: np.ndarray, effect: np.ndarray, past: int = 8) -> b
     return max(shares, default=0.0) > 0.1
 
 
-def _summed(log: Log, leads: Sequence[Lead], settings: Settings) -> set[int]:
-    """Return the actuators whose responses do not follow, but change as the commands say."""
-    odd = [j for j, lead in enumerate(leads) if lead.left > 0.1]
-    if not odd:
-        return set()
-    rates = np.diff(log.response, axis=0, prepend=log.response[:1])
-    rates[log.begins] = 0.0
-    spread = without_outliers(rates).std(0)
-    changes = replace(log, response=rates / np.where(spread > 0, spread, 1.0))
-    rate_leads = find_leads(changes.thinned(settings.searched), odd, settings)
-    return {
-        j
-        for j, rate in zip(odd, rate_leads, strict=True)
-        if rate.left < 0.3 * leads[j].left and rate.driver == j
-    }
+def _summed(log: Log, leads: Sequence[Lead]) -> set[int]:
+    """Return the actuators whose responses are sums of their commands, and no positions.
+
+    The sum has to explain far more than any position that is on its way: a servo whose rate is
+    limited settles where a command holds long enough, or turns back towards the next one.
+    """
+    odd = [j for j, lead in enumerate(leads) if lead.left > 0.1 and lead.driver == j]
+    episode = np.cumsum(log.begins) - 1
+    begins = np.eye(episode[-1] + 1)[episode] if episode[-1] < 50 else np.ones((len(episode), 1))
+    summed = set()
+    for j in odd:
+        u, y, lead = log.command[:, j], log.response[:, j], leads[j]
+        sums = np.cumsum(u - u.mean())
+        position = [_left(begins, x, y) for x in _positions(log, j, lead)]
+        whole = _left(begins, np.column_stack([sums, np.arange(len(u))]), y)
+        if whole < min(0.1, 0.3 * lead.left, *(0.3 * left for left in position)):
+            summed.add(j)
+    return summed
+
+
+def _positions(log: Log, j: int, lead: Lead) -> Iterator[np.ndarray]:
+    """Yield the responses of the position servos that the search found best."""
+    clock, u, y = lead.clock_of(log), log.command[:, j], log.response[:, j]
+    line = lead.line or (1.0, 0.0)
+    begin = beginning(clock, u, y, line)
+    half = max(0.5 * float(np.ptp(u)), 1e-12)
+    shapes = [*lead.starts, *(Shape(rate=half * rate) for rate in (0.2, 0.1, 0.05, 0.02, 0.01))]
+    for shape in shapes:
+        yield respond(clock, u, shape, begin)
+
+
+def _left(begins: np.ndarray, columns: np.ndarray, y: np.ndarray) -> float:
+    """Return the share of the variance of a response that lines leave."""
+    design = np.column_stack([begins, columns])
+    residual = y - design @ np.linalg.lstsq(design, y, rcond=None)[0]
+    return float(residual.var() / max(y.var(), 1e-300))

@@ -52,7 +52,7 @@ def fit_response(
         while added < settings.most:
             larger_ones = chain.from_iterable(step(problem, model) for step in steps)
             refined = [refine(large, other) for other in larger_ones]
-            better = min(refined, key=COST, default=model)
+            better = _usual(large, refined, model)
             if not (
                 needed(large, better, model, settings) and _visible(large, better, model, settings)
             ):
@@ -95,6 +95,40 @@ def _simplest(problem: Problem, models: Sequence[Model], settings: Settings) -> 
         if better.size > first.size and needed(problem, better, first, settings):
             first = better
     return first
+
+
+def with_gain(problem: Problem, model: Model, gain: float, settings: Settings) -> Model:
+    """Return the model of a limited rate with another gain, if that explains as much.
+
+    What never arrives does not show how far it would go.
+    """
+    if "rate" not in model.active or not 0 < model.gain:
+        return model
+    shape = model.shape._replace(rate=model.shape.rate * model.gain / gain)
+    other = replace(model, gain=gain, shape=shape)
+    residual = (problem.y - other.predict(problem))[problem.use]
+    shift = float(np.median(residual))
+    cost = float(costs(residual - shift).mean())
+    rows = problem.use.sum() * weight_of(problem, model)
+    if rows * math.log((cost + FLOOR) / (model.cost + FLOOR)) > settings.price(rows):
+        return model
+    return replace(other, offset=other.offset + shift, cost=cost)
+
+
+def _usual(problem: Problem, models: Sequence[Model], default: Model) -> Model:
+    """Return the best of some models; one that takes over each command, if that is as good.
+
+    Where commands hold for some rows, one of so many is taken over, or each is late.
+    """
+    best = min(models, key=COST, default=default)
+    if "hold" in best.active and "hold" not in default.active:
+        rest = tuple(name for name in best.active if name not in ("hold", "phase", "delay"))
+        late = replace(best, active=("delay", *rest), shape=best.shape._replace(hold=1, phase=0))
+        delays = [{"delay": best.shape.delay + k} for k in range(1, best.shape.hold)]
+        models = [*models, refine(problem, _best(problem, late, delays))]
+    rows = problem.use.sum() * weight_of(problem, best)
+    alike = [m for m in models if rows * math.log((m.cost + FLOOR) / (best.cost + FLOOR)) < 4]
+    return min(alike, key=lambda model: ("hold" in model.active, model.cost), default=default)
 
 
 def needed(problem: Problem, large: Model, small: Model, settings: Settings) -> bool:
@@ -145,9 +179,11 @@ def larger(problem: Problem, model: Model, tried: int = 3) -> Iterator[Model]:
     own, shape = problem.u[:, model.driver], model.shape
     models = []
     for names, options in _beginnings(own, shape).items():
-        for begin in _bases(model, names):
-            trial = replace(begin, active=(*begin.active, *names.split()))
-            models.append(_best(problem, trial, options))
+        trials = (
+            _best(problem, replace(begin, active=(*begin.active, *names.split())), options)
+            for begin in _bases(model, names)
+        )
+        models.append(min(trials, key=COST))
     if own.min() < 0 < own.max() and DOWN not in model.others:
         sides = replace(model, others=(*model.others, DOWN), gains=(*model.gains, 0.0))
         models.append(fit_lines(problem, sides))
@@ -172,10 +208,12 @@ def _beginnings(own: np.ndarray, shape: Shape) -> dict[str, list[dict[str, Any]]
         "play": (high - low) * np.array([0.02, 0.05, 0.1, 0.18, 0.28]),
         "stick": float(sizes.max()) * np.geomspace(0.03, 0.8, 14),
     }
+    taken = {name for name, value in shape._asdict().items() if value != NONE[name]}
+    if taken & {"delay", "keep"}:  # it looks like these
+        grids["rate"] = (0.8, 0.5, 0.3, 0.15, 0.08)
     if low < 0 < high and not shape.dead_zone and not shape.jump:
         grids["dead_zone"] = np.quantile(sizes, 0.98) * np.array([0.05, 0.1, 0.2, 0.35, 0.5, 0.7])
         grids["jump"] = grids["stick"]
-    taken = {name for name, value in shape._asdict().items() if value != NONE[name]}
     found = {
         name: [{name: float(value)} for value in values]
         for name, values in grids.items()
@@ -201,11 +239,11 @@ def _bases(model: Model, names: str) -> Iterator[Model]:
     yield model
     rest = tuple(name for name in model.active if name not in ("delay", "keep"))
     # Some may be mistaken for delay and lag.
-    if names.split()[0] not in ("play", "stick", "hold") or len(rest) == len(model.active):
+    if names.split()[0] not in ("play", "stick", "hold", "rate") or len(rest) == len(model.active):
         return
     yield replace(model, active=rest, shape=model.shape._replace(delay=0.0, keep=0.0))
     delay = round(model.shape.delay)
-    for late in range(max(delay - 2, 1), delay + 1) if names == "hold phase" else ():
+    for late in range(max(delay - 2, 1), delay + 1) if names in ("hold phase", "rate") else ():
         shape = model.shape._replace(delay=float(late), keep=0.0)
         yield replace(model, active=(*rest, "delay"), shape=shape)
 

@@ -168,11 +168,13 @@ def follow_with_stiction(command: np.ndarray, stick: float, start: np.ndarray) -
     """
     if _many(start):
         return _side_by_side(command, start, lambda x, u: np.where(np.abs(u - x) > stick, u, x))
-    place, places = 0.0, []
-    for row, (value, first) in enumerate(zip(command.tolist(), start.tolist(), strict=True)):
-        if first == row or abs(value - place) > stick:
-            place = value
-        places.append(place)
+    places: list[float] = []
+    for values in _episodes(command, start):
+        place, low, high = 0.0, np.inf, -np.inf
+        for value in values:
+            if value < low or value > high:
+                place, low, high = value, value - stick, value + stick
+            places.append(place)
     return np.array(places)
 
 
@@ -186,14 +188,24 @@ def limit_rate(target: np.ndarray, rate: Any, start: np.ndarray) -> np.ndarray:
         return _side_by_side(
             target, start, lambda x, u: np.minimum(np.maximum(u, x - rate), x + rate)
         )
-    place, places = 0.0, []
-    for row, (value, first) in enumerate(zip(target.tolist(), start.tolist(), strict=True)):
-        if first == row or -rate <= value - place <= rate:
-            place = value
-        else:
-            place += rate if value > place else -rate
-        places.append(place)
+    places: list[float] = []
+    for values in _episodes(target, start):
+        place = values[0]
+        for value in values:
+            way = value - place
+            if way > rate:
+                place += rate
+            elif way < -rate:
+                place -= rate
+            else:
+                place = value
+            places.append(place)
     return np.array(places)
+
+
+def _episodes(values: np.ndarray, start: np.ndarray) -> list[list[float]]:
+    """Return the values of each episode."""
+    return [part.tolist() for part in np.split(values, np.unique(start)[1:])]
 
 
 def _many(start: np.ndarray, least: int = 12) -> bool:

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from afm_rl.diagnosis.changes import Part, find_parts
+from afm_rl.diagnosis.changes import Part, find_parts, problem_of
 from afm_rl.diagnosis.checks import SUMMED, Doubt, copies_of, echoes, effort_notes, find_doubts
 from afm_rl.diagnosis.findings import Actuator, Change, Diagnosis
+from afm_rl.diagnosis.fit import with_gain
 from afm_rl.diagnosis.log import Log
 from afm_rl.diagnosis.numbers import numbers_of, quantum_of
 from afm_rl.diagnosis.residuals import without_lost
@@ -94,6 +95,11 @@ def _explain(
                 parts[j] = find_parts(clean, j, lead, settings)
     parts = agree(clean, parts, scaled.reach, settings)
     for j, own in parts.items():
+        if len(own) == 1 and own[0].model.driver == j:
+            problem = problem_of(clean.thinned(settings.refined), j, own[0].lead, settings)
+            usual = float(scaled.reach[j] / scaled.spread[j])
+            model = with_gain(problem, own[0].model, usual, settings)
+            parts[j] = own = [replace(own[0], model=model)]
         if any(part.model.shape.endless for part in own):
             doubts[j] = SUMMED
     return clean, parts, doubts

@@ -18,6 +18,7 @@ from afm_rl.diagnosis.replay.table import (
     affine,
     arx,
     quantile_with_interval,
+    removed_by,
     running_gain,
 )
 
@@ -161,6 +162,17 @@ def test_sentences():
         "that of c."
     )
     assert say(-0.2) == "A correction would have added 20 % to that of a."
+
+
+@pytest.mark.parametrize(("rest", "gain"), [(0.67, 0.5), (0.67, -1.0), (0.3, 0.5), (0.0, 0.5)])
+def test_rows_at_rest_do_not_count(rest, gain):
+    """A joint that rests most of the time: as commanded is right there, but for the noise."""
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, (600, 1)) * np.repeat(rng.random((30, 1)) >= rest, 20, axis=0)
+    y = gain * u + 0.003 * rng.standard_normal(u.shape)
+    predictions = {ALONE: u, AFM: gain * u}
+    assert removed_by(Log(("arm",), u, y), predictions)["arm"] > 0.98
+    assert removed_by(Log(("arm",), u, y), {ALONE: gain * u, AFM: gain * u})["arm"] == 0
 
 
 def test_slow_actuators_are_named():

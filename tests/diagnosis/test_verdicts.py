@@ -186,3 +186,38 @@ def test_grippers_are_reversed_about_their_middle(seed, low, high, answer, words
     (shown,) = explain(u[pairs], log.response[pairs], names=log.names).actuators
     for said in (actuator, shown):
         assert re.fullmatch(f"joint_0: {words}", said.sentence), said.sentence
+
+
+def pulses(seed, rows, hold, top, kind):
+    """Return commands that are 0 but for pulses, of any size, of one size, or to one side."""
+    rng, u, k = np.random.default_rng(seed), np.zeros((rows, 1)), 10
+    while k < rows - 20:
+        size = {"any": rng.uniform(-1, 1), "one size": rng.choice([-1, 1]), "one side": 1.0}[kind]
+        u[k : k + hold] = top * size
+        k += hold + int(rng.integers(5, 25))
+    return u
+
+
+@pytest.mark.parametrize("kind", ["any", "one size", "one side", "steps"])
+@pytest.mark.parametrize(("hold", "top", "delay"), [(5, 900.0, 2), (5, 1500.0, 0), (8, 2160.0, 4)])
+def test_pulses_show_a_limited_rate(kind, hold, top, delay):
+    u = top * steps(0, 600, hold=hold) if kind == "steps" else pulses(0, 600, hold, top, kind)
+    (actuator,) = diagnose(log_of(u, servo(u, 180.0, delay), 4.0)).actuators
+    assert actuator.gain == pytest.approx(1, abs=0.03)
+    assert actuator.rate == pytest.approx(180, rel=0.05)
+    assert actuator.delay_s + actuator.lag_s == pytest.approx(delay, abs=0.6)
+    assert "takes over" not in actuator.sentence and "known" not in actuator.sentence
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("scale", [1.0, 100.0])
+@pytest.mark.parametrize(("hold", "rate"), [(10, 0.05), (20, 0.02), (30, 0.1), (4, 0.15)])
+def test_a_servo_in_a_hurry_is_no_sum(seed, scale, hold, rate):
+    u = steps(seed, 900, hold=hold)
+    y = servo(u, rate, 1)
+    (position,) = diagnose(log_of(scale * u, scale * y, 0.01 * scale)).actuators
+    assert "added up" not in position.sentence
+    assert position.rate == pytest.approx(scale * rate, rel=0.06)
+    sums = np.cumsum(rate * u, axis=0)
+    (speed,) = diagnose(log_of(scale * u, scale * sums, 0.01 * scale * sums.std())).actuators
+    assert speed.status == "cannot tell" and "added up its command" in speed.sentence

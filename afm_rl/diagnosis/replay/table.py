@@ -128,8 +128,8 @@ class Replayed:
         errors: a row for each actuator, stretch of time and predictor: ``actuator``, ``stretch``,
             ``from``, ``to`` (s), ``predictor``, ``rows``, and of the absolute error ``median`` and
             ``p90`` with the ends of their 95 % intervals, ``median_low`` and so on.
-        removed: share of each actuator's median error that a correction would have removed; 0
-            where it may be chance, below 0 where it would have added.
+        removed: share of each actuator's median error that a correction would have removed, by the
+            rows that move; 0 where it may be chance, below 0 where it would have added.
         slow: actuators whose commands act in later rows, see :func:`slow_in`.
     """
 
@@ -235,12 +235,14 @@ def removed_by(
 ) -> dict[str, float]:
     """Return for each actuator which share of its median error a correction would have removed.
 
-    It is 0 where it is smaller than ``least``, or where the difference of the errors may be chance.
+    Rows at rest do not count: there is little to remove. It is 0 where it is smaller than
+    ``least``, or where the difference of the errors may be chance.
     """
     shares = {}
     for j, name in enumerate(log.names):
+        rows = moving(log.command[:, j])
         alone, corrected = (
-            np.abs(predictions[kind][:, j] - log.response[:, j]) for kind in (ALONE, AFM)
+            np.abs(predictions[kind][rows, j] - log.response[rows, j]) for kind in (ALONE, AFM)
         )
         before, after = float(np.median(alone)), float(np.median(corrected))
         low, _, high = quantile_with_interval(alone - corrected, 0.5)
@@ -248,6 +250,21 @@ def removed_by(
         clear = low > 0 if share > 0 else high < 0
         shares[name] = share if clear and abs(share) >= least else 0.0
     return shares
+
+
+def moving(command: np.ndarray, often: float = 0.25, bins: int = 40) -> np.ndarray:
+    """Return in which rows a command ``(N,)`` is not at rest: where it is in a quarter of the rows.
+
+    All rows, if there is no such place.
+
+    >>> moving(np.array([0.0, 0.0, 0.0, 1.0, 0.5, 0.0, -1.0]))
+    array([False, False, False,  True,  True, False,  True])
+    """
+    counts, ends = np.histogram(command, bins)
+    place = int(counts.argmax())
+    low, high = ends[max(place - 1, 0)], ends[min(place + 2, bins)]
+    away = (command < low) | (command > high)
+    return away if counts[place] > often * len(command) and away.any() else ~np.zeros_like(away)
 
 
 def slow_in(log: Log, share: float = 0.5) -> tuple[str, ...]:
