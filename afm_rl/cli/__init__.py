@@ -14,9 +14,9 @@ from omegaconf import DictConfig
 from afm_rl import conf
 from afm_rl._version import __version__
 from afm_rl.cli.error_messages import errors_in_one_line
-from afm_rl.cli.imports import without_collection
 from afm_rl.cli.launcher import register
 from afm_rl.cli.overrides import checked, relaxed, with_sweep_folder
+from afm_rl.imports import without_collection
 
 _launched: list[bool] = []
 """Whether Hydra is done with the settings."""

@@ -26,8 +26,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
-from afm_rl.cli.imports import without_collection
 from afm_rl.errors import check_choice, check_number, printable
+from afm_rl.imports import without_collection
 
 
 def main() -> None:

@@ -15,8 +15,8 @@ from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
-from afm_rl.cli.imports import without_collection
 from afm_rl.errors import check_choice
+from afm_rl.imports import without_collection
 from afm_rl.jobs.executor import LocalExecutor, RayExecutor, SubmititExecutor
 
 NAMESPACE = "hydra_plugins"

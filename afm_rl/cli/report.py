@@ -18,8 +18,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from afm_rl.cli.error_messages import OneLineParser, errors_in_one_line
-from afm_rl.cli.imports import without_collection
 from afm_rl.errors import ArtefactError
+from afm_rl.imports import without_collection
 
 
 def main() -> None:

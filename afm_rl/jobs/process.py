@@ -60,7 +60,7 @@ def start(job: Job) -> Process:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     context: Any = multiprocessing.get_context(START)  # every kind has processes
     if START == "forkserver":
-        context.set_forkserver_preload(["afm_rl.jobs.run", "afm_rl.envs"])
+        context.set_forkserver_preload(["afm_rl.jobs.preload", "afm_rl.envs"])
     process = context.Process(target=work, args=(job,), name=job.name, daemon=True)
     process.start()
     return process

@@ -128,7 +128,7 @@ def map_scene(
     styles, alone, longest = style.method_styles(runs), len(runs) == 1, max(runs.values(), key=len)
     label = f"{'distance from' if planned else 'error of'}\n{label}"
     moving = _cursors({label: lower}, longest, alone)
-    lower.set_yscale("log")
+    lower.set_yscale("log", subs=[])  # without minor ticks, which take time
     handles: dict[str, Artist] = {}
     for method, steps in runs.items():
         look = style.Style(style.NOMINAL, "-", "o") if alone else styles[method]
