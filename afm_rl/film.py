@@ -20,7 +20,6 @@ from afm_rl.errors import ConfigurationError
 
 FRAMES, RATE = 150, 15  # at most; per second
 SIZE = 480, 640  # height and width of MuJoCo's own buffer, pixels
-CAPSULE, CYLINDER = 3, 5  # MuJoCo's numbers of kinds of geoms
 BODY, FIXED = "#0072b2", "#999999"
 Moves = dict[Artist, Callable[[int], object]]
 
@@ -201,7 +200,7 @@ def segments(model: Any, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     import mujoco
 
     data, solid = mujoco.MjData(model), _solid(model)
-    long = np.isin(model.geom_type[solid], (CAPSULE, CYLINDER))
+    long = np.isin(model.geom_type[solid], (3, 5))  # capsules and cylinders
     half = np.where(long, model.geom_size[solid, 1], 0.05 * model.geom_size[solid, 0])[:, None]
     ends = []
     for row in states:

@@ -17,7 +17,6 @@ from afm_rl.errors import ConfigurationError, check_choice, check_count, check_f
 
 T = TypeVar("T")
 Target = TypeVar("Target", bound=Callable[..., Any])
-HUGE = 2**63 - 1  # the largest whole number of 64 bits
 
 
 class Option(NamedTuple):
@@ -70,8 +69,9 @@ class Option(NamedTuple):
         if bool in kinds:
             return check_flag(name, value)
         if int in kinds:
-            ends = (int(max(-HUGE, min(HUGE, end))) for end in (self.low, self.high))
-            return check_count(name, value, low=next(ends), high=next(ends))
+            huge = 2**63 - 1  # the largest whole number of 64 bits
+            least, most = (int(max(-huge, min(huge, end))) for end in (self.low, self.high))
+            return check_count(name, value, low=least, high=most)
         if float in kinds:
             low, high = self.low, self.high
             return check_number(name, value, low=low, high=high, open_low=self.is_open)

@@ -20,7 +20,6 @@ from afm_rl.imports import without_collection
 from afm_rl.jobs.executor import LocalExecutor, RayExecutor, SubmititExecutor
 
 NAMESPACE = "hydra_plugins"
-EXECUTORS = {"local": LocalExecutor, "submitit": SubmititExecutor, "ray": RayExecutor}
 
 
 class JobLauncher(Launcher):
@@ -39,8 +38,9 @@ class JobLauncher(Launcher):
 
     def __init__(self, executor: str, **settings: Any) -> None:
         super().__init__()
-        kind = EXECUTORS[check_choice("hydra.launcher.executor", executor, EXECUTORS)]
-        self.executor = kind(**settings)
+        kinds = {"local": LocalExecutor, "submitit": SubmititExecutor, "ray": RayExecutor}
+        kind = check_choice("hydra.launcher.executor", executor, kinds)
+        self.executor = kinds[kind](**settings)
 
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig

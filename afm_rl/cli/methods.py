@@ -13,15 +13,14 @@ from afm_rl.cli.overrides import OPTIONAL, PARTS, has, optional
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions.selection import select_seeds
 
-IN_TABLES = ("method", "label", "compare", "study", "seeds", "tracks", "regimes")
-"""Settings whose effect the tables show: methods need not be named after them."""
-
 
 def jobs_of(cfg: DictConfig, hydra: DictConfig, swept: Sequence[str] = ()) -> dict[str, DictConfig]:
     """Return the configuration of each job that a command asks for, by name.
 
     A job is one method; in a study, one method with one seed.
     """
+    # What tables show themselves: methods need not be named after it.
+    in_tables = ("method", "label", "compare", "study", "seeds", "tracks", "regimes")
     methods = _methods(cfg, hydra)
     loose = optional(swept)
     swept = [text.removeprefix(OPTIONAL) for text in swept]
@@ -30,9 +29,9 @@ def jobs_of(cfg: DictConfig, hydra: DictConfig, swept: Sequence[str] = ()) -> di
     for method in methods:
         parts = method.label.split("+")
         parts += [text for text, key in keys.items() if key in loose and not _has(method, key)]
-        extra = [t for t, key in keys.items() if key not in IN_TABLES and t not in parts]
+        extra = [t for t, key in keys.items() if key not in in_tables and t not in parts]
         method.label = "+".join([method.label, *extra])
-        shown = [text for text, key in keys.items() if key in IN_TABLES]
+        shown = [text for text, key in keys.items() if key in in_tables]
         labelled = ("compare", "label") if cfg.label else ("method", "compare", "label")
         shown = [text for text in shown if keys[text] not in labelled]
         name = "+".join([method.label, *shown])

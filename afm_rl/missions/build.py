@@ -46,8 +46,6 @@ from afm_rl.storage.artefacts import cached
 from afm_rl.transforms import ActionFlowTransform, Guard
 from afm_rl.trust import check_targets, check_trust, instantiate, trusting
 
-TRANSFORM = ("enabled", "extend_action_box")
-"""Settings of whatever corrector is chosen."""
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
 DEFAULTS = {
     **{"seeds": 1, "budget": 5000, "label": None, "faults": "hold"},
@@ -170,8 +168,8 @@ def _build(settings: dict[str, Any]) -> Agent:
             f"corrector={settings['corrector']!r}: expected the settings of a corrector, such as "
             "those of corrector=afm"
         )
-    own = {key: value for key, value in settings["corrector"].items() if key not in TRANSFORM}
-    around = {key: value for key, value in settings["corrector"].items() if key in TRANSFORM}
+    own = dict(settings["corrector"])  # but for what is set of whatever corrector is chosen
+    around = {key: own.pop(key) for key in ("enabled", "extend_action_box") if key in own}
     with blaming("corrector"):
         found = instantiate("corrector", own)(robot, dynamics)
         corrector = as_part("corrector", found, Corrector)

@@ -16,9 +16,6 @@ from afm_rl.errors import ConfigurationError, check_choice, check_count
 from afm_rl.missions.robot import Robot
 from afm_rl.regimes import Compose, Schedule
 
-KEYS = ("draw", "set", "ramp", "changes")
-"""Parts that do nothing, and are not named."""
-
 
 @dataclass(frozen=True)
 class Listed:
@@ -119,13 +116,13 @@ class Family:
 def find_family(name: str, robot: Robot) -> Family | Listed:
     """Return a family of the robot's configuration."""
     given: Any = robot.families[check_choice("regimes", name, robot.families)]
-    where = f"robot.families.{name}"
+    where, settings = f"robot.families.{name}", ("draw", "set", "ramp", "changes")
     if isinstance(given, Mapping) and "list" in given:
         return Listed(name, [{"regime": regime} for regime in given["list"]])
     if not isinstance(given, Mapping):
-        raise ConfigurationError(f"{where}={given!r}: expected a mapping of {', '.join(KEYS)}")
+        raise ConfigurationError(f"{where}={given!r}: expected a mapping of {', '.join(settings)}")
     for key in given:
-        check_choice(f"{where}: setting", key, KEYS)
+        check_choice(f"{where}: setting", key, settings)
     rows = given.get("draw", [])
     if isinstance(rows, list) and all(isinstance(entry, str) for entry in rows):
         rows = [rows]

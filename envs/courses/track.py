@@ -60,8 +60,6 @@ def _finite(cell: str, where: str) -> float:
     return value
 
 
-GRID = 1e3  # m: origins are multiples of it
-FARTHEST = 1e8  # m from zero: there is no such place on Earth
 LONGEST = 1e5  # m: a longer course is a typing error, and its centre line would fill the memory
 
 
@@ -74,17 +72,17 @@ def local_origin(points: Tensor) -> Tensor:
     >>> local_origin(torch.tensor([[500_123.4, 5_400_007.8]]))
     tensor([ 500000., 5400000.])
     """
-    return (points.mean(0) / GRID).round() * GRID
+    return (points.mean(0) / 1e3).round() * 1e3  # m
 
 
-def check_near(points: Tensor, name: str) -> None:
-    """Refuse ``points`` ``(N, D)`` that are nowhere on Earth, naming the first."""
-    far = points.abs().amax(-1) > FARTHEST
+def check_near(points: Tensor, name: str, farthest: float = 1e8) -> None:
+    """Refuse ``points`` ``(N, D)`` that are nowhere on Earth (m from zero), naming the first."""
+    far = points.abs().amax(-1) > farthest
     if far.any():
         first = int(far.nonzero()[0])
         raise ConfigurationError(
             f"tracks: {name} {first + 1} at {points[first].tolist()}: expected coordinates of at "
-            f"most {FARTHEST:g} m"
+            f"most {farthest:g} m"
         )
 
 
