@@ -112,7 +112,8 @@ def _varied(pairs: Tensor, size: int, rows: int) -> Tensor:
     them. Where there are fewer, rows are not valid.
     """
     sent, sound = pairs[..., :size], pairs[..., 3 * size] == 1.0
-    apart = (sent.unsqueeze(-2) - sent.unsqueeze(-3)).square().sum(-1)
+    by_axis = sent.mT  # rows last: loops over two or three numbers are slow
+    apart = (by_axis.unsqueeze(-1) - by_axis.unsqueeze(-2)).square().sum(-3)
     age = torch.arange(pairs.shape[-2] - 1, -1, -1, device=pairs.device)
     later = (age < age.unsqueeze(-1)) & sound.unsqueeze(-2)
     # The squared distance to what came later (1e3: nothing did); of equal ones, the newer.
