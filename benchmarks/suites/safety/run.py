@@ -1,9 +1,9 @@
 """Is a correction ever worse than none? Situations that are no fault of the actuators.
 
-    python benchmarks/suites/safety/run.py
+    python benchmarks/suites/safety/run.py --write docs/reliability.md
 
-plays the policy alone and corrected in every situation, and prints the table of
-docs/reliability.md. Each robot's costs are kept in `outputs/safety`; delete them to play again.
+plays the policy alone and corrected in every situation, prints the costs, and writes the table of a
+page. Each robot's costs are kept in `outputs/safety`; delete them to play again.
 """
 
 from __future__ import annotations
@@ -13,15 +13,14 @@ from pathlib import Path
 
 import pandas as pd
 import torch
-from batches import flow_for
 from batches import play as play_world
 from tasks import CHANGES, ROBOTS
 from tasks import play as play_task
-from worlds import SITUATIONS, ground, pendulum
+from worlds import SITUATIONS, WORLDS
 
 from afm_rl.storage.files import write_whole
 
-WORLDS = {"pendulum": pendulum, "ground robot": ground}
+MARKS = "<!-- safety begin -->\n", "<!-- safety end -->\n"
 
 
 def main() -> None:
@@ -32,13 +31,22 @@ def main() -> None:
     parser.add_argument(
         "--set", nargs="*", default=[], help="of the correction, such as odds=0; with another --out"
     )
+    parser.add_argument("--write", type=Path, help="page whose table is written")
     args = parser.parse_args()
     torch.set_num_threads(1)
     settings = {name: float(value) for name, value in (pair.split("=") for pair in args.set)}
     if settings and not set(args.robots) <= set(WORLDS):
         parser.error(f"--set: only with --robots of {', '.join(WORLDS)}")
     tables = [costs(name, args.seeds, args.out, settings) for name in args.robots]
-    print_table(pd.concat(tables, ignore_index=True), args.seeds)
+    shown = judged(pd.concat(tables, ignore_index=True))
+    print(every(shown), summary(shown, args.seeds), sep="\n")
+    if args.write:
+        before, _, rest = args.write.read_text(encoding="utf-8").partition(MARKS[0])
+        _, end, after = rest.partition(MARKS[1])
+        if not end:
+            raise SystemExit(f"{args.write} has no lines {' and '.join(MARKS)}".replace("\n", ""))
+        new = before + MARKS[0] + summary(shown, args.seeds) + MARKS[1] + after
+        write_whole(args.write, new.encode())
 
 
 def costs(name: str, seeds: int, out: Path, settings: dict[str, float]) -> pd.DataFrame:
@@ -49,8 +57,9 @@ def costs(name: str, seeds: int, out: Path, settings: dict[str, float]) -> pd.Da
     if name in WORLDS:
         world, names = WORLDS[name](), list(SITUATIONS)
         rules = list(SITUATIONS.values())
-        alone = play_world(world, rules, seeds, None).numpy()
-        corrected = play_world(world, rules, seeds, flow_for(world, **settings)).numpy()
+        alone, corrected = (
+            play_world(world, rules, seeds, how).numpy() for how in (None, settings)
+        )
     else:
         names = list(CHANGES)
         alone, corrected = (play_task(name, afm, seeds) for afm in (False, True))
@@ -74,18 +83,34 @@ def judge(rows: pd.DataFrame) -> pd.Series:
     return pd.Series({"alone": alone, "AFM": rows["AFM"].mean(), "": verdict})
 
 
-def print_table(table: pd.DataFrame, seeds: int) -> None:
-    """Print the mean cost a step of every situation, and how many are worse."""
+def judged(table: pd.DataFrame) -> pd.DataFrame:
+    """Return a row for each robot and situation: mean costs, and the verdict."""
     grouped = table.groupby(["robot", "situation"], sort=False)
-    shown = grouped[["alone", "AFM"]].apply(judge).reset_index()
-    print("| robot | situation | alone | AFM | |\n|---|---|---|---|---|")
-    for row in shown.itertuples(index=False):
-        print(f"| {row[0]} | {row[1]} | {row[2]:.3f} | {row[3]:.3f} | {row[4]} |")
-    count = shown[""].value_counts()
-    print(
-        f"\n{len(shown)} situations, {seeds} seeds: "
-        f"worse {count.get('worse', 0)}, better {count.get('better', 0)}"
-    )
+    return grouped[["alone", "AFM"]].apply(judge).reset_index()
+
+
+def every(shown: pd.DataFrame) -> str:
+    """Return the mean cost a step of every situation."""
+    text = "| robot | situation | alone | AFM | |\n|---|---|---|---|---|\n"
+    for robot, situation, alone, corrected, verdict in shown.itertuples(index=False):
+        text += f"| {robot} | {situation} | {alone:.3f} | {corrected:.3f} | {verdict} |\n"
+    return text
+
+
+def summary(shown: pd.DataFrame, seeds: int) -> str:
+    """Return how many situations of every robot are better, and which are worse."""
+    counts = shown[""].value_counts()
+    text = f"Of {len(shown)} situations, {seeds} seeds, "
+    text += f"{counts.get('worse', 0)} are worse, {counts.get('better', 0)} better:\n\n"
+    text += "| robot | situations | better | worse: cost a step, alone → AFM |\n|---|---|---|---|\n"
+    for robot, rows in shown.groupby("robot", sort=False):
+        worse = [
+            f"{row.situation} ({row.alone:.3f} → {row.AFM:.3f})"
+            for row in rows[rows[""] == "worse"].itertuples()
+        ]
+        better = (rows[""] == "better").sum()
+        text += f"| {robot} | {len(rows)} | {better} | {', '.join(worse)} |\n"
+    return text
 
 
 if __name__ == "__main__":

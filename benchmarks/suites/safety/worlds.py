@@ -1,7 +1,8 @@
-"""Two robots as batches: every row is an episode with a disturbance of its own.
+"""Robots as batches: every row is an episode with a disturbance of its own.
 
 A world is what happens; the correction sees only the step function that a user would write, and a
 state as the sensor gives it. Nothing here is a fault of the actuators, unless its name says so.
+Forces are in units of each robot; steps are counted from a third of the episode on.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -18,22 +20,41 @@ NOMINAL = {
     "teleport": 0.0,  # jump of a position there
     "gust": 0.0,  # standard deviation of a force at every step
     "wind": 0.0,  # constant force
+    "swing": 0.0,  # largest force that oscillates
+    "period": 60.0,  # of it, steps
+    "ramp": 0.0,  # what a force grows by in 100 steps
     "noise": 0.0,  # standard deviation of the sensor
+    "colour": 0.0,  # correlation of noise and gusts from step to step
+    "tails": 0.0,  # have they a Student's t distribution with two degrees of freedom?
     "outliers": 0.0,  # share of readings that are off by a lot
     "quantum": 0.0,  # of the readings
     "stale": 0.0,  # share of readings that are sent twice
+    "gap": 0.0,  # steps of every 40 in which the last reading is repeated
+    "lost": 0.0,  # share of readings that are not a number; the policy keeps the last one
     "wall": math.inf,  # where the robot is stopped
     "stall": 0.0,  # share of the steps in which it stands still
     "fade": 0.0,  # of the actuators, per second
+    "gain": 1.0,  # of the actuators, from step 0 on
+    "over": 1.0,  # steps in which it is reached
+    "lasts": 1e9,  # steps that it lasts
+    "every": 1e9,  # steps after which it comes again
+    "then": 1.0,  # factor on it from step 60 on
+    "stick": 0.0,  # change of a command that has no effect, a share of the largest
+    "backlash": 0.0,  # half of what a command must go back until it acts, likewise
     "mass": 1.0,
+    "load": 1.0,  # factor on the mass from step 20 to 60
     "gravity": 1.0,
     "length": 1.0,
     "friction": 0.0,
     "dt": 1.0,  # of the world, relative to what the model believes
+    "jitter": 0.0,  # its standard deviation
     "zero": 0.0,  # is the command zero from a third of the episode on?
     "constant": 0.0,  # is it the one of then?
     "bang": 0.0,  # is it at a limit, always?
+    "chatter": 0.0,  # what is added, and subtracted at every other step, a share of the largest
+    "box": 0.0,  # the unit in which actions are given: a number of BOXES
 }
+BOXES = (-1.0, 1.0), (0.0, 1.0), (-1e-3, 1e-3), (-1e3, 1e3)  # of every action; 0: a robot's own
 
 
 @dataclass
@@ -155,6 +176,47 @@ def ground() -> World:
     return World(dt, limit, step, move, read, policy, cost, start, 200)
 
 
+def servos(joints: int) -> World:
+    """Return servos that hang down a little, and follow two sines each, not all alike."""
+    limit, number = torch.ones(joints), torch.arange(joints)
+
+    def step(state: Tensor, action: Tensor, load=1.0, rate=0.5) -> Tensor:
+        return state + rate * (action - state) - 0.05 * load * state.sin()
+
+    def move(state: Tensor, action: Tensor, rules: dict[str, Tensor], draw: Tensor) -> Tensor:
+        r = rules
+        away = action + 0.5 * r["wind"] - state
+        away = away - 0.1 * r["friction"] * (10 * away).tanh()
+        load = r["mass"] * r["gravity"] * r["length"]
+        after = step(state, state + away, load, 0.5 * r["dt"] / r["mass"])
+        after = after + 0.1 * r["gust"] * draw[..., :joints]
+        after = after + r["jump"] * (0.1 * r["push"] + 0.3 * r["teleport"])
+        return after.clamp(-r["wall"], r["wall"])
+
+    def reference(time: int) -> Tensor:
+        angle = 0.03 * (1 + 0.3 * (number % 6)) * time + 1.3 * number
+        return 0.5 * angle.sin() + 0.15 * (2.7 * angle).sin()
+
+    def policy(state: Tensor, time: int) -> Tensor:
+        return (2 * reference(time + 1) - state).clamp(-limit, limit)
+
+    def cost(state: Tensor, time: int) -> Tensor:
+        return (state - reference(time)).abs().mean(-1)
+
+    def start(count: int, generator: torch.Generator) -> Tensor:
+        return reference(0) + 0.1 * torch.randn(count, joints, generator=generator)
+
+    read = torch.full((joints,), 0.1)
+    return World(1.0, limit, step, move, read, policy, cost, start, 200)
+
+
+WORLDS: dict[str, Callable[[], World]] = {
+    "pendulum": pendulum,
+    "ground robot": ground,
+    "one servo": partial(servos, 1),
+    "6 servos": partial(servos, 6),
+    "30 servos": partial(servos, 30),
+}
 SITUATIONS: dict[str, dict[str, float]] = {
     "healthy": {},
     "push 2": {"push": 2.0},
@@ -192,4 +254,49 @@ SITUATIONS: dict[str, dict[str, float]] = {
     "bang-bang": {"bang": 1.0},
     "bang-bang, noise 0.2": {"bang": 1.0, "noise": 0.2},
     "friction 0.3, noise 0.05": {"friction": 0.3, "noise": 0.05},
+    **{
+        f"force {size} that oscillates in {period} steps": {"swing": size, "period": period}
+        for size in (0.1, 0.3, 0.6)
+        for period in (15, 30, 60, 120)
+    },
+    "force grows by 0.2 in 100 steps": {"ramp": 0.2},
+    "force grows by 0.6 in 100 steps": {"ramp": 0.6},
+    "stiction 0.02": {"stick": 0.02},
+    "stiction 0.05": {"stick": 0.05},
+    "stiction 0.1": {"stick": 0.1},
+    "backlash 0.02": {"backlash": 0.02},
+    "backlash 0.1": {"backlash": 0.1},
+    "payload x 1.5, dropped": {"load": 1.5},
+    "payload x 3, dropped": {"load": 3.0},
+    "wall at 0.1": {"wall": 0.1},
+    "wall at 1": {"wall": 1.0},
+    "no reading for 5 of 40 steps": {"gap": 5},
+    "no reading for 10 of 40 steps": {"gap": 10},
+    "10 % of readings lost": {"lost": 0.1},
+    "reversed for 20 of 60 steps": {"gain": -1, "lasts": 20, "every": 60},
+    "reversed for 50 of 100 steps": {"gain": -1, "lasts": 50, "every": 100},
+    "gain 0.3 for 20 of 60 steps": {"gain": 0.3, "lasts": 20, "every": 60},
+    "gain 0.3 for 50 of 100 steps": {"gain": 0.3, "lasts": 50, "every": 100},
+    "gain from 1 to -1 in 100 steps": {"gain": -1, "over": 100},
+    "gain 0.5, then -0.5": {"gain": 0.5, "then": -1},
+    "gain -1, then -0.5": {"gain": -1, "then": 0.5},
+    "chattering 0.3": {"chatter": 0.3},
+    "chattering 1": {"chatter": 1.0},
+    "bang-bang, gain 0.5": {"bang": 1.0, "gain": 0.5},
+    "dt jitters by 10 %": {"jitter": 0.1},
+    "dt jitters by 30 %": {"jitter": 0.3},
+    "noise 0.05, coloured": {"noise": 0.05, "colour": 0.9},
+    "noise 0.05, heavy tails": {"noise": 0.05, "tails": 1.0},
+    "gust 0.3, coloured": {"gust": 0.3, "colour": 0.9},
+    "gust 0.1, heavy tails": {"gust": 0.1, "tails": 1.0},
+    **{
+        f"actions from {BOXES[box][0]:g} to {BOXES[box][1]:g}, {name}": {"box": box, **rules}
+        for box in (1, 2, 3)
+        for name, rules in {
+            "healthy": {},
+            "wind 0.3": {"wind": 0.3},
+            "noise 0.05": {"noise": 0.05},
+            "reversed": {"gain": -1.0},
+        }.items()
+    },
 }

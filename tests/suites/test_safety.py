@@ -1,0 +1,106 @@
+"""Situations in which a correction could do harm: what their rules do, and the table of them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+pytest.importorskip("mujoco")
+SUITE = Path(__file__).parents[2] / "benchmarks" / "suites" / "safety"
+
+
+@pytest.fixture
+def module(modules_of):
+    return modules_of(SUITE)
+
+
+@pytest.mark.parametrize(
+    ("rules", "name", "expected"),  # at steps 0, 25, 60, 90, from the fault on
+    [
+        ({}, "gain", [1, 1, 1, 1]),
+        ({"gain": -1, "lasts": 20, "every": 60}, "gain", [-1, 1, -1, 1]),
+        ({"gain": 0.3, "lasts": 50, "every": 100}, "gain", [0.3, 0.3, 1, 1]),
+        ({"gain": -1, "over": 91}, "gain", [1 - 2 * k / 91 for k in (1, 26, 61, 91)]),
+        ({"gain": 0.5, "then": -1}, "gain", [0.5, 0.5, -0.5, -0.5]),
+        ({"load": 3}, "mass", [1, 3, 1, 1]),
+        ({"wind": 0.1, "ramp": 0.2}, "wind", [0.1, 0.15, 0.22, 0.28]),
+        ({"swing": 0.6, "period": 100}, "wind", [0, 0.6, -0.35267, -0.35267]),
+        ({"jitter": 0.1}, "dt", [1.2, 1.2, 1.2, 1.2]),
+    ],
+)
+def test_what_comes_goes_and_grows(module, rules, name, expected):
+    batches = module("batches")
+    rows, luck = batches.rules_of([rules], 1), torch.full((1, 1), 2.0)
+    values = [batches.rules_at(rows, time, 1.0, luck)[name].item() for time in (0, 25, 60, 90)]
+    assert values == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("rules", "expected"),
+    [
+        ({}, [0.2, 0.3, 0.2, 0.5]),
+        ({"stick": 0.15}, [0.2, 0.2, 0.2, 0.5]),
+        ({"backlash": 0.1}, [0.1, 0.2, 0.2, 0.4]),
+        ({"chatter": 0.1}, [0.3, 0.2, 0.3, 0.4]),
+        ({"gain": -1}, [0.2, 0.3, -0.2, -0.5]),
+    ],
+)
+def test_what_reaches_the_robot(module, monkeypatch, rules, expected):
+    batches, worlds = module("batches"), module("worlds")
+    monkeypatch.setattr(batches, "SINCE", 2)
+    commands, given = [0.2, 0.3, 0.2, 0.5], []
+
+    def move(state, action, rules, force):
+        given.append(action.item())
+        return state + action
+
+    world = replace(
+        worlds.servos(1),
+        move=move,
+        policy=lambda state, step: torch.full((1, 1), commands[step]),
+        steps=4,
+    )
+    batches.play(world, [rules], 1)
+    assert given == pytest.approx(expected, abs=1e-6)
+
+
+def test_every_situation_has_an_effect_on_one_of_the_robots(module):
+    batches, worlds = module("batches"), module("worlds")
+    situations = [{**rules, "box": 0} for rules in worlds.SITUATIONS.values()]
+    robots = [make() for name, make in worlds.WORLDS.items() if name != "30 servos"]
+    costs = torch.stack([batches.play(world, situations, 1) for world in robots])
+    assert costs.isfinite().all()
+    changed = (costs != costs[:, :1]).any(0).flatten().tolist()
+    silent = [name for name, moved in zip(worlds.SITUATIONS, changed, strict=True) if not moved]
+    assert {name.split()[-1] for name in silent} == {"healthy"}
+
+
+def test_the_unit_of_actions_makes_no_difference(module, monkeypatch):
+    batches, worlds = module("batches"), module("worlds")
+    monkeypatch.setattr(batches, "SINCE", 4)
+    world = replace(worlds.servos(1), steps=16)
+    rows = [{"gain": -1.0, "box": box} for box in (0, 2, 3)]
+    own, small, large = batches.play(world, rows, 2, {})
+    torch.testing.assert_close(small, own, atol=1e-3, rtol=0)
+    torch.testing.assert_close(large, own, atol=1e-3, rtol=0)
+    alone = batches.play(world, rows[:1], 2)
+    assert (own < 0.6 * alone).all()
+
+
+def test_the_table_is_written_into_a_page(module, monkeypatch, tmp_path, capsys):
+    run, short = module("run"), replace(module("worlds").servos(1), steps=75)
+    monkeypatch.setattr(run, "WORLDS", {"one servo": lambda: short})
+    monkeypatch.setattr(run, "SITUATIONS", {"healthy": {}, "reversed": {"gain": -1.0}})
+    page = tmp_path / "page.md"
+    page.write_text("a\n<!-- safety begin -->\nold\n<!-- safety end -->\nz\n")
+    command = ["run.py", "--robots", "one servo", "--seeds", "3", "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", [*command, "--write", str(page)])
+    run.main()
+    assert "| one servo | healthy |" in capsys.readouterr().out
+    new = page.read_text()
+    assert new.startswith("a\n<!-- safety begin -->\nOf 2 situations, 3 seeds, 0 are worse, 1 bett")
+    assert "| one servo | 2 | 1 |  |\n<!-- safety end -->\nz\n" in new and "old" not in new
+    page.write_text("no marks")
+    with pytest.raises(SystemExit, match="has no lines <!-- safety begin -->"):
+        run.main()
