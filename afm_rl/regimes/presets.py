@@ -38,6 +38,31 @@ def presets(actuators: int) -> dict[str, Fault]:
     return faults
 
 
+def servo_faults(joints: int, one: int = 0, other: int = 1) -> dict[str, Fault]:
+    """Return faults of so many position servos by name, about their pose, offsets in rad.
+
+    Args:
+        joints: how many.
+        one: index of the one that fails alone.
+        other: of the one that it is swapped with.
+
+    >>> servo_faults(12, one=3)["offset .25 on one"]
+    {'bias_3': 0.25}
+    """
+    every = range(joints)
+    return {
+        "none": {},
+        "one reversed": {f"gain_{one}": -1.0},
+        "offset .25 on one": {f"bias_{one}": 0.25},
+        "offset .1 on all": {f"bias_{k}": 0.1 for k in every},
+        "all at .7": {f"gain_{k}": 0.7 for k in every},
+        "all at half": {f"gain_{k}": 0.5 for k in every},
+        "swapped pair": {f"from_{one}": other, f"from_{other}": one},
+        "late 1": {"delay": 1},
+        "late 2": {"delay": 2},
+    }
+
+
 def shifted(past: Tensor, command: Tensor) -> Tensor:
     """Return the newest D commands ``(*B, D, A)``, newest first, after one more ``(*B, A)``.
 
@@ -60,6 +85,8 @@ class Actuators:
         low: lowest command, ``(A,)``.
         high: highest command, ``(A,)``.
         batch: how many are side by side, B.
+        home: pose of position servos, ``(A,)``, about which they have their faults; these are then
+            in the unit of the commands, not in half ranges: an offset of .1 is one of .1 rad.
 
     >>> motor = Actuators([-1.0], [1.0])
     >>> before = motor(torch.tensor([0.5]))
@@ -69,9 +96,17 @@ class Actuators:
     """
 
     def __init__(
-        self, low: Sequence[float], high: Sequence[float], batch: Sequence[int] = ()
+        self,
+        low: Sequence[float],
+        high: Sequence[float],
+        batch: Sequence[int] = (),
+        home: Tensor | None = None,
     ) -> None:
         families = actuator_regimes(low, high)
+        self.home = torch.zeros(len(low)).double()
+        if home is not None:
+            low, high = [-1.0] * len(low), [1.0] * len(low)
+            families, self.home = actuator_regimes(low, high), home.double()
         chosen = ("delay", "lag", "permutation", "gain", "dead", "bias")
         self.regime = Compose({name: families[name] for name in chosen})
         self.low, self.high = (torch.tensor(list(end)).double() for end in (low, high))
@@ -109,9 +144,9 @@ class Actuators:
 
     def __call__(self, command: Tensor) -> Tensor:
         """Return the effect ``(*B, A)`` of a command, in double precision."""
-        command = command.double()
+        command = command.double() - self.home
         effect = self.regime.apply(command, self.rows, command[..., :1], self.past)
         if self.last is not None:
             effect = effect.clamp(self.last - self.most, self.last + self.most)
         self.past, self.last = shifted(self.past, command), effect
-        return effect
+        return effect + self.home

@@ -73,6 +73,7 @@ def play(task: Task, method: str, pairs: list[tuple[str, int]], steps: int) -> l
             "before": mine[: task.at].sum(),
             "after": mine[task.at :].sum(),
             "survived": bool(last == steps),
+            "lasted": int(last),
             "recovered": recovered(mine[task.at :], level, window),
         }
         for (fault, episode), mine, last in zip(pairs, rewards.T, lasted, strict=True)
@@ -85,13 +86,14 @@ def rewards_of(
     """Return rewards ``(T, N)``, 0 after the end of an episode, and how long each one lasted."""
     torch.manual_seed(0)
     faults = [task.faults[fault] for fault, _ in pairs]
-    inner = FaultyVector(task.vector(len(pairs)), faults, task.at)
+    inner = FaultyVector(task.vector(len(pairs)), faults, task.at, task.home)
     envs, act = METHODS[method](task, inner)
-    observations, _ = envs.reset(seed=[episode for _, episode in pairs])
+    task.begin(len(pairs))
+    observations, infos = envs.reset(seed=[episode for _, episode in pairs])
     rewards, alive = np.zeros((steps, len(pairs))), np.ones(len(pairs), dtype=bool)
     lasted = np.zeros(len(pairs), dtype=int)
     for step in range(steps):
-        observations, reward, terminated, truncated, _ = envs.step(act(observations))
+        observations, reward, terminated, truncated, infos = envs.step(act(observations, infos))
         rewards[step] = np.where(alive, reward, 0.0)
         lasted += alive
         alive &= ~(terminated | truncated)

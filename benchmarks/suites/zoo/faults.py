@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv, VectorWrapper
+from torch import Tensor
 
 from afm_rl.regimes import Actuators
 from afm_rl.regimes.presets import Fault
@@ -23,12 +24,16 @@ class FaultyVector(VectorWrapper):
         env: of N environments.
         faults: what happens in each, N of those of :class:`~afm_rl.regimes.Actuators`.
         at: step from which it does.
+        home: pose of position servos, ``(A,)``, see :class:`~afm_rl.regimes.Actuators`.
     """
 
-    def __init__(self, env: VectorEnv, faults: Sequence[Fault], at: int) -> None:
+    def __init__(
+        self, env: VectorEnv, faults: Sequence[Fault], at: int, home: Tensor | None = None
+    ) -> None:
         super().__init__(env)
         space: Any = env.single_action_space
-        self.actuators = Actuators(space.low.tolist(), space.high.tolist(), [env.num_envs])
+        box = space.low.tolist(), space.high.tolist()
+        self.actuators = Actuators(*box, [env.num_envs], home)
         self.at = at
         self.faults = faults
 

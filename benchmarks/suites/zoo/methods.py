@@ -16,7 +16,7 @@ from afm_rl import ActionFlowVectorWrapper
 from afm_rl.correction import L1Augmentation, LeastSquares
 from afm_rl.transforms.collect_then_fit import CollectThenFit
 
-Acting = Callable[[np.ndarray], np.ndarray]
+Acting = Callable[..., np.ndarray]  # of observations, and infos if a clock counts
 COLLECTING = 24  # healthy environments that a model is learned from, side by side
 
 
@@ -70,7 +70,7 @@ class Truth:
     def __init__(self, task: Task, envs: FaultyVector) -> None:
         self.task, self.envs = task, envs
 
-    def __call__(self, observations: np.ndarray) -> np.ndarray:
+    def __call__(self, observations: np.ndarray, infos: Any = None) -> np.ndarray:
         if not self.envs.failed:
             return self.task.act(observations)
         actuators = self.envs.actuators
@@ -78,17 +78,20 @@ class Truth:
         lag = actuators.value("lag").unsqueeze(-1)
         keep = torch.where(lag > 0, (-1 / lag).exp(), 0.0)
         expected = observations.copy()
-        for row, steps in enumerate(actuators.value("delay").int().tolist()):
+        delays = actuators.value("delay").int()
+        for row, steps in enumerate(delays.tolist()):
             if steps:
                 parameters = static[row].expand(steps, -1)
                 pending = past[row, :steps].flip(0)  # oldest first
-                effects = regime.apply(pending, parameters, pending[:, :1])
+                effects = regime.apply(pending, parameters, pending[:, :1]) + actuators.home
                 expected[row] = self.task.after(self.envs.env.envs[row], effects.numpy())
-        wanted = torch.as_tensor(self.task.act(expected)).double()
+        arrival = {"afm": {"delay": delays.numpy()}}
+        wanted = torch.as_tensor(self.task.act(expected, arrival)).double() - actuators.home
         reached = _lagged(past, keep)
         wanted = (wanted - keep * reached) / (1 - keep)
-        box = self.task.low, self.task.high
-        return regime.inverse(wanted, static, wanted[:, :1], *box).numpy()
+        box = self.task.low - actuators.home, self.task.high - actuators.home
+        commands = regime.inverse(wanted, static, wanted[:, :1], *box)
+        return (commands + actuators.home).numpy()
 
 
 def _lagged(past: Tensor, keep: Tensor) -> Tensor:

@@ -29,6 +29,7 @@ class Task:
         self.name = file.stem
         self.policy, about = load_policy(file)
         self.id, self.settings = about["id"], about.get("settings", {})
+        self.home = None
         self.twin = self.make()
         self.steps = self.twin.spec.max_episode_steps
         self.at = round(HEALTHY * self.steps)
@@ -45,8 +46,11 @@ class Task:
         """Return ``count`` environments."""
         return SyncVectorEnv([self.make] * count)
 
-    def act(self, observations: np.ndarray) -> np.ndarray:
-        """Return the policy's actions ``(N, A)``."""
+    def begin(self, count: int) -> None:
+        """Have the policy act in so many environments from their start."""
+
+    def act(self, observations: np.ndarray, infos: Any = None) -> np.ndarray:
+        """Return the policy's actions ``(N, A)``; infos tell policies with a clock the delay."""
         return self.policy(torch.as_tensor(observations, dtype=torch.float32)).numpy()
 
     @property
