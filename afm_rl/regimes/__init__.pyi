@@ -26,7 +26,12 @@ from .gains import (
 from .ground import Patches as Patches, WheelSlip as WheelSlip
 from .late import Backlash as Backlash, Delay as Delay, Lag as Lag
 from .physics import Physics as Physics
-from .presets import Actuators as Actuators, presets as presets, shifted as shifted
+from .presets import (
+    Actuators as Actuators,
+    presets as presets,
+    servo_faults as servo_faults,
+    shifted as shifted,
+)
 from .schedule import (
     Schedule as Schedule,
     blend_phases as blend_phases,

@@ -14,9 +14,9 @@ import torch
 from task import HEALTHY, Task
 
 from afm_rl.dynamics.mujoco_model import read_model
-from afm_rl.errors import ConfigurationError
+from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.planning import policy_from_onnx
-from afm_rl.regimes.presets import servo_faults
+from afm_rl.regimes import servo_faults
 
 OWN = Path(__file__).parent / "robots"
 TILTED, LOW, SHAKEN = 0.5, 0.5, 0.02  # cosine; share of the first height; rad
@@ -84,23 +84,25 @@ class Robot(Task):
     """
 
     def __init__(self, folder: Path, name: str) -> None:
-        self.name = name
-        self.about = _read(folder, name)
+        self.name, self.about = name, _read(folder, name)
         self.mjcf, _ = read_model(folder / f"{name}.xml")
         self.mjcf.opt.timestep = self.about["frame"]
         self.policy = policy_from_onnx(folder / f"{name}_policy.onnx")
-        self.twin = self.make()
-        self.data = mujoco.MjData(self.mjcf)  # in which the policy looks at states
-        driven = self.mjcf.jnt_qposadr[self.mjcf.actuator_trnid[:, 0]]
-        self.home = torch.from_numpy(self.twin.key.qpos[driven])
         self.low, self.high = torch.from_numpy(self.mjcf.actuator_ctrlrange.T.copy())
         self.steps = self.about.get("steps", 500)
         self.at = round(HEALTHY * self.steps)
-        failing = [self.mjcf.actuator(servo).id for servo in self.about["failing"]]
-        self.faults = servo_faults(self.mjcf.nu, *failing)
-        self.parts = [self._part(entry) for entry in self.about["observation"]]
-        self.begin(1)
-        size = len(self.seen(self.twin.reset(seed=0)[0], 0))
+        self.data = mujoco.MjData(self.mjcf)  # in which the policy looks at states
+        try:
+            self.twin = self.make()
+            driven = self.mjcf.jnt_qposadr[self.mjcf.actuator_trnid[:, 0]]
+            self.home = torch.from_numpy(self.twin.key.qpos[driven])
+            failing = [self.mjcf.actuator(servo).id for servo in self.about["failing"]]
+            self.faults = servo_faults(self.mjcf.nu, *failing)
+            self.parts = [self._part(entry) for entry in self.about["observation"]]
+            self.begin(1)
+            size = len(self.seen(self.twin.reset(seed=0)[0], 0))
+        except KeyError as error:  # of MuJoCo, which says the names that it has
+            raise ConfigurationError(f"{name}.json: {error.args[0]}") from error
         if (size, self.mjcf.nu) != (self.policy.observation_size, self.policy.action_size):
             raise ConfigurationError(
                 f"{name}: {size} observations and {self.mjcf.nu} servos; its policy has "
@@ -168,6 +170,8 @@ def _read(folder: Path, name: str) -> dict[str, Any]:
     about = json.loads(file.read_text())
     if missing := KEYS - about.keys():
         raise ConfigurationError(f"{file}: {', '.join(sorted(missing))}: missing")
+    frames = about["period"] / check_number(f"{file}: frame", about["frame"], low=0, open_low=True)
+    check_number(f"{file}: period per frame", frames, low=1)
     return about
 
 

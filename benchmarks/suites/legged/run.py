@@ -21,7 +21,7 @@ from methods import METHODS  # noqa: E402
 from robot import OWN, Robot  # noqa: E402
 from show import ordered, print_table  # noqa: E402
 
-from afm_rl.regimes.presets import servo_faults  # noqa: E402
+from afm_rl.regimes import servo_faults  # noqa: E402
 
 
 def main() -> None:

@@ -1,0 +1,109 @@
+"""Robots of position servos and their policies, from a folder."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from afm_rl.errors import ConfigurationError
+
+pytest.importorskip("mujoco")
+pytest.importorskip("onnxruntime")
+pytest.importorskip("onnx")
+SUITES = Path(__file__).parents[2] / "benchmarks" / "suites"
+OWN = SUITES / "legged" / "robots"
+
+
+@pytest.fixture
+def legged(modules_of):
+    """The suite's modules, by name."""
+    modules_of(SUITES / "zoo")
+    return modules_of(SUITES / "legged")
+
+
+@pytest.fixture
+def small(legged):
+    return legged("robot").Robot(OWN, "small")
+
+
+def test_the_command_plays_and_goes_on(legged, monkeypatch, tmp_path, capsys):
+    asked = ["run.py", "--out", str(tmp_path), "--seeds", "1", "--steps", "140", "--faults"]
+    monkeypatch.setattr("sys.argv", [*asked, "none", "all at half", "--methods", "alone", "truth"])
+    legged("run").main()
+    said = capsys.readouterr().out
+    assert "small, alone: 2 episodes" in said and "| all at half | 0." in said
+    monkeypatch.setattr("sys.argv", [*asked, "none", "late 1", "--methods", "alone"])
+    legged("run").main()
+    assert "small, alone: 1 episodes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("fault", ["offset .1 on all", "all at half", "swapped pair", "late 2"])
+def test_with_the_truth_a_robot_walks_on(legged, small, fault):
+    rewards_of, pairs = legged("episodes").rewards_of, [("none", 0), (fault, 0)]
+    rewards, lasted = rewards_of(small, "truth", pairs, 160)
+    healthy, corrected = -rewards[small.at :].mean(0)
+    alone = -rewards_of(small, "alone", pairs[1:], 160)[0][small.at :].mean()
+    assert (lasted == 160).all() and healthy < 0.2
+    assert corrected < healthy + 0.1 and (fault == "late 2" or alone > corrected)
+
+
+def test_our_gait_is_the_one_that_is_written(legged, monkeypatch, tmp_path):
+    file = tmp_path / "policy.onnx"
+    monkeypatch.setattr("sys.argv", ["write_gait.py", "--out", str(file)])
+    legged("write_gait").main()
+    assert file.read_bytes() == (OWN / "small_policy.onnx").read_bytes()
+
+
+def described(folder, **changed):
+    """Copy the small robot to a folder, with another description."""
+    for file in OWN.glob("small*"):
+        shutil.copy(file, folder)
+    about = json.loads((OWN / "small.json").read_text()) | changed
+    about = {name: value for name, value in about.items() if value is not None}
+    (folder / "small.json").write_text(json.dumps(about))
+    return folder
+
+
+def test_an_observation_has_the_named_parts_in_order(legged, tmp_path):
+    parts = [
+        {"phases": [0.0, np.pi], "rate": 3.0},
+        {"sensor": "gyro"},
+        {"gravity": "imu"},
+        {"positions": ["FL_knee"]},
+        {"velocities": "all"},
+        "action",
+        "command",
+    ]
+    robot = legged("robot").Robot(OWN, "small")
+    robot.parts = [robot._part(entry) for entry in parts]
+    robot.begin(1)
+    robot.last[:] = 7.0
+    state = robot.twin.reset(seed=0)[0]
+    seen = robot.seen(state, 0, late=2)
+    angle = 3.0 * 2 * np.pi * 0.04
+    phases = np.cos([angle, angle + np.pi]), np.sin([angle, angle + np.pi])
+    expected = [*phases, np.zeros(3), [0, 0, -1], state[10:11] + 1, np.zeros(8), [7.0] * 8]
+    assert np.allclose(seen, np.concatenate([*expected, [0.75, 0, 0]]))
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"speed": None}, "speed: missing"),
+        ({"observation": [{"smell": "imu"}]}, "expected sensor, gravity"),
+        ({"observation": ["command"]}, "3 observations and 8 servos; its policy has 4 and 8"),
+        ({"keyframe": "standing"}, "standing"),
+        ({"failing": ["tail", "FL_hip"]}, "tail"),
+        ({"frame": 0.0}, "frame"),
+    ],
+)
+def test_what_a_description_lacks_is_said(legged, tmp_path, changed, expected):
+    with pytest.raises(ConfigurationError, match=expected):
+        legged("robot").Robot(described(tmp_path, **changed), "small")
+
+
+def test_a_robot_without_description_is_refused(legged, tmp_path):
+    with pytest.raises(ConfigurationError, match=r"mine\.json: no such file"):
+        legged("robot").Robot(tmp_path, "mine")
