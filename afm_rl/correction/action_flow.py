@@ -67,6 +67,7 @@ class ActionFlow(PairCorrector):
     delay_likelihood: Tensor
     delay_log_prior: Tensor
     cause: Tensor
+    healthy: Tensor
     episodic = (*PairCorrector.episodic, "under_way")
 
     @old_arguments
@@ -138,6 +139,9 @@ class ActionFlow(PairCorrector):
             "delays": delays,
             "delay_likelihood": likelihood,
             "delay_log_prior": delay_log_prior,
+            "healthy": torch.tensor(
+                [float(row.kind in ("nominal", "healthy")) for row in self.hypotheses]
+            ),
             "cause": torch.tensor([self.causes.index(cause) for cause in causes]),
         }
         for name, value in fixed.items():
@@ -241,9 +245,24 @@ class ActionFlow(PairCorrector):
             [before, belief.losses],
         )
         parts["delay"], belief = delay.unsqueeze(-1).to(newest), belief._replace(losses=losses)
-        begins = (parts["misaligned"] != 1.0) & misaligned
+        begins = misaligned & ((parts["misaligned"] != 1.0) | self.is_sudden(parts))
         parts["pairs"] = self.mark_old(parts["pairs"], begins)
         return parts | belief._asdict() | {"misaligned": misaligned.to(newest)}
+
+    def is_sudden(self, parts: Fields) -> Tensor:
+        """Return whether a robot that was healthy, if not exactly as modelled, changes now.
+
+        Its newest effect, but not the one before, surprises the most probable of the models by
+        which it is healthy by five standard deviations of the noise that was learnt, ``(*B, 1)``.
+        """
+        size, pairs = self.action_size, parts["pairs"]
+        sent, effect, std, _ = pairs[..., -2:, :].split([size, size, size, 1 + self.tail], -1)
+        weights = self.weights(parts) * self.healthy.unsqueeze(-1)
+        likely = parts["forecasts"].gather(-2, weights.argmax(-2, keepdim=True))
+        expected = torch.cat([sent[..., :1, :], likely], -2)
+        far = (effect - expected).abs() > 5 * torch.hypot(std, parts["noise"].unsqueeze(-2))
+        before, now = far.any(-1, keepdim=True).unbind(-2)
+        return (weights.sum(-2) > 0.5).all(-1, keepdim=True) & now & ~before
 
     def share_losses(self, before: Tensor, losses: Tensor) -> Tensor:
         """Return the losses ``(*B, M, A)`` as models may have them until a change is known.

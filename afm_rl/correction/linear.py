@@ -69,7 +69,9 @@ class Lines(NamedTuple):
         return invert_affine(self.matrix, self.bias.unsqueeze(-1), plan).squeeze(-1)
 
 
-def fit_lines(sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor) -> Lines:
+def fit_lines(
+    sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor, noise: Tensor | float = EXACT
+) -> Lines:
     r"""Fit all linear :data:`~afm_rl.correction.hypotheses.HYPOTHESES`, in their order.
 
     By least squares, with a weak prior D = 1, b = 0.
@@ -79,6 +81,7 @@ def fit_lines(sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor) -> Line
         acted: those that acted, if they act late; the others are fitted to them.
         came: the effects.
         weight: of the rows, ``(B, M, A)``.
+        noise: standard deviation that no model explains, ``(B, A)``.
 
     >>> u = torch.tensor([[[0.5], [-1.0], [0.2]]])
     >>> lines = fit_lines(u, u, 0.1 - 2 * u, torch.ones(1, 3, 1))
@@ -98,7 +101,8 @@ def fit_lines(sent: Tensor, acted: Tensor, came: Tensor, weight: Tensor) -> Line
     trend = _extrapolate(v - u, weight)
     biases = [none[..., :1], offset[..., :2], none[..., :2], rest[..., 2:], drift, goes_on, trend]
     affine, shift = fit_affine(sent.mT, v.mT, weight.mT)
-    driven, rest, driver = _driven(sent, v, weight, affine, shift.unsqueeze(-1))
+    exact = torch.as_tensor(noise).to(v).clamp_min(EXACT).square().unsqueeze(-1)
+    driven, rest, driver = _driven(sent, v, weight, exact, affine, shift.unsqueeze(-1))
     matrix = torch.cat([torch.diag_embed(gains.mT), torch.stack([affine, driven], 1)], 1)
     bias = torch.cat([*biases, shift.unsqueeze(-1), rest], -1).mT
     constant, slopes = quadratic(1 / mass, 0), quadratic(1 / square, 2)  # (B, A, W, 3)
@@ -245,7 +249,7 @@ def _extrapolate(offset: Tensor, weight: Tensor) -> Tensor:
 
 
 def _driven(
-    u: Tensor, v: Tensor, weight: Tensor, else_matrix: Tensor, else_bias: Tensor
+    u: Tensor, v: Tensor, weight: Tensor, exact: Tensor, else_matrix: Tensor, else_bias: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return matrix ``(B, A, A)`` and offset ``(B, A, 1)`` of axes that another command drives.
 
@@ -258,6 +262,7 @@ def _driven(
         u: executed actions, ``(B, A, K)``.
         v: effects.
         weight: of both.
+        exact: mean square of what a fit that explains all rows may leave, ``(B, A, 1)``.
         else_matrix: of the axes that are not explained, ``(B, A, A)``.
         else_bias: likewise, ``(B, A, 1)``.
     """
@@ -268,9 +273,9 @@ def _driven(
     gain = cross / square
     left = ((pull * v).sum(-1, keepdim=True) - gain * cross) / (mass + PRIOR)
     # An axis that its own command explains is driven by it, whatever else fits by chance.
-    left, driver = (left + EXACT**2 * other).min(-1, keepdim=True)
+    left, driver = (left + exact * other).min(-1, keepdim=True)
     swapped = other.expand_as(gain).gather(-1, driver) > 0
-    explained = swapped & (left < 2 * EXACT**2) & (mass > LEAST_ROWS)
+    explained = swapped & (left < 2 * exact) & (mass > LEAST_ROWS)
     nothing = torch.zeros_like(gain)
     chosen = nothing.scatter(-1, driver, gain.gather(-1, driver))
     variance = nothing.scatter(-1, driver, explained / square.gather(-1, driver))

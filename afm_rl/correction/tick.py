@@ -218,7 +218,7 @@ class Tick(nn.Module):
         last = slice(-self.rows, None)
         gains = fit_gain(delayed, effect[:, None, last], weight[:, None, last])
         square = (weight[:, None, last] * delayed.square()).sum(-2) + PRIOR
-        lines = fit_lines(pairs[..., :size], acted, effect, weight)
+        lines = fit_lines(pairs[..., :size], acted, effect, weight, noise)
         limits = within_rate(effect, recent)
         series = acted, effect, recent
         errors = sensor_noise(*series)

@@ -121,3 +121,35 @@ def test_of_a_thousand_memories_none_leads_farther_than_its_evidence_reaches(mon
     episode(flow, model, lambda state, step: plans[step], world, torch.zeros(count, 1), 20)
     agreed = torch.cat(agreed)
     assert len(agreed) > 2000 and agreed.min() > 0.49
+
+
+@pytest.mark.parametrize("joints", [6, 29])
+@torch.no_grad()
+def test_swapped_servos_are_corrected_after_a_long_time_with_an_inexact_model(joints):
+    """They hold a pose, and move a little; their errors are larger than what the model states."""
+    generator, count, change = torch.Generator().manual_seed(0), 4, 60
+    draw = torch.rand(4, count, joints, generator=generator)
+    pose, size, first, second = 0.6 * draw[0] - 0.3, 0.15 * (0.5 + draw[1]), *(6.28 * draw[2:])
+    swapped = torch.arange(joints)
+    swapped[:2] = torch.tensor([1, 0])
+    effects, plans = [], []
+
+    def gait(state, step):
+        jitter = 0.02 * torch.randn(count, joints, generator=generator)
+        wave = (0.35 * step + first).sin() + 0.4 * (0.7 * step + second).sin()
+        plans.append(pose + size * wave + jitter)
+        return plans[-1]
+
+    def world(state, command, step):
+        effects.append(command[:, swapped] if step >= change else command)
+        noise = 0.02 * torch.randn(count, joints, generator=generator)
+        return state + 0.4 * (effects[-1] + noise - state)
+
+    model = KnownDynamics(lambda q, u: q + 0.4 * (u - q), Manifold(joints), joints)
+    one = torch.ones(joints)
+    episode(ActionFlow(-one, one), model, gait, world, pose, change + 60)
+    miss = (torch.stack(effects) - torch.stack(plans)).abs()
+    assert (miss[:change] == 0).float().mean() > 0.99
+    assert (
+        miss[change + 40 :, :, :2].mean() < 0.2 * (plans[-1][:, 0] - plans[-1][:, 1]).abs().mean()
+    )
