@@ -61,6 +61,9 @@ class Settings:
     """Share of the healthy gain: where the interval is wider to either side, nothing is said."""
     dead: float = 0.1
     """Share of the healthy gain: an actuator whose whole interval is below does not answer."""
+    followed: float = 0.8
+    """Share of the range of commands that a healthy joint follows: there are end stops beyond. That
+    it stops is said all the same."""
     left: float = 0.05
     """Share of the variance: what leaves more than that unexplained says so."""
     unknown: float = 0.3

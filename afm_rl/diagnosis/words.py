@@ -123,14 +123,19 @@ def _judged(
         return "dead", ["does not answer its command"]
     if vague:
         return "cannot tell", [f"cannot tell: {_reason(actuator)}"]
+    ends, stops = actuator.limits, []  # of a healthy joint
+    if ends is not None and _followed(ends, actuator) >= s.followed:
+        command = f" {actuator.units[0]}" * bool(actuator.units[0])
+        stops = [f"no more for commands {_beyond(ends, actuator, command)}"]
     if not faults and not noticed:
-        return "healthy", ["healthy", _rest(actuator)] if unexplained > s.left else []
+        said = [*stops, *([_rest(actuator)] if unexplained > s.left else [])]
+        return "healthy", ["healthy", *said] if said else []
     if faults and unexplained > s.unknown:
         return "changed", [_rest(actuator) + _closest(faults)]
     status: Status = "changed" if faults or unexplained > s.left else "healthy"
     if noticed or unexplained > s.left:
         faults = [*(faults or ["nearly healthy"]), _rest(actuator)]
-    return status, faults
+    return status, [*faults, *stops]
 
 
 def _said(actuator: Actuator) -> str:
@@ -221,14 +226,14 @@ def _faults(
         yield f"moves in steps of {actuator.quantum:.3g}{response}"
     if actuator.dead_zone > small:
         yield f"no motion for commands below {actuator.dead_zone:.3g}{command}"
-    if ends is not None and not switches:
+    if ends is not None and not switches and _followed(ends, actuator) < s.followed:
         yield f"no more for commands {_beyond(ends, actuator, command)}"
     if actuator.backlash > small:
         yield f"play of {2 * actuator.backlash:.3g}{command}"
     if actuator.stick > small:
         yield f"sticks for changes below {actuator.stick:.3g}{command}"
     if actuator.rate is not None:
-        yield f"no faster than {actuator.rate:.3g}{response} per second"
+        yield f"no faster than {actuator.rate:.3g}{response} per {'second' if timed else 'row'}"
     if actuator.every > 1:
         yield f"takes over one of {actuator.every} commands only"
     yield from _timing(actuator, step, usual_delay, timed, s)
@@ -251,6 +256,15 @@ def _timing(
         yield f"{_steps(delay, step, timed)} late"
     if delay + lag > usual_delay + late and lag > late:
         yield f"a lag of {_steps(lag, step, timed)}"
+
+
+def _followed(ends: Interval, actuator: Actuator) -> float:
+    """Return the share of the range of commands that is followed."""
+    first, last = actuator.command_range
+    low, high = ends
+    if low == high:  # one end only
+        low, high = (first, high) if high > actuator.middle else (low, last)
+    return (min(high, last) - max(low, first)) / (2 * actuator.reach)
 
 
 def _beyond(ends: Interval, actuator: Actuator, unit: str) -> str:

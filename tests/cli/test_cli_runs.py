@@ -35,10 +35,9 @@ def test_one_method(afm_rl, tmp_path, quick):
     assert "physics" in done.out and done.out.rstrip().endswith(f"Results: {folder}")
 
 
-def test_bare_compares_four_methods(afm_rl, tmp_path, small_training):
-    done = afm_rl(
-        f"hydra.run.dir={tmp_path}", f"cache={tmp_path}/parts", "budget=6", "planner.population=8"
-    )
+def test_bare_compares_four_methods(afm_rl, tmp_path, small_training, quick):
+    few = [f"cache={tmp_path}/parts", "budget=24", "planner.population=8", "regimes=slip"]
+    done = afm_rl(f"hydra.run.dir={tmp_path}", *few)
     assert done.status == 0
     methods = ["physics", "online_pe", "afm_physics", "oracle"]
     missions = pd.read_csv(tmp_path / "missions.csv")
@@ -46,7 +45,7 @@ def test_bare_compares_four_methods(afm_rl, tmp_path, small_training):
     assert missions["mission"].tolist() == [0, 1, 2, 3]
     assert missions["track"].eq("ethz_2").all()
     assert read_runs([tmp_path]).steps()["mission"].tolist() == [
-        k for k in range(4) for _ in range(6)
+        k for k in range(4) for _ in range(24)
     ]
     assert sorted(path.name for path in (tmp_path / "jobs").iterdir()) == sorted(methods)
     assert (tmp_path / "figures" / "trajectory.png").stat().st_size > 1000
@@ -54,6 +53,12 @@ def test_bare_compares_four_methods(afm_rl, tmp_path, small_training):
     said = "".join(path.read_text() for path in tmp_path.glob("jobs/*/log.txt"))
     assert "ensemble: held-out error" in said
     assert all(method in done.out for method in methods)
+    # What a planner without correction runs into under slip shows little of the actuators.
+    which, *said = done.out.partition("Actuators, by the steps of ")[2].splitlines()
+    assert which == "afm_physics, ethz_2, seed 0:"
+    assert [line.partition(":")[0] for line in said[:-1]] == ["v", "omega"]
+    alone = ["compare=[physics, oracle]", f"hydra.run.dir={tmp_path}/alone", *quick]
+    assert "Actuators" not in afm_rl(*few, *alone).out
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from afm_rl.cli import diagnose as command
-from afm_rl.diagnosis import calibrate, diagnose
+from afm_rl.diagnosis import calibrate
 from afm_rl.diagnosis.readers import read_log
 
 
@@ -97,14 +97,3 @@ def test_the_command_says_it_in_frames(tmp_path, monkeypatch, capsys):
     name, *numbers = [part.strip().split(" [")[0] for part in row.split("  ") if part]
     assert name == "joint_0.pos"
     assert [float(number) for number in numbers] == pytest.approx([4, 0.25, -0.98], abs=0.1)
-
-
-@pytest.mark.slow  # eight data sets of six joints
-def test_no_healthy_joint_is_accused(tmp_path):
-    rng = np.random.default_rng(0)
-    for number in range(8):
-        folder = tmp_path / str(number)
-        robot = {"gain": rng.choice([0.25, 0.4, 0.7, 1.0]), "late": int(rng.integers(1, 5))}
-        robot |= {"noise": rng.choice([0.03, 0.1, 0.3]), "quantum": rng.choice([0.0, 0.088])}
-        write(folder, offset=0.0, joints=6, seed=number, episodes=12, odd=0, **robot)
-        assert {actuator.status for actuator in diagnose(read_log(folder)).actuators} == {"healthy"}

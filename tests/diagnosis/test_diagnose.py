@@ -160,7 +160,7 @@ ODD = {
     r"gain drifts from (1|0.99\d?|1.0\d?) to (0.5|0.49\d?|0.50\d?)": (
         lambda u, rng: u * np.linspace(1, 0.5, len(u))
     ),
-    r"no faster than (0\.1|0\.09\d+|0\.10\d+) per second": limit_rate,
+    r"no faster than (0\.1|0\.09\d+|0\.10\d+) per row": limit_rate,
     "takes over one of 4 commands only": lambda u, rng: u[np.arange(len(u)) // 4 * 4],
     "answers 3 steps before its command in the log": lambda u, rng: np.roll(u, -3),
     r"reversed, offset \+2\.[789]\d* \(1[34]\d % of its range\)": (
