@@ -12,7 +12,7 @@ PAGE = (DOCS / "paper.md").read_text(encoding="utf-8")
 PARTS = ("cost", "planner", "dynamics", "updater", "corrector")
 OURS = {  # keys that the paper has nothing to say of
     *("_target_", "_partial_", "seed", "seed_key", "precision"),
-    *("enabled", "extend_action_box", "checkpoint"),
+    *("enabled", "most", "rate", "extend_action_box", "checkpoint"),
 }
 OPTIMISER = "updater.optimizer._target_"
 

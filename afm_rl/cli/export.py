@@ -83,6 +83,8 @@ def _run(arguments: list[str]) -> None:
         transform.prefix,
         transform.enabled,
         transform.extend_action_box,
+        most=transform.most,
+        rate=transform.rate,
     )
     print("exporting: tracing, then writing, which takes several times as long", flush=True)
     controller = Controller(None if alone else agent.planner, policy)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from afm_rl.correction.first_steps import FirstSteps
+from afm_rl.correction.first_steps import FirstSteps, HeldBack
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError
 from afm_rl.faults import count_repeats, trusted
@@ -85,7 +85,7 @@ class Corrector(nn.Module, ABC):
                 "one size, finite, low < high"
             )
         self.layouts: dict[int, tuple[list, list, list]] = {}  # by the size of a state
-        self.first_steps = FirstSteps()
+        self.first_steps, self.held_back = FirstSteps(), HeldBack()
         self.recent = recent
         scale = torch.maximum(low.abs(), high.abs())
         self.action_size = len(scale)
@@ -253,6 +253,15 @@ class Corrector(nn.Module, ABC):
         every = torch.cat([waiting, executed.unsqueeze(-2)], -2)
         which = (self.delay - self.hold).expand_as(executed).unsqueeze(-2)
         return every.gather(-2, which).squeeze(-2)
+
+    def at_once(self, memory: Tensor, executed: Tensor) -> Tensor:
+        """Return the memory if no axis waits for others with what is executed now, ``(*B, A)``."""
+        if not self.holds:
+            return memory
+        parts, executed = self.unpack(memory, self.states_in(memory)), executed.unsqueeze(-2)
+        which = (self.delay - self.hold).expand_as(executed)
+        every = torch.cat([parts["sent"], executed], -2).scatter(-2, which, executed)
+        return self.pack({**parts, "sent": every[..., :-1, :]})
 
     def unpack(self, memory: Tensor, state_size: int) -> Fields:
         """Return the parts of a memory."""

@@ -1,4 +1,4 @@
-"""Corrections from the first step on: a robot that was changed before, or a wrong model."""
+"""What most steps of a correction are like, if the user should know of it: said once."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-STEPS = 60  # the first ones
-MOST = 0.5  # share of those that are corrected, in each third but the first
+STEPS = 60  # that are looked at together
+MOST = 0.5  # share of them, in each third but the first
 
 
 class FirstSteps:
@@ -25,6 +25,13 @@ class FirstSteps:
     >>> [str(warning.message)[:68] for warning in said]
     ['100 % of the first 60 steps were corrected (gain 0.5 on all): the ro']
     """
+
+    text = (
+        "{share:.0f} % of the first {steps} steps were corrected ({cause}): the robot was changed "
+        "before it began, or the model is wrong, which afm_rl.check_model(env, model) tells"
+    )
+    again = False
+    """Are later steps looked at, too, until there is something to be said?"""
 
     def __init__(self) -> None:
         self.corrected: list[Tensor] = []
@@ -48,9 +55,21 @@ class FirstSteps:
             return
         parts = torch.stack(self.corrected).reshape(3, -1).mean(-1)
         if parts[1:].amin() > MOST:
-            warnings.warn(
-                f"{100 * parts.mean():.0f} % of the first {STEPS} steps were corrected "
-                f"({cause() or 'what is wrong is not known'}): the robot was changed before it "
-                "began, or the model is wrong, which afm_rl.check_model(env, model) tells",
-                stacklevel=3,
-            )
+            known, share = cause() or "what is wrong is not known", 100 * float(parts.mean())
+            text = self.text.format(share=share, steps=STEPS, cause=known)
+            warnings.warn(text, stacklevel=3)
+        elif self.again:
+            self.corrected.clear()
+
+
+class HeldBack(FirstSteps):
+    """Notes at which steps the user's limits hold a correction back, and warns at most once.
+
+    That is where most of 60 steps are, whenever.
+    """
+
+    text = (
+        "{share:.0f} % of {steps} steps were held back by the limits most and rate ({cause}): what "
+        "was planned cannot be had within them; raise them, or plan for what is left"
+    )
+    again = True

@@ -169,7 +169,8 @@ def _build(settings: dict[str, Any]) -> Agent:
             "those of corrector=afm"
         )
     own = dict(settings["corrector"])  # but for what is set of whatever corrector is chosen
-    around = {key: own.pop(key) for key in ("enabled", "extend_action_box") if key in own}
+    options = ("enabled", "most", "rate", "extend_action_box")
+    around = {key: own.pop(key) for key in options if key in own}
     with blaming("corrector"):
         found = instantiate("corrector", own)(robot, dynamics)
         corrector = as_part("corrector", found, Corrector)

@@ -20,7 +20,7 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance
 from afm_rl.spaces.keys import as_key, as_keys
 from afm_rl.transforms import delay_compensation as delays
-from afm_rl.transforms.loop import CorrectionLoop, Shell, bounds_of, precise, warn_of_old
+from afm_rl.transforms.loop import CorrectionLoop, Limit, Shell, bounds_of, precise, warn_of_old
 from afm_rl.transforms.simulation import SIMULATOR_STATE, Simulation, simulation_in
 from afm_rl.transforms.stateful import StatefulTransform
 
@@ -31,7 +31,7 @@ class ActionFlowTransform(Shell, StatefulTransform):
     r"""Action Flow Matching: the planned action goes in, the action that does it comes out.
 
     A view of the :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``,
-    ``enabled``, ``delay``, ``delay_compensation``, ``belief``, ``keep_memory_on_reset``,
+    ``enabled``, ``most``, ``rate``, ``delay``, ``delay_compensation``, ``belief``, ``keep_memory_on_reset``,
     ``extend_action_box`` and ``record``. On the way to the environment the planned action is
     corrected; on the way back the transition enters the memory. The dynamics model is shared with
     planner and updater; of one that learns, the *present* one is asked about the newest transitions
@@ -103,6 +103,8 @@ class ActionFlowTransform(Shell, StatefulTransform):
         carry_memory: bool = False,
         keep_memory_on_reset: bool = False,
         record: str | Path | None = None,
+        most: Limit = None,
+        rate: Limit = None,
     ) -> None:
         state, known = "observation", None
         if isinstance(model, str):
@@ -120,6 +122,8 @@ class ActionFlowTransform(Shell, StatefulTransform):
             known,
             corrector,
             enabled=enabled,
+            most=most,
+            rate=rate,
             delay=delay,
             delay_compensation=delay_compensation,
             belief=belief,
@@ -130,6 +134,11 @@ class ActionFlowTransform(Shell, StatefulTransform):
         self._loop = loop if corrector is None or known is None else loop.complete()
         self._corrector = corrector  # registered here
         self._simulation: Any = (None, None)
+        if rate is not None and reported_key is not None:
+            raise ConfigurationError(
+                f"transform.rate={rate!r}: with reported_key the command of the step before is not "
+                "remembered; give most, or leave reported_key out"
+            )
         self.reported_key = None if reported_key is None else as_key(reported_key)
         self.carry_memory = check_flag("transform.carry_memory", carry_memory)
         self._newest: Any = None  # the entries of the newest step, and its memory
@@ -237,7 +246,8 @@ class ActionFlowTransform(Shell, StatefulTransform):
         """Replace the planned action by the corrected one."""
         warn_of_old(tensordict, self.prefix)
         planned = tensordict.get(self.action_key, None)
-        entries = self.loop.act(memory, planned, self._action_spec, self.action_key)
+        enabled = tensordict.get(self.key("enabled"), None)
+        entries = self.loop.act(memory, planned, self._action_spec, self.action_key, enabled)
         tensordict.set(self.action_key, entries.get("executed_action"))
         measured = tensordict.get(self.prefix).select("observation", "arrival", "delay")
         if self.simulation is None:
@@ -253,7 +263,8 @@ class ActionFlowTransform(Shell, StatefulTransform):
             memory = self.corrector.reported(memory, given)
         state = self._state(next_tensordict)
         memory = self.loop.observe(memory, state, self.observation_key)
-        entries |= {"memory": memory, **self._seen(memory, state, next_tensordict)}
+        seen = self._seen(memory, state, next_tensordict, entries["enabled"])
+        entries |= {"memory": memory, **seen}
         # Of the device that the next tensordict names: else every entry is moved to where it is.
         later = TensorDict(entries, memory.shape[:-1], device=next_tensordict.device)
         return next_tensordict.set(self.prefix, self._hold(later))
@@ -305,9 +316,15 @@ class ActionFlowTransform(Shell, StatefulTransform):
             state = self.simulation.state.to(tensordict.device or "cpu")
         return state
 
-    def _seen(self, memory: Tensor, state: Tensor, tensordict: TensorDictBase) -> dict[str, Any]:
+    def _seen(
+        self,
+        memory: Tensor,
+        state: Tensor,
+        tensordict: TensorDictBase,
+        enabled: Tensor | None = None,
+    ) -> dict[str, Any]:
         """Return the entries of what was measured and of where the next action acts."""
-        reached, delay = self.loop.arrival(memory)
+        reached, delay = self.loop.arrival(memory, enabled)
         reached = torch.where((delay > 0).unsqueeze(-1), reached.to(state.dtype), state)
         measured = self._measured(tensordict, state).clone()
         if self.delay_compensation:

@@ -114,7 +114,7 @@ class CollectThenFit:
     def collecting(self, loop: CorrectionLoop) -> CorrectionLoop:
         """Return the loop that collects, for the time before there is a model."""
         corrector = Excitation(loop.corrector, self)
-        return replace(loop, corrector=corrector, enabled=True, delay_compensation=False)
+        return replace(loop, corrector=corrector, delay_compensation=False)
 
     def fits(self) -> bool:
         """Fit a model if there is enough for it; is it good enough?"""

@@ -26,9 +26,11 @@ from afm_rl.transforms.policy import ActionFlowPolicy
 Draw = tuple[tuple[int, ...], float | None]
 """Shape and bound of normal numbers."""
 
+OFF = 2.0  # first number of a memory while plans are executed as they are
 RETURNED = ("next_memory", "executed_action")
 MEANINGS = {
-    "memory": "what is remembered; zeros begin a mission, then next_memory of the tick before",
+    "memory": "what is remembered; zeros begin a mission, then next_memory of the tick before; with "
+    "2 as its first number plans are executed as they are, with 1 they are corrected",
     "observation": "the state, as it was measured; not a number where there is no reading",
     "action": "the planned action, in the robot's units",
     "noise": "standard normal numbers, fresh ones at each tick, none beyond noise_bound",
@@ -43,9 +45,10 @@ class Controller(nn.Module):
     .. math:: (m, s, g, \epsilon) \mapsto (m', a)
 
     All that is remembered is in m; a memory of zeros begins a mission, and, with the policy's
-    ``keep_memory_on_reset``, one whose first number was set to -1 goes on with what was learnt. A
-    planner that samples takes standard normal numbers :math:`\epsilon`, fresh ones at each tick,
-    none beyond :attr:`noise_bound`. Actions are those of planner and policy, up to rounding.
+    ``keep_memory_on_reset``, one whose first number was set to -1 goes on with what was learnt.
+    While that number is 2, plans are executed as they are, and evidence is gathered on; 1 corrects
+    again. A planner that samples takes standard normal numbers :math:`\epsilon`, fresh ones at each
+    tick, none beyond :attr:`noise_bound`. Actions are those of planner and policy, up to rounding.
 
     Args:
         planner: writes the planned action and, under ``next``, what it remembers. None: the
@@ -110,7 +113,8 @@ class Controller(nn.Module):
         """Find out which noise is asked for."""
         given = _Given(None)
         still = [torch.zeros(size).to(self.start) for size in self.task.values()]
-        self._tick(self.start, torch.zeros(self._states).to(self.start), still, given)
+        state, on = torch.zeros(self._states).to(self.start), torch.ones((), dtype=torch.bool)
+        self._tick(self.start, state, on.to(state.device), still, given)
         self.draws = given.asked
 
     @property
@@ -150,8 +154,9 @@ class Controller(nn.Module):
         if self.policy.keep_memory_on_reset:
             before = torch.where(memory[:1] < 0.0, self._resumed(memory), before)
         noise = _Given(given[-1] if self.draws else None)
-        found, action = self._tick(before, observation, task, noise)
-        return torch.cat([torch.ones_like(memory[:1]), found]), action
+        on = memory[0] != OFF
+        found, action = self._tick(before, observation, on, task, noise)
+        return torch.cat([torch.where(on, 1.0, memory[:1]), found]), action
 
     def _resumed(self, memory: Tensor) -> Tensor:
         """Return what a mission begins with that keeps what was learnt."""
@@ -161,9 +166,15 @@ class Controller(nn.Module):
         return torch.cat([self.start[:-size], learnt])
 
     def _tick(
-        self, memory: Tensor, observation: Tensor, task: Sequence[Tensor], noise: _Given
+        self,
+        memory: Tensor,
+        observation: Tensor,
+        enabled: Tensor,
+        task: Sequence[Tensor],
+        noise: _Given,
     ) -> tuple[Tensor, Tensor]:
         td = TensorDict({self.policy.observation_key: observation})
+        td.set(self.policy.enabled_key, enabled)
         td.update(dict(zip(self.task, task, strict=True)))
         parts = memory.split([math.prod(shape) for shape in self.shapes.values()])
         for (key, shape), part in zip(self.shapes.items(), parts, strict=True):

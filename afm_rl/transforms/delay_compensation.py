@@ -77,6 +77,7 @@ class Arrival(TensorDictModuleBase):
         loop, (key, memory_key) = self.policy.loop, self.in_keys
         state = tensordict.get(key, None)
         memory = loop.observe(tensordict.get(memory_key), state, key)
-        reached, steps = loop.arrival(memory)
+        enabled = tensordict.get(self.policy.enabled_key, None)
+        reached, steps = loop.arrival(memory, enabled)
         arrival_key, delay_key = self.out_keys
         return tensordict.set(arrival_key, reached.to(state.dtype)).set(delay_key, steps)

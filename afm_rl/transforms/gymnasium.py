@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -27,7 +28,7 @@ from afm_rl.errors import ConfigurationError
 from afm_rl.faults import fault_of
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import delay_compensation as delays
-from afm_rl.transforms.loop import CorrectionLoop, precise
+from afm_rl.transforms.loop import CorrectionLoop, Limit, precise
 from afm_rl.transforms.simulation import Simulation
 
 if TYPE_CHECKING:  # a room that is entered when it is asked for
@@ -48,10 +49,20 @@ SHOWN = {
 """What ``info["afm"]`` has of the entries."""
 
 
+def _option(name: str) -> property:
+    def change(shell: GymnasiumShell, value: Any) -> None:
+        shell._options = replace(shell._options, **{name: value})
+        if shell._entries is not None:
+            shell._loop = replace(shell._loop, **{name: value})
+
+    return property(lambda shell: getattr(shell._options, name), change)
+
+
 class GymnasiumShell:
     """The loop for N environments of gymnasium: what :class:`ActionFlowWrapper` says."""
 
     env: Any
+    _loop: CorrectionLoop
 
     @old_arguments
     def __init__(
@@ -67,10 +78,13 @@ class GymnasiumShell:
         belief: bool = False,
         keep_memory_on_reset: bool = False,
         record: str | Path | None = None,
+        most: Limit = None,
+        rate: Limit = None,
     ) -> None:
         options: Any = {"corrector": corrector, "enabled": enabled, "delay": delay}
         options |= {"delay_compensation": delay_compensation, "belief": belief}
         options |= {"keep_memory_on_reset": keep_memory_on_reset, "record": record}
+        options |= {"most": most, "rate": rate}
         given: Any = {"model": model, "state": state, "observe": observe, **options}
         RecordConstructorArgs.__init__(self, **given)  # type: ignore[arg-type]
         super().__init__(env)  # type: ignore[call-arg]
@@ -122,6 +136,10 @@ class GymnasiumShell:
         return self._collection
 
     watching = old_attribute("watching", "collection")
+
+    enabled = _option("enabled")
+    most = _option("most")
+    rate = _option("rate")
 
     @torch.no_grad()
     def _begin(
@@ -273,7 +291,8 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
     as it is, brought into the action space; when it does not, the corrector's answer is. Seeds,
     rewards, ends and observations are the environment's own. It is a view of the
     :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``, ``enabled``,
-    ``delay_compensation``, ``delay``, ``belief``, ``keep_memory_on_reset`` and ``record``.
+    ``most``, ``rate``, ``delay_compensation``, ``delay``, ``belief``, ``keep_memory_on_reset`` and
+    ``record``; the first three are attributes, which may be changed at any step.
 
     ``info["afm"]`` has, after each step, ``planned``, ``executed`` and ``predicted`` ``(A,)``, the
     last being the effect that the executed action is expected to have; ``corrects``, whether the

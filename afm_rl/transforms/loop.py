@@ -7,18 +7,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
+from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction import ActionFlow, Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
 from afm_rl.faults import check_numbers, safe_action
+from afm_rl.options import Option, option
 from afm_rl.transforms.delay_compensation import state_at_arrival
+
+LIMIT = cast(
+    Option, option(None, "half ranges of the action, one number or one per axis", gt=0, le=2)
+)
+Limit = float | Sequence[float] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +40,10 @@ class CorrectionLoop:
     * ``"planned_action"`` and ``"executed_action"`` ``(*B, A)``,
     * ``"predicted_effect"`` ``(*B, A)``: the effect that the executed action is predicted to have;
       where nothing is corrected, itself,
-    * ``"misaligned"`` ``(*B)``: does the model misjudge actions, so that they are corrected (with
-      ``enabled=False``: so that they would be)?
+    * ``"enabled"`` ``(*B)``: is this mission corrected? True at first; False from the caller, until
+      the mission ends, is what ``enabled=False`` is for all of them,
+    * ``"misaligned"`` ``(*B)``: does the model misjudge actions, so that they are corrected (while
+      that is switched off: so that they would be)?
     * ``"innovation"`` ``(*B)``: the misalignment, in standard deviations that the model states,
     * ``"spread"`` ``(*B, A)``: standard deviation of the flow's samples,
     * ``"noise"`` ``(*B, A)``: standard deviation of effects that nothing explains,
@@ -51,7 +60,12 @@ class CorrectionLoop:
         model: dynamics model, shared with planner and updater; None: said by :meth:`complete`.
         corrector: the correction, owned; None: the universal
             :class:`~afm_rl.correction.ActionFlow` for the action box.
-        enabled: False to watch only.
+        enabled: False to watch only: plans are executed to the bit, and the evidence is gathered
+            on. May be changed at any step.
+        most: how far from the planned action the executed one may be at most, in half ranges of the
+            action, one number or one per axis; None: as far as the box allows.
+        rate: how much that difference may change from a step to the next, likewise, where ``most``
+            and the box allow it. Each episode begins with none.
         delay: steps from an action to its effect that are known, one number or one per axis: used
             from the first step on. Faster axes are kept waiting. What comes on top is found out.
         delay_compensation: show the policy, while actions act late, what is observed in the state
@@ -86,6 +100,8 @@ class CorrectionLoop:
     model: Any = None
     corrector: Any = None
     enabled: bool = True
+    most: Limit = None
+    rate: Limit = None
     delay: int | Sequence[int] | None = None
     delay_compensation: bool = True
     belief: bool = False
@@ -98,6 +114,9 @@ class CorrectionLoop:
         for name, value in vars(self).items():
             if isinstance(getattr(CorrectionLoop, name, None), bool):
                 check_flag(f"{self.owner}.{name}", value)
+        for name in ("most", "rate"):
+            value = LIMIT.check(f"{self.owner}.{name}", Limit, getattr(self, name))
+            object.__setattr__(self, name, value)
         if isinstance(self.record, str | Path):
             from afm_rl.transforms.record import Recorder
 
@@ -140,6 +159,12 @@ class CorrectionLoop:
                 f"{owner}.corrector: made for {corrector.action_size} actions, but the dynamics "
                 f"model has {size}"
             )
+        for name in ("most", "rate"):
+            limit = getattr(self, name)
+            if isinstance(limit, list) and len(limit) != size:
+                raise ConfigurationError(
+                    f"{owner}.{name}={limit}: expected one number, or {size}, one per action"
+                )
         if self.belief:
             check_instance(f"{owner}.belief=True: {owner}.corrector", corrector, ActionFlow)
         return replace(self, model=model, corrector=corrector)
@@ -159,6 +184,7 @@ class CorrectionLoop:
             spread=real(actions),
             noise=real(actions),
             innovation=real(),
+            enabled=Binary(shape=batch, dtype=torch.bool),
             misaligned=Binary(shape=batch, dtype=torch.bool),
             shape=batch,
         )
@@ -174,6 +200,7 @@ class CorrectionLoop:
         check_precision()
         entries = self.spec(state.shape[:-1], action_spec.dtype).to(state.device).zero()
         entries.set("effect_bounds", box_of(action_spec, entries.get("planned_action")))
+        entries.set("enabled", ~entries.get("enabled"))
         state = state.to(precise(state.dtype))
         if learnt is None or learnt.shape[:-1] != state.shape[:-1]:
             return self._with_belief(entries.set("memory", self.corrector.begin(state)))
@@ -187,6 +214,7 @@ class CorrectionLoop:
         planned: Tensor,
         action_spec: TensorSpec,
         key: NestedKey = "action",
+        enabled: Tensor | None = None,
     ) -> TensorDictBase:
         """Return the entries with what was planned ``(*B, A)`` and what should be executed.
 
@@ -195,30 +223,49 @@ class CorrectionLoop:
             planned: the planned action; where it is not finite, the one before is taken.
             action_spec: actions that can be executed.
             key: where the planned action was found.
+            enabled: which missions are corrected, ``(*B)``; None: all.
 
         Raises:
             ConfigurationError: for a plan that is not real numbers ``(*B, A)``.
         """
         check_precision()
-        model, corrector, enabled = self.model, self.corrector, self.enabled
+        model, corrector = self.model, self.corrector
         low, high = bounds_of(action_spec)
         check_numbers(key, planned, (*memory.shape[:-1], corrector.action_size))
         planned = computable(planned, low, high, memory.dtype)
         box = box_of(action_spec, planned)
         _, last, sent = corrector.latest(memory)
         plan = torch.where(planned.isfinite().all(-1, keepdim=True), planned, last)
-        memory, answer = corrector.correct(memory, plan, model, box)
-        if enabled:
-            corrector.first_steps(answer.misaligned, partial(corrector.cause_in, memory))
+        inside, _ = safe_action(plan, low, high, sent)
+        inside = inside.to(memory.dtype)
+        given = self.enabled_in(memory, enabled)
+        on = (given & self.enabled).unsqueeze(-1)
+        # Where nothing is corrected the box is the plan alone, so that its effect is foreseen.
+        ends = torch.where(on.unsqueeze(-1), box, inside.unsqueeze(-2))
+        before = torch.where(on, memory, corrector.at_once(memory, inside))
+        memory, answer = corrector.correct(before, plan, model, ends)
+        cause = partial(corrector.cause_in, memory)
+        corrector.first_steps(answer.misaligned & on.squeeze(-1), cause)
         # The last clamp depends on nothing but the spec, whatever the corrector answers.
-        executed, _ = safe_action(answer.executed if enabled else plan, low, high, sent)
-        executed, predicted = executed.to(memory.dtype), answer.predicted
-        if enabled:  # a corrector that keeps to the box has noted all of it
-            memory = Corrector.executing(corrector, memory, plan, executed)
-            executed = corrector.sending(memory, executed)
-        else:
-            memory, predicted = corrector.executing(memory, plan, executed), executed
-        bounds = answer.bounds if enabled else box
+        executed, _ = safe_action(answer.executed, low, high, sent)
+        executed, predicted = torch.where(on, executed.to(memory.dtype), inside), answer.predicted
+        # A corrector that keeps to the box has noted all of it.
+        memory = Corrector.executing(corrector, memory, plan, executed)
+        if self.most is not None or self.rate is not None:
+            correction = sent.clamp(low, high) - last.clamp(low, high)
+            limited = torch.where(
+                on, self._limited(executed, inside, correction, low, high), inside
+            )
+            held = (limited != executed).any(-1)
+            corrector.held_back(held & answer.misaligned, cause)
+            if not all_hold(~held):
+                memory = corrector.executing(memory, plan, limited)
+                foreseen, _ = corrector.predict(before, limited, model)
+                predicted = torch.where(held.unsqueeze(-1), foreseen.to(predicted), predicted)
+            executed = limited
+        predicted = torch.where(on, predicted, executed)
+        executed = torch.where(on, corrector.sending(memory, executed), executed)
+        bounds = torch.where(on.unsqueeze(-1), answer.bounds, box)
         if not (self.extend_action_box and model.extrapolates):
             low, high = box.unbind(-2)
             bounds = torch.minimum(torch.maximum(bounds, low.unsqueeze(-2)), high.unsqueeze(-2))
@@ -227,12 +274,12 @@ class CorrectionLoop:
             "executed_action": executed,
             "predicted_effect": predicted,
             "effect_bounds": bounds,
-            "spread": answer.spread if enabled else torch.zeros_like(answer.spread),
+            "spread": torch.where(on, answer.spread, 0.0),
             "noise": answer.noise,
             "innovation": answer.innovation,
         }
         entries = {name: value.to(action_spec.dtype) for name, value in entries.items()}
-        entries |= {"misaligned": answer.misaligned, "memory": memory}
+        entries |= {"enabled": given, "misaligned": answer.misaligned, "memory": memory}
         if self.record is not None:
             self.record.acted(corrector.latest(memory)[0], plan, entries["executed_action"])
         return self._with_belief(TensorDict(entries, planned.shape[:-1], device=planned.device))
@@ -250,15 +297,41 @@ class CorrectionLoop:
             self.record.observed(self.model, self.corrector.scale, state)
         return self.corrector.observe(memory, state)
 
-    def arrival(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+    def arrival(self, memory: Tensor, enabled: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the state ``(*B, S)`` in which the next action acts, and in how many steps.
 
-        The present state and 0 while no action is late, and with ``enabled=False``.
+        The present state and 0 while no action is late, and where nothing is corrected.
         """
-        if self.enabled:
-            return state_at_arrival(self.corrector, memory, self.model)
-        state = self.corrector.latest(memory)[0]
-        return state, torch.zeros_like(state[..., 0], dtype=torch.long)
+        now = self.corrector.latest(memory)[0]
+        on = self.enabled_in(memory, enabled)
+        if not self.enabled:
+            return now, torch.zeros_like(on, dtype=torch.long)
+        state, steps = state_at_arrival(self.corrector, memory, self.model)
+        return torch.where(on.unsqueeze(-1), state, now), torch.where(on, steps, 0)
+
+    def enabled_in(self, memory: Tensor, enabled: Tensor | None) -> Tensor:
+        """Return which missions of a memory ``(*B, P)`` are corrected, ``(*B)``; None: all."""
+        if enabled is None:
+            return torch.ones_like(memory[..., 0], dtype=torch.bool)
+        return enabled.to(memory.device, torch.bool).expand(memory.shape[:-1])
+
+    def _limited(
+        self, executed: Tensor, plan: Tensor, correction: Tensor, low: Tensor, high: Tensor
+    ) -> Tensor:
+        """Return the actions ``(*B, A)`` that are nearest to ``executed`` within the limits.
+
+        Args:
+            executed: the corrector's answer.
+            plan: the planned action, in the box.
+            correction: the last executed action minus the planned one.
+            low: lowest action.
+            high: highest action.
+        """
+        for limit, centre in ((self.rate, plan + correction), (self.most, plan)):
+            if limit is not None:  # what comes last holds in any case
+                reach = 0.5 * (high - low) * torch.as_tensor(limit).to(high)
+                executed = executed.clamp(centre - reach, centre + reach)
+        return executed.clamp(low, high).to(plan)
 
     def _with_belief(self, entries: TensorDictBase) -> TensorDictBase:
         if self.belief:
@@ -350,6 +423,8 @@ class Shell:
         return self.loop.model if self._loop.model is None else self._loop.model
 
     enabled = _option("enabled")
+    most = _option("most")
+    rate = _option("rate")
     delay = _option("delay")
     delay_compensation = _option("delay_compensation")
     belief = _option("belief")

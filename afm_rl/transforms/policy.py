@@ -18,7 +18,7 @@ from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.planning.receding import ZeroPrimer
 from afm_rl.spaces.keys import as_key
 from afm_rl.transforms.delay_compensation import Arrival
-from afm_rl.transforms.loop import CorrectionLoop, Shell, precise, warn_of_old
+from afm_rl.transforms.loop import CorrectionLoop, Limit, Shell, precise, warn_of_old
 from afm_rl.transforms.stateful import check_free
 
 
@@ -28,9 +28,9 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
     Put it after a planner in a ``TensorDictSequential``: a state goes in, the action to execute
     comes out under ``action_key``, as a robot wants it that is no environment. It is a view of the
     :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``, ``enabled``,
-    ``extend_action_box``, ``delay``, ``keep_memory_on_reset`` and ``record``. Under ``prefix`` are
-    its entries, with the memory as ``"_memory"``, which collectors leave out; the next ones go to
-    ``("next", prefix)``, as planners have it. Prime the first tensordict with
+    ``most``, ``rate``, ``extend_action_box``, ``delay``, ``keep_memory_on_reset`` and ``record``.
+    Under ``prefix`` are its entries, with the memory as ``"_memory"``, which collectors leave out;
+    the next ones go to ``("next", prefix)``, as planners have it. Prime the first tensordict with
     :meth:`make_tensordict_primer` (or append that to an environment), which keeps what was learnt
     of the last step, or of the tensordict that it is given; and carry ``"next"`` on (``step_mdp``
     does). Actions are the same as the transform's.
@@ -75,6 +75,8 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
         delay: int | Sequence[int] | None = None,
         keep_memory_on_reset: bool = False,
         record: str | Path | None = None,
+        most: Limit = None,
+        rate: Limit = None,
     ) -> None:
         super().__init__()
         self.action_spec = check_instance("policy.action_spec", action_spec, Bounded)
@@ -83,6 +85,8 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
             model,
             corrector,
             enabled=enabled,
+            most=most,
+            rate=rate,
             delay=delay,
             keep_memory_on_reset=keep_memory_on_reset,
             extend_action_box=extend_action_box,
@@ -110,6 +114,11 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
     def memory_key(self) -> NestedKey:
         """Where the memory is: collectors leave out what begins with an underscore."""
         return unravel_key((self.prefix, "_memory"))
+
+    @property
+    def enabled_key(self) -> NestedKey:
+        """Where it is said which missions are corrected."""
+        return unravel_key((self.prefix, "enabled"))
 
     @property
     def _spec(self) -> Composite:
@@ -149,7 +158,8 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
         state = tensordict.get(self.observation_key, None)
         memory = self.loop.observe(memory, state, self.observation_key)
         planned = tensordict.get(self.action_key, None)
-        entries = self.loop.act(memory, planned, self.action_spec, self.action_key)
+        enabled = tensordict.get(self.enabled_key, None)
+        entries = self.loop.act(memory, planned, self.action_spec, self.action_key, enabled)
         entries.rename_key_("memory", "_memory")
         tensordict.set(unravel_key(("next", self.prefix)), entries)
         return tensordict.set(self.action_key, entries.get("executed_action"))

@@ -5,12 +5,12 @@ import warnings
 import pytest
 import torch
 
-from afm_rl.correction.first_steps import STEPS, FirstSteps
+from afm_rl.correction.first_steps import STEPS, FirstSteps, HeldBack
 
 
-def said(steps):
+def said(steps, first=None):
     """Return what is said of steps (bool)."""
-    first = FirstSteps()
+    first = first or FirstSteps()
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         for corrected in steps:
@@ -34,6 +34,21 @@ def test_it_is_said_once_where_corrections_began_with_the_first_steps(steps, cou
     messages = said(steps)
     assert len(messages) == count
     assert all("first 60 steps were corrected (gain 0.5 on all)" in text for text in messages)
+
+
+@pytest.mark.parametrize(
+    ("held", "count"),
+    [
+        ([True] * 300, 1),
+        ([True, True, False] * 100, 1),
+        ([False] * 200 + [True] * 120, 1),
+        ([True, False] * 200, 0),
+    ],
+)
+def test_that_limits_hold_back_is_said_once_whenever_it_begins(held, count):
+    messages = said(held, HeldBack())
+    assert len(messages) == count
+    assert all("of 60 steps were held back by the limits" in text for text in messages)
 
 
 def test_numbers_are_not_looked_at_on_the_way_nor_in_a_compiled_tick():

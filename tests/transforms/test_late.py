@@ -100,6 +100,14 @@ def test_a_delay_is_found_and_made_up_for(sign):
     assert 10 * cost[True] < cost[False], cost
 
 
+def test_switched_off_each_axis_is_known_to_act_as_soon_as_it_can():
+    env = ActionFlowWrapper(Carts((3, 1)), glide, delay=[3, 1], enabled=False)
+    seen, _ = env.reset(seed=0)
+    for step in range(60):
+        seen, _, _, _, info = env.step(law(seen) + 0.5 * np.sin([step, 0.7 * step]))
+        assert not env._entries["misaligned"].any() and info["afm"]["innovation"] < 1
+
+
 WAYS = {  # delays of the robot, settings, steps that are told at the end, what is said of them
     "found": ((8, 8), {}, 8, "8 steps late\nlateness: 8 steps, made up for"),
     "known": ((3, 3), {"delay": 3}, 3, "healthy\nlateness: 3 steps, made up for"),

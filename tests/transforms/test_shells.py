@@ -22,6 +22,7 @@ from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
 from afm_rl.transforms.controller import Controller
 
 EPISODE = 6
+STAY = {}  # whether actions are corrected from a step on, by step: it stays as it is
 BOX = -torch.ones(2), torch.ones(2)
 
 
@@ -31,7 +32,7 @@ def starts(dtype):
         yield torch.randn(4, generator=generator).to(dtype)
 
 
-def transform(plans, dtype, gain=-1.0, ends=EPISODE, **settings):
+def transform(plans, dtype, gain=-1.0, ends=EPISODE, switch=STAY, **settings):
     actual = KnownDynamics(lambda s, a: push(s, gain * a), Manifold(4), 2)
     world = PlanningEnv(actual, KnownReward(lambda s, a, n: -n.square().sum(-1)), *BOX)
     model = KnownDynamics(push, Manifold(4), 2)
@@ -39,24 +40,28 @@ def transform(plans, dtype, gain=-1.0, ends=EPISODE, **settings):
     for k, plan in enumerate(plans):
         if k % ends == 0:
             td = env.reset(TensorDict({"observation": next(start)}))
+        env.transform.enabled = switch.get(k, env.transform.enabled)
         td = step_mdp(env.step(td.set("action", plan)))
         yield td["afm", "executed_action"]
 
 
-def policy(plans, dtype, gain=-1.0, ends=EPISODE, **settings):
+def policy(plans, dtype, gain=-1.0, ends=EPISODE, switch=STAY, **settings):
     model = KnownDynamics(push, Manifold(4), 2)
     corrected, start = ActionFlowPolicy(model, Bounded(*BOX), **settings), starts(dtype)
     primer, td = corrected.make_tensordict_primer(), TensorDict()
     for k, plan in enumerate(plans):
         if k % ends == 0:
             td, state = primer(td), next(start)
+        corrected.enabled = switch.get(k, corrected.enabled)
         td = corrected(td.update({"observation": state, "action": plan}))
         executed, td = td["action"], step_mdp(td)
         state = push(state.float(), gain * executed.float()).to(dtype)
         yield executed
 
 
-def controller(plans, dtype, gain=-1.0, ends=EPISODE, keep_memory_on_reset=False, **settings):
+def controller(
+    plans, dtype, gain=-1.0, ends=EPISODE, switch=STAY, keep_memory_on_reset=False, **settings
+):
     model = KnownDynamics(push, Manifold(4), 2)
     corrected = ActionFlowPolicy(
         model, Bounded(*BOX), keep_memory_on_reset=keep_memory_on_reset, **settings
@@ -68,6 +73,8 @@ def controller(plans, dtype, gain=-1.0, ends=EPISODE, keep_memory_on_reset=False
             state = next(start)
             memory = memory.clone() if keep_memory_on_reset else torch.zeros_like(memory)
             memory[0] *= -1
+        if k in switch:
+            memory[0] = 1.0 if switch[k] else 2.0
         memory, executed = pure(memory, state, plan)
         state = push(state.float(), gain * executed.float()).to(dtype)
         yield executed
@@ -77,10 +84,11 @@ def numpy_of(dtype):
     return torch.zeros((), dtype=dtype).numpy().dtype
 
 
-def wrapper(plans, dtype, gain=-1.0, ends=EPISODE, **settings):
+def wrapper(plans, dtype, gain=-1.0, ends=EPISODE, switch=STAY, **settings):
     env = ActionFlowWrapper(Puck(numpy_of(dtype), gain, ends), push, **settings)
     env.reset(seed=0)
-    for plan in plans:
+    for k, plan in enumerate(plans):
+        env.enabled = switch.get(k, env.enabled)
         *_, over, _, info = env.step(plan)
         if over:
             env.reset()
@@ -88,12 +96,13 @@ def wrapper(plans, dtype, gain=-1.0, ends=EPISODE, **settings):
 
 
 def vector(mode):
-    def run(plans, dtype, gain=-1.0, ends=EPISODE, **settings):
+    def run(plans, dtype, gain=-1.0, ends=EPISODE, switch=STAY, **settings):
         makers = [lambda: Puck(numpy_of(dtype), gain, ends)] * 2
         env = SyncVectorEnv(makers, autoreset_mode=mode)
         env = ActionFlowVectorWrapper(env, push, **settings)
         env.reset(seed=0)
-        for plan in plans:
+        for k, plan in enumerate(plans):
+            env.enabled = switch.get(k, env.enabled)
             _, _, over, _, info = env.step(torch.stack([plan, plan]))
             if mode is AutoresetMode.DISABLED and over.any():
                 env.reset(options={"reset_mask": over})
@@ -180,6 +189,74 @@ def test_a_correction_from_the_first_steps_on_is_said_once(shell):
         texts = [str(w.message) for w in issued if "were corrected" in str(w.message)]
         assert len(texts) == count
         assert all("(gain 0.5 on all: dt or a unit of the model?)" in text for text in texts)
+
+
+def test_switched_off_plans_are_executed_to_the_bit_and_evidence_is_gathered(shell):
+    plans, switch = plans_of(40), {1: False, 20: True, 25: False, 35: True}
+    executed = torch.stack(list(shell(plans, torch.float32, ends=99, switch=switch)))
+    off = [*range(1, 20), *range(25, 35)]
+    on = [*range(20, 25), *range(35, 40)]
+    assert executed[off].equal(plans[off])
+    assert ((executed + plans)[on].abs() < 0.05).all()
+
+
+LIMITS = {"by axis": {"most": [0.1, 2.0]}, "both": {"most": 0.4, "rate": [0.1, 0.05]}}
+
+
+@pytest.mark.parametrize("case", LIMITS)
+def test_no_command_is_beyond_the_limits_and_what_they_leave_is_used(shell, case):
+    plans, limits = 0.3 * plans_of(30), LIMITS[case]
+    executed = torch.stack(list(shell(plans, torch.float32, ends=99, **limits)))
+    moved = executed - plans
+    most, rate = (torch.tensor(limits.get(name, 2.0)) for name in ("most", "rate"))
+    assert (moved.abs() <= most + 1e-6).all() and (moved.diff(dim=0).abs() <= rate + 1e-6).all()
+    for plan, before, now in zip(plans[12:], moved[11:], moved[12:], strict=False):
+        wanted = (-2 * plan).clamp(before - rate, before + rate).clamp(-most, most)
+        torch.testing.assert_close(now, wanted, atol=0.05, rtol=0)  # it knows what acted
+
+
+HELD = [
+    ({"most": 0.1}, 1),
+    ({"rate": 0.01}, 1),
+    ({"most": 2.0}, 0),
+    ({"most": 0.1, "gain": 1.0}, 0),
+]
+
+
+@pytest.mark.parametrize(("how", "count"), HELD)
+def test_it_is_said_that_limits_hold_the_correction_back(how, count):
+    with warnings.catch_warnings(record=True) as issued:
+        warnings.simplefilter("always")
+        list(wrapper(0.5 * plans_of(75), torch.float32, ends=200, **how))
+    texts = [str(w.message) for w in issued if "held back by the limits most and" in str(w.message)]
+    assert len(texts) == count and all("(gain -1 on all" in text for text in texts)
+
+
+def test_an_entry_switches_missions_of_a_batch_off_one_by_one():
+    """And what is told of a limited action is what it does."""
+    actual = KnownDynamics(lambda s, a: push(s, -a), Manifold(4), 2)
+    world = PlanningEnv(actual, KnownReward(lambda s, a, n: -n.square().sum(-1)), *BOX)
+    model = KnownDynamics(push, Manifold(4), 2)
+    env = TransformedEnv(world, ActionFlowTransform(model, most=0.5))
+    pure, plans = ActionFlowPolicy(model, Bounded(*BOX), most=0.5), plans_of(30)
+    td = env.reset(TensorDict({"observation": torch.zeros(2, 4)}, [2]))
+    other = pure.make_tensordict_primer()(TensorDict({}, [2]))
+    for k, plan in enumerate(plans):
+        if k == 20:
+            for each in (td, other):
+                each["afm", "enabled"] = torch.tensor([True, False])
+        other["observation"], other["action"] = td["observation"], plan.expand(2, 2)
+        other = pure(other)
+        td = env.step(td.set("action", plan.expand(2, 2)))["next"]
+        executed = td["afm", "executed_action"]
+        assert executed.equal(other["action"])
+        other = step_mdp(other)
+        if k > 12:
+            told = td["afm", "predicted_effect"][0]
+            torch.testing.assert_close(told, -executed[0], atol=0.1, rtol=0)
+            assert not executed[0].equal(plan) and executed[1].equal(plan) is (k >= 20)
+    env.transform.load_state_dict(env.transform.state_dict())
+    assert td["afm", "enabled"].tolist() == [True, False]
 
 
 CAUSES = {

@@ -1,5 +1,7 @@
 """What shells cannot use is refused where it is given, by name and value."""
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -76,6 +78,16 @@ REFUSED = [
     (r"\['act'\]: the environment has no .*'action'", lambda: track(in_keys_inv=["act"])),
     ("transform.enabled='yes'", lambda: transform(enabled="yes")),
     ("transform.extend_action_box='yes'", lambda: transform(extend_action_box="yes")),
+    *(
+        (
+            rf"transform.{name}={value}: expected a finite number in \(0, 2\]",
+            partial(transform, **{name: value}),
+        )
+        for name in ("most", "rate")
+        for value in (0, -0.1, 2.5, True, float("nan"))
+    ),
+    (r"transform.most=\[0.1\]: expected one number, or 2", lambda: transform(most=[0.1])),
+    ("transform.rate=0.1: with reported_key", lambda: transform(rate=0.1, reported_key="given")),
     ("transform.carry_memory=1", lambda: transform(carry_memory=1)),
     # wrappers
     ("Discrete", lambda: wrapped(action_space=Discrete(2))),
@@ -93,6 +105,8 @@ REFUSED = [
     ("a ActionFlow", lambda: wrapped(belief=True, corrector=LeastSquares(-ONES, ONES))),
     ("belief='yes'", lambda: wrapped(belief="yes")),
     ("delay_compensation='yes'", lambda: wrapped(delay_compensation="yes")),
+    ("wrapper.rate=3: expected", lambda: wrapped(rate=3)),
+    ("wrapper.most=.0.1, 0.1, 0.1.: expected one", lambda: wrapped(most=[0.1, 0.1, 0.1])),
     ("give observe=", lambda: wrapped(delay=2, **TWICE)),
     ("a corrector was given too", lambda: wrapped(delay=2, corrector=ActionFlow(-ONES, ONES))),
     # what they are given at a step
