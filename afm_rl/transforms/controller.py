@@ -29,8 +29,8 @@ Draw = tuple[tuple[int, ...], float | None]
 OFF = 2.0  # first number of a memory while plans are executed as they are
 RETURNED = ("next_memory", "executed_action")
 MEANINGS = {
-    "memory": "what is remembered; zeros begin a mission, then next_memory of the tick before; with "
-    "2 as its first number plans are executed as they are, with 1 they are corrected",
+    "memory": "what is remembered; zeros begin a mission, then next_memory of the tick before; "
+    "while its first number is 2, plans are executed as they are, with 1 they are corrected",
     "observation": "the state, as it was measured; not a number where there is no reading",
     "action": "the planned action, in the robot's units",
     "noise": "standard normal numbers, fresh ones at each tick, none beyond noise_bound",
