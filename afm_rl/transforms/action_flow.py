@@ -31,11 +31,11 @@ class ActionFlowTransform(Shell, StatefulTransform):
     r"""Action Flow Matching: the planned action goes in, the action that does it comes out.
 
     A view of the :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``,
-    ``enabled``, ``most``, ``rate``, ``delay``, ``delay_compensation``, ``belief``, ``keep_memory_on_reset``,
-    ``extend_action_box`` and ``record``. On the way to the environment the planned action is
-    corrected; on the way back the transition enters the memory. The dynamics model is shared with
-    planner and updater; of one that learns, the *present* one is asked about the newest transitions
-    again.
+    ``enabled``, ``most``, ``rate``, ``delay``, ``delay_compensation``, ``belief``,
+    ``keep_memory_on_reset``, ``extend_action_box`` and ``record``. On the way to the environment
+    the planned action is corrected; on the way back the transition enters the memory. The dynamics
+    model is shared with planner and updater; of one that learns, the *present* one is asked about
+    the newest transitions again.
 
     Every mission of a batch has a memory of its own, which a reset empties. Under ``prefix`` are
     the entries of the loop (the root action stays the planned one, which losses of policies need;
@@ -44,7 +44,7 @@ class ActionFlowTransform(Shell, StatefulTransform):
     * ``(prefix, "observation")`` and ``(prefix, "arrival")`` ``(*B, S)``: the measured state, and
       the one in which the next action will act; while no action is late, the same,
     * ``(prefix, "delay")`` ``(*B)``: in how many steps that will be, an integer; 0 at once, and
-      with ``enabled=False``.
+      while the correction is switched off.
 
     The memory is large, and no part of rollouts and of what collectors yield: of the newest step it
     is held here. A tensordict of another step goes on with an empty one, and a warning.

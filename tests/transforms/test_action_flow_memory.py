@@ -74,6 +74,7 @@ def test_it_is_empty_at_the_start_but_for_state_and_box(make):
     for seen in ("observation", "arrival"):
         assert torch.equal(entries.pop(seen), td["observation"])
     begun = env.transform.corrector.begin(td["observation"])
+    assert entries.pop("enabled").all()
     assert torch.equal(memory, begun) and not any(part.any() for part in entries.values())
 
 
