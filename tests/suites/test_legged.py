@@ -32,7 +32,7 @@ def small(legged):
 
 
 def test_the_command_plays_and_goes_on(legged, monkeypatch, tmp_path, capsys):
-    asked = ["run.py", "--out", str(tmp_path), "--seeds", "1", "--steps", "140", "--faults"]
+    asked = ["run.py", "--out", str(tmp_path), "--seeds", "1", "--steps", "60", "--faults"]
     monkeypatch.setattr("sys.argv", [*asked, "none", "all at half", "--methods", "alone", "truth"])
     legged("run").main()
     said = capsys.readouterr().out
@@ -42,22 +42,22 @@ def test_the_command_plays_and_goes_on(legged, monkeypatch, tmp_path, capsys):
     assert "small, alone: 1 episodes" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("fault", ["offset .1 on all", "all at half", "swapped pair", "late 2"])
+@pytest.mark.parametrize("fault", ["offset .1 on all", "all at half", "swapped pair"])
 def test_with_the_truth_a_robot_walks_on(legged, small, fault):
     rewards_of, pairs = legged("episodes").rewards_of, [("none", 0), (fault, 0)]
-    rewards, lasted = rewards_of(small, "truth", pairs, 160)
+    rewards, lasted = rewards_of(small, "truth", pairs, 100)
     healthy, corrected = -rewards[small.at :].mean(0)
-    alone = -rewards_of(small, "alone", pairs[1:], 160)[0][small.at :].mean()
-    assert (lasted == 160).all() and healthy < 0.15
+    alone = -rewards_of(small, "alone", pairs[1:], 100)[0][small.at :].mean()
+    assert (lasted == 100).all() and healthy < 0.15
     assert corrected < healthy + 0.05 and alone > corrected
 
 
 def test_corrected_a_robot_of_servos_walks_on(legged, small):
-    """The correction as it comes; three robots side by side, some seconds."""
+    """The correction as it comes; two robots side by side, some seconds."""
     rewards_of = legged("episodes").rewards_of
-    pairs = [("one reversed", 0), ("all at half", 0), ("late 1", 0)]
+    pairs = [("one reversed", 0), ("all at half", 0)]
     alone, corrected = (
-        -rewards_of(small, method, pairs, 180)[0][small.at :].mean(0) for method in ("alone", "AFM")
+        -rewards_of(small, method, pairs, 110)[0][small.at :].mean(0) for method in ("alone", "AFM")
     )
     assert (corrected < 0.6 * alone).all()
 
