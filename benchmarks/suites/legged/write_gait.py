@@ -40,8 +40,7 @@ def main() -> None:
     weight = gait()
     sizes = {"obs": [1, len(weight)], "continuous_actions": [1, weight.shape[1]]}
     ends = [
-        helper.make_tensor_value_info(name, TensorProto.FLOAT, size)
-        for name, size in sizes.items()
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, size) for name, size in sizes.items()
     ]
     node = helper.make_node("MatMul", ["obs", "weight"], ["continuous_actions"])
     weights = [numpy_helper.from_array(weight, "weight")]
