@@ -99,8 +99,8 @@ def test_the_table_is_written_into_a_page(module, monkeypatch, tmp_path, capsys)
     run.main()
     assert "| one servo | healthy |" in capsys.readouterr().out
     new = page.read_text()
-    assert new.startswith("a\n<!-- safety begin -->\nOf 2 situations, 3 seeds, 0 are worse, 1 bett")
-    assert "| one servo | 2 | 1 |  |\n<!-- safety end -->\nz\n" in new and "old" not in new
+    assert new.startswith("a\n<!-- safety begin -->\nOf 2 situations 0 are worse, 1 better")
+    assert "| one servo | 3 | 2 | 1 |  |\n<!-- safety end -->\nz\n" in new and "old" not in new
     page.write_text("no marks")
     with pytest.raises(SystemExit, match="has no lines <!-- safety begin -->"):
         run.main()
