@@ -95,6 +95,7 @@ def test_the_table_is_written_into_a_page(module, monkeypatch, tmp_path, capsys)
     page = tmp_path / "page.md"
     page.write_text("a\n<!-- safety begin -->\nold\n<!-- safety end -->\nz\n")
     command = ["run.py", "--robots", "one servo", "--seeds", "3", "--out", str(tmp_path)]
+    command += ["--set", "saturation=clip", "samples=8"]
     monkeypatch.setattr("sys.argv", [*command, "--write", str(page)])
     run.main()
     assert "| one servo | healthy |" in capsys.readouterr().out

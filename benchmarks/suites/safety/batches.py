@@ -20,7 +20,7 @@ def play(
     world: World,
     situations: Sequence[dict[str, float]],
     seeds: int,
-    settings: dict[str, float] | None = None,
+    settings: dict | None = None,
 ) -> Tensor:
     """Return the mean cost a step after :data:`SINCE`, ``(situations, seeds)``.
 
@@ -44,7 +44,7 @@ def play_in_box(
     world: World,
     situations: Sequence[dict[str, float]],
     seeds: int,
-    settings: dict[str, float] | None,
+    settings: dict | None,
     ends: tuple[float, float] | None,
 ) -> Tensor:
     """Return the costs of :func:`play` where the correction knows actions between two ends."""

@@ -15,13 +15,14 @@ from pathlib import Path
 import pandas as pd
 import torch
 from batches import play as play_world
+from omegaconf import OmegaConf
 from tasks import CHANGES, ROBOTS
 from tasks import play as play_task
 from worlds import SITUATIONS, WORLDS
 
 from afm_rl.storage.files import write_whole
 
-SEEDS = {"30 servos": 4}  # each plays thirty joints; of the other robots 8
+SEEDS = {"30 servos": 3}  # each plays thirty joints; of the other robots 8
 MARKS = "<!-- safety begin -->\n", "<!-- safety end -->\n"
 
 
@@ -31,12 +32,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, help="of every situation, at least 2")
     parser.add_argument("--out", type=Path, default=Path("outputs/safety"))
     parser.add_argument(
-        "--set", nargs="*", default=[], help="of the correction, such as odds=0; with another --out"
+        "--set",
+        nargs="*",
+        default=[],
+        help="of the correction, such as saturation=clip; with another --out",
     )
     parser.add_argument("--write", type=Path, help="page whose table is written")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    settings = {name: float(value) for name, value in (pair.split("=") for pair in args.set)}
+    settings = dict(OmegaConf.from_dotlist(args.set))
     if settings and not set(args.robots) <= set(WORLDS):
         parser.error(f"--set: only with --robots of {', '.join(WORLDS)}")
     tables = [
@@ -53,7 +57,7 @@ def main() -> None:
         write_whole(args.write, new.encode())
 
 
-def costs(name: str, seeds: int, out: Path, settings: dict[str, float]) -> pd.DataFrame:
+def costs(name: str, seeds: int, out: Path, settings: dict) -> pd.DataFrame:
     """Return the costs of a robot, a row for each situation and seed; from the file if it is."""
     file = out / f"{name.replace(' ', '_')}.{seeds}.csv"
     if file.is_file():
