@@ -252,8 +252,8 @@ class ActionFlow(PairCorrector):
     def is_sudden(self, parts: Fields) -> Tensor:
         """Return whether a robot that was healthy, if not exactly as modelled, changes now.
 
-        Its newest effect, but not the one before, surprises the most probable of the models by
-        which it is healthy by five standard deviations of the noise that was learnt, ``(*B, 1)``.
+        On some axis the newest effect, but not the one before, surprises the most probable of the
+        models by which it is healthy, by five standard deviations of the learnt noise, ``(*B, 1)``.
         """
         size, pairs = self.action_size, parts["pairs"]
         sent, effect, std, _ = pairs[..., -2:, :].split([size, size, size, 1 + self.tail], -1)
@@ -261,8 +261,8 @@ class ActionFlow(PairCorrector):
         likely = parts["forecasts"].gather(-2, weights.argmax(-2, keepdim=True))
         expected = torch.cat([sent[..., :1, :], likely], -2)
         far = (effect - expected).abs() > 5 * torch.hypot(std, parts["noise"].unsqueeze(-2))
-        before, now = far.any(-1, keepdim=True).unbind(-2)
-        return (weights.sum(-2) > 0.5).all(-1, keepdim=True) & now & ~before
+        before, now = far.unbind(-2)
+        return ((weights.sum(-2) > 0.5).all(-1) & (now & ~before).any(-1)).unsqueeze(-1)
 
     def share_losses(self, before: Tensor, losses: Tensor) -> Tensor:
         """Return the losses ``(*B, M, A)`` as models may have them until a change is known.

@@ -98,7 +98,8 @@ HYPOTHESES = (
     # In periodic motion coupling looks like a delay. These are of the present command, whatever
     # delay is believed, so that a wrong one can be rejected.
     Hypothesis("affine", "linear", follows_delay=False),
-    Hypothesis("driven", "linear", follows_delay=False),  # by the command of another axis: swapped
+    Hypothesis("driven", "linear", follows_delay=False),  # by the command of another axis
+    Hypothesis("swapped", "linear", follows_delay=False),  # two axes: each other's command
     *_slow("delay"),
     # The gain of commands that are not late, as there is one for every delay and lag.
     Hypothesis("gain_now", "delayed gain", follows_delay=False, log_prior=None),

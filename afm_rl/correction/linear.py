@@ -34,7 +34,7 @@ class Lines(NamedTuple):
 
     How unsure a fit is of the effect of an action says Bayesian linear regression,
     :math:`x^T (X^T W X + \rho)^{-1} x` in units of the noise: of a model of one axis
-    :math:`c_0 + c_1 u + c_2 u^2`. The last two mix axes.
+    :math:`c_0 + c_1 u + c_2 u^2`. The last three mix axes; of swapped ones nothing is fitted.
     """
 
     matrix: Tensor
@@ -42,7 +42,7 @@ class Lines(NamedTuple):
     bias: Tensor
     """b, ``(B, L, A)``."""
     spread: Tensor
-    """c of those of one axis, ``(B, L - 2, 3, A)``."""
+    """c of those of one axis, ``(B, L - 3, 3, A)``."""
     leverage: Tensor
     """:math:`(X^T W X + \rho)^{-1}` of the affine map, x = (u, 1), ``(B, A + 1, A + 1)``."""
     driver: Tensor
@@ -55,7 +55,8 @@ class Lines(NamedTuple):
         inputs = torch.nn.functional.pad(actions, (0, 1), value=1.0)
         affine = ((inputs @ self.leverage) * inputs).sum(-1, keepdim=True).expand_as(actions)
         driven = actions.square() @ self.driver.mT
-        mixing = torch.stack([affine, torch.where(driven > 0, driven, affine)], 1)
+        driven = torch.where(driven > 0, driven, affine)
+        mixing = torch.stack([affine, driven, torch.zeros_like(driven)], 1)
         return torch.cat([c0 + u * (c1 + u * c2), mixing], 1)
 
     def effect(self, actions: Tensor) -> Tensor:
@@ -103,8 +104,9 @@ def fit_lines(
     affine, shift = fit_affine(sent.mT, v.mT, weight.mT)
     exact = torch.as_tensor(noise).to(v).clamp_min(EXACT).square().unsqueeze(-1)
     driven, rest, driver = _driven(sent, v, weight, exact, affine, shift.unsqueeze(-1))
-    matrix = torch.cat([torch.diag_embed(gains.mT), torch.stack([affine, driven], 1)], 1)
-    bias = torch.cat([*biases, shift.unsqueeze(-1), rest], -1).mT
+    mixing = torch.stack([affine, driven, _swapped(sent, v, weight, exact)], 1)
+    matrix = torch.cat([torch.diag_embed(gains.mT), mixing], 1)
+    bias = torch.cat([*biases, shift.unsqueeze(-1), rest, none[..., :1]], -1).mT
     constant, slopes = quadratic(1 / mass, 0), quadratic(1 / square, 2)  # (B, A, W, 3)
     spreads = [
         quadratic(none[..., :1], 0),  # reversed: there is nothing that could be unsure
@@ -281,3 +283,24 @@ def _driven(
     variance = nothing.scatter(-1, driver, explained / square.gather(-1, driver))
     matrix = torch.where(explained, chosen, else_matrix)
     return matrix, torch.where(explained, 0.0, else_bias), variance
+
+
+def _swapped(u: Tensor, v: Tensor, weight: Tensor, exact: Tensor) -> Tensor:
+    """Return the matrix ``(B, A, A)`` of axes of which two may have each other's command.
+
+    Which two, the fewest of all rows tell: both have to do what the other one is commanded.
+
+    Args:
+        u: executed actions, ``(B, A, K)``.
+        v: effects.
+        weight: of both.
+        exact: mean square of what a model that explains all rows may leave, ``(B, A, 1)``.
+    """
+    size, mass = u.shape[-2], weight.sum(-1, keepdim=True) + PRIOR
+    own = torch.eye(size, device=u.device, dtype=u.dtype)
+    cross = weight @ u.square().mT - 2 * (weight * v) @ u.mT
+    miss = ((weight * v.square()).sum(-1, keepdim=True) + cross) / mass + exact * (1 - own)
+    partner = (miss + miss.mT).argmin(-1)
+    axis = torch.arange(size, device=u.device)
+    partner = torch.where(partner.gather(-1, partner) == axis, partner, axis)
+    return torch.zeros_like(miss).scatter(-1, partner.unsqueeze(-1), 1.0)

@@ -84,6 +84,7 @@ def test_every_line_is_the_least_squares_solution_of_its_rows():
         "drift": (gain_12, v[-1] - gain_12 * u[-1]),
         "arx": (b, c * u[-1] + a * v[-1] + d),
         "affine": solved([u, one], v),
+        "swapped": (1.0, 0.0),  # one axis has no other
     }
     assert {*wanted, "trend", "driven"} == set(LINEAR)
     for name, (gain, offset) in wanted.items():
@@ -118,6 +119,7 @@ def test_the_variance_of_every_line_is_that_of_its_prediction():
         "arx": leverage_of([at, u[-1], v[-1], 1], u[1:], u[:-1], v[:-1], one[1:]),
         "trend": 5.0,
         "affine": leverage_of([at, 0.4, 1], u, w, one),
+        "swapped": 0.0,
     }
     for name, value in wanted.items():
         assert float(variance[LINEAR.index(name), 0]) == pytest.approx(value, rel=0.02), name
@@ -181,3 +183,15 @@ def test_singular_maps_have_answers_of_moderate_size():
     almost = torch.tensor([[1.0, 1.0], [1.0, 1.0 + 1e-6]])
     action = invert_affine(almost, torch.zeros(2, 1), torch.tensor([[1.0], [-1.0]]))
     assert action.abs().max() < 1
+
+
+def test_swapped_are_the_two_that_do_what_the_other_one_is_commanded():
+    """From two rows; an axis that does as commanded, and one whose partner does, has no other."""
+    u = torch.tensor([[[0.3, -0.2, 0.1, 0.5], [0.1, 0.4, -0.3, 0.2]]])
+    swapped = LINEAR.index("swapped")
+    for order in ([2, 1, 0, 3], [0, 1, 2, 3], [3, 2, 1, 0]):
+        matrix = fit_lines(u, u, u[..., order], torch.ones(1, 2, 4)).matrix[0, swapped]
+        torch.testing.assert_close(matrix, torch.eye(4)[order])
+    around = u[..., [1, 2, 0, 3]]  # three of them in a ring are no pairs
+    matrix = fit_lines(u, u, around, torch.ones(1, 2, 4)).matrix[0, swapped]
+    torch.testing.assert_close(matrix, matrix.mT)
