@@ -178,7 +178,10 @@ def larger(problem: Problem, model: Model, tried: int = 3) -> Iterator[Model]:
     """Yield the best models of the own command with one number more, from a good beginning."""
     own, shape = problem.u[:, model.driver], model.shape
     models = []
-    for names, options in _beginnings(own, shape).items():
+    beginnings = _beginnings(own, shape)
+    if weight_of(problem, model) > 0.8:  # a limit would leave neighbours that are alike
+        beginnings.pop("rate", None)
+    for names, options in beginnings.items():
         trials = (
             _best(problem, replace(begin, active=(*begin.active, *names.split())), options)
             for begin in _bases(model, names)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -154,6 +155,11 @@ class Clock:
             if self.hold:
                 place = np.floor(place + 1e-9)
         return np.clip(place, self.start, len(rows) - 1)
+
+    @cached_property
+    def since(self) -> np.ndarray:
+        """Return the steps since each row's episode began, ``(N,)``."""
+        return self.time - self.time[self.start]
 
     @property
     def even(self) -> bool:

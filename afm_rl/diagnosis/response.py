@@ -102,10 +102,12 @@ def shaped(
 
 def begin_at(clock: Clock, values: np.ndarray, begin: np.ndarray, delay: float) -> np.ndarray:
     """Return values ``(N, ...)`` with those before the first command of an episode replaced."""
-    waited = (clock.time - clock.time[clock.start] - delay + 1).clip(0.0, 1.0)
-    waited[clock.start == np.arange(len(waited))] = 0.0
+    since, values = clock.since, values.copy()
+    early = np.flatnonzero(since < max(delay, 1e-9))
+    waited = np.where(since[early] > 0, (since[early] - delay + 1).clip(0.0), 0.0)
     share = waited.reshape(-1, *(1 for _ in values.shape[1:]))
-    return begin + share * (values - begin)
+    values[early] = begin[early] + share * (values[early] - begin[early])
+    return values
 
 
 def look_back(clock: Clock, values: np.ndarray, shape: Shape) -> np.ndarray:
@@ -188,6 +190,9 @@ def limit_rate(target: np.ndarray, rate: Any, start: np.ndarray) -> np.ndarray:
         return _side_by_side(
             target, start, lambda x, u: np.minimum(np.maximum(u, x - rate), x + rate)
         )
+    same = start[1:] == start[:-1]
+    if not (np.abs(np.diff(target)[same]) > rate).any():
+        return target
     places: list[float] = []
     for values in _episodes(target, start):
         place = values[0]
