@@ -239,7 +239,8 @@ def _beginnings(own: np.ndarray, shape: Shape) -> dict[str, list[dict[str, Any]]
 
 def _bases(model: Model, names: str) -> Iterator[Model]:
     """Yield the model, and what may stand in the place of its delay and lag."""
-    yield model
+    if names != "rate" or "keep" not in model.active:  # a limit looks like a lag
+        yield model
     rest = tuple(name for name in model.active if name not in ("delay", "keep"))
     # Some may be mistaken for delay and lag.
     if names.split()[0] not in ("play", "stick", "hold", "rate") or len(rest) == len(model.active):
