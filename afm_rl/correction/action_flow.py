@@ -252,17 +252,18 @@ class ActionFlow(PairCorrector):
     def is_sudden(self, parts: Fields) -> Tensor:
         """Return whether a robot that was healthy, if not exactly as modelled, changes now.
 
-        On some axis the newest effect, but not the one before, surprises the most probable of the
-        models by which it is healthy, by five standard deviations of the learnt noise, ``(*B, 1)``.
+        On some axis the newest effect, but not the one before, surprises all models by which it is
+        healthy by five standard deviations of the learnt noise, ``(*B, 1)``.
         """
         size, pairs = self.action_size, parts["pairs"]
         sent, effect, std, _ = pairs[..., -2:, :].split([size, size, size, 1 + self.tail], -1)
-        weights = self.weights(parts) * self.healthy.unsqueeze(-1)
-        likely = parts["forecasts"].gather(-2, weights.argmax(-2, keepdim=True))
-        expected = torch.cat([sent[..., :1, :], likely], -2)
-        far = (effect - expected).abs() > 5 * torch.hypot(std, parts["noise"].unsqueeze(-2))
-        before, now = far.unbind(-2)
-        return ((weights.sum(-2) > 0.5).all(-1) & (now & ~before).any(-1)).unsqueeze(-1)
+        noise = 5 * torch.hypot(std, parts["noise"].unsqueeze(-2))
+        miss = (effect[..., 1:, :] - parts["forecasts"]).abs()
+        miss = torch.where(self.healthy.unsqueeze(-1) > 0, miss, torch.inf).amin(-2)
+        before = (effect - sent)[..., 0, :].abs() > noise[..., 0, :]
+        sudden = ((miss > noise[..., 1, :]) & ~before).any(-1, keepdim=True)
+        believed = (self.weights(parts) * self.healthy.unsqueeze(-1)).sum(-2)
+        return sudden & (believed > 0.5).all(-1, keepdim=True)
 
     def share_losses(self, before: Tensor, losses: Tensor) -> Tensor:
         """Return the losses ``(*B, M, A)`` as models may have them until a change is known.
