@@ -211,9 +211,9 @@ def pretrain_ensemble(
     action_box: tuple[Tensor, Tensor],
     *,
     samples: int = option(50_000, "transitions; a tenth more are held out", ge=1, le=100_000_000),
-    epochs: int = option(3, "passes over them", ge=1, le=100_000_000),
-    batch_size: int = option(64, "transitions per step and member", ge=1, le=100_000_000),
-    lr: float = option(1e-3, "largest step size of Adam", gt=0, le=1),
+    epochs: int = option(16, "passes over them", ge=1, le=100_000_000),
+    batch_size: int = option(256, "transitions per step and member", ge=1, le=100_000_000),
+    lr: float = option(2e-3, "largest step size of Adam", gt=0, le=1),
     one_cycle: bool = option(True, "the step size rises and falls; False: it stays, as published"),
     tolerance: float = option(
         0.0, "least change of the held-out loss to go on; published: 1e-3", ge=0
