@@ -21,6 +21,7 @@ from afm_rl.errors import ConfigurationError
 FRAMES, RATE = 150, 15  # at most; per second
 SIZE = 480, 640  # height and width of MuJoCo's own buffer, pixels
 BODY, FIXED = "#0072b2", "#999999"
+BONE = 0.015  # m, radius
 Moves = dict[Artist, Callable[[int], object]]
 
 
@@ -167,7 +168,7 @@ def can_render() -> bool:
 def _bones(model: Any, states: np.ndarray) -> Iterator[np.ndarray]:
     """Yield pictures of the axes of capsules and the middles of other geoms."""
     ends, wide = segments(model, states)  # (T, K, 2, 3), (K,)
-    moving = np.array([model.body_weldid[body] > 0 for body in model.geom_bodyid])[_solid(model)]
+    moving = np.append(model.body_weldid[model.geom_bodyid[_solid(model)]], bones(model)[:, 1]) > 0
     own = ends[:, moving] if moving.any() else ends
     spread = np.ptp(own.reshape(-1, 3), axis=0)
     across = [0, 2] if spread[2] > spread[1] else [0, 1]
@@ -192,7 +193,7 @@ def _bones(model: Any, states: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def segments(model: Any, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ends (m) of the axes of geoms, ``(T, K, 2, 3)``, and their radii (m), ``(K,)``.
+    """Return ends (m) of the axes of geoms and of :func:`bones`, ``(T, K, 2, 3)``, and radii (m).
 
     Planes are left out; geoms that are not long have both ends near the middle: a line without any
     length would not be drawn.
@@ -200,15 +201,36 @@ def segments(model: Any, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     import mujoco
 
     data, solid = mujoco.MjData(model), _solid(model)
-    long = np.isin(model.geom_type[solid], (3, 5))  # capsules and cylinders
-    half = np.where(long, model.geom_size[solid, 1], 0.05 * model.geom_size[solid, 0])[:, None]
-    ends = []
+    kind, size = model.geom_type[solid], model.geom_size[solid]
+    boxes, long = np.isin(kind, (4, 6, 7)), np.isin(kind, (3, 5))  # ellipsoids, meshes; capsules
+    radius = np.where(boxes, np.median(size, 1), size[:, 0])
+    half = np.where(boxes, np.maximum(size.max(1) - radius, 0.05 * radius), 0.05 * radius)
+    half = np.where(long, size[:, 1], half)[:, None]
+    which, along = np.arange(len(solid)), np.where(boxes, size.argmax(1), 2)
+    pairs, ends = bones(model), []
     for row in states:
         data.qpos = row[: model.nq]
         mujoco.mj_kinematics(model, data)
-        axis = half * data.geom_xmat[solid].reshape(-1, 3, 3)[..., 2]
-        ends.append(np.stack([data.geom_xpos[solid] - axis, data.geom_xpos[solid] + axis], 1))
-    return np.stack(ends), model.geom_size[solid, 0]
+        axis = half * data.geom_xmat[solid].reshape(-1, 3, 3)[which, :, along]
+        both = np.stack([data.geom_xpos[solid] - axis, data.geom_xpos[solid] + axis], 1)
+        ends.append(np.concatenate([both, data.xpos[pairs]]))
+    return np.stack(ends), np.append(radius, [BONE] * len(pairs))
+
+
+def bones(model: Any) -> np.ndarray:
+    """Return the bodies (parent, child) ``(K, 2)`` of which one has no shape: to be joined.
+
+    So a robot whose meshes are left out is seen as its skeleton.
+    """
+    shaped = np.isin(np.arange(model.nbody), model.geom_bodyid[_solid(model)])
+    parents = model.body_parentid
+    length = np.linalg.norm(model.body_pos, axis=1)
+    pairs = [
+        (parents[child], child)
+        for child in range(1, model.nbody)
+        if parents[child] and length[child] > 0 and not (shaped[parents[child]] and shaped[child])
+    ]
+    return np.array(pairs, dtype=int).reshape(-1, 2)
 
 
 def curves(t: np.ndarray, states: np.ndarray, names: Sequence[str]) -> Iterator[np.ndarray]:

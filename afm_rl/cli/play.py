@@ -2,6 +2,7 @@
 
 afm-rl-play                          a half cheetah
 afm-rl-play --robot hopper --open    another robot; the browser opens
+afm-rl-play --robot FOLDER/go1       a legged robot of a folder (docs/legged.md)
 afm-rl-play --policy mine.safetensors   a policy of your own, in its own task
 afm-rl-play --robot hopper --policy mine.onnx   one of any origin, for this robot
 """
@@ -20,7 +21,7 @@ def main() -> None:
     """Run ``afm-rl-play``; a mistake ends in one line and exit status 2."""
     parser = OneLineParser("afm-rl-play", __doc__)
     add = parser.add_argument
-    add("--robot", help="half_cheetah (without anything said), hopper, ant, ugv, ...")
+    add("--robot", help="half_cheetah (without anything said), hopper, ant, ugv, ...; FOLDER/NAME")
     add(
         "--policy",
         metavar="FILE",

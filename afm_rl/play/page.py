@@ -17,6 +17,7 @@ from afm_rl.play.world import SIDES, World
 from afm_rl.regimes import presets
 
 FRAME = 0.04  # seconds between two pictures
+MANY = 9  # actuators
 PLOT: Any = {"aspect": 2.0, "scales": {"x": uplot.Scale(time=False)}}
 STROKES = {name: f"rgb{colour}" for name, colour in COLOURS.items()}
 
@@ -43,11 +44,13 @@ def faults_of(world: World) -> str:
     words = str(world.sides["AFM"].env.diagnosis)
     for k, name in enumerate(world.robot.names):
         words = words.replace(f"actuator {k}:", f"{name}:").replace(f"a_{k}:", f"{name}:")
-    return "  \n".join(x for x in words.splitlines() if not x.endswith(": healthy"))
+    return "  \n".join(line for line in words.splitlines() if ": healthy" not in line)
 
 
 def believed(names: list[str], belief: dict[str, np.ndarray], noise: np.ndarray) -> list[str]:
     """Return a table of what is believed most of each actuator, and of all on average.
+
+    Of many actuators it has those that have changed.
 
     >>> believed(["joint"], {"1 step late": np.array([0.97])}, np.array([0.05]))[-1]
     '| joint | 1 step late | 97 | 0.05 |'
@@ -59,6 +62,8 @@ def believed(names: list[str], belief: dict[str, np.ndarray], noise: np.ndarray)
     rows = ["| actuator | believed | % | noise |", "|---|---|---|---|"]
     for name, chance, spread in zip(names, chances.T, noise, strict=True):
         cause = list(belief)[chance.argmax()]
+        if len(names) > MANY and cause == list(belief)[0] and name != "*mean*":
+            continue
         rows.append(f"| {name} | {cause} | {100 * chance.max():.0f} | {spread:.2g} |")
     return rows
 
@@ -80,8 +85,9 @@ class Page:
         look: Any = {"control_width": "large", "show_logo": False, "show_share_button": False}
         self.server.gui.configure_theme(**look)
         self.server.scene.set_up_direction("+z")
-        self.server.initial_camera.position = (1.6, -6.5, 3.0)
-        self.server.initial_camera.look_at = (1.6, 0.0, 0.0)  # left of the controls
+        near = 1.0 if world.robot.home is None else 0.6
+        self.server.initial_camera.position = near * np.array([1.6, -6.5, 3.0])
+        self.server.initial_camera.look_at = near * np.array([1.6, 0.0, 0.0])  # left of controls
         sides = world.sides.items()
         self.figures = {name: figure_of(self.server, name, side.inner) for name, side in sides}
         self.labels = {
@@ -98,7 +104,8 @@ class Page:
 
     def _controls(self) -> None:
         gui, names = self.server.gui, self.world.robot.names
-        self.presets = presets(len(names))
+        bias = "Bias" if self.world.robot.home is None else "Offset (rad)"
+        self.presets = self.world.robot.faults or presets(len(names))
         self.choice = gui.add_dropdown("What fails", list(self.presets), order=-2.0)
         self.chosen = self.choice.value
         with gui.add_folder("Run"):
@@ -113,7 +120,7 @@ class Page:
         for k, name in enumerate(names):
             with gui.add_folder(name, expand_by_default=k == 0):
                 self._slider(f"gain_{k}", "Gain", -1.5, 1.5, 0.1, 1.0)
-                self._slider(f"bias_{k}", "Bias", -0.5, 0.5, 0.05, 0.0)
+                self._slider(f"bias_{k}", bias, -0.5, 0.5, 0.05, 0.0)
                 self._slider(f"loss_{k}", "Lost share", 0.0, 1.0, 0.1, 0.0)
 
     def _slider(

@@ -30,8 +30,10 @@ from afm_rl.planning import (
     policy_from_onnx,
 )
 from afm_rl.planning.riccati import stationary_value
+from afm_rl.play.legged import Gait, LeggedRobot
+from afm_rl.regimes.presets import Fault
 
-Acting = Callable[[np.ndarray], np.ndarray]
+Acting = Callable[..., np.ndarray]  # of an observation, and of infos if a clock counts
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class PlayedRobot:
     Attributes:
         name: what it is called.
         make: makes an environment without a time limit.
-        policy: makes a policy; each robot has its own, as planners remember.
+        policy: makes a policy for an episode; each has its own, as planners remember.
         model: keyword arguments of :class:`~afm_rl.ActionFlowWrapper`.
         push: pushes a robot, given its innermost environment and a direction of -1 or 1.
         dt: seconds a step.
@@ -49,6 +51,8 @@ class PlayedRobot:
         score: what is counted of an episode: the name of an info, or ``reward``.
         corrector: makes the correction; the universal one in units of the box, if None comes of it.
         task: of gymnasium, without its version, if it has a stored policy.
+        faults: what can happen to its actuators, by name; None: the presets.
+        home: pose of position servos, see :class:`~afm_rl.regimes.Actuators`.
     """
 
     name: str
@@ -61,13 +65,16 @@ class PlayedRobot:
     score: str = "reward"
     corrector: Callable[[], Any] = lambda: None
     task: str | None = None
+    faults: dict[str, Fault] | None = None
+    home: torch.Tensor | None = None
 
 
 def make_robot(name: str | None = None, file: str | Path | None = None) -> PlayedRobot:
     """Return a robot of :data:`ROBOTS`, or the one that the policy in a file was trained for.
 
     Args:
-        name: of the robot; ``half_cheetah`` without name and file.
+        name: of the robot, or a folder and the name of a legged robot in it, such as
+            ``FOLDER/go1``; ``half_cheetah`` without name and file.
         file: what :func:`~afm_rl.planning.save_policy` wrote, with a task of gymnasium as ``id``
             and, if it has any, numbers as its ``settings``; or an ONNX file, for the named robot.
 
@@ -75,6 +82,11 @@ def make_robot(name: str | None = None, file: str | Path | None = None) -> Playe
         ConfigurationError: for an unknown name, or a file that does not fit it.
         ArtefactError: if the file is damaged, or holds something else.
     """
+    legged = Path(name or "")
+    if len(legged.parts) > 1:
+        if file is not None:
+            raise ConfigurationError(f"--policy={file}: {name} has its own; leave --policy out")
+        return _legged(LeggedRobot(legged.parent, legged.name))
     if file is None:
         return ROBOTS[check_choice("--robot", name or "half_cheetah", ROBOTS)]()
     graph = Path(file).suffix == ".onnx"
@@ -120,7 +132,7 @@ def _stored(file: Path, name: str | None = None) -> PlayedRobot:
 
 
 def _acting(policy: Callable[[torch.Tensor], torch.Tensor]) -> Acting:
-    return lambda seen: policy(torch.as_tensor(seen, dtype=torch.float32)).numpy()
+    return lambda seen, infos=None: policy(torch.as_tensor(seen, dtype=torch.float32)).numpy()
 
 
 def _check_fits(file: str | Path, robot: PlayedRobot, sizes: tuple[int, int]) -> None:
@@ -177,7 +189,7 @@ def _cart_pole() -> PlayedRobot:
     gain = stationary_value(a, b, *cost)[1].numpy()
     space = env.action_space
 
-    def act(seen: np.ndarray) -> np.ndarray:
+    def act(seen: np.ndarray, infos: Any = None) -> np.ndarray:
         return np.clip(-gain @ seen, space.low, space.high).astype(np.float32)
 
     return replace(_gymnasium("cart_pole", "InvertedPendulum-v5", lambda: act, {}), task=None)
@@ -188,7 +200,7 @@ def _planned(planner: Any, parts: dict[str, tuple[int, ...]]) -> Acting:
     memory = planner.make_tensordict_primer()(TensorDict({}))
     sizes = [math.prod(shape) for shape in parts.values()]
 
-    def act(seen: np.ndarray) -> np.ndarray:
+    def act(seen: np.ndarray, infos: Any = None) -> np.ndarray:
         nonlocal memory
         values = torch.as_tensor(seen).float().split(sizes)
         for (key, shape), value in zip(parts.items(), values, strict=True):
@@ -198,6 +210,20 @@ def _planned(planner: Any, parts: dict[str, tuple[int, ...]]) -> Acting:
         return planned["action"].numpy()
 
     return act
+
+
+def _legged(robot: LeggedRobot) -> PlayedRobot:
+    return PlayedRobot(
+        robot.name,
+        robot.make,
+        lambda: Gait(robot),
+        {"model": "mujoco"},
+        _push_root,
+        robot.twin.dt,
+        robot.joints,
+        faults=robot.faults,
+        home=robot.home,
+    )
 
 
 def _first(size: int) -> dict[str, Any]:

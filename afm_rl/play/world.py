@@ -23,6 +23,7 @@ class FaultyEnv(gymnasium.Wrapper):
 
     Args:
         env: with a vector of real numbers between finite bounds as action.
+        home: pose of position servos, whose faults are about it and in the unit of the commands.
 
     >>> env = FaultyEnv(gymnasium.make("Pendulum-v1"))
     >>> env.fail({"gain_0": -1.0})
@@ -31,15 +32,16 @@ class FaultyEnv(gymnasium.Wrapper):
     array([-1.5], dtype=float32)
     """
 
-    def __init__(self, env: gymnasium.Env) -> None:
+    def __init__(self, env: gymnasium.Env, home: torch.Tensor | None = None) -> None:
         super().__init__(env)
         space: Any = env.action_space
-        self.actuators = Actuators(space.low.tolist(), space.high.tolist())
-        self.half, self.noise = (space.high - space.low) / 2, 0.0
+        self.actuators = Actuators(space.low.tolist(), space.high.tolist(), home=home)
+        self.half = (space.high - space.low) / 2 if home is None else 1.0
+        self.noise = 0.0
         self.random = np.random.default_rng(0)
 
     def fail(self, fault: Fault) -> None:
-        """Have a fault of :class:`~afm_rl.regimes.Actuators`, or ``noise``, in half ranges."""
+        """Have a fault of :class:`~afm_rl.regimes.Actuators`, or ``noise``, as an offset is."""
         self.noise = fault.get("noise", 0.0)
         self.actuators.fail({name: x for name, x in fault.items() if name != "noise"})
 
@@ -60,8 +62,8 @@ class Side:
     """One of the two robots."""
 
     def __init__(self, robot: PlayedRobot, corrected: bool) -> None:
-        self.robot, self.act = robot, robot.policy()
-        self.env: Any = FaultyEnv(robot.make())
+        self.robot = robot
+        self.env: Any = FaultyEnv(robot.make(), robot.home)
         self.faulty: FaultyEnv = self.env
         if corrected:
             model, corrector = robot.model, robot.corrector()
@@ -73,6 +75,7 @@ class Side:
 
     def reset(self, seed: int) -> None:
         """Begin anew."""
+        self.act = self.robot.policy()
         self.observation, self.info = self.env.reset(seed=seed)
         self.steps, self.total, self.lying = 0, 0.0, 0.0
 
@@ -83,7 +86,7 @@ class Side:
             if self.lying <= 0:
                 self.reset(self.falls)
             return
-        planned = self.act(self.observation)
+        planned = self.act(self.observation, self.info)
         self.observation, reward, over, _, self.info = self.env.step(planned)
         self.steps, self.total = self.steps + 1, self.total + float(reward)
         self.rewards.append(float(reward))

@@ -5,12 +5,14 @@ import socket
 import threading
 import time
 import warnings
+from pathlib import Path
 
 import pytest
 
 from afm_rl.play import World, make_robot
 from afm_rl.play.page import text_of
 
+SMALL = str(Path(__file__).parents[2] / "benchmarks" / "suites" / "legged" / "robots" / "small")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("chrome")
 FLAGS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
 FLAGS += ["--enable-unsafe-swiftshader", "--disable-background-networking"]
@@ -117,6 +119,21 @@ def test_robots_are_drawn_and_described(name, cause, page_of):
     assert "cannot find" in text_of(page.world)
     choose(page, "none")
     assert page.world.fault["gain_0"] == 1.0
+
+
+def test_a_legged_robot_is_drawn_and_described(page_of):
+    page = page_of(SMALL)
+    choose(page, "one reversed")
+    for _ in range(20):
+        page.world.step()
+    page.draw()
+    page.say()
+    (name,) = page.presets["one reversed"]
+    effect, servo = page.world.sides["AFM"].faulty.effect, int(name[5:])
+    pose, executed = float(page.world.robot.home[servo]), page.world.sides["AFM"].info["afm"]["executed"]
+    assert effect[servo] - pose == pytest.approx(pose - executed[servo], rel=1e-5)
+    assert page.sliders[name][0].value == -1.0
+    assert page.sliders[f"bias_{servo}"][0].label == "Offset (rad)"
 
 
 def test_a_slider_reverses_a_motor(served, browser):

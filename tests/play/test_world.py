@@ -1,5 +1,7 @@
 """Two robots share policy and faults; one of them is corrected."""
 
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from afm_rl.play import FaultyEnv, World, make_robot
 from afm_rl.regimes import Actuators, presets
 
 pytest.importorskip("mujoco")
+LEGGED = Path(__file__).parents[2] / "benchmarks" / "suites" / "legged"
+SMALL = str(LEGGED / "robots" / "small")
 
 
 def test_a_reversed_cart_falls_unless_it_is_corrected():
@@ -57,6 +61,24 @@ def test_actuators_do_what_is_set():
     assert 0 < np.abs(env.effect - 0.3).max() < 0.5
 
 
+def test_a_robot_of_a_folder_has_faults_about_its_pose():
+    pytest.importorskip("onnxruntime")
+    world = World(make_robot(SMALL))
+    for _ in range(5):
+        world.step()
+    alone, corrected = world.sides.values()
+    assert alone.rewards == corrected.rewards  # both walk in step, by the clock of their own gait
+    world.fail(world.robot.faults["offset .25 on one"])
+    servo = next(int(name[5:]) for name in world.fault)
+    for _ in range(30):
+        world.step()
+    planned, executed, effect = np.array(corrected.commands)[-1]
+    assert effect[servo] == pytest.approx(executed[servo] + 0.25, rel=1e-6)  # rad
+    assert abs(effect - planned)[servo] < 0.1
+    world.reset()
+    assert alone.act.steps == corrected.act.steps == 0
+
+
 @pytest.mark.parametrize("count", [1, 2, 6])
 def test_presets_are_faults_of_any_robot(count):
     actuators = Actuators([-1.0] * count, [1.0] * count)
@@ -70,6 +92,9 @@ def test_presets_are_faults_of_any_robot(count):
     [
         (["--robot", "dog"], "--robot='dog'"),
         (["--policy", "nothing.safetensors"], "no such file"),
+        (["--robot", "nowhere/go1"], "nowhere/go1.xml"),
+        (["--robot", "nowhere/dog"], "dog.json: no such file; docs/legged.md"),
+        (["--robot", SMALL, "--policy", "x.onnx"], "has its own; leave --policy out"),
         (["--port", "70000"], "--port=70000"),
         (["--port", "x"], "invalid int"),
     ],

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from afm_rl.diagnosis.live import explain
 from afm_rl.errors import ConfigurationError
@@ -37,9 +38,22 @@ def test_the_command_plays_and_goes_on(legged, monkeypatch, tmp_path, capsys):
     legged("run").main()
     said = capsys.readouterr().out
     assert "small, alone: 2 episodes" in said and "| all at half | 0." in said
-    monkeypatch.setattr("sys.argv", [*asked, "none", "late 1", "--methods", "alone"])
+    more = ["--methods", "alone", "--figure", str(tmp_path / "figure.png")]
+    monkeypatch.setattr("sys.argv", [*asked, "none", "late 1", *more])
     legged("run").main()
     assert "small, alone: 1 episodes" in capsys.readouterr().out
+    with Image.open(tmp_path / "figure.png") as figure:
+        assert figure.width > 500
+
+
+def test_the_film_shows_who_falls(legged, monkeypatch, tmp_path, capsys):
+    film = tmp_path / "film.gif"
+    asked = ["--fault", "late 2", "--at", "0.1", "--seconds", "0.4", "--out", str(film)]
+    monkeypatch.setattr("sys.argv", ["film.py", *asked])
+    legged("film").main()
+    assert "fell: []" in capsys.readouterr().out
+    with Image.open(film) as pictures:
+        assert pictures.n_frames == 6
 
 
 @pytest.mark.parametrize("fault", ["offset .1 on all", "all at half", "swapped pair"])
@@ -106,10 +120,8 @@ def test_an_observation_has_the_named_parts_in_order(legged, tmp_path):
     ]
     robot = legged("robot").Robot(OWN, "small")
     robot.parts = [robot._part(entry) for entry in parts]
-    robot.begin(1)
-    robot.last[:] = 7.0
     state = robot.twin.reset(seed=0)[0]
-    seen = robot.seen(state, 0, late=2)
+    seen = robot.seen(state, np.full(8, 7.0), seconds=0.04)
     angle = 3.0 * 2 * np.pi * 0.04
     phases = np.cos([angle, angle + np.pi]), np.sin([angle, angle + np.pi])
     expected = [*phases, np.zeros(3), [0, 0, -1], state[10:11] + 1, np.zeros(8), [7.0] * 8]
@@ -134,4 +146,7 @@ def test_what_a_description_lacks_is_said(legged, tmp_path, changed, expected):
 
 def test_a_robot_without_description_is_refused(legged, tmp_path):
     with pytest.raises(ConfigurationError, match=r"mine\.json: no such file"):
+        legged("robot").Robot(tmp_path, "mine")
+    (tmp_path / "mine.json").write_text("[")
+    with pytest.raises(ConfigurationError, match=r"mine\.json: expected an object of JSON"):
         legged("robot").Robot(tmp_path, "mine")

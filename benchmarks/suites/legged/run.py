@@ -2,8 +2,9 @@
 
     python benchmarks/suites/legged/run.py --folder FOLDER --robots go1 g1
 
-plays what is not yet in `outputs/legged` and prints the tables. It can be ended at any time; the
-same command goes on. The folder has NAME.xml and NAME_policy.onnx, see `docs/legged.md`.
+plays what is not yet in `outputs/legged` and prints the tables; `--figure FILE` draws them. It can
+be ended at any time; the same command goes on. The folder has NAME.xml and NAME_policy.onnx, see
+`docs/legged.md`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ from robot import OWN, Robot  # noqa: E402
 from show import ordered, print_table  # noqa: E402
 
 from afm_rl.regimes import servo_faults  # noqa: E402
+from afm_rl.report import style  # noqa: E402
+from afm_rl.storage.files import write_whole  # noqa: E402
 
 
 def main() -> None:
@@ -35,8 +38,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, help="cut episodes (use another --out)")
     parser.add_argument("--together", type=int, default=5, help="episodes between two savings")
     parser.add_argument("--out", type=Path, default=Path("outputs/legged"))
+    parser.add_argument("--figure", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
+    tables: dict[str, pd.DataFrame] = {}
     files = sorted(args.folder.glob("*_policy.onnx"))
     for name in args.robots or [file.stem.removesuffix("_policy") for file in files]:
         robot, rows = Robot(args.folder, name), []
@@ -47,13 +52,40 @@ def main() -> None:
         chosen = results["fault"].isin(args.faults) & (results["episode"] < args.seeds)
         results = with_errors(results[chosen], robot.at)
         print(f"\n{name}: mean error of the speed after the fault, m/s (survivors)\n")
-        print_table(ordered(results, list(METHODS), args.faults), _cell)
+        tables[name] = ordered(results, list(METHODS), args.faults)
+        print_table(tables[name], _cell)
+    if args.figure:
+        draw(tables, args.figure)
 
 
 def with_errors(results: pd.DataFrame, at: int) -> pd.DataFrame:
     """Return results with the mean ``error`` a step, from the fault to the end or the fall."""
     after = (results["lasted"] - at).clip(lower=1)
     return results.assign(error=-results["after"] / after)
+
+
+def draw(tables: dict[str, pd.DataFrame], file: Path) -> None:
+    """Draw the errors: a panel per robot, a row per fault, a mark per method and episode."""
+    faults = list(next(iter(tables.values()))["fault"].cat.categories)
+    figure = style.new_figure(3.4 * len(tables) + 1.6, 0.36 * len(faults) + 1.3)
+    looks = style.method_styles(METHODS)
+    panels = figure.subplots(1, len(tables), sharey=True, squeeze=False)[0]
+    for panel, (robot, results) in zip(panels, tables.items(), strict=True):
+        most = 1.15 * results["error"][results["survived"]].max()
+        panel.axvline(most, color=style.FAINT, lw=0.8)
+        methods = results["method"].cat.categories
+        for place, method in enumerate(methods):
+            rows, look = results[results["method"] == method], looks[method]
+            error = rows["error"].where(rows["survived"], 1.08 * most)
+            at = rows["fault"].cat.codes + 0.16 * (place - (len(methods) - 1) / 2)
+            panel.plot(error, at, look.marker, color=look.color, ms=5, mew=0, label=method)
+        style.dress(panel, "error of the speed (m/s)", size=style.LARGE)
+        panel.set_title(robot.capitalize(), fontsize=style.LARGE)
+        panel.set(xlim=(0, 1.16 * most), ylim=(len(faults) - 0.5, -0.5))
+        panel.set_yticks(range(len(faults)), faults, fontsize=style.LARGE)
+        panel.text(1.08 * most, -0.55, "falls", ha="center", va="bottom", fontsize=style.SMALL)
+    style.legend_above(figure, *panels[0].get_legend_handles_labels())
+    write_whole(file, style.png_bytes(figure))
 
 
 def _cell(rows: pd.DataFrame) -> str:
