@@ -129,8 +129,9 @@ def test_a_legged_robot_is_drawn_and_described(page_of):
     page.draw()
     page.say()
     (name,) = page.presets["one reversed"]
-    effect, servo = page.world.sides["AFM"].faulty.effect, int(name[5:])
-    pose, executed = float(page.world.robot.home[servo]), page.world.sides["AFM"].info["afm"]["executed"]
+    corrected, servo = page.world.sides["AFM"], int(name[5:])
+    effect, executed = corrected.faulty.effect, corrected.info["afm"]["executed"]
+    pose = float(page.world.robot.home[servo])
     assert effect[servo] - pose == pytest.approx(pose - executed[servo], rel=1e-5)
     assert page.sliders[name][0].value == -1.0
     assert page.sliders[f"bias_{servo}"][0].label == "Offset (rad)"
