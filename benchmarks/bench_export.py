@@ -15,12 +15,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pandas as pd
 import torch
 from torch import Tensor
 
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
+from afm_rl.report.tables import markdown
 from afm_rl.transforms import ActionFlowPolicy
 from afm_rl.transforms.controller import Controller, export_controller
 
@@ -60,7 +62,7 @@ def main() -> None:
     parser.add_argument("--ticks", type=int, default=10_000)
     ticks = parser.parse_args().ticks
     torch.set_num_threads(1)
-    print(f"{'ms per tick, ' + str(ticks) + ' ticks':52}{'p50':>8}{'p99':>8}")
+    rows: dict[str, dict[str, str]] = {}
     for name, planned in (("correction", False), ("MPPI and correction", True)):
         plain, fast = controller(planned, compile=False), controller(planned, compile=True)
         with tempfile.TemporaryDirectory() as folder, torch.inference_mode(False):
@@ -72,7 +74,9 @@ def main() -> None:
             for what, gain in ((name, -0.8), (f"{name}, healthy", 1.0)):
                 spent = drive(tick, plain if way == "exported" else tick, ticks, gain)
                 p50, p99 = spent.quantile(torch.tensor([0.5, 0.99])).tolist()
-                print(f"{what + ', ' + way:52}{p50:8.2f}{p99:8.2f}", flush=True)
+                rows.setdefault(what, {})[way] = f"{p50:.2f} / {p99:.2f}"
+    table = pd.DataFrame(rows).T.rename_axis("median / 99th percentile").reset_index()
+    print(markdown(f"ms per tick, {ticks} ticks", table))
 
 
 if __name__ == "__main__":

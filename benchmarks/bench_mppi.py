@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable
 from statistics import median
 
+import pandas as pd
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -27,6 +28,7 @@ from torchrl.objectives.value import TDLambdaEstimator
 
 from afm_rl.dynamics import Dubins
 from afm_rl.planning import MPPI, Cost, PlanningEnv
+from afm_rl.report.tables import markdown
 
 try:
     from pytorch_mppi import MPPI as Peer
@@ -148,17 +150,18 @@ def main() -> None:
         print("pytorch_mppi is not installed, so its row is missing: pip install pytorch_mppi")
     else:
         kinds["pytorch_mppi"] = peer
-    print(f"{'ms per plan':26}" + "".join(f"{count:>10}" for count in options.samples))
     spent = []
     for count in options.samples:
         jobs = {name: make(count) for name, make in kinds.items()}
         calls = {name: lambda job=job: job(START) for name, job in jobs.items()}
         spent.append(timed(calls, options.rounds, clock=time.thread_time))
-    for name in kinds:
-        print(f"{name:26}" + "".join(f"{median(times[name]):10.2f}" for times in spent))
-    print("cost of a driven step")
-    for name, make in kinds.items():
-        print(f"{name:26}{driven(make(1024), options.ticks):10.3f}")
+    heads = ["samples", *options.samples, "driven"]
+    rows = [
+        [name, *(f"{median(times[name]):.1f}" for times in spent)]
+        + [f"{driven(make(1024), options.ticks):.3f}"]
+        for name, make in kinds.items()
+    ]
+    print(markdown("ms per plan", pd.DataFrame(rows, columns=heads)))
 
 
 if __name__ == "__main__":

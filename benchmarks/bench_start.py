@@ -26,6 +26,7 @@ import torch
 from hydra import compose, initialize_config_module
 
 from afm_rl.missions import build, prepare
+from afm_rl.report.tables import markdown
 from afm_rl.storage.files import csv_text
 from afm_rl.storage.manifest import write_manifest
 
@@ -129,11 +130,13 @@ def main() -> None:
     parser.add_argument("rows", nargs="*", choices=[[], *ROWS], default=list(ROWS))
     unit = min(python("import torchrl.data") for _ in range(3))
     print(f"import torchrl.data: {unit:.2f} s\n")
-    print("| | s | at most, quiet | in imports of torchrl.data | at most |\n|---|---|---|---|---|")
+    heads, rows = ["", "s", "at most, quiet", "in imports of torchrl.data", "at most"], []
     for name in parser.parse_args().rows:
         what, limit, rounds, measure = ROWS[name]
         spent = min(measure() for _ in range(rounds))
-        print(f"| {what} | {spent:.2f} | {limit:.2f} | {spent / unit:.2f} | {limit / 2.6:.2f} |")
+        numbers = (spent, limit, spent / unit, limit / 2.6)
+        rows.append([what, *(f"{number:.2f}" for number in numbers)])
+    print(markdown("start", pd.DataFrame(rows, columns=heads)))
 
 
 if __name__ == "__main__":

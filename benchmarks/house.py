@@ -1,11 +1,11 @@
 """Count the house: what it holds, what its parts load, and the way of one action through it.
 
-    python benchmarks/house.py [ROOT] [--time] [--write]
+    python benchmarks/house.py [ROOT] [--time]
 
 Lines, classes and constants are those of ``afm_rl`` and ``envs`` in ROOT. A constant is a name in
 capitals that a module assigns, once for each. Three programs run: fifty steps of a pendulum behind
 ``ActionFlowTransform``, fifty behind ``ActionFlowWrapper``, and a mission by the command line.
-``--time`` runs ``make test`` and ``.ci/run``, too. ``--write`` puts the table into docs/design.md.
+``--time`` runs ``make test`` and ``.ci/run``, too.
 """
 
 from __future__ import annotations
@@ -22,7 +22,11 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
-HERE = Path(__file__).parents[1]
+import pandas as pd
+
+from afm_rl.report.tables import markdown
+
+HERE = Path(__file__).resolve().parents[1]
 TRANSFORM = """
 import torch
 from torchrl.envs import GymEnv, TransformedEnv, step_mdp
@@ -229,20 +233,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("root", type=Path, nargs="?", default=HERE)
     parser.add_argument("--time", action="store_true", help="run make test and .ci/run, too")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/design.md")
     options = parser.parse_args()
     rows = count(options.root.resolve())
     for name, command in (("make test", ["make", "test"]), (".ci/run", [".ci/run"])):
         if options.time:
             rows[f"`{name}`: minutes"] = minutes(options.root, command)
-    table = "| | before | now |\n|---|---|---|\n"
-    table += "".join(f"| {name} | {BEFORE[name]} | {now} |\n" for name, now in rows.items())
-    print(table)
-    if options.write:
-        page = HERE / "docs" / "design.md"
-        before, begin, rest = page.read_text(encoding="utf-8").partition("<!-- house begin -->\n")
-        _, end, after = rest.partition("<!-- house end -->\n")
-        page.write_text(before + begin + table + end + after, encoding="utf-8")
+    table = {"": list(rows), "before": [BEFORE[name] for name in rows], "now": list(rows.values())}
+    print(markdown("house", pd.DataFrame(table)))
 
 
 if __name__ == "__main__":

@@ -92,15 +92,3 @@ def test_the_quadrotor_s_table(paper):
     assert table.loc["online_knode, Jiahao et al.", "0.8 m/s"] == "0.0660"
     assert table.loc["physics, ours", "1.7 m/s"] == "0.20400"
     assert table["mean change (%)"].iloc[-1] == "-6.6"
-
-
-def test_tables_replace_those_of_a_page(paper, ours):
-    page = "a\n<!-- tables begin -->\nold\n<!-- tables end -->\nz\n"
-    found = paper["tables"](ours)
-    new = paper["with_tables"](page, "tables", found)
-    assert new.startswith("a\n<!-- tables begin -->\n\n**All scenarios") and "old" not in new
-    assert new.endswith("<!-- tables end -->\nz\n")
-    assert paper["with_tables"](new, "tables", found) == new
-    assert new.count("\n| --- |") == 5
-    with pytest.raises(SystemExit, match="no marks <!-- flights begin -->"):
-        paper["with_tables"](page, "flights", found)

@@ -1,4 +1,4 @@
-"""The tables of a report: what they hold, and their views as CSV, as LaTeX and in a terminal."""
+"""The tables of a report: what they hold; as CSV, LaTeX and Markdown, and in a terminal."""
 
 from __future__ import annotations
 
@@ -99,6 +99,22 @@ def grid_of(
     for row, texts in enumerate(shown.to_numpy()):
         grid.add_row(*(Text(text, look(row, column)) for column, text in enumerate(texts)))
     return grid
+
+
+def markdown(title: str, shown: pd.DataFrame) -> str:
+    """Return texts as a table of Markdown, under its title.
+
+    >>> print(markdown("returns", pd.DataFrame({"fault": ["none"], "AFM": [1]})))
+    <BLANKLINE>
+    returns:
+    <BLANKLINE>
+    | fault | AFM |
+    |---|---|
+    | none | 1 |
+    """
+    rows = [f"| {' | '.join(map(str, row))} |" for row in [list(shown), *shown.to_numpy().tolist()]]
+    rows.insert(1, "|" + "---|" * shown.shape[1])
+    return "\n".join(["", f"{title}:", "", *rows])
 
 
 def terminal(file: IO[str] | None) -> Console:

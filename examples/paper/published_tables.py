@@ -1,16 +1,14 @@
 """Our means beside those that the paper printed: its tables 1 to 4, the means, and the quadrotor's.
 
     python examples/paper/published_tables.py outputs/study/ugv_paper
-    python examples/paper/published_tables.py outputs/study/ugv_paper --page docs/paper.md
 
-Writes CSV and LaTeX; with a page, the same between the page's marks. Give it the folder of
+Writes CSV and LaTeX, and prints Markdown. Give it the folder of
 study=quadrotor_paper, too, for the quadrotor's. The paper gave each mission
 5000 steps, and one that ran out counts 4999, the number of its last step. Steps of ours compare
 with these only under the same budget: the tables say where it differs.
 """
 
 import argparse
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -19,7 +17,7 @@ import pandas as pd
 from afm_rl.report import read_runs
 from afm_rl.report.runs import scenario_names
 from afm_rl.report.statistics import estimate, pair
-from afm_rl.report.tables import Table, interval_text
+from afm_rl.report.tables import Table, interval_text, markdown
 from afm_rl.storage.files import write_whole
 from afm_rl.storage.measures import number
 
@@ -56,7 +54,6 @@ JIAHAO = {  # Online-KNODE-MPC, Jiahao et al. 2022, table 1, circles of 2 m: m/s
     "physics": {0.8: 0.0904, 1.0: 0.1280, 1.2: 0.1705},
     "online_knode": {0.8: 0.0660, 1.0: 0.1113, 1.2: 0.1678},
 }
-MARKS = r"(<!-- {} begin -->\n).*?(<!-- {} end -->)"
 
 
 def published() -> pd.DataFrame:
@@ -220,46 +217,24 @@ def flights_table(missions: pd.DataFrame) -> Table:
     return Table("paper_quadrotor", title, note, pd.DataFrame(numbers), shown)
 
 
-def markdown(table: Table) -> str:
-    """Return a table as a page shows it."""
-    lines = [list(table.shown), ["---"] * table.shown.shape[1], *table.shown.to_numpy().tolist()]
-    rows = "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
-    return f"**{table.title}**\n\n{rows}\n\n{table.note}\n"
-
-
-def with_tables(page: str, name: str, found: Sequence[Table]) -> str:
-    """Return a page with tables in the place of those between its marks."""
-    text = "\n" + "\n".join(map(markdown, found)) + "\n"
-    marks = re.compile(MARKS.format(name, name), re.DOTALL)
-    if not marks.search(page):
-        raise SystemExit(f"the page has no marks <!-- {name} begin --> and <!-- {name} end -->")
-    return marks.sub(lambda match: match[1] + text + match[2], page)
-
-
-def of_folders(folders: Sequence[Path]) -> Iterator[tuple[str, list[Table]]]:
-    """Yield the name of a part of the page, and its tables, for each kind of mission there is."""
-    kinds: dict[str, list[Path]] = {"tables": [], "flights": []}
+def of_folders(folders: Sequence[Path]) -> Iterator[Table]:
+    """Yield the tables of each kind of mission that there is."""
+    kinds: dict[bool, list[Path]] = {False: [], True: []}
     for folder in folders:
-        columns = read_runs([folder]).missions.columns
-        kinds["flights" if "mse" in columns else "tables"].append(folder)
-    for name, some in kinds.items():
+        kinds["mse" in read_runs([folder]).missions].append(folder)
+    for flies, some in kinds.items():
         if some:
             missions = read_runs(some).missions
-            yield name, [flights_table(missions)] if name == "flights" else tables(missions)
+            yield from [flights_table(missions)] if flies else tables(missions)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="+", type=Path, help="results of runs or studies")
     parser.add_argument("--out", type=Path, help="where to (FOLDER/report/tables, of the first)")
-    parser.add_argument("--page", type=Path, help="page with marks between which to write them")
     options = parser.parse_args()
     out = options.out or options.folders[0] / "report" / "tables"
-    for part, found in of_folders(options.folders):
-        for each in found:
-            write_whole(out / f"{each.name}.csv", each.to_csv().encode())
-            write_whole(out / f"{each.name}.tex", each.to_latex().encode())
-            print(f"{each.title}. {each.note}\n{each.shown.to_string(index=False)}\n")
-        if options.page:
-            text = with_tables(options.page.read_text(encoding="utf-8"), part, found)
-            write_whole(options.page, text.encode())
+    for each in of_folders(options.folders):
+        write_whole(out / f"{each.name}.csv", each.to_csv().encode())
+        write_whole(out / f"{each.name}.tex", each.to_latex().encode())
+        print(markdown(each.title, each.shown), each.note, sep="\n\n")

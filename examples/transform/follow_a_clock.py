@@ -11,11 +11,13 @@ from collections import deque
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import torch
 from gymnasium.spaces import Box
 
 from afm_rl import ActionFlowWrapper
 from afm_rl.dynamics import dubins_step
+from afm_rl.report.tables import markdown
 
 DT = 0.1
 
@@ -102,15 +104,17 @@ def follow(body, env, ahead=False, steps=240):
 
 def main():
     torch.set_num_threads(1)
+    rows = {}
     for name, body in {"cart": Cart(), "ground robot": Rover()}.items():
         corrected = ActionFlowWrapper(Robot(body), body.move)
-        rows = {
+        rows[name] = {
             "healthy": follow(body, Robot(body, healthy=True)),
             "late, alone": follow(body, Robot(body)),
             "AFM, reference of now": follow(body, corrected),
             "AFM, reference at arrival": follow(body, corrected, ahead=True),
         }
-        print(f"{name}: " + ", ".join(f"{row} {miss:.3f}" for row, miss in rows.items()))
+    table = pd.DataFrame(rows).T.map("{:.3f}".format)
+    print(markdown("distance (m)", table.rename_axis("").reset_index()))
 
 
 if __name__ == "__main__":

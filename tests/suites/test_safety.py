@@ -88,20 +88,14 @@ def test_the_unit_of_actions_makes_no_difference(module, monkeypatch):
     assert (own < 0.6 * alone).all()
 
 
-def test_the_table_is_written_into_a_page(module, monkeypatch, tmp_path, capsys):
+def test_the_tables_say_what_is_better_and_what_is_worse(module, monkeypatch, tmp_path, capsys):
     run, short = module("run"), replace(module("worlds").servos(1), steps=75)
     monkeypatch.setattr(run, "WORLDS", {"one servo": lambda: short})
     monkeypatch.setattr(run, "SITUATIONS", {"healthy": {}, "reversed": {"gain": -1.0}})
-    page = tmp_path / "page.md"
-    page.write_text("a\n<!-- safety begin -->\nold\n<!-- safety end -->\nz\n")
     command = ["run.py", "--robots", "one servo", "--seeds", "3", "--out", str(tmp_path)]
     command += ["--set", "saturation=clip", "samples=8"]
-    monkeypatch.setattr("sys.argv", [*command, "--write", str(page)])
+    monkeypatch.setattr("sys.argv", command)
     run.main()
-    assert "| one servo | healthy |" in capsys.readouterr().out
-    new = page.read_text()
-    assert new.startswith("a\n<!-- safety begin -->\nOf 2 situations 0 are worse, 1 better")
-    assert "| one servo | 3 | 2 | 1 |  |\n<!-- safety end -->\nz\n" in new and "old" not in new
-    page.write_text("no marks")
-    with pytest.raises(SystemExit, match="has no lines <!-- safety begin -->"):
-        run.main()
+    said = capsys.readouterr().out
+    assert "| one servo | healthy |" in said
+    assert "| one servo | 3 | 2 | 1 | 0 |  |\n| all |  | 2 | 1 | 0 |  |" in said

@@ -14,6 +14,7 @@ import pandas as pd
 
 from afm_rl.report import read_runs
 from afm_rl.report.statistics import estimate, interquartile_mean
+from afm_rl.report.tables import interval_text, markdown
 
 SPLITS = ["train", "in", "out"]
 
@@ -35,4 +36,9 @@ def scores(missions: pd.DataFrame) -> pd.DataFrame:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="+", type=Path, help="results of tasks")
-    print(scores(read_runs(parser.parse_args().folders).missions).round(2).to_string(index=False))
+    table = scores(read_runs(parser.parse_args().folders).missions)
+    texts = [interval_text(row, "score", 2) for row in table.to_dict("records")]
+    wide = table.assign(score=texts).pivot_table(
+        index="split", columns="method", values="score", aggfunc="first", sort=False
+    )
+    print(markdown("score", wide.reset_index()))

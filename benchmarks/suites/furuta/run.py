@@ -20,12 +20,14 @@ import torch
 from agents import METHODS, Agent
 from plant import PERIOD, Plant, Simulated, drawn
 
+from afm_rl.report.tables import markdown
 from afm_rl.storage.files import write_whole
 
 VALIDATION = [(23, 18, 1), (23, 42, -1), (37, 18, -1), (37, 42, 1)]  # cm, g, sign
 VALIDATION += [(30, 30, 1), (26, 36, -1), (34, 22, 1), (31, 44, -1)]
 NEAR, LASTS = 0.15, 20  # rad; steps: up is to stay near for a second
 PUSH = 0.3  # N m
+PUBLISHED = "published, with a second of excitation"  # and its film, one run
 TOGETHER = 8  # runs that are played side by side, and then kept
 
 
@@ -96,7 +98,8 @@ def main() -> None:
             runs = [run._replace(steps=args.steps or run.steps) for run in PARTS[part]()]
             file = args.out / f"{part}.{method}.csv"
             tables.append(complete(file, runs[: args.runs], part, method))
-    print_tables(pd.concat(tables, ignore_index=True), args.methods)
+    for name, table in tables_of(pd.concat(tables, ignore_index=True), args.methods).items():
+        print(markdown(name, table))
 
 
 def complete(file: Path, runs: Sequence[Run], part: str, method: str) -> pd.DataFrame:
@@ -155,25 +158,26 @@ def recovery(angles: np.ndarray, at: int) -> float:
     return float(near.argmax() * PERIOD) if near.any() else np.inf
 
 
-def print_tables(rows: pd.DataFrame, methods: Sequence[str]) -> None:
-    """Print what the page shows."""
-    print("\n| | up, A | median time (s) | slowest (s) | worst RMS (rad) | up, B | median (s) |")
-    print("|---|---|---|---|---|---|---|")
+def tables_of(rows: pd.DataFrame, methods: Sequence[str]) -> dict[str, pd.DataFrame]:
+    """Return what the page shows."""
+    up, film = [], []
     for method in methods:
-        a, b = (_of(rows, method, part) for part in "AB")
+        a, b, events, alone = (_of(rows, method, part) for part in PARTS)
         good = np.isfinite(a["up"]) & (a["held"] > 0.95)
-        cells = [f"{good.sum()}/{len(a)}", _middle(a["up"]), f"{a['up'].max():.2f}"]
+        cells = [method, f"{good.sum()}/{len(a)}", _middle(a["up"]), f"{a['up'].max():.2f}"]
         cells += [f"{a['rms'].max():.3f}", f"{np.isfinite(b['up']).sum()}/{len(b)}"]
-        print(f"| {method} | {' | '.join(cells)} | {_middle(b['up'])} |".replace("inf", "∞"))
-    print(f"\n| film | {' | '.join(EVENTS)} | lost | ms a step: median, 95 %, mean |")
-    print(f"|---|{'---|' * (len(EVENTS) + 2)}")
-    for method in methods:
-        events, alone = (_of(rows, method, part) for part in ("film", "time"))
+        up.append([*cells, _middle(b["up"])])
         cells = [f"{_middle(events[name])}, {events[name].max():.2f}" for name in EVENTS]
         lost = np.isinf(events[[*EVENTS]]).any(axis=1).sum()
         ms = ", ".join(f"{alone[f'ms {q}'].mean():.1f}" for q in ("50", "95", "mean"))
-        row = f"| {method} | {' | '.join(cells)} | {lost}/{len(events)} | {ms} |"
-        print(row.replace("inf", "∞"))
+        film.append([method, *cells, f"{lost}/{len(events)}", ms])
+    up.append([PUBLISHED, "32/32", "2.1", "18.8", "0.047", "12/12", ""])
+    film.append([PUBLISHED, "1.0", "3.7", "1.0", "1.2", "0/1", "50 on 12 cores"])
+    heads = ["", "up, A", "median time (s)", "slowest (s)", "worst RMS (rad)", "up, B"]
+    costs = ["lost", "ms a step: median, 95 %, mean"]
+    tables = {"up": pd.DataFrame(up, columns=[*heads, "median (s)"])}
+    tables["film"] = pd.DataFrame(film, columns=["film", *EVENTS, *costs])
+    return {name: table.replace("inf", "∞", regex=True) for name, table in tables.items()}
 
 
 def _of(rows: pd.DataFrame, method: str, part: str) -> pd.DataFrame:

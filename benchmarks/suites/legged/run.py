@@ -20,10 +20,11 @@ sys.path[:0] = [str(Path(__file__).parents[1] / name) for name in ("zoo", "legge
 from episodes import complete  # noqa: E402
 from methods import METHODS  # noqa: E402
 from robot import OWN, Robot  # noqa: E402
-from show import ordered, print_table  # noqa: E402
+from show import ordered, table_by  # noqa: E402
 
 from afm_rl.regimes import servo_faults  # noqa: E402
 from afm_rl.report import style  # noqa: E402
+from afm_rl.report.tables import markdown  # noqa: E402
 from afm_rl.storage.files import write_whole  # noqa: E402
 
 
@@ -51,9 +52,8 @@ def main() -> None:
         results = pd.concat(rows, ignore_index=True)
         chosen = results["fault"].isin(args.faults) & (results["episode"] < args.seeds)
         results = with_errors(results[chosen], robot.at)
-        print(f"\n{name}: mean error of the speed after the fault, m/s (survivors)\n")
         tables[name] = ordered(results, list(METHODS), args.faults)
-        print_table(tables[name], _cell)
+        print(markdown(name, table_by(tables[name], "method", _cell)))
     if args.figure:
         draw(tables, args.figure)
 

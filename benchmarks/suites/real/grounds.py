@@ -25,11 +25,14 @@ from afm_rl.diagnosis.replay import replay
 from afm_rl.diagnosis.replay.belief import believe
 from afm_rl.diagnosis.replay.table import AFM, ALONE, SIMPLE, Predictor
 from afm_rl.report import style
+from afm_rl.report.tables import markdown
 from afm_rl.storage.files import write_whole
 
 LOGS = Path(__file__).parents[3] / "examples" / "real_logs"
 GROUNDS = ("warthog_asphalt", "warthog_gravel", "warthog_ice")
 TRACKS = "marmotte_boreal"
+REPLAYED = ["warthog_ice.csv", "marmotte_boreal.csv"]
+REPLAYED += ["warthog_ice_wheels.parquet", "crazyflie_ramp.parquet"]
 SHARES = {"median": 0.5, "p90": 0.9}
 
 
@@ -77,6 +80,15 @@ def within(table: pd.DataFrame, name: str, share: float = 0.1) -> int:
     return int((twelve[name] <= (1 + share) * twelve[list(SIMPLE)].min(axis=1)).sum())
 
 
+def both(table: pd.DataFrame) -> pd.DataFrame:
+    """Return median / 90th percentile of each ground and axis, and in how many of 12 it is good."""
+    texts = table.map("{:.3f}".format)
+    pairs = texts.xs("median", level=2) + " / " + texts.xs("p90", level=2)
+    pairs.index = [f"{log.partition('_')[2]}, {axis}" for log, axis in pairs.index]
+    pairs.loc["within 10 % of the best simple one, of 12"] = [within(table, name) for name in table]
+    return pairs.rename_axis("").reset_index()
+
+
 def twelve(corrector: PairCorrector) -> tuple[pd.DataFrame, int]:
     """Return the table with a column ``AFM``, and in how many of the twelve it is within 10 %."""
     table = compare(AFM=by(corrector))
@@ -120,10 +132,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--figure", type=Path, help="where to draw the three grounds")
     options = parser.parse_args()
-    table = compare(AFM=replayed)
-    print(table.round(3).to_string())
-    for name in table:
-        print(f"{name}: within 10 % of the best simple one in {within(table, name)} of 12")
+    print(markdown("errors", both(compare(AFM=replayed))))
+    said = [(log, replay(read_log(LOGS / log)).sentence) for log in REPLAYED]
+    heads = ["log", "what a correction would have removed"]
+    print(markdown("replays", pd.DataFrame(said, columns=heads)))
     if options.figure is not None:
         write_whole(options.figure, style.png_bytes(draw(one_drive())))
 

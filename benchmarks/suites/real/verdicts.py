@@ -14,9 +14,11 @@ import argparse
 from collections.abc import Iterator
 
 import numpy as np
+import pandas as pd
 
 from afm_rl.diagnosis import Actuator, Log, diagnose
 from afm_rl.diagnosis.replay import replay
+from afm_rl.report.tables import markdown
 
 
 def steps(seed: int, rows: int, size: int, hold: int = 10, low: float = -1.0) -> np.ndarray:
@@ -136,8 +138,8 @@ def main() -> None:
     parser.add_argument("--healthy", type=int, help="make so many healthy joints instead")
     args = parser.parse_args()
     if args.healthy is None:
-        for row in table():
-            print(*row, sep=" | ")
+        rows = pd.DataFrame(table(), columns=["log", "truth", "said"])
+        print(markdown("verdicts", rows))
         return
     wrong = accused(args.healthy)
     print(f"{len(wrong)} of {args.healthy} healthy joints are not called healthy")

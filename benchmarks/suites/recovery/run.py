@@ -29,6 +29,7 @@ from missions import rewards as of_missions  # noqa: E402
 from pendulums import rewards as of_pendulums  # noqa: E402
 from task import POLICIES, Task  # noqa: E402
 
+from afm_rl.report.tables import markdown  # noqa: E402
 from afm_rl.storage.files import write_whole  # noqa: E402
 
 FAULTS = ["one reversed", "all reversed", "half", "bias .3", "late 2", "swapped pair"]
@@ -59,7 +60,7 @@ def main() -> None:
                 print(f"{task}, {method}: done", flush=True)
             tables.append(pd.read_csv(file))
             level = tables[-1]["level"][0] if level is None else level
-    print_table(pd.concat(tables, ignore_index=True), args)
+    print(markdown("seconds until recovered", table(pd.concat(tables, ignore_index=True), args)))
 
 
 def times(task: str, method: str, level: float | None, args: argparse.Namespace) -> list[dict]:
@@ -101,18 +102,19 @@ def times_of_policy(
     return rows[["task", "method", "fault", "seed", "level", "seconds"]].to_dict("records")
 
 
-def print_table(rows: pd.DataFrame, args: argparse.Namespace) -> None:
-    """Print the median over seeds of each task and fault, by method."""
-    print(f"\nSeconds until recovered: {', '.join(args.methods)}; ∞: not within the episode\n")
-    print(f"| | {' | '.join(args.faults)} |\n|---{'|---' * len(args.faults)}|")
-    keys = ["task", "fault", "method"]
-    middle = rows.groupby(keys)["seconds"].quantile(0.5, interpolation="higher")
-    for task in args.tasks:
-        cells = []
-        for fault in args.faults:
-            medians = [middle.get((task, fault, method), np.nan) for method in args.methods]
-            cells.append("–" if np.isnan(medians).all() else ", ".join(map(_seconds, medians)))
-        print(f"| {task.replace('_', ' ')} | {' | '.join(cells)} |")
+def table(rows: pd.DataFrame, args: argparse.Namespace) -> pd.DataFrame:
+    """Return the median over seeds of each task and fault, by method."""
+    middle = rows.groupby(["task", "fault", "method"])["seconds"]
+    middle = middle.quantile(0.5, interpolation="higher")
+    cells = {"": [task.replace("_", " ") for task in args.tasks]}
+    for fault in args.faults:
+        medians = [
+            [middle.get((task, fault, m), np.nan) for m in args.methods] for task in args.tasks
+        ]
+        cells[fault] = [
+            "–" if np.isnan(some).all() else ", ".join(map(_seconds, some)) for some in medians
+        ]
+    return pd.DataFrame(cells)
 
 
 def _seconds(value: float) -> str:

@@ -1,10 +1,10 @@
 """Is a correction ever worse than none? Situations that are no fault of the actuators.
 
-    python benchmarks/suites/safety/run.py --write docs/reliability.md
+    python benchmarks/suites/safety/run.py
 
-plays the policy alone and corrected in every situation, prints the costs, and writes the table of a
-page. Each robot's costs are kept in `outputs/safety`; delete them to play again. The policies in
-MuJoCo take hours: `--robots half_cheetah_tqc hopper_trpo swimmer_trpo`.
+plays the policy alone and corrected in every situation, and prints the costs. Each robot's costs
+are kept in `outputs/safety`; delete them to play again. The policies in MuJoCo take hours:
+`--robots half_cheetah_tqc hopper_trpo swimmer_trpo`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from tasks import CHANGES, ROBOTS
 from tasks import play as play_task
 from worlds import SITUATIONS, WORLDS
 
+from afm_rl.report.tables import markdown
 from afm_rl.storage.files import write_whole
 
 SEEDS = {"30 servos": 3}  # each plays thirty joints; of the other robots 8
-MARKS = "<!-- safety begin -->\n", "<!-- safety end -->\n"
 
 
 def main() -> None:
@@ -37,7 +37,6 @@ def main() -> None:
         default=[],
         help="of the correction, such as saturation=clip; with another --out",
     )
-    parser.add_argument("--write", type=Path, help="page whose table is written")
     args = parser.parse_args()
     torch.set_num_threads(1)
     settings = dict(OmegaConf.from_dotlist(args.set))
@@ -47,14 +46,8 @@ def main() -> None:
         costs(name, args.seeds or SEEDS.get(name, 8), args.out, settings) for name in args.robots
     ]
     shown = judged(pd.concat(tables, ignore_index=True))
-    print(every(shown), summary(shown), sep="\n")
-    if args.write:
-        before, _, rest = args.write.read_text(encoding="utf-8").partition(MARKS[0])
-        _, end, after = rest.partition(MARKS[1])
-        if not end:
-            raise SystemExit(f"{args.write} has no lines {' and '.join(MARKS)}".replace("\n", ""))
-        new = before + MARKS[0] + summary(shown) + MARKS[1] + after
-        write_whole(args.write, new.encode())
+    costs_shown = shown.drop(columns="seeds").round({"alone": 3, "AFM": 3})
+    print(markdown("mean cost a step", costs_shown), markdown("verdicts", summary(shown)), sep="\n")
 
 
 def costs(name: str, seeds: int, out: Path, settings: dict) -> pd.DataFrame:
@@ -97,30 +90,19 @@ def judged(table: pd.DataFrame) -> pd.DataFrame:
     return grouped[["alone", "AFM"]].apply(judge).reset_index()
 
 
-def every(shown: pd.DataFrame) -> str:
-    """Return the mean cost a step of every situation."""
-    text = "| robot | situation | alone | AFM | |\n|---|---|---|---|---|\n"
-    for robot, situation, alone, corrected, verdict, _ in shown.itertuples(index=False):
-        text += f"| {robot} | {situation} | {alone:.3f} | {corrected:.3f} | {verdict} |\n"
-    return text
-
-
-def summary(shown: pd.DataFrame) -> str:
+def summary(shown: pd.DataFrame) -> pd.DataFrame:
     """Return how many situations of every robot are better, and which are worse."""
-    verdicts = shown[""].value_counts()
-    text = f"Of {len(shown)} situations {verdicts.get('worse', 0)} are worse, "
-    text += f"{verdicts.get('better', 0)} better:\n\n"
-    text += "| robot | seeds | situations | better | worse: cost a step, alone → AFM |\n"
-    text += "|---|---|---|---|---|\n"
-    for robot, rows in shown.groupby("robot", sort=False):
+    rows = []
+    for robot, mine in shown.groupby("robot", sort=False):
         worse = [
             f"{row.situation} ({row.alone:.3f} → {row.AFM:.3f})"
-            for row in rows[rows[""] == "worse"].itertuples()
+            for row in mine[mine[""] == "worse"].itertuples()
         ]
-        better = (rows[""] == "better").sum()
-        cells = [robot, rows["seeds"].iloc[0], len(rows), better, ", ".join(worse)]
-        text += f"| {' | '.join(map(str, cells))} |\n"
-    return text
+        better = (mine[""] == "better").sum()
+        rows.append([robot, mine["seeds"].iloc[0], len(mine), better, len(worse), ", ".join(worse)])
+    rows.append(["all", "", *(sum(row[k] for row in rows) for k in (2, 3, 4)), ""])
+    heads = ["robot", "seeds", "situations", "better", "worse", "cost a step, alone → AFM"]
+    return pd.DataFrame(rows, columns=heads)
 
 
 if __name__ == "__main__":

@@ -13,10 +13,13 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from faults import FaultyVector
 from methods import METHODS
 from task import POLICIES, Task
+
+from afm_rl.report.tables import markdown
 
 
 def main() -> None:
@@ -30,10 +33,9 @@ def main() -> None:
     torch.set_num_threads(1)
     task = Task(args.folder / f"{args.policy}.safetensors")
     spent = {name: np.quantile(times, 0.5) for name, times in measure(task, args).items()}
-    print("| method | µs a step | of AFM's |\n|---|---|---|")
-    for name, seconds in spent.items():
-        added = seconds - spent["alone"]
-        print(f"| {name} | {1e6 * added:.0f} | {added / (spent['AFM'] - spent['alone']):.2f} |")
+    added = {name: seconds - spent["alone"] for name, seconds in spent.items()}
+    rows = [(name, f"{1e6 * x:.0f}", f"{x / added['AFM']:.2f}") for name, x in added.items()]
+    print(markdown("cost", pd.DataFrame(rows, columns=["method", "µs a step", "of AFM's"])))
 
 
 def measure(task: Task, args: argparse.Namespace) -> dict[str, list[float]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,10 @@ import pandas as pd
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from afm_rl.report.tables import markdown
+
 HARM = 0.05  # share of the healthy return
+SHORT = ["none", "all reversed", "half", "dead", "late 4", "reversed and late 2"]
 NUMBERED = 8  # policies up to which each cell has its number
 
 
@@ -41,12 +45,21 @@ def ordered(results: pd.DataFrame, methods: list[str], faults: list[str]) -> pd.
 
 def print_tables(results: pd.DataFrame) -> None:
     """Print the return after the fault of each policy, and what all have in common."""
-    for policy, rows in results.groupby("policy"):
-        print(f"\n{policy}: return after the fault (survivors, where some fell)\n")
-        print_table(rows, _sum)
-    for title, cell in ALL.items():
-        print(f"\nAll policies: {title}\n")
-        print_table(results, cell)
+    methods = list(results["method"].cat.categories)
+    if methods[0] == "alone" and len(methods) in (2, 3):
+        returns = table_by(results, "policy", lambda rows: _change(rows, methods))
+        print(markdown("returns", returns))
+        short = returns[returns["fault"].isin(SHORT)]
+        print(markdown("short", short.replace(r"( \(|, \d+ fell).*", "", regex=True)))
+    cases = results.sort_values(["policy", "fault"])
+    names = cases["policy"] + ", " + cases["fault"].astype(str)
+    cases = cases.assign(fault=pd.Categorical(names, names.unique()))
+    print(markdown("each", table_by(cases, "method", _sum)))
+    parts = [
+        table_by(results, "method", cell).set_index("fault").add_prefix(f"{name}: ")
+        for name, cell in ALL.items()
+    ]
+    print(markdown("shares", pd.concat(parts, axis=1).reset_index()))
     harmed(results)
 
 
@@ -60,12 +73,20 @@ def harmed(results: pd.DataFrame) -> None:
         print(f"\nless than alone by more than {HARM}, {method}: {cases or 'nowhere'}")
 
 
-def print_table(rows: pd.DataFrame, cell) -> None:
-    methods = rows["method"].cat.categories
-    print(f"| fault | {' | '.join(methods)} |\n|---{'|---' * len(methods)}|")
-    for fault, mine in rows.groupby("fault", observed=True):
-        groups = [mine[mine["method"] == method] for method in methods]
-        print(f"| {fault} | {' | '.join(cell(x) if len(x) else '–' for x in groups)} |")
+def table_by(results: pd.DataFrame, column: str, cell: Callable[..., str]) -> pd.DataFrame:
+    """Return what ``cell`` says of the rows of each fault, with a column for each kind."""
+    groups = results.groupby(["fault", column], observed=True)[list(results)]
+    wide = groups.apply(cell).unstack(fill_value="–")
+    return wide.set_axis(list(wide), axis=1).reset_index().astype(str)
+
+
+def _change(rows: pd.DataFrame, methods: list[str]) -> str:
+    """Say what becomes of the return: alone → corrected (truth), and how many fell."""
+    groups = [rows[rows["method"] == method] for method in methods]
+    alone, corrected, *truth = (f"{group['after'].mean():.0f}" for group in groups)
+    fell = (~groups[1]["survived"].astype(bool)).sum()
+    text = f"{alone} → {corrected}" + "".join(f" ({value})" for value in truth)
+    return text + (f", {fell} fell" if fell else "")
 
 
 def _sum(rows: pd.DataFrame) -> str:
@@ -78,9 +99,9 @@ def _steps(rows: pd.DataFrame) -> str:
 
 
 ALL = {
-    "share of the healthy return": lambda rows: f"{rows['share'].mean():.2f}",
-    "survivors": lambda rows: f"{rows['survived'].mean():.0%}",
-    "median steps until recovered": _steps,
+    "share": lambda rows: f"{rows['share'].mean():.2f}",
+    "survive": lambda rows: f"{rows['survived'].mean():.0%}",
+    "steps": _steps,
 }
 
 

@@ -1,0 +1,286 @@
+"""Measured tables and figures of README and docs: are they of today's code, and what renews them?
+
+    python benchmarks/results.py                      # list them
+    python benchmarks/results.py --renew NAME ...     # measure again; `all`: whatever is stale
+    python benchmarks/results.py --write              # put what the files say into the pages
+
+A result is a file, `benchmarks/results/NAME.json`. By hand: its ``commands``, as a page prints
+them, ``seeds`` in words, ``figures`` that they draw, and what they ``need`` that is not in the
+repository, with SHA-256. The rest is written by ``--renew``: the ``tables`` that they printed,
+commit, versions, machine, seconds of processor time, and the ``code``: a digest of each file of the
+repository that was read. A result is stale when one of these has another digest now.
+
+A page shows a table between `<!-- result NAME: TABLE -->` and `<!-- end -->`; TABLE is what its
+command printed above it, and may be left out where there is one. Within a sentence
+`<!-- result NAME: TABLE | ROW | COLUMN -->` shows a cell, without its interval.
+
+``--renew`` works in `outputs/results/NAME`, beside links to the repository. If it is ended, the
+same command goes on there, unless code that was read has changed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import hashlib
+import importlib.util
+import json
+import os
+import platform
+import re
+import resource
+import shutil
+import subprocess
+import sys
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+MARK = re.compile(
+    r"(<!-- result ([\w-]+)(?:: ([^|>]+?))?(?: \| ([^|>]+?) \| ([^|>]+?))? -->).*?(<!-- end -->)",
+    re.DOTALL,
+)
+HOOK = """
+import os, sys
+
+target = os.open(os.environ["RESULTS_READ"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+seen = set()
+
+def note(event, arguments):
+    if event == "open" and isinstance(arguments[0], str) and arguments[0] not in seen:
+        if not arguments[2] & (os.O_WRONLY | os.O_RDWR):
+            seen.add(arguments[0])
+            os.write(target, (os.path.abspath(arguments[0]) + "\\n").encode())
+
+sys.addaudithook(note)
+"""  # sitecustomize of every Python that a command starts: imports, too, open files
+Result = dict[str, Any]
+
+
+def load(name: str) -> Result:
+    """Return a result, or end in a line that says which there are."""
+    file = ROOT / "benchmarks" / "results" / f"{name}.json"
+    if not file.is_file():
+        raise SystemExit(f"{name}: no such result; there are {', '.join(names())}")
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def names() -> list[str]:
+    return sorted(file.stem for file in (ROOT / "benchmarks" / "results").glob("*.json"))
+
+
+def pages() -> list[Path]:
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+@cache
+def digest(file: Path) -> str:
+    """Return what tells a file from another one: comments, docstrings and layout do not count."""
+    content = file.read_bytes() if file.is_file() else b""
+    if file.suffix == ".py":
+        tree = ast.parse(content)
+        for node in ast.walk(tree):
+            kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+            if isinstance(node, kinds) and ast.get_docstring(node, clean=False) is not None:
+                node.body = node.body[1:] or [ast.Pass()]
+        content = ast.unparse(tree).encode()
+    elif file.suffix == ".yaml":
+        content = repr(yaml.safe_load(content)).encode()
+    return hashlib.sha256(content).hexdigest()
+
+
+def code_now() -> dict[str, str]:
+    """Return the digest of every file that may count: all of the repository but its texts."""
+    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    files = subprocess.check_output(listed, cwd=ROOT, text=True).splitlines()
+    counted = (f for f in files if not f.startswith(("docs/", "benchmarks/results/")))
+    return {f: digest(ROOT / f)[:8] for f in counted if not f.endswith(".md")}
+
+
+def asked(result: Result) -> str:
+    """Return the digest of what is written by hand."""
+    text = json.dumps([result["commands"], result.get("need")])
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def reasons(result: Result) -> tuple[str, str]:
+    """Return why a result is stale, and why it cannot be renewed here; empty where it is not."""
+    code = dict(result.get("code", {}))
+    old = code.pop("commands", None)
+    changed = [f for f, value in code.items() if digest(ROOT / f)[:8] != value]
+    why = "never renewed" if old is None else ""
+    if changed:
+        why = changed[0] + (f" and {len(changed) - 1} more changed" if changed[1:] else " changed")
+    elif old not in (None, asked(result)):
+        why = "its commands changed"
+    need = result.get("need", {})
+    absent = [file for file, value in need.items() if digest(ROOT / file) != value]
+    return why, f"needs {', '.join(absent)}" if absent else ""
+
+
+def tables_of(text: str) -> dict[str, list[str]]:
+    r"""Return the Markdown tables of a text, by the line above each.
+
+    >>> tables_of("Errors:\n\n| a |\n|---|\n| 1 |\n")
+    {'Errors': ['| a |', '|---|', '| 1 |']}
+    """
+    found: dict[str, list[str]] = {}
+    title = ""
+    for line in text.splitlines():
+        if line.startswith("|"):
+            found.setdefault(title, []).append(line)
+        elif line.strip():
+            title = line.strip().rstrip(":")
+    return found
+
+
+def filled(page: Path) -> str:
+    """Return a page with what the results say between its marks."""
+
+    def fill(match: re.Match[str]) -> str:
+        begin, name, title, row, column, end = match.groups()
+        tables = load(name)["tables"]
+        if title is None and len(tables) == 1:
+            title = next(iter(tables))
+        if title not in tables:
+            raise SystemExit(f"{page}: {begin}: expected a table of {', '.join(tables)}")
+        if row is None:
+            return "\n".join([begin, *tables[title], end])
+        cells = [[c.strip(" *") for c in line.split("|")[1:-1]] for line in tables[title]]
+        values = [dict(zip(cells[0], c, strict=True)).get(column) for c in cells if c[0] == row]
+        if len(values) != 1 or values[0] is None:
+            raise SystemExit(f"{page}: {begin}: expected a row and a column of that table")
+        return begin + values[0].partition(" [")[0] + end
+
+    return MARK.sub(fill, page.read_text(encoding="utf-8"))
+
+
+def write_pages() -> None:
+    for page in pages():
+        page.write_text(filled(page), encoding="utf-8")
+
+
+def renew(name: str) -> None:
+    """Run the commands of a result in a folder of its own, or go on there; write file and pages."""
+    result, now = load(name), code_now()
+    if reasons(result)[1]:
+        raise SystemExit(f"{name}: cannot be renewed here: it {reasons(result)[1]}")
+    folder = ROOT / "outputs" / "results" / name
+    state, read = folder / "begun.json", folder / "read.txt"
+    begun = {"code": now, "commands": asked(result), "seconds": 0.0}
+    if state.is_file():
+        earlier = json.loads(state.read_text(encoding="utf-8"))
+        same = all(earlier["code"].get(file) == now.get(file) for file in files_in(read))
+        if same and earlier["commands"] == begun["commands"]:
+            begun = earlier
+        else:
+            print(f"{name}: begins anew, what it depends on has changed", flush=True)
+            shutil.rmtree(folder)
+    (folder / "hook").mkdir(parents=True, exist_ok=True)
+    (folder / "hook" / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
+    for part in {Path(file).parts[0] for file in [*now, *result.get("need", {}), "docs"]}:
+        if not (folder / part).is_symlink():
+            (folder / part).symlink_to(ROOT / part)
+    settings = {"PYTHONPATH": str(folder / "hook"), "RESULTS_READ": str(read)}
+    settings |= {"AFM_RL_CACHE": str(folder / "cache"), "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    settings["PATH"] = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
+    printed, start = "", processor_seconds()
+    try:
+        for command in result["commands"]:
+            print(f"{name}: {command}", flush=True)
+            printed += subprocess.check_output(
+                ["bash", "-c", command], cwd=folder, env=os.environ | settings, text=True
+            )
+    except subprocess.CalledProcessError as error:
+        raise SystemExit(f"{name}: ended with status {error.returncode}: {command}") from None
+    finally:
+        begun["seconds"] += processor_seconds() - start
+        state.write_text(json.dumps(begun), encoding="utf-8")
+    files = [file for file in files_in(read) if file in begun["code"]]
+    result |= {
+        "figures": {file: digest.__wrapped__(ROOT / file) for file in result.get("figures", {})},
+        "tables": tables_of(printed),
+        "commit": commit_of(files),
+        "versions": {part: version(part) for part in ("torch", "torchrl", "mujoco")}
+        | {"python": platform.python_version(), "afm-rl": version("afm-rl")},
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "seconds": round(begun["seconds"]),
+        "code": {"commands": begun["commands"]} | {file: begun["code"][file] for file in files},
+    }
+    save(name, result)
+    write_pages()
+
+
+def files_in(read: Path) -> list[str]:
+    """Return the files of the repository in the list that was written while commands ran."""
+    lines = read.read_text(encoding="utf-8").splitlines() if read.is_file() else []
+    files = set()
+    for line in lines:
+        file = Path(importlib.util.source_from_cache(line) if line.endswith(".pyc") else line)
+        if file.resolve().is_relative_to(ROOT):
+            files.add(file.resolve().relative_to(ROOT).as_posix())
+    return sorted(files)
+
+
+def processor_seconds() -> float:
+    """Return the processor time of the commands that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def commit_of(files: list[str]) -> str:
+    """Return the commit, marked where one of the files differs from it."""
+    head = subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, text=True)
+    same = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", *files], cwd=ROOT, check=False)
+    return head.strip() + ("" if same.returncode == 0 else ", changed")
+
+
+def save(name: str, result: Result) -> None:
+    text = json.dumps(result, indent=1, ensure_ascii=False)
+    file = ROOT / "benchmarks" / "results" / f"{name}.json"
+    file.write_text(text + "\n", encoding="utf-8")
+
+
+def where() -> dict[str, list[str]]:
+    """Return the pages of each result: those with its marks, and those that show its figures."""
+    texts = {
+        page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8") for page in pages()
+    }
+    return {
+        name: [
+            page
+            for page, text in texts.items()
+            if name in {mark[1] for mark in MARK.findall(text)}
+            or any(f"images/{Path(figure).name})" in text for figure in load(name)["figures"])
+        ]
+        for name in names()
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--renew", nargs="+", metavar="NAME", help="measure again; all: stale ones")
+    parser.add_argument("--write", action="store_true", help="write the pages from the files")
+    options = parser.parse_args()
+    if options.write:
+        write_pages()
+    elif options.renew:
+        stale = [name for name in names() if reasons(load(name))[0] and not reasons(load(name))[1]]
+        for name in stale if options.renew == ["all"] else options.renew:
+            renew(name)
+    else:
+        for name, shown_on in where().items():
+            result = load(name)
+            why, why_not = reasons(result)
+            cost = f"{result['seconds'] / 60:.1f} min" if "seconds" in result else "cost unknown"
+            said = f"stale: {why}" if why else "fresh"
+            said += f"; cannot be renewed here: {why_not}" if why_not else ""
+            print(f"{name:24}{cost:>13}  {', '.join(shown_on)}: {said}")
+
+
+if __name__ == "__main__":
+    main()

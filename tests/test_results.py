@@ -1,0 +1,178 @@
+"""What README and docs show of measurements is what the files of results say."""
+
+import importlib.util
+import json
+import re
+import subprocess
+
+import pytest
+from pages import PAGES, ROOT, name_of
+
+spec = importlib.util.spec_from_file_location("results", ROOT / "benchmarks" / "results.py")
+results = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(results)
+
+NUMBER = re.compile(r"^[\s*~<>≤±+-]*[.\d][\d.,]*")
+NOT_MEASURED = {  # tables of numbers outside marks: page, head: why
+    ("paper.md", "| the paper | setting | value |"): "settings of the paper",
+    ("quickstart.md", "| column of `steps.parquet` | what it says |"): "what 0 and 1 mean",
+}
+SHOWN_ALONE = {  # figures of no result: why
+    "layers.svg": "drawn from the imports whenever the site is built",
+    "play.png": "a page of ours, as it looks",
+    "diagnosis.png": "a page of ours, as it looks",
+}
+
+
+def outside(page):
+    """Return the tables of a page, without code, that stand outside marks."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    return re.findall(r"(?:^\|.*\n)+", results.MARK.sub("", text), re.MULTILINE)
+
+
+def is_of_numbers(table):
+    """Return whether a fifth of the cells, without heads of rows and columns, begin as numbers."""
+    cells = [c for line in table.splitlines()[2:] for c in line.strip("|").split("|")[1:]]
+    return sum(bool(NUMBER.match(cell)) for cell in cells) * 5 > len(cells)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_a_page_shows_what_the_files_of_results_say(page):
+    text = page.read_text()
+    assert results.filled(page) == text
+    assert not re.search(r"^<!-- result [^>|]+\|", text, re.MULTILINE)  # ends the paragraph
+
+
+def test_every_table_of_numbers_is_of_a_result():
+    heads = {
+        (name_of(page), table.splitlines()[0])
+        for page in PAGES
+        for table in outside(page)
+        if is_of_numbers(table)
+    }
+    assert heads == set(NOT_MEASURED)
+
+
+def test_every_figure_is_of_a_result():
+    figures = {file for name in results.names() for file in results.load(name)["figures"]}
+    shown = {
+        image
+        for page in PAGES
+        for image in re.findall(r"!\[[^]]*\]\(\S*?images/(\S+)\)", page.read_text())
+    }
+    assert {f"docs/images/{image}" for image in shown - set(SHOWN_ALONE)} == figures
+
+
+@pytest.mark.parametrize("name", results.names())
+def test_a_result_is_shown_and_its_figures_are_those_of_its_file(name):
+    assert results.where()[name]
+    for file, digest in results.load(name)["figures"].items():
+        assert results.digest(ROOT / file) == digest
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "same"),
+    [
+        ("a.py", '"""A."""\nx = 1  # one\n', "x = (1)\n", True),
+        ("a.py", "def f():\n    '''F.'''\n", "def f():\n    pass\n", True),
+        ("a.py", "x = 1\n", "x = 2\n", False),
+        ("a.yaml", "x: 1 # one\n", "x: 1\n", True),
+        ("a.yaml", "x: 1\n", "x: 2\n", False),
+        ("a.csv", "x\n1\n", "x\n1\n\n", False),
+    ],
+)
+def test_what_tells_files_apart(tmp_path, file, old, new, same):
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / file).write_text(old)
+    (tmp_path / file).write_text(new)
+    assert (results.digest(tmp_path / file) == results.digest(tmp_path / "old" / file)) is same
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch):
+    """Make a repository with one result, whose command forks, and ends at first."""
+    monkeypatch.setattr(results, "ROOT", tmp_path)
+    program = """
+        import os, pathlib, sys
+        import used
+        if not os.fork():
+            import forked
+            os._exit(0)
+        os.wait()
+        open("conf.yaml").read()
+        done = pathlib.Path("outputs", "done")
+        done.parent.mkdir(exist_ok=True)
+        parts = int(done.read_text()) if done.exists() else 0
+        done.write_text(str(parts + 1))
+        if not parts:
+            sys.exit(3)
+        print(f"errors:\\n\\n| | mean |\\n|---|---|\\n| **a** | {used.x} [1, {parts}] |")
+    """
+    files = {
+        "run.py": re.sub("^ {8}", "", program, flags=re.MULTILINE),
+        "used.py": '"""Used."""\nx = 1\n',
+        "forked.py": "",
+        "unused.py": "",
+        "conf.yaml": "x: 1\n",
+        ".gitignore": "outputs/\n",
+        "README.md": "<!-- result one -->\n<!-- end -->\n"
+        "It is <!-- result one: errors | a | mean --><!-- end -->.\n",
+        "benchmarks/results/one.json": json.dumps(
+            {"commands": ["python run.py"], "seeds": "none", "figures": {}, "tables": {}}
+        ),
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b"]
+    for arguments in (["init", "-q"], ["add", "."], ["commit", "-qm", "a"]):
+        subprocess.run([*git, *arguments], cwd=tmp_path, check=True)
+    return tmp_path
+
+
+def change(file, text):
+    file.write_text(text)
+    results.digest.cache_clear()
+
+
+def test_renewing_goes_on_notes_what_was_read_and_writes_the_page(desk):
+    assert results.reasons(results.load("one")) == ("never renewed", "")
+    with pytest.raises(SystemExit, match="one: ended with status 3: python run.py"):
+        results.renew("one")
+    results.renew("one")
+    result = results.load("one")
+    assert set(result["code"]) == {"commands", "run.py", "used.py", "forked.py", "conf.yaml"}
+    assert result["tables"] == {"errors": ["| | mean |", "|---|---|", "| **a** | 1 [1, 1] |"]}
+    page = (desk / "README.md").read_text()
+    assert "| **a** | 1 [1, 1] |\n<!-- end -->" in page and "mean -->1<!-- end -->." in page
+    assert results.reasons(result) == ("", "")
+    change(desk / "unused.py", "x = 2")
+    change(desk / "used.py", '"""It is used."""\nx = 1  # one\n')
+    assert results.reasons(result) == ("", "")
+    change(desk / "used.py", "x = 2\n")
+    assert results.reasons(result) == ("used.py changed", "")
+    with pytest.raises(SystemExit, match="status 3"):  # begins anew
+        results.renew("one")
+
+
+def test_what_needs_files_that_are_missing_cannot_be_renewed(desk):
+    results.save("one", results.load("one") | {"need": {"data/robot.xml": "0" * 64}})
+    with pytest.raises(SystemExit, match="one: cannot be renewed here: it needs data/robot.xml"):
+        results.renew("one")
+
+
+@pytest.mark.parametrize(
+    ("mark", "said"),
+    [
+        ("result two", "two: no such result; there are one"),
+        ("result one: other", "expected a table of errors"),
+        ("result one: errors | b | mean", "expected a row and a column of that table"),
+        ("result one: errors | a | median", "expected a row and a column of that table"),
+    ],
+)
+def test_marks_that_say_nothing(desk, mark, said):
+    tables = {"errors": ["| | mean |", "|---|---|", "| a | 1 |"]}
+    results.save("one", results.load("one") | {"tables": tables})
+    (desk / "README.md").write_text(f"<!-- {mark} --><!-- end -->")
+    with pytest.raises(SystemExit, match=re.escape(said)):
+        results.filled(desk / "README.md")
