@@ -81,7 +81,7 @@ def pages() -> list[Path]:
 def digest(file: Path) -> str:
     """Return what tells a file from another one: comments, docstrings and layout do not count."""
     content = file.read_bytes() if file.is_file() else b""
-    if file.suffix == ".py":
+    if file.suffix in (".py", ".pyi"):
         tree = ast.parse(content)
         for node in ast.walk(tree):
             kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
@@ -107,10 +107,33 @@ def asked(result: Result) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
+def packed(code: dict[str, str]) -> dict[str, str]:
+    """Return digests of files with a line for each folder.
+
+    >>> packed({"a/b.py": "01", "a/c.py": "02"})
+    {'a': 'b.py 01 c.py 02'}
+    """
+    folders: dict[str, str] = {}
+    for file, value in code.items():
+        folder, _, name = file.rpartition("/")
+        folders[folder] = f"{folders.get(folder, '')} {name} {value}".lstrip()
+    return folders
+
+
+def unpacked(folders: dict[str, str]) -> dict[str, str]:
+    """Return what was packed."""
+    pairs = ((Path(folder), iter(text.split())) for folder, text in folders.items())
+    return {
+        (folder / name).as_posix(): value
+        for folder, words in pairs
+        for name, value in zip(words, words, strict=True)
+    }
+
+
 def reasons(result: Result) -> tuple[str, str]:
     """Return why a result is stale, and why it cannot be renewed here; empty where it is not."""
-    code = dict(result.get("code", {}))
-    old = code.pop("commands", None)
+    code = unpacked(result.get("code", {}))
+    old = result.get("asked")
     changed = [f for f, value in code.items() if digest(ROOT / f)[:8] != value]
     why = "never renewed" if old is None else ""
     if changed:
@@ -171,11 +194,11 @@ def renew(name: str) -> None:
         raise SystemExit(f"{name}: cannot be renewed here: it {reasons(result)[1]}")
     folder = ROOT / "outputs" / "results" / name
     state, read = folder / "begun.json", folder / "read.txt"
-    begun = {"code": now, "commands": asked(result), "seconds": 0.0}
+    begun = {"code": now, "asked": asked(result), "seconds": 0.0}
     if state.is_file():
         earlier = json.loads(state.read_text(encoding="utf-8"))
         same = all(earlier["code"].get(file) == now.get(file) for file in files_in(read))
-        if same and earlier["commands"] == begun["commands"]:
+        if same and earlier["asked"] == begun["asked"]:
             begun = earlier
         else:
             print(f"{name}: begins anew, what it depends on has changed", flush=True)
@@ -207,9 +230,10 @@ def renew(name: str) -> None:
         "commit": commit_of(files),
         "versions": {part: version(part) for part in ("torch", "torchrl", "mujoco")}
         | {"python": platform.python_version(), "afm-rl": version("afm-rl")},
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "machine": f"{processor()}, {os.cpu_count()} cores",
         "seconds": round(begun["seconds"]),
-        "code": {"commands": begun["commands"]} | {file: begun["code"][file] for file in files},
+        "asked": begun["asked"],
+        "code": packed({file: begun["code"][file] for file in files}),
     }
     save(name, result)
     write_pages()
@@ -224,6 +248,13 @@ def files_in(read: Path) -> list[str]:
         if file.resolve().is_relative_to(ROOT):
             files.add(file.resolve().relative_to(ROOT).as_posix())
     return sorted(files)
+
+
+def processor() -> str:
+    """Return the name of the processor, or of its kind."""
+    said = Path("/proc/cpuinfo")
+    model = re.search(r"model name\s*: (.*)", said.read_text()) if said.is_file() else None
+    return model[1] if model else platform.machine()
 
 
 def processor_seconds() -> float:

@@ -141,7 +141,7 @@ def test_renewing_goes_on_notes_what_was_read_and_writes_the_page(desk):
         results.renew("one")
     results.renew("one")
     result = results.load("one")
-    assert set(result["code"]) == {"commands", "run.py", "used.py", "forked.py", "conf.yaml"}
+    assert set(results.unpacked(result["code"])) == {"run.py", "used.py", "forked.py", "conf.yaml"}
     assert result["tables"] == {"errors": ["| | mean |", "|---|---|", "| **a** | 1 [1, 1] |"]}
     page = (desk / "README.md").read_text()
     assert "| **a** | 1 [1, 1] |\n<!-- end -->" in page and "mean -->1<!-- end -->." in page

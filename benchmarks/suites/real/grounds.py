@@ -84,8 +84,9 @@ def both(table: pd.DataFrame) -> pd.DataFrame:
     """Return median / 90th percentile of each ground and axis, and in how many of 12 it is good."""
     texts = table.map("{:.3f}".format)
     pairs = texts.xs("median", level=2) + " / " + texts.xs("p90", level=2)
-    pairs.index = [f"{log.partition('_')[2]}, {axis}" for log, axis in pairs.index]
-    pairs.loc["within 10 % of the best simple one, of 12"] = [within(table, name) for name in table]
+    pairs.index = [f"{log.replace('_', ' ')}, {axis}" for log, axis in pairs.index]
+    count = [str(within(table, name)) for name in table]
+    pairs.loc["within 10 % of the best simple one, of 12"] = count
     return pairs.rename_axis("").reset_index()
 
 
