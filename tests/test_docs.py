@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -111,6 +112,21 @@ def test_links_of_the_readme_lead_to_pages_or_are_text(hooks):
     text = "[a](docs/afm.md#x) [b](notebooks/n.ipynb) [c](LICENSE) ![d](docs/images/e.png)"
     expected = "[a](afm.md#x) [b](notebooks/n.md) c ![d](images/e.png)"
     assert hooks.with_site_links(text) == expected
+
+
+def test_the_front_page_says_which_versions():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = {"Python": project["requires-python"]}
+    for line in (*project["dependencies"], *sum(project["optional-dependencies"].values(), [])):
+        name, range_ = re.match(r"([\w-]+)(?:\[[\w,]+\])?(.*)", line).groups()
+        needed.setdefault(name, range_)
+    tested = re.findall(r"^(\S+)==(\S+)", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    table = re.search(r"tested with \|\n.*\n((?:\|.*\n)+)", (ROOT / "README.md").read_text())[1]
+    for row in table.splitlines():
+        part, range_, version = (cell.strip() for cell in row.strip("|").split("|"))
+        name = part.split(",")[0]
+        assert needed[name] == range_
+        assert dict(tested).get(name, "3.11") == version
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda p: p.stem)
