@@ -12,9 +12,11 @@ import time
 from statistics import median
 
 import gymnasium
+import pandas as pd
 import torch
 
 from afm_rl import ActionFlowWrapper
+from afm_rl.report.tables import markdown
 
 WEAK, STEPS, ROUNDS = 0.6, 100, 3
 
@@ -48,9 +50,9 @@ def spent(steps: int) -> float:
 def main() -> None:
     torch.set_num_threads(1)
     usual = spent(0)
-    print(f"no delay: {usual:.1f} ms a step")
-    for steps in (1, 2, 4, 8):
-        print(f"{steps} steps late: {spent(steps) / usual:.2f} times that")
+    rows = [[steps, f"{spent(steps) / usual:.2f}"] for steps in (1, 2, 4, 8)]
+    heads = ["steps late", "of a step without delay"]
+    print(markdown("cost", pd.DataFrame(rows, columns=heads)))
 
 
 if __name__ == "__main__":

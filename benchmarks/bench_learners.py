@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import copy
 import time
-from pathlib import Path
 
 import pandas as pd
 import torch
@@ -26,6 +25,7 @@ from torch import Tensor
 
 from afm_rl.missions import build, prepare
 from afm_rl.missions.build import Agent
+from afm_rl.report.tables import markdown
 
 FAMILIES = ["gains", "bias", "coupling", "dead_zone", "slip", "saturation"]
 BEFORE, DURING, OTHER, AFTER, STAY = 100, 200, 100, 200, 20
@@ -39,12 +39,13 @@ LEARNERS = {
 }
 
 
-def make(overrides: list[str], seeds: int, cache: str) -> Agent:
+def make(overrides: list[str], seeds: int) -> Agent:
     """Return the agent that the command line would build, trained."""
     chosen = [f"regimes=[{','.join(FAMILIES)}]", "tracks=ethz_1", f"seeds={seeds}"]
     with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        agent = build(compose("config", [*overrides, *chosen]))
-    prepare(agent, cache, echo=lambda line: None)
+        cfg = compose("config", [*overrides, *chosen])
+        agent = build(cfg)
+    prepare(agent, cfg.cache, echo=lambda line: None)
     return agent
 
 
@@ -115,19 +116,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Online learners on one stream.")
     parser.add_argument("--seeds", type=int, default=20, help="robots per family")
     parser.add_argument("--learners", nargs="*", default=list(LEARNERS), choices=list(LEARNERS))
-    parser.add_argument("--cache", default=str(Path("~/.cache/afm_rl").expanduser()))
     options = parser.parse_args()
     torch.set_num_threads(1)
     whole, families = {}, {}
     for name in options.learners:
-        errors, usual, seconds = drive(make(LEARNERS[name], options.seeds, options.cache))
+        errors, usual, seconds = drive(make(LEARNERS[name], options.seeds))
         rows = judge(errors, usual)
         whole[name] = rows.drop(columns="family").median()
         whole[name]["ms per update"] = 1e3 * seconds / len(rows)
         families[name] = rows.groupby("family", sort=False)["aligned after"].median()
         print(f"{name}: done", flush=True)
-    print(pd.DataFrame(whole).T.to_string(float_format="%.3g"))
-    print(pd.DataFrame(families).T.to_string(float_format="%.3g"))
+    for title, columns in {"medians": whole, "steps to alignment": families}.items():
+        table = (
+            pd.DataFrame(columns).T.map("{:.3g}".format).replace("inf", "∞").rename_axis("learner")
+        )
+        print(markdown(title, table.reset_index()))
 
 
 if __name__ == "__main__":

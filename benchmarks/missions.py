@@ -2,8 +2,8 @@
 
     python benchmarks/missions.py outputs/study/arm --rows regime --measures return:1 steps:0
 
-A measure is a column of `missions.csv` and its digits after the point. With `--columns` all
-measures are in one cell; without, each has a column of its own.
+Columns are those of `missions.csv`, and `run`, the name of a folder. A measure is a column and its
+digits after the point. With `--columns` all measures are in one cell; without, each has its own.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ def main() -> None:
     parser.add_argument("--columns", nargs="*", default=[], help="columns of missions.csv")
     parser.add_argument("--measures", nargs="+", required=True, help="such as steps:0")
     options = parser.parse_args()
-    missions = with_scenarios(read_runs(options.folders).missions)
+    parts = [read_runs([folder]).missions.assign(run=folder.name) for folder in options.folders]
+    missions = with_scenarios(pd.concat(parts, ignore_index=True))
     shown = table(missions, options.rows, options.columns, options.measures)
     print(markdown(options.title, shown))
 

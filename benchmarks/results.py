@@ -11,8 +11,8 @@ commit, versions, machine, seconds of processor time, and the ``code``: a digest
 repository that was read. A result is stale when one of these has another digest now.
 
 A page shows a table between `<!-- result NAME: TABLE -->` and `<!-- end -->`; TABLE is what its
-command printed above it, and may be left out where there is one. Within a sentence
-`<!-- result NAME: TABLE | ROW | COLUMN -->` shows a cell, without its interval.
+command printed above it. Within a sentence `<!-- result NAME: TABLE | ROW | COLUMN -->` shows a
+cell, without its interval; such a mark does not begin a line, where it would end the paragraph.
 
 ``--renew`` works in `outputs/results/NAME`, beside links to the repository. If it is ended, the
 same command goes on there, unless code that was read has changed.
@@ -41,7 +41,7 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 MARK = re.compile(
-    r"(<!-- result ([\w-]+)(?:: ([^|>]+?))?(?: \| ([^|>]+?) \| ([^|>]+?))? -->).*?(<!-- end -->)",
+    r"(<!-- result ([\w-]+): ([^|>]+?)(?: \| ([^|>]+?) \| ([^|>]+?))? -->).*?(<!-- end -->)",
     re.DOTALL,
 )
 HOOK = """
@@ -167,8 +167,6 @@ def filled(page: Path) -> str:
     def fill(match: re.Match[str]) -> str:
         begin, name, title, row, column, end = match.groups()
         tables = load(name)["tables"]
-        if title is None and len(tables) == 1:
-            title = next(iter(tables))
         if title not in tables:
             raise SystemExit(f"{page}: {begin}: expected a table of {', '.join(tables)}")
         if row is None:

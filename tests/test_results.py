@@ -116,7 +116,7 @@ def desk(tmp_path, monkeypatch):
         "unused.py": "",
         "conf.yaml": "x: 1\n",
         ".gitignore": "outputs/\n",
-        "README.md": "<!-- result one -->\n<!-- end -->\n"
+        "README.md": "<!-- result one: errors -->\n<!-- end -->\n"
         "It is <!-- result one: errors | a | mean --><!-- end -->.\n",
         "benchmarks/results/one.json": json.dumps(
             {"commands": ["python run.py"], "seeds": "none", "figures": {}, "tables": {}}
@@ -165,7 +165,7 @@ def test_what_needs_files_that_are_missing_cannot_be_renewed(desk):
 @pytest.mark.parametrize(
     ("mark", "said"),
     [
-        ("result two", "two: no such result; there are one"),
+        ("result two: errors", "two: no such result; there are one"),
         ("result one: other", "expected a table of errors"),
         ("result one: errors | b | mean", "expected a row and a column of that table"),
         ("result one: errors | a | median", "expected a row and a column of that table"),

@@ -142,9 +142,9 @@ def main() -> None:
         print(markdown("verdicts", rows))
         return
     wrong = accused(args.healthy)
-    print(f"{len(wrong)} of {args.healthy} healthy joints are not called healthy")
-    for actuator in wrong:
-        print(actuator.sentence)
+    said = "; ".join(actuator.sentence for actuator in wrong)
+    heads = ["healthy joints", "not called healthy", "said"]
+    print(markdown("healthy", pd.DataFrame([[args.healthy, len(wrong), said]], columns=heads)))
 
 
 if __name__ == "__main__":

@@ -60,17 +60,19 @@ def print_tables(results: pd.DataFrame) -> None:
         for name, cell in ALL.items()
     ]
     print(markdown("shares", pd.concat(parts, axis=1).reset_index()))
-    harmed(results)
+    print(markdown(f"less than alone by more than {HARM}", harmed(results)))
 
 
-def harmed(results: pd.DataFrame) -> None:
+def harmed(results: pd.DataFrame) -> pd.DataFrame:
     """Say where a correction has less of the healthy return than the policy alone."""
     keys = ["policy", "fault"]
     table = results.pivot_table(index=keys, columns="method", values="share", observed=True)
+    rows = []
     for method in table.columns.drop("alone"):
         lost = (table["alone"] - table[method]).loc[lambda gap: gap > HARM].sort_values()[::-1]
-        cases = ", ".join(f"{policy} {fault} -{gap:.2f}" for (policy, fault), gap in lost.items())
-        print(f"\nless than alone by more than {HARM}, {method}: {cases or 'nowhere'}")
+        where = ", ".join(f"{policy} {fault} -{gap:.2f}" for (policy, fault), gap in lost.items())
+        rows.append([method, len(lost), table[method].count(), where])
+    return pd.DataFrame(rows, columns=["method", "less", "of", "where"])
 
 
 def table_by(results: pd.DataFrame, column: str, cell: Callable[..., str]) -> pd.DataFrame:
