@@ -1,5 +1,6 @@
 """What README and docs print: code, files and commands."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -46,11 +47,17 @@ def write_files(page, folder):
 
 
 def commands():
-    """Find each distinct command, without what stands for something else."""
+    """Find each distinct command, without what stands for something else.
+
+    Those that a page prints, and those that renew its numbers.
+    """
     found = {}
-    for page in PAGES:
-        prose = re.sub(OTHER_FENCE, "", page.read_text())
-        lines = [line.replace("\n", " ") for line in INLINE.findall(prose)]
+    for page in [*PAGES, *sorted((ROOT / "benchmarks" / "results").glob("*.json"))]:
+        if page.suffix == ".json":
+            lines = json.loads(page.read_text())["commands"]
+        else:
+            prose = re.sub(OTHER_FENCE, "", page.read_text())
+            lines = [line.replace("\n", " ") for line in INLINE.findall(prose)]
         for block in blocks(page, "sh", "bash"):
             lines += block.replace("\\\n", " ").splitlines()
         for line in lines:
@@ -60,5 +67,6 @@ def commands():
             if not words or any(PLACEHOLDER.search(word) for word in words):
                 continue
             words[0] = words[0].removeprefix(".venv/bin/")
+            words = [word for word in words if not re.match(r"hydra\.\w+\.dir=", word)]
             found.setdefault(tuple(words), Command(page, tuple(words)))
     return list(found.values())

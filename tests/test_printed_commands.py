@@ -212,7 +212,7 @@ def check_completion(words):
 
 
 ELSEWHERE = {"pip": check_install, "make": check_make, "sh": check_file, "eval": check_completion}
-ELSEWHERE |= dict.fromkeys(("ray", "kill", "pytest"), check_file)
+ELSEWHERE |= dict.fromkeys(("ray", "kill", "pytest", "cp"), check_file)
 
 
 @pytest.mark.filterwarnings("ignore")

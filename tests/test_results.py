@@ -3,14 +3,17 @@
 import importlib.util
 import json
 import re
+import runpy
 import subprocess
 
+import pandas as pd
 import pytest
 from pages import PAGES, ROOT, name_of
 
 spec = importlib.util.spec_from_file_location("results", ROOT / "benchmarks" / "results.py")
 results = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(results)
+table = runpy.run_path(str(ROOT / "benchmarks" / "missions.py"))["table"]
 
 NUMBER = re.compile(r"^[\s*~<>≤±+-]*[.\d][\d.,]*")
 NOT_MEASURED = {  # tables of numbers outside marks: page, head: why
@@ -87,6 +90,17 @@ def test_what_tells_files_apart(tmp_path, file, old, new, same):
     (tmp_path / "old" / file).write_text(old)
     (tmp_path / file).write_text(new)
     assert (results.digest(tmp_path / file) == results.digest(tmp_path / "old" / file)) is same
+
+
+def test_a_table_of_missions():
+    rows = [("a", "ring", 0, 1.0), ("a", "ring", 1, 2.0), ("b", "ring", 0, 4.0)]
+    missions = pd.DataFrame(rows, columns=["method", "track", "seed", "steps"])
+    missions = missions.assign(scenario="ring", share=0.25)
+    shown = table(missions, ["track"], ["method"], ["steps:1", "share:2"])
+    assert shown.to_dict("records") == [
+        {"track": "ring", "a": "1.5 [1.0, 2.0] / 0.25", "b": "4.0 / 0.25"}
+    ]
+    assert table(missions, ["method"], [], ["steps:0"])["steps"].tolist() == ["2 [1, 2]", "4"]
 
 
 @pytest.fixture
