@@ -67,7 +67,18 @@ bench: $(VENV)/.with-base ## Run every benchmarks/bench_*.py, one after the othe
 	@for f in $(sort $(wildcard benchmarks/bench_*.py)); do \
 		echo "== $$f"; OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/python $$f || exit 1; done
 
-docs: $(VENV)/.with-docs build/package ## Build the documentation into site/
+# A page of the site runs an exported file. Where it cannot be had, the site is built without.
+TRY := build/try/policy.onnx build/try/onnxruntime-web-1.30.0.tgz
+EXPORTED := $(foreach room,compiling correction dynamics transforms,$(wildcard afm_rl/$(room)/*.*))
+
+build/try/policy.onnx: $(EXPORTED)
+	@mkdir -p $(@D)
+	@$(BIN)/afm-rl-export method=afm_physics planner=null out=$@ > /dev/null || true
+
+build/try/%.tgz:
+	@mkdir -p $(@D) && cd $(@D) && npm pack --silent $(subst web-,web@,$*) > /dev/null || true
+
+docs: $(VENV)/.with-docs build/package $(TRY) ## Build the documentation into site/
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict && echo "docs: site/index.html"
 
 notebooks: $(VENV)/.with-test ## Run every notebook from top to bottom, at a small size

@@ -4,7 +4,8 @@ import html
 import re
 from pathlib import Path
 
-import layers  # beside this file
+import browser  # beside this file
+import layers
 from latex2mathml.converter import convert
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
@@ -92,6 +93,10 @@ def on_files(files, config):
         for name, image in made["outputs"].items():
             files.append(File.generated(config, f"notebooks/{name}", content=image))
     files.append(File.generated(config, "images/layers.svg", content=layers.draw()))
+    try:
+        files.append(File.generated(config, "theme/try_runtime.js", content=browser.script()))
+    except ValueError as error:
+        print(f"docs: the page Try it here cannot run anything: {error}")
     return files
 
 
