@@ -19,7 +19,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.diagnosis import Log
+from afm_rl.diagnosis import Log, diagnose
 from afm_rl.diagnosis.readers import read_log
 from afm_rl.diagnosis.replay import replay
 from afm_rl.diagnosis.replay.belief import believe
@@ -31,6 +31,7 @@ from afm_rl.storage.files import write_whole
 LOGS = Path(__file__).parents[3] / "examples" / "real_logs"
 GROUNDS = ("warthog_asphalt", "warthog_gravel", "warthog_ice")
 TRACKS = "marmotte_boreal"
+PREFIX = "A correction would have removed "
 REPLAYED = ["warthog_ice.csv", "marmotte_boreal.csv"]
 REPLAYED += ["warthog_ice_wheels.parquet", "crazyflie_ramp.parquet"]
 SHARES = {"median": 0.5, "p90": 0.9}
@@ -134,9 +135,19 @@ def main() -> None:
     parser.add_argument("--figure", type=Path, help="where to draw the three grounds")
     options = parser.parse_args()
     print(markdown("errors", both(compare(AFM=replayed))))
-    said = [(log, replay(read_log(LOGS / log)).sentence) for log in REPLAYED]
+    logs = {name: read_log(LOGS / name) for name in REPLAYED}
+    said = []
+    for name, log in logs.items():
+        diagnosis = diagnose(log)
+        said += [(name, note) for note in diagnosis.common]
+        for actuator in diagnosis.actuators:
+            said.append((f"{name}, {actuator.name}", actuator.sentence.partition(": ")[2]))
+    print(markdown("diagnoses", pd.DataFrame(said, columns=["log, actuator", "what it does"])))
     heads = ["log", "what a correction would have removed"]
-    print(markdown("replays", pd.DataFrame(said, columns=heads)))
+    removed = [
+        (name, replay(log).sentence.removeprefix(PREFIX).strip(".")) for name, log in logs.items()
+    ]
+    print(markdown("replays", pd.DataFrame(removed, columns=heads)))
     if options.figure is not None:
         write_whole(options.figure, style.png_bytes(draw(one_drive())))
 
