@@ -254,6 +254,17 @@ def test_a_file_is_asked_for_its_checksum_and_says_what_it_takes(monkeypatch, tm
     assert agent.memory.tolist() == [2.0] * 4  # a state that follows nothing, and this one
 
 
+def test_a_file_of_somebody_else_is_refused_in_one_line(tmp_path):
+    pytest.importorskip("onnxruntime")
+    small = Path(__file__).parents[1] / "benchmarks/suites/legged/robots/small_policy.onnx"
+    sound, path = small.read_bytes(), tmp_path / "policy.onnx"
+    for content, words in ((b"", "No graph"), (sound[:200], "Protobuf"), (sound, "'arguments'")):
+        path.write_bytes(content)
+        with pytest.raises(SystemExit, match="no file of afm-rl-export that runs here") as refused:
+            agents.load(path, sha256(content).hexdigest())
+        assert words in str(refused.value) and "\n" not in str(refused.value)
+
+
 @pytest.mark.parametrize(
     ("endpoint", "keys", "words"),
     [

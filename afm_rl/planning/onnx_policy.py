@@ -83,8 +83,10 @@ def policy_from_onnx(
     options.intra_op_num_threads, options.log_severity_level = 1, 4
     try:
         model = _model(path)
-        named = _inputs(path, model, inputs)
         outputs = [entry.name for entry in model.graph.output]
+        if not model.graph.input or not outputs:
+            raise ArtefactError(f"{path}: no inputs, or no outputs; expected both")
+        named = _inputs(path, model, inputs)
         if output is not None and output not in outputs:
             raise ConfigurationError(f"{path}: output={output!r}: expected one of {_list(outputs)}")
         _check_sizes(path, model)

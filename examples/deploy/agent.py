@@ -77,9 +77,15 @@ def load(path: str | Path, sha256: str | None) -> Agent:
             f"{path}: its sha256 is {found}, expected {sha256}; give --sha256 as afm-rl-export "
             "printed it"
         )
-    policy, about = (graph if Path(path).suffix == ".onnx" else program)(code)
-    sizes = {name: int(n) for name, n in (s.rsplit(":", 1) for s in about["arguments"].split())}
-    return Agent(policy, sizes, float(about["noise_bound"]), about["dtype"])
+    try:
+        policy, about = (graph if Path(path).suffix == ".onnx" else program)(code)
+        sizes = {name: int(n) for name, n in (s.rsplit(":", 1) for s in about["arguments"].split())}
+        return Agent(policy, sizes, float(about["noise_bound"]), about["dtype"])
+    except Exception as error:  # each runtime has its own; another's file lacks entries
+        why = " ".join(str(error).split())[:200]
+        raise SystemExit(
+            f"{path}: no file of afm-rl-export that runs here ({type(error).__name__}: {why})"
+        ) from error
 
 
 def graph(code: bytes) -> tuple[Policy, dict[str, str]]:

@@ -133,6 +133,7 @@ REFUSED = {
         lambda: graph([node("MatMul", "obs", "W", "act")], [("W", WEIGHT.T)]),
         "no policy that onnxruntime can run",
     ),
+    "nothing": (onnx.ModelProto, "no inputs, or no outputs"),
     "an unknown operator": (lambda: graph([node("Harm", "obs", "act")]), "numbers Harm returns"),
 }
 
