@@ -5,10 +5,11 @@
     python benchmarks/results.py --write              # put what the files say into the pages
 
 A result is a file, `benchmarks/results/NAME.json`. By hand: its ``commands``, as a page prints
-them, ``seeds`` in words, ``figures`` that they draw, and what they ``need`` that is not in the
-repository, with SHA-256. The rest is written by ``--renew``: the ``tables`` that they printed,
-commit, versions, machine, seconds of processor time, and the ``code``: a digest of each file of the
-repository that was read. A result is stale when one of these has another digest now.
+them, ``seeds`` in words, ``figures`` that they draw, patterns of data that C++ ``reads``, unseen by
+Python, and what they ``need`` that is not in the repository, with SHA-256. The rest is written by
+``--renew``: the ``tables`` that they printed, commit, versions, machine, seconds of processor time,
+and the ``code``: a digest of each file of the repository that was read. A result is stale when one
+of these has another digest now. Those without code are older than these files.
 
 A page shows a table between `<!-- result NAME: TABLE -->` and `<!-- end -->`; TABLE is what its
 command printed above it. Within a sentence `<!-- result NAME: TABLE | ROW | COLUMN -->` shows a
@@ -22,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import fnmatch
 import hashlib
 import importlib.util
 import json
@@ -58,6 +60,7 @@ def note(event, arguments):
 
 sys.addaudithook(note)
 """  # sitecustomize of every Python that a command starts: imports, too, open files
+BEGUN, READ = "begun.json", "read.txt"  # in the folder of a result
 Result = dict[str, Any]
 
 
@@ -187,27 +190,14 @@ def write_pages() -> None:
 
 def renew(name: str) -> None:
     """Run the commands of a result in a folder of its own, or go on there; write file and pages."""
-    result, now = load(name), code_now()
+    digest.cache_clear()
+    result = load(name)
     if reasons(result)[1]:
         raise SystemExit(f"{name}: cannot be renewed here: it {reasons(result)[1]}")
     folder = ROOT / "outputs" / "results" / name
-    state, read = folder / "begun.json", folder / "read.txt"
-    begun = {"code": now, "asked": asked(result), "seconds": 0.0}
-    if state.is_file():
-        earlier = json.loads(state.read_text(encoding="utf-8"))
-        same = all(earlier["code"].get(file) == now.get(file) for file in files_in(read))
-        if same and earlier["asked"] == begun["asked"]:
-            begun = earlier
-        else:
-            print(f"{name}: begins anew, what it depends on has changed", flush=True)
-            shutil.rmtree(folder)
-    (folder / "hook").mkdir(parents=True, exist_ok=True)
-    (folder / "hook" / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
-    for part in {Path(file).parts[0] for file in [*now, *result.get("need", {}), "docs"]}:
-        if not (folder / part).is_symlink():
-            (folder / part).symlink_to(ROOT / part)
-    settings = {"PYTHONPATH": str(folder / "hook"), "RESULTS_READ": str(read)}
-    settings |= {"AFM_RL_CACHE": str(folder / "cache"), "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    begun = begin(name, result, folder)
+    settings = {"PYTHONPATH": f"{folder / 'hook'}", "RESULTS_READ": f"{folder / READ}"}
+    settings |= {"AFM_RL_CACHE": f"{folder / 'cache'}", "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
     settings["PATH"] = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
     printed, start = "", processor_seconds()
     try:
@@ -217,27 +207,51 @@ def renew(name: str) -> None:
                 ["bash", "-c", command], cwd=folder, env=os.environ | settings, text=True
             )
     except subprocess.CalledProcessError as error:
+        print(error.output[-2000:])
         raise SystemExit(f"{name}: ended with status {error.returncode}: {command}") from None
     finally:
         begun["seconds"] += processor_seconds() - start
-        state.write_text(json.dumps(begun), encoding="utf-8")
-    files = [file for file in files_in(read) if file in begun["code"]]
+        (folder / BEGUN).write_text(json.dumps(begun), encoding="utf-8")
+    digest.cache_clear()
+    files = files_in(folder / READ)
+    for pattern in result.get("reads", []):
+        files |= {*fnmatch.filter(begun["code"], pattern)}
+    code = {file: value for file, value in begun["code"].items() if file in files}
     result |= {
-        "figures": {file: digest.__wrapped__(ROOT / file) for file in result.get("figures", {})},
+        "figures": {file: digest(ROOT / file) for file in result["figures"]},
         "tables": tables_of(printed),
-        "commit": commit_of(files),
-        "versions": {part: version(part) for part in ("torch", "torchrl", "mujoco")}
-        | {"python": platform.python_version(), "afm-rl": version("afm-rl")},
+        "commit": commit_of([*code]),
+        "versions": {"python": platform.python_version()}
+        | {part: version(part) for part in ("afm-rl", "torch", "torchrl", "mujoco")},
         "machine": f"{processor()}, {os.cpu_count()} cores",
         "seconds": round(begun["seconds"]),
         "asked": begun["asked"],
-        "code": packed({file: begun["code"][file] for file in files}),
+        "code": packed(code),
     }
     save(name, result)
     write_pages()
 
 
-def files_in(read: Path) -> list[str]:
+def begin(name: str, result: Result, folder: Path) -> Result:
+    """Make the folder of a result, or find it; return what the code was when that was begun."""
+    now = code_now()
+    begun = {"code": now, "asked": asked(result), "seconds": 0.0}
+    if (folder / BEGUN).is_file():
+        earlier = json.loads((folder / BEGUN).read_text(encoding="utf-8"))
+        same = all(earlier["code"].get(file) == now.get(file) for file in files_in(folder / READ))
+        if same and earlier["asked"] == begun["asked"]:
+            return earlier
+        print(f"{name}: begins anew, what it depends on has changed", flush=True)
+        shutil.rmtree(folder)
+    (folder / "hook").mkdir(parents=True, exist_ok=True)
+    (folder / "hook" / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
+    for part in {Path(file).parts[0] for file in [*now, *result.get("need", {}), "docs"]}:
+        if not (folder / part).is_symlink():
+            (folder / part).symlink_to(ROOT / part)
+    return begun
+
+
+def files_in(read: Path) -> set[str]:
     """Return the files of the repository in the list that was written while commands ran."""
     lines = read.read_text(encoding="utf-8").splitlines() if read.is_file() else []
     files = set()
@@ -245,7 +259,7 @@ def files_in(read: Path) -> list[str]:
         file = Path(importlib.util.source_from_cache(line) if line.endswith(".pyc") else line)
         if file.resolve().is_relative_to(ROOT):
             files.add(file.resolve().relative_to(ROOT).as_posix())
-    return sorted(files)
+    return files
 
 
 def processor() -> str:
@@ -299,8 +313,14 @@ def main() -> None:
         write_pages()
     elif options.renew:
         stale = [name for name in names() if reasons(load(name))[0] and not reasons(load(name))[1]]
+        failed = []
         for name in stale if options.renew == ["all"] else options.renew:
-            renew(name)
+            try:
+                renew(name)
+            except SystemExit as end:
+                failed.append(str(end))
+        if failed:
+            raise SystemExit("\n".join(failed))
     else:
         for name, shown_on in where().items():
             result = load(name)
