@@ -29,7 +29,7 @@ def main() -> None:
         env = gymnasium.make(task)
         for threads in (0, 2):
             model = MuJoCoDynamics(env, threads=threads)
-            inner, skip, _ = model.step.settings
+            inner, skip, *_ = model.step.settings
             state = torch.zeros(model.state_size)
             plans = 2 * torch.rand(CANDIDATES, HORIZON, model.action_size) - 1
             first = np.repeat(model.step.rest[None], CANDIDATES, 0)

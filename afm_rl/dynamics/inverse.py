@@ -29,7 +29,7 @@ def effective_action(
     action: Tensor,
     next_state: Tensor,
     half_range: Tensor,
-    rounds: int = 3,
+    rounds: int = 4,
     quiet: float | Tensor = 0.0,
     guess: Tensor | None = None,
     unseen: float = 4.0,
@@ -53,8 +53,14 @@ def effective_action(
     many local minima, and a correction that is right lies in the deepest. A round moves each axis
     by half a range at most, a row is only changed where its error becomes smaller (its next step
     is a quarter as long where it does not), and its rounds end early when little is left that an
-    action can explain. ``std`` grows by the root mean square of the normalised error that remains,
-    where that exceeds 1: a contact that the rounds did not resolve tells little.
+    action can explain. J is differentiated once, where the rounds begin, and ``std`` is of that
+    one. With what the step d of a round changes, :math:`\Delta`, the next one corrects it (Broyden
+    1965, Mathematics of Computation 19),
+
+    .. math:: J \leftarrow J + \frac{(\Delta - J d)\, d^\top}{d^\top d}
+
+    ``std`` grows by the root mean square of the normalised error that remains, where that exceeds
+    1: a contact that the rounds did not resolve tells little.
 
     A row with a number that is not finite tells nothing: the executed action, the largest
     ``std``, innovation 0.
@@ -97,19 +103,21 @@ def effective_action(
         there = model.manifold.difference(next_state, model(state, guess)) / noise
         better = there.square().sum(-1, True) < error.square().sum(-1, True)
         effective, error = torch.where(better, guess, action), torch.where(better, there, error)
+    jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()
+    covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
+    std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     limit = torch.ones_like(innovation).unsqueeze(-1)
-    going, covariance = limit > 0, limit.double().unsqueeze(-1)
+    going = limit > 0
     for last in (False,) * (rounds - 1) + (True,):
-        jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()
-        inverse = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
-        covariance = torch.where(going.unsqueeze(-1), inverse, covariance)
         slope = jacobian.mT @ error.unsqueeze(-1).double()
         step = (covariance @ slope).squeeze(-1)
         if model.affine:
             effective = effective + step.to(action) * half_range
             break
-        trial = effective + (step.clamp(-limit, limit) * half_range).to(action)
+        moved = step.clamp(-limit, limit)
+        trial = effective + (moved * half_range).to(action)
         remaining = model.manifold.difference(next_state, model(state, trial)) / noise
+        missed = error - remaining - (jacobian @ moved.unsqueeze(-1)).squeeze(-1)
         better = going & (remaining.square().sum(-1, True) < error.square().sum(-1, True))
         effective = torch.where(better, trial, effective)
         error = torch.where(better, remaining, error)
@@ -117,7 +125,9 @@ def effective_action(
         going = going & ((step * slope.squeeze(-1)).sum(-1, True) > enough)
         if last or all_hold(~going):
             break
-    std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        along = moved / moved.square().sum(-1, True).clamp_min(1e-12)
+        jacobian = jacobian + missed.unsqueeze(-1) * along.unsqueeze(-2)
+        covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
     if not model.affine:  # what the rounds could not explain, per coordinate
         std = (std * error.square().mean(-1, True).sqrt().clamp_min(1.0)).clamp_max(unseen)
     known = innovation + std.sum(-1) < torch.inf

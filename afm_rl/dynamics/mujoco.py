@@ -56,6 +56,7 @@ class Simulator:
         self.rest = np.empty(mujoco.mj_stateSize(model, kind))
         mujoco.mj_getState(model, self.data[0], self.rest, kind)
         self.changed: dict[tuple[float, ...], Any] = {}
+        self.accelerations: list[dict[bytes, np.ndarray]] = []  # by state, of the newest two calls
         self.state = slice(1, 1 + model.nq + model.nv + model.na)  # the time stands before it
 
     def __reduce__(self):  # threads can neither be copied nor sent to another process
@@ -73,6 +74,23 @@ class Simulator:
         for row in set(rows) - self.changed.keys():
             self.changed[row] = model if row == nominal else change(model, row)
         return [self.changed[row] for row in rows]
+
+    def warm_start(self, states: np.ndarray, accelerations: np.ndarray) -> None:
+        """Begin from these states ``(N, S)`` with what the solver had found, ``(N, V)``.
+
+        Kept until the next but one call, which is about the states that follow the next.
+        """
+        found = {row.tobytes(): acc for row, acc in zip(states, accelerations, strict=True)}
+        self.accelerations = [*self.accelerations[-1:], found]
+
+    def _warm(self, states: np.ndarray) -> np.ndarray | None:
+        """Return the accelerations ``(N, V)`` that solvers begin with; zeros if not known."""
+        known = {row: acc for found in self.accelerations for row, acc in found.items()}
+        rows = [known.get(row.tobytes()) for row in states] if known else []
+        if all(row is None for row in rows):
+            return None
+        none = np.zeros(self.settings[0].nv)
+        return np.stack([none if row is None else row for row in rows])
 
     def __call__(
         self, states: np.ndarray, controls: np.ndarray, physics: np.ndarray | None = None
@@ -93,7 +111,8 @@ class Simulator:
         if bad.any():
             full[bad], controls = self.rest, np.where(bad[:, None, None], 0.0, controls)
         controls = np.repeat(controls, skip, 1)
-        after, _ = self.pool.rollout(model, self.data, full, controls)
+        warm = self._warm(states)
+        after, _ = self.pool.rollout(model, self.data, full, controls, initial_warmstart=warm)
         after = after[:, skip - 1 :: skip, self.state]
         if bad.any():
             after[bad] = np.nan
@@ -188,6 +207,19 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
     def names(self) -> tuple[list[str], list[str]]:
         """Names of the state coordinates, ``q_JOINT``, ``v_JOINT``, ``w_...``, and of actions."""
         return state_names(self.mjcf), actuator_names(self.mjcf)
+
+    def warm_start(self, states: np.ndarray, accelerations: np.ndarray) -> None:
+        """Tell where the solver of a robot that is simulated, too, begins: what it found last.
+
+        A solver that is stopped after few iterations ends elsewhere from elsewhere: with this the
+        model is exact there, too. Where it converges, nothing changes.
+
+        Args:
+            states: of the robots at present, ``(N, S)``, in double precision.
+            accelerations: ``qacc_warmstart`` of their ``MjData``, ``(N, V)``.
+        """
+        simulator: Any = self.step
+        simulator.warm_start(states, accelerations)
 
     def forward(self, state: Tensor, action: Tensor) -> Tensor:
         """Return the next state ``(*B, S)``."""

@@ -313,7 +313,7 @@ class ActionFlowTransform(Shell, StatefulTransform):
         """Return the measured state; None if there is none."""
         state = tensordict.get(self.observation_key, None)
         if state is None and self.simulation is not None:
-            state = self.simulation.state.to(tensordict.device or "cpu")
+            state = self.simulation.state_for(self.model).to(tensordict.device or "cpu")
         return state
 
     def _seen(

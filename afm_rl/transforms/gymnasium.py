@@ -29,7 +29,7 @@ from afm_rl.faults import fault_of
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import delay_compensation as delays
 from afm_rl.transforms.loop import CorrectionLoop, Limit, precise
-from afm_rl.transforms.simulation import Simulation
+from afm_rl.transforms.simulation import Simulation, states_of
 
 if TYPE_CHECKING:  # a room that is entered when it is asked for
     from afm_rl.transforms.collect_then_fit import CollectThenFit
@@ -111,7 +111,8 @@ class GymnasiumShell:
                 "put the wrapper inside of those that change actions"
             )
         if state is None and simulated:
-            state = _vector_state if isinstance(env, VectorEnv) else _env_state
+            read = _vector_state if isinstance(env, VectorEnv) else _env_state
+            state = partial(read, self._model)
             simulation = Simulation(env)
             if observe is None and simulation.seen:
                 observe = partial(_observed_in, simulation)
@@ -472,15 +473,17 @@ def _observed_in(simulation: Simulation, states: np.ndarray) -> np.ndarray:
     return simulation.observe(states)["observation"]
 
 
-def _env_state(env: Any, observation: Any) -> np.ndarray:
+def _env_state(model: MuJoCoDynamics, env: Any, observation: Any) -> np.ndarray:
     """Return positions, velocities and activations of a simulation."""
-    data = env.unwrapped.data
-    return np.concatenate([data.qpos, data.qvel, data.act])
+    return states_of([env.unwrapped], model)[0]
 
 
-def _vector_state(env: Any, observations: Any) -> np.ndarray:
-    """Return positions and velocities of each simulation."""
-    return np.stack(env.unwrapped.call("state_vector"))
+def _vector_state(model: MuJoCoDynamics, env: Any, observations: Any) -> np.ndarray:
+    """Return those of each simulation, without activations where these run elsewhere."""
+    envs = getattr(env.unwrapped, "envs", None)
+    if envs is None:
+        return np.stack(env.unwrapped.call("state_vector"))
+    return states_of([one.unwrapped for one in envs], model)
 
 
 def _simulation(source: Any) -> MuJoCoDynamics:

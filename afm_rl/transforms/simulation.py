@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cached_property, partial
 from typing import Any
@@ -76,10 +76,15 @@ class Simulation:
             )
         return torch.from_numpy(self._state)
 
+    def state_for(self, model: Any) -> Tensor:
+        """Return :attr:`state`; a model of MuJoCo is told where its solver begins there."""
+        state = self.state
+        states_of([self.host], model)
+        return state
+
     @property
     def _state(self) -> np.ndarray:
-        data = self.host.data
-        return np.concatenate([data.qpos, data.qvel, data.act])
+        return states_of([self.host])[0]
 
     def dynamics(self, low: Tensor, high: Tensor) -> MuJoCoDynamics:
         """Return the model of one action, with the frames that are skipped.
@@ -171,6 +176,20 @@ class Simulation:
     def _transforms(self) -> list[Transform]:
         chains = [layer.transform for layer in self.layers if isinstance(layer, TransformedEnv)]
         return [t for chain in chains for t in getattr(chain, "transforms", [chain])]
+
+
+def states_of(hosts: Sequence[Any], model: Any = None) -> np.ndarray:
+    """Return positions, velocities and activations of simulations, ``(N, S)``.
+
+    Args:
+        hosts: have the simulations' ``data``.
+        model: of MuJoCo, which is told where solvers begin there; anything else is told nothing.
+    """
+    found = [host.data for host in hosts]
+    states = np.stack([np.concatenate([data.qpos, data.qvel, data.act]) for data in found])
+    if isinstance(model, MuJoCoDynamics):
+        model.warm_start(states, np.stack([data.qacc_warmstart for data in found]))
+    return states
 
 
 def simulation_in(env: Any) -> Simulation | None:

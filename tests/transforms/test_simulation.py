@@ -4,6 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.vector import SyncVectorEnv
 from torchrl.envs import (
     ActionScaling,
     Compose,
@@ -18,7 +19,7 @@ from torchrl.envs import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from afm_rl import ActionFlowWrapper
+from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
 from afm_rl.correction import LeastSquares
 from afm_rl.dynamics import MuJoCoDynamics
 from afm_rl.errors import ConfigurationError
@@ -212,3 +213,45 @@ def test_observations_that_change_on_the_way_are_shown_as_measured():
         data = env.rollout(15)
     assert data["next", "afm", "delay"][-1] == LATE
     assert data["next", "afm", "arrival"].shape == (15, 18)
+
+
+def stopped_early():
+    """A robot whose solver of contacts takes a single iteration."""
+    env = gymnasium.make("HalfCheetah-v5")
+    env.unwrapped.model.opt.iterations = 1
+    return env
+
+
+def innovations_of(shell, steps=60):
+    env = shell(stopped_early())
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    for _ in range(steps):
+        yield np.max(env.step(env.action_space.sample())[-1]["afm"]["innovation"])
+
+
+def innovations_in_torchrl(_, steps=60):
+    env = TransformedEnv(GymWrapper(stopped_early()), ActionFlowTransform("mujoco"))
+    env.set_seed(0)
+    return env.rollout(steps, break_when_any_done=False)["next", "afm", "innovation"].tolist()
+
+
+def of_one(env):
+    return ActionFlowWrapper(env)
+
+
+def of_a_vector(env):
+    return ActionFlowVectorWrapper(SyncVectorEnv([lambda: env]))
+
+
+@pytest.mark.parametrize("told", [True, False])
+@pytest.mark.parametrize(
+    ("play", "shell"),
+    [(innovations_of, of_one), (innovations_of, of_a_vector), (innovations_in_torchrl, None)],
+)
+def test_a_solver_that_is_stopped_early_goes_on_where_the_robots_did(
+    play, shell, told, monkeypatch
+):
+    if not told:
+        monkeypatch.setattr(MuJoCoDynamics, "warm_start", lambda *_: None)
+    assert (max(play(shell)) < 1e-6) == told

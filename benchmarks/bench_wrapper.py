@@ -1,0 +1,122 @@
+"""What a step of `ActionFlowWrapper` takes as it comes, around robots of MuJoCo, beside its limit.
+
+    python benchmarks/bench_wrapper.py
+    python benchmarks/bench_wrapper.py --robots HalfCheetah go1 g1 --folder FOLDER
+
+HalfCheetah acts at random, and all its motors are reversed; the walking robots (`docs/legged.md`
+says what is in their folder) have policies, and one servo is reversed. Whole steps, correction,
+exact model and robot included: medians and 99th percentiles of processor time of one thread.
+Correcting: from the first step after the fault. Times grow on a busy machine, those of 1,000
+additions ``x + x`` of small tensors, too: the last two columns count in these.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from timing import timed
+
+from afm_rl import ActionFlowWrapper
+from afm_rl.regimes import Actuators
+
+sys.path[:0] = [str(Path(__file__).parent / "suites" / name) for name in ("zoo", "legged")]
+from robot import OWN, Robot  # noqa: E402
+
+LIMITS = {
+    "HalfCheetah": ((0.9, 3.0), (0.8, 2.6)),
+    "go1": ((2.0, 8.0), None),
+    "g1": ((3.0, 18.0), None),
+}
+"""Healthy and correcting, at most: in ms on a quiet machine; in times of 1,000 additions."""
+Acting = Callable[[np.ndarray, dict[str, Any]], np.ndarray]
+
+
+class Faulty(gymnasium.ActionWrapper):
+    """An environment behind actuators that may fail; adds up its own time (s)."""
+
+    def __init__(self, env: gymnasium.Env, home: torch.Tensor | None = None) -> None:
+        super().__init__(env)
+        low, high = env.action_space.low.tolist(), env.action_space.high.tolist()
+        self.actuators, self.spent = Actuators(low, high, home=home), 0.0
+
+    def step(self, action: np.ndarray) -> tuple:
+        begun = time.thread_time()
+        effect = self.actuators(torch.as_tensor(np.asarray(action))).numpy()
+        answer = self.env.step(effect.astype(self.action_space.dtype))
+        self.spent += time.thread_time() - begun
+        return answer
+
+
+def half_cheetah() -> tuple[Faulty, Acting, dict[str, float]]:
+    env = Faulty(gymnasium.make("HalfCheetah-v5"))
+    env.action_space.seed(0)
+    return env, lambda *_: env.action_space.sample(), {f"gain_{k}": -1.0 for k in range(6)}
+
+
+def legged(folder: Path, name: str) -> tuple[Faulty, Acting, dict[str, float]]:
+    robot = Robot(folder if (folder / f"{name}.xml").is_file() else OWN, name)
+    robot.begin(1)
+
+    def act(observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
+        return robot.act(observation[None], info)[0]
+
+    return Faulty(robot.make(), robot.home), act, robot.faults["one reversed"]
+
+
+def measure(env: Faulty, act: Acting, fault: dict[str, float], steps: int) -> list[np.ndarray]:
+    """Return the ms of each step, healthy and correcting: all of it, and the robot's ``(T, 2)``."""
+    wrapper = ActionFlowWrapper(env)
+    observation, info = wrapper.reset(seed=0)
+    spent = []
+    for part in ({}, fault):
+        env.actuators.fail(part)
+        rows = []
+        for _ in range(steps):
+            action, own = act(observation, info), env.spent
+            begun = time.thread_time()
+            observation, _, terminated, truncated, info = wrapper.step(action)
+            rows.append((time.thread_time() - begun, env.spent - own))
+            if terminated or truncated:
+                break
+        spent.append(1e3 * np.array(rows[1:] if part == {} else rows))
+    return spent
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--robots", nargs="*", default=["HalfCheetah", "small"])
+    parser.add_argument("--folder", type=Path, default=OWN, help="where walking robots are")
+    parser.add_argument("--steps", type=int, default=200, help="healthy, and as many correcting")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    x = torch.ones(8)
+    print(
+        "| | ms, p50 | p99 | robot | at most, quiet | 1,000 additions | at most |\n"
+        "|---|---|---|---|---|---|---|"
+    )
+    for name in options.robots:
+        robot = half_cheetah() if name == "HalfCheetah" else legged(options.folder, name)
+        limits, relative = LIMITS.get(name, (None, None))
+        spent = measure(*robot, options.steps)
+        unit = np.median(timed({"": lambda: [x + x for _ in range(1000)]}, 9)[""])
+        for k, (what, rows) in enumerate(zip(("healthy", "correcting"), spent, strict=True)):
+            p50, p99 = np.quantile(rows[:, 0], [0.5, 0.99])
+            most, times = (f"{limit[k]:.1f}" if limit else "" for limit in (limits, relative))
+            print(
+                f"| {name}, {what}, {len(rows)} steps | {p50:.2f} | {p99:.2f} | "
+                f"{np.median(rows[:, 1]):.2f} | {most} | {p50 / unit:.2f} | {times} |",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
