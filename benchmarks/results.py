@@ -138,7 +138,7 @@ def reasons(result: Result) -> tuple[str, str]:
     code = unpacked(result.get("code", {}))
     old = result.get("asked")
     changed = [f for f, value in code.items() if digest(ROOT / f)[:8] != value]
-    why = "never renewed" if old is None else ""
+    why = f"never renewed, of {result.get('commit', 'no commit')}" if old is None else ""
     if changed:
         why = changed[0] + (f" and {len(changed) - 1} more changed" if changed[1:] else " changed")
     elif old not in (None, asked(result)):

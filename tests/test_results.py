@@ -151,7 +151,7 @@ def change(file, text):
 
 
 def test_renewing_goes_on_notes_what_was_read_and_writes_the_page(desk):
-    assert results.reasons(results.load("one")) == ("never renewed", "")
+    assert results.reasons(results.load("one")) == ("never renewed, of no commit", "")
     with pytest.raises(SystemExit, match="one: ended with status 3: python run.py"):
         results.renew("one")
     results.renew("one")
