@@ -49,17 +49,17 @@ MARK = re.compile(
 HOOK = """
 import os, sys
 
-target = os.open(os.environ["RESULTS_READ"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 seen = set()
 
 def note(event, arguments):
     if event == "open" and isinstance(arguments[0], str) and arguments[0] not in seen:
         if not arguments[2] & (os.O_WRONLY | os.O_RDWR):
             seen.add(arguments[0])
-            os.write(target, (os.path.abspath(arguments[0]) + "\\n").encode())
+            with open(os.environ["RESULTS_READ"], "a") as file:
+                file.write(os.path.abspath(arguments[0]) + "\\n")
 
 sys.addaudithook(note)
-"""  # sitecustomize of every Python that a command starts: imports, too, open files
+"""  # sitecustomize of every Python that a command starts; who imports a module opens its file
 BEGUN, READ = "begun.json", "read.txt"  # in the folder of a result
 Result = dict[str, Any]
 
