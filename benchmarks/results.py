@@ -7,9 +7,9 @@
 A result is a file, `benchmarks/results/NAME.json`. By hand: its ``commands``, as a page prints
 them, ``seeds`` in words, ``figures`` that they draw, patterns of data that C++ ``reads``, unseen by
 Python, and what they ``need`` that is not in the repository, with SHA-256. The rest is written by
-``--renew``: the ``tables`` that they printed, commit, versions, machine, seconds of processor time,
-and the ``code``: a digest of each file of the repository that was read. A result is stale when one
-of these has another digest now. Those without code are older than these files.
+``--renew``: the ``tables`` that they printed, versions, machine, seconds of processor time, and the
+``code``: a digest of each file of the repository that was read, and their last ``commit``. A result
+is stale when one of these has another digest now. One without code is older than these files.
 
 A page shows a table between `<!-- result NAME: TABLE -->` and `<!-- end -->`; TABLE is what its
 command printed above it. Within a sentence `<!-- result NAME: TABLE | ROW | COLUMN -->` shows a
@@ -276,10 +276,11 @@ def processor_seconds() -> float:
 
 
 def commit_of(files: list[str]) -> str:
-    """Return the commit, marked where one of the files differs from it."""
-    head = subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, text=True)
+    """Return the last commit of some files, marked where they differ from it."""
+    log = ["git", "log", "-1", "--format=%h", "--", *files]
+    last = subprocess.check_output(log, cwd=ROOT, text=True).strip()
     same = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", *files], cwd=ROOT, check=False)
-    return head.strip() + ("" if same.returncode == 0 else ", changed")
+    return last + ("" if same.returncode == 0 else ", changed")
 
 
 def save(name: str, result: Result) -> None:
