@@ -22,6 +22,7 @@ How a stale sensor and a robot that stands still differ:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -42,6 +43,15 @@ def whole(reading: Tensor, absurd: float = 1e12) -> Tensor:
     tensor([ True, False, False])
     """
     return (reading.abs() < absurd).all(-1)  # false for NaN
+
+
+def finite(numbers: Tensor) -> Tensor:
+    """Return whether all numbers of rows ``(*B, N)`` are finite, ``(*B)``.
+
+    >>> finite(torch.tensor([[1.0, 2.0], [1.0, torch.nan], [torch.inf, 0.0]]))
+    tensor([ True, False, False])
+    """
+    return whole(numbers, math.inf)
 
 
 def count_repeats(
@@ -145,6 +155,6 @@ def safe_action(action: Tensor, low: Tensor, high: Tensor, last: Tensor) -> tupl
     (tensor([[1.0000, 0.5000],
             [0.0000, 0.0000]]), tensor([False,  True]))
     """
-    held = ~action.isfinite().all(-1)
+    held = ~finite(action)
     sound = torch.where(held.unsqueeze(-1), last.nan_to_num(), action.to(last.dtype))
     return sound.clamp(low, high), held

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -101,40 +101,51 @@ def effective_action(
     if guess is not None and not model.affine:
         guess = guess.to(action)
         there = model.manifold.difference(next_state, model(state, guess)) / noise
-        better = there.square().sum(-1, True) < error.square().sum(-1, True)
+        better = _size(there) < _size(error)
         effective, error = torch.where(better, guess, action), torch.where(better, there, error)
     jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()
     covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    limit = torch.ones_like(innovation).unsqueeze(-1)
-    going = limit > 0
+    limit: Any = 1.0
+    left, going = _size(error), True
     for last in (False,) * (rounds - 1) + (True,):
-        slope = jacobian.mT @ error.unsqueeze(-1).double()
-        step = (covariance @ slope).squeeze(-1)
+        slope = _times(jacobian.mT, error.double())
+        step = _times(covariance, slope)
         if model.affine:
             effective = effective + step.to(action) * half_range
             break
         moved = step.clamp(-limit, limit)
         trial = effective + (moved * half_range).to(action)
         remaining = model.manifold.difference(next_state, model(state, trial)) / noise
-        missed = error - remaining - (jacobian @ moved.unsqueeze(-1)).squeeze(-1)
-        better = going & (remaining.square().sum(-1, True) < error.square().sum(-1, True))
-        effective = torch.where(better, trial, effective)
-        error = torch.where(better, remaining, error)
-        limit = limit * torch.where(better, 1.0, 0.25)
-        going = going & ((step * slope.squeeze(-1)).sum(-1, True) > enough)
+        now = _size(remaining)
+        better = going & (now < left)
+        going = going & ((step * slope).sum(-1, True) > enough)
+        before, effective = error, torch.where(better, trial, effective)
+        error, left = torch.where(better, remaining, error), torch.where(better, now, left)
         if last or all_hold(~going):
             break
-        along = moved / moved.square().sum(-1, True).clamp_min(1e-12)
+        limit = limit * torch.where(better, 1.0, 0.25)
+        missed = before - remaining - _times(jacobian, moved)
+        along = moved / _size(moved).clamp_min(1e-12)
         jacobian = jacobian + missed.unsqueeze(-1) * along.unsqueeze(-2)
         covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
     if not model.affine:  # what the rounds could not explain, per coordinate
-        std = (std * error.square().mean(-1, True).sqrt().clamp_min(1.0)).clamp_max(unseen)
+        std = (std * (left / error.shape[-1]).sqrt().clamp_min(1.0)).clamp_max(unseen)
     known = innovation + std.sum(-1) < torch.inf
-    row = (known & ~silent).unsqueeze(-1)
+    row = known & ~silent
     else_std = torch.where(silent, assumed, unseen).unsqueeze(-1)
     return EffectiveAction(
-        torch.where(row, effective, action.nan_to_num()).to(dtype),
-        (torch.where(row, std, else_std) * half_range).to(dtype),
+        torch.where(row.unsqueeze(-1), effective, action.nan_to_num()).to(dtype),
+        (torch.where(row.unsqueeze(-1), std, else_std) * half_range).to(dtype),
         torch.where(known, innovation, 0.0).to(dtype),
     )
+
+
+def _size(rows: Tensor) -> Tensor:
+    """Return the squared length of rows ``(*B, N)``, ``(*B, 1)``."""
+    return torch.linalg.vecdot(rows, rows).unsqueeze(-1)
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Return matrices ``(*B, N, M)`` times vectors ``(*B, M)``, in fewer operations than ``@``."""
+    return (matrix * vector.unsqueeze(-2)).sum(-1)

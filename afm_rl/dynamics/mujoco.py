@@ -251,14 +251,19 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
         """Return the states ``(*B, H, S)`` after actions ``(*B, H, A)`` from ``(*B, S)``."""
         if self.mix is not None:
             actions = actions @ self.mix.to(actions).mT
-        batch = torch.broadcast_shapes(state.shape[:-1], actions.shape[:-2])
-        rows = state.expand(*batch, -1).reshape(-1, state.shape[-1])
-        plans = actions.expand(*batch, -1, -1).reshape(-1, *actions.shape[-2:])
+        batch = np.broadcast_shapes(state.shape[:-1], actions.shape[:-2])
+        rows, plans = _numbers(state), _numbers(actions)
+        rows = np.broadcast_to(rows, (*batch, rows.shape[-1])).reshape(-1, rows.shape[-1])
+        plans = np.broadcast_to(plans, (*batch, *plans.shape[-2:])).reshape(-1, *plans.shape[-2:])
         step: Any = self.step  # of plans, in numpy
-        numbers = [rows, plans]
-        told = self.physics_now
-        if not torch.equal(told, self.nominal.to(told).expand_as(told)):
+        told, nominal, numbers = self.physics_now, self.nominal, [rows, plans]
+        if told is not nominal and not torch.equal(told, nominal.to(told).expand_as(told)):
             told = self._physics_for(len(batch))
-            numbers.append(told.expand(*batch, -1).reshape(len(rows), told.shape[-1]))
-        after = step(*(x.detach().cpu().double().numpy() for x in numbers))
-        return torch.from_numpy(after).to(state).reshape(*batch, *after.shape[1:])
+            numbers.append(_numbers(told.expand(*batch, -1).reshape(len(rows), told.shape[-1])))
+        after = step(*numbers)
+        return torch.from_numpy(after.reshape(*batch, *after.shape[1:])).to(state)
+
+
+def _numbers(values: Tensor) -> np.ndarray:
+    """Return a tensor as an array in double precision."""
+    return values.numpy(force=True).astype(np.float64, copy=False)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from afm_rl.errors import ConfigurationError, check_number, printable
 from afm_rl.regimes import Physics
-from afm_rl.spaces.manifold import Manifold, wrap_angle
+from afm_rl.spaces.manifold import Manifold
 
 
 class MuJoCoSpace(Manifold):
@@ -62,8 +62,7 @@ class MuJoCoSpace(Manifold):
 
     def difference(self, state: Tensor, origin: Tensor) -> Tensor:
         """Return the tangent vector ``(*B, D)`` that leads from ``origin`` to ``state``."""
-        raw = state - origin
-        raw = torch.where(self.is_angle, wrap_angle(raw), raw)
+        raw = super().difference(state, origin)
         if not self.quaternions:
             return raw
         parts = self._parts(raw, 4)
@@ -80,8 +79,7 @@ class MuJoCoSpace(Manifold):
             here = origin[..., first : first + 4].roll(-1, -1)
             turned = roma.quat_product(here, roma.rotvec_to_unitquat(turns[2 * k + 1]))
             turns[2 * k + 1] = turned.roll(1, -1) - origin[..., first : first + 4]
-        raw = origin + torch.cat(turns, -1)
-        return torch.where(self.is_angle, wrap_angle(raw), raw)
+        return super().add(origin, torch.cat(turns, -1))
 
 
 try:

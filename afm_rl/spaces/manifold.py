@@ -77,13 +77,14 @@ class Manifold(nn.Module):
 
     def difference(self, state: Tensor, origin: Tensor) -> Tensor:
         """Return the tangent vector ``(*B, D)`` that leads from ``origin`` to ``state``."""
-        raw = state - origin
-        return torch.where(self.is_angle, wrap_angle(raw), raw)
+        return self._wrapped(state - origin)
 
     def add(self, origin: Tensor, tangent: Tensor) -> Tensor:
         """Return the state ``(*B, S)`` reached from ``origin`` along ``tangent``."""
-        raw = origin + tangent
-        return torch.where(self.is_angle, wrap_angle(raw), raw)
+        return self._wrapped(origin + tangent)
+
+    def _wrapped(self, raw: Tensor) -> Tensor:
+        return torch.where(self.is_angle, wrap_angle(raw), raw) if self._turning else raw
 
 
 class RigidBodySpace(Manifold):

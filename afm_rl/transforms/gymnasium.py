@@ -201,7 +201,7 @@ class GymnasiumShell:
         # A policy knows no effects beyond the space, as a planner may: these are cut first.
         space = self._spec.space
         inside = planned.clamp(space.low.to(planned), space.high.to(planned))
-        planned = torch.where(planned.isfinite(), inside, planned).detach()
+        planned = torch.where(planned.abs() < torch.inf, inside, planned)
         self._entries = self._loop.act(self._entries.get("memory"), planned, self._spec)
         self._info = self._describe()
         return self._info["executed"].astype(self._actions.dtype)
@@ -212,8 +212,9 @@ class GymnasiumShell:
         fresh = over if same_step else self._over
         states = self._states_in(observations)
         states = states.to(precise(states.dtype))
-        # What led into a new episode is no transition.
-        reached = states.masked_fill(torch.from_numpy(fresh).unsqueeze(-1), torch.nan)
+        reached = states
+        if fresh.any():  # what led into a new episode is no transition
+            reached = states.masked_fill(torch.from_numpy(fresh).unsqueeze(-1), torch.nan)
         entries.set("memory", self._loop.observe(entries.get("memory"), reached))
         self._states, info = states, self._info
         if fresh.any():
@@ -454,7 +455,7 @@ def as_numbers(name: str, given: Any, shape: Sequence[int] | None) -> Tensor:
         numbers = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given)
     except ValueError:  # lists of several lengths
         numbers = np.asarray(None)
-    found: Any = torch.tensor(numbers) if numbers.dtype.kind in "iufcb" else given
+    found: Any = torch.from_numpy(numbers.copy()) if numbers.dtype.kind in "iufcb" else given
     fault = fault_of(found, np.shape(numbers) if shape is None else shape)
     if fault:
         raise ConfigurationError(f"ActionFlowWrapper: {name}: {fault}")

@@ -18,7 +18,7 @@ from afm_rl.compiling.tracing import all_hold
 from afm_rl.correction import ActionFlow, Corrector
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_flag, check_instance
-from afm_rl.faults import check_numbers, safe_action
+from afm_rl.faults import check_numbers, finite, safe_action
 from afm_rl.options import Option, option
 from afm_rl.transforms.delay_compensation import state_at_arrival
 
@@ -235,27 +235,34 @@ class CorrectionLoop:
         planned = computable(planned, low, high, memory.dtype)
         box = box_of(action_spec, planned)
         _, last, sent = corrector.latest(memory)
-        plan = torch.where(planned.isfinite().all(-1, keepdim=True), planned, last)
+        plan = torch.where(finite(planned).unsqueeze(-1), planned, last)
         inside, _ = safe_action(plan, low, high, sent)
         inside = inside.to(memory.dtype)
         given = self.enabled_in(memory, enabled)
-        on = (given & self.enabled).unsqueeze(-1)
+        everywhere = enabled is None and self.enabled
+        on = given if self.enabled else ~given & given
+
+        def chosen(corrected: Tensor, otherwise: Tensor | float) -> Tensor:
+            """Return what is where missions are corrected, and elsewhere."""
+            if everywhere:
+                return corrected
+            mask = on[(..., *[None] * (corrected.dim() - on.dim()))]
+            return torch.where(mask, corrected, otherwise)
+
         # Where nothing is corrected the box is the plan alone, so that its effect is foreseen.
-        ends = torch.where(on.unsqueeze(-1), box, inside.unsqueeze(-2))
-        before = torch.where(on, memory, corrector.at_once(memory, inside))
+        ends = chosen(box, inside.unsqueeze(-2))
+        before = chosen(memory, corrector.at_once(memory, inside))
         memory, answer = corrector.correct(before, plan, model, ends)
         cause = partial(corrector.cause_in, memory)
-        corrector.first_steps(answer.misaligned & on.squeeze(-1), cause)
+        corrector.first_steps(answer.misaligned & on, cause)
         # The last clamp depends on nothing but the spec, whatever the corrector answers.
         executed, _ = safe_action(answer.executed, low, high, sent)
-        executed, predicted = torch.where(on, executed.to(memory.dtype), inside), answer.predicted
+        executed, predicted = chosen(executed.to(memory.dtype), inside), answer.predicted
         # A corrector that keeps to the box has noted all of it.
         memory = Corrector.executing(corrector, memory, plan, executed)
         if self.most is not None or self.rate is not None:
             correction = sent.clamp(low, high) - last.clamp(low, high)
-            limited = torch.where(
-                on, self._limited(executed, inside, correction, low, high), inside
-            )
+            limited = chosen(self._limited(executed, inside, correction, low, high), inside)
             held = (limited != executed).any(-1)
             corrector.held_back(held & answer.misaligned, cause)
             if not all_hold(~held):
@@ -263,9 +270,9 @@ class CorrectionLoop:
                 foreseen, _ = corrector.predict(before, limited, model)
                 predicted = torch.where(held.unsqueeze(-1), foreseen.to(predicted), predicted)
             executed = limited
-        predicted = torch.where(on, predicted, executed)
-        executed = torch.where(on, corrector.sending(memory, executed), executed)
-        bounds = torch.where(on.unsqueeze(-1), answer.bounds, box)
+        predicted = chosen(predicted, executed)
+        executed = chosen(corrector.sending(memory, executed), executed)
+        bounds = chosen(answer.bounds, box)
         if not (self.extend_action_box and model.extrapolates):
             low, high = box.unbind(-2)
             bounds = torch.minimum(torch.maximum(bounds, low.unsqueeze(-2)), high.unsqueeze(-2))
@@ -274,7 +281,7 @@ class CorrectionLoop:
             "executed_action": executed,
             "predicted_effect": predicted,
             "effect_bounds": bounds,
-            "spread": torch.where(on, answer.spread, 0.0),
+            "spread": chosen(answer.spread, 0.0),
             "noise": answer.noise,
             "innovation": answer.innovation,
         }
@@ -303,16 +310,18 @@ class CorrectionLoop:
         The present state and 0 while no action is late, and where nothing is corrected.
         """
         now = self.corrector.latest(memory)[0]
-        on = self.enabled_in(memory, enabled)
         if not self.enabled:
-            return now, torch.zeros_like(on, dtype=torch.long)
+            return now, torch.zeros_like(memory[..., 0], dtype=torch.long)
         state, steps = state_at_arrival(self.corrector, memory, self.model)
+        if enabled is None:
+            return state, steps
+        on = self.enabled_in(memory, enabled)
         return torch.where(on.unsqueeze(-1), state, now), torch.where(on, steps, 0)
 
     def enabled_in(self, memory: Tensor, enabled: Tensor | None) -> Tensor:
         """Return which missions of a memory ``(*B, P)`` are corrected, ``(*B)``; None: all."""
         if enabled is None:
-            return torch.ones_like(memory[..., 0], dtype=torch.bool)
+            return memory.new_ones(memory.shape[:-1], dtype=torch.bool)
         return enabled.to(memory.device, torch.bool).expand(memory.shape[:-1])
 
     def _limited(
@@ -364,8 +373,8 @@ def computable(plan: Tensor, low: Tensor, high: Tensor, dtype: torch.dtype) -> T
     tensor([5.7936e+03, 5.0000e-01])
     """
     reach = torch.finfo(dtype).eps ** -0.5 * (high - low)
-    near = torch.minimum(torch.maximum(plan, low - reach), high + reach)
-    return torch.where(plan.isinf(), torch.nan, near).to(dtype)
+    near = plan.clamp(low - reach, high + reach)
+    return torch.where(plan.abs() < torch.inf, near, torch.nan).to(dtype)
 
 
 def warn_of_old(tensordict: TensorDictBase, prefix: NestedKey) -> None:
