@@ -83,7 +83,7 @@ def make_robot(name: str | None = None, file: str | Path | None = None) -> Playe
         ArtefactError: if the file is damaged, or holds something else.
     """
     legged = Path(name or "")
-    if len(legged.parts) > 1:
+    if name not in ROBOTS and (len(legged.parts) > 1 or Path(f"{name}.xml").is_file()):
         if file is not None:
             raise ConfigurationError(f"--policy={file}: {name} has its own; leave --policy out")
         return _legged(LeggedRobot(legged.parent, legged.name))

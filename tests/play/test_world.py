@@ -61,7 +61,7 @@ def test_actuators_do_what_is_set():
     assert 0 < np.abs(env.effect - 0.3).max() < 0.5
 
 
-def test_a_robot_of_a_folder_has_faults_about_its_pose():
+def test_a_robot_of_a_folder_has_faults_about_its_pose(monkeypatch):
     pytest.importorskip("onnxruntime")
     world = World(make_robot(SMALL))
     for _ in range(5):
@@ -77,6 +77,8 @@ def test_a_robot_of_a_folder_has_faults_about_its_pose():
     assert abs(effect - planned)[servo] < 0.1
     world.reset()
     assert alone.act.steps == corrected.act.steps == 0
+    monkeypatch.chdir(Path(SMALL).parent)
+    assert make_robot("./small").name == make_robot("small").name == "small"
 
 
 @pytest.mark.parametrize("count", [1, 2, 6])

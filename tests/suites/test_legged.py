@@ -42,6 +42,11 @@ def test_the_command_plays_and_goes_on(legged, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("sys.argv", [*asked, "none", "late 1", *more])
     legged("run").main()
     assert "small, alone: 1 episodes" in capsys.readouterr().out
+    more = ["--methods", "alone", "--at", "20", "30"]
+    monkeypatch.setattr("sys.argv", [*asked, "late 1", *more])
+    legged("run").main()
+    said = capsys.readouterr().out
+    assert said.count("small, alone: 1 episodes") == 2 and "small, at 2 steps:" in said
     with Image.open(tmp_path / "figure.png") as figure:
         assert figure.width > 500
 

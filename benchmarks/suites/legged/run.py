@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from itertools import product
 from pathlib import Path
 
 import pandas as pd
@@ -36,6 +37,7 @@ def main() -> None:
     parser.add_argument("--faults", nargs="*", choices=servo_faults(2), default=[*servo_faults(2)])
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=usual)
     parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--at", type=int, nargs="*", help="steps of the fault; default: a fifth")
     parser.add_argument("--steps", type=int, help="cut episodes (use another --out)")
     parser.add_argument("--together", type=int, default=5, help="episodes between two savings")
     parser.add_argument("--out", type=Path, default=Path("outputs/legged"))
@@ -46,14 +48,16 @@ def main() -> None:
     files = sorted(args.folder.glob("*_policy.onnx"))
     for name in args.robots or [file.stem.removesuffix("_policy") for file in files]:
         robot, rows = Robot(args.folder, name), []
-        for method in args.methods:
+        for at, method in product(args.at or [robot.at], args.methods):
+            robot.at, out = at, args.out / f"at_{at}" if args.at else args.out
             more = args.steps, args.together
-            rows.append(complete(robot, method, args.faults, args.seeds, args.out, *more))
+            played = complete(robot, method, args.faults, args.seeds, out, *more)
+            rows.append(with_errors(played, at))
         results = pd.concat(rows, ignore_index=True)
         chosen = results["fault"].isin(args.faults) & (results["episode"] < args.seeds)
-        results = with_errors(results[chosen], robot.at)
-        tables[name] = ordered(results, list(METHODS), args.faults)
-        print(markdown(name, table_by(tables[name], "method", _cell)))
+        tables[name] = ordered(results[chosen], list(METHODS), args.faults)
+        title = f"{name}, at {len(args.at)} steps" if args.at else name
+        print(markdown(title, table_by(tables[name], "method", _cell)))
     if args.figure:
         draw(tables, args.figure)
 
@@ -82,6 +86,7 @@ def draw(tables: dict[str, pd.DataFrame], file: Path) -> None:
         style.dress(panel, "error of the speed (m/s)", size=style.LARGE)
         panel.set_title(robot.capitalize(), fontsize=style.LARGE)
         panel.set(xlim=(0, 1.16 * most), ylim=(len(faults) - 0.5, -0.5))
+        panel.set_xticks([tick for tick in panel.get_xticks() if 0 <= tick < most])
         panel.set_yticks(range(len(faults)), faults, fontsize=style.LARGE)
         panel.text(1.08 * most, -0.55, "falls", ha="center", va="bottom", fontsize=style.SMALL)
     style.legend_above(figure, *panels[0].get_legend_handles_labels())

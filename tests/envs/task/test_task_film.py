@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from afm_rl.envs import TaskEnv, gymnasium_task
-from afm_rl.film import SIZE, body_pictures, can_render, segments
+from afm_rl.film import BONE, SIZE, body_pictures, bones, can_render, segments
 
 HEIGHT, WIDTH = SIZE
 
@@ -43,6 +43,18 @@ def test_bones_are_where_the_body_is(pole):
     assert lying == [(0, 0, 1), (1, 0, 1)]
     np.testing.assert_allclose(ends[1, 1].mean(0), [1, 0, 1], atol=1e-6)
     assert radii.tolist() == [0.02, 0.1]
+
+
+def test_bodies_without_a_shape_are_joined_by_bones():
+    box = '<geom type="box" size=".02 .3 .1"/>'
+    legs = f'<body pos="0 0 -.3"><body pos="0 .1 -.2"><body>{box}</body></body></body>'
+    mjcf = f"<mujoco><worldbody><body pos='0 0 1'>{box}{legs}</body></worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(mjcf)
+    assert bones(model).tolist() == [[1, 2], [2, 3]]  # the last one is where its parent is
+    (ends,), radii = segments(model, np.zeros((1, 0)))
+    np.testing.assert_allclose(ends[0], [[0, -0.2, 1], [0, 0.2, 1]])  # along the longest side
+    np.testing.assert_allclose(ends[2:], [[[0, 0, 1], [0, 0, 0.7]], [[0, 0, 0.7], [0, 0.1, 0.5]]])
+    assert radii.tolist() == [0.1, 0.1, BONE, BONE]
 
 
 def test_where_nothing_can_render_bones_are_drawn(pole, blind):
