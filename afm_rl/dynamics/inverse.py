@@ -106,8 +106,9 @@ def effective_action(
     jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()
     covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    limit: Any = 1.0
-    left, going = _size(error), True
+    limit: Any = 1.0  # of a step; tensors from the first round on
+    going: Any = True
+    left = _size(error)
     for last in (False,) * (rounds - 1) + (True,):
         slope = _times(jacobian.mT, error.double())
         step = _times(covariance, slope)
