@@ -149,18 +149,19 @@ def reasons(result: Result) -> tuple[str, str]:
 
 
 def tables_of(text: str) -> dict[str, list[str]]:
-    r"""Return the Markdown tables of a text, by the line above each.
+    r"""Return the Markdown tables of a text, by the line above each; the last of one name.
 
     >>> tables_of("Errors:\n\n| a |\n|---|\n| 1 |\n")
     {'Errors': ['| a |', '|---|', '| 1 |']}
     """
     found: dict[str, list[str]] = {}
-    title = ""
+    title, above = "", ""
     for line in text.splitlines():
         if line.startswith("|"):
-            found.setdefault(title, []).append(line)
+            found[title] = [*found[title], line] if above.startswith("|") else [line]
         elif line.strip():
             title = line.strip().rstrip(":")
+        above = line
     return found
 
 
