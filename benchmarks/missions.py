@@ -2,8 +2,9 @@
 
     python benchmarks/missions.py outputs/study/arm --rows regime --measures return:1 steps:0
 
-Columns are those of `missions.csv`, and `run`, the name of a folder. A measure is a column and its
-digits after the point. With `--columns` all measures are in one cell; without, each has its own.
+Columns are those of `missions.csv`, and `run`, the name of a folder. A measure is a column, its
+digits after the point and, if it is to be divided, by what: `return:3:-2500`. With `--columns` all
+measures are in one cell; without, each has its own.
 """
 
 from __future__ import annotations
@@ -28,9 +29,10 @@ def table(
         names = [str(part) for part in key]
         row = shown.setdefault(", ".join(names[: len(rows)]), {})
         texts = {}
-        for name, _, digits in (measure.partition(":") for measure in measures):
-            mean = estimate(name, group[name].astype(float), group["scenario"])
-            texts[name] = interval_text(mean, name, int(digits or 0))
+        for name, digits, *unit in (measure.split(":") for measure in measures):
+            values = group[name] / float(*unit or [1])
+            mean = estimate(name, values, group["scenario"])
+            texts[name] = interval_text(mean, name, int(digits))
         row |= {", ".join(names[len(rows) :]): " / ".join(texts.values())} if columns else texts
     wide = pd.DataFrame(shown).T.fillna("–")
     return wide.rename_axis(", ".join(rows)).reset_index()
