@@ -200,7 +200,8 @@ def count(root: Path) -> dict[str, str]:
     code = {name: text for name, text in texts.items() if name.endswith(".py")}
     trees = {n: ast.parse(t) for n, t in code.items() if n.startswith(("afm_rl/", "envs/"))}
     nodes = [node for tree in trees.values() for node in ast.walk(tree)]
-    words = [len(t.split()) for n, t in texts.items() if re.match(r"(README|docs/.*)\.md", n)]
+    pages = [t for n, t in texts.items() if re.match(r"(README|docs/.*)\.md", n)]
+    words = [len(re.sub("<!--.*?-->", "", text).split()) for text in pages]
 
     def lines(files: Iterable[str]) -> str:
         return f"{sum(code[file].count(chr(10)) for file in files):,}"
