@@ -329,6 +329,8 @@ def main() -> None:
         for name in stale if options.renew == ["all"] else options.renew:
             try:
                 renew(name)
+            except KeyboardInterrupt:
+                raise SystemExit(f"{name}: ended; the same command goes on") from None
             except SystemExit as end:
                 failed.append(str(end))
         if failed:
