@@ -12,7 +12,7 @@ MODES = ("mixed", "direction", "clip")
 SATURATION = choice(
     "mixed", mixed="slower if under 15 %", direction="do it slower", clip="cut each component"
 )
-LEAST = 0.15  # share of an action that must be had for "mixed" to clip it
+LEAST = 0.15  # share of a component that must be had for "mixed" to clip it
 LITTLE = 0.3  # share of the box that must be reached for plans to keep to it
 TRIED = 0.1  # share of the box that must have been tried to know that little can be reached
 DEAD = 0.025  # share of which nothing can be had
@@ -24,18 +24,24 @@ def saturate(unit: Tensor, mode: str, dim: int = -1) -> Tensor:
     The axes are in the dimension ``dim``.
 
     ``"clip"`` cuts each component for itself; ``"direction"`` shrinks all alike, so that the
-    robot does the same thing slower: the ratio of turning to driving is kept. ``"mixed"``
-    clips what can be had to 15 % at least, and does the rest slower.
+    robot does the same thing slower: the ratio of turning to driving is kept. ``"mixed"`` does it
+    slower where of half of the components, at least, less than 15 % can be had, and clips else.
 
     >>> saturate(torch.tensor([0.5, 2.0]), "direction")
     tensor([0.2500, 1.0000])
     """
     if mode == "clip":
         return unit.clamp(-1.0, 1.0)
-    excess = unit.abs().amax(dim, keepdim=True).clamp_min(1.0)
+    excess = unit.abs().clamp_min(1.0)
+    slower = unit / excess.amax(dim, keepdim=True)
     if mode == "direction":
-        return unit / excess
-    return torch.where(excess * LEAST > 1.0, unit / excess, unit.clamp(-1.0, 1.0))
+        return slower
+    return torch.where(_half(excess * LEAST > 1.0, dim), slower, unit.clamp(-1.0, 1.0))
+
+
+def _half(mask: Tensor, dim: int = -1) -> Tensor:
+    """Return whether a mask holds for half of the axes at least: one of two, or ten of twenty."""
+    return mask.to(torch.float32).mean(dim, keepdim=True) >= 0.5
 
 
 def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
@@ -56,8 +62,8 @@ def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
     limit = torch.where(unit < 0, -low, high).clamp_min(0.0)
     share = limit / unit.abs().clamp_min(1e-6)
     share = torch.where(high - low < 2 * DEAD, 1.0, share)  # no slowness helps there
-    share = share.amin(-1, keepdim=True).clamp_max(1.0)
-    return unit * share if mode == "direction" else torch.where(share < LEAST, unit * share, unit)
+    slower = unit * share.amin(-1, keepdim=True).clamp_max(1.0)
+    return slower if mode == "direction" else torch.where(_half(share < LEAST), slower, unit)
 
 
 def extend(reach: Tensor, box: Tensor, tried: Tensor) -> Tensor:

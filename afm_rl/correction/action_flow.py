@@ -14,7 +14,7 @@ from afm_rl.correction.achievable import SATURATION
 from afm_rl.correction.base import LONGEST, Correction, Fields
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.delay import command_acting, delay_tables, likeliest_delay
-from afm_rl.correction.hypotheses import CHOICES, acting_of, choose, delayed
+from afm_rl.correction.hypotheses import CHOICES, USUAL_DELAY, acting_of, choose, delayed
 from afm_rl.correction.network import AxisNetwork, load_universal
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.tick import Tick
@@ -77,6 +77,9 @@ class ActionFlow(PairCorrector):
         action_low: Tensor,
         action_high: Tensor,
         hypotheses: Sequence[str] | None = option(None, "context windows and delays; None: all"),
+        longest_delay: int = option(
+            USUAL_DELAY, "steps of a delay that is looked for", ge=0, le=25
+        ),
         rows: int | None = option(None, "pairs of a context window; None: 12, or more", ge=1),
         memory: int = option(80, "transitions that are remembered", ge=1),
         place: Sequence[int] = option((), "state coordinates in which the ground may differ", ge=0),
@@ -111,11 +114,12 @@ class ActionFlow(PairCorrector):
             ge=0,
             le=LONGEST,
         ),
+        home: Sequence[float] | None = option(None, "action at rest, as a pose; None: zero"),
     ) -> None:
         size, place = len(torch.as_tensor(action_low)), list(place)
         rows = max(12, size + 4) if rows is None else rows
-        super().__init__(action_low, action_high, rows, memory, len(place), quiet, delay)
-        self.hypotheses = choose(hypotheses, bool(place), plain)
+        super().__init__(action_low, action_high, rows, memory, len(place), quiet, delay, home)
+        self.hypotheses = choose(hypotheses, bool(place), plain, longest_delay)
         self.models = tuple(row.name for row in self.hypotheses)
         self.odds, self.most_odds, self.discount, self.tails = odds, most_odds, discount, tails
         self.noise = check_number("corrector.noise", noise, low=least_noise)
@@ -205,12 +209,20 @@ class ActionFlow(PairCorrector):
         size, count = self.action_size, len(self.models)
         belief = {"losses": (count, size), "forecasts": (count, size), "noise": (size,)}
         delay = {"delay": (1,), "under_way": (self.longest_delay + self.delay, size)}
-        return {**super().shapes(state_size), **delay, **belief}
+        return {**super().shapes(state_size), "corrects": (1,), "usual": (1,), **delay, **belief}
 
     def begin(self, state: Tensor) -> Tensor:
         """Return the memory ``(*B, P)`` of missions that begin in ``state`` ``(*B, S)``."""
         parts = self.unpack(super().begin(state), state.shape[-1])
         return self.pack({**parts, "noise": torch.full_like(parts["noise"], self.noise)})
+
+    def quiet_in(self, parts: Fields) -> Tensor:
+        """Return up to which innovation a transition needs no explanation, ``(*B, 1)``.
+
+        While plans are executed, what two of three do not exceed: of a model that is only nearly
+        exact, not all transitions are explained. None while actions are corrected.
+        """
+        return self.quiet * (1 - parts["corrects"]) * parts["usual"].exp()
 
     def belief(self, parts: Fields) -> Belief:
         """Return the belief in the parts of a memory."""
@@ -225,13 +237,18 @@ class ActionFlow(PairCorrector):
         """Return the probabilities of the models ``(*B, M, A)``."""
         noise = parts["noise"]
         prior = prior_of(self.log_prior.to(noise), self.odds, noise, self.floor(parts))
-        return self.belief(parts).weights(prior)
+        belief = self.belief(parts)
+        return belief.weights(belief.shared_prior(prior))
 
     def measure(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts of the memory with the newest pairs and the belief after them."""
         parts = super().measure(memory, model)
         newest, size = parts["pairs"][..., -1, :], self.action_size
-        _, effect, std, valid, _ = newest.split([size, size, size, 1, self.tail], -1)
+        _, effect, std, valid, tail = newest.split([size, size, size, 1, self.tail], -1)
+        loud = (tail[..., :1] > self.quiet_in(parts)).to(tail)
+        learns = valid * (1 - parts["corrects"])
+        usual = parts["usual"] + 0.05 * learns * (loud - 1 / 3)
+        parts |= {"usual": usual.clamp_min(0.0), "loud": torch.maximum(loud, parts["corrects"])}
         floor = self.floor(parts)
         constants = (self.discount, self.noise_rate, floor, self.tails)
         prior = prior_of(self.log_prior.to(floor), self.odds, parts["noise"], floor)
@@ -245,9 +262,14 @@ class ActionFlow(PairCorrector):
             [before, belief.losses],
         )
         parts["delay"], belief = delay.unsqueeze(-1).to(newest), belief._replace(losses=losses)
-        begins = misaligned & ((parts["misaligned"] != 1.0) | self.is_sudden(parts))
-        parts["pairs"] = self.mark_old(parts["pairs"], begins)
-        return parts | belief._asdict() | {"misaligned": misaligned.to(newest)}
+
+        def with_old_rows() -> list[Tensor]:
+            begins = misaligned & ((parts["misaligned"] != 1.0) | self.is_sudden(parts))
+            return [self.mark_old(parts["pairs"], begins)]
+
+        (pairs,) = somewhere(misaligned.squeeze(-1), with_old_rows, [parts["pairs"]])
+        misaligned = misaligned.to(newest)
+        return parts | belief._asdict() | {"pairs": pairs, "misaligned": misaligned}
 
     def is_sudden(self, parts: Fields) -> Tensor:
         """Return whether a robot that was healthy, if not exactly as modelled, changes now.
@@ -309,6 +331,7 @@ class ActionFlow(PairCorrector):
         follows = (self.delays < 0).unsqueeze(-1)
         acts = torch.where(follows, command_acting(acted, delay).unsqueeze(-2), acts)
         believed = (self.delays_now(delay) == delay.unsqueeze(-1)) & (delay > 0).unsqueeze(-1)
+        kept = believed.unsqueeze(-1) | (parts["misaligned"] == 1.0).unsqueeze(-1)
         best = torch.minimum(losses, losses[..., :1, :])
         newest = commands.shape[-2] - parts["under_way"].shape[-2]
         return parts | {
@@ -316,7 +339,8 @@ class ActionFlow(PairCorrector):
             "executed": action,
             "acting": self.denormalise(command_acting(acted, delay)),
             "forecasts": acts,
-            "losses": torch.where(believed.unsqueeze(-1), losses, best),
+            "losses": torch.where(kept, losses, best),
+            "corrects": torch.zeros_like(parts["corrects"]),
             "under_way": commands[..., newest:, :],
         }
 
@@ -337,7 +361,7 @@ class ActionFlow(PairCorrector):
         """
         parts = self.measure(memory, model)
         innovation = parts["pairs"][..., -1, -self.tail]
-        misaligned = parts["misaligned"].squeeze(-1) == 1.0
+        misaligned = (parts.pop("loud") * parts["misaligned"]).squeeze(-1) == 1.0
         memory = self.pack(parts)
         unchanged = parts if all_hold(misaligned) else self.forecast_unchanged(parts, planned)
         return memory, self.pack(unchanged), misaligned, innovation
@@ -355,13 +379,19 @@ class ActionFlow(PairCorrector):
         """
         parts = self.unpack(memory, self.states_in(memory))
         weights, delay = self.weights(parts), parts["delay"].squeeze(-1).long()
-        rest = [x.to(self.tick.scale) for x in (self.normalise(parts["sent"]), planned, box)]
+        rest = [self.normalise(x).to(self.tick.scale) for x in (parts["sent"], planned, box)]
         answer = self.tick(*self._evidence(parts, weights), delay, *rest)
+        executed, predicted, bounds = (
+            self.denormalise(x.to(memory))
+            for x in (answer.executed, answer.predicted, answer.bounds)
+        )
         acting = self.denormalise((weights * answer.forecasts.to(memory)).sum(-2))
-        parts |= {"planned": planned, "executed": answer.executed.to(memory), "acting": acting}
+        parts |= {"planned": planned, "executed": executed, "acting": acting}
         parts["forecasts"] = answer.forecasts.to(memory)
         parts["under_way"] = answer.under_way.to(memory)
-        return (self.pack(parts), *answer[:-2])
+        parts["corrects"] = answer.corrects.unsqueeze(-1).to(memory)
+        spread = self.scale * answer.spread.to(memory)
+        return self.pack(parts), executed, predicted, spread, bounds, answer.corrects
 
     def correct(
         self, memory: Tensor, planned: Tensor, model: DynamicsModel, box: Tensor
@@ -385,7 +415,7 @@ class ActionFlow(PairCorrector):
 
     def noise_in(self, memory: Tensor) -> Tensor:
         """Return the noise that was learnt, ``(*B, A)``, in units of the action."""
-        return self.denormalise(memory[..., -self.action_size :])
+        return self.scale * memory[..., -self.action_size :]
 
     def weights_in(self, memory: Tensor) -> Tensor:
         """Return how probable the :attr:`models` are, by axis, ``(*B, M, A)``."""
@@ -406,11 +436,13 @@ class ActionFlow(PairCorrector):
             model: the dynamics model as it is now.
         """
         with torch.no_grad():
-            memory = self._with_forecasts(self.pack(self.measure(memory, model)), action)
+            parts = self.measure(memory, model)
+            parts.pop("loud")
+            memory = self._with_forecasts(self.pack(parts), action)
             parts = self.unpack(memory, model.state_size)
             weights = self.weights(parts)
             mean, std = mean_and_std(parts["forecasts"], weights)
-            return self.denormalise(mean), self.denormalise(torch.hypot(std, parts["noise"]))
+            return self.denormalise(mean), self.scale * torch.hypot(std, parts["noise"])
 
     def executing(
         self, memory: Tensor, planned: Tensor, executed: Tensor, misaligned: Tensor | None = None
@@ -426,7 +458,7 @@ class ActionFlow(PairCorrector):
         parts = self.unpack(super().reported(memory, given), self.states_in(memory))
         if self.delay:
             sent = self.unpack(memory, self.states_in(memory))["sent"][..., 0, :]
-        difference = self.normalise(given - sent).unsqueeze(-2)
+        difference = ((given - sent) / self.scale).unsqueeze(-2)
         return self.pack({**parts, "forecasts": parts["forecasts"] + difference})
 
     @torch.no_grad()

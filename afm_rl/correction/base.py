@@ -47,21 +47,23 @@ class Corrector(nn.Module, ABC):
 
     A corrector is a pure function on a memory, one flat tensor ``(*B, P)`` per mission:
     :meth:`begin` makes it, :meth:`correct` turns a planned action into the one to execute, and
-    :meth:`observe` adds the state that this led to. Inside, an action is divided by the largest one
-    that its box has, u in [-1, 1]^A: a factor on an action stays one, also where it cannot be
-    negative, as a thrust.
+    :meth:`observe` adds the state that this led to. Inside, an action is counted from the one at
+    rest, ``home``, and divided by the largest one that its box has, u in [-1, 1]^A: a factor on an
+    action stays one, also where it cannot be negative, as a thrust.
 
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
         delay: steps from an action to its effect that are known, one number or one per axis. Faster
             axes are kept waiting for the slowest, so that actions have their effects together.
+        home: the action at rest, such as the pose of position servos, ``(A,)``; None: zero.
 
     Raises:
         ConfigurationError: for bounds or numbers that cannot be used.
     """
 
     scale: Tensor
+    home: Tensor
     lowest: Tensor
     highest: Tensor
     hold: Tensor
@@ -75,6 +77,7 @@ class Corrector(nn.Module, ABC):
         action_high: Tensor,
         recent: int = option(..., "transitions that are kept as they were observed, R", ge=1),
         delay: int | Sequence[int] = option(0, "known steps to its effect", ge=0, le=LONGEST),
+        home: Sequence[float] | None = option(None, "action at rest, as a pose; None: zero"),
     ) -> None:
         super().__init__()
         low, high = torch.as_tensor(action_low), torch.as_tensor(action_high)
@@ -87,9 +90,18 @@ class Corrector(nn.Module, ABC):
         self.layouts: dict[int, tuple[list, list, list]] = {}  # by the size of a state
         self.first_steps, self.held_back = FirstSteps(), HeldBack()
         self.recent = recent
+        rest = torch.zeros_like(low) if home is None else torch.as_tensor(home).to(low)
+        if rest.shape != low.shape or not bool(
+            ((low <= rest) & (rest <= high) | (rest == 0)).all()
+        ):
+            raise ConfigurationError(
+                f"corrector.home={rest.tolist()}: expected {len(low)} actions between "
+                f"{low.tolist()} and {high.tolist()}"
+            )
+        low, high = low - rest, high - rest
         scale = torch.maximum(low.abs(), high.abs())
         self.action_size = len(scale)
-        ends = {"scale": scale, "lowest": low / scale, "highest": high / scale}
+        ends = {"scale": scale, "home": rest, "lowest": low / scale, "highest": high / scale}
         for name, value in ends.items():
             self.register_buffer(name, value, persistent=False)
         steps = [delay] * self.action_size if isinstance(delay, int) else list(delay)
@@ -298,11 +310,11 @@ class Corrector(nn.Module, ABC):
 
     def normalise(self, action: Tensor) -> Tensor:
         """Return u for an action in its own units."""
-        return action / self.scale
+        return (action - self.home) / self.scale
 
     def denormalise(self, unit: Tensor) -> Tensor:
         """Return the action for u."""
-        return self.scale * unit
+        return self.home + self.scale * unit
 
     def within(self, share: Tensor) -> Tensor:
         """Return the u whose place between lowest (-1) and highest (1) is ``share`` ``(*B, A)``."""

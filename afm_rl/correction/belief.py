@@ -79,6 +79,31 @@ class Belief(NamedTuple):
         """
         return (prior - self.losses).softmax(-2)
 
+    def shared_prior(self, prior: Tensor, alike: float = 0.5, most: float = 7.0) -> Tensor:
+        r"""Return the log prior of an axis, given the losses of the others, ``(*B, M, A)``.
+
+        .. math:: \pi_{ha} \leftarrow (1 - \lambda)\,\pi_{ha} + \lambda\,\mathrm{softmax}_h \Big(
+                  \log \pi_{ha} - \sum_{b \neq a} \min\{l_{hb} - \min_k l_{kb},\; 7\} \Big)
+
+        With a probability of :math:`\lambda` all axes have the same fault, as where a supply
+        fails, or a unit is wrong. Of twelve axes each then shows it to the others.
+
+        Args:
+            prior: log-odds of the models.
+            alike: :math:`\lambda`.
+            most: what one axis may say against a model: none decides alone.
+
+        >>> losses = torch.tensor([[0.0, 9.0, 9.0], [3.0, 0.0, 0.0]])  # the first shows nothing
+        >>> belief = Belief(losses, losses, torch.ones(3))
+        >>> prior = torch.tensor([[1.0], [0.0]]).expand(2, 3)
+        >>> belief.shared_prior(prior).exp()[:, 0].round(decimals=2)
+        tensor([0.3700, 0.6300])
+        """
+        doubt = (self.losses - self.losses.amin(-2, keepdim=True)).clamp_max(most)
+        others = doubt.sum(-1, keepdim=True) - doubt
+        alike = alike if prior.shape[-1] > 1 else 0.0
+        return torch.lerp(prior.softmax(-2), (prior - others).softmax(-2), alike).log()
+
 
 def haste(noise: Tensor, floor: Tensor | float) -> Tensor:
     r"""Return :math:`q = \min\{1, (s_0 / s)^2\}`: how little a row tells in noise, ``(*B, A)``.

@@ -16,6 +16,8 @@ from torch import Tensor
 from afm_rl.correction.context_windows import CONTEXT_WINDOWS
 from afm_rl.errors import ConfigurationError, check_choice
 
+LONGEST_DELAY = 25  # steps of a delay that may be looked for
+USUAL_DELAY = 8  # that are, if nothing else is said
 FILTER = 12  # commands that a lag looks back on
 KINDS = ("nominal", "network", "linear", "delay", "delayed gain", "healthy")
 
@@ -58,10 +60,10 @@ def delayed(steps: int) -> str:
 
 
 def _slow(kind: str, prefix: str = "") -> list[Hypothesis]:
-    """Return the rows of a kind for delays of one to eight steps, and for three lags."""
+    """Return the rows of a kind for delays of one to 25 steps, and for three lags."""
     delays = [
         Hypothesis(f"{prefix}delay_{k}", kind, delay=k, follows_delay=False, cause=delayed(k))
-        for k in range(1, 9)
+        for k in range(1, LONGEST_DELAY + 1)
     ]
     return delays + [
         Hypothesis(f"{prefix}lag_{k}", kind, lag=k, follows_delay=False, cause="slow")
@@ -114,13 +116,16 @@ CHOICES = [row.name for row in HYPOTHESES if row.kind in ("network", "delay")]
 """What a robot may name: the others are always there, a delayed gain with its delay."""
 
 
-def choose(names: Sequence[str] | None, by_place: bool, plain: float) -> tuple[Hypothesis, ...]:
+def choose(
+    names: Sequence[str] | None, by_place: bool, plain: float, longest: int = USUAL_DELAY
+) -> tuple[Hypothesis, ...]:
     """Return the hypotheses of a robot, each with its prior log-odds.
 
     Args:
-        names: of :data:`CHOICES`; all if None.
+        names: of :data:`CHOICES`; all if None, with delays up to the longest.
         by_place: may the ground differ from place to place? Windows by place are dropped else.
         plain: prior log-odds of a fit against an answer of the network.
+        longest: delay that is looked for, in steps.
 
     Raises:
         ConfigurationError: if it is no list of such names, or none by time is left.
@@ -129,7 +134,8 @@ def choose(names: Sequence[str] | None, by_place: bool, plain: float) -> tuple[H
     >>> [row.name for row in rows if row.kind not in ("linear", "healthy")]
     ['nothing has changed', 'recent', 'lag_1', 'gain_now', 'gain_lag_1']
     """
-    names = CHOICES if names is None else names
+    if names is None:
+        names = [row.name for row in HYPOTHESES if row.name in CHOICES and row.delay <= longest]
     if isinstance(names, str) or not isinstance(names, Sequence) or not names:
         raise ConfigurationError(
             f"corrector.hypotheses={names!r}: expected a list of {', '.join(CHOICES)}"

@@ -17,7 +17,6 @@ from afm_rl.correction.least_squares import (
     invert_affine,
     moments_of,
     not_zero,
-    quadratic,
     solve_line,
     variance_of_line,
 )
@@ -26,6 +25,7 @@ from afm_rl.spaces.small_matrices import add_diagonal, invert_positive
 EXACT = 0.02  # a fit that misses by less explains all rows
 LEAST_ROWS = 3.0  # weight of the rows that can tell which command drives an axis
 WINDOWS = (1, 3, 12, 0)  # rows; 0: all
+MIXING = 3  # models that mix axes, the last ones
 RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for a few noisy rows
 
 
@@ -52,12 +52,20 @@ class Lines(NamedTuple):
         """Return the variances ``(B, L, C, A)`` of the effects of actions ``(B, C, A)``."""
         u = actions.unsqueeze(1)
         c0, c1, c2 = self.spread.unsqueeze(3).unbind(2)
+        return torch.cat([c0 + u * (c1 + u * c2), self.mixing(actions)[1]], 1)
+
+    def mixing(self, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return effects and variances of actions ``(B, C, A)``, ``(B, 3, C, A)`` each.
+
+        By the models that mix axes.
+        """
+        matrix, bias = self.matrix[:, -MIXING:], self.bias[:, -MIXING:]
+        effect = actions.unsqueeze(1) @ matrix.mT + bias.unsqueeze(2)
         inputs = torch.nn.functional.pad(actions, (0, 1), value=1.0)
         affine = ((inputs @ self.leverage) * inputs).sum(-1, keepdim=True).expand_as(actions)
         driven = actions.square() @ self.driver.mT
         driven = torch.where(driven > 0, driven, affine)
-        mixing = torch.stack([affine, driven, torch.zeros_like(driven)], 1)
-        return torch.cat([c0 + u * (c1 + u * c2), mixing], 1)
+        return effect, torch.stack([affine, driven, torch.zeros_like(driven)], 1)
 
     def effect(self, actions: Tensor) -> Tensor:
         """Return the effects ``(B, L, C, A)`` of actions ``(B, C, A)``, or ``(B, L, C, A)``."""
@@ -92,36 +100,37 @@ def fit_lines(
     sent, u, v, weight = (x.mT.double() for x in (sent, acted, came, weight))  # (B, A, M)
     newest = _windows(u.shape[-1], u.device) * weight.unsqueeze(-2)
     square, mean, mass, cross, shift = moments_of(newest, u, v)  # (B, A, W)
-    gain, offset = not_zero(cross / square), (shift - mean) / mass
-    slope, rest = solve_line(square, mean, mass, cross, shift)
-    gain_12 = gain[..., 2:3]
+    one, none = torch.ones_like(mass), torch.zeros_like(mass)
+    gain, of_offset, of_gain = not_zero(cross / square), 1 / mass, 1 / square
+    drift = (shift - gain[..., 2:3] * mean)[..., :1] / mass[..., :1]
+    offset, gain_12 = (shift - mean) / mass, gain[..., 2:3]
     drift = (shift - gain_12 * mean)[..., :1] / mass[..., :1]
-    arx, goes_on, arx_spread = _autoregressive(u, v, weight)
-    one, none = torch.ones_like(arx), torch.zeros_like(gain)
-    gains = torch.cat([-one, one, one, gain[..., 1::2], slope[..., 2:], gain_12, arx, one], -1)
-    trend = _extrapolate(v - u, weight)
-    biases = [none[..., :1], offset[..., :2], none[..., :2], rest[..., 2:], drift, goes_on, trend]
-    affine, shift = fit_affine(sent.mT, v.mT, weight.mT)
-    exact = torch.as_tensor(noise).to(v).clamp_min(EXACT).square().unsqueeze(-1)
-    driven, rest, driver = _driven(sent, v, weight, exact, affine, shift.unsqueeze(-1))
-    mixing = torch.stack([affine, driven, _swapped(sent, v, weight, exact)], 1)
-    matrix = torch.cat([torch.diag_embed(gains.mT), mixing], 1)
-    bias = torch.cat([*biases, shift.unsqueeze(-1), rest, none[..., :1]], -1).mT
-    constant, slopes = quadratic(1 / mass, 0), quadratic(1 / square, 2)  # (B, A, W, 3)
-    spreads = [
-        quadratic(none[..., :1], 0),  # reversed: there is nothing that could be unsure
-        constant[..., :2, :],
-        slopes[..., 1::2, :],
-        variance_of_line(square, mean, mass)[..., 2:, :],
-        slopes[..., 2:3, :] + constant[..., :1, :],
-        arx_spread.unsqueeze(-2),
-        quadratic(5 + none[..., :1], 0),  # the trend: of two squared, and of one offset
+    line = (
+        *solve_line(square, mean, mass, cross, shift),
+        *variance_of_line(square, mean, mass).unbind(-1),
+    )
+    offsets, gains, lines = (
+        torch.stack(terms, -1)  # gain, offset, and the coefficients of the variance
+        for terms in ((one, offset, of_offset, none, none), (gain, none, none, none, of_gain), line)
+    )
+    last = [gain_12, drift, of_offset[..., :1], none[..., :1], of_gain[..., 2:3]]
+    single = [
+        torch.stack([-one, none, none, none, none], -1)[..., :1, :],  # reversed
+        offsets[..., :2, :],
+        gains[..., 1::2, :],
+        lines[..., 2:, :],
+        torch.stack(last, -1),
+        _autoregressive(u, v, weight),
+        _trend(v - u, weight),
     ]
-    spread = torch.cat(spreads, -2).permute(0, 2, 3, 1)
+    gains, bias, *spread = torch.cat(single, -2).transpose(1, 2).unbind(-1)  # (B, L, A)
+    matrix, shift, driver = _mixing(sent, v, weight, noise)
     inputs = torch.nn.functional.pad(sent.mT, (0, 1), value=1.0)
     rows = weight.mean(1).unsqueeze(-1) * inputs
     leverage = invert_positive(add_diagonal(rows.mT @ inputs, PRIOR))
-    return Lines(*(x.to(came) for x in (matrix, bias, spread, leverage, driver)))
+    matrix = torch.cat([torch.diag_embed(gains), matrix], 1)
+    bias = torch.cat([bias, shift], 1)
+    return Lines(*(x.to(came) for x in (matrix, bias, torch.stack(spread, 2), leverage, driver)))
 
 
 @cached(maxsize=16)
@@ -200,12 +209,11 @@ def at_rest(
     return torch.where((acts - now).abs() <= 1.05 * band, now, acts)
 
 
-def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Return gain and offset ``(B, A, 1)`` of :math:`v_k = b u_k + c u_{k-1} + a v_{k-1} + d`.
+def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> Tensor:
+    r"""Return the line in u_k that is :math:`v_k = b u_k + c u_{k-1} + a v_{k-1} + d`.
 
-    And the variance of v_k as a polynomial of u_k, ``(B, A, 3)``, in units of the noise.
-
-    The row before is known, so this is a line in u. Rows after one that does not count do not.
+    The row before is known. Gain, offset, and the coefficients of the variance, ``(B, A, 1, 5)``.
+    Rows after one that does not count do not.
 
     Args:
         u: executed, the oldest first, ``(B, A, M)``.
@@ -213,94 +221,88 @@ def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> tuple[Tensor, Tenso
         weight: of the rows.
     """
     sound = (weight > 0).to(u)
-    before = torch.stack([u * sound, v * sound], -1)
-    now = u[..., 1:].unsqueeze(-1)
-    x = torch.cat([now, before[..., :-1, :], torch.ones_like(now)], -1)
+    before = torch.stack([u * sound, v * sound, torch.ones_like(u)], -1)
+    x = torch.cat([before[..., :-1, :], u[..., 1:].unsqueeze(-1)], -1)
     pull = (weight[..., 1:] * sound[..., :-1]).unsqueeze(-1) * x
-    left = add_diagonal(pull.mT @ x, RIDGE)
-    right = pull.mT @ (v - u)[..., 1:].unsqueeze(-1)
-    covariance = invert_positive(left)
-    b, from_before, d = (covariance @ right).split([1, 2, 1], -2)  # (B, A, ., 1)
-    goes_on = before[..., -1:, :] @ from_before
-    rest = torch.nn.functional.pad(before[..., -1, :], (0, 1), value=1.0).unsqueeze(-1)
-    shared = covariance[..., 1:, :] * rest  # (B, A, 3, 4)
-    c0 = (shared[..., 1:] * rest.mT).sum((-2, -1))
-    spread = torch.stack([c0, 2 * shared[..., 0].sum(-1), covariance[..., 0, 0]], -1)
-    return not_zero(1 + b).squeeze(-1), (goes_on + d).squeeze(-1), spread
+    covariance = invert_positive(add_diagonal(pull.mT @ x, RIDGE))
+    fit = covariance @ (pull.mT @ (v - u)[..., 1:].unsqueeze(-1))  # (B, A, 4, 1)
+    # The inputs of the next row are (0, rest) + u_k (1, 0).
+    rest = torch.nn.functional.pad(before[..., -1:, :], (0, 1))
+    ends = torch.cat([rest, torch.eye(4).to(u)[3:].expand_as(rest)], -2)
+    (offset, gain), spread = (ends @ fit).squeeze(-1).unbind(-1), ends @ covariance @ ends.mT
+    c0, c1, c2 = spread[..., 0, 0], 2 * spread[..., 0, 1], spread[..., 1, 1]
+    return torch.stack([not_zero(1 + gain), offset, c0, c1, c2], -1).unsqueeze(-2)
 
 
-def _extrapolate(offset: Tensor, weight: Tensor) -> Tensor:
-    r"""Return the next offset ``(B, A, 1)`` of a disturbance that goes on as it changes.
+def _trend(offset: Tensor, weight: Tensor) -> Tensor:
+    r"""Return the line of a gain of one and a disturbance that goes on as it changes.
 
     .. math:: d_{k+1} = c\,d_k - d_{k-1},\qquad c = 2 \cos \omega
 
     is a line (c = 2) or an oscillation; c is fitted to the newest rows of ``(B, A, M)``. The newest
     offset where the one before it does not count, zero where neither does; at most half of the
-    largest action: what is larger is a fault.
+    largest action: what is larger is a fault. The variance is that of two squared, and of one.
     """
     counts = (weight > 0).to(offset)
     offset = offset * counts
     before, now, after = (offset[..., k : k - 2 or None] for k in range(3))
-    every = counts[..., :-2] * counts[..., 1:-1] * counts[..., 2:]
-    pull = every * now * 0.95 ** torch.arange(every.shape[-1] - 1, -1, -1, device=every.device)
-    c = (pull * (before + after)).sum(-1, keepdim=True) + 2 * PRIOR
-    c = (c / ((pull * now).sum(-1, keepdim=True) + PRIOR)).clamp(-2, 2)
-    before, newest = offset[..., -2:].split(1, -1)
-    both = counts[..., -2:].prod(-1, keepdim=True)
-    return (newest + both * ((c - 1) * newest - before)).clamp(-0.5, 0.5)
+    pull = now * counts[..., :-2] * counts[..., 2:] * _newest(now.shape[-1], now.device)
+    c = (pull * (before + after)).sum(-1) + 2 * PRIOR
+    c = (c / ((pull * now).sum(-1) + PRIOR)).clamp(-2, 2)
+    before, newest = offset[..., -2], offset[..., -1]
+    both = counts[..., -2] * counts[..., -1]
+    goes_on = (newest + both * ((c - 1) * newest - before)).clamp(-0.5, 0.5)
+    one, none = torch.ones_like(c), torch.zeros_like(c)
+    return torch.stack([one, goes_on, 5 * one, none, none], -1).unsqueeze(-2)
 
 
-def _driven(
-    u: Tensor, v: Tensor, weight: Tensor, exact: Tensor, else_matrix: Tensor, else_bias: Tensor
+@cached(maxsize=16)
+def _newest(length: int, device: torch.device) -> Tensor:
+    """Return weights that halve in some fourteen rows, ``(M,)``."""
+    return 0.95 ** torch.arange(length - 1, -1, -1, dtype=torch.float64, device=device)
+
+
+def _mixing(
+    u: Tensor, v: Tensor, weight: Tensor, noise: Tensor | float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return matrix ``(B, A, A)`` and offset ``(B, A, 1)`` of axes that another command drives.
+    """Return the models that mix axes: matrices ``(B, 3, A, A)``, and offsets ``(B, 3, A)``.
 
-    And what the square of each command adds to the variance of an axis, ``(B, A, A)``.
-
-    Of many axes an affine map needs many rows, and a gait that repeats itself shows only a few; but
-    swapped cables need no more than gains. It stands where one explains all rows.
+    And what the square of each command adds to the variance of an axis that it drives,
+    ``(B, A, A)``. An affine map; the same, but for axes that another command drives; and two axes
+    that have each other's command.
 
     Args:
         u: executed actions, ``(B, A, K)``.
         v: effects.
         weight: of both.
-        exact: mean square of what a fit that explains all rows may leave, ``(B, A, 1)``.
-        else_matrix: of the axes that are not explained, ``(B, A, A)``.
-        else_bias: likewise, ``(B, A, 1)``.
+        noise: standard deviation that no model explains, ``(B, A)``.
     """
-    other = 1 - torch.eye(u.shape[-2], device=u.device, dtype=u.dtype)
+    affine, shift = fit_affine(u.mT, v.mT, weight.mT)
+    own = torch.eye(u.shape[-2], device=u.device, dtype=u.dtype)
+    # Mean square of what a model that explains all rows may leave. An axis that its own command
+    # explains is driven by it, whatever else fits by chance.
+    exact = torch.as_tensor(noise).to(v).clamp_min(EXACT).square().unsqueeze(-1)
+    fair = exact * (1 - own)
     pull, mass = weight * v, weight.sum(-1, keepdim=True)
-    cross = pull @ u.mT + PRIOR * (1 - other)
-    square = weight @ u.square().mT + PRIOR
-    gain = cross / square
-    left = ((pull * v).sum(-1, keepdim=True) - gain * cross) / (mass + PRIOR)
-    # An axis that its own command explains is driven by it, whatever else fits by chance.
-    left, driver = (left + exact * other).min(-1, keepdim=True)
-    swapped = other.expand_as(gain).gather(-1, driver) > 0
-    explained = swapped & (left < 2 * exact) & (mass > LEAST_ROWS)
+    cross, square = pull @ u.mT, weight @ u.square().mT
+    total, count = (pull * v).sum(-1, keepdim=True), mass + PRIOR
+    gain, square = (cross + PRIOR * own) / (square + PRIOR), square + PRIOR
+    # Of many axes an affine map needs many rows, and a gait that repeats itself shows only a few;
+    # but swapped cables need no more than gains.
+    left, driver = ((total - gain * cross) / count + fair).min(-1, keepdim=True)
+    explained = (
+        (left < 2 * exact) & (mass > LEAST_ROWS) & (own.expand_as(gain).gather(-1, driver) == 0)
+    )
     nothing = torch.zeros_like(gain)
-    chosen = nothing.scatter(-1, driver, gain.gather(-1, driver))
+    driven = nothing.scatter(-1, driver, gain.gather(-1, driver))
     variance = nothing.scatter(-1, driver, explained / square.gather(-1, driver))
-    matrix = torch.where(explained, chosen, else_matrix)
-    return matrix, torch.where(explained, 0.0, else_bias), variance
-
-
-def _swapped(u: Tensor, v: Tensor, weight: Tensor, exact: Tensor) -> Tensor:
-    """Return the matrix ``(B, A, A)`` of axes of which two may have each other's command.
-
-    Which two, the fewest of all rows tell: both have to do what the other one is commanded.
-
-    Args:
-        u: executed actions, ``(B, A, K)``.
-        v: effects.
-        weight: of both.
-        exact: mean square of what a model that explains all rows may leave, ``(B, A, 1)``.
-    """
-    size, mass = u.shape[-2], weight.sum(-1, keepdim=True) + PRIOR
-    own = torch.eye(size, device=u.device, dtype=u.dtype)
-    cross = weight @ u.square().mT - 2 * (weight * v) @ u.mT
-    miss = ((weight * v.square()).sum(-1, keepdim=True) + cross) / mass + exact * (1 - own)
+    # Which two are swapped, the fewest of all rows tell: both do what the other one is commanded.
+    miss = (total + square - 2 * cross) / count + fair
     partner = (miss + miss.mT).argmin(-1)
-    axis = torch.arange(size, device=u.device)
+    axis = torch.arange(u.shape[-2], device=u.device)
     partner = torch.where(partner.gather(-1, partner) == axis, partner, axis)
-    return torch.zeros_like(miss).scatter(-1, partner.unsqueeze(-1), 1.0)
+    swapped = nothing.scatter(-1, partner.unsqueeze(-1), 1.0)
+    matrix = torch.stack([affine, torch.where(explained, driven, affine), swapped], 1)
+    none = torch.zeros_like(shift)
+    driven_shift = torch.where(explained.squeeze(-1), none, shift)
+    return matrix, torch.stack([shift, driven_shift, none], 1), variance

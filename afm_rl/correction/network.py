@@ -184,27 +184,35 @@ class AxisNetwork(nn.Module):
             time, left = tau, max(1 - tau, LEAST_TIME)
         hidden = asked.hidden + at * self.point_weight + time * self.time_weight
         own, shares = self._mixture(self.plan_head(hidden.relu()))
-        return (shares * torch.cat([own, (asked.answers - at) / left], -1)).sum(-1).mT
+        return self._mean(shares, own, (asked.answers - at) / left)
 
     def effect(self, encoded: Encoded, executed: Tensor) -> Tensor:
         """Return the effects ``(N, C, A)`` that actions ``(N, C, A)`` are predicted to have."""
-        return self.forecast(encoded, executed)[0]
+        answers, own, shares = self._read(encoded, executed)
+        return self._mean(shares, own, answers[..., :EXPERTS])
 
     def forecast(self, encoded: Encoded, executed: Tensor) -> tuple[Tensor, Tensor]:
         """Return the effects of actions ``(N, C, A)``, and their variances in units of the noise.
 
         Those of the fits that are mixed; the own answer is as sure as the line. ``(N, C, A)`` each.
         """
+        answers, own, shares = self._read(encoded, executed)
+        variances = encoded.experts.variance(executed, answers[..., EXPERTS:])
+        line = variances[..., MISSES - 1 : MISSES]
+        effect = self._mean(shares, own, answers[..., :EXPERTS])
+        return effect, self._mean(shares, line, variances)
+
+    def _read(self, encoded: Encoded, executed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the experts' answers about actions, the own one, and the shares of all."""
         answers = encoded.experts.effect(executed)
         misses = encoded.experts.misses.expand(*answers.shape[:-1], -1)
         asked = torch.cat([executed.mT.unsqueeze(-1), answers, misses], -1)
         hidden = (encoded.effect + self.effect_query(asked)).relu()
-        own, shares = self._mixture(self.effect_head(hidden))
-        variances = encoded.experts.variance(executed, answers[..., EXPERTS:])
-        line = variances[..., MISSES - 1 : MISSES]
-        each = torch.cat([own, answers[..., :EXPERTS]], -1), torch.cat([line, variances], -1)
-        effect, variance = ((shares * part).sum(-1).mT for part in each)
-        return effect, variance
+        return answers, *self._mixture(self.effect_head(hidden))
+
+    def _mean(self, shares: Tensor, own: Tensor, experts: Tensor) -> Tensor:
+        """Return the mean ``(N, C, A)`` of the own answer and of the experts'."""
+        return (shares * torch.cat([own, experts], -1)).sum(-1).mT
 
     def _mixture(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """Return the own answers ``(N, A, C, 1)``, and the shares of these and of the experts."""

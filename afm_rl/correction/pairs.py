@@ -27,6 +27,7 @@ class PairCorrector(Corrector):
             needs no explanation.
         delay: steps from an action to its effect that are known, see
             :class:`~afm_rl.correction.Corrector`.
+        home: the action at rest, likewise.
     """
 
     is_valid: Tensor
@@ -41,8 +42,9 @@ class PairCorrector(Corrector):
         place: int = 0,
         quiet: float = 1.0,
         delay: int | Sequence[int] = 0,
+        home: Sequence[float] | None = None,
     ) -> None:
-        super().__init__(action_low, action_high, recent, delay)
+        super().__init__(action_low, action_high, recent, delay, home)
         self.memory, self.quiet = max(memory, recent), quiet
         self.pair_size, self.tail = 3 * self.action_size + 2 + place, 1 + place
         is_valid = torch.arange(self.pair_size) == 3 * self.action_size
@@ -75,9 +77,8 @@ class PairCorrector(Corrector):
         # What acted last was predicted to have an effect; older ones were asked about before.
         before = parts["pairs"][..., self.memory - count + 1 :, size : 2 * size]
         guess = torch.cat([self.denormalise(before), parts["acting"].unsqueeze(-2)], -2)
-        quiet = torch.where(parts["misaligned"] == 1.0, 0.0, self.quiet)
         seen = effective_action(
-            model, state, executed, reached, self.scale, quiet=quiet, guess=guess
+            model, state, executed, reached, self.scale, quiet=self.quiet_in(parts), guess=guess
         )
         rows = torch.cat(
             [
@@ -96,6 +97,10 @@ class PairCorrector(Corrector):
         before = torch.nn.functional.pad(asked == 0.5, (0, 0, 0, 1)) & self.is_valid
         rows = torch.where(before, 0.5 * rows, rows)
         return parts | {"pairs": torch.cat([older, rows], -2)}
+
+    def quiet_in(self, parts: Fields) -> Tensor:
+        """Return up to which innovation a transition needs no explanation, ``(*B, 1)``."""
+        return torch.where(parts["misaligned"] == 1.0, 0.0, self.quiet)
 
     def cause_in(self, memory: Tensor) -> str:
         """Return the gains that explain the pairs of memories ``(*B, P)``, in words, if any do."""

@@ -18,6 +18,7 @@ from afm_rl.correction.experts import MISSES, Rows, fit_experts
 from afm_rl.correction.hypotheses import KINDS, Hypothesis, acting_of
 from afm_rl.correction.least_squares import PRIOR, fit_gain, precision_of, quadratic
 from afm_rl.correction.linear import (
+    MIXING,
     Lines,
     at_rest,
     fit_lines,
@@ -28,7 +29,7 @@ from afm_rl.correction.network import AxisNetwork, Encoded, midpoint
 
 
 class Answer(NamedTuple):
-    """What the models make of plans, in units of the action."""
+    """What the models make of plans; actions are shares of the largest one."""
 
     executed: Tensor
     """The action, ``(B, A)``."""
@@ -85,6 +86,11 @@ class Forecast(NamedTuple):
     """Shares of the largest action."""
     variance: Tensor
     """Of the fits, in units of the noise."""
+
+    def at(self, which: Tensor) -> Forecast:
+        """Return the forecast of other actions, of which each axis has an index ``(B, K, A)``."""
+        which = which.unsqueeze(1).expand(-1, self.effect.shape[1], -1, -1)
+        return Forecast(self.effect.gather(2, which), self.variance.gather(2, which))
 
 
 class Tick(nn.Module):
@@ -163,44 +169,42 @@ class Tick(nn.Module):
             place: where the missions are, ``(B, P)``.
             delay: of commands, in steps, ``(B,)``.
             waiting: commands that are known to come, the oldest first, ``(B, D, A)``.
-            planned: in units of the action, ``(B, A)``.
+            planned: the planned action, ``(B, A)``.
             box: lowest and highest action, ``(B, 2, A)``.
         """
-        unit, ends = planned / self.scale, box / self.scale
+        plan = planned.clamp(*box.unbind(1))
         fits = self.fit(pairs, noise, place, delay)
-        models = self.most_likely(fits, weights)
-        proposals, spread = self.propose(models, unit, ends)
-        expected = self.expect(models, proposals)
-        reach = self.reach(models, expected.effect)
-        low, high = reach.unbind(-2)
-        wanted = attainable(unit, low, high, self.saturation)
-        sent = pairs[..., : len(self.scale)]
-        bounds = extend(reach, ends, sent.amax(1) - sent.amin(1))
-        action, effects = self.decide(models, proposals, expected, wanted, noise)
-        lag = (self.filter_of_model.to(weights) @ weights).argmax(1)  # the most probable one
-
-        def against_lag() -> tuple[Tensor, Tensor]:
-            command, acts = self.lead(action, lag, torch.cat([sent, waiting], 1), ends)
-            return command, self.expect(models, acts.unsqueeze(1)).effect.squeeze(2)
-
-        action, effects = somewhere((lag > 0).any(-1), against_lag, [action, effects])
         healthy = weights[:, 0] + weights[:, -self.counts[-1] :].sum(1)
         changed = healthy < 0.5  # else the plan, to the bit
-        corrects = changed & action.isfinite().all(-1, True)
-        action = torch.where(corrects, action, proposals[:, 0])
-        effects = torch.where(corrects.unsqueeze(1), effects, expected.effect[:, :, 0])
-        predicted = (models.weights * effects).sum(1)
+        still = [plan, plan, torch.zeros_like(plan), box]
+
+        def corrected() -> tuple[Tensor, ...]:
+            models = self.most_likely(fits, weights)
+            proposals, spread = self.propose(models, planned, box)
+            expected = self.expect(models, proposals)
+            reach = self.reach(models, expected.effect)
+            low, high = reach.unbind(-2)
+            wanted = attainable(planned, low, high, self.saturation)
+            sent = pairs[..., : len(self.scale)]
+            bounds = extend(reach, box, sent.amax(1) - sent.amin(1))
+            action, effects = self.decide(models, proposals, expected, wanted, noise)
+            lag = (self.filter_of_model.to(weights) @ weights).argmax(1)  # the most probable one
+
+            def against_lag() -> tuple[Tensor, Tensor]:
+                command, acts = self.lead(action, lag, torch.cat([sent, waiting], 1), box)
+                return command, self.expect(models, acts.unsqueeze(1)).effect.squeeze(2)
+
+            action, effects = somewhere((lag > 0).any(-1), against_lag, [action, effects])
+            corrects = changed & action.isfinite().all(-1, True)
+            action = torch.where(corrects, action, plan)
+            effects = torch.where(corrects.unsqueeze(1), effects, expected.effect[:, :, 0])
+            return action, (models.weights * effects).sum(1), spread, bounds
+
+        action, predicted, spread, bounds = somewhere(changed.any(-1), corrected, still)
         ahead = torch.cat([waiting, action.unsqueeze(1)], 1)
         forecasts, under_way = self.forecast(fits, weights, delay, pairs, ahead)
-        return Answer(
-            action * self.scale,
-            predicted * self.scale,
-            spread * self.scale,
-            bounds * self.scale,
-            changed.any(-1),
-            forecasts,
-            under_way,
-        )
+        changed = changed.any(-1)
+        return Answer(action, predicted, spread, bounds, changed, forecasts, under_way)
 
     def fit(self, pairs: Tensor, noise: Tensor, place: Tensor, delay: Tensor) -> Fits:
         """Return all models, fitted to the memory; see :meth:`forward`."""
@@ -294,22 +298,26 @@ class Tick(nn.Module):
         and tell nothing. So would small actions in noise: the plan is kept where they save less
         than .02 of expected loss.
         """
-        cost, axis, whole = self.rate(models, proposals, expected, wanted, noise)  # (B, C, A)
-        cost = torch.cat([cost[:, :1] - 0.02, cost[:, 1:]], 1)
+        loss, axis, whole = self.rate(models, proposals, expected, wanted, noise)  # (B, C, A)
+        cost = torch.cat([loss[:, :1] - 0.02, loss[:, 1:]], 1)
         each = torch.where(axis, cost, torch.inf).argmin(1, keepdim=True)
-        total = torch.where(whole, cost.sum(-1, keepdim=True), torch.inf)
-        least, joint = total.min(1, keepdim=True)
+        least, joint = torch.where(whole, cost.sum(-1, keepdim=True), torch.inf).min(1, True)
         joint = joint.expand_as(each)
-        action = proposals.gather(1, joint)
-        effect = expected.effect.gather(2, joint.unsqueeze(1).expand_as(expected.effect[:, :, :1]))
+        action, effect = proposals.gather(1, joint), expected.at(joint).effect
 
         def by_axis() -> tuple[Tensor, Tensor]:
-            other = torch.cat([proposals[:, :1], proposals.gather(1, each)], 1)
-            forecast = self.expect(models, other)
-            loss, _, whole = self.rate(models, other, forecast, wanted, noise)
+            which = torch.cat([torch.zeros_like(each), each], 1)
+            actions = proposals.gather(1, which)
+            own = expected.at(which)  # of the models that mix no axes
+            effect_of_all, variance = models.lines.mixing(actions)
+            forecast = Forecast(
+                torch.cat([own.effect[:, :-MIXING], effect_of_all], 1),
+                torch.cat([own.variance[:, :-MIXING], variance], 1),
+            )
+            loss, _, whole = self.rate(models, actions, forecast, wanted, noise)
             better = whole[:, 1:] & (loss[:, 1:].sum(-1, keepdim=True) <= least + 1e-6)
             return (
-                torch.where(better, other[:, 1:], action),
+                torch.where(better, actions[:, 1:], action),
                 torch.where(better.unsqueeze(1), forecast.effect[:, :, 1:], effect),
             )
 

@@ -40,6 +40,9 @@ class DynamicsModel(nn.Module, ABC):
     extrapolates: bool = False
     """Whether it predicts actions beyond their box: equations do, networks do not."""
 
+    home: Tensor | None = None
+    """Action at rest, such as the pose of position servos, ``(A,)``; None: zero."""
+
     conditioned_on: str | None = None
     """What an updater sets in it: ``regime``, ``calibration``, or nothing."""
 

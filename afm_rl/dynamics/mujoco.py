@@ -14,6 +14,7 @@ from afm_rl.dynamics.mujoco_model import (
     HUGE,
     actuator_names,
     changed_model,
+    home_of,
     read_model,
     space_of,
     state_names,
@@ -198,6 +199,9 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
         if mix is not None:  # no single actuator limits an action
             low = high = torch.zeros(self.action_size, dtype=torch.float64)
             limited = low.bool()
+        else:
+            now = getattr(getattr(model, "unwrapped", model), "data", None)
+            self.home = home_of(mujoco_model, None if now is None else now.qpos)
         self.action_low = torch.where(limited, low, -torch.inf)
         self.action_high = torch.where(limited, high, torch.inf)
         half = torch.where(limited, (high - low) / 2, 1.0)

@@ -284,6 +284,31 @@ def actuator_names(model: Any) -> list[str]:
     return names
 
 
+def home_of(model: Any, pose: np.ndarray | None = None) -> Tensor | None:
+    """Return the commands ``(A,)`` by which position servos hold the robot's pose, others 0.
+
+    That is the keyframe nearest to positions ``pose``; of several, without these, that with the
+    name "home", else the first one. Without keyframes it is the pose in which the model is
+    described. None where all are 0, or there is no servo.
+    """
+    data = mujoco.MjData(model)
+    if model.nkey:
+        names = [model.key(k).name for k in range(model.nkey)]
+        first = names.index("home") if "home" in names else 0
+        away = 0 if pose is None else np.abs(model.key_qpos - pose).sum(-1)
+        mujoco.mj_resetDataKeyframe(model, data, first if pose is None else np.argmin(away))
+    mujoco.mj_fwdPosition(model, data)
+    gain, bias = model.actuator_gainprm[:, 0], model.actuator_biasprm
+    servo = (
+        (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (bias[:, 1] < 0) & (gain > 0)
+    )
+    held = -(bias[:, 0] + bias[:, 1] * data.actuator_length) / np.where(servo, gain, 1.0)
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, np.inf).T
+    low = np.where(np.isinf(low), -np.inf, low)
+    home = np.where(servo, held, 0.0).clip(low, high)
+    return torch.from_numpy(home) if home.any() else None
+
+
 def changed_model(model: Any, row: tuple[float, ...]) -> Any:
     """Return a copy of an ``MjModel`` with other physics, a row of :attr:`Physics.names`.
 

@@ -24,6 +24,7 @@ from afm_rl.correction import Corrector
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.deprecated import old_arguments, old_attribute
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
+from afm_rl.dynamics.mujoco_model import home_of
 from afm_rl.errors import ConfigurationError
 from afm_rl.faults import fault_of
 from afm_rl.spaces.manifold import Manifold
@@ -187,6 +188,10 @@ class GymnasiumShell:
                 f"ActionFlowWrapper: the state has {tuple(states.shape[1:])} numbers, that of the "
                 f"model {model.state_size}; say what it is by state=lambda env, observation: ..."
             )
+        if (
+            isinstance(model, MuJoCoDynamics) and model.mix is None
+        ):  # of several poses, the one of this mission
+            model.home = home_of(model.mjcf, states[0, : model.mjcf.nq].numpy())
         low, high = (torch.as_tensor(x).to(states) for x in (self._actions.low, self._actions.high))
         self._spec = Bounded(low, high, low.shape, dtype=low.dtype)
         self._loop = options.complete(model, self._spec)

@@ -147,7 +147,8 @@ class CorrectionLoop:
                     "or give a corrector with bounds of its own"
                 )
             low, high = low.reshape(-1, size)[0], high.reshape(-1, size)[0]
-            corrector = ActionFlow(low, high, delay=self.delay or 0)
+            home = None if model.home is None else model.home.tolist()
+            corrector = ActionFlow(low, high, delay=self.delay or 0, home=home)
         elif self.delay is not None:
             raise ConfigurationError(
                 f"{owner}.delay={self.delay!r}: a corrector was given too; say it there, as in "

@@ -35,9 +35,10 @@ def test_a_delayed_gain_comes_with_its_delay_and_readings_by_place_with_a_place(
     assert priors["gain_lag_1"] == pytest.approx(-math.log(2))  # they share one
 
 
-def test_without_names_all_are_chosen():
-    assert len(choose(None, True, -6.0)) == len(HYPOTHESES)
-    assert choose(CHOICES, True, -6.0) == choose(None, True, -6.0)
+def test_without_names_all_are_chosen_up_to_the_longest_delay():
+    assert len(choose(None, True, -6.0, 25)) == len(HYPOTHESES)
+    assert choose(CHOICES, True, -6.0) == choose(None, True, -6.0, 25)
+    assert [max(row.delay for row in choose(None, True, -6.0, n)) for n in (0, 8, 25)] == [0, 8, 25]
 
 
 @pytest.mark.parametrize(
