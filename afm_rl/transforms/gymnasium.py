@@ -188,9 +188,7 @@ class GymnasiumShell:
                 f"ActionFlowWrapper: the state has {tuple(states.shape[1:])} numbers, that of the "
                 f"model {model.state_size}; say what it is by state=lambda env, observation: ..."
             )
-        if (
-            isinstance(model, MuJoCoDynamics) and model.mix is None
-        ):  # of several poses, the one of this mission
+        if isinstance(model, MuJoCoDynamics) and model.mix is None:  # its pose now
             model.home = home_of(model.mjcf, states[0, : model.mjcf.nq].numpy())
         low, high = (torch.as_tensor(x).to(states) for x in (self._actions.low, self._actions.high))
         self._spec = Bounded(low, high, low.shape, dtype=low.dtype)

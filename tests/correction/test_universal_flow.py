@@ -275,4 +275,4 @@ def test_where_plans_are_done_slower_they_may_ask_for_more(line, drive, plans):
     flow, planned = flow_of(2, saturation="mixed"), plans(24, 4, 2, size=1.0)
     found, _ = drive(flow, line(2), lambda sent: factor * sent[-1], planned)
     low, high = found[3][-1].unbind(-2)
-    assert (high > 1 - 1e-6).all() and (low < 1e-6 - 1).all()
+    assert (high > 0.9999).all() and (low < -0.9999).all()
