@@ -124,7 +124,7 @@ def test_the_steps_until_commands_act_are_told_and_said(way):
     late, settings, steps, words = WAYS[way]
     env = ActionFlowWrapper(Carts(late), glide, **settings)
     assert env.reset(seed=0)[1]["afm"]["delay"] == settings.get("delay", 0)
-    info = drive(env, 120)[1]["afm"]
+    info = drive(env, 110)[1]["afm"]
     assert info["delay"] == steps and isinstance(info["delay"], int)
     assert not info["corrects"] or way in ("found", "left")
     assert env.diagnosis.endswith(words)
