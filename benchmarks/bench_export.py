@@ -19,6 +19,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from afm_rl.compiling.machine_code import finish_compiling
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
@@ -69,6 +70,8 @@ def main() -> None:
             path = Path(folder) / "policy.pt2"
             export_controller(plain, path)
             exported = torch._inductor.aoti_load_package(str(path))
+        drive(fast, fast, ticks=20)
+        finish_compiling()
         ways = {"as it is": plain, "corrector.compile=true": fast, "exported": exported}
         for way, tick in ways.items():
             for what, gain in ((name, -0.8), (f"{name}, healthy", 1.0)):

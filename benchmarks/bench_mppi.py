@@ -26,6 +26,7 @@ from torch import Tensor
 from torchrl.modules import MPPIPlanner
 from torchrl.objectives.value import TDLambdaEstimator
 
+from afm_rl.compiling.machine_code import finish_compiling
 from afm_rl.dynamics import Dubins
 from afm_rl.planning import MPPI, Cost, PlanningEnv
 from afm_rl.report.tables import markdown
@@ -154,6 +155,9 @@ def main() -> None:
     for count in options.samples:
         jobs = {name: make(count) for name, make in kinds.items()}
         calls = {name: lambda job=job: job(START) for name, job in jobs.items()}
+        for call in calls.values():
+            call()
+        finish_compiling()
         spent.append(timed(calls, options.rounds, clock=time.thread_time))
     heads = ["samples", *options.samples, "driven"]
     rows = [

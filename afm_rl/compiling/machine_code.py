@@ -7,13 +7,15 @@ import io
 import json
 import os
 import shutil
+import signal
+import sys
 import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +23,8 @@ from torch import Tensor, nn
 from afm_rl._version import __version__
 from afm_rl.progress import waiting
 from afm_rl.storage.signed import read_signed, write_signed
+
+LONGEST = 900  # seconds that a process may compile
 
 
 def checksum_of(code: bytes) -> str:
@@ -102,6 +106,8 @@ class MachineCode:
             if like.is_cpu:  # machine code is for the processor
                 code = compile_module(code, two, self.cache, traced=model is not None) or code
             self.codes[key] = code
+        if isinstance(code, Beside):
+            code = self.codes[key] = code.finished()
         return in_one_batch(code, *(part.contiguous() for part in given))  # as it was compiled for
 
 
@@ -137,14 +143,88 @@ def in_one_batch(function: Callable[..., Sequence[Tensor]], *given: Tensor) -> l
     return [part.view((*batch, *part.shape[1:])) for part in function(*given)]
 
 
+class Beside:
+    """A module that runs as it is until a process beside this one has compiled it.
+
+    That goes on when this process ends, so that the next one finds what it made.
+
+    Args:
+        module: takes tensors, returns a tuple of tensors.
+        path: file that is written, and run from then on.
+        work: writes it.
+    """
+
+    processes: ClassVar[dict[Path, tuple[int, int]]] = {}
+
+    def __init__(self, module: nn.Module, path: Path, work: Callable[[], None]) -> None:
+        self.module, self.path = module, path
+        if path not in Beside.processes:
+            Beside.processes[path] = _begin(work)
+
+    def __call__(self, *given: Tensor) -> Sequence[Tensor]:
+        return self.module(*given)
+
+    def finished(self, wait: bool = False) -> Callable[..., Sequence[Tensor]]:
+        """Return the machine code if it is there, else this; the module if it never will be."""
+        reason = ""
+        if self.path in Beside.processes:
+            process, end = Beside.processes[self.path]
+            if not _ended(process, wait):
+                return self
+            with open(end, "rb") as reasons:
+                reason = reasons.read().decode()
+            del Beside.processes[self.path]
+        code = read_signed(self.path)
+        if code is None:
+            _warn(reason or "the process that compiled was ended")
+        return self.module if code is None else runner(code)
+
+
+def finish_compiling() -> None:
+    """Wait for all processes that compile beside this one."""
+    for process, _ in Beside.processes.values():
+        _ended(process, wait=True)
+
+
+def _ended(process: int, wait: bool) -> bool:
+    try:
+        return os.waitpid(process, 0 if wait else os.WNOHANG)[0] != 0
+    except ChildProcessError:  # it was waited for before
+        return True
+
+
+def _begin(work: Callable[[], None]) -> tuple[int, int]:
+    """Do work in another process; return its number, and where to read why it failed."""
+    end, start = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of threads, none of which the work needs
+        process = os.fork()
+    if process:
+        os.close(start)
+        return process, end
+    try:
+        signal.alarm(LONGEST)
+        os.nice(10)
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        for stream in range(3):  # nobody shall wait for an end of these
+            os.dup2(nowhere, stream)
+        torch.set_num_threads(1)
+        work()
+    except BaseException as error:  # compilers fail in many ways
+        os.write(start, _reason(error).encode())
+    finally:
+        os._exit(0)
+
+
 def compile_module(
     module: nn.Module, inputs: Sequence[Tensor], cache: str | Path, traced: bool
 ) -> Callable[..., Sequence[Tensor]] | None:
     """Return a module as machine code, for any number of missions.
 
-    It is compiled ahead of time (AOTInductor), which takes half a minute of one core, and only if
-    the cache does not hold it already for these weights, shapes, settings and versions, with this
-    user's signature; a line says so if it does not run what is there.
+    It is compiled ahead of time (AOTInductor), which takes half a minute of one core or more, and
+    only if the cache does not hold it already for these weights, shapes, settings and versions,
+    with this user's signature; a line says so if it does not run what is there. On Linux a process
+    beside this one compiles, and the module runs as it is meanwhile (:class:`Beside`).
 
     Args:
         module: takes tensors whose first dimension counts missions, returns a tuple of such.
@@ -161,18 +241,38 @@ def compile_module(
         name = f"{_digest(module, inputs, drawn and drawn.program)}.pt2"
         path = Path(cache).expanduser() / "compiled" / name
         code = read_signed(path)
-        if code is None:
-            found = f"{path} was not written by you" if path.exists() else "nothing compiled yet"
-            print(f"{found}: compiling anew", flush=True)
-            code = _compile(module, inputs, drawn)
-            write_signed(path, code)
-        # What is loaded could be called, but would read its description anew each time.
-        run = loaded(code).loader.boxed_run
-        return lambda *given: run(list(given))
+        if code is not None:
+            return runner(code)
+        found = f"{path} was not written by you" if path.exists() else "nothing compiled yet"
+        print(f"{found}: compiling anew", flush=True)
+        if not has_compiler():
+            raise RuntimeError("no C++ compiler was found")
+
+        def work() -> None:
+            write_signed(path, _compile(module, inputs, drawn))
+
+        if sys.platform == "linux":
+            return Beside(module, path, work)
+        work()
+        return runner(read_signed(path) or b"")
     except Exception as error:  # compilers fail in many ways
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        warnings.warn(f"compile=true: goes on uncompiled: {reason}", stacklevel=2)
+        _warn(_reason(error))
         return None
+
+
+def runner(code: bytes) -> Callable[..., Sequence[Tensor]]:
+    """Return the function of a program that returns as many tensors as it does."""
+    # What is loaded could be called, but would read its description anew each time.
+    run = loaded(code).loader.boxed_run
+    return lambda *given: run(list(given))
+
+
+def _reason(error: BaseException) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def _warn(reason: str) -> None:
+    warnings.warn(f"compile=true: goes on uncompiled: {reason}", stacklevel=3)
 
 
 def has_compiler() -> bool:
@@ -186,8 +286,6 @@ def _trace(module: nn.Module, inputs: Sequence[Tensor]) -> Trace:
 
 
 def _compile(module: nn.Module, inputs: Sequence[Tensor], traced: Trace | None) -> bytes:
-    if not has_compiler():
-        raise RuntimeError("no C++ compiler was found")
     code = package(traced or _trace(module, inputs), settings_for(inputs))
     with torch.no_grad():
         for one, other in zip(loaded(code)(*inputs), module(*inputs), strict=True):

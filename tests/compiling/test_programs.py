@@ -1,7 +1,9 @@
 """Machine code runs only if it is what was written here."""
 
 import os
+import signal
 import stat
+import sys
 from pathlib import Path
 
 import pytest
@@ -102,10 +104,40 @@ class Doubled(nn.Module):
         return (2.0 * given[0],)
 
 
+def doubled(cache):
+    return machine_code.compile_module(Doubled(), [torch.ones(2, 1)], cache, traced=False)
+
+
 def run(cache):
     """Return what the compiled module makes of ones; None if it goes on uncompiled."""
-    found = machine_code.compile_module(Doubled(), [torch.ones(2, 1)], cache, traced=False)
+    found = doubled(cache)
+    if isinstance(found, machine_code.Beside):
+        assert found(torch.ones(3, 1))[0].flatten().tolist() == [2.0] * 3  # as it is, meanwhile
+        found = found.finished(wait=True)
+        assert not isinstance(found, nn.Module)
     return None if found is None else found(torch.ones(3, 1))[0].flatten().tolist()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="compiles in this process")
+@pytest.mark.parametrize(
+    ("fails", "reason"),
+    [
+        (lambda *_: 1 / 0, "division by zero"),
+        (lambda *_: os.kill(os.getpid(), signal.SIGKILL), "the process that compiled was ended"),
+    ],
+)
+def test_a_process_that_cannot_compile_leaves_the_module_as_it_is(
+    tmp_path, monkeypatch, fails, reason
+):
+    monkeypatch.setattr(machine_code, "has_compiler", lambda: True)
+    monkeypatch.setattr(machine_code, "_compile", fails)
+    twins = doubled(tmp_path), doubled(tmp_path)  # of one process
+    for twin in twins:
+        with pytest.warns(UserWarning, match="compile=true: goes on uncompiled"):
+            found = twin.finished(wait=True)
+        assert isinstance(found, Doubled) and found(torch.ones(1))[0] == 2.0
+    with pytest.warns(UserWarning, match=reason):
+        doubled(tmp_path).finished(wait=True)
 
 
 @pytest.fixture(scope="module")
