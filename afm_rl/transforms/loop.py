@@ -240,8 +240,8 @@ class CorrectionLoop:
         inside, _ = safe_action(plan, low, high, sent)
         inside = inside.to(memory.dtype)
         given = self.enabled_in(memory, enabled)
-        everywhere = enabled is None and self.enabled
-        on = given if self.enabled else ~given & given
+        on = given & self.enabled
+        everywhere = all_hold(on)
 
         def chosen(corrected: Tensor, otherwise: Tensor | float) -> Tensor:
             """Return what is where missions are corrected, and elsewhere."""
@@ -314,9 +314,9 @@ class CorrectionLoop:
         if not self.enabled:
             return now, torch.zeros_like(memory[..., 0], dtype=torch.long)
         state, steps = state_at_arrival(self.corrector, memory, self.model)
-        if enabled is None:
-            return state, steps
         on = self.enabled_in(memory, enabled)
+        if all_hold(on):
+            return state, steps
         return torch.where(on.unsqueeze(-1), state, now), torch.where(on, steps, 0)
 
     def enabled_in(self, memory: Tensor, enabled: Tensor | None) -> Tensor:
