@@ -275,7 +275,9 @@ def export_controller(controller: Controller, path: str | Path) -> str:
             f"cannot be exported: {reason}"
         ) from error
     if path.suffix == ".pt2":
-        settings = settings_for([controller.policy.action_spec.zero()])
+        action = controller.policy.action_spec.zero()
+        like = action if controller.planner is None else action.expand(1, 1, 1, -1)  # plans
+        settings = settings_for([like])
         code = package(traced, {"aot_inductor.metadata": about, **settings})
     write_whole(path, code)
     return checksum_of(code)
