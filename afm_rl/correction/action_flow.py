@@ -284,6 +284,8 @@ class ActionFlow(PairCorrector):
         miss = torch.where(self.healthy.unsqueeze(-1) > 0, miss, torch.inf).amin(-2)
         before = (effect - sent)[..., 0, :].abs() > noise[..., 0, :]
         sudden = ((miss > noise[..., 1, :]) & ~before).any(-1, keepdim=True)
+        if all_hold(~sudden):
+            return sudden
         believed = (self.weights(parts) * self.healthy.unsqueeze(-1)).sum(-2)
         return sudden & (believed > 0.5).all(-1, keepdim=True)
 
