@@ -35,6 +35,7 @@ def effective_action(
     unseen: float = 4.0,
     assumed: float = 0.1,
     enough: float = 0.1,
+    far: float = 0.2,
 ) -> EffectiveAction:
     r"""Express a prediction error in action space, for any model and robot.
 
@@ -53,9 +54,10 @@ def effective_action(
     many local minima, and a correction that is right lies in the deepest. A round moves each axis
     by half a range at most, a row is only changed where its error becomes smaller (its next step
     is a quarter as long where it does not), and its rounds end early when little is left that an
-    action can explain. J is differentiated once, where the rounds begin, and ``std`` is of that
-    one. With what the step d of a round changes, :math:`\Delta`, the next one corrects it (Broyden
-    1965, Mathematics of Computation 19),
+    action can explain. J is differentiated where the rounds begin, and after a ``far`` step, as
+    there are in the first ticks of a fault; ``std`` is of the last of these. After other steps d,
+    which change the forecast by :math:`\Delta`, the next round corrects J (Broyden 1965,
+    Mathematics of Computation 19),
 
     .. math:: J \leftarrow J + \frac{(\Delta - J d)\, d^\top}{d^\top d}
 
@@ -78,6 +80,7 @@ def effective_action(
         unseen: standard deviation of an axis of which a transition shows nothing (half ranges).
         assumed: that where nothing needs an explanation (half ranges).
         enough: what a round has to promise, to be worth its time (squared standard deviations).
+        far: step of a round after which the model is differentiated anew (half ranges).
 
     >>> from afm_rl.dynamics import Dubins
     >>> s, a = torch.zeros(3), torch.tensor([0.5, 0.2])
@@ -103,7 +106,11 @@ def effective_action(
         there = model.manifold.difference(next_state, model(state, guess)) / noise
         better = _size(there) < _size(error)
         effective, error = torch.where(better, guess, action), torch.where(better, there, error)
-    jacobian = (model.jacobian(state, effective) * half_range / noise.unsqueeze(-1)).double()
+
+    def derivative(at: Tensor) -> Tensor:
+        return (model.jacobian(state, at) * half_range / noise.unsqueeze(-1)).double()
+
+    jacobian = derivative(effective)
     covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     limit: Any = 1.0  # of a step; tensors from the first round on
@@ -126,10 +133,16 @@ def effective_action(
         if last or all_hold(~going):
             break
         limit = limit * torch.where(better, 1.0, 0.25)
-        missed = before - remaining - _times(jacobian, moved)
-        along = moved / _size(moved).clamp_min(1e-12)
-        jacobian = jacobian + missed.unsqueeze(-1) * along.unsqueeze(-2)
+        near = all_hold((moved.abs().amax(-1, True) < far) | ~going)
+        if near:
+            missed = before - remaining - _times(jacobian, moved)
+            along = moved / _size(moved).clamp_min(1e-12)
+            jacobian = jacobian + missed.unsqueeze(-1) * along.unsqueeze(-2)
+        else:
+            jacobian = derivative(effective)
         covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
+        if not near:
+            std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
     if not model.affine:  # what the rounds could not explain, per coordinate
         std = (std * (left / error.shape[-1]).sqrt().clamp_min(1.0)).clamp_max(unseen)
     known = innovation + std.sum(-1) < torch.inf
