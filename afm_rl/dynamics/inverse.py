@@ -133,16 +133,14 @@ def effective_action(
         if last or all_hold(~going):
             break
         limit = limit * torch.where(better, 1.0, 0.25)
-        near = all_hold((moved.abs().amax(-1, True) < far) | ~going)
-        if near:
-            missed = before - remaining - _times(jacobian, moved)
-            along = moved / _size(moved).clamp_min(1e-12)
-            jacobian = jacobian + missed.unsqueeze(-1) * along.unsqueeze(-2)
-        else:
-            jacobian = derivative(effective)
+        missed = before - remaining - _times(jacobian, moved)
+        along = moved / _size(moved).clamp_min(1e-12)
+        jacobian = jacobian + missed.unsqueeze(-1) * along.unsqueeze(-2)
+        away = going & (moved.abs().amax(-1, True) > far)
+        if not all_hold(~away):
+            jacobian = torch.where(away.unsqueeze(-1), derivative(effective), jacobian)
         covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
-        if not near:
-            std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        std = torch.where(away, covariance.diagonal(dim1=-2, dim2=-1).sqrt(), std)
     if not model.affine:  # what the rounds could not explain, per coordinate
         std = (std * (left / error.shape[-1]).sqrt().clamp_min(1.0)).clamp_max(unseen)
     known = innovation + std.sum(-1) < torch.inf
