@@ -233,12 +233,15 @@ class CorrectionLoop:
         model, corrector = self.model, self.corrector
         low, high = bounds_of(action_spec)
         check_numbers(key, planned, (*memory.shape[:-1], corrector.action_size))
-        planned = computable(planned, low, high, memory.dtype)
-        box = box_of(action_spec, planned)
         _, last, sent = corrector.latest(memory)
-        plan = torch.where(finite(planned).unsqueeze(-1), planned, last)
-        inside, _ = safe_action(plan, low, high, sent)
-        inside = inside.to(memory.dtype)
+        if all_hold((planned >= low) & (planned <= high)):  # as most are: nothing to be done
+            plan = inside = planned = planned.to(memory.dtype, copy=True)
+        else:
+            planned = computable(planned, low, high, memory.dtype)
+            plan = torch.where(finite(planned).unsqueeze(-1), planned, last)
+            inside, _ = safe_action(plan, low, high, sent)
+            inside = inside.to(memory.dtype)
+        box = box_of(action_spec, planned)
         given = self.enabled_in(memory, enabled)
         on = given & self.enabled
         everywhere = all_hold(on)
