@@ -63,6 +63,7 @@ class ActionFlow(PairCorrector):
     _machine_code: MachineCode
     log_prior: Tensor
     delays: Tensor
+    constant_delays: Tensor
     acting: Tensor
     delay_likelihood: Tensor
     delay_log_prior: Tensor
@@ -131,6 +132,8 @@ class ActionFlow(PairCorrector):
         # Of a model: its delay; -1: the one that is believed.
         delays = torch.tensor([-1 if row.follows_delay else row.delay for row in self.hypotheses])
         likelihood, delay_log_prior = delay_tables(delays, prior)
+        pure = [row.kind in ("nominal", "delay") and not row.lag for row in self.hypotheses]
+        constant = [k for k, is_pure in enumerate(pure) if is_pure]
         self.longest_delay = max(delays.tolist())
         causes = [
             delayed(row.delay + self.delay) if row.delay else row.cause for row in self.hypotheses
@@ -141,6 +144,7 @@ class ActionFlow(PairCorrector):
             "log_prior": log_prior,
             "acting": acting_of(self.hypotheses),
             "delays": delays,
+            "constant_delays": torch.tensor(constant),
             "delay_likelihood": likelihood,
             "delay_log_prior": delay_log_prior,
             "healthy": torch.tensor(
@@ -250,7 +254,7 @@ class ActionFlow(PairCorrector):
         usual = parts["usual"] + 0.05 * learns * (loud - 1 / 3)
         parts |= {"usual": usual.clamp_min(0.0), "loud": torch.maximum(loud, parts["corrects"])}
         floor = self.floor(parts)
-        constants = (self.discount, self.noise_rate, floor, self.tails)
+        constants = (self.discount, self.noise_rate, floor, self.tails, self.constant_delays)
         prior = prior_of(self.log_prior.to(floor), self.odds, parts["noise"], floor)
         belief = self.belief(parts).update(effect, std, valid, prior, *constants)
         belief = belief._replace(losses=self.share_losses(parts["losses"], belief.losses))
@@ -258,7 +262,7 @@ class ActionFlow(PairCorrector):
         before = parts["delay"].squeeze(-1).long()
         delay, losses = somewhere(
             misaligned.squeeze(-1) | (before > 0),
-            lambda: self.delayed(belief, belief.weights(prior), before),
+            lambda: self.delayed(belief, prior, before),
             [before, belief.losses],
         )
         parts["delay"], belief = delay.unsqueeze(-1).to(newest), belief._replace(losses=losses)
@@ -307,12 +311,16 @@ class ActionFlow(PairCorrector):
         """Return the delays of all models ``(*B, M)`` while ``delay`` ``(*B)`` is believed."""
         return torch.where(self.delays < 0, delay.unsqueeze(-1), self.delays)
 
-    def delayed(self, belief: Belief, weights: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+    def delayed(self, belief: Belief, prior: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Return the delay ``(*B)`` that is believed now, and the losses ``(*B, M, A)``.
 
-        Models that follow a new one begin as good as the best that had it already.
+        None while *nothing has changed* is believed everywhere. Models that follow a new one begin
+        as good as the best that had it already.
         """
-        delay = likeliest_delay(weights, before, self.delay_likelihood, self.delay_log_prior)
+        tables = self.delay_likelihood, self.delay_log_prior
+        delay = likeliest_delay(belief.weights(prior), before, *tables)
+        unchanged = belief.weights(belief.shared_prior(prior))[..., 0, :] >= 0.5
+        delay = torch.where(unchanged.all(-1) & (before == 0), 0, delay)
         has_it = (self.delays == delay.unsqueeze(-1)).unsqueeze(-1)
         best = torch.where(has_it, belief.losses, torch.inf).amin(-2, keepdim=True)
         begin = (self.delays < 0) & (delay != before).unsqueeze(-1)

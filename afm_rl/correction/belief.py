@@ -6,6 +6,7 @@ likelihood and a noise that is learnt. Model 0 says that *nothing has changed*.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -32,6 +33,7 @@ class Belief(NamedTuple):
         rate: float,
         floor: Tensor | float,
         tails: float,
+        constant_delays: Tensor | None = None,
     ) -> Belief:
         r"""Return the belief after an effect was seen.
 
@@ -55,12 +57,22 @@ class Belief(NamedTuple):
             rate: :math:`\beta`.
             floor: least noise.
             tails: degrees of freedom of the Student-t distribution.
+            constant_delays: indices ``(K,)`` of models, no delay and each one; the last model is
+                then that of a delay that changes: it has the loss of the best of them at this step,
+                the same one on all A axes, and :math:`\log(K) / A` for the choice.
         """
         kept = 1 - (1 - discount) * haste(self.noise, floor).unsqueeze(-2)
         variance, stated = self.noise.square(), std.square()
         miss = (self.forecasts - effect.unsqueeze(-2)).square()
         scaled = miss / (variance + stated).unsqueeze(-2)
-        losses = kept * self.losses + 0.5 * (tails + 1) * (scaled / tails).log1p()
+        loss = 0.5 * (tails + 1) * (scaled / tails).log1p()
+        if constant_delays is not None:
+            total = loss[..., constant_delays, :].sum(-1)
+            which = constant_delays[total.argmin(-1)][..., None, None].expand_as(loss[..., :1, :])
+            choice = math.log(len(constant_delays)) / loss.shape[-1]
+            loss = torch.cat([loss[..., :-1, :], loss.gather(-2, which) + choice], -2)
+            miss = torch.cat([miss[..., :-1, :], miss.gather(-2, which)], -2)
+        losses = kept * self.losses + loss
         losses = torch.where(valid.unsqueeze(-2) > 0, losses, self.losses)
         best = (losses - prior).argmin(-2, keepdim=True)
         excess = miss.gather(-2, best).squeeze(-2) - stated

@@ -51,7 +51,6 @@ def likeliest_delay(
     .. math:: k = \operatorname{argmax}_k \log p_k + \sum_a \log\frac{p_{ka}}{p_k}
 
     One for all axes, from the evidence of all: an axis whose commands hardly change shows none.
-    None while *nothing has changed* is believed everywhere.
 
     Args:
         weights: probabilities of the models on every axis, ``(*B, M, A)``.
@@ -67,8 +66,7 @@ def likeliest_delay(
     evidence = likelihood[before].to(weights) @ weights  # (*B, K + 1, A)
     # No axis decides alone: on each, every delay keeps a thousandth of the best.
     evidence = (evidence / evidence.amax(-2, keepdim=True)).clamp_min(1e-3).log()
-    delay = (log_prior[before].to(weights) + evidence.sum(-1)).argmax(-1)
-    return torch.where((weights[..., 0, :] < 0.5).any(-1) | (before > 0), delay, 0)
+    return (log_prior[before].to(weights) + evidence.sum(-1)).argmax(-1)
 
 
 def command_acting(commands: Tensor, delay: Tensor) -> Tensor:

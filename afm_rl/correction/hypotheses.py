@@ -32,7 +32,7 @@ class Hypothesis(NamedTuple):
     (:func:`~afm_rl.correction.linear.fit_lines`, in this order); "delay": earlier commands, as the
     row says; "delayed gain": the same times a gain that is fitted; "healthy": models by which there
     is nothing to correct (:func:`~afm_rl.correction.linear.within_rate`,
-    :func:`~afm_rl.correction.linear.sensor_noise`)."""
+    :func:`~afm_rl.correction.linear.sensor_noise`), or nothing that can be corrected."""
     delay: int = 0
     """Steps from a command to its effect."""
     lag: float = 0.0
@@ -109,6 +109,11 @@ HYPOTHESES = (
     Hypothesis("rate limit", "healthy", cause="rate limit"),
     Hypothesis("sensor noise", "healthy", cause="sensor noise"),
     Hypothesis("stiction", "healthy", log_prior=-3.0, cause="stiction"),
+    # At every step another one of the delays: nobody can tell which command will act. It is the
+    # last row, of which the belief looks up the delay afterwards.
+    Hypothesis(
+        "changing delay", "healthy", follows_delay=False, log_prior=None, cause="a changing delay"
+    ),
 )
 """All of them, kind by kind in the order of :data:`KINDS`. The prior of the first is a setting,
 ``odds``, and those with a delayed gain share one."""

@@ -400,6 +400,7 @@ class Tick(nn.Module):
             acts.clamp(*fits.rate_limits.split(1, 1)),
             acts + fits.sensor_noise,
             at_rest(acts, *fits.series),
+            acts,
         ]
         forecasts = [now, network, linear, delayed[:, 1:], fits.gains * delayed, *healthy]
 

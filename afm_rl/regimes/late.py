@@ -11,11 +11,11 @@ from afm_rl.errors import ConfigurationError, check_counts
 from afm_rl.options import option, options
 from afm_rl.regimes.base import DelayedRegime, HalfRange, check_span
 
-MOST_STEPS = 10
+MOST_STEPS = 25
 
 
 class Delay(DelayedRegime):
-    r"""The command of d steps ago: :math:`a_\mathrm{eff} = a_{t - d}`, with d up to 10.
+    r"""The command of d steps ago: :math:`a_\mathrm{eff} = a_{t - d}`, with d up to 25.
 
     Between whole steps, as in a ramp, the neighbouring commands are mixed linearly. Without
     the previous commands there is no delay, and so the inverse is the action itself. The
@@ -44,10 +44,10 @@ class Delay(DelayedRegime):
             )
 
     def effect_of(self, action: Tensor, parameters: Tensor, past: Tensor) -> Tensor:
-        effect = action * (1 - parameters).clamp(min=0.0)
-        for steps, command in enumerate(past.unbind(-2), 1):
-            effect = effect + command * (1 - (parameters - steps).abs()).clamp(min=0.0)
-        return effect
+        commands = torch.cat([action.unsqueeze(-2), past], -2)
+        steps = torch.arange(commands.shape[-2], device=action.device)
+        shares = (1 - (parameters - steps).abs()).clamp(min=0.0)
+        return (shares.unsqueeze(-1) * commands).sum(-2)
 
     def encode(self, values: Mapping[str, float]) -> Tensor:
         """Return the parameter row; only whole steps are taken."""

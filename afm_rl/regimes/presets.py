@@ -79,7 +79,9 @@ class Actuators:
 
     with the regime g of :func:`~afm_rl.regimes.actuator_regimes` (delay, lag, permutation, gain,
     loss, bias) and a limited rate r, in half ranges h a step. No regime is that limit: it goes on
-    from the last effect, not from a command.
+    from the last effect, not from a command. Nor is a delay that is random: with ``random_delay`` D
+    every command takes a number of steps of its own, drawn from 0, ..., D as it is sent, and the
+    newest that has arrived acts, so that none acts after a newer one.
 
     Args:
         low: lowest command, ``(A,)``.
@@ -117,6 +119,8 @@ class Actuators:
     def reset(self) -> None:
         """Begin with actuators that were not used yet."""
         self.past = self.low.new_zeros(*self.batch, self.regime.history, len(self.low))
+        self.steps = self.past.new_zeros(*self.batch, 1 + self.regime.history)  # of each, likewise
+        self.draws = torch.Generator().manual_seed(0)
         self.last: Tensor | None = None
 
     def fail(self, *faults: Fault) -> None:
@@ -125,11 +129,13 @@ class Actuators:
         Raises:
             ConfigurationError: for an unknown name, or a value that it cannot have.
         """
-        rows = [self.regime.encode({k: v for k, v in x.items() if k != "rate"}) for x in faults]
-        rates = [[fault.get("rate", math.inf)] for fault in faults]
-        both = torch.stack(rows).double(), torch.tensor(rates).double()
-        self.rows, rate = (x.expand(*self.batch, -1) if self.batch else x[0] for x in both)
-        self.most = rate * (self.high - self.low) / 2
+        own = {"rate": math.inf, "random_delay": 0.0}
+        rows = [self.regime.encode({k: v for k, v in x.items() if k not in own}) for x in faults]
+        others = [[fault.get(name, usual) for name, usual in own.items()] for fault in faults]
+        both = torch.stack(rows).double(), torch.tensor(others).double()
+        self.rows, other = (x.expand(*self.batch, -1) if self.batch else x[0] for x in both)
+        self.most = other[..., :1] * (self.high - self.low) / 2
+        self.random_delay = other[..., 1:]
 
     def value(self, name: str) -> Tensor:
         """Return a parameter of the fault, such as ``delay``, ``(*B)``."""
@@ -145,8 +151,18 @@ class Actuators:
     def __call__(self, command: Tensor) -> Tensor:
         """Return the effect ``(*B, A)`` of a command, in double precision."""
         command = command.double() - self.home
-        effect = self.regime.apply(command, self.rows, command[..., :1], self.past)
+        rows = self.rows.clone()
+        rows[..., [self.regime.names.index("delay")]] += self._arrived()
+        effect = self.regime.apply(command, rows, command[..., :1], self.past)
         if self.last is not None:
             effect = effect.clamp(self.last - self.most, self.last + self.most)
         self.past, self.last = shifted(self.past, command), effect
         return effect + self.home
+
+    def _arrived(self) -> Tensor:
+        """Return how many steps ago the newest command that has arrived was sent, ``(*B, 1)``."""
+        drawn = torch.rand(self.random_delay.shape, generator=self.draws, dtype=torch.double)
+        steps = (drawn * (self.random_delay + 1)).floor()
+        self.steps = torch.cat([steps, self.steps[..., :-1]], -1)
+        has_arrived = self.steps <= torch.arange(self.steps.shape[-1])
+        return has_arrived.int().argmax(-1, keepdim=True)

@@ -3,8 +3,10 @@
 import pytest
 import torch
 
+from afm_rl.correction import ActionFlow
 from afm_rl.correction.delay import align, command_acting, delay_tables, likeliest_delay
 from afm_rl.correction.least_squares import fit_gain
+from afm_rl.regimes import Actuators
 
 
 @pytest.mark.parametrize("late", [1, 3])
@@ -90,3 +92,19 @@ def test_a_delay_that_was_found_stays_for_a_while():
     weights = torch.tensor([[0.05], [0.05], [0.5], [0.3], [0.1]])
     assert likeliest_delay(weights, torch.tensor(0), *TABLES) == 1
     assert likeliest_delay(weights, torch.tensor(2), *TABLES) == 2
+
+
+@pytest.mark.parametrize("size", [1, 2, 6])
+def test_while_the_delay_changes_nothing_is_corrected_nor_predicted(drive, line, plans, size):
+    """Nobody knows which command will act next."""
+    flow = ActionFlow(-torch.ones(size), torch.ones(size))
+    actuators, planned = Actuators([-1.0] * size, [1.0] * size), plans(80, size)
+
+    def effect(sent):
+        if len(sent) == 11:
+            actuators.fail({"random_delay": 3})
+        return actuators(sent[-1]).float()
+
+    (executed, *_), effects = drive(flow, line(size), effect, planned)
+    assert (executed == planned).all(-1)[30:].float().mean() > 0.9
+    assert (effects[11:] - executed[11:]).abs().mean() > 0.1

@@ -93,6 +93,26 @@ def test_a_gain_of_twelve_servos_is_found_sooner_than_that_of_one(drive):
     assert after(12) < 0.8 * after(1)
 
 
+@pytest.mark.parametrize("late", [1, 2, 4])
+def test_a_delay_of_twelve_servos_is_found_after_four_steps(drive, late):
+    home, flow = torch.zeros(12), ActionFlow(-torch.ones(12), torch.ones(12))
+    model = KnownDynamics(lambda q, u: q + 0.4 * (u - q), Manifold(12), 12)
+    plans, found, observe = gait(home, 20), [], flow.observe
+
+    def observed(memory, state):
+        found.append(flow.under_way(memory)[2])
+        return observe(memory, state)
+
+    def effect(sent):
+        return sent[-1] if len(sent) < 12 else sent[-1 - late]
+
+    flow.observe = observed
+    torch.manual_seed(0)
+    drive(flow, model, effect, plans, state=plans[0], noise=0.002)
+    found = torch.stack(found)
+    assert (found[:12] == 0).all() and (found[15:] == late).all()  # steps 12 to 15 were late
+
+
 def test_a_healthy_robot_over_an_inexact_model_is_hardly_ever_explained(drive, monkeypatch):
     """The model's noise is a tenth of what it leaves unexplained; two of three rows are usual."""
     model = KnownDynamics(lambda q, u: q + 0.4 * (u - q), Manifold(2), 2, 1e-3)

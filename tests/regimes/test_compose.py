@@ -96,7 +96,7 @@ def robot(gains):
 
 
 def test_history_and_noise_are_those_of_the_families(robot, both):
-    assert (robot.history, robot.noisy) == (10, True)
+    assert (robot.history, robot.noisy) == (25, True)
     assert (both.history, both.noisy) == (0, False)
     row = robot.encode({"delay": 1.0, "gain_noise": 0.5})
     past = torch.tensor([[0.4, -0.2], *[[0.0, 0.0]] * 9])
@@ -163,10 +163,10 @@ def test_only_rows_with_a_family_without_a_closed_form_are_searched(gains, monke
 
 def test_families_that_depend_on_previous_actions_follow_each_other():
     both = Compose({"delay": Delay(), "lag": Lag(history=4), "backlash": Backlash(HALF, history=2)})
-    assert both.history == 16
-    commands = torch.randn(30, 2, generator=torch.Generator().manual_seed(0))
+    assert both.history == 31
+    commands = torch.randn(40, 2, generator=torch.Generator().manual_seed(0))
     row = both.encode({"delay": 2, "lag": 1.5, "backlash": 0.1})
-    t, newest_first = 29, commands.flip(0)
+    t, newest_first = 39, commands.flip(0)
 
     def late(step):
         return commands[step - 2]
@@ -178,13 +178,13 @@ def test_families_that_depend_on_previous_actions_follow_each_other():
     past = torch.stack([slow(t - 1), slow(t - 2)])
     loose = Backlash(HALF, history=2)
     expected = loose.apply(slow(t), torch.tensor([0.1]), torch.zeros(3), past)
-    found = both.apply(commands[t], row, torch.zeros(3), newest_first[1:17])
+    found = both.apply(commands[t], row, torch.zeros(3), newest_first[1:32])
     torch.testing.assert_close(found, expected)
     batch = both.apply(
         commands[t].expand(3, 2),
         row.expand(3, -1),
         torch.zeros(3, 3),
-        newest_first[1:17].expand(3, 16, 2),
+        newest_first[1:32].expand(3, 31, 2),
     )
     torch.testing.assert_close(batch, expected.expand(3, 2))
 

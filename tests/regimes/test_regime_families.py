@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from afm_rl.errors import ConfigurationError
 from afm_rl.regimes import (
     ActionGain,
+    Actuators,
     AsymmetricGain,
     Backlash,
     Bias,
@@ -317,7 +318,7 @@ def test_a_row_is_described_by_what_is_not_nominal(gains):
         ("lag", {"lag": 9}, r"lag=9: .* in \[0, 8\]"),
         ("slip", {"slip_at": -1}, r"slip_at=-1: .* in \[0, 10\]"),
         ("slip", {"slip_peak": "much"}, "slip_peak='much': expected a finite number"),
-        ("delay", {"delay": 11}, r"delay=11: expected a finite number in \[0, 10\]"),
+        ("delay", {"delay": 26}, r"delay=26: expected a finite number in \[0, 25\]"),
         ("delay", {"delay": 0.5}, "delay=0.5: expected whole steps"),
         ("bias", {"v_bias": math.nan}, r"v_bias=nan: expected a finite number in \[-10, 10\]"),
         ("mass", {"mass": 0.0}, r"mass=0.0: expected a finite number in \[0.01, 100\]"),
@@ -350,7 +351,7 @@ def test_values_beyond_their_limits_are_refused(family, values, complaint):
         (lambda: WheelSlip(HALF, peak=["a", 1]), "peak='a': expected"),
         (lambda: Patches(names=[]), r"names=\(\): expected distinct names"),
         (lambda: Delay([3, 2]), r"span=\[3, 2\]: expected two numbers of steps"),
-        (lambda: Delay([1, 11]), "highest <= 10"),
+        (lambda: Delay([1, 26]), "highest <= 25"),
         (lambda: AsymmetricGain(["v"], span=[0.0, 1.0]), "span=0.0: expected"),
         (lambda: Permutation(["a"], HALF), r"names=\('a',\): expected 2 distinct names"),
         (lambda: GainNoise(span=[-0.1, 1.0]), "span=-0.1: expected"),
@@ -368,3 +369,16 @@ def test_values_beyond_their_limits_are_refused(family, values, complaint):
 def test_impossible_settings_are_refused(make, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
         make()
+
+
+def test_of_commands_with_random_delays_the_newest_that_has_arrived_acts():
+    actuators, late = Actuators([0.0], [1.0], [400]), 3
+    actuators.fail({"random_delay": late})
+    sent = torch.arange(1.0, 21.0)
+    acts = torch.stack([actuators(command.expand(400, 1))[:, 0] for command in sent])
+    assert (acts.diff(dim=0) >= 0).all()  # none acts after a newer one
+    share = [(sent[late:, None] - acts[late:] == age).double().mean() for age in range(late + 1)]
+    waits = [1 - (age + 1) / (late + 1) for age in range(late + 1)]  # that one has not arrived yet
+    none_newer = torch.tensor([1.0, *waits[:-1]]).cumprod(0)
+    expected = none_newer * (1 - torch.tensor(waits))
+    torch.testing.assert_close(torch.stack(share).float(), expected, atol=0.02, rtol=0)

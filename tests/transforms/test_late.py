@@ -15,6 +15,7 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
+from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import KnownDynamics
 from afm_rl.planning import KnownReward, PlanningEnv
 from afm_rl.regimes import Delay
@@ -43,7 +44,7 @@ class Carts(gymnasium.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.state, self.count = torch.tensor([1.0, -0.5, 0.0, 0.3], dtype=torch.float64), 0
-        self.past = deque([np.zeros(2)] * 12, maxlen=12)
+        self.past = deque([np.zeros(2)] * 26, maxlen=26)
         return self.state.numpy().copy(), {}
 
     def step(self, action):
@@ -98,6 +99,16 @@ def test_a_delay_is_found_and_made_up_for(sign):
         cost[compensated] = np.square(drive(env, 100)[0][50:]).mean()
         assert (drive(env, 25)[1]["afm"]["belief"]["4 steps late"] > 0.9).all()
     assert 10 * cost[True] < cost[False], cost
+
+
+@pytest.mark.parametrize("settings", [{"delay": 25}, {"corrector": 25}], ids=["known", "found"])
+def test_delays_of_25_steps_are_made_up_for(settings):
+    if "corrector" in settings:
+        settings = {"corrector": ActionFlow(-torch.ones(2), torch.ones(2), longest_delay=25)}
+    env = ActionFlowWrapper(Carts((25, 25)), glide, **settings)
+    found, info = drive(env, 250)
+    assert info["afm"]["delay"] == 25
+    assert np.abs(found[-50:, :2]).max() < 0.1 < np.abs(drive(Carts((25, 25)), 250)[0][-50:]).max()
 
 
 def test_switched_off_each_axis_is_known_to_act_as_soon_as_it_can():

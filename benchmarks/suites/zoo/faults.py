@@ -13,7 +13,13 @@ from torch import Tensor
 from afm_rl.regimes import Actuators
 from afm_rl.regimes.presets import Fault
 
-SLOW = ("lag 1", "lag 3", "rate .3", "rate .2")
+LATER: dict[str, Fault] = {
+    "late 3": {"delay": 3},
+    "late 12": {"delay": 12},
+    "late 25": {"delay": 25},
+    "late 0 to 3": {"random_delay": 3},
+}
+RARE = ("lag 1", "lag 3", "rate .3", "rate .2", *LATER)
 """Faults that are played only if they are asked for."""
 
 

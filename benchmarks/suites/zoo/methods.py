@@ -13,7 +13,7 @@ from task import Task
 from torch import Tensor
 
 from afm_rl import ActionFlowVectorWrapper
-from afm_rl.correction import L1Augmentation, LeastSquares
+from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares
 from afm_rl.transforms.collect_then_fit import CollectThenFit
 
 Acting = Callable[..., np.ndarray]  # of observations, and infos if a clock counts
@@ -39,6 +39,18 @@ def l1(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
 def afm(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
     """The wrapper as it comes, over the exact model."""
     return ActionFlowVectorWrapper(envs, **task.model), task.act
+
+
+def afm_longer(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+    """The same, looking for delays of up to 25 steps."""
+    corrector = ActionFlow(task.low, task.high, longest_delay=25)
+    return ActionFlowVectorWrapper(envs, corrector=corrector, **task.model), task.act
+
+
+def afm_told(task: Task, envs: FaultyVector) -> tuple[Any, Acting]:
+    """The wrapper that is told the delay, for faults that are there from the first step on."""
+    (delay,) = {fault.get("delay", 0) for fault in envs.faults}
+    return ActionFlowVectorWrapper(envs, delay=int(delay), **task.model), task.act
 
 
 @cache
@@ -111,6 +123,8 @@ METHODS = {
     "least squares": least_squares,
     "L1": l1,
     "AFM": afm,
+    "AFM, up to 25 steps": afm_longer,
+    "AFM, told": afm_told,
     "AFM, learned": afm_learned,
     "truth": truth,
 }

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from faults import LATER
 from gymnasium.vector import SyncVectorEnv
 
 from afm_rl.envs.task.rewards import pendulum_step
@@ -35,7 +36,7 @@ class Task:
         self.at = round(HEALTHY * self.steps)
         space = self.twin.action_space
         self.low, self.high = (torch.from_numpy(end).double() for end in (space.low, space.high))
-        self.faults = presets(len(space.low))
+        self.faults = presets(len(space.low)) | LATER
         self.twin.reset(seed=0)
 
     def make(self) -> gymnasium.Env:
