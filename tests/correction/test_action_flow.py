@@ -117,12 +117,12 @@ def test_models_that_take_a_new_delay_begin_as_good_as_the_best_that_had_it():
     losses = torch.arange(float(len(flow.models))).unsqueeze(-1)
     weights = torch.full_like(losses, 1e-6)
     weights[flow.models.index("delay_3")] = 1.0
-    belief = Belief(losses, losses, torch.ones(1))
-    late, found = flow.delayed(belief, weights, torch.tensor(0))
+    belief, prior = Belief(losses, losses, torch.ones(1)), losses + weights.log()
+    late, found = flow.delayed(belief, prior, torch.tensor(0))
     best = losses[flow.delays == 3].min()
     assert late == 3 and (found[flow.delays < 0] == best).all()
     assert torch.equal(found[flow.delays >= 0], losses[flow.delays >= 0])
-    late, found = flow.delayed(belief, weights, torch.tensor(3))
+    late, found = flow.delayed(belief, prior, torch.tensor(3))
     assert late == 3 and torch.equal(found, losses)
 
 
