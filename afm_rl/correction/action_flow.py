@@ -322,7 +322,8 @@ class ActionFlow(PairCorrector):
         unchanged = belief.weights(belief.shared_prior(prior))[..., 0, :] >= 0.5
         delay = torch.where(unchanged.all(-1) & (before == 0), 0, delay)
         has_it = (self.delays == delay.unsqueeze(-1)).unsqueeze(-1)
-        best = torch.where(has_it, belief.losses, torch.inf).amin(-2, keepdim=True)
+        # The last model explains the past by all delays: that says nothing for any one.
+        best = torch.where(has_it, belief.losses, torch.inf)[..., :-1, :].amin(-2, keepdim=True)
         begin = (self.delays < 0) & (delay != before).unsqueeze(-1)
         return delay, torch.where(begin.unsqueeze(-1), best, belief.losses)
 

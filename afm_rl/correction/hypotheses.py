@@ -111,9 +111,7 @@ HYPOTHESES = (
     Hypothesis("stiction", "healthy", log_prior=-3.0, cause="stiction"),
     # At every step another one of the delays: nobody can tell which command will act. It is the
     # last row, of which the belief looks up the delay afterwards.
-    Hypothesis(
-        "changing delay", "healthy", follows_delay=False, log_prior=None, cause="a changing delay"
-    ),
+    Hypothesis("changing delay", "healthy", follows_delay=False, cause="a changing delay"),
 )
 """All of them, kind by kind in the order of :data:`KINDS`. The prior of the first is a setting,
 ``odds``, and those with a delayed gain share one."""

@@ -48,7 +48,7 @@ def complete(
     missing = [pair for pair in wanted if pair not in done]
     for first in range(0, len(missing), together):
         start, pairs = time.perf_counter(), missing[first : first + together]
-        rows += play(task, method, pairs, steps or task.steps)
+        rows += play(task, method, pairs, min(steps or task.steps, task.steps))
         write_whole(file, pd.DataFrame(rows).to_csv(index=False).encode())
         spent = time.perf_counter() - start
         print(f"{task.name}, {method}: {len(pairs)} episodes in {spent:.0f} s", flush=True)
