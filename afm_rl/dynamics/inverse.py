@@ -35,7 +35,7 @@ def effective_action(
     unseen: float = 4.0,
     assumed: float = 0.1,
     enough: float = 0.1,
-    far: float = 0.2,
+    far: float = 0.05,
 ) -> EffectiveAction:
     r"""Express a prediction error in action space, for any model and robot.
 
