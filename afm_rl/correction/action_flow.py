@@ -314,12 +314,13 @@ class ActionFlow(PairCorrector):
     def delayed(self, belief: Belief, prior: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Return the delay ``(*B)`` that is believed now, and the losses ``(*B, M, A)``.
 
-        None while *nothing has changed* is believed everywhere. Models that follow a new one begin
-        as good as the best that had it already.
+        None while *nothing has changed* keeps a quarter of the probability on each axis, given all:
+        a first surprise tells little of which delay. Models that follow a new one begin as good as
+        the best that had it already.
         """
         tables = self.delay_likelihood, self.delay_log_prior
         delay = likeliest_delay(belief.weights(prior), before, *tables)
-        unchanged = belief.weights(belief.shared_prior(prior))[..., 0, :] >= 0.5
+        unchanged = belief.weights(belief.shared_prior(prior))[..., 0, :] >= 0.25
         delay = torch.where(unchanged.all(-1) & (before == 0), 0, delay)
         has_it = (self.delays == delay.unsqueeze(-1)).unsqueeze(-1)
         # The last model explains the past by all delays: that says nothing for any one.
