@@ -83,7 +83,7 @@ def test_families_are_chosen_by_name(robot):
         (["nope"], "^regimes='nope': expected one of gains, coupling"),
         ([{"phases": {}}], r"^regimes: phases=\{\}: expected a list"),
         ([{"phases": [3]}], "^regimes: 3: expected a mapping of delay"),
-        ([{"phases": [{"delay": 11}]}], "^regimes: delay=11: expected a finite number"),
+        ([{"phases": [{"delay": 26}]}], "^regimes: delay=26: expected a finite number"),
         ([{"phases": [{}], "at": 0.5}], "^regimes: at=0.5: expected a list"),
         ([{"phases": [{}], "ramp": -1}], "^regimes: ramp=-1: expected a whole number"),
         ([{"phases": [{}], "rmap": 1}], "^regimes: setting='rmap': expected one of phases, at, ra"),

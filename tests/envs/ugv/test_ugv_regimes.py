@@ -47,7 +47,7 @@ def steer(data):
 def test_specs_hold(batch, dtype):
     env = quiet(batch_size=batch, max_steps=3, dtype=dtype, missions={"ramp": 2})
     check_env_specs(env, break_when_any_done="both")
-    assert env.reset()["past"].shape == (*batch, 10, 2)
+    assert env.reset()["past"].shape == (*batch, 25, 2)
     assert "past" not in UGVTrack(batch_size=batch).reset()
 
 
