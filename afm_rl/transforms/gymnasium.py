@@ -100,6 +100,7 @@ class GymnasiumShell:
         self._model: Any = model
         if isinstance(model, str) and model == "mujoco":
             self._model = _simulation(env)
+            self._model.home = None  # that in which the first episode begins
         if self._collection is None and not callable(self._model):
             raise ConfigurationError(
                 f"ActionFlowWrapper: model={model!r}: expected 'mujoco', 'learn', a step function "
@@ -188,7 +189,7 @@ class GymnasiumShell:
                 f"ActionFlowWrapper: the state has {tuple(states.shape[1:])} numbers, that of the "
                 f"model {model.state_size}; say what it is by state=lambda env, observation: ..."
             )
-        if isinstance(model, MuJoCoDynamics) and model.mix is None:  # its pose now
+        if isinstance(model, MuJoCoDynamics) and model.home is None and model.mix is None:
             model.home = home_of(model.mjcf, states[0, : model.mjcf.nq].numpy())
         low, high = (torch.as_tensor(x).to(states) for x in (self._actions.low, self._actions.high))
         self._spec = Bounded(low, high, low.shape, dtype=low.dtype)

@@ -1,14 +1,20 @@
 """Position servos: faults about a pose, many joints, a model that is only nearly exact."""
 
+import math
+
+import gymnasium
+import numpy as np
 import pytest
 import torch
 
+from afm_rl import ActionFlowWrapper
 from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import KnownDynamics, MuJoCoDynamics
 from afm_rl.dynamics.mujoco_model import home_of
 from afm_rl.errors import ConfigurationError
 from afm_rl.spaces.manifold import Manifold
 
+mujoco = pytest.importorskip("mujoco")
 SERVOS = """<mujoco><worldbody><body><joint name="a"/><geom size=".1"/><body><joint name="b"/>
 <geom size=".1"/></body></body></worldbody><actuator><position joint="a" kp="20" gear="2"/>
 <position joint="b" kp="10"/><motor joint="b"/></actuator><keyframe>
@@ -129,3 +135,32 @@ def test_a_healthy_robot_over_an_inexact_model_is_hardly_ever_explained(drive, m
     found, _ = drive(flow, model, lambda sent: steps.append(1) or sent[-1], plans, noise=0.01)
     assert len([step for step in explained if step >= 100]) < 45
     torch.testing.assert_close(found[0], plans)
+
+
+class Servos(gymnasium.Env):
+    """Begins in the keyframe that is not called home."""
+
+    action_space = gymnasium.spaces.Box(-2.0, 2.0, (3,))
+    observation_space = gymnasium.spaces.Box(-math.inf, math.inf, (4,))
+    frame_skip = 1
+
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string(SERVOS.replace('"0 0"', '"0.1 0.2"'))
+        self.data = mujoco.MjData(self.model)
+
+    def reset(self, *, seed=None, options=None):
+        mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        return np.concatenate([self.data.qpos, self.data.qvel]), {}
+
+
+@pytest.mark.parametrize(("given", "home"), [(None, [0.2, 0.2, 0.0]), ([0.1, 0.1, 0.1],) * 2])
+def test_a_wrapper_is_at_home_where_the_first_episode_begins_unless_it_is_told(given, home):
+    env = Servos()
+    model = "mujoco"
+    if given is not None:
+        model = MuJoCoDynamics(env)
+        model.home = torch.tensor(given)
+    wrapper = ActionFlowWrapper(env, model)
+    wrapper.reset(seed=0)
+    found = wrapper._loop.corrector.home
+    torch.testing.assert_close(found, torch.tensor(home).to(found))
