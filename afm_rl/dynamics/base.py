@@ -40,6 +40,12 @@ class DynamicsModel(nn.Module, ABC):
     extrapolates: bool = False
     """Whether it predicts actions beyond their box: equations do, networks do not."""
 
+    keeps_derivative: bool = False
+    """Whether the search of an effective action begins with the last :attr:`derivative`."""
+
+    derivative: Tensor | None = None
+    """By the action, ``(*B, D, A)``, at the last transition, if it is kept."""
+
     home: Tensor | None = None
     """Action at rest, such as the pose of position servos, ``(A,)``; None: zero."""
 

@@ -29,13 +29,12 @@ def effective_action(
     action: Tensor,
     next_state: Tensor,
     half_range: Tensor,
-    rounds: int = 4,
+    rounds: int = 6,
     quiet: float | Tensor = 0.0,
     guess: Tensor | None = None,
     unseen: float = 4.0,
     assumed: float = 0.1,
     enough: float = 0.1,
-    far: float = 0.05,
 ) -> EffectiveAction:
     r"""Express a prediction error in action space, for any model and robot.
 
@@ -54,12 +53,13 @@ def effective_action(
     many local minima, and a correction that is right lies in the deepest. A round moves each axis
     by half a range at most, a row is only changed where its error becomes smaller (its next step
     is a quarter as long where it does not), and its rounds end early when little is left that an
-    action can explain. J is differentiated where the rounds begin, and after a ``far`` step, as
-    there are in the first ticks of a fault; ``std`` is of the last of these. After other steps d,
-    which change the forecast by :math:`\Delta`, the next round corrects J (Broyden 1965,
-    Mathematics of Computation 19),
+    action can explain. Each step d, which changes the forecast by :math:`\Delta`, corrects J
+    (Broyden 1965, Mathematics of Computation 19),
 
     .. math:: J \leftarrow J + \frac{(\Delta - J d)\, d^\top}{d^\top d}
+
+    and a step that gains less than half of what it promised has J differentiated anew, twice at
+    most. A model that keeps its derivative has the rounds begin with that of the transition before.
 
     ``std`` grows by the root mean square of the normalised error that remains, where that exceeds
     1: a contact that the rounds did not resolve tells little.
@@ -80,7 +80,6 @@ def effective_action(
         unseen: standard deviation of an axis of which a transition shows nothing (half ranges).
         assumed: that where nothing needs an explanation (half ranges).
         enough: what a round has to promise, to be worth its time (squared standard deviations).
-        far: step of a round after which the model is differentiated anew (half ranges).
 
     >>> from afm_rl.dynamics import Dubins
     >>> s, a = torch.zeros(3), torch.tensor([0.5, 0.2])
@@ -100,62 +99,74 @@ def effective_action(
     if all_hold(silent):  # nothing more to compute
         std = (assumed * half_range).expand_as(action)
         return EffectiveAction(action.to(dtype), std.to(dtype), innovation.to(dtype))
-    effective = action
+    effective, between = action, (torch.zeros_like(action), torch.zeros_like(error))
     if guess is not None and not model.affine:
         guess = guess.to(action)
         there = model.manifold.difference(next_state, model(state, guess)) / noise
+        between = (guess - action) / half_range, error - there
         better = _size(there) < _size(error)
         effective, error = torch.where(better, guess, action), torch.where(better, there, error)
+    per_unit = half_range / noise.unsqueeze(-1)
 
     def derivative(at: Tensor) -> Tensor:
-        return (model.jacobian(state, at) * half_range / noise.unsqueeze(-1)).double()
+        return (model.jacobian(state, at) * per_unit).double()
 
-    jacobian = derivative(effective)
+    kept: Any = model.derivative
+    if kept is None or kept.shape[:-2] != error.shape[:-1] or not bool(kept.isfinite().all()):
+        jacobian, renewed = derivative(effective), torch.ones_like(error[..., :1])
+    else:
+        jacobian, renewed = _corrected(kept * per_unit, *between), torch.zeros_like(error[..., :1])
     covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
     std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    limit: Any = 1.0  # of a step; tensors from the first round on
-    going: Any = True
-    left = _size(error)
+    going, left, limit = ~silent.unsqueeze(-1), _size(error), torch.ones_like(renewed)
     for last in (False,) * (rounds - 1) + (True,):
         slope = _times(jacobian.mT, error.double())
         step = _times(covariance, slope)
         if model.affine:
             effective = effective + step.to(action) * half_range
             break
+        promised = (step * slope).sum(-1, True)
         moved = step.clamp(-limit, limit)
         trial = effective + (moved * half_range).to(action)
         remaining = model.manifold.difference(next_state, model(state, trial)) / noise
-        now = _size(remaining)
-        better = going & (now < left)
-        going = going & ((step * slope).sum(-1, True) > enough)
-        before, effective = error, torch.where(better, trial, effective)
-        error, left = torch.where(better, remaining, error), torch.where(better, now, left)
+        gained = left - _size(remaining)
+        better = going & (gained > 0)
+        jacobian = _corrected(jacobian, torch.where(going, moved, 0.0), error - remaining)
+        effective = torch.where(better, trial, effective)
+        error, left = torch.where(better, remaining, error), left - torch.where(better, gained, 0.0)
+        going = going & (promised > enough)
+        again = going & (gained < promised / 2) & (renewed < torch.where(better, 2, 1))
+        limit = limit * torch.where(better | again, 1.0, 0.25)
         if last or all_hold(~going):
             break
-        limit = limit * torch.where(better, 1.0, 0.25)
-        missed = before - remaining - _times(jacobian, moved)
-        along = moved / _size(moved).clamp_min(1e-12)
-        jacobian = jacobian + missed.unsqueeze(-1) * along.unsqueeze(-2)
-        away = going & (moved.abs().amax(-1, True) > far)
-        if not all_hold(~away):
-            jacobian = torch.where(away.unsqueeze(-1), derivative(effective), jacobian)
+        if not all_hold(~again):
+            jacobian = torch.where(again.unsqueeze(-1), derivative(effective), jacobian)
+            renewed = renewed + again.to(left)
         covariance = invert_positive(add_diagonal(jacobian.mT @ jacobian, unseen**-2))
-        std = torch.where(away, covariance.diagonal(dim1=-2, dim2=-1).sqrt(), std)
+        std = torch.where(going, covariance.diagonal(dim1=-2, dim2=-1).sqrt(), std)
+    if model.keeps_derivative:
+        model.derivative = jacobian / per_unit
     if not model.affine:  # what the rounds could not explain, per coordinate
         std = (std * (left / error.shape[-1]).sqrt().clamp_min(1.0)).clamp_max(unseen)
-    known = innovation + std.sum(-1) < torch.inf
-    row = known & ~silent
+    finite = innovation + std.sum(-1) < torch.inf
+    row = finite & ~silent
     else_std = torch.where(silent, assumed, unseen).unsqueeze(-1)
     return EffectiveAction(
         torch.where(row.unsqueeze(-1), effective, action.nan_to_num()).to(dtype),
         (torch.where(row.unsqueeze(-1), std, else_std) * half_range).to(dtype),
-        torch.where(known, innovation, 0.0).to(dtype),
+        torch.where(finite, innovation, 0.0).to(dtype),
     )
 
 
 def _size(rows: Tensor) -> Tensor:
     """Return the squared length of rows ``(*B, N)``, ``(*B, 1)``."""
     return torch.linalg.vecdot(rows, rows).unsqueeze(-1)
+
+
+def _corrected(jacobian: Tensor, step: Tensor, change: Tensor) -> Tensor:
+    """Return derivatives ``(*B, D, A)`` by which a step ``(*B, A)`` has its change ``(*B, D)``."""
+    along = step / _size(step).clamp_min(1e-24)
+    return jacobian + (change - _times(jacobian, step)).unsqueeze(-1) * along.unsqueeze(-2)
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:

@@ -189,6 +189,8 @@ class MuJoCoDynamics(KnownDynamics, PhysicsModel):
             )
         size = mujoco_model.nu if mix is None else len(mix[0])
         super().__init__(simulator, space_of(mujoco_model), size, noise_std)
+        # A derivative takes A simulations; to begin with an old one, two more rounds.
+        self.keeps_derivative = size > 8
         controls = None if mix is None else torch.tensor(mix, dtype=torch.float64)
         self.register_buffer("mix", controls, persistent=False)
         self._name_physics(physics)
