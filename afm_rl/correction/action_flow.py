@@ -212,7 +212,9 @@ class ActionFlow(PairCorrector):
         """Return names and shapes, with the belief; its noise is the last part."""
         size, count = self.action_size, len(self.models)
         belief = {"losses": (count, size), "forecasts": (count, size), "noise": (size,)}
-        delay = {"delay": (1,), "under_way": (self.longest_delay + self.delay, size)}
+        # One row at least: no exported branch may return an empty tensor.
+        waiting = max(1, self.longest_delay + self.delay)
+        delay = {"delay": (1,), "under_way": (waiting, size)}
         return {**super().shapes(state_size), "corrects": (1,), "usual": (1,), **delay, **belief}
 
     def begin(self, state: Tensor) -> Tensor:
@@ -423,7 +425,8 @@ class ActionFlow(PairCorrector):
         """Return the state, the newest commands' effects, and how many of them are to come."""
         parts = self.unpack(memory, self.states_in(memory))
         steps = parts["delay"].squeeze(-1).long() + self.delay
-        return parts["state"], self.denormalise(parts["under_way"]), steps
+        effects = parts["under_way"][..., : self.longest_delay + self.delay, :]
+        return parts["state"], self.denormalise(effects), steps
 
     def noise_in(self, memory: Tensor) -> Tensor:
         """Return the noise that was learnt, ``(*B, A)``, in units of the action."""

@@ -390,7 +390,7 @@ class Tick(nn.Module):
         acted = commands[:, : pairs.shape[1] + 1]
         acts = command_acting(acted, delay).unsqueeze(1)
         delayed = self.acting @ acted[:, -self.acting.shape[-1] :]  # (B, W, A)
-        newest = commands[:, commands.shape[1] - self.longest_delay - ahead.shape[1] + 1 :]
+        newest = commands[:, -max(1, self.longest_delay + ahead.shape[1] - 1) :]
         shape = -1, self.counts[1], acts.shape[-1]
         each = acts.expand(shape).flatten(0, 1).unsqueeze(1)
         network = self.network.effect(fits.encoded, each).view(shape)

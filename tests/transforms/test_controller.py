@@ -35,12 +35,12 @@ def planner_of(kind=MPPI, **settings):
     return kind(world, horizon=3, population=20, seed=5, **settings)
 
 
-def policy_of(corrector=None):
+def policy_of(corrector=None, **limits):
     torch.manual_seed(0)
     # Among samples or readings that are as good, rounding would decide.
     network = AxisNetwork(width=8, latent=8)
     flow = ActionFlow(LOW, HIGH, ["recent"], source_std=0.0, network=network)
-    return ActionFlowPolicy(Dubins(), planner_of().action_spec, corrector or flow)
+    return ActionFlowPolicy(Dubins(), planner_of().action_spec, corrector or flow, **limits)
 
 
 def driven(act, ticks=16):
@@ -202,9 +202,9 @@ def check_runs(run, path_driven, folder):
     torch.testing.assert_close(found.double(), actions(path_driven), atol=1e-5, rtol=0)
 
 
-def corrected_alone(corrector, ticks=24):
+def corrected_alone(corrector, ticks=24, **limits):
     """Return the correction of a planned action as a controller, and a drive with it."""
-    controller = Controller(None, policy_of(corrector))
+    controller = Controller(None, policy_of(corrector, **limits))
     kept = torch.zeros(controller.sizes["memory"]).double()
 
     def act(state, goal):
@@ -244,7 +244,8 @@ def test_a_graph_acts_the_same_without_torch(tmp_path, flow):
     """In a Python process of its own, and in the C++ program."""
     # Some seconds, most of them torch's exporter; the only such test that is not slow.
     onnx = pytest.importorskip("onnx")
-    controller, path_driven = corrected_alone(None if flow else LeastSquares(LOW, HIGH))
+    corrector = None if flow else LeastSquares(LOW, HIGH)
+    controller, path_driven = corrected_alone(corrector, most=0.7, rate=0.2)
     path = tmp_path / "policy.onnx"
     checksum = export_controller(controller, path)
     assert path.stat().st_size < 2e6
@@ -257,7 +258,8 @@ def test_a_graph_acts_the_same_without_torch(tmp_path, flow):
             subprocess.run(build, check=True)
             check_runs([tmp_path / "run", library, path], path_driven, tmp_path)
     model = onnx.load(path)
-    assert [node.op_type for node in model.graph.node].count("If") == 1  # only one side is computed
+    # Only one side is computed: of the correction, and of forecasts where a limit has changed it.
+    assert [node.op_type for node in model.graph.node].count("If") == 1 + flow
     about = {entry.key: entry.value for entry in model.metadata_props}
     assert about["arguments"] == f"memory:{controller.sizes['memory']} observation:3 action:2"
     for entry in (*model.graph.input, *model.graph.output):
