@@ -1,10 +1,15 @@
 """What needs training is trained once, and taken from the cache ever after."""
 
+import os
+import shutil
+
 import pytest
 import torch
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.missions import build, prepare
+from afm_rl.missions.build import TRAINED
+from afm_rl.storage.artefacts import read_tensors
 
 METHOD = "method=afm_paper"  # trains an ensemble, and a flow over it
 
@@ -51,6 +56,25 @@ def test_only_what_the_result_depends_on_is_part_of_the_key(prepared, cache):
     assert ["from the cache" in line for line in lines] == [True, False]
     _, lines = prepared(cache, **{"dynamics.seed": 1})
     assert not any("from the cache" in line for line in lines)
+
+
+def test_the_ensemble_of_the_first_command_comes_with_the_library(composed, tmp_path):
+    """``RENEW=1 pytest`` trains it anew, in a minute: after each change of what it depends on."""
+    agent, lines, own = build(composed("method=online_pe")), [], TRAINED / "ensemble.safetensors"
+    if os.environ.get("RENEW"):
+        own.unlink(missing_ok=True)
+        prepare(agent, tmp_path / "new")
+        shutil.copy(next((tmp_path / "new").glob("ensemble-*")), own)
+    prepare(agent, tmp_path, echo=lines.append)
+    assert lines[0].startswith("ensemble: held-out error 0.003")
+    assert lines[0].endswith("(as it comes)")
+    assert torch.equal(agent.model.weights[0], read_tensors(own)[0]["weights.0"])
+    lines.clear()
+    prepare(agent, tmp_path, echo=lines.append)
+    assert "(from the cache)" in lines[0]
+    other = composed("method=online_pe", "dynamics.hidden=[8]", "dynamics.pretrain.epochs=1")
+    prepare(build(other), tmp_path, echo=lines.append)
+    assert "(trained in" in lines[2]
 
 
 def test_a_damaged_file_is_named_not_used(prepared, tmp_path):
