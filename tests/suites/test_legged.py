@@ -47,6 +47,9 @@ def test_the_command_plays_and_goes_on(legged, monkeypatch, tmp_path, capsys):
     legged("run").main()
     said = capsys.readouterr().out
     assert said.count("small, alone: 1 episodes") == 2 and "small, at 2 steps:" in said
+    monkeypatch.setattr("sys.argv", [*asked[:-1], "--each", "--methods", "truth"])
+    legged("run").main()
+    assert "small, 8 servos:" in capsys.readouterr().out
     with Image.open(tmp_path / "figure.png") as figure:
         assert figure.width > 500
 

@@ -35,6 +35,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=OWN, help="where robots and policies are")
     parser.add_argument("--robots", nargs="*", help="default: all of the folder")
     parser.add_argument("--faults", nargs="*", choices=servo_faults(2), default=[*servo_faults(2)])
+    parser.add_argument("--each", action="store_true", help="reverse one servo after the other")
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=usual)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--at", type=int, nargs="*", help="steps of the fault; default: a fifth")
@@ -47,16 +48,22 @@ def main() -> None:
     tables: dict[str, pd.DataFrame] = {}
     files = sorted(args.folder.glob("*_policy.onnx"))
     for name in args.robots or [file.stem.removesuffix("_policy") for file in files]:
-        robot, rows = Robot(args.folder, name), []
+        robot, rows, faults = Robot(args.folder, name), [], args.faults
+        if args.each:
+            each = {f"{k} reversed": {f"gain_{k}": -1.0} for k in range(len(robot.low))}
+            robot.faults, faults = robot.faults | each, [*each]
         for at, method in product(args.at or [robot.at], args.methods):
             robot.at, out = at, args.out / f"at_{at}" if args.at else args.out
             more = args.steps, args.together
-            played = complete(robot, method, args.faults, args.seeds, out, *more)
+            played = complete(robot, method, faults, args.seeds, out, *more)
             rows.append(with_errors(played, at))
         results = pd.concat(rows, ignore_index=True)
-        chosen = results["fault"].isin(args.faults) & (results["episode"] < args.seeds)
-        tables[name] = ordered(results[chosen], list(METHODS), args.faults)
+        chosen = results["fault"].isin(faults) & (results["episode"] < args.seeds)
+        if args.each:
+            results["fault"], faults = "each reversed", ["each reversed"]
+        tables[name] = ordered(results[chosen], list(METHODS), faults)
         title = f"{name}, at {len(args.at)} steps" if args.at else name
+        title += f", {len(robot.low)} servos" if args.each else ""
         print(markdown(title, table_by(tables[name], "method", _cell)))
     if args.figure:
         draw(tables, args.figure)
