@@ -169,16 +169,32 @@ def tables_of(text: str) -> dict[str, list[str]]:
     return found
 
 
+def renamed(table: list[str], names: dict[str, str]) -> list[str]:
+    """Return the lines of a table with other names of columns and rows.
+
+    >>> renamed(["| | b |", "|---|---|", "| half | half |"], {"half": "1/2", "b": "B"})
+    ['| | B |', '|---|---|', '| 1/2 | half |']
+    """
+    cell = re.compile(r"(?<=\| )[^|]+(?= \|)")
+    columns, *rows = table
+
+    def name(match: re.Match[str]) -> str:
+        return names.get(match[0], match[0])
+
+    return [cell.sub(name, columns), *(cell.sub(name, row, count=1) for row in rows)]
+
+
 def filled(page: Path) -> str:
     """Return a page with what the results say between its marks."""
 
     def fill(match: re.Match[str]) -> str:
         begin, name, title, row, column, end = match.groups()
-        tables = load(name)["tables"]
+        result = load(name)
+        tables, names = result["tables"], result.get("names", {})
         if title not in tables:
             raise SystemExit(f"{page}: {begin}: expected a table of {', '.join(tables)}")
         if row is None:
-            return "\n".join([begin, *tables[title], end])
+            return "\n".join([begin, *renamed(tables[title], names), end])
         cells = [[c.strip(" *") for c in line.split("|")[1:-1]] for line in tables[title]]
         values = [dict(zip(cells[0], c, strict=True)).get(column) for c in cells if c[0] == row]
         if len(values) != 1 or values[0] is None:

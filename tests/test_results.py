@@ -176,6 +176,14 @@ def test_what_needs_files_that_are_missing_cannot_be_renewed(desk):
         results.renew("one")
 
 
+def test_a_page_has_names_of_its_own(desk):
+    tables = {"errors": ["| | gain_0 |", "|---|---|", "| gain_0 = -1 | gain_0 |"]}
+    names = {"gain_0": "gain", "gain_0 = -1": "reversed"}
+    results.save("one", results.load("one") | {"tables": tables, "names": names})
+    (desk / "README.md").write_text("<!-- result one: errors --><!-- end -->")
+    assert "| | gain |\n|---|---|\n| reversed | gain_0 |\n" in results.filled(desk / "README.md")
+
+
 @pytest.mark.parametrize(
     ("mark", "said"),
     [
