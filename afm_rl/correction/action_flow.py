@@ -254,7 +254,9 @@ class ActionFlow(PairCorrector):
         loud = (tail[..., :1] > self.quiet_in(parts)).to(tail)
         learns = valid * (1 - parts["corrects"])
         usual = parts["usual"] + 0.05 * learns * (loud - 1 / 3)
-        parts |= {"usual": usual.clamp_min(0.0), "loud": torch.maximum(loud, parts["corrects"])}
+        # What was decided holds until there is a surprise; but only here, where places differ.
+        loud = torch.ones_like(loud) if self.place else torch.maximum(loud, parts["corrects"])
+        parts |= {"usual": usual.clamp_min(0.0), "loud": loud}
         floor = self.floor(parts)
         constants = (self.discount, self.noise_rate, floor, self.tails, self.constant_delays)
         prior = prior_of(self.log_prior.to(floor), self.odds, parts["noise"], floor)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from afm_rl.correction import ActionFlow
+from afm_rl.dynamics import Dubins
 
 SIZES = [1, 2, 6, 17]
 STEPS, MANY = 20, 56
@@ -276,3 +277,21 @@ def test_where_plans_are_done_slower_they_may_ask_for_more(line, drive, plans):
     found, _ = drive(flow, line(2), lambda sent: factor * sent[-1], planned)
     low, high = found[3][-1].unbind(-2)
     assert (high > 0.9999).all() and (low < -0.9999).all()
+
+
+@pytest.mark.parametrize("gain", [-1.3, -1.0, -0.7])
+def test_a_robot_crosses_ground_that_drives_it_back(gain):
+    """Whoever forgot at its edge what is beyond would be thrown back for ever."""
+    box = torch.tensor([[-1.0, -1.0], [1.0, 1.0]])
+    flow, model, state = ActionFlow(*box, place=[0, 1]), Dubins(), torch.zeros(1, 3)
+    memory = flow.begin(state)
+    for _ in range(80):
+        memory, answer = flow.correct(
+            memory, torch.tensor([[1.0, 0.0]]), model, box.expand(1, 2, 2)
+        )
+        effect = answer.executed.clone()
+        if 1.0 < state[0, 0] < 3.0:
+            effect[:, 0] *= gain
+        state = model(state, effect)
+        memory = flow.observe(memory, state)
+    assert state[0, 0] > 4.0
