@@ -263,12 +263,12 @@ def begin(name: str, result: Result, folder: Path) -> Result:
         if same and earlier["asked"] == begun["asked"]:
             return earlier
         print(f"{name}: begins anew, what it depends on has changed", flush=True)
-        shutil.rmtree(folder)
-    (folder / "hook").mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "hook").mkdir(parents=True)
     (folder / "hook" / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
     for part in {Path(file).parts[0] for file in [*now, *result.get("need", {}), "docs"]}:
-        if not (folder / part).is_symlink():
-            (folder / part).symlink_to(ROOT / part)
+        (folder / part).symlink_to(ROOT / part)
+    (folder / BEGUN).write_text(json.dumps(begun), encoding="utf-8")
     return begun
 
 
