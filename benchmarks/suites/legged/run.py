@@ -79,7 +79,8 @@ def draw(tables: dict[str, pd.DataFrame], file: Path) -> None:
     """Draw the errors: a panel per robot, a row per fault, a mark per method and episode."""
     faults = list(next(iter(tables.values()))["fault"].cat.categories)
     figure = style.new_figure(3.4 * len(tables) + 1.6, 0.36 * len(faults) + 1.3)
-    looks = style.method_styles(METHODS)
+    shown = {method for results in tables.values() for method in results["method"].cat.categories}
+    looks = style.method_styles([method for method in METHODS if method in shown])
     panels = figure.subplots(1, len(tables), sharey=True, squeeze=False)[0]
     for panel, (robot, results) in zip(panels, tables.items(), strict=True):
         most = 1.15 * results["error"][results["survived"]].max()
