@@ -19,7 +19,7 @@ PYTHON ?= $(shell for p in $(CANDIDATES); do \
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
 
-demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and film them (a minute)
+demo: $(VENV)/.with-base ## Run four methods on a robot that changes; draw and film them (half a minute)
 	@echo "A robot drives along a track. After the second target its motors drive it backwards, until"
 	@echo "three targets are left."
 	@echo "Four methods meet that: the old physics alone (physics), an ensemble that learns from every"
