@@ -54,7 +54,7 @@ def opened(tmp_path):
 
 
 def shown(page, robot=1, steps=0):
-    """Return what the page says of one tick of a robot (1: with AFM), after further steps, in one reading."""
+    """Return what the page says of one tick of a robot (1: with AFM), after further steps."""
     data = f"document.querySelectorAll('figcaption')[{robot}].dataset"
     page.wait_for_function(f"{data}.command")
     after = steps + int(page.evaluate(f"{data}.step"))
