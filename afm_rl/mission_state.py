@@ -69,7 +69,7 @@ class MissionState(nn.Module):
         known, before = self.missions, self._asked
         self._asked = missions, missions._version
         if before[0] is missions and before[1] == missions._version:
-            return True  # without a look at the numbers, which would wait for the device
+            return True  # the numbers are not read, which would wait for the device
         if missions.shape == known.shape and torch.equal(missions, known):
             return True
         among = bool(missions.dim() and known.dim() and torch.isin(missions, known).all())

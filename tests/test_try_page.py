@@ -53,13 +53,17 @@ def opened(tmp_path):
         chromium.close()
 
 
-def numbers(page, of):
-    """Return what is planned, or commanded, of the robot with AFM."""
-    said = page.locator("figcaption").nth(1).get_attribute(f"data-{of}")
-    return [float(number) for number in said.split(",")]
+def shown(page, robot=1, steps=0):
+    """Return what the page says of one tick of a robot (1: with AFM), after further steps."""
+    data = f"document.querySelectorAll('figcaption')[{robot}].dataset"
+    page.wait_for_function(f"{data}.command")
+    after = steps + int(page.evaluate(f"{data}.step"))
+    page.wait_for_function(f"{data}.step >= {after}")
+    said = page.evaluate(f"({{...{data}}})")
+    return {name: [float(number) for number in said[name].split(",")] for name in said}
 
 
-@pytest.mark.slow  # torch's exporter, and 5 s of driving
+@pytest.mark.slow  # torch's exporter, and 50 steps of driving
 def test_a_reversed_motor_is_corrected_in_the_browser(browser, opened, tmp_path):
     pytest.importorskip("onnx")
     if not browser.RUNTIME.is_file():
@@ -68,15 +72,12 @@ def test_a_reversed_motor_is_corrected_in_the_browser(browser, opened, tmp_path)
     policy = ActionFlowPolicy(Dubins(), Bounded(low, high), LeastSquares(low, high))
     export_controller(Controller(None, policy), tmp_path / "policy.onnx")
     page, asked = opened(browser.script(tmp_path / "policy.onnx"))
-    page.wait_for_function("document.querySelectorAll('figcaption')[1].dataset.command")
-    assert numbers(page, "command") == pytest.approx(numbers(page, "plan"), abs=1e-6)
+    healthy = shown(page)
+    assert healthy["command"] == pytest.approx(healthy["plan"], abs=1e-6)
     page.locator("input").nth(1).fill("-1")
-    page.wait_for_timeout(5000)
-    (_, planned), (_, sent) = numbers(page, "plan"), numbers(page, "command")
-    assert sent == pytest.approx(-planned, abs=0.02)
-    captions = page.locator("figcaption").all()
-    alone, corrected = (float(caption.get_attribute("data-distance")) for caption in captions)
-    assert corrected < 0.2 < alone
+    corrected, alone = shown(page, steps=50), shown(page, robot=0)
+    assert corrected["command"][1] == pytest.approx(-corrected["plan"][1], abs=0.02)
+    assert corrected["distance"][0] < 0.2 < alone["distance"][0]
     assert all(url.startswith(("file:", "blob:")) for url in asked)  # nothing from elsewhere
 
 

@@ -24,7 +24,7 @@ from afm_rl._version import __version__
 from afm_rl.progress import waiting
 from afm_rl.storage.signed import read_signed, write_signed
 
-PLANS = 3  # dimensions that all else has at most
+PLANS = 3  # tensors with more dimensions are plans
 LONGEST = 900  # seconds that a process may compile
 
 

@@ -13,7 +13,7 @@ Result = TypeVar("Result")
 
 
 def may_look(values: Tensor) -> bool:
-    """Return whether what follows may depend on numbers.
+    """Return whether control flow may depend on the numbers of a tensor.
 
     Not while a function is being exported; and on a GPU it would have to be waited for, which takes
     longer than the work that is saved.

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from afm_rl.options import choice
 
-LIMIT = 4.0  # half ranges: effects beyond carry no more news
+LIMIT = 4.0  # shares of the largest action: effects beyond are clipped
 MODES = ("mixed", "direction", "clip")
 SATURATION = choice(
     "mixed", mixed="slower if under 15 %", direction="do it slower", clip="cut each component"
@@ -19,7 +19,7 @@ DEAD = 0.025  # share of which nothing can be had
 
 
 def saturate(unit: Tensor, mode: str, dim: int = -1) -> Tensor:
-    """Bring an action in half ranges, ``(*B, A)``, into the box [-1, 1]^A.
+    """Bring an action ``(*B, A)``, in shares of the largest one, into the box [-1, 1]^A.
 
     The axes are in the dimension ``dim``.
 
@@ -45,7 +45,7 @@ def _half(mask: Tensor, dim: int = -1) -> Tensor:
 
 
 def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
-    """Return the part of a planned action ``(*B, A)`` that should be had, in half ranges.
+    """Return the part of a planned action ``(*B, A)`` that should be had, in shares of the largest.
 
     Args:
         unit: the planned action.
@@ -69,10 +69,10 @@ def attainable(unit: Tensor, low: Tensor, high: Tensor, mode: str) -> Tensor:
 def extend(reach: Tensor, box: Tensor, tried: Tensor) -> Tensor:
     """Return the bounds ``(*B, 2, A)`` that plans should keep, given what can be reached.
 
-    That is what they keep best. But where it is less than 30 %, a plan is better made with all of
-    the box, to be cut or done slower: a few steps ahead, a planner sees no way with so little. Not
-    where nothing can be reached at all; and where only a small part of the box was tried, plans
-    that stay within reach try more of it.
+    Usually that is what can be reached. Where it is less than 30 % of the box, the bounds hold all
+    of the box, and plans are cut or done slower afterwards: with so little a planner sees no way a
+    few steps ahead. Not so where nothing can be reached at all, nor where only a small part of the
+    box was tried: plans that stay within reach try more of it.
 
     Args:
         reach: lowest and highest effect, ``(*B, 2, A)``.

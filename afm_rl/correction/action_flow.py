@@ -48,6 +48,10 @@ class ActionFlow(PairCorrector):
         action_high: highest action, ``(A,)``.
         network: the network; None: the universal one that comes with the package.
 
+    Raises:
+        ConfigurationError: for unknown hypotheses, ``noise`` below ``least_noise``, or a ``memory``
+            that is shorter than hypotheses look back.
+
     >>> flow = ActionFlow(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
     >>> from afm_rl.dynamics import Dubins
     >>> memory, state = flow.begin(torch.zeros(3)), torch.zeros(3)
@@ -180,7 +184,7 @@ class ActionFlow(PairCorrector):
     def belief_in(self, memory: Tensor) -> Tensor:
         """Return how probable the :attr:`causes` are, by axis, ``(*B, C, A)``.
 
-        Of a memory ``(*B, P)``. What takes any delay that is believed counts as late.
+        Of a memory ``(*B, P)``. A model that follows the believed delay counts as that delay.
 
         >>> flow = ActionFlow(-torch.ones(1), torch.ones(1))
         >>> belief = flow.belief_in(flow.begin(torch.zeros(2)))
@@ -225,8 +229,8 @@ class ActionFlow(PairCorrector):
     def quiet_in(self, parts: Fields) -> Tensor:
         """Return up to which innovation a transition needs no explanation, ``(*B, 1)``.
 
-        While plans are executed, what two of three do not exceed: of a model that is only nearly
-        exact, not all transitions are explained. None while actions are corrected.
+        While plans are executed, what two of three transitions do not exceed, for a nearly exact
+        model does not explain all of them. Zero while actions are corrected.
         """
         return self.quiet * (1 - parts["corrects"]) * parts["usual"].exp()
 
@@ -318,9 +322,9 @@ class ActionFlow(PairCorrector):
     def delayed(self, belief: Belief, prior: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
         """Return the delay ``(*B)`` that is believed now, and the losses ``(*B, M, A)``.
 
-        None while *nothing has changed* keeps a quarter of the probability on each axis, given all:
-        a first surprise tells little of which delay. Models that follow a new one begin as good as
-        the best that had it already.
+        Zero while *nothing has changed* has a quarter of the probability or more on every axis: a
+        first surprise says little about which delay it is. Models that follow a new one begin as
+        good as the best that had it already.
         """
         tables = self.delay_likelihood, self.delay_log_prior
         delay = likeliest_delay(belief.weights(prior), before, *tables)

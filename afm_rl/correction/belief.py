@@ -40,8 +40,9 @@ class Belief(NamedTuple):
         .. math::
 
             l_h &\leftarrow \big(1 - (1 - \alpha)\,q\big)\,l_h
-            + \log\Big(1 + \frac{(v - T_h)^2}{s^2 + \sigma^2}\Big) \\
-            s^2 &\leftarrow s^2 + \beta\,k\,\big(\min\{(v - T)^2 - \sigma^2, 3 s^2\} - s^2\big),
+            + \frac{\nu + 1}{2} \log\Big(1 + \frac{(v - T_h)^2}{\nu\,(s^2 + \sigma^2)}\Big) \\
+            s^2 &\leftarrow s^2
+            + \beta\,k\,\big(\min\{\max\{(v - T)^2 - \sigma^2, 0\}, 3 s^2\} - s^2\big),
             \qquad k = \frac{s^2}{s^2 + \sigma^2}
 
         with the forecasts :math:`T_h`, that of the model that is believed most, T, and no noise
@@ -56,7 +57,7 @@ class Belief(NamedTuple):
             discount: :math:`\alpha`.
             rate: :math:`\beta`.
             floor: least noise.
-            tails: degrees of freedom of the Student-t distribution.
+            tails: degrees of freedom :math:`\nu` of the Student-t distribution.
             constant_delays: indices ``(K,)`` of models, no delay and each one; the last model is
                 then that of a delay that changes: it has the loss of the best of them at this step,
                 the same one on all A axes, and :math:`\log(K) / A` for the choice.
@@ -118,7 +119,9 @@ class Belief(NamedTuple):
 
 
 def haste(noise: Tensor, floor: Tensor | float) -> Tensor:
-    r"""Return :math:`q = \min\{1, (s_0 / s)^2\}`: how little a row tells in noise, ``(*B, A)``.
+    r"""Return :math:`q = \min\{1, (s_0 / s)^2\}`, the weight of a row in noise s, ``(*B, A)``.
+
+    No noise is less than the ``floor``, :math:`s_0`.
 
     >>> haste(torch.tensor([0.02, 0.04]), floor=0.02)
     tensor([1.0000, 0.2500])

@@ -1,4 +1,4 @@
-"""Textbook correctors: one fit to all that is remembered, which always acts."""
+"""Textbook correctors: one fit to all that is remembered, used while the model is contradicted."""
 
 from __future__ import annotations
 

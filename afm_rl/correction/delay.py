@@ -76,7 +76,7 @@ def command_acting(commands: Tensor, delay: Tensor) -> Tensor:
 
 
 def align(pairs: Tensor, delay: Tensor, size: int) -> Tensor:
-    """Return pairs ``(*B, M, D)`` with the commands of so many steps before each effect.
+    """Return pairs ``(*B, M, D)`` with the commands of ``delay`` ``(*B)`` steps before each effect.
 
     >>> pairs = torch.tensor([[0.1, 7.0, 0.0, 1.0], [0.2, 8.0, 0.0, 1.0]])
     >>> align(pairs, torch.tensor(1), 1)[..., [0, 3]]

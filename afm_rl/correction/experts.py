@@ -18,9 +18,9 @@ from afm_rl.correction.least_squares import (
     variance_of_line,
 )
 
-NOISE = 0.1  # half ranges: a pair with this standard deviation counts half
-LEAST_MISS = 1e-3  # half ranges: smaller residuals are all the same
-NEAR = 0.15  # half ranges: a pair so far from the question counts half as much
+NOISE = 0.1  # shares of the largest action: a pair with this standard deviation counts half
+LEAST_MISS = 1e-3  # shares of the largest action: smaller residuals are all the same
+NEAR = 0.15  # shares: a pair so far from the question counts half as much
 SHORT, LONG = 0.5, 0.9  # forgetting per row
 EXPERTS = 4
 ANSWERS = EXPERTS + 1  # the experts' answers, and the effect or nearness of the nearest pairs
@@ -28,7 +28,7 @@ MISSES = EXPERTS - 1  # the nearest pairs have no residual of their own
 
 
 class Rows(NamedTuple):
-    """Pairs that describe a regime, oldest first, in half ranges."""
+    """Pairs that describe a regime, oldest first, in shares of the largest action."""
 
     executed: Tensor
     """Executed actions u, ``(*B, K, A)``."""

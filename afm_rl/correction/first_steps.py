@@ -1,4 +1,4 @@
-"""What most steps of a correction are like, if the user should know of it: said once."""
+"""Warnings, given once, when most steps are corrected, or are held back by limits."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ MOST = 0.5  # share of them, in each third but the first
 
 
 class FirstSteps:
-    """Notes which of the first 60 steps are corrected, and warns if most of them are, all along.
+    """Notes which of the first 60 steps are corrected, and warns if most of them are.
 
-    Numbers are looked at once, at the last of these steps, and nothing is noted in a function that
-    is compiled, exported or captured.
+    Most: more than half of the second 20, and of the third. Numbers are looked at once, at the last
+    of these steps, and nothing is noted in a function that is compiled, exported or captured.
 
     >>> first = FirstSteps()
     >>> with warnings.catch_warnings(record=True) as said:
@@ -65,7 +65,7 @@ class FirstSteps:
 class HeldBack(FirstSteps):
     """Notes at which steps the user's limits hold a correction back, and warns at most once.
 
-    That is where most of 60 steps are, whenever.
+    It looks at 60 steps at a time, over the whole mission.
     """
 
     text = (

@@ -10,11 +10,11 @@ from afm_rl.spaces.small_matrices import add_diagonal, solve_positive
 
 PRIOR = 1e-4  # weight of the nominal map in every fit
 LEAST_GAIN = 0.02  # smallest gain that is divided by
-OUTLIER = 0.1  # half ranges: a residual of this size halves a pair's weight in the robust fit
+OUTLIER = 0.1  # shares of the largest action: such a residual halves a pair's weight
 
 
 def precision_of(std: Tensor, valid: Tensor) -> Tensor:
-    r"""Return the weights ``(B, M, A)`` of rows: :math:`1 / \sigma^2`, less than that of the best.
+    r"""Return weights ``(B, M, A)`` of rows, :math:`1 / (\sigma^2 + 10^{-4})` over the best row's.
 
     Args:
         std: standard deviation of the effects, ``(B, M, A)``.
@@ -57,7 +57,7 @@ def fit_line(
     Args:
         executed: u, ``(*B, K, A)``.
         effective: its effective action, ``(*B, K, A)``.
-        weight: of pairs and axes, ``(*B, K, A)``.
+        weight: of pairs, ``(*B, K, 1)``, or of pairs and axes, ``(*B, K, A)``.
         rounds: times that the weights are renewed.
 
     Returns:
@@ -148,9 +148,11 @@ def fit_affine(executed: Tensor, effective: Tensor, weight: Tensor) -> tuple[Ten
 
 
 def invert_affine(matrix: Tensor, bias: Tensor, unit: Tensor) -> Tensor:
-    """Return the actions ``(*B, A, C)`` whose effects come nearest to what is wanted.
+    r"""Return the actions ``(*B, A, C)`` whose effects come nearest to what is wanted.
 
-    Of :func:`fit_affine`. A small ridge keeps them finite where the matrix is all but singular.
+    .. math:: u = (D^\top D + 0.02^2 I)^{-1} D^\top (v - b)
+
+    with D and b of :func:`fit_affine`; the ridge keeps u finite where D is nearly singular.
 
     Args:
         matrix: D, ``(*B, A, A)``.

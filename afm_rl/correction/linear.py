@@ -32,9 +32,10 @@ RIDGE = 0.01  # rows that say b = 1 and a = c = d = 0: four numbers are many for
 class Lines(NamedTuple):
     r"""L linear models of B missions, :math:`T(u) = D u + b`, shares of the largest action.
 
-    How unsure a fit is of the effect of an action says Bayesian linear regression,
-    :math:`x^T (X^T W X + \rho)^{-1} x` in units of the noise: of a model of one axis
-    :math:`c_0 + c_1 u + c_2 u^2`. The last three mix axes; of swapped ones nothing is fitted.
+    The variance of a predicted effect is that of Bayesian linear regression, in units of the noise
+    :math:`x^T (X^T W X + \rho)^{-1} x`; of a model of one axis it is
+    :math:`c_0 + c_1 u + c_2 u^2`. The last three models mix axes; of swapped axes nothing is
+    fitted.
     """
 
     matrix: Tensor
@@ -89,7 +90,7 @@ def fit_lines(
         sent: commands, the oldest first, ``(B, M, A)``; what mixes axes is fitted to them.
         acted: those that acted, if they act late; the others are fitted to them.
         came: the effects.
-        weight: of the rows, ``(B, M, A)``.
+        weight: of the rows, ``(B, M, A)`` or ``(B, M, 1)``.
         noise: standard deviation that no model explains, ``(B, A)``.
 
     >>> u = torch.tensor([[[0.5], [-1.0], [0.2]]])
@@ -213,7 +214,7 @@ def _autoregressive(u: Tensor, v: Tensor, weight: Tensor) -> Tensor:
     r"""Return the line in u_k that is :math:`v_k = b u_k + c u_{k-1} + a v_{k-1} + d`.
 
     The row before is known. Gain, offset, and the coefficients of the variance, ``(B, A, 1, 5)``.
-    Rows after one that does not count do not.
+    A row after one that does not count does not count either.
 
     Args:
         u: executed, the oldest first, ``(B, A, M)``.

@@ -94,15 +94,15 @@ class AxisNetwork(nn.Module):
 
     .. math:: y = s_0\,y_\mathrm{own} + \sum_e s_e\,y_e,\qquad s = \mathrm{softmax}(5 \ell)
 
-    which is exact where an expert is, as no network of this size is by itself. All actions are in
-    half ranges.
+    which is exact where an expert is, as no network of this size is by itself. All actions are
+    shares of the largest one.
 
     Args:
         width: units of the heads' hidden layers.
         latent: size of an axis's code.
-        across: False lets no axis see the others' codes (a lesion for ablations).
-        experts: False lets the heads answer by themselves alone (a lesion).
-        noise: False hides the standard deviations of the pairs (a lesion).
+        across: False lets no axis see the others' codes (for ablations).
+        experts: False lets the heads answer by themselves alone (for ablations).
+        noise: False hides the standard deviations of the pairs (for ablations).
         seed: of the initial weights.
 
     >>> from afm_rl.correction.experts import fit_experts
@@ -243,6 +243,9 @@ def midpoint(velocity: Velocity, start: Tensor, steps: int) -> Tensor:
         velocity: v, takes the time and the point.
         start: x_0, ``(*B, A)``.
         steps: number of equal steps.
+
+    Raises:
+        ConfigurationError: if ``steps`` is no whole number above 0.
 
     >>> x = midpoint(lambda tau, x: x, torch.ones(1), 100)
     >>> abs(float(x) - 2.718281828) < 1e-4

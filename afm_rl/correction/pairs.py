@@ -15,7 +15,7 @@ from afm_rl.dynamics.inverse import effective_action
 
 
 class PairCorrector(Corrector):
-    """A corrector that remembers pairs (executed, effective action), shares of the largest.
+    """A corrector that remembers pairs (executed, effective), shares of the largest action.
 
     Args:
         action_low: lowest action, ``(A,)``.
@@ -67,8 +67,8 @@ class PairCorrector(Corrector):
     def measure(self, memory: Tensor, model: DynamicsModel) -> Fields:
         """Return the parts of the memory with the newest pairs.
 
-        A model that stays as it is needs to be asked about the newest transition only, one that
-        learns about all R.
+        A model that does not learn is asked about the newest transition only; one that learns is
+        asked about all R again.
         """
         parts = self.unpack(memory, model.state_size)
         count, size = 1 if model.taught_in is None else self.recent, self.action_size

@@ -19,18 +19,26 @@ from afm_rl.spaces.manifold import draw_states, uniform
 class PaperFlow(Corrector):
     r"""The published flow: one transition, from the planned action to the one that explains it.
 
-    Trained on :math:`e = f(s, a^1) \ominus f(s, a^0)` with the velocity
-    :math:`a^1 - a^0` along :math:`a^\tau = (1-\tau) a^0 + \tau a^1` (paper, section IV-C).
-    It is kept for comparison: see the documentation for why it brings little. Its quirks
-    have switches, set as in the published runs. With the rule that its authors coded, the plan is
-    executed once a misalignment is noted, the transition before that describes the regime, and all
-    other actions are transformed.
+    Trained on :math:`e = f(s, a^1) \ominus f(s, a^0)` (paper, section IV-B, eq. 19) with the
+    velocity :math:`a^1 - a^0` along :math:`a^\tau = (1-\tau) a^0 + \tau a^1` (eq. 6; eq. 8 divides
+    it by :math:`1 - \tau`, a slip). The gate is that of eqs. 22 and 23. It is kept for comparison:
+    see the documentation for why it brings little. Its quirks have switches, set as in the
+    published runs. With the rule that its authors coded, the plan is executed once a misalignment
+    is noted, the transition before that describes the regime, and all other actions are
+    transformed. The ``innovation`` is the norm of the error, in the mixed units of the state, not
+    in standard deviations.
 
     Args:
         action_low: lowest action, ``(A,)``.
         action_high: highest action, ``(A,)``.
         features: indices of the state coordinates that the network sees.
         state_size: number of state coordinates, D of the error.
+
+    Raises:
+        ConfigurationError: for ``features`` that are no indices of state coordinates.
+
+    >>> PaperFlow(-torch.ones(1), torch.ones(1), features=[0], state_size=2).action_size
+    1
     """
 
     @options("corrector")

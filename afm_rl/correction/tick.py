@@ -164,7 +164,7 @@ class Tick(nn.Module):
 
         Args:
             pairs: what is remembered, the newest last, ``(B, M, D)``.
-            weights: probabilities of the models, ``(B, M + 1, A)``.
+            weights: probabilities of the H models, ``(B, H, A)``.
             noise: that no model explains, ``(B, A)``.
             place: where the missions are, ``(B, P)``.
             delay: of commands, in steps, ``(B,)``.
@@ -291,6 +291,7 @@ class Tick(nn.Module):
         .. math:: u_a = \operatorname{argmin}_u \sum_h w_{ha}
                   \log\Big(1 + \frac{(T_{ha}(u) - u^*_a)^2}{s_a^2}\Big)
 
+        with the wanted effect :math:`u^*`, the forecasts T and the probabilities w of the models,
         over the proposals that the evidence reaches (:meth:`rate`), axis by axis, if these actions
         together are no worse than the best proposal as a whole, as they may be where one command
         moves several axes. The loss averages models that differ by less than the noise s, and
@@ -332,9 +333,9 @@ class Tick(nn.Module):
 
         It does if half of the probability is with models that promise at least twice their standard
         deviation :math:`\sigma`: that the miss is so much less than that of the first
-        action, which is the plan :math:`u^*`,
+        action, which is the plan :math:`u_0`,
 
-        .. math:: \sum_h w_{ha} \big[\,|T_{ha}(u^*) - u^*_a| - |T_{ha}(u) - u^*_a|
+        .. math:: \sum_h w_{ha} \big[\,|T_{ha}(u_0) - u^*_a| - |T_{ha}(u) - u^*_a|
                   \ge 2 \sigma_{ha}(u)\big] \ge \tfrac12 \sum_h w_{ha},
 
         axis by axis ``(B, C, A)``; and as a whole ``(B, C, 1)``, where axes count as far as they
@@ -374,14 +375,14 @@ class Tick(nn.Module):
     def forecast(
         self, fits: Fits, weights: Tensor, delay: Tensor, pairs: Tensor, ahead: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Return the effects ``(B, M + 1, A)`` that all models expect of what acts now.
+        """Return the effects ``(B, H, A)`` that all models expect of what acts now.
 
         And those ``(B, K + D, A)`` that the newest commands have or will have, by the models with
         the present delay; the commands themselves where none is to come.
 
         Args:
             fits: all models.
-            weights: their probabilities, ``(B, M + 1, A)``.
+            weights: their probabilities, ``(B, H, A)``.
             delay: of commands, in steps, ``(B,)``.
             pairs: what is remembered.
             ahead: commands that wait, and the present one, ``(B, D + 1, A)``.

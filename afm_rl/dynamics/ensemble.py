@@ -30,7 +30,7 @@ CHUNK = 2**18  # activations per layer and chunk: 1 MiB in float32, so that they
 
 
 class Ensemble(PerMissionModel):
-    r"""Probabilistic ensemble of E networks (Chua et al. 2018; paper, section V-A).
+    r"""Probabilistic ensemble of E networks (Chua et al. 2018; paper, section V-B).
 
     Each member maps the standardised features of state and action to mean and
     log-variance of the standardised state change,
@@ -55,6 +55,10 @@ class Ensemble(PerMissionModel):
         manifold: state space.
         action_size: number of action components, A.
         features: indices of the state coordinates that the dynamics depend on.
+
+    Raises:
+        ConfigurationError: for features that are no indices, or bounds of the log-variance that
+            are not low < high.
 
     >>> model = Ensemble(Manifold(3, angles=[2]), 2, features=[2], hidden=[16])
     >>> model(torch.zeros(7, 3), torch.zeros(7, 2)).shape

@@ -58,8 +58,9 @@ def effective_action(
 
     .. math:: J \leftarrow J + \frac{(\Delta - J d)\, d^\top}{d^\top d}
 
-    and a step that gains less than half of what it promised has J differentiated anew, twice at
-    most. A model that keeps its derivative has the rounds begin with that of the transition before.
+    and after a step that gains less than half of what it promised J is differentiated anew, twice
+    at most, the first time included. A model that keeps its derivative begins with that of the
+    transition before.
 
     ``std`` grows by the root mean square of the normalised error that remains, where that exceeds
     1: a contact that the rounds did not resolve tells little.
@@ -72,7 +73,7 @@ def effective_action(
         state: ``(*B, S)``.
         action: the action that was executed, ``(*B, A)``.
         next_state: the realised next state, ``(*B, S)``.
-        half_range: h, half ranges of the action box, ``(A,)``.
+        half_range: h, the unit of v: half ranges of the box, or largest actions, ``(A,)``.
         rounds: Gauss-Newton steps at most.
         quiet: innovations up to this size need no explanation: the executed action is returned,
             with a standard deviation of a tenth; one number, or one per row ``(*B)``.

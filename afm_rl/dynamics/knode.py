@@ -38,6 +38,10 @@ class KNODE(PerMissionModel):
         rate: f as a function, ``rate(state, action) -> (*B, S)``; None for a
             :class:`~afm_rl.dynamics.Quadrotor`, whose equations are known.
 
+    Raises:
+        ConfigurationError: without ``dt`` or ``rate``, for ``frame="body"`` of another model, or
+            features that are no indices.
+
     >>> model = KNODE(Quadrotor()).push_()
     >>> level = torch.zeros(4, 13).index_fill(1, torch.tensor(9), 1.0)
     >>> ahead, by_state, by_action = model.linearise(level, torch.zeros(4, 4))

@@ -139,8 +139,8 @@ class ParametricDynamics(KnownDynamics, PhysicsModel):
     millisecond for each product with a tensor that is not differentiated, such as these parameters.
 
     Args:
-        step: ``step(state, action, physics) -> next state``, batched and differentiable; physics
-            ``(*B, P)`` are in the order of their names.
+        step: ``step(state, action, physics) -> next state``, batched, not necessarily
+            differentiable; physics ``(*B, P)`` are in the order of their names.
         manifold: state space.
         action_size: number of action components, A.
         physics: names of the parameters, with their nominal values.

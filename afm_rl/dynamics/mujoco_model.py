@@ -313,9 +313,10 @@ def changed_model(model: Any, row: tuple[float, ...]) -> Any:
     """Return a copy of an ``MjModel`` with other physics, a row of :attr:`Physics.names`.
 
     ``mass`` scales masses and inertias, ``friction`` that of contacts and joints, ``damping`` that
-    of joints and tendons; wind is an acceleration (m/s^2). ``length`` is of links (bodies that only
-    turn, and what is fixed to them) and of tendons' limits: masses stay, inertias grow with the
-    square. The ``payload``, a share of the whole mass, is at the centre of the heaviest body.
+    of joints and tendons, ``gravity`` itself; wind is an acceleration (m/s^2). ``length`` is of
+    links (bodies that only turn, and what is fixed to them) and of tendons' limits: masses stay,
+    inertias grow with the square. The ``payload``, a share of the whole mass, is at the centre of
+    the heaviest body.
     """
     import mujoco
 

@@ -53,7 +53,7 @@ def stacked_mlp_tangent(
     biases: Sequence[Tensor],
     layer_norm: bool = False,
 ) -> Tensor:
-    """Push tangents ``(A, in)``, the same for all rows, through them: ``(M, N, A, out)``."""
+    """Return the networks' derivatives along tangents ``(A, in)``, ``(M, N, A, out)``."""
     axes = tangents.unsqueeze(1).expand(len(inputs), -1, *inputs.shape[1:])
     moved = torch.cat([inputs.unsqueeze(1), axes], 1)  # (M, 1 + A, N, in): values, then tangents
     for layer, (weight, bias) in enumerate(zip(weights, biases, strict=True)):

@@ -66,6 +66,9 @@ class KNODEUpdater(Learner):
     Args:
         loss: a loss over a :class:`~afm_rl.dynamics.KNODE`, whose keys are read.
 
+    Raises:
+        ConfigurationError: for another model, or a window that is no multiple of the tick.
+
     >>> from tensordict import TensorDict
     >>> from afm_rl.dynamics import Quadrotor
     >>> updater = KNODEUpdater(GaussianNLLLoss(KNODE(Quadrotor()).expand_(4)), begin=0.0)

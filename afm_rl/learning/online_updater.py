@@ -30,6 +30,9 @@ class OnlineUpdater(Learner):
     Args:
         loss: the loss to descend.
         optimizer: makes the optimiser of the model's parameters.
+
+    Raises:
+        ConfigurationError: if the model has no parameters, or ``optimizer`` is no function.
     """
 
     by_gradient = True
@@ -175,9 +178,9 @@ class UnmatchedUpdater(Updater):
     actions works against it: both correct one error, and the transform reads its window through
     a model that keeps changing. Here each transition is taken apart first
     (:func:`~afm_rl.learning.error_decomposition.decompose_error`) into the action v that explains
-    it best and a rest, in standard deviations of the model,
+    it best and a rest, in standard deviations of the model, with J the Jacobian by the action,
 
-    .. math:: r = N^{-1}\,(s_{t+1} \ominus f(s_t, v)).
+    .. math:: r = (I - J J^+)\,N^{-1}\,(s_{t+1} \ominus f(s_t, v)).
 
     Where :math:`\max_d |r_d|` exceeds the gate the updater learns from :math:`(s_t, v, s_{t+1})`;
     elsewhere actions explain everything, and the model stays as it is. The loss is that of the

@@ -30,7 +30,8 @@ def effective_log(
     """Return what states ``(N, S)`` show of actions ``(N, A)``: responses are effective actions.
 
     The last row of each episode has no next state, and is left out; so are rows in which the
-    effective action cannot be seen: its standard deviation is above ``unseen`` half ranges.
+    effective action cannot be seen: its standard deviation is above ``unseen`` times the largest
+    action.
 
     Raises:
         ConfigurationError: if too few states show what an action did.

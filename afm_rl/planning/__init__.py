@@ -1,4 +1,4 @@
-"""Planners, and the world in which they imagine."""
+"""Planners, and the environment in which they plan."""
 
 from afm_rl.deprecated import lazy_package
 

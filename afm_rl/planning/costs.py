@@ -41,7 +41,7 @@ class GoalDistance(Cost):
 
     The goal gives the first coordinates; a coordinate without a goal is driven to zero. So
     coordinates ``[0, 1]`` with a goal (x, y) are ``goal_position``, and ``[0, 1, 2]`` with
-    the same goal are the paper's ``goal_pose``, which asks for heading 0 everywhere.
+    the same goal are ``goal_pose`` of its authors' code, which asks for heading 0 everywhere.
 
     >>> cost = GoalDistance([0, 1])
     >>> here = torch.zeros(3)

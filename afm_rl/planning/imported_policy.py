@@ -91,6 +91,10 @@ def read_normaliser(file: str | Path) -> tuple[Tensor, float]:
 
     The file is a pickle. It is not unpickled: its stream of operations is read for the numbers that
     follow these names, which can do no harm.
+
+    Raises:
+        ConfigurationError: if there is no such file.
+        ArtefactError: if it holds no mean and variance.
     """
     content, wanted, word, began = _content(file), "", None, False
     found: dict[str, Any] = {}

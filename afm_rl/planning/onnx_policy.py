@@ -1,4 +1,4 @@
-"""A policy that somebody exported as ONNX, trusted with tensors alone."""
+"""A policy from an ONNX file that need not be trusted."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def policy_from_onnx(
 ) -> GraphPolicy:
     """Return the policy in an ONNX file, a function of observations ``(*B, O)``.
 
-    The file is trusted with tensors alone: operators are those of ONNX, none of them a loop, a
+    The file need not be trusted: operators are those of ONNX, none of them a loop, a
     branch or somebody's own, weights are in the file or in files of its folder, and every result
     has a size that is known and no larger than 2^24 numbers.
 

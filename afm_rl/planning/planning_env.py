@@ -1,4 +1,4 @@
-"""The world as the planner imagines it."""
+"""The environment in which planners roll out their plans."""
 
 from __future__ import annotations
 

@@ -111,13 +111,14 @@ def solve_lq(problem: LQProblem, sweeps: int = 300, patience: float = 3.0) -> LQ
 def stationary_value(
     A: Tensor, B: Tensor, Q: Tensor, R: Tensor, doublings: int = 20
 ) -> tuple[Tensor, Tensor]:
-    r"""Return P and K of linear-quadratic control without an end, all of a batch at once.
+    r"""Return P ``(*B, S, S)`` and K ``(*B, A, S)`` of the stationary linear-quadratic regulator.
 
     .. math:: \sum_{k=0}^\infty x_k^\top Q x_k + u_k^\top R u_k = x_0^\top P x_0
         \quad\text{for}\quad u_k = -K x_k,\ x_{k+1} = A x_k + B u_k
 
     Each round of the structure-preserving doubling algorithm (Chu et al. 2004) doubles the number
-    of stages that P looks ahead. In double precision, returned in that of A.
+    of stages that P looks ahead. In double precision, returned in that of A. All may have batch
+    dimensions: A ``(*B, S, S)``, B ``(*B, S, A)``, Q ``(*B, S, S)``, R ``(*B, A, A)``.
 
     >>> one = torch.ones(1, 1)
     >>> stationary_value(one, one, one, one)  # the golden ratio, and its inverse

@@ -82,10 +82,10 @@ def draw_between(
 class Regime:
     """A family of regimes: the effective action as a function of action and parameters.
 
-    The same object serves the simulator, the oracle and the counterfactual generator. Its
-    parameters are one row of named numbers, so a batch of missions, each under a regime of
-    its own, is one tensor ``(*B, F)``. A family that is made with settings that cannot be used
-    raises a :class:`~afm_rl.errors.ConfigurationError`.
+    The same object serves the simulator and the oracle. Its parameters are one row of named
+    numbers, so a batch of missions, each under a regime of its own, is one tensor ``(*B, F)``. A
+    family that is made with settings that cannot be used raises a
+    :class:`~afm_rl.errors.ConfigurationError`.
 
     Attributes:
         names: names of the F parameters, in order.

@@ -78,8 +78,8 @@ class Actuators:
     .. math:: y_t = \mathrm{clip}(g(u_t;\, u_{t-1}, \dots),\ y_{t-1} - r h,\ y_{t-1} + r h)
 
     with the regime g of :func:`~afm_rl.regimes.actuator_regimes` (delay, lag, permutation, gain,
-    loss, bias) and a limited rate r, in half ranges h a step. No regime is that limit: it goes on
-    from the last effect, not from a command. Nor is a delay that is random: with ``random_delay`` D
+    loss, bias) and a limited rate r, in half ranges h a step. The limit is not a regime, since it
+    begins at the last effect, not at a command; nor is a random delay: with ``random_delay`` D
     every command takes a number of steps of its own, drawn from 0, ..., D as it is sent, and the
     newest that has arrived acts, so that none acts after a newer one.
 

@@ -3,6 +3,7 @@
 ============= ===================================================================================
 files         files that are written whole or not at all; tables as CSV; locks of folders
 artefacts     trained parts and checkpoints: safetensors, with their SHA-256 inside
+signed        files that only this user can have written, by a keyed checksum
 manifest      the SHA-256 of every file of a folder of results, and which settings it must share
 measures      by what stored results are compared
 torch_files   what others wrote: members of a zip, and the tensors of ``torch.save``, in bounds

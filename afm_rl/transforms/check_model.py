@@ -44,8 +44,11 @@ def check_model(
         policy: returns the action for an observation; in TorchRL, a policy of a rollout. None:
             random actions, which show the most, to a robot that may do anything.
         state: as in :class:`~afm_rl.ActionFlowWrapper`; in TorchRL, its key.
-        steps: that are made.
+        steps: that are compared; where a wrapper normalises observations, as many come before.
         seed: of environment and random actions.
+
+    Returns:
+        Is the model ``right``, which ``share`` it predicts (0 to 1), and the ``cause`` if not.
 
     Raises:
         ConfigurationError: for a model that does not fit, or a robot that rests.

@@ -298,16 +298,17 @@ class ActionFlowWrapper(GymnasiumShell, gymnasium.Wrapper, RecordConstructorArgs
     rewards, ends and observations are the environment's own. It is a view of the
     :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``, ``enabled``,
     ``most``, ``rate``, ``delay_compensation``, ``delay``, ``belief``, ``keep_memory_on_reset`` and
-    ``record``; the first three are attributes, which may be changed at any step.
+    ``record``. The attributes ``enabled``, ``most`` and ``rate`` may be changed at any step.
 
     ``info["afm"]`` has, after each step, ``planned``, ``executed`` and ``predicted`` ``(A,)``, the
     last being the effect that the executed action is expected to have; ``corrects``, whether the
     planned action was replaced by the corrector's; the ``innovation``, in standard deviations of
     the model; the ``noise`` ``(A,)`` of the effects that was learnt; the ``observation`` that was
-    measured; and the ``delay``, in how many steps the next action will act, known and found: who
-    follows a clock looks as far ahead. With ``enabled=False`` it is 0. With ``belief=True`` there
-    is the ``belief``, how probable ``(A,)`` each cause is, by name, such as ``"nothing has
-    changed"`` or ``"2 steps late"``. :attr:`diagnosis` says in words what the actuators seem to do.
+    measured; and the ``delay``: steps until the next action acts, known and found ones. A reference
+    that follows a clock is read that far ahead. With ``enabled=False`` it is 0. With
+    ``belief=True`` there is the ``belief``, how probable ``(A,)`` each cause is, by name, such as
+    ``"nothing has changed"`` or ``"2 steps late"``. :attr:`diagnosis` says in words what the
+    actuators seem to do.
 
     What the model takes for the state is, with ``"mujoco"`` or a
     :class:`~afm_rl.dynamics.MuJoCoDynamics`, the whole state of the environment's simulation, else

@@ -34,21 +34,21 @@ class CorrectionLoop:
 
     Each step is a pure function of the corrector's memory ``(*B, P)``, which belongs to the caller,
     as do action spec and state. While the model explains what happens, the planned action is
-    executed; when it does not, the corrector's answer is (paper, section IV-D). It never learns and
+    executed; when it does not, the corrector's answer is (paper, section IV-C). It never learns and
     never changes the model. What it tells of a step, in a tensordict ``(*B)``:
 
     * ``"planned_action"`` and ``"executed_action"`` ``(*B, A)``,
     * ``"predicted_effect"`` ``(*B, A)``: the effect that the executed action is predicted to have;
       where nothing is corrected, itself,
-    * ``"enabled"`` ``(*B)``: is this mission corrected? True at first; False from the caller, until
-      the mission ends, is what ``enabled=False`` is for all of them,
+    * ``"enabled"`` ``(*B)``: is this mission corrected? True at first; a caller may set it to False
+      until the mission ends, as ``enabled=False`` does for all missions,
     * ``"misaligned"`` ``(*B)``: does the model misjudge actions, so that they are corrected (while
       that is switched off: so that they would be)?
     * ``"innovation"`` ``(*B)``: the misalignment, in standard deviations that the model states,
     * ``"spread"`` ``(*B, A)``: standard deviation of the flow's samples,
     * ``"noise"`` ``(*B, A)``: standard deviation of effects that nothing explains,
-    * ``"effect_bounds"`` ``(*B, 2, A)``: lowest and highest effect that an action can have, at
-      least the action box: for planners that can plan beyond it,
+    * ``"effect_bounds"`` ``(*B, 2, A)``: lowest and highest effect that plans should
+      keep to, narrower or wider than the action box: for a planner's ``box_key``,
     * ``"belief"`` ``(*B, C, A)``, if it is asked for: how probable the ``causes`` of the
       :class:`~afm_rl.correction.ActionFlow` are, by axis,
     * ``"memory"`` ``(*B, P)``.
@@ -311,7 +311,7 @@ class CorrectionLoop:
     def arrival(self, memory: Tensor, enabled: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the state ``(*B, S)`` in which the next action acts, and in how many steps.
 
-        The present state and 0 while no action is late, and where nothing is corrected.
+        The present state and 0 while no action is late, and where the correction is off.
         """
         now = self.corrector.latest(memory)[0]
         if not self.enabled:

@@ -26,7 +26,7 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
     """The correction of :class:`~afm_rl.transforms.ActionFlowTransform` as the end of a policy.
 
     Put it after a planner in a ``TensorDictSequential``: a state goes in, the action to execute
-    comes out under ``action_key``, as a robot wants it that is no environment. It is a view of the
+    comes out under ``action_key``, for a robot that is not an environment. It is a view of the
     :class:`~afm_rl.transforms.CorrectionLoop`, which has the options ``corrector``, ``enabled``,
     ``most``, ``rate``, ``extend_action_box``, ``delay``, ``keep_memory_on_reset`` and ``record``.
     Under ``prefix`` are its entries, with the memory as ``"_memory"``, which collectors leave out;
@@ -46,6 +46,7 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
 
     Raises:
         ConfigurationError: for parts that do not fit each other.
+        KeyError: at a step, if the tensordict holds no memory: prime it first.
 
     >>> from tensordict import TensorDict
     >>> from tensordict.nn import TensorDictSequential

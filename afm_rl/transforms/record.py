@@ -59,7 +59,7 @@ class Recorder:
 
         Args:
             model: by which effects are understood.
-            scale: half ranges of the actions, ``(A,)``.
+            scale: largest action of each axis, ``(A,)``.
             state: the measured one.
         """
         if self._acted is None or self._acted[0].shape != state.shape:

@@ -39,9 +39,8 @@ CHANGED = gymnasium.ObservationWrapper, VectorObservationWrapper
 class Simulation:
     """The MuJoCo simulation inside an environment, which is not touched.
 
-    What is observed in other states is looked at through the environment's own eyes, in a
-    simulation beside its own. Of environments that run elsewhere, as those of a vector or of
-    workers, one is made here.
+    Observations in other states come from the environment's own function, in a second simulation.
+    Of environments in a vector or in workers, one is made in this process.
 
     Args:
         env: of gymnasium, dm_control or TorchRL, or a vector or batch of such.

@@ -24,6 +24,9 @@ class StatefulTransform(Transform, ABC):
         observation_key: the state.
         action_key: the action.
         prefix: where the memory is kept.
+
+    Raises:
+        KeyError: at a step, if the tensordict holds no memory: begin with ``env.reset()``.
     """
 
     def __init__(

@@ -15,6 +15,7 @@
   const clip = (value, most) => Math.max(-most, Math.min(most, value));
   const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
   const points = Array.from({ length: 240 }, (_, k) => line((2 * Math.PI * k) / 240));
+  robots.step = 0;
   let session, memorySize, anew;
 
   function begin() {
@@ -89,6 +90,7 @@
   async function tick() {
     const begun = performance.now();
     if (anew) anew = begin();
+    robots.step += 1;
     for (const [k, robot] of robots.entries()) {
       const plan = planned(robot), before = performance.now();
       const command = k ? await corrected(robot, plan) : plan;
@@ -99,7 +101,7 @@
       const mean = robot.trail.reduce((sum, row) => sum + row[3], 0) / robot.trail.length;
       const [name, colour] = k ? ["with AFM", "#3399dd"] : ["alone", "#e06a10"];
       captions[k].textContent = `${name}: ${mean.toFixed(2)} m from the line`;
-      Object.assign(captions[k].dataset, { distance: mean, plan, command });
+      Object.assign(captions[k].dataset, { distance: mean, plan, command, step: robots.step });
       draw(robot, colour);
     }
     said.textContent = `one correction: ${robots.took.toFixed(1)} ms`;

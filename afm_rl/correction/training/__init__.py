@@ -1,4 +1,4 @@
-"""How the flow is trained: on regimes without a robot, and refined on one."""
+"""How flows are trained: the universal one without a robot, the published one on a model."""
 
 from afm_rl.deprecated import lazy_package
 

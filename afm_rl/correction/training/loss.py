@@ -26,13 +26,14 @@ def flow_losses(
 ) -> tuple[Tensor, Tensor]:
     r"""Return the losses ``(N,)`` of velocity and effect.
 
-    .. math:: \|r\|^2 + 0.5\,|r|_\epsilon,\ r = v(c, u_0, \tau, x_\tau) - (x_1 - x_0),\qquad
-              |r|_\epsilon,\ r = \hat T(u) - T(u),\qquad
-              |r|_\epsilon = \sqrt{r^2 + \epsilon^2} - \epsilon
+    .. math:: \|r\|^2 + 0.5\,|r|_\delta,\ r = v(c, u_0, \tau, x_\tau) - (x_1 - x_0),\qquad
+              |r|_\delta,\ r = \hat T(u) - T(u),\qquad
+              |r|_\delta = \sqrt{r^2 + \delta^2} - \delta
 
-    with :math:`x_\tau = (1 - \tau) x_0 + \tau x_1` (conditional flow matching, Lipman et al.
-    2023; paper, eq. 6), :math:`x_0 = u_0 + 0.3\,\epsilon` around the plan and the intended
-    action :math:`x_1 = T^{-1}(u_0)`, both as means over plans and axes.
+    with :math:`\delta = 0.01`, :math:`x_\tau = (1 - \tau) x_0 + \tau x_1` (conditional flow
+    matching, Lipman et al. 2023; paper, eq. 6), :math:`x_0 = u_0 + 0.3\,\epsilon` around the plan,
+    :math:`\epsilon \sim N(0, I)`, and the intended action :math:`x_1 = T^{-1}(u_0)`, both as means
+    over plans and axes.
     """
     with torch.no_grad():
         experts = fit_experts(drawn.rows)

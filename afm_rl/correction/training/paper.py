@@ -38,6 +38,10 @@ def train_flow(
 
     Returns:
         Root mean square error of the corrected action on new examples, in action units.
+
+    Raises:
+        ConfigurationError: if ``flow`` is no :class:`PaperFlow`, or states are not finite or of
+            another size.
     """
     check_instance("flow", flow, PaperFlow)
     for rows in states if isinstance(states, tuple) else [states]:

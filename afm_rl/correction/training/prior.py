@@ -67,9 +67,9 @@ class Maps(NamedTuple):
     def inverse(self, planned: Tensor, mode: str) -> Tensor:
         """Return the actions ``(N, C, A)`` in [-1, 1] for planned effects ``(N, C, A)``.
 
-        What is out of reach is saturated as :func:`~afm_rl.correction.achievable.intend` does:
-        as much of its direction as there is (``"direction"``), every axis as far as it goes
-        (``"clip"``), or the first of both only where less than 15 % can be had (``"mixed"``).
+        What is out of reach is saturated: as much of its direction as there is (``"direction"``),
+        every axis as far as it goes (``"clip"``), or the first of both only where less than 15 %
+        can be had (``"mixed"``).
         """
         bias = self.bias.unsqueeze(-2)
         still = torch.linalg.solve(self.matrix, -bias.mT).mT
@@ -328,8 +328,8 @@ def _disturb(now: Maps, executed: Tensor, share: float, draw: Draw) -> tuple[Map
 def draw_actions(count: int, rows: int, axes: int, draw: Draw) -> Tensor:
     """Draw executed actions ``(N, K, A)``.
 
-    Two windows of five keep near one action, one of ten does not change it at all, and one of
-    twelve jumps between the limits.
+    36 % of the windows keep near one action, 9 % do not change it at all, and 5 % jump between the
+    limits.
     """
     wide = draw.uniform(-1.0, 1.0, count, rows, axes)
     # Centres of narrow windows are drawn in a larger box and cut: many actions saturate.
