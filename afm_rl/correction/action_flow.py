@@ -14,7 +14,14 @@ from afm_rl.correction.achievable import SATURATION
 from afm_rl.correction.base import LONGEST, Correction, Fields
 from afm_rl.correction.belief import Belief, mean_and_std, prior_of
 from afm_rl.correction.delay import command_acting, delay_tables, likeliest_delay
-from afm_rl.correction.hypotheses import CHOICES, USUAL_DELAY, acting_of, choose, delayed
+from afm_rl.correction.hypotheses import (
+    CHOICES,
+    LONGEST_DELAY,
+    USUAL_DELAY,
+    acting_of,
+    choose,
+    delayed,
+)
 from afm_rl.correction.network import AxisNetwork, load_universal
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.tick import Tick
@@ -71,6 +78,7 @@ class ActionFlow(PairCorrector):
     acting: Tensor
     delay_likelihood: Tensor
     delay_log_prior: Tensor
+    farthest: Tensor
     cause: Tensor
     healthy: Tensor
     episodic = (*PairCorrector.episodic, "under_way")
@@ -83,7 +91,7 @@ class ActionFlow(PairCorrector):
         action_high: Tensor,
         hypotheses: Sequence[str] | None = option(None, "context windows and delays; None: all"),
         longest_delay: int = option(
-            USUAL_DELAY, "steps of a delay that is looked for", ge=0, le=25
+            USUAL_DELAY, "steps of a delay that is looked for", ge=0, le=LONGEST_DELAY
         ),
         rows: int | None = option(None, "pairs of a context window; None: 12, or more", ge=1),
         memory: int = option(80, "transitions that are remembered", ge=1),
@@ -151,6 +159,7 @@ class ActionFlow(PairCorrector):
             "constant_delays": torch.tensor(constant),
             "delay_likelihood": likelihood,
             "delay_log_prior": delay_log_prior,
+            "farthest": most_odds / (1 + (delays > 0).unsqueeze(-1).to(prior)),
             "healthy": torch.tensor(
                 [float(row.kind in ("nominal", "healthy")) for row in self.hypotheses]
             ),
@@ -307,13 +316,15 @@ class ActionFlow(PairCorrector):
         What surprises *nothing has changed* surprises all models that have yet to learn of it. One
         that foresaw it better, as some delay may by chance, leads by no more than the odds. And
         while nothing has changed, no model falls farther behind than a change may need: it may
-        come at any step (fixed share: Herbster and Warmuth 1998, Machine Learning 32).
+        come at any step (fixed share: Herbster and Warmuth 1998, Machine Learning 32). A
+        delay falls half as far: it is one for all axes, and where a model is not exact, axes whose
+        commands stand still would hold against it what they showed before the change.
         """
         nothing = losses[..., :1, :]
         first = (before[..., :1, :] <= self.odds) & (nothing > self.odds)
         losses = torch.where(first, torch.maximum(losses, nothing - self.odds), losses)
         healthy = (nothing <= losses.amin(-2, keepdim=True) + self.odds).all(-1, keepdim=True)
-        return torch.where(healthy, torch.minimum(losses, nothing + self.most_odds), losses)
+        return torch.where(healthy, torch.minimum(losses, nothing + self.farthest), losses)
 
     def delays_now(self, delay: Tensor) -> Tensor:
         """Return the delays of all models ``(*B, M)`` while ``delay`` ``(*B)`` is believed."""

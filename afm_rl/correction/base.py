@@ -315,7 +315,3 @@ class Corrector(nn.Module, ABC):
     def denormalise(self, unit: Tensor) -> Tensor:
         """Return the action for u."""
         return self.home + self.scale * unit
-
-    def within(self, share: Tensor) -> Tensor:
-        """Return the u whose place between lowest (-1) and highest (1) is ``share`` ``(*B, A)``."""
-        return self.lowest + 0.5 * (share + 1) * (self.highest - self.lowest)

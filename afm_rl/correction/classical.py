@@ -38,7 +38,7 @@ class ClassicalCorrector(PairCorrector):
         action_low: Tensor,
         action_high: Tensor,
         window: int = option(24, "transitions that can be remembered, K", ge=1),
-        gate: float = option(5.0, "innovation at which it does nothing, standard deviations", ge=0),
+        gate: float = option(5.0, "innovation up to which it is idle, standard deviations", ge=0),
         saturation: str = SATURATION,
     ) -> None:
         super().__init__(action_low, action_high, window, window, quiet=gate)

@@ -103,7 +103,6 @@ def fit_lines(
     square, mean, mass, cross, shift = moments_of(newest, u, v)  # (B, A, W)
     one, none = torch.ones_like(mass), torch.zeros_like(mass)
     gain, of_offset, of_gain = not_zero(cross / square), 1 / mass, 1 / square
-    drift = (shift - gain[..., 2:3] * mean)[..., :1] / mass[..., :1]
     offset, gain_12 = (shift - mean) / mass, gain[..., 2:3]
     drift = (shift - gain_12 * mean)[..., :1] / mass[..., :1]
     line = (

@@ -28,7 +28,7 @@ from afm_rl.diagnosis.settings import Settings
 
 
 def likely_intervals(
-    problem: Problem, model: Model, part: Part, middle: float, settings: Settings
+    problem: Problem, model: Model, middle: float, settings: Settings
 ) -> np.ndarray:
     """Return the 95 % intervals of the gain, of two responses, and of the time they take.
 
@@ -84,7 +84,7 @@ def numbers_of(scaled: Scaled, clean: Log, part: Part, j: int, settings: Setting
     command = log.command[:, model.driver]
     low, high = (float(end[0]) for end in ends_of(command[:, None]))
     middle = 0.5 * (low + high)
-    intervals = likely_intervals(problem, model, part, middle / unit, settings)
+    intervals = likely_intervals(problem, model, middle / unit, settings)
     extra = dict(zip(model.others, model.gains, strict=True))
     usual = sum(g * middle_of(log.command[:, i]) / reach[i] for i, g in extra.items() if i >= 0)
     gain, offset = model.gain * scale, (model.offset + usual) * spread[j]

@@ -216,7 +216,6 @@ class SamplingPlanner(RecedingHorizonPlanner):
         if self.box_key is not None:
             self.in_keys.append(self.box_key)
         self.streams = Streams(salt=1, seed=seed)
-        self.discarded = 0
 
     def _noise(
         self, td: TensorDictBase, like: Tensor, count: int, bound: float | None = None

@@ -176,7 +176,7 @@ def _page(
     shown = _table(diagnosis)
     note = (
         "95 % intervals in brackets. Gain: response per command. Offset, noise: in units of the "
-        "response. Dead zone, saturation, backlash, rate: in units of the command."
+        "response. Rate: of these a second. Dead zone, saturation, backlash: of the command."
     )
     tables = [Table("actuators", "All actuators", note, shown, shown)]
     caption = (

@@ -63,18 +63,23 @@ def test_a_transition_becomes_a_pair(line, reached, corrected, pair):
     [
         (0.5, [5.0, 0.1, 9.0], [5.0, 4.0, 9.0]),  # one that foresaw a surprise leads by the odds
         (2.0, [5.0, 0.1, 9.0], [5.0, 0.1, 9.0]),  # it was one before
-        (0.5, [0.9, 0.1, 40.0], [0.9, 0.1, 16.9]),  # a change may come: none falls far behind
+        (0.5, [0.9, 40.0, 40.0], [0.9, 16.9, 8.9]),  # none falls far behind, a delay least
     ],
 )
 def test_until_a_change_is_known_models_are_held_together(before, after, expected):
     flow = flow_of(1, odds=1.0, most_odds=16.0)
-    losses = torch.tensor([before, 0.0, 0.0]).unsqueeze(-1), torch.tensor(after).unsqueeze(-1)
-    torch.testing.assert_close(flow.share_losses(*losses).squeeze(-1), torch.tensor(expected))
+    rows = [flow.models.index(name) for name in ("nothing has changed", "recent", "delay_1")]
+    losses = torch.full((2, len(flow.models), 1), 9.0)
+    losses[0, rows[0]], losses[1, rows, 0] = before, torch.tensor(after)
+    found = flow.share_losses(*losses)[rows, 0]
+    torch.testing.assert_close(found, torch.tensor(expected))
 
 
 def test_a_model_falls_behind_only_while_an_axis_is_in_doubt():
-    losses = torch.tensor([[0.5, 5.0], [40.0, 0.1]])
-    assert torch.equal(flow_of(2).share_losses(losses, losses), losses)
+    flow = flow_of(2)
+    losses = torch.full((len(flow.models), 2), 40.0)
+    losses[:2] = torch.tensor([[0.5, 5.0], [40.0, 0.1]])
+    assert torch.equal(flow.share_losses(losses, losses), losses)
 
 
 @pytest.mark.parametrize(("largest", "floor"), [(0.1, 0.005), (0.5, 0.01), (3.0, 0.02)])

@@ -57,8 +57,6 @@ def test_actions_are_handled_as_shares_of_the_largest():
     unit = corrector.normalise(corners)
     assert unit.tolist() == [[0.0, -0.5], [0.5, 0.5], [1.0, 1.0]]
     assert torch.equal(corrector.denormalise(unit), corners)
-    shares = torch.tensor([[-1.0, -1.0], [0.0, 0.0], [1.0, 1.0]])
-    assert corrector.within(shares).tolist() == [[0.0, -0.5], [0.5, 0.25], [1.0, 1.0]]
     assert corrector.action_size == 2
 
 
