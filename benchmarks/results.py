@@ -6,10 +6,11 @@
 
 A result is a file, `benchmarks/results/NAME.json`. By hand: its ``commands``, as a page prints
 them, ``seeds`` in words, ``figures`` that they draw, patterns of data that C++ ``reads``, unseen by
-Python, and what they ``need`` that is not in the repository, with SHA-256. The rest is written by
-``--renew``: the ``tables`` that they printed, versions, machine, seconds of processor time, and the
-``code``: a digest of each file of the repository that was read, and their last ``commit``. A result
-is stale when one of these has another digest now. One without code is older than these files.
+Python, what they ``need`` that is not in the repository, with SHA-256, and ``gpu``: true, where
+they need one. The rest is written by ``--renew``: the ``tables`` that they printed, versions,
+machine, seconds of processor time, and the ``code``: a digest of each file of the repository that
+was read, and their last ``commit``. A result is stale when one of these has another digest now. One
+without code is older than these files.
 
 A page shows a table between `<!-- result NAME: TABLE -->` and `<!-- end -->`; TABLE is what its
 command printed above it. Within a sentence `<!-- result NAME: TABLE | ROW | COLUMN -->` shows a
@@ -149,6 +150,8 @@ def reasons(result: Result) -> tuple[str, str]:
         why = "its commands changed"
     need = result.get("need", {})
     absent = [file for file, value in need.items() if digest(ROOT / file) != value]
+    if result.get("gpu") and shutil.which("nvidia-smi") is None:
+        absent.append("a GPU")
     return why, f"needs {', '.join(absent)}" if absent else ""
 
 

@@ -170,9 +170,14 @@ def test_renewing_goes_on_notes_what_was_read_and_writes_the_page(desk):
         results.renew("one")
 
 
-def test_what_needs_files_that_are_missing_cannot_be_renewed(desk):
-    results.save("one", results.load("one") | {"need": {"data/robot.xml": "0" * 64}})
-    with pytest.raises(SystemExit, match="one: cannot be renewed here: it needs data/robot.xml"):
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [({"need": {"data/a.xml": "0" * 64}}, "data/a.xml"), ({"gpu": True}, "a GPU")],
+)
+def test_what_needs_something_that_is_missing_cannot_be_renewed(desk, monkeypatch, given, said):
+    monkeypatch.setattr(results.shutil, "which", lambda _: None)
+    results.save("one", results.load("one") | given)
+    with pytest.raises(SystemExit, match=f"one: cannot be renewed here: it needs {said}"):
         results.renew("one")
 
 
