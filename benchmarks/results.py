@@ -95,10 +95,21 @@ def digest(file: Path) -> str:
             kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
             if isinstance(node, kinds) and ast.get_docstring(node, clean=False) is not None:
                 node.body = node.body[1:] or [ast.Pass()]
-        content = ast.unparse(tree).encode()
+        content = repr(plain(tree)).encode()
     elif file.suffix == ".yaml":
         content = repr(yaml.safe_load(content)).encode()
     return hashlib.sha256(content).hexdigest()
+
+
+def plain(part: Any) -> Any:
+    """Return a syntax tree as lists that are the same in all versions of Python.
+
+    Versions differ in fields that are empty here, and in how they write code out.
+    """
+    if isinstance(part, ast.AST):
+        fields = ((name, value) for name, value in ast.iter_fields(part) if value not in (None, []))
+        return [type(part).__name__, *([name, plain(value)] for name, value in fields)]
+    return [plain(one) for one in part] if isinstance(part, list) else repr(part)
 
 
 def code_now() -> dict[str, str]:

@@ -92,6 +92,11 @@ def test_what_tells_files_apart(tmp_path, file, old, new, same):
     assert (results.digest(tmp_path / file) == results.digest(tmp_path / "old" / file)) is same
 
 
+def test_a_file_has_one_digest_in_all_versions_of_python(tmp_path):
+    (tmp_path / "a.py").write_text("def f(x: int = 1) -> str:\n    return f\"{x!r:>4} {'a'}\"\n")
+    assert results.digest(tmp_path / "a.py")[:8] == "d48c710a"
+
+
 def test_a_table_of_missions():
     rows = [("a", "ring", 0, 1.0), ("a", "ring", 1, 2.0), ("b", "ring", 0, 4.0)]
     missions = pd.DataFrame(rows, columns=["method", "track", "seed", "steps"])
