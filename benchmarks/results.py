@@ -6,10 +6,11 @@
 
 A result is a file, `benchmarks/results/NAME.json`. By hand: its ``commands``, as a page prints
 them, ``seeds`` in words, ``figures`` that they draw, patterns of data that C++ ``reads``, unseen by
-Python, and what they ``need`` that is not in the repository, with SHA-256. The rest is written by
-``--renew``: the ``tables`` that they printed, versions, machine, seconds of processor time, and the
-``code``: a digest of each file of the repository that was read, and their last ``commit``. A result
-is stale when one of these has another digest now. One without code is older than these files.
+Python, what they ``need`` that is not in the repository, with SHA-256, and ``gpu``: true, where
+they need one. The rest is written by ``--renew``: the ``tables`` that they printed, versions,
+machine, seconds of processor time, and the ``code``: a digest of each file of the repository that
+was read, and their last ``commit``. A result is stale when one of these has another digest now. One
+without code is older than these files.
 
 A page shows a table between `<!-- result NAME: TABLE -->` and `<!-- end -->`; TABLE is what its
 command printed above it. Within a sentence `<!-- result NAME: TABLE | ROW | COLUMN -->` shows a
@@ -94,10 +95,21 @@ def digest(file: Path) -> str:
             kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
             if isinstance(node, kinds) and ast.get_docstring(node, clean=False) is not None:
                 node.body = node.body[1:] or [ast.Pass()]
-        content = ast.unparse(tree).encode()
+        content = repr(plain(tree)).encode()
     elif file.suffix == ".yaml":
         content = repr(yaml.safe_load(content)).encode()
     return hashlib.sha256(content).hexdigest()
+
+
+def plain(part: Any) -> Any:
+    """Return a syntax tree as lists that are the same in all versions of Python.
+
+    Versions differ in fields that are empty here, and in how they write code out.
+    """
+    if isinstance(part, ast.AST):
+        fields = ((name, value) for name, value in ast.iter_fields(part) if value not in (None, []))
+        return [type(part).__name__, *([name, plain(value)] for name, value in fields)]
+    return [plain(one) for one in part] if isinstance(part, list) else repr(part)
 
 
 def code_now() -> dict[str, str]:
@@ -149,6 +161,8 @@ def reasons(result: Result) -> tuple[str, str]:
         why = "its commands changed"
     need = result.get("need", {})
     absent = [file for file, value in need.items() if digest(ROOT / file) != value]
+    if result.get("gpu") and shutil.which("nvidia-smi") is None:
+        absent.append("a GPU")
     return why, f"needs {', '.join(absent)}" if absent else ""
 
 

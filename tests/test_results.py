@@ -92,6 +92,11 @@ def test_what_tells_files_apart(tmp_path, file, old, new, same):
     assert (results.digest(tmp_path / file) == results.digest(tmp_path / "old" / file)) is same
 
 
+def test_a_file_has_one_digest_in_all_versions_of_python(tmp_path):
+    (tmp_path / "a.py").write_text("def f(x: int = 1) -> str:\n    return f\"{x!r:>4} {'a'}\"\n")
+    assert results.digest(tmp_path / "a.py")[:8] == "d48c710a"
+
+
 def test_a_table_of_missions():
     rows = [("a", "ring", 0, 1.0), ("a", "ring", 1, 2.0), ("b", "ring", 0, 4.0)]
     missions = pd.DataFrame(rows, columns=["method", "track", "seed", "steps"])
@@ -170,9 +175,14 @@ def test_renewing_goes_on_notes_what_was_read_and_writes_the_page(desk):
         results.renew("one")
 
 
-def test_what_needs_files_that_are_missing_cannot_be_renewed(desk):
-    results.save("one", results.load("one") | {"need": {"data/robot.xml": "0" * 64}})
-    with pytest.raises(SystemExit, match="one: cannot be renewed here: it needs data/robot.xml"):
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [({"need": {"data/a.xml": "0" * 64}}, "data/a.xml"), ({"gpu": True}, "a GPU")],
+)
+def test_what_needs_something_that_is_missing_cannot_be_renewed(desk, monkeypatch, given, said):
+    monkeypatch.setattr(results.shutil, "which", lambda _: None)
+    results.save("one", results.load("one") | given)
+    with pytest.raises(SystemExit, match=f"one: cannot be renewed here: it needs {said}"):
         results.renew("one")
 
 

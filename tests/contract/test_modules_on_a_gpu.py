@@ -42,10 +42,12 @@ def test_a_module_stays_on_its_device_and_waits_for_it_only_where_it_must(movabl
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_it_says_the_same_on_a_gpu(movable_case):
     _, case = movable_case
-    expected, module = case.say(case.make(), (4,), device="cpu"), case.make()
+    double = {"dtype": torch.float64}  # in single precision, fits differ by rounding
+    expected = case.say(case.make(**double), (4,), device="cpu", **double)
+    module = case.make(**double)
     for part in parts_of(module):
         part.to("cuda")
-    found = case.say(module, (4,), device="cuda")
+    found = case.say(module, (4,), device="cuda", **double)
     for one, other in zip(found, expected, strict=True):
         assert one.is_cuda
-        torch.testing.assert_close(one.cpu(), other, rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(one.cpu(), other, rtol=1e-5, atol=1e-6)
