@@ -14,8 +14,9 @@ class Streams:
     Missions that carry the same seed get the same numbers, and a mission gets the same
     numbers alone as among hundreds, also after others have left the batch. That makes
     comparisons between methods paired, and costs one draw per seed instead of one per
-    mission. They are drawn on the CPU whatever the device, so missions meet the same noise on all.
-    The global torch generator is never touched.
+    mission. They are drawn on the device that asks for them, by a generator per seed and device:
+    the numbers of a CPU and of a GPU differ, comparisons on one are paired. The global torch
+    generator is never touched.
 
     Args:
         salt: tells the streams of different users (planner, environment) apart.
@@ -30,7 +31,7 @@ class Streams:
     def __init__(self, salt: int = 0, seed: int = 0) -> None:
         self.salt = salt
         self.seed = seed
-        self._generators: dict[int, torch.Generator] = {}
+        self._generators: dict[tuple[int, torch.device], torch.Generator] = {}
         self._asked: tuple[Tensor | None, int] = None, 0
         self._seeds: list[int] = []
 
@@ -39,14 +40,17 @@ class Streams:
         self.seed = seed
         self._generators.clear()
 
-    def generator(self, seed: int | None = None) -> torch.Generator:
-        """Return the generator of one seed."""
-        seed = self.seed if seed is None else seed
-        if seed not in self._generators:
+    def generator(
+        self, seed: int | None = None, device: torch.device | str = "cpu"
+    ) -> torch.Generator:
+        """Return the generator of one seed on a device."""
+        key = self.seed if seed is None else seed, torch.device(device)
+        if key not in self._generators:
             # Odd factors spread both over the 64-bit seed space.
-            mixed = (seed * 2 + 1) * 0x9E3779B97F4A7C15 + self.salt * 0x632BE59BD9B4E019
-            self._generators[seed] = torch.Generator().manual_seed(mixed & (2**63 - 1))
-        return self._generators[seed]
+            mixed = (key[0] * 2 + 1) * 0x9E3779B97F4A7C15 + self.salt * 0x632BE59BD9B4E019
+            generator = torch.Generator(key[1]).manual_seed(mixed & (2**63 - 1))
+            self._generators[key] = generator
+        return self._generators[key]
 
     def normal(
         self,
@@ -64,35 +68,40 @@ class Streams:
             shape: shape of one mission's numbers.
             batch: batch shape, drawn independently when there are no ``seeds``.
             seeds: integer seeds ``(*B)``; the result is ``(*B, *shape)``.
-            device: where the numbers are moved to.
+            device: where the numbers are drawn.
             dtype: floating-point type.
         """
 
         def draw(size, generator):
             if bound is None:
-                return torch.randn(size, generator=generator, dtype=dtype)
+                return torch.randn(size, generator=generator, device=device, dtype=dtype)
             edge = math.erf(bound / math.sqrt(2))
-            noise = torch.empty(size, dtype=dtype)
+            noise = torch.empty(size, device=device, dtype=dtype)
             noise.uniform_(-edge, edge, generator=generator)
             return noise.erfinv_().mul_(math.sqrt(2)).clamp_(-bound, bound)
 
         if seeds is None:
-            return draw((*batch, *shape), self.generator()).to(device)
+            return draw((*batch, *shape), self.generator(device=device))
         if seeds.numel() == 0:
             return torch.empty((*seeds.shape, *shape), device=device, dtype=dtype)
         if self._asked[0] is not seeds or self._asked[1] != seeds._version:
             self._asked = seeds, seeds._version  # a look waits for the device
             self._seeds = seeds.flatten().tolist()
-        drawn = {seed: draw(shape, self.generator(seed)) for seed in dict.fromkeys(self._seeds)}
-        whole = torch.stack([drawn[seed] for seed in self._seeds]).to(device)
-        return whole.view(*seeds.shape, *shape)
+        drawn = {
+            seed: draw(shape, self.generator(seed, device)) for seed in dict.fromkeys(self._seeds)
+        }
+        return torch.stack([drawn[seed] for seed in self._seeds]).view(*seeds.shape, *shape)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return every generator's state, keyed by its seed, and the default ``seed``."""
-        states = {str(seed): one.get_state() for seed, one in self._generators.items()}
+        """Return every generator's state, keyed by seed and device, and the default ``seed``."""
+        states = {
+            f"{seed} {device}": generator.get_state()
+            for (seed, device), generator in self._generators.items()
+        }
         return {"seed": torch.tensor(self.seed), **states}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self.manual_seed(int(state["seed"]))
         for key in state.keys() - {"seed"}:
-            self.generator(int(key)).set_state(state[key])
+            seed, device = key.split()
+            self.generator(int(seed), device).set_state(state[key])

@@ -23,6 +23,7 @@ from afm_rl.errors import (
 )
 from afm_rl.options import choice, option, options
 from afm_rl.spaces.manifold import Manifold
+from afm_rl.streams import Streams
 
 Stack = Sequence[Tensor]
 Parameters = tuple[Iterable[Tensor], Iterable[Tensor]]  # weights and biases, layer by layer
@@ -115,14 +116,14 @@ class Ensemble(PerMissionModel):
         self.log_variance = (float(low), float(high))
         self.propagation, self.precision, self.encode = propagation, precision, encode
         self.layer_norm, self._cast = layer_norm, CastCache(torch.bfloat16)
-        self._generator = torch.Generator().manual_seed(seed)
+        self.streams, generator = Streams(salt=6, seed=seed), torch.Generator().manual_seed(seed)
         self._encoded_size = self._encoded(torch.zeros(manifold.size)).shape[-1]
         inputs, targets = self._encoded_size + action_size, manifold.tangent_size
         sizes = [inputs, *self.hidden, 2 * targets]
         draw = {"uniform": uniform_layer, "sparse": sparse_layer}[init]
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
-            weight, bias = draw(members, fan_in, fan_out, self._generator)
+            weight, bias = draw(members, fan_in, fan_out, generator)
             self.weights.append(nn.Parameter(weight))
             self.biases.append(nn.Parameter(bias))
         for name, size in (("input", inputs), ("target", targets)):
@@ -188,9 +189,7 @@ class Ensemble(PerMissionModel):
         size, parameters = self.manifold.tangent_size, self._planning_parameters()
         if self.propagation == "sample":
             mean, log_variance = self._moments(self._run(state, action, 2 * size, parameters))
-            noise = torch.randn(
-                mean.shape, generator=self._generator, dtype=mean.dtype, device="cpu"
-            ).to(mean.device)
+            noise = self.streams.normal(mean.shape, device=mean.device, dtype=mean.dtype)
             change = (mean + noise * (0.5 * log_variance).exp()).mean(-2)
         elif self.propagation == "member" and self._enough(state):
             change = self._run_shared_out(state, action, size, parameters)

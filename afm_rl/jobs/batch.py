@@ -108,7 +108,8 @@ def write_tables(folder: Path) -> None:
         # As text, so that numbers come out as they went in.
         texts = [pd.read_csv(run / MISSIONS, dtype=str, keep_default_na=False) for run in runs]
         taken = pd.concat([pd.read_csv(run / COMPUTE) for run in runs])
-        whole = taken.groupby("method", sort=False).sum().reset_index()
+        how = {name: "mean" if name.endswith("_error") else "sum" for name in taken.columns[1:]}
+        whole = taken.groupby("method", sort=False).agg(how).reset_index()
         write_whole(folder / MISSIONS, csv_text(join(texts)).encode())
         write_whole(folder / COMPUTE, csv_text(whole).encode())
     write_manifest(folder, [n for n in (RECORD, MISSIONS, COMPUTE) if (folder / n).exists()])

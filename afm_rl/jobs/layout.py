@@ -5,7 +5,7 @@ A *run* is the missions of one method in one folder::
     FOLDER/
       missions.csv         one row per mission; nothing in it depends on the clock
       steps.parquet        one row per mission and step
-      compute.csv          method, missions, steps, seconds: the time that the run took
+      compute.csv          method, missions, steps, seconds that the run took, held-out errors
       config.yaml          the settings, resolved
       figures/, video/, tensorboard/
       manifest.json        the SHA-256 of all of these; a folder with a manifest is finished

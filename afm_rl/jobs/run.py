@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
 
@@ -120,16 +120,16 @@ def finish(
         return
     cfg = OmegaConf.create(safe_load((new / CONFIG).read_bytes()))
     agent = agent or build(cfg)
-    prepare(agent, cfg.cache, progress, echo)
+    errors = prepare(agent, cfg.cache, progress, echo)
     every, keep, stop.waits = cfg.checkpoints.every, cfg.checkpoints.keep, not stop.asked
     try:
         results = run(agent, progress, new, every, keep, lambda loop: stop.asked)
     finally:
         stop.waits = False
-    _publish(folder, results)
+    _publish(folder, results, errors)
 
 
-def _publish(folder: Path, results: Results) -> None:
+def _publish(folder: Path, results: Results, errors: Mapping[str, float] | None = None) -> None:
     """Replace what a folder holds by new results. If this is interrupted, ``finish`` does it again.
 
     The new files are on the disk before an old one is touched. From the removal of the old manifest
@@ -143,7 +143,7 @@ def _publish(folder: Path, results: Results) -> None:
         # Times differ from run to run: without them the same missions make the same file.
         MISSIONS: csv_text(missions.drop(columns="seconds")).encode(),
         STEPS: steps.getvalue(),
-        COMPUTE: csv_text(compute(missions)).encode(),
+        COMPUTE: csv_text(compute(missions, errors or {})).encode(),
         measures.FILE: results.measures.to_json().encode(),
     }
     shutil.rmtree(new / READY, ignore_errors=True)
@@ -164,16 +164,19 @@ def _publish(folder: Path, results: Results) -> None:
     new.rmdir()
 
 
-def compute(missions: pd.DataFrame) -> pd.DataFrame:
+def compute(missions: pd.DataFrame, errors: Mapping[str, float]) -> pd.DataFrame:
     """Return what each method took: one core's time, summed over its missions.
 
+    Beside it stand held-out ``errors`` of what was trained before.
+
     >>> row = {"method": "a", "steps": 99, "seconds": 0.5}
-    >>> compute(pd.DataFrame([row, row])).values.tolist()
-    [['a', 2, 200, 1.0]]
+    >>> compute(pd.DataFrame([row, row]), {"flow": 0.1}).to_dict("records")
+    [{'method': 'a', 'missions': 2, 'steps': 200, 'seconds': 1.0, 'flow_error': 0.1}]
     """
     rows = missions.assign(missions=1, steps=missions["steps"] + 1)  # the last step's number
     columns = ["missions", "steps", "seconds"]
-    return rows.groupby("method", sort=False)[columns].sum().reset_index()
+    rows = rows.groupby("method", sort=False)[columns].sum().reset_index()
+    return rows.assign(**{f"{title}_error": error for title, error in errors.items()})
 
 
 class Stop:

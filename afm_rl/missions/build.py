@@ -48,6 +48,8 @@ from afm_rl.transforms import ActionFlowTransform, Guard
 from afm_rl.trust import check_targets, check_trust, instantiate, trusting
 
 GROUPS = ("robot", "cost", "planner", "dynamics", "updater", "corrector")
+UNCLAMPED = 10.0
+"""Box of an environment whose corrector is told not to clamp, in boxes of the robot."""
 DEFAULTS = {
     **{"seeds": 1, "budget": 5000, "label": None, "faults": "hold"},
     "device": "cpu",
@@ -146,14 +148,21 @@ def _build(settings: dict[str, Any]) -> Agent:
     total = len(tracks) * len(regimes) * len(seeds)
     check_count("seeds: missions, for all tracks and regimes", total, high=1_000_000)
     faults = check_choice("faults", settings["faults"], ("hold", "skip", "raise"))
+    if not isinstance(settings["corrector"], Mapping):
+        raise ConfigurationError(
+            f"corrector={settings['corrector']!r}: expected the settings of a corrector, such as "
+            "those of corrector=afm"
+        )
+    clamps = settings["corrector"].get("clamp", True)
+    reach = 1.0 if clamps else UNCLAMPED
     with blaming("robot.env"):
         env = robot.env(
             tracks=tracks,
             regime=robot.regime,
             schedule=fit_schedule(robot.schedule, regimes),
             max_steps=budget,
-            action_low=robot.action_low,
-            action_high=robot.action_high,
+            action_low=[reach * end for end in robot.action_low],
+            action_high=[reach * end for end in robot.action_high],
         )
     if robot.reported is not None:
         check_choice("robot.reported", robot.reported, env.full_observation_spec.keys())
@@ -166,11 +175,6 @@ def _build(settings: dict[str, Any]) -> Agent:
 
     dynamics = as_part("dynamics", make("dynamics", robot), DynamicsModel)
     model = dynamics.module
-    if not isinstance(settings["corrector"], Mapping):
-        raise ConfigurationError(
-            f"corrector={settings['corrector']!r}: expected the settings of a corrector, such as "
-            "those of corrector=afm"
-        )
     own = dict(settings["corrector"])  # but for what is set of whatever corrector is chosen
     options = ("enabled", "most", "rate", "extend_action_box")
     around = {key: own.pop(key) for key in options if key in own}
@@ -194,7 +198,7 @@ def _build(settings: dict[str, Any]) -> Agent:
         cost = instantiate("cost", settings["cost"])
         cost = cost if isinstance(cost, Cost) else cost(robot)
     # Without a transform the planner does not know which effects are achievable.
-    no_box = transform is None and "box_key" in settings["planner"]
+    no_box = (transform is None or not clamps) and "box_key" in settings["planner"]
     changed = {"box_key": None} if no_box else {}
     seen = "observation" if transform is None else transform.key("arrival")
     world = PlanningEnv(model, cost, *robot.action_box, observation_key=seen, observe=robot.observe)
@@ -240,7 +244,7 @@ def _build(settings: dict[str, Any]) -> Agent:
 
 def prepare(
     agent: Agent, cache: str | Path, progress: bool = False, echo: Callable[[str], None] = print
-) -> None:
+) -> dict[str, float]:
     """Train what needs training, unless it is in the cache or in :data:`TRAINED`; say the errors.
 
     Args:
@@ -249,12 +253,15 @@ def prepare(
         progress: show progress bars.
         echo: receives one line per part.
 
+    Returns:
+        Held-out errors, by what was trained.
+
     Raises:
         ConfigurationError: if the cache cannot be written; before anything is trained.
         ArtefactError: if a part in the cache is damaged.
     """
     folder = Path(cache).expanduser()
-
+    errors = {}
     for part in agent.trainings:
         description = {"name": part.title, "version": __version__, "settings": part.settings}
         description.update(getattr(part.module, "signature", {}))
@@ -264,6 +271,7 @@ def prepare(
         trained = "as it comes" if own else f"trained in {time.perf_counter() - start:.0f} s"
         spent = "from the cache" if hit else trained
         report = report if isinstance(report, Mapping) else {"error": report}
+        errors[part.title] = float(report["error"])
         echo(f"{part.title}: held-out error {report['error']:.4f} {part.unit} ({spent})")
         if "rms" in report:
             pairs = zip(report["names"], report["rms"], strict=True)
@@ -272,6 +280,7 @@ def prepare(
         if "rewards" in report:
             rewards = ", ".join(f"{reward:.3g}" for reward in report["rewards"])
             echo(f"{part.title}: reward per step of each round of data, random first: {rewards}")
+    return errors
 
 
 def _as_it_comes(part: Training, description: Mapping[str, Any]) -> Callable[[], Any] | None:

@@ -189,9 +189,13 @@ def paper_flow(
     dynamics: Part,
     train: Mapping[str, Any],
     checkpoint: str | None = CHECKPOINT,
+    clamp: bool = option(True, "keep its actions in the robot's box; the published runs did not"),
     **settings: Any,
 ) -> Part:
-    """Return the published flow, to be trained over a model whose states are plain numbers."""
+    """Return the published flow, to be trained over a model whose states are plain numbers.
+
+    Without ``clamp`` the environment takes actions of up to ten times the robot's box.
+    """
     model = dynamics.module
     if model.manifold.tangent_size != model.state_size:
         raise ConfigurationError(

@@ -16,10 +16,14 @@ from afm_rl.planning.receding import SamplingPlanner, action_spec_of
 from afm_rl.spaces.keys import as_key
 
 
-def smooth(plan: Tensor, past: Tensor, beta: float, low: Tensor, high: Tensor) -> Tensor:
+def smooth(
+    plan: Tensor, past: Tensor, beta: float, low: Tensor, high: Tensor, within: bool = True
+) -> Tensor:
     r"""Filter plans x ``(*B, H, A)`` in time, within the action box; ``beta`` 1 does not smooth.
 
     .. math:: u_h = \mathrm{clamp}(\beta\,x_h + (1 - \beta)\,u_{h-1}),\qquad u_{-1} = u_\text{past}
+
+    Where not ``within``, all is clamped after the last step, and :math:`u_{h-1}` may leave the box.
 
     >>> box = -torch.ones(1), torch.ones(1)
     >>> smooth(torch.tensor([[1.0], [1.0], [9.0]]), torch.zeros(1), 0.5, *box).squeeze(-1)
@@ -33,7 +37,11 @@ def smooth(plan: Tensor, past: Tensor, beta: float, low: Tensor, high: Tensor) -
         part.expand(*plan.shape[:-2], -1).movedim(-1, 0).contiguous() for part in (past, low, high)
     )
     for now in steps.unbind(0):
-        past = now.add_(past, alpha=1.0 - beta).clamp_(low, high)
+        past = now.add_(past, alpha=1.0 - beta)
+        if within:
+            past.clamp_(low, high)
+    if not within:
+        steps.clamp_(low, high)
     return steps.movedim(1, -1).movedim(0, -2)
 
 
@@ -80,8 +88,9 @@ class MPPI(SamplingPlanner):
     The mean lives in the tensordict, so every mission of a batch has its own and resets
     start afresh: append :meth:`make_tensordict_primer` to the environment.
 
-    The published runs used ``noise="unit"`` and ``past="shifted"``. What is compiled is kept in the
-    cache; where there is no compiler, the planner works as without, with a warning.
+    The published runs used ``noise="unit"``, ``past="shifted"`` and ``clamp="end"``. What is
+    compiled is kept in the cache; where there is no compiler, the planner works as without, with a
+    warning.
 
     Args:
         env: batch-unlocked environment to plan in; a :class:`PlanningEnv` is fastest.
@@ -113,6 +122,11 @@ class MPPI(SamplingPlanner):
             previous="smoothing starts from the previous action",
             shifted="from the shifted plan",
         ),
+        clamp: str = choice(
+            "within",
+            within="smoothing goes on from the clamped action",
+            end="candidates are clamped after it",
+        ),
         mean_key: NestedKey = option(("mppi", "mean"), "where the mean plan is kept"),
         compile: bool = option(False, "roll-outs as machine code, over equations; compiled once"),
         cache: str | Path = option("~/.cache/afm_rl", "folder of what is compiled"),
@@ -121,7 +135,8 @@ class MPPI(SamplingPlanner):
         memory = {as_key(mean_key): (horizon, *action_spec_of(env).shape)}
         super().__init__(env, memory, horizon, population, iterations, **settings)
         self.temperature, self.sigma, self.beta = temperature, sigma, beta
-        self.truncate, self.noise, self.past, self.compiles = truncate, noise, past, compile
+        self.truncate, self.noise, self.past, self.clamp = truncate, noise, past, clamp
+        self.compiles = compile
         self.__dict__["_machine_code"] = MachineCode(self, cache)
         space = self.action_spec.space
         half = (space.high - space.low) / 2
@@ -138,7 +153,8 @@ class MPPI(SamplingPlanner):
         for _ in range(self.iterations):
             eps = self._noise(td, mean, self.population, self.truncate)
             raw = eps.mul_(rows_like(scale, eps)).add_(best.unsqueeze(-3))
-            plans = smooth(raw, past.unsqueeze(-2), self.beta, low, high)
+            within = self.clamp == "within"
+            plans = smooth(raw, past.unsqueeze(-2), self.beta, low, high, within)
             if self._as_machine_code:
                 state, *task = self.env.entries(td)
                 given = state, plans, *task

@@ -159,10 +159,10 @@ def test_examples_register_one_action_as_if_it_were_another(make, states, box, w
 
 def test_training_leaves_the_noise_of_a_sampling_model_alone(make, states, make_ensemble):
     model = make_ensemble(propagation="sample")
-    before = model._generator.get_state()
+    before = model.streams.generator().get_state()
     settings = {"iterations": 2, "batch_size": 8}
     errors = {train_flow(make(), model, states, **settings) for _ in range(2)}
-    assert len(errors) == 1 and torch.equal(model._generator.get_state(), before)
+    assert len(errors) == 1 and torch.equal(model.streams.generator().get_state(), before)
 
 
 def test_the_correction_integrates_from_the_planned_action_in_raw_units(make, transitions):

@@ -12,6 +12,8 @@ from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.options import option, options
 from afm_rl.progress import Bar
 
+LOOKS, EXAMPLES = 100, 2048
+
 
 @options("corrector.train")
 def train_flow(
@@ -26,6 +28,9 @@ def train_flow(
     progress: bool = False,
 ) -> float:
     """Train the published flow by Adam, on transitions of one action registered as another's.
+
+    At a constant step size its error can grow again, so the weights that did best on held-out
+    examples are kept, of a hundred looks.
 
     The universal :class:`~afm_rl.correction.ActionFlow` knows no robot and needs none of this.
 
@@ -58,12 +63,20 @@ def train_flow(
     parameters = [parameter.requires_grad_(True) for parameter in flow.parameters()]
     optimizer = torch.optim.Adam(parameters, lr=lr, fused=True)
     bar = Bar(range(iterations), desc="training the flow", shown=progress)
+    best, best_error = flow.state_dict(), torch.inf
     for step in bar:
         with torch.enable_grad():
             loss = flow.training_loss(model, states, batch_size, generator)
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
         optimizer.step()
-        if progress and step % 100 == 0:
-            bar.set_postfix_str(f"loss {loss.item():.4f}", refresh=False)
-    return flow.held_out_error(model, states, 2048, generator)
+        if (step + 1) % max(1, iterations // LOOKS) and step + 1 < iterations:
+            continue
+        held_out = torch.Generator().manual_seed(seed + 1)  # the same examples at each look
+        error = flow.held_out_error(model, states, EXAMPLES, held_out)
+        if error < best_error:
+            best = {name: value.clone() for name, value in flow.state_dict().items()}
+            best_error = error
+        bar.set_postfix_str(f"held-out error {error:.4f}", refresh=False)
+    flow.load_state_dict(best)
+    return flow.held_out_error(model, states, EXAMPLES, generator)
