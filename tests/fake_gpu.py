@@ -30,11 +30,15 @@ class FakeGPU(TorchDispatchMode):
         self.answer, self.waits = answer, []
         self.tensors = FakeTensorMode(allow_non_fake_inputs=False)
         self.engine = mock.patch("torch.autograd._engine_run_backward", _no_gradients)
+        self.generators = mock.patch(
+            "torch.Generator", lambda device="cpu", make=torch.Generator: make()
+        )
 
     def __enter__(self):
         _lend_a_guard()
         _forget()
         self.engine.start()
+        self.generators.start()
         self.tensors.__enter__()
         return super().__enter__()
 
@@ -42,6 +46,7 @@ class FakeGPU(TorchDispatchMode):
         super().__exit__(*reason)
         self.tensors.__exit__(*reason)
         self.engine.stop()
+        self.generators.stop()
         _forget()
 
     def move(self, *parts):

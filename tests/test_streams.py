@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from fake_gpu import DEVICE, FakeGPU
 
 from afm_rl.streams import Streams
 
@@ -88,6 +89,14 @@ def test_streams_continue_from_their_saved_state():
     resumed = other.normal((4,), seeds=seeds), other.normal((4,))
     assert torch.equal(resumed[0], expected[0]) and torch.equal(resumed[1], expected[1])
     assert other.seed == 6
+
+
+def test_each_device_has_a_generator_of_its_own_per_seed():
+    with FakeGPU():
+        streams = Streams(seed=3)
+        assert streams.normal((4,)).device.type == "cpu"
+        assert streams.normal((4,), device=DEVICE, bound=2.0).device == DEVICE
+    assert streams.state_dict().keys() == {"seed", "3 cpu", "3 cuda:0"}
 
 
 @pytest.mark.parametrize("seed", [0, 1, -1, 2**40, 2**62])

@@ -152,10 +152,14 @@ def influential(settings: Mapping[str, Any]) -> dict[str, Any]:
 
     >>> influential({"budget": 5, "progress": True})
     {'budget': 5}
+    >>> influential({"device": "cuda:1"})
+    {'device': 'cuda'}
     """
     shown = ("progress", "figures", "video", "tensorboard", "label", "compare", "study", "trust")
-    done = ("overwrite", "cache", "threads", "device", "compile", "checkpoints")
+    done = ("overwrite", "cache", "threads", "compile", "checkpoints")
     kept = {name: value for name, value in settings.items() if name not in (*shown, *done)}
+    if "device" in kept:  # each kind of device has noise of its own
+        kept["device"] = str(kept["device"]).partition(":")[0]
     return json.loads(json.dumps(_without(kept, ("cache", "compile"))))
 
 

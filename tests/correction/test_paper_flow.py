@@ -185,6 +185,21 @@ def test_it_learns_what_it_is_taught(make, states):
     assert train_flow(flow, Dubins(), states, **settings) < 0.5 * before
 
 
+def test_the_weights_that_did_best_on_held_out_examples_are_kept(make, states):
+    flow, looks = make(), []
+    errors = iter([0.5, 0.2, 0.9, 0.3])  # the last one is that of new examples
+
+    def look(*arguments):
+        looks.append({name: value.clone() for name, value in flow.state_dict().items()})
+        return next(errors)
+
+    flow.held_out_error = look
+    assert train_flow(flow, Dubins(), states, iterations=3, batch_size=8) == 0.3
+    for name, value in flow.state_dict().items():
+        assert torch.equal(value, looks[1][name]) and torch.equal(value, looks[3][name])
+    assert any(not torch.equal(value, looks[2][name]) for name, value in looks[1].items())
+
+
 @pytest.fixture
 def train(make, states):
     def run(seed=0, **settings):

@@ -12,7 +12,7 @@ import afm_rl.conf
 from afm_rl.correction import ActionFlow, PaperFlow
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.errors import ArtefactError, ConfigurationError
-from afm_rl.missions import build, prepare
+from afm_rl.missions import build, prepare, run
 from afm_rl.missions.checks import blaming
 from afm_rl.storage.artefacts import save_artefact
 
@@ -40,6 +40,19 @@ def test_planner_transform_and_updater_share_one_model(configure, no_training, m
         (agent.model.model, cfg.dynamics.base) if calibrated else (agent.model, cfg.dynamics)
     )
     assert models == [trained] * (settings.get("pretrain") is not None)
+
+
+@pytest.mark.parametrize("clamp", [True, False])
+def test_only_where_it_is_asked_for_actions_leave_the_box_of_the_robot(configure, cache, clamp):
+    asked = ("method=afm_paper_code", "planner=mppi", f"corrector.clamp={str(clamp).lower()}")
+    agent = build(configure(*asked, "dynamics=physics", "updater=frozen", "budget=60"))
+    with torch.no_grad():  # a flow that asks for five times the box
+        agent.transform.corrector.head[-1].bias.copy_(torch.tensor([5.0, -5.0]))
+    planned, executed = (
+        run(agent).steps[[f"{kind}_v", f"{kind}_omega"]].to_numpy() for kind in ("planned", "executed")
+    )
+    assert (abs(planned) <= [1.0, 1.58]).all()
+    assert (abs(executed) <= [1.0, 1.58]).all() == clamp and abs(executed).max() <= 10 * 1.58
 
 
 def test_an_agent_without_a_label_is_named_after_its_parts(configure):
