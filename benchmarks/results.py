@@ -9,8 +9,8 @@ them, ``seeds`` in words, ``figures`` that they draw, patterns of data that C++ 
 Python, what they ``need`` that is not in the repository, with SHA-256, and ``gpu``: true, where
 they need one. The rest is written by ``--renew``: the ``tables`` that they printed, versions,
 machine, seconds of processor time, and the ``code``: a digest of each file of the repository that
-was read, and their last ``commit``. A result is stale when one of these has another digest now. One
-without code is older than these files.
+was read (`digests.py`), and their last ``commit``. A result is stale when one of these has another
+digest now. One without code is older than these files.
 
 A page shows a table between `<!-- result NAME: TABLE -->` and `<!-- end -->`; TABLE is what its
 command printed above it. Within a sentence `<!-- result NAME: TABLE | ROW | COLUMN -->` shows a
@@ -23,7 +23,6 @@ same command goes on there, unless code that was read has changed.
 from __future__ import annotations
 
 import argparse
-import ast
 import contextlib
 import ctypes
 import fnmatch
@@ -38,12 +37,11 @@ import shutil
 import subprocess
 import sys
 import time
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import yaml
+from digests import digest, packed, unpacked
 
 ROOT = Path(__file__).resolve().parents[1]
 MARK = re.compile(
@@ -85,33 +83,6 @@ def pages() -> list[Path]:
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-@cache
-def digest(file: Path) -> str:
-    """Return what tells a file from another one: comments, docstrings and layout do not count."""
-    content = file.read_bytes() if file.is_file() else b""
-    if file.suffix in (".py", ".pyi"):
-        tree = ast.parse(content)
-        for node in ast.walk(tree):
-            kinds = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-            if isinstance(node, kinds) and ast.get_docstring(node, clean=False) is not None:
-                node.body = node.body[1:] or [ast.Pass()]
-        content = repr(plain(tree)).encode()
-    elif file.suffix == ".yaml":
-        content = repr(yaml.safe_load(content)).encode()
-    return hashlib.sha256(content).hexdigest()
-
-
-def plain(part: Any) -> Any:
-    """Return a syntax tree as lists that are the same in all versions of Python.
-
-    Versions differ in fields that are empty here, and in how they write code out.
-    """
-    if isinstance(part, ast.AST):
-        fields = ((name, value) for name, value in ast.iter_fields(part) if value not in (None, []))
-        return [type(part).__name__, *([name, plain(value)] for name, value in fields)]
-    return [plain(one) for one in part] if isinstance(part, list) else repr(part)
-
-
 def code_now() -> dict[str, str]:
     """Return the digest of every file that may count: all of the repository but its texts."""
     listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
@@ -124,29 +95,6 @@ def asked(result: Result) -> str:
     """Return the digest of what is written by hand."""
     text = json.dumps([result["commands"], result.get("need")])
     return hashlib.sha256(text.encode()).hexdigest()[:8]
-
-
-def packed(code: dict[str, str]) -> dict[str, str]:
-    """Return digests of files with a line for each folder.
-
-    >>> packed({"a/b.py": "01", "a/c.py": "02"})
-    {'a': 'b.py 01 c.py 02'}
-    """
-    folders: dict[str, str] = {}
-    for file, value in code.items():
-        folder, _, name = file.rpartition("/")
-        folders[folder] = f"{folders.get(folder, '')} {name} {value}".lstrip()
-    return folders
-
-
-def unpacked(folders: dict[str, str]) -> dict[str, str]:
-    """Return what was packed."""
-    pairs = ((Path(folder), iter(text.split())) for folder, text in folders.items())
-    return {
-        (folder / name).as_posix(): value
-        for folder, words in pairs
-        for name, value in zip(words, words, strict=True)
-    }
 
 
 def reasons(result: Result) -> tuple[str, str]:

@@ -1,18 +1,22 @@
 """What README and docs show of measurements is what the files of results say."""
 
-import importlib.util
+import doctest
 import json
 import re
 import runpy
 import subprocess
+import sys
+from pathlib import Path
 
 import pandas as pd
 import pytest
 from pages import PAGES, ROOT, name_of
 
-spec = importlib.util.spec_from_file_location("results", ROOT / "benchmarks" / "results.py")
-results = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(results)
+sys.path.insert(0, str(ROOT / "benchmarks"))
+import digests  # noqa: E402
+import results  # noqa: E402
+
+del sys.path[0]
 table = runpy.run_path(str(ROOT / "benchmarks" / "missions.py"))["table"]
 
 NUMBER = re.compile(r"^[\s*~<>≤±+-]*[.\d][\d.,]*")
@@ -85,16 +89,65 @@ def test_every_result_is_shown_and_its_figures_are_those_of_its_file():
         ("a.csv", "x\n1\n", "x\n1\n\n", False),
     ],
 )
-def test_what_tells_files_apart(tmp_path, file, old, new, same):
-    (tmp_path / "old").mkdir()
-    (tmp_path / "old" / file).write_text(old)
-    (tmp_path / file).write_text(new)
-    assert (results.digest(tmp_path / file) == results.digest(tmp_path / "old" / file)) is same
+def test_what_tells_files_apart(file, old, new, same):
+    old, new = (digests.digest_of(text.encode(), Path(file).suffix) for text in (old, new))
+    assert (old == new) is same
 
 
-def test_a_file_has_one_digest_in_all_versions_of_python(tmp_path):
-    (tmp_path / "a.py").write_text("def f(x: int = 1) -> str:\n    return f\"{x!r:>4} {'a'}\"\n")
-    assert results.digest(tmp_path / "a.py")[:8] == "d48c710a"
+def is_a_matter_of_taste(code):
+    """Return whether `@` of a program can be `a` or `b`, and no digest says which."""
+    texts = (code.replace("@", name).encode() for name in "ab")
+    return len({digests.digest_of(text, ".py") for text in texts}) == 1
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "def f(x):\n for @ in x: x.y[@] = @",
+        "def f(x):\n @: int = 1\n def g():\n  nonlocal @\n  @ += 1\n return lambda a: a, @",
+        "def f(x):\n class C:\n  def g(self): return @\n @ = 1",
+        "def f(x):\n try: f(x)\n except E as @: return @\n with f(x) as @: return @",
+        "def f(x):\n match x:\n  case {'x': @, **y} | C(x=@, y=y): return @, y",
+        "def f(x): return [y for y in x], {@: y for @, y in x if (z := @)}, z",
+        "def f(x): return {y: z for y, z in x if (@ := y)}, @",
+        "x = [@ for @ in x]",
+    ],
+)
+def test_a_local_variable_may_have_another_name(code):
+    assert is_a_matter_of_taste(code)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "@ = 1",
+        "def f(@): return @",
+        "x = lambda @: @",
+        "f(@=1)",
+        "class C:\n @ = 1",
+        "def f(x): x.@ = 1",
+        "def f():\n import @\n def g(): return @",
+        "def f():\n def @(): pass\n return @",
+        "def f():\n global @\n @ = 1",
+        "def f():\n @ = 1\n return locals()",
+        "def f():\n @ = 1\n return f'{@=}'",
+        "def f(a):\n x = [@ for a in f(a)]",
+        "def f():\n a, b = 1, 2\n return @",
+        "def f():\n a, x = 1, 2\n class C:\n  a = 3\n  def g(self): return @",
+    ],
+)
+def test_what_others_can_say_or_see_may_not(code):
+    assert not is_a_matter_of_taste(code)
+
+
+@pytest.mark.parametrize("module", [digests, results])
+def test_examples_in_docstrings(module):
+    assert doctest.testmod(module).failed == 0
+
+
+def test_a_file_has_one_digest_in_all_versions_of_python():
+    text = b"def f(x: int = 1) -> str:\n    y = x\n    return f\"{y!r:>4} {'a'}\"\n"
+    assert digests.digest_of(text, ".py")[:8] == "67784549"
 
 
 def test_a_table_of_missions():
