@@ -10,7 +10,6 @@ import yaml
 from pages import DOCS, PAGES, ROOT, name_of
 
 import afm_rl.conf
-from afm_rl.deprecated import ARGUMENTS, NAMES
 
 PATHS = re.compile(r"`((?:afm_rl|envs|conf|examples|notebooks|tests|benchmarks)/[\w./]+)`")
 CONF = Path(afm_rl.conf.__file__).parent
@@ -28,12 +27,6 @@ def test_pages_are_short_and_what_they_name_exists(page):
     assert [path for path in PATHS.findall(text) if not (ROOT / path).exists()] == []
     if page.parent.name == "methods":
         assert text.count("\n") <= 60
-
-
-def test_the_page_about_moving_has_every_old_name():
-    page = (ROOT / "docs" / "moving.md").read_text(encoding="utf-8")
-    old = [*NAMES, *(f"({name}=" for given in ARGUMENTS.values() for name in given)]
-    assert [name for name in old if name not in page] == []
 
 
 def test_the_glossary_is_short():

@@ -18,7 +18,6 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from afm_rl.deprecated import ARGUMENTS
 from afm_rl.errors import AFMError, causes, printable
 
 
@@ -95,10 +94,6 @@ def explain(error: BaseException) -> str | None:
 
 def _unknown(key: str, overrides: Sequence[str]) -> str:
     """Return the complaint about a setting that does not exist, with the nearest one."""
-    folder, dot, name = key.rpartition(".")
-    for renamed in ARGUMENTS.values():
-        if dot and name in renamed:
-            return f"{key}: it is called {folder}.{renamed[name][0]} now"
     near = nearest(key, _known(overrides))
     advice = f"did you mean {near}?" if near else "afm-rl --cfg job shows all settings"
     return f"{key}: there is no such setting; {advice}"

@@ -25,7 +25,6 @@ from afm_rl.correction.hypotheses import (
 from afm_rl.correction.network import AxisNetwork, load_universal
 from afm_rl.correction.pairs import PairCorrector
 from afm_rl.correction.tick import Tick
-from afm_rl.deprecated import old_arguments
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.options import option, options
@@ -83,7 +82,6 @@ class ActionFlow(PairCorrector):
     healthy: Tensor
     episodic = (*PairCorrector.episodic, "under_way")
 
-    @old_arguments
     @options("corrector")
     def __init__(
         self,

@@ -1,5 +1,5 @@
 """Regimes: what changes under the robot, and when."""
 
-from afm_rl.deprecated import lazy_package
+import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_package(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -15,7 +15,6 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import FrameSkipTransform
 
 from afm_rl.correction import Corrector
-from afm_rl.deprecated import old_arguments
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_choice, check_flag, check_instance
 from afm_rl.spaces.keys import as_key, as_keys
@@ -88,7 +87,6 @@ class ActionFlowTransform(Shell, StatefulTransform):
     torch.Size([5, 2])
     """
 
-    @old_arguments
     def __init__(
         self,
         model: DynamicsModel | str,

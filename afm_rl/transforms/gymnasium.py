@@ -22,7 +22,6 @@ from torchrl.data import Bounded
 
 from afm_rl.correction import Corrector
 from afm_rl.correction.pairs import PairCorrector
-from afm_rl.deprecated import old_arguments, old_attribute
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
 from afm_rl.dynamics.mujoco_model import home_of
 from afm_rl.errors import ConfigurationError
@@ -65,7 +64,6 @@ class GymnasiumShell:
     env: Any
     _loop: CorrectionLoop
 
-    @old_arguments
     def __init__(
         self,
         env: Any,
@@ -137,8 +135,6 @@ class GymnasiumShell:
     def collection(self) -> CollectThenFit | None:
         """What is collected, and the fit to it, with ``model="learn"``."""
         return self._collection
-
-    watching = old_attribute("watching", "collection")
 
     enabled = _option("enabled")
     most = _option("most")

@@ -148,8 +148,3 @@ def test_what_is_no_mistake_is_not_explained():
 def test_lines_are_joined_so_that_they_read_well():
     assert one_line("It failed.\nTry again:\n\tone\n\ttwo\n\n") == "It failed. Try again: one, two"
     assert one_line("Wrong\nSee https://example.org/a/b for details") == "Wrong"
-
-
-def test_a_setting_with_an_old_name_is_told_its_new_one(refuse):
-    line = refuse("method=afm_physics", "corrector.readings=[recent]")
-    assert line == "afm-rl: corrector.readings: it is called corrector.hypotheses now\n"

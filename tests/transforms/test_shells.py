@@ -269,29 +269,3 @@ CAUSES = {
 def test_the_cause_is_said(cause):
     with pytest.warns(UserWarning, match=cause):
         list(wrapper(plans_of(80), torch.float32, ends=100, **CAUSES[cause]))
-
-
-OLD = {
-    "wrapper": lambda **given: ActionFlowWrapper(Puck(), push, **given),
-    "transform": lambda **given: ActionFlowTransform(KnownDynamics(push, Manifold(4), 2), **given),
-}
-
-
-@pytest.mark.parametrize("make", OLD.values(), ids=OLD)
-def test_the_old_name_of_delay_compensation_works_and_is_warned_of(make):
-    for old, new in (("predict", True), ("leave", False)):
-        with pytest.warns(DeprecationWarning, match="ActionFlow.*: late is called delay_compens"):
-            shell = make(late=old)
-        assert getattr(shell, "_options", shell).delay_compensation is new
-    with pytest.raises(ConfigurationError, match="delay_compensation='ignore'"):
-        make(late="ignore")
-
-
-def test_the_old_names_of_a_collection_work_and_are_warned_of():
-    with pytest.warns(DeprecationWarning, match="called afm_rl.transforms.collect_then_fit.Coll"):
-        from afm_rl.learning.watching import Watching
-    env = ActionFlowWrapper(Puck(), Watching(transitions=7))
-    with pytest.warns(DeprecationWarning, match="ActionFlowWrapper.watching is called collection"):
-        assert env.watching is env.collection and env.collection.transitions == 7
-    with pytest.raises(ImportError):
-        from afm_rl.learning.watching import Nothing  # noqa: F401

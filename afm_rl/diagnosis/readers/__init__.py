@@ -5,6 +5,6 @@ what was logged, and a function that reads some of it. What is a command and wha
 chosen afterwards, the same way for all formats.
 """
 
-from afm_rl.deprecated import lazy_package
+import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_package(__name__, __file__)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
