@@ -158,4 +158,5 @@ def test_imports_point_downwards(monkeypatch):
     assert upwards == {}
     # environments are found by name: only the command line and the page import them
     assert {here for here, there in layers.imports() if there == "envs"} <= {"cli", "play"}
+    assert layers.circles() == []
     assert layers.draw().count("<rect") == sum(map(len, layers.FLOORS))
