@@ -92,52 +92,32 @@ def trusted(reading: Tensor, count: Tensor, patience: float = PATIENCE) -> Tenso
     return whole(reading) & ((count == 0) | (count > patience))
 
 
-def fault_of(found: Any, shape: Sequence[int]) -> str:
-    """Return what keeps a value from being real numbers of a shape; nothing if it is that.
-
-    >>> fault_of(torch.zeros(2), (3,)), fault_of(torch.zeros(3), (3,))
-    ('shape (2,), expected (3,)', '')
-    """
-    if not isinstance(found, Tensor):
-        return f"{type(found).__name__}, expected real numbers {tuple(shape)}"
-    if found.is_complex() or found.dtype is torch.bool:
-        return f"type {found.dtype}, expected real numbers {tuple(shape)}"
-    if found.shape != torch.Size(shape):
-        return f"shape {tuple(found.shape)}, expected {tuple(shape)}"
-    return ""
-
-
-def check_numbers(key: object, given: Any, shape: Sequence[int]) -> Tensor:
+def check_numbers(key: object, given: Any, shape: Sequence[int] | None = None) -> Tensor:
     """Return what was found under a key, if it is a tensor of real numbers of a shape.
 
-    Raises:
-        ConfigurationError: otherwise, naming key, shape and what was expected.
-    """
-    fault = fault_of(given, shape)
-    if fault:
-        raise ConfigurationError(f"{key!r}: {fault}")
-    return given
-
-
-def as_reading(found: Tensor, like: Tensor) -> tuple[Tensor, str]:
-    """Return a reading of the shape and type of ``like``, and what was wrong with it.
-
-    Real numbers of another precision are converted. Anything else of another shape or type is no
-    reading: NaN.
-
     Args:
-        found: what the sensor gave.
-        like: a tensor ``(*B, S)`` of the shape and type that is expected.
+        key: where it was found.
+        given: what was found.
+        shape: of the tensor; None: any.
 
-    >>> as_reading(torch.zeros(2), torch.zeros(3))
-    (tensor([nan, nan, nan]), 'shape (2,), expected (3,)')
+    Raises:
+        ConfigurationError: otherwise, naming key, what was found and what was expected.
+
+    >>> check_numbers("action", torch.ones(2), (2,))
+    tensor([1., 1.])
+    >>> check_numbers("action", torch.ones(2), (3,))
+    Traceback (most recent call last):
+    afm_rl.errors.ConfigurationError: 'action': torch.float32 (2,), expected real numbers (3,)
     """
-    fault = fault_of(found, like.shape)
-    if not fault and not found.is_floating_point():
-        fault = f"type {found.dtype}, expected {like.dtype}"
-    if not fault:
-        return found.to(like.dtype), ""
-    return torch.full_like(like, torch.nan), fault
+    if isinstance(given, Tensor):
+        real = not given.is_complex() and given.dtype is not torch.bool
+        if real and (shape is None or given.shape == torch.Size(shape)):
+            return given
+        found = f"{given.dtype} {tuple(given.shape)}"
+    else:
+        found = type(given).__name__
+    size = "" if shape is None else f" {tuple(shape)}"
+    raise ConfigurationError(f"{key!r}: {found}, expected real numbers{size}")
 
 
 def safe_action(action: Tensor, low: Tensor, high: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:

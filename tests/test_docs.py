@@ -3,11 +3,16 @@
 import json
 import re
 import tomllib
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
+from packaging.specifiers import SpecifierSet
+from packaging.version import Version
 from pages import DOCS, PAGES, ROOT, name_of
+from torchrl.data import PrioritizedSampler
 
 import afm_rl.conf
 
@@ -116,10 +121,19 @@ def test_the_front_page_says_which_versions():
     tested = re.findall(r"^(\S+)==(\S+)", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
     table = re.search(r"tested with \|\n.*\n((?:\|.*\n)+)", (ROOT / "README.md").read_text())[1]
     for row in table.splitlines():
-        part, range_, version = (cell.strip() for cell in row.strip("|").split("|"))
-        name = part.split(",")[0]
-        assert needed[name] == range_
-        assert dict(tested).get(name, "3.11") == version
+        part, range_, versions = (cell.strip() for cell in row.strip("|").split("|"))
+        name, versions = part.split(",")[0], versions.split(", ")
+        assert needed[name] == range_ and all(map(SpecifierSet(range_).contains, versions))
+        assert name not in dict(tested) or dict(tested)[name] == versions[0]
+        if name == "Python":
+            claims = [line.rpartition(" ")[2] for line in project["classifiers"]]
+            assert [claim for claim in claims if claim.startswith("3.")] == versions
+
+
+def test_prioritised_buffers_work_with_the_torch_that_the_front_page_names():
+    ends = pytest.raises(RuntimeError, match="SumSegmentTreeFp32 is not available")
+    with nullcontext() if Version(torch.__version__) >= Version("2.14") else ends:
+        PrioritizedSampler(max_capacity=2, alpha=0.7, beta=0.5)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda p: p.stem)
@@ -144,4 +158,5 @@ def test_imports_point_downwards(monkeypatch):
     assert upwards == {}
     # environments are found by name: only the command line and the page import them
     assert {here for here, there in layers.imports() if there == "envs"} <= {"cli", "play"}
+    assert layers.circles() == []
     assert layers.draw().count("<rect") == sum(map(len, layers.FLOORS))

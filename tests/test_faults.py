@@ -1,13 +1,15 @@
 """Which readings are trusted, and which actions pass."""
 
 import math
+import re
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from afm_rl.faults import PATIENCE, as_reading, count_repeats, safe_action, trusted
+from afm_rl.errors import ConfigurationError
+from afm_rl.faults import PATIENCE, check_numbers, count_repeats, safe_action, trusted
 
 WILD = st.one_of(st.floats(width=32), st.sampled_from([math.nan, math.inf, -math.inf, 1e30, -0.0]))
 
@@ -73,21 +75,23 @@ def test_only_finite_actions_inside_the_box_pass(actions, last):
 
 
 @pytest.mark.parametrize(
-    ("found", "fault"),
+    ("entry", "found"),
     [
-        (torch.zeros(4, 2), "shape (4, 2), expected (4, 3)"),
-        (torch.zeros(4, 3, dtype=torch.int64), "type torch.int64, expected torch.float32"),
-        (
-            torch.zeros(4, 3, dtype=torch.complex64),
-            "type torch.complex64, expected real numbers (4, 3)",
-        ),
+        (torch.zeros(4, 2), "torch.float32 (4, 2)"),
+        (torch.zeros(4, 3, dtype=torch.complex64), "torch.complex64 (4, 3)"),
+        (torch.zeros(4, 3, dtype=torch.bool), "torch.bool (4, 3)"),
+        ([0.0, 0.0, 0.0], "list"),
+        (None, "NoneType"),
     ],
 )
-def test_a_malformed_reading_is_no_reading(found, fault):
-    reading, said = as_reading(found, torch.zeros(4, 3))
-    assert said == fault and reading.isnan().all() and reading.dtype == torch.float32
+def test_what_is_no_tensor_of_real_numbers_is_refused_by_its_key(entry, found):
+    words = re.escape(f"('robot', 'speed'): {found}, expected real numbers (4, 3)")
+    with pytest.raises(ConfigurationError, match=words):
+        check_numbers(("robot", "speed"), entry, (4, 3))
 
 
-def test_a_reading_of_double_precision_is_converted():
-    reading, fault = as_reading(torch.ones(2, 3, dtype=torch.float64), torch.zeros(2, 3))
-    assert not fault and torch.equal(reading, torch.ones(2, 3))
+@pytest.mark.parametrize("shape", [(4, 3), torch.Size([4, 3]), None])
+@pytest.mark.parametrize("kind", [torch.float16, torch.float64, torch.int64])
+def test_real_numbers_of_a_shape_are_handed_back(kind, shape):
+    speed = torch.zeros(4, 3, dtype=kind)
+    assert check_numbers("speed", speed, shape) is speed

@@ -41,7 +41,8 @@ LESS = {  # programs that run to their end, with less to do
     "benchmarks/suites/furuta/run.py": "--methods iCEM+LQR --parts A --runs 2 --steps 12",
 }
 BUILT = {"method=afm_sysid"}  # takes seconds a step: built, and not run
-NEED = {"robot=gymnasium": "mujoco", "robot=dm_control": "dm_control"}
+OF_DM_CONTROL = ("robot=dm_control", "robot=inversion_cartpole", "robot=inversion_cheetah")
+NEED = {"robot=gymnasium": "mujoco"} | dict.fromkeys((*OF_DM_CONTROL, "DMControlEnv"), "dm_control")
 FOLDER = re.compile(r"outputs/\S+")
 
 
@@ -209,6 +210,12 @@ ELSEWHERE = {"pip": check_install, "make": check_make, "sh": check_file, "eval":
 ELSEWHERE |= dict.fromkeys(("ray", "kill", "pytest", "cp"), check_file)
 
 
+def skip_where_missing(code):
+    for name, package in NEED.items():
+        if name in code:
+            pytest.importorskip(package)
+
+
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize(
     "command", commands(), ids=lambda c: f"{name_of(c.page)}: {' '.join(c.words)}"
@@ -216,9 +223,7 @@ ELSEWHERE |= dict.fromkeys(("ray", "kill", "pytest", "cp"), check_file)
 def test_commands_run(command, desk, cache, results, monkeypatch, capsys):
     page, words = command
     program = words[0]
-    for choice, module in NEED.items():
-        if choice in words:
-            pytest.importorskip(module)
+    skip_where_missing(words)
     if program == "afm-rl" and {"--help", "--cfg"} & set(words):
         with initialize_config_module("afm_rl.conf", version_base="1.3"):
             compose("config", [word for word in words[1:] if "=" in word])
@@ -242,5 +247,6 @@ def test_commands_run(command, desk, cache, results, monkeypatch, capsys):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=name_of)
 def test_snippets_run(page, desk, short_trainings):
+    skip_where_missing("".join(blocks(page, "python")))
     rest = write_files(page, desk)
     exec(compile("\n".join(rest), str(page), "exec"), {"__name__": "page"})

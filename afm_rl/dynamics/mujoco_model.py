@@ -112,11 +112,11 @@ def read_model(source: Any) -> tuple[Any, int]:
     name = f"dynamics.model={str(source)[:80]!r}"
     if found.nu == 0:
         raise ConfigurationError(f"{name}: expected actuators, found none")
-    check_numbers(name, found)
+    check_physics(name, found)
     return copy.copy(found), skip
 
 
-def check_numbers(name: str, model: Any) -> None:
+def check_physics(name: str, model: Any) -> None:
     """Refuse a time step that is not above 0, and masses that nothing can move."""
     check_number(f"{name}: timestep", float(model.opt.timestep), low=0.0, open_low=True)
     for kind, values in (("mass", model.body_mass), ("inertia", model.body_inertia)):

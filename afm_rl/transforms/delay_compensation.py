@@ -7,19 +7,12 @@ effects of the actions that are still under way.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
-from tensordict import TensorDictBase, unravel_key
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.correction import Corrector
 from afm_rl.dynamics import DynamicsModel
-
-if TYPE_CHECKING:
-    from afm_rl.transforms.policy import ActionFlowPolicy
 
 UNKNOWN = (
     "what is observed in the state in which they act is not known; {}, or delay_compensation=False"
@@ -52,32 +45,3 @@ def state_at_arrival(
     reached = states.gather(-2, last).squeeze(-2).to(state)
     steps = torch.where(reached.isfinite().all(-1), steps, 0)
     return torch.where((steps > 0).unsqueeze(-1), reached, state), steps
-
-
-class Arrival(TensorDictModuleBase):
-    """Writes the state in which the next action will act to ``(prefix, "arrival")``.
-
-    And in how many steps that will be to ``(prefix, "delay")`` ``(*B)``.
-
-    Put it before the planner, which reads that: ``PlanningEnv(..., observation_key=("afm",
-    "arrival"))``.
-
-    Args:
-        policy: the correction after the planner, whose memory it reads.
-    """
-
-    def __init__(self, policy: ActionFlowPolicy) -> None:
-        super().__init__()
-        self.__dict__["policy"] = policy  # shared, so not registered
-        self.in_keys = [policy.observation_key, policy.memory_key]
-        self.out_keys = [unravel_key((policy.prefix, name)) for name in ("arrival", "delay")]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Look at the state, and roll the model to where the next action will act."""
-        loop, (key, memory_key) = self.policy.loop, self.in_keys
-        state = tensordict.get(key, None)
-        memory = loop.observe(tensordict.get(memory_key), state, key)
-        enabled = tensordict.get(self.policy.enabled_key, None)
-        reached, steps = loop.arrival(memory, enabled)
-        arrival_key, delay_key = self.out_keys
-        return tensordict.set(arrival_key, reached.to(state.dtype)).set(delay_key, steps)

@@ -11,14 +11,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 
 from afm_rl.errors import ConfigurationError, check_number
-from afm_rl.faults import (
-    PATIENCE,
-    as_reading,
-    check_numbers,
-    count_repeats,
-    safe_action,
-    trusted,
-)
+from afm_rl.faults import PATIENCE, check_numbers, count_repeats, safe_action, trusted
 from afm_rl.spaces.keys import as_key
 from afm_rl.transforms.stateful import StatefulTransform
 
@@ -31,8 +24,8 @@ class Guard(StatefulTransform):
 
     The guard knows no model, planner or corrector. Put it *first* in a ``Compose``: on the way
     to the environment it is then the last. At the start of an episode the last executed action
-    is the one of the spec that is nearest to zero. A reading of another shape or type than the
-    observation spec says becomes NaN, with a warning that names both.
+    is the one of the spec that is nearest to zero. A reading of real numbers gets the type of the
+    observation spec; anything else, or of another shape, becomes NaN, with a warning that says so.
 
     The memory lives in the tensordict, under ``prefix``, one per environment of a batch:
 
@@ -86,10 +79,8 @@ class Guard(StatefulTransform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         memory = tensordict.get(self.prefix).clone(recurse=False)
         last, count = memory.get("reading"), memory.get("repeats")
-        reading, fault = as_reading(next_tensordict.get(self.observation_key), last)
-        if fault:
-            warnings.warn(f"{self.observation_key!r}: {fault}: taken for no reading", stacklevel=2)
-            next_tensordict.set(self.observation_key, reading)
+        reading = self._reading(next_tensordict, last)
+        next_tensordict.set(self.observation_key, reading)
         stamps = self._stamp(next_tensordict), memory.get("stamp", None)
         repeats = count_repeats(reading, last, count, *stamps)
         sound = trusted(last, count, self.patience) & trusted(reading, repeats, self.patience)
@@ -107,10 +98,19 @@ class Guard(StatefulTransform):
         space = self._action_spec.space
         rest, _ = safe_action(memory["executed_action"], space.low, space.high, torch.zeros(()))
         memory.update({"executed_action": rest, "sound": torch.ones_like(memory["sound"])})
-        memory.set("reading", as_reading(reading, memory["reading"])[0].clone())
+        memory.set("reading", self._reading(tensordict_reset, memory["reading"]).clone())
         if self.stamp_key is not None:
             memory.set("stamp", self._stamp(tensordict_reset))
         return tensordict_reset.set(self.prefix, memory)
+
+    def _reading(self, tensordict: TensorDictBase, like: Tensor) -> Tensor:
+        """Return the reading in the type of ``like`` ``(*B, S)``; NaN if it is no such numbers."""
+        found = tensordict.get(self.observation_key)
+        try:
+            return check_numbers(self.observation_key, found, like.shape).to(like.dtype)
+        except ConfigurationError as error:
+            warnings.warn(f"{error}: taken for no reading", stacklevel=3)
+            return torch.full_like(like, torch.nan)
 
     def _stamp(self, tensordict: TensorDictBase) -> Tensor | None:
         if self.stamp_key is None:

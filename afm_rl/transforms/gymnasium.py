@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from functools import partial
@@ -25,7 +26,7 @@ from afm_rl.correction.pairs import PairCorrector
 from afm_rl.dynamics import DynamicsModel, KnownDynamics, MuJoCoDynamics, UnknownDynamics
 from afm_rl.dynamics.mujoco_model import home_of
 from afm_rl.errors import ConfigurationError
-from afm_rl.faults import fault_of
+from afm_rl.faults import check_numbers
 from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import delay_compensation as delays
 from afm_rl.transforms.loop import CorrectionLoop, Limit, precise
@@ -441,8 +442,8 @@ def _collection(model: Model) -> CollectThenFit | None:
     return CollectThenFit() if isinstance(model, str) else None
 
 
-def as_numbers(name: str, given: Any, shape: Sequence[int] | None) -> Tensor:
-    """Return real numbers of a shape (None: of any) as a tensor, a copy.
+def as_numbers(key: str, given: Any, shape: Sequence[int] | None) -> Tensor:
+    """Return real numbers of a host, of a shape (None: of any), as a tensor, a copy.
 
     Raises:
         ConfigurationError: for anything else, naming what was given and what was expected.
@@ -450,17 +451,12 @@ def as_numbers(name: str, given: Any, shape: Sequence[int] | None) -> Tensor:
     >>> as_numbers("action", [1, 0.5], (2,))
     tensor([1.0000, 0.5000], dtype=torch.float64)
     """
-    if isinstance(given, Tensor) and given.dtype is torch.bfloat16:  # which numpy does not know
-        given = given.float()
-    try:
-        numbers = np.asarray(given.detach().cpu() if isinstance(given, Tensor) else given)
-    except ValueError:  # lists of several lengths
-        numbers = np.asarray(None)
-    found: Any = torch.from_numpy(numbers.copy()) if numbers.dtype.kind in "iufcb" else given
-    fault = fault_of(found, np.shape(numbers) if shape is None else shape)
-    if fault:
-        raise ConfigurationError(f"ActionFlowWrapper: {name}: {fault}")
-    return found if found.is_floating_point() else found.to(torch.get_default_dtype())
+    given = given.detach().cpu() if isinstance(given, Tensor) else given
+    with suppress(TypeError, ValueError):  # what is no array, or bfloat16, which numpy lacks
+        given = torch.from_numpy(np.array(given))
+    numbers = check_numbers(key, given, shape)
+    precise = numbers.dtype in (torch.float32, torch.float64)
+    return numbers if precise else numbers.to(torch.get_default_dtype())
 
 
 def _observed(env: Any, observation: Any) -> Any:

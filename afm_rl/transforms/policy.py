@@ -17,7 +17,6 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_instance
 from afm_rl.planning.receding import ZeroPrimer
 from afm_rl.spaces.keys import as_key
-from afm_rl.transforms.delay_compensation import Arrival
 from afm_rl.transforms.loop import CorrectionLoop, Limit, Shell, precise, warn_of_old
 from afm_rl.transforms.stateful import check_free
 
@@ -164,6 +163,35 @@ class ActionFlowPolicy(Shell, TensorDictModuleBase):
         entries.rename_key_("memory", "_memory")
         tensordict.set(unravel_key(("next", self.prefix)), entries)
         return tensordict.set(self.action_key, entries.get("executed_action"))
+
+
+class Arrival(TensorDictModuleBase):
+    """Writes the state in which the next action will act to ``(prefix, "arrival")``.
+
+    And in how many steps that will be to ``(prefix, "delay")`` ``(*B)``.
+
+    Put it before the planner, which reads that: ``PlanningEnv(..., observation_key=("afm",
+    "arrival"))``.
+
+    Args:
+        policy: the correction after the planner, whose memory it reads.
+    """
+
+    def __init__(self, policy: ActionFlowPolicy) -> None:
+        super().__init__()
+        self.__dict__["policy"] = policy  # shared, so not registered
+        self.in_keys = [policy.observation_key, policy.memory_key]
+        self.out_keys = [unravel_key((policy.prefix, name)) for name in ("arrival", "delay")]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Look at the state, and roll the model to where the next action will act."""
+        loop, (key, memory_key) = self.policy.loop, self.in_keys
+        state = tensordict.get(key, None)
+        memory = loop.observe(tensordict.get(memory_key), state, key)
+        enabled = tensordict.get(self.policy.enabled_key, None)
+        reached, steps = loop.arrival(memory, enabled)
+        arrival_key, delay_key = self.out_keys
+        return tensordict.set(arrival_key, reached.to(state.dtype)).set(delay_key, steps)
 
 
 class MemoryPrimer(ZeroPrimer):

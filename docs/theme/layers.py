@@ -45,29 +45,57 @@ def room(module: str) -> str:
     return name if name in rooms else "foundations"
 
 
-def imported(tree: ast.AST):
-    """Yield the names of our modules that are imported."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("afm_rl"):
-            yield from (
-                f"{node.module}.{name.name}" if node.module == "afm_rl" else node.module
-                for name in node.names
-            )
-        elif isinstance(node, ast.Import):
-            yield from (name.name for name in node.names if name.name.startswith("afm_rl."))
+def files() -> dict[str, Path]:
+    """Return the file of each module and package, by its full name."""
+    return {
+        ".".join([prefix, *path.relative_to(ROOT / top).with_suffix("").parts]).removesuffix(
+            ".__init__"
+        ): path
+        for top, prefix in (("afm_rl", "afm_rl"), ("envs", "afm_rl.envs"))
+        for path in sorted((ROOT / top).rglob("*.py"))
+    }
+
+
+def imported(path: Path) -> set[str]:
+    """Return what of ours a file imports, by full names; also within functions and for types."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    plain = {name.name for node in nodes if isinstance(node, ast.Import) for name in node.names}
+    taken = {
+        f"{node.module}.{name.name}"
+        for node in nodes
+        if isinstance(node, ast.ImportFrom)
+        for name in node.names
+    }
+    return {name for name in plain | taken if name.startswith("afm_rl.")}
 
 
 def imports() -> dict[tuple[str, str], list[str]]:
     """Find the files of each room that import from another, {(from, to): paths}."""
     found: dict[tuple[str, str], list[str]] = {}
-    for top, prefix in (("afm_rl", "afm_rl"), ("envs", "afm_rl.envs")):
-        for path in sorted((ROOT / top).rglob("*.py")):
-            inside = path.relative_to(ROOT / top).with_suffix("").parts
-            here = room(".".join([prefix, *inside]))
-            there = {room(name) for name in imported(ast.parse(path.read_text(encoding="utf-8")))}
-            for other in there - {here}:
-                found.setdefault((here, other), []).append(str(path.relative_to(ROOT)))
+    for module, path in files().items():
+        for other in {room(name) for name in imported(path)} - {room(module)}:
+            found.setdefault((room(module), other), []).append(str(path.relative_to(ROOT)))
     return found
+
+
+def circles() -> list[list[str]]:
+    """Find modules that import each other, directly or through others."""
+    modules = files()
+    handed_on = {  # by packages that load lazily: a name, and the module that has it
+        f"{package}.{name.name}": f"{package}.{node.module}"
+        for package, path in modules.items()
+        if path.with_suffix(".pyi").exists()
+        for node in ast.parse(path.with_suffix(".pyi").read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ImportFrom)
+        for name in node.names
+    }
+    pairs = nx.DiGraph()
+    for module, path in modules.items():
+        for name in imported(path):
+            while name in handed_on:
+                name = f"{handed_on[name]}.{name.rpartition('.')[2]}"
+            pairs.add_edge(module, name if name in modules else name.rpartition(".")[0])
+    return [sorted(ring) for ring in nx.strongly_connected_components(pairs) if len(ring) > 1]
 
 
 def floor_of(name: str) -> int:

@@ -188,7 +188,7 @@ def dm_control_task(
             env = suite.load(domain, task, task_kwargs={"random": draws})
         except ImportError as error:
             raise ConfigurationError(
-                "robot=dm_control: the package dm_control is missing; install afm-rl[dm_control]"
+                "robot=dm_control: no dm_control; install afm-rl[dm_control] (below Python 3.13)"
             ) from error
         except ValueError as error:
             raise ConfigurationError(f"robot.domain={domain} robot.task={task}: {error}") from error

@@ -106,6 +106,8 @@ def test_the_change_comes_when_the_schedule_says(tmp_path):
     ],
 )
 def test_mistakes_are_said_in_one_line(overrides, message):
+    if "robot=dm_control" in overrides:
+        pytest.importorskip("dm_control")
     with pytest.raises(ConfigurationError, match=message) as error:
         agent_of(*overrides, "method=physics", trusted=["tests"])
     assert "\n" not in str(error.value)

@@ -41,6 +41,7 @@ def test_a_swimmer_that_is_corrected_recovers_and_results_are_kept(table_of):
 
 
 def test_a_mission_of_the_command_line(table_of):
+    pytest.importorskip("dm_control")
     asked = ["--faults", "one reversed", "--methods", "alone", "--steps", "10"]
     rows, _ = table_of("--tasks", "cart-pole", *asked)
     assert rows["fault"].tolist() == ["none", "one reversed"] and rows["seconds"].notna().all()

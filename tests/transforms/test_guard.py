@@ -123,8 +123,8 @@ def test_one_frozen_sensor_among_others():
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (lambda seen: seen[..., :2], "'observation': shape .4, 2., expected .4, 3."),
-        (lambda seen: seen.round().long(), "'observation': type torch.int64"),
+        (lambda seen: seen[..., :2], "'observation': torch.float32 .4, 2., expected .* .4, 3."),
+        (lambda seen: seen > 0, "'observation': torch.bool"),
     ],
 )
 def test_a_malformed_reading_is_named_and_is_no_reading(wrong, words):
@@ -134,6 +134,13 @@ def test_a_malformed_reading_is_named_and_is_no_reading(wrong, words):
     sound = torch.stack([row["guard", "sound"] for row in rows], 1)
     assert sound.tolist() == [[True, True, False, False, True, True]] * 4
     assert rows[2]["observation"].isnan().all() and rows[2]["observation"].shape == (4, 3)
+
+
+@pytest.mark.parametrize("kind", [torch.float64, torch.int64])
+def test_a_reading_of_another_type_is_converted(kind):
+    rows = drive(UGVTrack(batch_size=(4,)), [Readings(lambda _, seen: seen.to(kind)), Guard()], 3)
+    assert all(row["observation"].dtype == torch.float32 for row in rows[1:])
+    assert rows[2]["guard", "reading"].equal(rows[2]["observation"].to(kind).float())
 
 
 def test_a_time_stamp_that_stands_still():
@@ -147,5 +154,5 @@ def test_a_time_stamp_that_stands_still():
 def test_an_action_of_another_shape_is_refused():
     env = TransformedEnv(UGVTrack(batch_size=(4,)), Compose(Guard()))
     td = env.reset().set("action", torch.zeros(4, 3))
-    with pytest.raises(ConfigurationError, match=r"'action': shape \(4, 3\), expected \(4, 2\)"):
+    with pytest.raises(ConfigurationError, match=r"\(4, 3\), expected real numbers \(4, 2\)"):
         env.step(td)

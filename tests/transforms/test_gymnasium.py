@@ -135,7 +135,7 @@ def test_steps_need_a_reset_and_go_on_after_what_is_no_action():
     with pytest.raises(ResetNeeded):
         env.step(np.zeros(2))
     env.reset(seed=0)
-    with pytest.raises(ConfigurationError, match="action: NoneType"):
+    with pytest.raises(ConfigurationError, match="'action': NoneType"):
         env.step(None)
     env.step(np.zeros(2))
 
