@@ -49,7 +49,8 @@ def test_only_where_it_is_asked_for_actions_leave_the_box_of_the_robot(configure
     with torch.no_grad():  # a flow that asks for five times the box
         agent.transform.corrector.head[-1].bias.copy_(torch.tensor([5.0, -5.0]))
     planned, executed = (
-        run(agent).steps[[f"{kind}_v", f"{kind}_omega"]].to_numpy() for kind in ("planned", "executed")
+        run(agent).steps[[f"{kind}_v", f"{kind}_omega"]].to_numpy()
+        for kind in ("planned", "executed")
     )
     assert (abs(planned) <= [1.0, 1.58]).all()
     assert (abs(executed) <= [1.0, 1.58]).all() == clamp and abs(executed).max() <= 10 * 1.58
