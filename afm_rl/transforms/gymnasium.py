@@ -451,9 +451,11 @@ def as_numbers(key: str, given: Any, shape: Sequence[int] | None) -> Tensor:
     >>> as_numbers("action", [1, 0.5], (2,))
     tensor([1.0000, 0.5000], dtype=torch.float64)
     """
-    given = given.detach().cpu() if isinstance(given, Tensor) else given
-    with suppress(TypeError, ValueError):  # what is no array, or bfloat16, which numpy lacks
-        given = torch.from_numpy(np.array(given))
+    if isinstance(given, Tensor):
+        given = given.detach().cpu().clone()
+    else:
+        with suppress(TypeError, ValueError):  # what is no array
+            given = torch.from_numpy(np.array(given))
     numbers = check_numbers(key, given, shape)
     precise = numbers.dtype in (torch.float32, torch.float64)
     return numbers if precise else numbers.to(torch.get_default_dtype())
