@@ -3,11 +3,13 @@
 import copy
 import functools
 import json
+import math
 import os
 import re
 
 import pytest
 import torch
+from harness import HIGH, LOW, track_of
 from hypothesis import settings
 
 import afm_rl.correction.training
@@ -17,6 +19,7 @@ from afm_rl.correction import ActionFlow
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins, Ensemble
 from afm_rl.learning import pretrain_ensemble
+from afm_rl.planning import GoalDistance, PlanningEnv
 from afm_rl.regimes import ActionGain
 from afm_rl.spaces.manifold import Manifold
 
@@ -24,7 +27,6 @@ torch.set_num_threads(1)
 settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=50)
 settings.load_profile("repeatable")
 
-LOW, HIGH = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])
 STATES = torch.tensor([-5.0, -5.0, -3.14]), torch.tensor([5.0, 5.0, 3.14])
 
 
@@ -45,6 +47,12 @@ def box():
 def states():
     """The box from which the small models were trained."""
     return STATES
+
+
+@pytest.fixture
+def world(box):
+    """The ground robot as a planner imagines it, on its way to a goal."""
+    return PlanningEnv(Dubins(), GoalDistance(), *box)
 
 
 @pytest.fixture
@@ -191,3 +199,17 @@ def short_trainings(monkeypatch):
             return _whole(*args, **{**settings, **_small, "progress": False})
 
         monkeypatch.setattr(module, name, functools.wraps(whole)(short))
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    """Folder of trained parts that all tests share."""
+    return tmp_path_factory.getbasetemp() / "trained_parts"
+
+
+@pytest.fixture
+def ring(tmp_path_factory):
+    """A round track of 20 targets, 1 m apart."""
+    angles = [2 * math.pi * k / 19 for k in range(19)]
+    points = [(3.02 * math.cos(a), 3.02 * math.sin(a)) for a in angles]
+    return track_of(tmp_path_factory.mktemp("tracks") / "ring.csv", points)

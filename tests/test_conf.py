@@ -1,16 +1,14 @@
 """Every choice of every configuration group says what it is, composes, and runs."""
 
 import copy
-import functools
 import itertools
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_module
+from harness import composed, shrink
 from omegaconf import OmegaConf
-from small import shrink
 
 import afm_rl.conf
 from afm_rl.missions import build, prepare, run
@@ -66,18 +64,6 @@ EACH = [
 EACH += [["method=online_pe", "seeds=2", *planner] for planner in choices("planner")]
 EACH += [[*cost, "method=afm_physics"] for cost in choices("cost")]
 EACH += choices("robot")
-
-
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory):
-    """Folder of trained parts that all these tests share."""
-    return tmp_path_factory.getbasetemp() / "trained_parts"
-
-
-@functools.cache
-def composed(*overrides):
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        return compose("config", list(overrides))
 
 
 @pytest.mark.parametrize("overrides", EACH, ids=" ".join)

@@ -3,13 +3,12 @@
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
+from harness import agent_trusting
 from torch import nn
 
-from afm_rl.cli.overrides import checked
 from afm_rl.correction import Corrector
 from afm_rl.errors import ConfigurationError
-from afm_rl.missions import build, run
+from afm_rl.missions import run
 from afm_rl.missions.factories import as_part
 
 FERRY = Path(__file__).parents[1] / "examples" / "external_project" / "ferry"
@@ -17,9 +16,7 @@ REVERSED = ["regimes=[{east_gain: -1, north_gain: -1}]", "robot.schedule.at=[]"]
 
 
 def agent_of(*overrides):
-    asked = [f"trust=[{FERRY}]", *overrides]
-    with checked(asked) as names, initialize_config_module("afm_rl.conf", version_base="1.3"):
-        return build(compose("config", asked), names)
+    return agent_trusting(FERRY, *overrides)
 
 
 def after(*overrides):

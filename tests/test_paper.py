@@ -4,7 +4,7 @@ import re
 
 import pytest
 import yaml
-from hydra import compose, initialize_config_module
+from harness import composed
 from omegaconf import OmegaConf
 from pages import DOCS, ROOT
 
@@ -48,24 +48,15 @@ def test_the_page_has_what_it_is_for():
     assert len(ELEMENTS) >= 25 and len(SETTINGS) >= 35
 
 
-@pytest.fixture(scope="module")
-def composed():
-    found = {}
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        for method in {method for method, *_ in SETTINGS}:
-            found[method] = compose("config", ["agent=paper", *([method] if method else [])])
-    return found
-
-
 @pytest.mark.parametrize(("method", "key", "value"), SETTINGS)
-def test_the_preset_is_what_the_paper_states(composed, method, key, value):
-    found = OmegaConf.select(composed[method], key)
+def test_the_preset_is_what_the_paper_states(method, key, value):
+    found = OmegaConf.select(composed("agent=paper", *([method] if method else [])), key)
     found = OmegaConf.to_container(found) if OmegaConf.is_config(found) else found
     stated = yaml.safe_load(value)
     assert found == (float(stated) if isinstance(found, float) else stated)
 
 
-def test_no_setting_of_the_preset_is_left_unsaid(composed):
+def test_no_setting_of_the_preset_is_left_unsaid():
     def leaves(node, path):
         for key, value in node.items():
             if isinstance(value, dict):
@@ -73,18 +64,16 @@ def test_no_setting_of_the_preset_is_left_unsaid(composed):
             elif key not in OURS:
                 yield f"{path}.{key}"
 
-    settings = OmegaConf.to_container(composed[None], resolve=True)
+    settings = OmegaConf.to_container(composed("agent=paper"), resolve=True)
     wanted = {leaf for part in PARTS for leaf in leaves(settings[part], part)} | {OPTIMISER}
     assert wanted == {key for method, key, _ in SETTINGS if method is None}
 
 
 def test_the_study_runs_the_preset():
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        study = compose("config", ["study=ugv_paper"])
-        for method in study.compare:
-            one, alone = (
-                compose("config", [choice, f"method={method}"])
-                for choice in ("study=ugv_paper", "agent=paper")
-            )
-            assert all(one[part] == alone[part] for part in PARTS)
+    study = composed("study=ugv_paper")
+    for method in study.compare:
+        one, alone = (
+            composed(choice, f"method={method}") for choice in ("study=ugv_paper", "agent=paper")
+        )
+        assert all(one[part] == alone[part] for part in PARTS)
     assert {"afm_paper", "afm_paper_code", "afm_dr", "online_pe"} <= set(study.compare)

@@ -11,11 +11,11 @@ import tomllib
 
 import pandas as pd
 import pytest
+from harness import shrink
 from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException
 from pages import PAGES, ROOT, blocks, commands, name_of, write_files
-from small import shrink
 
 from afm_rl.cli import diagnose, play, report
 from afm_rl.cli.overrides import checked
@@ -60,12 +60,6 @@ def desk(monkeypatch, tmp_path):
     suites = (ROOT / "benchmarks" / "suites").glob("*/*.py")
     for name in ("mine", *(file.stem for file in suites)):
         sys.modules.pop(name, None)
-
-
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory):
-    """Folder of trained parts that all these tests share."""
-    return tmp_path_factory.getbasetemp() / "trained_parts"
 
 
 @pytest.fixture(scope="session")

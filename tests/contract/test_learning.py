@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from harness import weights
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -26,10 +27,6 @@ def adam(parameters):
 
 def updater_of(model):
     return OnlineUpdater(GaussianNLLLoss(model), adam)
-
-
-def weights(model):
-    return torch.cat([parameter.detach().flatten() for parameter in model.parameters()])
 
 
 def agent(model, box):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import roma
 import torch
+from harness import level
 
 from afm_rl.dynamics import Dubins, DynamicsModel, Oracle, Quadrotor
 from afm_rl.dynamics import quadrotor as equations
@@ -15,12 +16,6 @@ from afm_rl.spaces.airframe import QuadrotorBody, mix, unmix, within_motors
 BODY = QuadrotorBody()
 INERTIA = torch.tensor(BODY.inertia, dtype=torch.float64)
 SCALE = torch.tensor([0.1, 2e-5, 2e-5, 5e-6], dtype=torch.float64)
-
-
-def level(*batch, dtype=torch.float64):
-    state = torch.zeros(*batch, 13, dtype=dtype)
-    state[..., 9] = 1.0
-    return state
 
 
 def flights(*batch, seed=0):
@@ -95,7 +90,7 @@ def test_actions_within_the_means_of_the_motors_are_kept_to_the_bit():
 def test_the_wind_pushes():
     wind = torch.tensor([0.5, 0.0, 1.0], dtype=torch.float64)
     action = torch.tensor([BODY.hover_thrust, 0, 0, 0], dtype=torch.float64)
-    after = quadrotor_path(level(), action, 2.0, 10, BODY, wind)[-1]
+    after = quadrotor_path(level(dtype=torch.float64), action, 2.0, 10, BODY, wind)[-1]
     torch.testing.assert_close(after[:3], 2 * wind)
     torch.testing.assert_close(after[3:6], 2 * wind)
 
@@ -121,7 +116,7 @@ def test_the_rate_is_that_of_a_rigid_body():
 def test_angular_momentum_and_energy_are_conserved_without_moments():
     body = QuadrotorBody(inertia=(1e-5, 2e-5, 3.5e-5))
     inertia = torch.tensor(body.inertia, dtype=torch.float64)
-    state = level()
+    state = level(dtype=torch.float64)
     state[10:] = torch.tensor([3.0, 0.1, -2.0])
     path = quadrotor_path(state, torch.zeros(4), 2.0, 1000, body)
     spin = path[:, 10:]
@@ -194,7 +189,7 @@ def test_missions_are_linearised_with_parameters_of_their_own():
 
 
 def test_the_jacobian_at_rest_is_finite():
-    found = Quadrotor().jacobian(level(), torch.zeros(4, dtype=torch.float64))
+    found = Quadrotor().jacobian(level(dtype=torch.float64), torch.zeros(4, dtype=torch.float64))
     assert found.shape == (12, 4) and found.isfinite().all()
 
 

@@ -1,7 +1,7 @@
 """Two processes give the same bytes, whatever the method, over many steps."""
 
 import pytest
-from small import shrink
+from harness import shrink
 
 from afm_rl.jobs.batch import run_batch
 from afm_rl.jobs.executor import LocalExecutor

@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from harness import same_weights
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Calibrated, Dubins, Ensemble
@@ -29,11 +30,6 @@ def observed(transitions):
     state, action = transitions(20, 50)
     data = TensorDict({"observation": state, "action": action}, [20, 50])
     return data.set(("next", "observation"), Dubins()(state, action))
-
-
-def same(left, right):
-    right = right.state_dict()
-    return all(torch.equal(value, right[name]) for name, value in left.state_dict().items())
 
 
 def test_it_learns_what_was_observed(make_ensemble, observed, transitions):
@@ -143,7 +139,7 @@ def test_the_seed_decides_everything_and_the_global_generator_nothing(make_ensem
         models.append(make_ensemble())
         fit_ensemble(models[-1], observed, seed=seed, **SHORT)
     assert torch.equal(torch.get_rng_state(), before)
-    assert same(models[0], models[1]) and not same(models[0], models[2])
+    assert same_weights(models[0], models[1]) and not same_weights(models[0], models[2])
 
 
 @pytest.mark.filterwarnings("ignore:the model leaves")
@@ -198,7 +194,7 @@ def test_keys_may_be_others(make_ensemble, observed):
     fit_ensemble(models[0], observed, **SHORT)
     keys = ("pose", ["agent", "force"], ["agent", "later"])
     fit_ensemble(models[1], named, keys=keys, **SHORT)
-    assert same(*models)
+    assert same_weights(*models)
 
 
 @pytest.mark.parametrize("key", ["observation", "action", ("next", "observation")])

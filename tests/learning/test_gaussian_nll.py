@@ -4,15 +4,11 @@ import math
 
 import pytest
 import torch
+from harness import transition
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins
 from afm_rl.learning import GaussianNLLLoss, gaussian_nll
-
-
-def transition(state, action, next_state):
-    td = TensorDict({"observation": state, "action": action}, state.shape[:-1])
-    return td.set(("next", "observation"), next_state)
 
 
 @pytest.fixture

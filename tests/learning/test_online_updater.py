@@ -5,23 +5,13 @@ import math
 
 import pytest
 import torch
-from tensordict import TensorDict
+from harness import transition, weights
 
-from afm_rl.dynamics import Dubins
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, ResetAdam
-
-
-def transition(state, action, factor=-1.0):
-    td = TensorDict({"observation": state, "action": action}, state.shape[:-1])
-    return td.set(("next", "observation"), Dubins()(state, factor * action))
 
 
 def updater_of(model, lr=1e-2, **settings):
     return OnlineUpdater(GaussianNLLLoss(model), lambda p: ResetAdam(p, lr=lr), **settings)
-
-
-def weights(model, index=...):
-    return torch.cat([parameter.detach()[index].flatten() for parameter in model.parameters()])
 
 
 @pytest.fixture

@@ -1,15 +1,11 @@
 """Updaters that do not learn, and what learners learn from."""
 
 import torch
+from harness import transition
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins, Oracle
 from afm_rl.learning import GaussianNLLLoss, OnlineUpdater, OracleUpdater, Updater
-
-
-def transition(state, action, next_state):
-    td = TensorDict({"observation": state, "action": action}, state.shape[:-1])
-    return td.set(("next", "observation"), next_state)
 
 
 def test_a_frozen_model_is_measured_only(make_ensemble, transitions):

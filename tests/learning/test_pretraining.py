@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from harness import same_weights
 
 from afm_rl.dynamics import Dubins
 from afm_rl.learning import fitting, pretrain_ensemble
@@ -22,11 +23,6 @@ def fit(make_ensemble, states, box):
         return model, report.error
 
     return run
-
-
-def same(left, right):
-    right = right.state_dict()
-    return all(torch.equal(value, right[name]) for name, value in left.state_dict().items())
 
 
 def test_a_small_budget_already_teaches(trained_ensemble, trained_error, transitions):
@@ -49,7 +45,7 @@ def test_the_best_epoch_is_kept_and_its_error_returned(fit, monkeypatch):
     monkeypatch.setattr(fitting, "judge", judge)
     model, best = fit(epochs=4)
     assert best == pytest.approx(0.2)
-    assert [same(model, other) for other in seen] == [False, True, False, False]
+    assert [same_weights(model, other) for other in seen] == [False, True, False, False]
 
 
 @pytest.mark.parametrize(("tolerance", "epochs"), [(0.0, 5), (0.1, 3), (0.6, 2)])

@@ -4,18 +4,13 @@ import copy
 
 import pytest
 import torch
-from tensordict import TensorDict
+from harness import transition
 
 from afm_rl.dynamics import Dubins
 from afm_rl.learning import GaussianNLLLoss, StreamXUpdater, gaussian_nll, pretrain_ensemble
 
 FORMS = ["error", "loss"]
 SETTINGS = {"init": "sparse", "layer_norm": True, "running_count": 1000}
-
-
-def transition(state, action, factor=-1.0):
-    td = TensorDict({"observation": state, "action": action}, state.shape[:-1])
-    return td.set(("next", "observation"), Dubins()(state, factor * action))
 
 
 def updater_of(model, **settings):

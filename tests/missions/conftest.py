@@ -1,36 +1,20 @@
 """Small agents, composed as the command line composes them, and a small track."""
 
 import copy
-import functools
-import math
 from types import SimpleNamespace
 
 import pytest
-from hydra import compose, initialize_config_module
+from harness import composed, shrink, track_of
 from omegaconf import OmegaConf
-from small import shrink
 
 from afm_rl.missions import build, prepare, run
 from afm_rl.trust import instantiate
 
 SMALL = {"budget": 12, "planner.population": 16, "planner.elites": 4}
-TARGETS = 20  # of the ring
-
-
-@pytest.fixture(scope="session")
-def composed():
-    """Compose a configuration from overrides, each once: it takes a tenth of a second."""
-
-    @functools.cache
-    def make(*overrides):
-        with initialize_config_module("afm_rl.conf", version_base="1.3"):
-            return compose("config", list(overrides))
-
-    return make
 
 
 @pytest.fixture
-def configure(composed):
+def configure():
     """Make a small configuration from overrides."""
 
     def make(*overrides, **settings):
@@ -42,12 +26,6 @@ def configure(composed):
         return cfg
 
     return make
-
-
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory):
-    """Folder of trained parts that all these tests share."""
-    return tmp_path_factory.getbasetemp() / "trained_parts"
 
 
 @pytest.fixture
@@ -90,21 +68,7 @@ def no_training(monkeypatch):
     monkeypatch.setattr("afm_rl.missions.factories.Training.train", never)
 
 
-def _track(path, points):
-    path.write_text("x,y\n" + "".join(f"{x:.4f},{y:.4f}\n" for x, y in points))
-    return str(path)
-
-
-@pytest.fixture
-def ring(tmp_path):
-    """A round track of 20 targets, 1 m apart."""
-    angles = [2 * math.pi * k / (TARGETS - 1) for k in range(TARGETS - 1)]
-    radius = (TARGETS - 1) / (2 * math.pi)
-    points = [(radius * math.cos(a), radius * math.sin(a)) for a in angles]
-    return _track(tmp_path / "ring.csv", points)
-
-
 @pytest.fixture
 def spot(tmp_path):
     """A track of three targets around the start: one is reached at each step."""
-    return _track(tmp_path / "spot.csv", [(0.0, 0.0), (0.02, 0.0)])
+    return track_of(tmp_path / "spot.csv", [(0.0, 0.0), (0.02, 0.0)])

@@ -1,20 +1,16 @@
 """Missions whose model is calibrated on the way."""
 
-import pandas as pd
 import pytest
+from harness import assert_same_results
 
 from afm_rl.missions import build, run
 
 
-def same(left, right):
-    for one, other in ((left.missions, right.missions), (left.steps, right.steps)):
-        one, other = (t.drop(columns=["seconds", "method"], errors="ignore") for t in (one, other))
-        pd.testing.assert_frame_equal(one, other, check_exact=True)
-
-
 def test_nothing_changes_where_nothing_changed(make_agent, ring):
     settings = {"tracks": [ring], "regimes": "none", "seeds": 2, "budget": 20}
-    same(*(run(make_agent(f"method={name}", **settings)) for name in ("rls", "physics")))
+    assert_same_results(
+        *(run(make_agent(f"method={name}", **settings)) for name in ("rls", "physics")), "method"
+    )
 
 
 @pytest.mark.parametrize("method", ["rls", "oracle"])

@@ -1,16 +1,14 @@
 import pytest
 import torch
-from hydra import compose, initialize_config_module
+from harness import agent_of
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.missions import build
 from afm_rl.missions.collected import transitions
 
 
 @pytest.fixture
 def robot():
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        return build(compose("config", ["robot=gymnasium", "method=frozen_pe"])).robot
+    return agent_of("robot=gymnasium", "method=frozen_pe").robot
 
 
 def test_data_under_regimes_are_of_each_by_turns(robot):

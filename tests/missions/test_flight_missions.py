@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from harness import assert_same_results, composed
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.missions import build, run
@@ -20,11 +21,6 @@ def fly(drive):
         return drive("robot=quadrotor", *overrides, **{**QUICK, **settings})
 
     return go
-
-
-def same(left, right):
-    left, right = (table.drop(columns="seconds", errors="ignore") for table in (left, right))
-    pd.testing.assert_frame_equal(left, right, check_exact=True)
 
 
 def test_the_columns(fly):
@@ -112,8 +108,7 @@ def test_an_interrupted_run_goes_on_to_the_bit(make_agent, tmp_path):
     with pytest.raises(Stopped):
         run(agent(), checkpoint=path, stopped=lambda loop: loop.step == 5)
     resumed = run(agent(), checkpoint=path)
-    same(whole.missions, resumed.missions)
-    same(whole.steps, resumed.steps)
+    assert_same_results(whole, resumed)
 
 
 def test_a_lost_flight_leaves_the_batch(fly):
@@ -200,7 +195,7 @@ def test_a_network_may_be_trained_before_the_flight(make_agent, randomised):
     assert np.isfinite(run(agent).steps.to_numpy(dtype=float)).all()
 
 
-def test_robots_say_which_readings_make_sense(composed):
+def test_robots_say_which_readings_make_sense():
     chosen = composed("robot=quadrotor", "method=afm_physics").corrector
     assert list(chosen.hypotheses) == ["recent", "newest", "varied"]
     assert composed("robot=ugv", "method=afm_physics").corrector.hypotheses is None

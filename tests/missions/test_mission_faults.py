@@ -3,9 +3,9 @@
 import warnings
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
+from harness import assert_same_tables
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Transform
 
@@ -66,12 +66,6 @@ def of(table, mission):
     return table[table["mission"] == mission].drop(columns="seconds", errors="ignore")
 
 
-def same(left, right):
-    pd.testing.assert_frame_equal(
-        left.reset_index(drop=True), right.reset_index(drop=True), check_exact=True
-    )
-
-
 @pytest.fixture
 def three(make_agent, ring):
     def make(*overrides, **settings):
@@ -86,8 +80,8 @@ def test_a_reading_that_is_nan_is_survived_and_the_others_do_not_notice(three, p
     healthy = drive(three(*PLANNERS[planner]))
     faulty = drive(three(*PLANNERS[planner]), Sensor([2], NAN))
     for mission in (1, 2):
-        same(of(faulty.steps, mission), of(healthy.steps, mission))
-        same(of(faulty.missions, mission), of(healthy.missions, mission))
+        assert_same_tables(of(faulty.steps, mission), of(healthy.steps, mission))
+        assert_same_tables(of(faulty.missions, mission), of(healthy.missions, mission))
     assert faulty.missions["faults"].tolist() == [2, 0, 0]  # into the reading, and out of it
     first = of(faulty.steps, 0)
     assert len(first) == 8
@@ -171,5 +165,5 @@ def test_a_track_in_map_coordinates_is_driven_to_the_bit_as_near_zero(make_agent
         corners = ((0, 0), (3, 0), (3, 3), (0, 3))
         path.write_text("x,y\n" + "".join(f"{east + a},{north + b}\n" for a, b in corners))
         steps.append(run(make_agent("method=oracle", tracks=str(path), budget=60)).steps)
-    same(*steps)
+    assert_same_tables(*steps)
     assert steps[0]["reached"].max() >= 3

@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 import torch
+from harness import composed
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.missions import build, prepare
@@ -58,7 +59,7 @@ def test_only_what_the_result_depends_on_is_part_of_the_key(prepared, cache):
     assert not any("from the cache" in line for line in lines)
 
 
-def test_the_ensemble_of_the_first_command_comes_with_the_library(composed, tmp_path):
+def test_the_ensemble_of_the_first_command_comes_with_the_library(tmp_path):
     """``RENEW=1 pytest`` trains it anew, in a minute: after each change of what it depends on."""
     agent, lines, own = build(composed("method=online_pe")), [], TRAINED / "ensemble.safetensors"
     if os.environ.get("RENEW"):

@@ -7,18 +7,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from harness import assert_same_results, assert_same_tables
 
 import afm_rl.conf
 from afm_rl.missions import run as run_missions
 
 BACKWARDS = {"v_gain": -1.0, "omega_gain": 1.0}
 STALLED = {"v_gain": 0.0, "omega_gain": 0.0}
-
-
-def same(left, right):
-    """Compare tables bit for bit, but for the time that was spent."""
-    left, right = (t.drop(columns="seconds", errors="ignore") for t in (left, right))
-    pd.testing.assert_frame_equal(left, right, check_exact=True)
 
 
 def alone(run, mission):
@@ -123,8 +118,7 @@ def test_two_runs_are_bit_identical_and_leave_the_global_generator_alone(drive, 
     before = torch.manual_seed(2).get_state()
     again = drive(*f"method={method}".split(), **settings)
     assert torch.equal(before, torch.random.get_rng_state())
-    same(first.steps, again.steps)
-    same(first.missions, again.missions)
+    assert_same_results(first, again)
     assert alone(first, 0)["x"].ne(alone(first, 1)["x"]).any()  # seeds matter
 
 
@@ -133,9 +127,9 @@ def test_a_mission_alone_is_the_same_as_among_others(drive, ring, spot, method):
     regimes, settings = [{}, BACKWARDS], {"budget": 60}
     batch = drive(f"method={method}", tracks=[spot, ring], regimes=regimes, seeds=2, **settings)
     single = drive(f"method={method}", tracks=ring, regimes=[BACKWARDS], seeds=[1], **settings)
-    same(alone(batch, 7), single.steps)
+    assert_same_tables(alone(batch, 7), single.steps)
     kept = [name for name in single.missions if name != "mission"]
-    same(batch.missions.loc[[7], kept].reset_index(drop=True), single.missions[kept])
+    assert_same_tables(batch.missions.loc[[7], kept], single.missions[kept])
 
 
 @pytest.mark.parametrize(("method", "budget"), [("afm_physics", 20), ("online_pe", 6)])

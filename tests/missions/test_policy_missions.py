@@ -6,12 +6,12 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_module
+from harness import agent_of
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from afm_rl.envs import gymnasium_task
 from afm_rl.errors import AFMError
-from afm_rl.missions import build, run
+from afm_rl.missions import run
 from afm_rl.planning import StoredPolicy, load_policy, save_policy
 from afm_rl.storage.artefacts import save_tensors
 
@@ -21,13 +21,11 @@ RUNNER = ["robot.id=HalfCheetah-v5", f"planner.file={CHEETAH}", "robot.steps=50"
 SWINGER = ["robot.id=Pendulum-v1", f"planner.file={PENDULUM}"]
 
 
-def agent_of(*overrides):
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        return build(compose("config", ["robot=gymnasium", "planner=policy", *overrides]))
+PLAYED = ("robot=gymnasium", "planner=policy")
 
 
 def returns_of(*overrides):
-    return run(agent_of(*overrides)).missions["return"].to_numpy()
+    return run(agent_of(*PLAYED, *overrides)).missions["return"].to_numpy()
 
 
 @pytest.mark.parametrize(
@@ -90,8 +88,8 @@ def test_a_correction_brings_back_what_a_reversal_takes():
 
 
 def test_actions_are_noisy_only_while_data_are_collected():
-    planner = agent_of(*SWINGER, "method=physics").planner
-    td = agent_of(*SWINGER, "method=physics").env.reset()
+    planner = agent_of(*PLAYED, *SWINGER, "method=physics").planner
+    td = agent_of(*PLAYED, *SWINGER, "method=physics").env.reset()
     told = planner(td.clone())["action"]
     assert planner(td.clone())["action"].equal(told)
     with set_exploration_type(ExplorationType.RANDOM):
@@ -104,7 +102,9 @@ def test_a_learned_model_is_that_of_the_policy_whatever_its_file_is_called(tmp_p
     for scale in (1.0, 2.0):
         policy = StoredPolicy([(scale * torch.eye(1, 3), torch.zeros(1))], *box)
         save_policy(tmp_path / "p.safetensors", policy, {})
-        agent = agent_of(f"planner.file={tmp_path / 'p.safetensors'}", "method=afm_frozen_pe")
+        agent = agent_of(
+            *PLAYED, f"planner.file={tmp_path / 'p.safetensors'}", "method=afm_frozen_pe"
+        )
         found.append(agent.trainings[0].settings)
     assert found[0] != found[1]
 
@@ -119,5 +119,5 @@ def test_files_that_do_not_fit_are_refused_in_one_line(tmp_path):
         ([f"planner.file={PENDULUM}", "planner.noise=-1"], "planner.noise=-1"),
     ):
         with pytest.raises(AFMError, match=message) as error:
-            agent_of("robot.id=Pendulum-v1", *settings, "method=physics")
+            agent_of(*PLAYED, "robot.id=Pendulum-v1", *settings, "method=physics")
         assert "\n" not in str(error.value)

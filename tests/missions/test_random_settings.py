@@ -4,11 +4,11 @@ import copy
 import random
 
 import pytest
+from harness import composed, shrink
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from small import shrink
 
 from afm_rl.errors import AFMError
 from afm_rl.missions import build
@@ -37,7 +37,7 @@ def leaves(node, place=""):
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("method", METHODS)
-def test_random_settings_end_in_a_run_or_in_one_line(composed, no_training, method):
+def test_random_settings_end_in_a_run_or_in_one_line(no_training, method):
     dice, parse = random.Random(method), OverridesParser.create().parse_override
     base = shrink(copy.deepcopy(composed(*method.split())))
     keys = sorted(leaves(OmegaConf.to_container(base, resolve=False)))

@@ -3,9 +3,9 @@
 import random
 from typing import NamedTuple
 
-import pandas as pd
 import pytest
 import torch
+from harness import assert_same_results
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.learning import Learner
@@ -37,14 +37,6 @@ def agent(make_agent, ring, spot):
     return make
 
 
-def same(left, right):
-    """Compare results bit for bit, but for the time that was spent."""
-    pairs = ((left.missions, right.missions), (left.steps, right.steps))
-    for one, other in pairs:
-        one, other = (t.drop(columns="seconds", errors="ignore") for t in (one, other))
-        pd.testing.assert_frame_equal(one, other, check_exact=True)
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_interrupted_runs_are_bit_identical(agent, tmp_path, method):
     whole = run(agent(method))
@@ -52,7 +44,7 @@ def test_interrupted_runs_are_bit_identical(agent, tmp_path, method):
         with pytest.raises(Stopped, match=f"step {stop}"):
             run(agent(method), checkpoint=tmp_path, stopped=lambda loop, at=stop: loop.step == at)
         torch.rand(5)  # the global generator goes its own way
-    same(whole, run(agent(method), checkpoint=tmp_path))
+    assert_same_results(whole, run(agent(method), checkpoint=tmp_path))
 
 
 @pytest.mark.parametrize("method", ["online_pe", "afm_physics"])
@@ -75,18 +67,18 @@ def test_a_run_killed_at_each_write_in_turn(agent, tmp_path, method, monkeypatch
             patched.setattr("afm_rl.storage.files.os.replace", replace)
             run(agent(method), checkpoint=path, every=0)
     assert list(path.glob(".*")) == []
-    same(whole, run(agent(method), checkpoint=path, every=0))
+    assert_same_results(whole, run(agent(method), checkpoint=path, every=0))
 
 
 def test_a_checkpoint_is_written_when_it_is_time_and_stays(agent, tmp_path):
     path = tmp_path / "deep" / "run"
     whole = run(agent("physics"), checkpoint=path)
     assert not path.exists()
-    same(whole, run(agent("physics"), checkpoint=path, every=0))
+    assert_same_results(whole, run(agent("physics"), checkpoint=path, every=0))
     assert [file.name for file in path.iterdir()] == [
         f"checkpoint-{step:07d}.safetensors" for step in (13, 14)
     ]
-    same(whole, run(agent("physics"), checkpoint=path))  # nothing is left to do
+    assert_same_results(whole, run(agent("physics"), checkpoint=path))  # nothing is left to do
 
 
 def test_a_run_without_a_checkpoint_can_be_stopped_too(agent):

@@ -1,5 +1,6 @@
 """Missions in other people's tasks, from settings to tables."""
 
+import copy
 import math
 import re
 import sys
@@ -8,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import torch
-from hydra import compose, initialize_config_module
+from harness import agent_of, composed
 from omegaconf import OmegaConf
 
 from afm_rl.errors import ConfigurationError
@@ -22,11 +23,6 @@ SMALL = ["planner.population=16", "planner.elites=4", "planner.horizon=8"]
 MODEL = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size="0.1"/></body>
 </worldbody><actuator><motor joint="x" ctrlrange="-1 1"/></actuator></mujoco>"""
 PENDULUM = ["robot=gymnasium", "robot.id=Pendulum-v1"]
-
-
-def agent_of(*overrides):
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        return build(compose("config", list(overrides)), ["tests"])
 
 
 def row_of(*overrides):
@@ -111,7 +107,7 @@ def test_the_change_comes_when_the_schedule_says(tmp_path):
 )
 def test_mistakes_are_said_in_one_line(overrides, message):
     with pytest.raises(ConfigurationError, match=message) as error:
-        agent_of(*overrides, "method=physics")
+        agent_of(*overrides, "method=physics", trusted=["tests"])
     assert "\n" not in str(error.value)
 
 
@@ -180,9 +176,8 @@ def mine(tmp_path, monkeypatch):
     def make(*overrides, small=True):
         size = [*SMALL, "dynamics.members=2", "dynamics.hidden=[16]"] if small else SMALL
         data = ["robot.data.rounds=[120,40]", "robot.data.fit.epochs=8"]
-        with initialize_config_module("afm_rl.conf", version_base="1.3"):
-            cfg = compose("config", ["robot=gymnasium", FLIP, *size, *data, *overrides])
-        return build(cfg, ["mine"])
+        chosen = ["robot=gymnasium", FLIP, *size, *data, *overrides]
+        return agent_of(*chosen, trusted=["mine"])
 
     yield make
     sys.modules.pop("mine", None)
@@ -233,8 +228,7 @@ def how_to(tmp_path, monkeypatch):
 
     def make(*overrides):
         path = f"hydra.searchpath=[file://{tmp_path}/conf]"
-        with initialize_config_module("afm_rl.conf", version_base="1.3"):
-            return build(compose("config", [path, *overrides]), ["mine"])
+        return agent_of(path, *overrides, trusted=["mine"])
 
     yield make
     sys.modules.pop("mine", None)
@@ -306,8 +300,7 @@ def test_mistakes_in_code_of_mine_are_said_in_one_line(mine, overrides, message)
 )
 def test_mistakes_in_models_are_said_in_one_line(mine, xml, message):
     pytest.importorskip("mujoco")
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        cfg = compose("config", ["robot=mujoco", "robot.reward=mine.home", "method=physics"])
+    cfg = copy.deepcopy(composed("robot=mujoco", "robot.reward=mine.home", "method=physics"))
     cfg.robot.xml = xml
     with pytest.raises(ConfigurationError, match=message) as error:
         build(cfg, ["mine"])
@@ -323,9 +316,8 @@ def test_an_mjcf_that_settings_name_reads_no_folder_but_its_own(mine, tmp_path, 
     (tmp_path / "parts" / "hull.xml").write_text("<mujoco><option timestep='0.01'/></mujoco>")
     path = tmp_path / "boat" / "boat.xml"
     path.write_text(MODEL.replace("<mujoco>", "<mujoco><include file='../parts/hull.xml'/>"))
-    with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        overrides = ["robot=mujoco", f"robot.xml={tmp_path}/own.xml", "robot.reward=mine.home"]
-        cfg = compose("config", [*overrides, "method=physics"])
+    overrides = ["robot=mujoco", f"robot.xml={tmp_path}/own.xml", "robot.reward=mine.home"]
+    cfg = copy.deepcopy(composed(*overrides, "method=physics"))
     if place == "robot.xml":
         cfg.robot.xml = str(path)
     else:

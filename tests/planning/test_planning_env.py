@@ -13,11 +13,6 @@ from afm_rl.planning import CEM, ICEM, MPPI, GoalDistance, KnownReward, Planning
 from afm_rl.spaces.manifold import Manifold
 
 
-@pytest.fixture
-def world(box):
-    return PlanningEnv(Dubins(), GoalDistance(), *box)
-
-
 def test_specs_hold(world, make_ensemble, box):
     check_env_specs(world)
     check_env_specs(PlanningEnv(make_ensemble(), GoalDistance([0, 1, 2]), *box))

@@ -6,6 +6,7 @@ import random
 
 import pytest
 import torch
+from harness import same_weights
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import nn
@@ -20,11 +21,6 @@ MADE_FOR = {"name": "net", "sizes": [3, 2], "rate": 0.1, "of": {"robot": "ugv"}}
 def net(outputs=2, seed=0):
     torch.manual_seed(seed)
     return nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4), nn.Linear(4, outputs))
-
-
-def same(left, right):
-    left, right = left.state_dict(), right.state_dict()
-    return all(torch.equal(left[name], right[name]) for name in left)
 
 
 @pytest.fixture
@@ -47,7 +43,7 @@ def refuses(path, match=None, description=MADE_FOR, module=None):
 def test_a_module_comes_back_as_it_was(stored):
     module = net(seed=1)
     load_artefact(str(stored), module, {"name": "net"})
-    assert same(module, net())
+    assert same_weights(module, net())
 
 
 def test_a_description_is_compared_as_json(stored):
@@ -158,9 +154,9 @@ def test_the_cache_trains_once_for_each_description(tmp_path):
     first, outcome = use(MADE_FOR, 1.0)
     assert outcome == (0.1, False)
     again, outcome = use({**MADE_FOR, "sizes": (3, 2)}, 2.0)
-    assert outcome == (0.1, True) and same(first, again)
+    assert outcome == (0.1, True) and same_weights(first, again)
     other, outcome = use({**MADE_FOR, "rate": 0.2}, 3.0)
-    assert outcome == (0.3, False) and not same(first, other)
+    assert outcome == (0.3, False) and not same_weights(first, other)
     assert calls == [1.0, 3.0]
     assert len(list(tmp_path.glob("net-*.safetensors"))) == 2
 

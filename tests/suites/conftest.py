@@ -5,15 +5,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
-
-from afm_rl.cli.overrides import checked
-from afm_rl.missions import build
+from harness import agent_trusting, shrink
 
 SUITES = Path(__file__).parents[2] / "benchmarks" / "suites"
 sys.path.append(str(SUITES))
-SMALL = {"planner.population": 8, "planner.elites": 2, "robot.contexts": 2}
 
 
 @pytest.fixture
@@ -21,13 +16,7 @@ def agent_of():
     """Build what a command asks for."""
 
     def make(suite, *overrides):
-        asked = [f"trust=[{SUITES / suite}]", *overrides]
-        with checked(asked) as names, initialize_config_module("afm_rl.conf", version_base="1.3"):
-            cfg = compose("config", asked)
-            for key, value in SMALL.items():
-                if OmegaConf.select(cfg, key) is not None:
-                    OmegaConf.update(cfg, key, value)
-            return build(cfg, names)
+        return agent_trusting(SUITES / suite, *overrides, change=shrink)
 
     return make
 

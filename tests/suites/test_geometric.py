@@ -4,6 +4,7 @@ import pytest
 import roma
 import torch
 from flight.geometric import Gains, GeometricController, geometric_wrench
+from harness import level
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins, Quadrotor
@@ -19,10 +20,6 @@ BODY, DT = QuadrotorBody(), 0.05
 
 def controller(**settings):
     return GeometricController(PlanningEnv(Quadrotor(), GoalDistance(), *BODY.bounds), **settings)
-
-
-def level(*batch, dtype=torch.float32):
-    return torch.zeros(*batch, 13, dtype=dtype).index_fill(-1, torch.tensor(9), 1.0)
 
 
 def steer(state, target=(0.0, 0.0, 0.0), **settings):

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from flight import MassEstimator
+from harness import level
 from tensordict import TensorDict
 
 from afm_rl.dynamics import Oracle, Quadrotor
@@ -26,10 +27,6 @@ def tick(state, factor, thrust=BODY.hover_thrust):
     given[:, 0] /= factor
     td = TensorDict({"observation": state, "action": action}, [len(state)])
     return td.set(("next", "observation"), quadrotor_step(state, given, 0.05, 25, BODY))
-
-
-def level(flights):
-    return torch.zeros(flights, 13).index_fill(1, torch.tensor(9), 1.0)
 
 
 @pytest.mark.parametrize("regime", [MassFactor(), flight_regimes()], ids=["mass", "all"])

@@ -1,0 +1,123 @@
+"""What the tests of several rooms make, drive and compare."""
+
+import copy
+import functools
+
+import pandas as pd
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+
+from afm_rl.cli.overrides import checked
+from afm_rl.dynamics import Dubins
+from afm_rl.missions import build
+
+LOW, HIGH = BOX = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])  # of the ground robot
+SMALL = {
+    "planner.population": 8,
+    "planner.elites": 2,
+    "dynamics.members": 2,
+    "dynamics.hidden": [8, 8],
+    "dynamics.pretrain.samples": 256,
+    "dynamics.pretrain.epochs": 1,
+    "dynamics.pretrain.flights": 4,
+    "dynamics.base.members": 2,
+    "dynamics.base.hidden": [8, 8],
+    "dynamics.base.pretrain.samples": 256,
+    "dynamics.base.pretrain.epochs": 1,
+    "corrector.width": 8,
+    "corrector.train.iterations": 5,
+    "robot.contexts": 2,
+    "robot.data.rounds": [64, 64],
+    "robot.data.fit.epochs": 1,
+}
+
+
+def shrink(cfg, more=()):
+    """Make the settings small that are there, in place."""
+    for key, value in (SMALL | dict(more)).items():
+        if OmegaConf.select(cfg, key) is not None:
+            OmegaConf.update(cfg, key, value)
+    return cfg
+
+
+@functools.cache
+def composed(*overrides):
+    """Compose a configuration, each once, as it takes a tenth of a second; to be copied."""
+    with initialize_config_module("afm_rl.conf", version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+def agent_of(*overrides, trusted=()):
+    """Build what settings ask for."""
+    return build(copy.deepcopy(composed(*overrides)), trusted)
+
+
+def agent_trusting(folder, *overrides, change=lambda cfg: cfg):
+    """Build what a command asks for that trusts a package."""
+    asked = [f"trust=[{folder}]", *overrides]
+    with checked(asked) as names, initialize_config_module("afm_rl.conf", version_base="1.3"):
+        return build(change(compose("config", asked)), names)
+
+
+def situation(*batch, name, **memory):
+    """Where robots are, where they shall go, and what a planner remembers, of these shapes."""
+    generator = torch.Generator().manual_seed(0)
+
+    def draw(*shape):
+        return torch.randn(*batch, *shape, generator=generator)
+
+    td = TensorDict({"observation": draw(3), "goal": 3 * draw(2)}, batch)
+    kept = {entry: 0.3 * draw(*shape) for entry, shape in memory.items()}
+    return td.set(name, TensorDict(kept, batch))
+
+
+def track_of(path, points):
+    """Write a track through points (m); return where it is."""
+    path.write_text("x,y\n" + "".join(f"{x:.4f},{y:.4f}\n" for x, y in points))
+    return str(path)
+
+
+def level(*batch, dtype=torch.float32):
+    """States ``(*batch, 13)`` of quadrotors that hover at the origin."""
+    return torch.zeros(*batch, 13, dtype=dtype).index_fill(-1, torch.tensor(9), 1.0)
+
+
+def transition(state, action, after=None, factor=-1.0):
+    """A transition; without ``after`` that of the ground robot under a gain."""
+    after = Dubins()(state, factor * action) if after is None else after
+    td = TensorDict({"observation": state, "action": action}, state.shape[:-1])
+    return td.set(("next", "observation"), after)
+
+
+def weights(model, index=...):
+    """Return all parameters, or those of one mission, as one vector."""
+    return torch.cat([parameter.detach()[index].flatten() for parameter in model.parameters()])
+
+
+def same_weights(left, right):
+    """Are all parameters and buffers equal to the bit?"""
+    left, right = left.state_dict(), right.state_dict()
+    return left.keys() == right.keys() and all(torch.equal(left[key], right[key]) for key in left)
+
+
+def assert_same_tables(left, right, *without):
+    """Compare tables bit for bit, but for the time that was spent."""
+    left, right = (
+        table.drop(columns=["seconds", *without], errors="ignore").reset_index(drop=True)
+        for table in (left, right)
+    )
+    pd.testing.assert_frame_equal(left, right, check_exact=True)
+
+
+def assert_same_results(left, right, *without):
+    """Compare missions and steps bit for bit, but for the time that was spent."""
+    assert_same_tables(left.missions, right.missions, *without)
+    assert_same_tables(left.steps, right.steps, *without)
+
+
+def files_of(folder):
+    """Return the names and contents of all files in a folder, but for locks."""
+    paths = (path for path in folder.rglob("*") if path.is_file() and path.name != ".lock")
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
