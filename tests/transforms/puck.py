@@ -14,7 +14,7 @@ class Puck(gymnasium.Env):
     """Two forces push a puck; ``gain`` is hidden from everybody."""
 
     def __init__(self, dtype=np.float64, gain=1.0, ends=None, nested=False):
-        self.dtype, self.gain, self.ends, self.nested = dtype, gain, ends, nested
+        self.dtype, self.gain, self.ends, self.nested = dtype, np.asarray(gain), ends, nested
         vector = Box(-np.inf, np.inf, (4,), dtype)
         self.observation_space = Dict({"puck": vector}) if nested else vector
         self.action_space = Box(-1, 1, (2,), dtype)

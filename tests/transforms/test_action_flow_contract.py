@@ -8,8 +8,6 @@ from torchrl.data import (
     Binary,
     Bounded,
     Composite,
-    LazyTensorStorage,
-    TensorDictReplayBuffer,
     Unbounded,
 )
 from torchrl.envs import (
@@ -26,7 +24,6 @@ from afm_rl.correction.network import AxisNetwork
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import GoalDistance, PlanningEnv
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform, Guard
 
 
@@ -71,18 +68,6 @@ TAKEN = {
 def test_two_under_one_prefix_are_refused(make):
     with pytest.raises(ConfigurationError, match="prefix='(afm|guard)': taken, by"):
         make().rollout(2)
-
-
-def test_in_a_replay_buffer():
-    data = env(batch_size=(2,)).rollout(6, break_when_any_done=False).reshape(-1)
-    for chain in (None, transform()):
-        storage = LazyTensorStorage(20)
-        buffer = TensorDictReplayBuffer(storage=storage, batch_size=7, transform=chain)
-        buffer.extend(data)
-        sample = buffer.sample()
-        assert sample["next", "afm", "executed_action"].shape == (7, 2)
-        found = (sample["action"].unsqueeze(1) == data["action"]).all(-1)
-        assert found.any(-1).all()  # the planned actions, as they were
 
 
 def test_the_corrector_is_owned_and_the_model_is_shared(make_ensemble, small_flow):
@@ -192,12 +177,3 @@ def test_a_prefix_that_is_not_reset_with_the_agents_is_refused():
     env = TransformedEnv(Team((), "agents"), ActionFlowTransform(Dubins(), **AGENTS))
     with pytest.raises(ConfigurationError, match=r"prefix='afm': .* such as \('agents', 'afm'\)"):
         env.reset()
-
-
-def test_nothing_but_a_model_is_needed(box):
-    world = PlanningEnv(Dubins(), GoalDistance(), *box)
-    env = TransformedEnv(world, ActionFlowTransform(Dubins()))
-    check_env_specs(env)
-    flow = env.transform.corrector
-    assert isinstance(flow, ActionFlow) and torch.equal(flow.scale, box[1])
-    assert env.rollout(3)["next", "afm", "executed_action"].shape == (3, 2)

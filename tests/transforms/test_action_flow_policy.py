@@ -7,9 +7,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import step_mdp
 
-from afm_rl.correction import ActionFlow
 from afm_rl.dynamics import Dubins
 from afm_rl.envs import UGVTrack
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
@@ -67,20 +65,6 @@ def test_actions_are_those_of_the_transform(track, agent, flow):
         assert torch.equal(found["next", "afm", name], expected["next", "afm", name])
 
 
-def test_a_loop_without_an_environment_takes_the_same_actions(track, agent):
-    twin = copy.deepcopy(agent)
-    expected = TransformedEnv(track(), primers(agent)).rollout(STEPS, agent)["action"]
-    robot = track()
-    seen, td = robot.reset(), TensorDict({}, [3])
-    td, taken = primers(twin)(td), []
-    for _ in range(STEPS):
-        td = twin(td.update(seen.select("observation", "goal")))
-        taken.append(td["action"])
-        seen = step_mdp(robot.step(seen.set("action", td["action"])))
-        td = step_mdp(td)
-    torch.testing.assert_close(torch.stack(taken, 1), expected)
-
-
 def test_the_first_state_is_no_transition(track, agent):
     data = TransformedEnv(track(), primers(agent)).rollout(3)
     memory = data["afm", "_memory"][:, 0]
@@ -112,14 +96,6 @@ def test_without_its_memory_it_says_what_is_missing(agent):
     td = TensorDict({"observation": torch.zeros(3), "action": torch.zeros(2)})
     with pytest.raises(KeyError, match="no 'afm' in the tensordict; apply make_tensordict_primer"):
         agent[1](td)
-
-
-def test_nothing_but_a_model_and_a_spec_is_needed(planner):
-    policy = ActionFlowPolicy(Dubins(), planner.action_spec)
-    assert isinstance(policy.corrector, ActionFlow)
-    td = policy.make_tensordict_primer()(TensorDict())
-    td.update({"observation": torch.zeros(3), "action": torch.tensor([0.3, 0.4])})
-    assert torch.equal(policy(td)["action"], torch.tensor([0.3, 0.4]))
 
 
 def test_a_primer_keeps_what_was_learnt_through_automatic_resets(planner, box):

@@ -92,20 +92,6 @@ def test_a_controller_acts_as_planner_and_policy(kind):
     assert torch.equal(actions(found), actions(expected))
 
 
-def test_without_a_planner_the_planned_action_is_given():
-    controller = Controller(None, policy_of())
-    assert list(controller.sizes) == ["memory", "observation", "action"]
-    policy, planned = policy_of(), torch.tensor([0.4, -0.3]).double()
-    td = policy.make_tensordict_primer()(TensorDict())
-    memory, state = torch.zeros(controller.sizes["memory"]).double(), torch.zeros(3).double()
-    for _ in range(8):
-        td = policy(td.update({"observation": state, "action": planned}))
-        memory, action = controller(memory, state, planned)
-        assert torch.equal(action, td["action"])
-        state, td = Dubins()(state, -action), step_mdp(td)
-    assert not torch.equal(action, planned)
-
-
 def test_a_reading_that_is_not_finite_gives_a_sound_action():
     controller = Controller(planner_of(), policy_of())
     memory = torch.zeros(controller.sizes["memory"]).double()

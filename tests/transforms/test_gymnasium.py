@@ -117,14 +117,6 @@ def test_a_fault_outlasts_episodes_that_are_too_short_to_find_it_in_each(late):
     assert shares[0] > 0.2 and shares[1] <= 0.05 and wrong[40:].mean() <= 0.05
 
 
-def test_an_episode_begins_with_an_empty_memory():
-    env = ActionFlowWrapper(Puck(gain=-1.0), push)
-    assert play(env, 10)[-1][-1]["afm"]["corrects"]
-    _, info = env.reset()
-    assert not info["afm"]["corrects"] and env.diagnosis == "healthy"
-    assert not env.step(np.zeros(2))[-1]["afm"]["corrects"]
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("plan", [5.0, 1e30, 1e300])
 def test_plans_beyond_the_space_are_brought_into_it(plan, dtype):

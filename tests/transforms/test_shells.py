@@ -5,127 +5,14 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from puck import Puck, push
+from shells import BOX, EPISODE, MODEL, plans_of, pucks, wrapper
 from tensordict import TensorDict
 from torchrl.data import Bounded
-from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
-from afm_rl import ActionFlowVectorWrapper, ActionFlowWrapper
 from afm_rl.correction import LeastSquares
-from afm_rl.dynamics import KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import KnownReward, PlanningEnv
-from afm_rl.spaces.manifold import Manifold
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
-from afm_rl.transforms.controller import Controller
-
-EPISODE = 6
-STAY = {}  # whether actions are corrected from a step on, by step: it stays as it is
-BOX = -torch.ones(2), torch.ones(2)
-
-
-def starts(dtype):
-    generator = torch.Generator().manual_seed(0)
-    while True:
-        yield torch.randn(4, generator=generator).to(dtype)
-
-
-def transform(plans, dtype, gain=-1.0, ends=EPISODE, switch=STAY, **settings):
-    actual = KnownDynamics(lambda s, a: push(s, gain * a), Manifold(4), 2)
-    world = PlanningEnv(actual, KnownReward(lambda s, a, n: -n.square().sum(-1)), *BOX)
-    model = KnownDynamics(push, Manifold(4), 2)
-    env, start = TransformedEnv(world, ActionFlowTransform(model, **settings)), starts(dtype)
-    for k, plan in enumerate(plans):
-        if k % ends == 0:
-            td = env.reset(TensorDict({"observation": next(start)}))
-        env.transform.enabled = switch.get(k, env.transform.enabled)
-        td = step_mdp(env.step(td.set("action", plan)))
-        yield td["afm", "executed_action"]
-
-
-def policy(plans, dtype, gain=-1.0, ends=EPISODE, switch=STAY, **settings):
-    model = KnownDynamics(push, Manifold(4), 2)
-    corrected, start = ActionFlowPolicy(model, Bounded(*BOX), **settings), starts(dtype)
-    primer, td = corrected.make_tensordict_primer(), TensorDict()
-    for k, plan in enumerate(plans):
-        if k % ends == 0:
-            td, state = primer(td), next(start)
-        corrected.enabled = switch.get(k, corrected.enabled)
-        td = corrected(td.update({"observation": state, "action": plan}))
-        executed, td = td["action"], step_mdp(td)
-        state = push(state.float(), gain * executed.float()).to(dtype)
-        yield executed
-
-
-def controller(
-    plans, dtype, gain=-1.0, ends=EPISODE, switch=STAY, keep_memory_on_reset=False, **settings
-):
-    model = KnownDynamics(push, Manifold(4), 2)
-    corrected = ActionFlowPolicy(
-        model, Bounded(*BOX), keep_memory_on_reset=keep_memory_on_reset, **settings
-    )
-    pure, start = Controller(None, corrected), starts(dtype)
-    memory = torch.zeros(pure.sizes["memory"])
-    for k, plan in enumerate(plans):
-        if k % ends == 0:
-            state = next(start)
-            memory = memory.clone() if keep_memory_on_reset else torch.zeros_like(memory)
-            memory[0] *= -1
-        if k in switch:
-            memory[0] = 1.0 if switch[k] else 2.0
-        memory, executed = pure(memory, state, plan)
-        state = push(state.float(), gain * executed.float()).to(dtype)
-        yield executed
-
-
-def numpy_of(dtype):
-    return torch.zeros((), dtype=dtype).numpy().dtype
-
-
-def wrapper(plans, dtype, gain=-1.0, ends=EPISODE, switch=STAY, **settings):
-    env = ActionFlowWrapper(Puck(numpy_of(dtype), gain, ends), push, **settings)
-    env.reset(seed=0)
-    for k, plan in enumerate(plans):
-        env.enabled = switch.get(k, env.enabled)
-        *_, over, _, info = env.step(plan)
-        if over:
-            env.reset()
-        yield torch.as_tensor(info["afm"]["executed"])
-
-
-def vector(mode):
-    def run(plans, dtype, gain=-1.0, ends=EPISODE, switch=STAY, **settings):
-        makers = [lambda: Puck(numpy_of(dtype), gain, ends)] * 2
-        env = SyncVectorEnv(makers, autoreset_mode=mode)
-        env = ActionFlowVectorWrapper(env, push, **settings)
-        env.reset(seed=0)
-        for k, plan in enumerate(plans):
-            env.enabled = switch.get(k, env.enabled)
-            _, _, over, _, info = env.step(torch.stack([plan, plan]))
-            if mode is AutoresetMode.DISABLED and over.any():
-                env.reset(options={"reset_mask": over})
-            executed = torch.as_tensor(info["afm"]["executed"][0])
-            yield (
-                executed if info["_afm"][0] else gain * plan.detach()
-            )  # of a step that only resets
-
-    return run
-
-
-SHELLS = {f.__name__: f for f in (transform, policy, controller, wrapper)}
-SHELLS |= {mode.value: vector(mode) for mode in AutoresetMode}
-
-
-@pytest.fixture(params=SHELLS)
-def shell(request):
-    """Run plans in a shell around pucks, whose actuators are reversed; yield what is executed."""
-    return SHELLS[request.param]
-
-
-def plans_of(count):
-    return torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
 
 
 def missed(shell, plans, dtype=torch.float32, **settings):
@@ -234,11 +121,8 @@ def test_it_is_said_that_limits_hold_the_correction_back(how, count):
 
 def test_an_entry_switches_missions_of_a_batch_off_one_by_one():
     """And what is told of a limited action is what it does."""
-    actual = KnownDynamics(lambda s, a: push(s, -a), Manifold(4), 2)
-    world = PlanningEnv(actual, KnownReward(lambda s, a, n: -n.square().sum(-1)), *BOX)
-    model = KnownDynamics(push, Manifold(4), 2)
-    env = TransformedEnv(world, ActionFlowTransform(model, most=0.5))
-    pure, plans = ActionFlowPolicy(model, Bounded(*BOX), most=0.5), plans_of(30)
+    env = pucks(-1.0, ActionFlowTransform(MODEL, most=0.5))
+    pure, plans = ActionFlowPolicy(MODEL, Bounded(*BOX), most=0.5), plans_of(30)
     td = env.reset(TensorDict({"observation": torch.zeros(2, 4)}, [2]))
     other = pure.make_tensordict_primer()(TensorDict({}, [2]))
     for k, plan in enumerate(plans):

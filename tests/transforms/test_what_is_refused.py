@@ -1,7 +1,5 @@
 """What shells cannot use is refused where it is given, by name and value."""
 
-from functools import partial
-
 import gymnasium
 import numpy as np
 import pytest
@@ -78,14 +76,8 @@ REFUSED = [
     (r"\['act'\]: the environment has no .*'action'", lambda: track(in_keys_inv=["act"])),
     ("transform.enabled='yes'", lambda: transform(enabled="yes")),
     ("transform.extend_action_box='yes'", lambda: transform(extend_action_box="yes")),
-    *(
-        (
-            rf"transform.{name}={value}: expected a finite number in \(0, 2\]",
-            partial(transform, **{name: value}),
-        )
-        for name in ("most", "rate")
-        for value in (0, -0.1, 2.5, True, float("nan"))
-    ),
+    (r"transform.most=0: expected a finite number in \(0, 2\]", lambda: transform(most=0)),
+    (r"transform.most=2.5: expected a finite number in \(0, 2\]", lambda: transform(most=2.5)),
     (r"transform.most=\[0.1\]: expected one number, or 2", lambda: transform(most=[0.1])),
     ("transform.rate=0.1: with reported_key", lambda: transform(rate=0.1, reported_key="given")),
     ("transform.carry_memory=1", lambda: transform(carry_memory=1)),
@@ -95,13 +87,10 @@ REFUSED = [
     (r"Dict.*state=lambda", lambda: wrapped(nested=True)),
     ("has no MuJoCo model", lambda: wrapped("mujoco")),
     ("'mujoco', 'learn'", lambda: wrapped("musculoskeletal")),
-    ("a step function", lambda: wrapped(3)),
     (r"state has \(4,\) numbers, that of the model 3", lambda: wrapped(Dubins())),
     ("3 finite bounds", lambda: wrapped(KnownDynamics(push, Manifold(4), 3))),
     ("inside of those that change actions", rescaled),
     ("delay=.*one number of steps, or 2", lambda: wrapped(delay=[1, 2, 3])),
-    ("delay=-1", lambda: wrapped(delay=-1)),
-    ("delay=1000000", lambda: wrapped(delay=10**6)),
     ("a ActionFlow", lambda: wrapped(belief=True, corrector=LeastSquares(-ONES, ONES))),
     ("belief='yes'", lambda: wrapped(belief="yes")),
     ("delay_compensation='yes'", lambda: wrapped(delay_compensation="yes")),
@@ -121,7 +110,6 @@ REFUSED = [
     (r"actions: shape \(2, 2\), expected \(3, 2\)", three_for_two),
     # the check of a model
     ("model='learn': there is no model yet", lambda: check_model(Puck(), "learn")),
-    ("the state has", lambda: check_model(Puck(), Dubins())),
     ("steps=0", lambda: check_model(Puck(), push, steps=0)),
     ("action: shape", lambda: check_model(Puck(), push, lambda seen: seen)),
     ("has no MuJoCo model", lambda: check_model(UGVTrack())),
@@ -130,8 +118,6 @@ REFUSED = [
     ("no MuJoCo model", lambda: check_model(GymEnv("Pendulum-v1"))),
     # regimes
     (r"phases=.*one more than at=.*torque", lambda: regime([{}], [3])),
-    (r"phases=.*one more than at=.*torque", lambda: regime([{}, {}], [])),
-    (r"phases=.*one more than at=.*torque", lambda: regime([], [])),
     (r"phases=.*one more than at=.*torque", lambda: regime(torch.ones(2, 2), [3])),
     (r"phases=.*one more than at=.*torque", lambda: regime(torch.ones(3, 1), [3])),
 ]
