@@ -2,9 +2,10 @@
 
 import pytest
 import torch
+from harness import situation
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from afm_rl.dynamics import Dubins
 from afm_rl.planning import ICEM, GoalDistance, PlanningEnv
@@ -13,21 +14,8 @@ from afm_rl.planning.icem import coloured
 SMALL = {"horizon": 4, "population": 32, "elites": 6, "iterations": 2}
 
 
-@pytest.fixture
-def world(box):
-    return PlanningEnv(Dubins(), GoalDistance(), *box)
-
-
-def situation(*batch, kept=2, seed=0):
-    """Where the robots are, where they shall go, and what they planned before."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def draw(*shape):
-        return torch.randn(*batch, *shape, generator=generator)
-
-    entries = {"observation": draw(3), "goal": 3 * draw(2)}
-    memory = {"mean": 0.3 * draw(4, 2), "elites": 0.3 * draw(kept, 4, 2)}
-    return TensorDict({**entries, "icem": TensorDict(memory, batch)}, batch)
+def robots(*batch, kept=2):
+    return situation(*batch, name="icem", mean=(4, 2), elites=(kept, 4, 2))
 
 
 def spy(world):
@@ -56,7 +44,7 @@ def test_the_population_shrinks_but_not_below_twice_the_elites(world):
     planner = ICEM(world, population=60, iterations=4, elites=20, decay=1.2)
     assert planner.counts == [60, 50, 42, 40]
     seen = spy(world)
-    planner(situation(2, kept=6).exclude("icem").set("icem", _empty(planner, 2)))
+    planner(robots(2, kept=6).exclude("icem").set("icem", _empty(planner, 2)))
     assert [plans.shape[-3] for plans, _ in seen] == planner.counts
 
 
@@ -66,7 +54,7 @@ def _empty(planner, *batch):
 
 
 def test_elites_go_on_and_the_mean_joins_last(world, box):
-    seen, td = spy(world), situation(3)
+    seen, td = spy(world), robots(3)
     out = ICEM(world, **SMALL)(td.clone())
     (first, worth), (second, _) = seen
     before = td["icem", "elites"]
@@ -86,7 +74,7 @@ def test_the_noise_shrinks_to_the_spread_of_the_elites():
     settings = {**SMALL, "population": 4000, "sigma": 0.005}
     planner = ICEM(world, **settings, momentum=0.0, decay=1.0, beta=0.0)
     seen = spy(world)
-    planner(situation(1))
+    planner(robots(1))
     (first, worth), (second, _) = seen
     torch.testing.assert_close(first[0, 2:].std(0), torch.full((4, 2), 0.5), atol=0.03, rtol=0)
     spread = first[0, worth[0].topk(6).indices].std(0, correction=0)
@@ -95,7 +83,7 @@ def test_the_noise_shrinks_to_the_spread_of_the_elites():
 
 def test_a_new_mission_starts_from_the_middle_of_the_box():
     world = PlanningEnv(Dubins(), GoalDistance(), [0.5, -1.0], [1.5, 2.0])
-    planner, td = ICEM(world, **SMALL, sigma=0.0), situation(2)
+    planner, td = ICEM(world, **SMALL, sigma=0.0), robots(2)
     td["icem"] = _empty(planner, 2)
     memory = planner(td)["next", "icem"]
     torch.testing.assert_close(memory["mean"], torch.tensor([1.0, 0.5]).expand(2, 4, 2))
@@ -105,7 +93,7 @@ def test_a_new_mission_starts_from_the_middle_of_the_box():
 def test_plans_keep_to_a_box_per_mission(world, box):
     """As long as an action is held, too: here the box shrinks before it ends."""
     low, high = box
-    planner, td = ICEM(world, **SMALL, hold=2, box_key="box"), situation(2)
+    planner, td = ICEM(world, **SMALL, hold=2, box_key="box"), robots(2)
     td["goal"] *= 100
     td["icem"] = _empty(planner, 2)
     td["box"] = torch.stack([torch.stack([low, 2.5 * high]), torch.zeros(2, 2)])
@@ -130,7 +118,7 @@ KINDS = {
 @pytest.mark.parametrize(("kind", "wanted"), KINDS.items(), ids=str)
 def test_the_exploration_type_chooses_between_best_and_mean(world, kind, wanted):
     with set_exploration_type(kind):
-        out = ICEM(world, **SMALL)(situation(4))
+        out = ICEM(world, **SMALL)(robots(4))
     memory = out["next", "icem"]
     expected = {"best": memory["elites"][:, 0, 0], "mean": memory["mean"][:, 0]}
     torch.testing.assert_close(out["action"], expected[wanted])
@@ -138,7 +126,7 @@ def test_the_exploration_type_chooses_between_best_and_mean(world, kind, wanted)
 
 
 def test_both_backends_plan_the_same_also_alone(world):
-    td = situation(3)
+    td = robots(3)
     td["seed"] = torch.tensor([1, 2, 1])
     fast, slow = (ICEM(world, **SMALL, backend=b, seed_key="seed") for b in ("fast", "env"))
     found = fast(td.clone())
@@ -151,7 +139,7 @@ def test_both_backends_plan_the_same_also_alone(world):
 def test_an_action_is_held_as_long_as_plans_say(world):
     planner = ICEM(world, **SMALL, hold=3)
     seen, env = spy(world), TransformedEnv(world, planner.make_tensordict_primer())
-    start = env.reset(situation(2).exclude("icem"))
+    start = env.reset(robots(2).exclude("icem"))
     actions = env.rollout(7, planner, auto_reset=False, tensordict=start)["action"]
     assert len(seen) == 3 * SMALL["iterations"]  # plans are made at the steps 0, 3 and 6
     assert [len(actions[0, a:b].unique(dim=0)) for a, b in ((0, 3), (3, 6), (2, 4))] == [1, 1, 2]
@@ -160,17 +148,3 @@ def test_an_action_is_held_as_long_as_plans_say(world):
     assert torch.equal(plans[..., ::3, :], plans[..., 2::3, :])
     best = seen[1][1].argmax(-1)
     assert torch.equal(actions[:, 0], seen[1][0][torch.arange(2), best, 0])
-
-
-def test_it_drives_to_the_goal(world, box):
-    planner = ICEM(world, horizon=8, population=64)
-    td = TensorDict({"observation": torch.zeros(3, 3), "goal": 2 * torch.randn(3, 2)}, [3])
-    env = TransformedEnv(world, planner.make_tensordict_primer())
-    td = env.reset(td)
-    gaps = []
-    for _ in range(30):
-        td = env.step(planner(td))
-        assert ((td["action"] >= box[0]) & (td["action"] <= box[1])).all()
-        gaps.append((td["next", "observation"][:, :2] - td["goal"]).norm(dim=-1))
-        td = step_mdp(td)
-    assert (torch.stack(gaps).amin(0) < 0.2).all()

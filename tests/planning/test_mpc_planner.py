@@ -1,7 +1,6 @@
 """Model predictive control as a module: what it plans."""
 
 import math
-import warnings
 from functools import partial
 
 import numpy as np
@@ -225,18 +224,6 @@ def test_new_flights_iterate_as_long_as_they_are_told(pendulum):
     few, many = plan(short, td)[1], plan(long, td)[1]
     torch.testing.assert_close(few[1], many[1])
     assert (few[0] - many[0]).abs().max() > 1e-3
-
-
-def test_a_missing_memory_is_told_once_and_taken_as_zero(box):
-    planner = car(box)
-    td = situation(planner, 2, memory=0.0)
-    expected = planner(td.clone())["action"]
-    del td["mpc"]
-    with pytest.warns(UserWarning, match=r"no \('mpc', 'states'\).*make_tensordict_primer"):
-        torch.testing.assert_close(planner(td.clone())["action"], expected)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        planner(td.clone())
 
 
 def test_plans_that_are_not_minima_are_counted(box, monkeypatch):

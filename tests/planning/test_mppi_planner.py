@@ -1,12 +1,9 @@
 """MPPI as a module: what it plans."""
 
-import warnings
-
 import pytest
 import torch
-from tensordict import TensorDict
+from harness import situation
 from torchrl.envs import TransformedEnv
-from torchrl.envs.utils import step_mdp
 
 from afm_rl.dynamics import Dubins
 from afm_rl.errors import ConfigurationError
@@ -15,21 +12,8 @@ from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 SMALL = {"horizon": 4, "population": 32}
 
 
-@pytest.fixture
-def world(box):
-    return PlanningEnv(Dubins(), GoalDistance(), *box)
-
-
-def situation(*batch, horizon=4, seed=0):
-    """Where the robots are, where they shall go, and what they planned before."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def draw(*shape):
-        return torch.randn(*batch, *shape, generator=generator)
-
-    entries = {"observation": draw(3), "goal": 3 * draw(2)}
-    entries["mppi"] = TensorDict({"mean": 0.3 * draw(horizon, 2)}, batch)
-    return TensorDict(entries, batch)
+def robots(*batch):
+    return situation(*batch, name="mppi", mean=(4, 2))
 
 
 def plan(planner, td):
@@ -43,7 +27,7 @@ def test_both_backends_plan_the_same(box, settings):
     fast, slow = (MPPI(world, backend=name, **SMALL, **settings) for name in ("fast", "env"))
     assert MPPI(world, **SMALL).backend == "fast"
     for batch in [(), (3,), (2, 2)]:
-        td = situation(*batch).double()
+        td = robots(*batch).double()
         torch.testing.assert_close(plan(fast, td), plan(slow, td), rtol=0, atol=1e-10)
 
 
@@ -52,8 +36,8 @@ def test_an_environment_without_returns_is_stepped(world):
     wrapped.__class__ = type("Plain", (TransformedEnv,), {"__getattr__": _without_returns})
     planner = MPPI(wrapped, **SMALL)
     assert planner.backend == "env"
-    expected = plan(MPPI(world, **SMALL), situation(3))
-    torch.testing.assert_close(plan(planner, situation(3)), expected, rtol=0, atol=1e-5)
+    expected = plan(MPPI(world, **SMALL), robots(3))
+    torch.testing.assert_close(plan(planner, robots(3)), expected, rtol=0, atol=1e-5)
     with pytest.raises(ConfigurationError, match="has no `returns`; use 'env'"):
         MPPI(wrapped, backend="fast")
 
@@ -65,7 +49,7 @@ def _without_returns(self, name):
 
 
 def test_a_batch_of_missions_equals_single_ones(world):
-    together, td = MPPI(world, seed_key="seed", **SMALL), situation(5)
+    together, td = MPPI(world, seed_key="seed", **SMALL), robots(5)
     td["seed"] = torch.tensor([3, 1, 4, 1, 5])
     planned = [plan(together, td) for _ in range(2)]
     for mission in range(5):
@@ -76,7 +60,7 @@ def test_a_batch_of_missions_equals_single_ones(world):
 
 
 def test_it_follows_its_seed_and_leaves_the_global_generator_alone(world):
-    td, before = situation(2), torch.get_rng_state()
+    td, before = robots(2), torch.get_rng_state()
     plans = [plan(MPPI(world, seed=seed, **SMALL), td) for seed in (1, 1, 2)]
     assert torch.equal(plans[0], plans[1]) and not torch.equal(plans[0], plans[2])
     assert torch.equal(torch.get_rng_state(), before)
@@ -86,7 +70,7 @@ def test_it_follows_its_seed_and_leaves_the_global_generator_alone(world):
 @pytest.mark.parametrize("sigma", [0.1, 50.0])
 def test_actions_and_plans_stay_in_the_box(world, noise, sigma, box):
     planner = MPPI(world, noise=noise, sigma=sigma, temperature=1e-6, **SMALL)
-    td = situation(20)
+    td = robots(20)
     td["mppi", "mean"] *= 100  # a plan that someone else made
     out = planner(td)
     spec = world.action_spec
@@ -96,7 +80,7 @@ def test_actions_and_plans_stay_in_the_box(world, noise, sigma, box):
 
 
 def test_without_noise_the_plan_is_shifted_and_smoothed(world):
-    td = situation(3)
+    td = robots(3)
     before = td["mppi", "mean"].clamp(-0.9, 0.9)
     td["mppi", "mean"] = before
     shifted = torch.cat([before[:, 1:], before[:, -1:]], 1)
@@ -123,48 +107,14 @@ def test_a_cold_planner_takes_the_best_of_its_candidates(world):
         return candidates["returns"]
 
     world.returns = spy
-    found = plan(planner, situation())
+    found = plan(planner, robots())
     best = candidates["plans"][candidates["returns"].argmax()]
     torch.testing.assert_close(found, best)
 
 
-def test_a_missing_plan_is_told_once_and_taken_as_zero(world):
-    planner, td = MPPI(world, **SMALL), situation(2)
-    zero = td.clone()
-    zero["mppi", "mean"].zero_()
-    expected = plan(MPPI(world, **SMALL), zero)
-    del td["mppi"]
-    with pytest.warns(UserWarning, match="make_tensordict_primer"):
-        found = plan(planner, td)
-    torch.testing.assert_close(found, expected)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        planner(td.clone())
-
-
-@pytest.mark.parametrize("settings", [{}, {"beta": 1.0, "iterations": 2}, {"noise": "unit"}])
-def test_it_drives_to_the_goal(world, settings):
-    planner = MPPI(world, horizon=8, population=100, **settings)
-    start = TensorDict(
-        {
-            "observation": torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 3.0], [1.0, 1.0, -1.5]]),
-            "goal": torch.tensor([[2.0, 1.0], [2.0, 0.0], [-1.0, 0.0]]),
-        },
-        [3],
-    )
-    env = TransformedEnv(world, planner.make_tensordict_primer())
-    td = env.reset(start)
-    gaps = []
-    for _ in range(40):
-        td = env.step(planner(td))
-        gaps.append((td["next", "observation"][:, :2] - td["goal"]).norm(dim=-1))
-        td = step_mdp(td)
-    assert (torch.stack(gaps).amin(0) < 0.2).all()
-
-
 def test_a_box_per_mission_replaces_that_of_the_actions(world, box):
     low, high = box
-    td = situation(3, 4)
+    td = robots(3, 4)
     td["goal"] = td["goal"] * 100
     td["observation"] = torch.zeros(3, 4, 3)
     wide, narrow = torch.stack([low, 2.5 * high]), torch.stack([0.2 * low, 0.1 * high])
@@ -183,11 +133,11 @@ def test_a_box_per_mission_replaces_that_of_the_actions(world, box):
 
 def test_a_box_key_that_nobody_writes_is_announced(world):
     with pytest.warns(UserWarning, match="box_key='bocks': the tensordict has no such entry"):
-        plan(MPPI(world, box_key="bocks", **SMALL), situation(1))
+        plan(MPPI(world, box_key="bocks", **SMALL), robots(1))
 
 
 def test_noise_grows_with_the_box(world, box):
-    td = situation(2)
+    td = robots(2)
     td["mppi", "mean"] = torch.zeros(2, 4, 2)
     td["box"] = torch.stack([torch.stack(box), 2 * torch.stack(box)])
     seen = []

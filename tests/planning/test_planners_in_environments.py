@@ -1,5 +1,7 @@
 """Planners as policies: a plan travels with the tensordict."""
 
+import warnings
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -100,6 +102,18 @@ def test_environments_in_series_have_plans_of_their_own(planner, plan):
     data = env.rollout(5, planner, break_when_any_done=False)
     assert data[plan].shape == (2, 5, 4, 2) and (data[plan][:, 3] == 0).all()
     assert (data[plan][:, [1, 2, 4]] != 0).any(-1).all()
+
+
+def test_a_missing_plan_is_told_once_and_taken_as_zero(planner, kind, box):
+    td = TensorDict({"observation": torch.zeros(2, 3), "goal": torch.ones(2, 2)}, [2])
+    expected = planner(planner.make_tensordict_primer()(td.clone()))["action"]
+    planner = make(kind, box)
+    with pytest.warns(UserWarning, match=rf"no \('{kind}', .*make_tensordict_primer"):
+        found = planner(td.clone())["action"]
+    torch.testing.assert_close(found, expected)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        planner(td.clone())
 
 
 def test_mpc_rolls_out_in_its_own_world(box):
