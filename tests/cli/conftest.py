@@ -40,14 +40,25 @@ def small_training(monkeypatch):
         monkeypatch.setattr(factories, name, functools.wraps(whole)(short))
 
 
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory):
-    """Folder of trained parts that all these tests share."""
-    return tmp_path_factory.getbasetemp() / "trained_parts"
+@pytest.fixture
+def called(monkeypatch, capsys):
+    """Call a command in this process; return status, output and errors."""
+
+    def run(main, *arguments):
+        monkeypatch.setattr(sys, "argv", [str(argument) for argument in arguments])
+        try:
+            main()
+            status = 0
+        except SystemExit as ended:
+            status = ended.code
+        said = capsys.readouterr()
+        return SimpleNamespace(status=status, out=said.out, err=said.err)
+
+    return run
 
 
 @pytest.fixture
-def afm_rl(monkeypatch, capsys, cache):
+def afm_rl(monkeypatch, capsys, cache, called):
     """Call the command line in this process; return status, output and errors."""
     monkeypatch.setenv("AFM_RL_CACHE", str(cache))
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
@@ -56,19 +67,12 @@ def afm_rl(monkeypatch, capsys, cache):
     root, states = logging.getLogger(), Singleton.get_state()
     handlers, level, threads = root.handlers[:], root.level, torch.get_num_threads()
 
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["afm-rl", *map(str, arguments)])
+    def main():
         GlobalHydra.instance().clear()
         capsys.readouterr()
-        try:
-            cli.main()
-            status = 0
-        except SystemExit as ended:
-            status = ended.code
-        said = capsys.readouterr()
-        return SimpleNamespace(status=status, out=said.out, err=said.err)
+        cli.main()
 
-    yield call
+    yield lambda *arguments: called(main, "afm-rl", *arguments)
     GlobalHydra.instance().clear()
     Singleton.set_state(states)
     root.handlers[:], root.level = handlers, level

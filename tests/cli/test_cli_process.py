@@ -36,12 +36,6 @@ def test_help_lists_groups_and_choices_and_needs_no_torch(process):
     assert "afm_physics" in done.stdout and "seeds" in done.stdout
 
 
-def test_a_mistake_is_one_line_and_status_2(afm_rl):
-    done = afm_rl("planner.horizon=-1", "method=physics")
-    assert (done.status, done.out) == (2, "")
-    assert done.err == "afm-rl: planner.horizon=-1: expected a whole number of at least 1\n"
-
-
 def test_a_choice_that_is_not_there_is_one_line_too(process):
     done = process(sys.executable, "-m", "afm_rl.cli", "planner=mpppi")
     assert done.returncode == 2

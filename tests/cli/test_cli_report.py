@@ -1,77 +1,25 @@
 """The command ``afm-rl-report``."""
 
+import functools
 import os
 import sys
-from itertools import product
-from types import SimpleNamespace
 
 import pandas as pd
 import pytest
+from laps import results, write_results
 
 from afm_rl.cli import report
-from afm_rl.missions import LapScore
-from afm_rl.storage.manifest import write_manifest
-from afm_rl.storage.measures import FILE
 
 
 @pytest.fixture
 def run_folder(tmp_path):
-    """A run of two methods that stood still, on a track of the catalogue."""
-    table = []
-    for number, (method, seed) in enumerate(product(["physics", "oracle"], range(2))):
-        success = float(method == "oracle")
-        table.append(
-            {
-                "method": method,
-                "track": "ethz_2",
-                "v_gain": -1.0,
-                "omega_gain": 1.0,
-                "seed": seed,
-                "success_rate": success,
-                "steps": 9 + seed,
-                "reached": int(19 * success),
-                "targets": 19,
-                "finished": success == 1,
-                "seconds": 1.0,
-                "mission": number,
-            }
-        )
-    steps = [
-        {
-            "mission": number,
-            "t": t,
-            "x": 7.2,
-            "y": 5.4,
-            "error": 0.1,
-            "loss": 1.0,
-            "regime_active": int(t > 4),
-            "reached": 0,
-        }
-        for number in range(4)
-        for t in range(10)
-    ]
-    (tmp_path / FILE).write_text(LapScore.measures.to_json())
-    pd.DataFrame(table).to_csv(tmp_path / "missions.csv", index=False)
-    pd.DataFrame(steps).to_parquet(tmp_path / "steps.parquet")
-    write_manifest(tmp_path)
-    return tmp_path
+    """A run of two methods on a track of the catalogue."""
+    return write_results(tmp_path, *results(("physics", "oracle"), seeds=2, tracks=("ethz_2",)))
 
 
 @pytest.fixture
-def call(monkeypatch, capsys):
-    """Call the command; return status, output and errors."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["afm-rl-report", *map(str, arguments)])
-        try:
-            report.main()
-            status = 0
-        except SystemExit as ended:
-            status = ended.code
-        said = capsys.readouterr()
-        return SimpleNamespace(status=status, out=said.out, err=said.err)
-
-    return run
+def call(called):
+    return functools.partial(called, report.main, "afm-rl-report")
 
 
 def test_a_report_of_a_run(call, run_folder):

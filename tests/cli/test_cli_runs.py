@@ -137,23 +137,6 @@ def test_each_stored_method_of_a_comparison_makes_its_own_run(afm_rl, tmp_path, 
     pd.testing.assert_frame_equal(replayed_steps.drop(columns="mission"), steps, check_exact=True)
 
 
-def test_tracks_of_ones_own(afm_rl, tmp_path, quick):
-    track = tmp_path / "my_track.csv"
-    track.write_text("x,y\n0,0\n0.02,0\n")
-    done = afm_rl(
-        "method=physics",
-        f"tracks=[{track},ethz_1]",
-        "regimes=none",
-        "budget=5",
-        *quick,
-        f"hydra.run.dir={tmp_path}/run",
-    )
-    assert done.status == 0
-    missions = pd.read_csv(tmp_path / "run" / "missions.csv")
-    assert missions["track"].tolist() == ["my_track", "ethz_1"]
-    assert missions["finished"].tolist() == [True, False]
-
-
 def test_a_bug_is_not_dressed_up_as_a_mistake(afm_rl, tmp_path, quick, monkeypatch):
     def bug(*args, **kwargs):
         raise RuntimeError("a bug")

@@ -36,19 +36,18 @@ def places(points):
 
 
 def shown(artist):
-    """Return what an artist shows, in few numbers."""
+    """Return what an artist shows, in few numbers, whatever its colours and widths."""
     if isinstance(artist, Text):
         return artist.get_text()
     if isinstance(artist, Line2D):
         data = artist.get_data_3d() if hasattr(artist, "get_data_3d") else artist.get_data()
-        look = artist.get_color(), artist.get_marker(), artist.get_linewidth()
-        return [*places(np.stack([np.ravel(x) for x in data], -1)), *look]
+        return [*places(np.stack([np.ravel(x) for x in data], -1)), artist.get_marker()]
     if isinstance(artist, FancyArrowPatch):
         return np.round(artist._posA_posB, 6).tolist()
     if isinstance(artist, Polygon):
-        return [places(artist.get_xy()), artist.get_facecolor()]
+        return places(artist.get_xy())
     if hasattr(artist, "get_widths"):  # the road
-        return [places(artist.get_offsets()), artist.get_widths().tolist()[:1]]
+        return places(artist.get_offsets())
     return type(artist).__name__
 
 
