@@ -1,6 +1,7 @@
 """What all regimes have in common, and what each does to an action."""
 
 import math
+import re
 
 import pytest
 import torch
@@ -305,31 +306,25 @@ def test_a_row_is_described_by_what_is_not_nominal(gains):
     assert gains.describe(whole.double()) == "v_gain = -1, omega_gain = 2"
 
 
+@every_family
+def test_values_beyond_their_limits_are_refused(family):
+    for name in family.names:
+        low, high = family.limits.get(name, (-math.inf, math.inf))
+        for value in (low - 1, high + 1, math.nan, math.inf, "much"):
+            match = rf"^regimes: {name}={re.escape(repr(value))}: expected a finite number"
+            with pytest.raises(ConfigurationError, match=match):
+                family.encode({name: value})
+
+
 @pytest.mark.parametrize(
     ("family", "values", "complaint"),
     [
-        (
-            "saturation",
-            {"saturation": 1.5},
-            r"saturation=1.5: expected a finite number in \[0.01, 1\]",
-        ),
-        ("gain", {"v_gain": 1e30}, r"v_gain=1e\+30: .* in \[-100, 100\]"),
-        ("permutation", {"v_from": 1}, r".*expected each of 0..1 once"),
-        ("lag", {"lag": 9}, r"lag=9: .* in \[0, 8\]"),
-        ("slip", {"slip_at": -1}, r"slip_at=-1: .* in \[0, 10\]"),
-        ("slip", {"slip_peak": "much"}, "slip_peak='much': expected a finite number"),
-        ("delay", {"delay": 26}, r"delay=26: expected a finite number in \[0, 25\]"),
+        ("saturation", {"saturation": 1.5}, r"saturation=1.5: .* in \[0.01, 1\]"),
         ("delay", {"delay": 0.5}, "delay=0.5: expected whole steps"),
-        ("bias", {"v_bias": math.nan}, r"v_bias=nan: expected a finite number in \[-10, 10\]"),
-        ("mass", {"mass": 0.0}, r"mass=0.0: expected a finite number in \[0.01, 100\]"),
-        ("mass", {"mass": -1.0}, "mass=-1.0"),
-        ("inertia", {"inertia": 0.0}, "inertia=0.0"),
-        ("motors", {"motor_2": 1.5}, r"motor_2=1.5: expected a finite number in \[0, 1\]"),
-        ("payload", {"payload": -0.1}, "payload=-0.1"),
-        ("wind", {"wind_x": math.inf}, "wind_x=inf"),
+        ("permutation", {"v_from": 1}, r".*expected each of 0..1 once"),
     ],
 )
-def test_values_beyond_their_limits_are_refused(family, values, complaint):
+def test_values_that_are_no_regime_are_refused(family, values, complaint):
     with pytest.raises(ConfigurationError, match=f"^regimes: {complaint}"):
         FAMILIES[family].encode(values)
 

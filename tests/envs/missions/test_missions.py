@@ -48,7 +48,6 @@ def test_given_entries_are_kept_and_copied(form):
         ({"at": torch.full((3, 2), torch.nan)}, "at: expected numbers"),
         ({"ramp": torch.tensor([0, -1, 0])}, "ramp: expected whole numbers of at least 0"),
         ({"track": torch.tensor([0, 2, 0])}, r"track: expected indices 0\.\.1"),
-        ({"track": torch.tensor([0, -1, 0])}, r"track: expected indices 0\.\.1"),
     ],
 )
 def test_impossible_entries_are_refused(form, entries, complaint):
@@ -93,7 +92,6 @@ def test_room_for_more_phases_changes_no_mission():
         ({"track": -1}, "missions: track=-1"),
         ({"seed": -1}, "missions: seed=-1"),
         ({"regime": {"gain": 1.0}}, "unknown parameter 'gain'; allowed: v_gain, omega_gain"),
-        ({"regime": {"v_gain": float("nan")}}, "v_gain=nan"),
         ({"regime": -1.0}, "expected one mapping"),
         ({"regime": [{}, {}]}, "expected one mapping, or one for each of 3 phases"),
         ({"regime": [1.0, 2.0, 3.0]}, "expected one mapping"),

@@ -49,8 +49,6 @@ def test_it_is_the_native_environment():
 def test_mistakes_are_explained():
     with pytest.raises(ConfigurationError, match="render_mode='human': expected none"):
         CrazyflieTrackGym(render_mode="human")
-    with pytest.raises(ConfigurationError, match="mass=0.0"):
-        CrazyflieTrackGym(regime={"mass": 0.0})
     env = CrazyflieTrackGym()
     with pytest.raises(ResetNeeded):
         env.step(HOVER)
