@@ -39,7 +39,9 @@ def agent(make_agent, ring, spot):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_interrupted_runs_are_bit_identical(agent, tmp_path, method):
+    before = torch.manual_seed(2).get_state()
     whole = run(agent(method))
+    assert torch.equal(before, torch.random.get_rng_state())  # left alone
     for stop in sorted(random.Random(method).sample(range(1, 14), 2)):
         with pytest.raises(Stopped, match=f"step {stop}"):
             run(agent(method), checkpoint=tmp_path, stopped=lambda loop, at=stop: loop.step == at)
