@@ -7,6 +7,7 @@ import pickle
 import gymnasium
 import pytest
 import torch
+from pushing import Car
 from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
 from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -121,29 +122,13 @@ def test_terminal_states_reach_the_memory_and_resets_do_not(box, remembered):
 @pytest.mark.parametrize("mode", ["SAME_STEP", "DISABLED"])
 def test_vectorised_gymnasium_environments_keep_terminal_states(mode):
     mode = gymnasium.vector.AutoresetMode(getattr(gymnasium.vector.AutoresetMode, mode))
-    envs = gymnasium.vector.SyncVectorEnv([Short] * 2, autoreset_mode=mode)
+    envs = gymnasium.vector.SyncVectorEnv([lambda: Car(ends=4)] * 2, autoreset_mode=mode)
     chain = [VecGymEnvTransform()] if mode is gymnasium.vector.AutoresetMode.SAME_STEP else []
     box = -torch.ones(2), torch.ones(2)
     env = TransformedEnv(GymWrapper(envs), Compose(*chain, afm(box)))
     data = env.rollout(9, break_when_any_done=False)
     assert data["next", "done"].sum() >= 4
     assert float(data["next", "afm", "innovation"].max()) < 0.1
-
-
-class Short(gymnasium.Env):
-    """A Dubins car whose episodes last four steps."""
-
-    observation_space = gymnasium.spaces.Box(-100.0, 100.0, (3,))
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state, self.count = torch.tensor([5.0, -3.0, 1.0]), 0
-        return self.state.numpy(), {}
-
-    def step(self, action):
-        self.state, self.count = Dubins()(self.state, torch.as_tensor(action)), self.count + 1
-        return self.state.numpy(), 0.0, self.count == 4, False, {}
 
 
 def test_a_compiled_environment_steps_alike(box):

@@ -1,8 +1,8 @@
 """Whatever surrounds it: with a model that is right, the transform stays silent."""
 
-import gymnasium
 import pytest
 import torch
+from pushing import Car
 from torchrl.envs import (
     ActionScaling,
     Compose,
@@ -125,22 +125,6 @@ def test_a_robot_in_double_precision_behind_single_precision(first):
         data = silent(whole)
         assert data["action"].dtype is torch.float32
         assert data["next", "afm", "executed_action"].dtype is torch.float64
-
-
-class Car(gymnasium.Env):
-    """A robot that keeps its state to itself, as gymnasium's do: only such can skip frames."""
-
-    observation_space = gymnasium.spaces.Box(-100.0, 100.0, (3,))
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
-
-    def reset(self, seed=None, options=None):
-        super().reset(seed=seed)
-        self.state = torch.zeros(3)
-        return self.state.numpy(), {}
-
-    def step(self, action):
-        self.state = dubins_step(self.state, torch.as_tensor(action), DT)
-        return self.state.numpy(), 0.0, False, False, {}
 
 
 def skipping(*chain):
