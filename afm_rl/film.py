@@ -6,7 +6,7 @@ import importlib.util
 import io
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -37,6 +37,31 @@ class Scene(NamedTuple):
         """Set all moving parts to a row."""
         for move in self.moving.values():
             move(row)
+
+
+def sheet(width: float = 8.0, height: float = 6.0, dpi: float = 80, **look: Any) -> Figure:
+    """Return an empty figure of so many inches, which needs no window; if not said, of SIZE."""
+    figure = Figure((width, height), dpi=dpi, **look)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def trail(line: Any, *columns: np.ndarray, longest: int = 10**9) -> Callable[[int], object]:
+    """Return what draws a line, in a plane or in space, up to a row of its columns ``(T,)``.
+
+    Args:
+        line: of matplotlib.
+        columns: x, y and, in space, z.
+        longest: rows that are drawn at most, the last ones.
+
+    >>> from matplotlib.lines import Line2D
+    >>> line = Line2D([], [])
+    >>> trail(line, np.arange(9), np.arange(9) ** 2, longest=2)(3)
+    >>> line.get_ydata().tolist()
+    [4, 9]
+    """
+    put = line.set_data if len(columns) == 2 else line.set_data_3d
+    return lambda row: put(*(column[max(row + 1 - longest, 0) : row + 1] for column in columns))
 
 
 def shown(count: int) -> np.ndarray:
@@ -92,8 +117,7 @@ def check_video(video: bool | str) -> str | None:
     needed = ("imageio", "imageio_ffmpeg") if video == "mp4" else ()
     if not all(importlib.util.find_spec(name) for name in needed):
         raise ConfigurationError(
-            "video=mp4: imageio and imageio-ffmpeg are not installed; install afm-rl[video], or "
-            "choose video=gif"
+            "video=mp4: imageio-ffmpeg is missing; install afm-rl[video], or choose video=gif"
         )
     return video
 
@@ -125,8 +149,8 @@ def _mp4(pictures: Iterable[np.ndarray]) -> bytes:
     """Return a film in H.264."""
     from imageio.v3 import imwrite  # an extra
 
-    whole = np.stack(list(pictures))
-    return imwrite("<bytes>", whole, extension=".mp4", plugin="FFMPEG", fps=RATE)
+    film = np.stack([*pictures])
+    return imwrite("<bytes>", film, extension=".mp4", plugin="FFMPEG", fps=RATE)
 
 
 ENCODERS: dict[str, Callable[[Iterable[np.ndarray]], bytes]] = {"gif": _gif, "mp4": _mp4}
@@ -168,7 +192,7 @@ def can_render() -> bool:
 def _bones(model: Any, states: np.ndarray) -> Iterator[np.ndarray]:
     """Yield pictures of the axes of capsules and the middles of other geoms."""
     ends, wide = segments(model, states)  # (T, K, 2, 3), (K,)
-    moving = np.append(model.body_weldid[model.geom_bodyid[_solid(model)]], bones(model)[:, 1]) > 0
+    moving = np.append(model.body_weldid[model.geom_bodyid[solid(model)]], bones(model)[:, 1]) > 0
     own = ends[:, moving] if moving.any() else ends
     spread = np.ptp(own.reshape(-1, 3), axis=0)
     across = [0, 2] if spread[2] > spread[1] else [0, 1]
@@ -178,7 +202,7 @@ def _bones(model: Any, states: np.ndarray) -> Iterator[np.ndarray]:
         box = own[..., across].reshape(-1, 2)
         middle = np.repeat((box.min(0) + box.max(0))[None] / 2, len(states), 0)
         size = max(size, 1.2 * np.ptp(box, axis=0).max())
-    figure = _sheet()
+    figure = sheet()
     axes = figure.add_axes((0.1, 0.1, 0.85, 0.85), aspect="equal")
     axes.set(xlabel="xyz"[across[0]] + " (m)", ylabel="xyz"[across[1]] + " (m)")
     points = 72 * 0.85 * figure.get_figheight() / size  # of a metre
@@ -200,19 +224,19 @@ def segments(model: Any, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     import mujoco
 
-    data, solid = mujoco.MjData(model), _solid(model)
-    kind, size = model.geom_type[solid], model.geom_size[solid]
+    data, geoms = mujoco.MjData(model), solid(model)
+    kind, size = model.geom_type[geoms], model.geom_size[geoms]
     boxes, long = np.isin(kind, (4, 6, 7)), np.isin(kind, (3, 5))  # ellipsoids, meshes; capsules
     radius = np.where(boxes, np.median(size, 1), size[:, 0])
     half = np.where(boxes, np.maximum(size.max(1) - radius, 0.05 * radius), 0.05 * radius)
     half = np.where(long, size[:, 1], half)[:, None]
-    which, along = np.arange(len(solid)), np.where(boxes, size.argmax(1), 2)
+    which, along = np.arange(len(geoms)), np.where(boxes, size.argmax(1), 2)
     pairs, ends = bones(model), []
     for row in states:
         data.qpos = row[: model.nq]
         mujoco.mj_kinematics(model, data)
-        axis = half * data.geom_xmat[solid].reshape(-1, 3, 3)[which, :, along]
-        both = np.stack([data.geom_xpos[solid] - axis, data.geom_xpos[solid] + axis], 1)
+        axis = half * data.geom_xmat[geoms].reshape(-1, 3, 3)[which, :, along]
+        both = np.stack([data.geom_xpos[geoms] - axis, data.geom_xpos[geoms] + axis], 1)
         ends.append(np.concatenate([both, data.xpos[pairs]]))
     return np.stack(ends), np.append(radius, [BONE] * len(pairs))
 
@@ -222,7 +246,7 @@ def bones(model: Any) -> np.ndarray:
 
     So a robot whose meshes are left out is seen as its skeleton.
     """
-    shaped = np.isin(np.arange(model.nbody), model.geom_bodyid[_solid(model)])
+    shaped = np.isin(np.arange(model.nbody), model.geom_bodyid[solid(model)])
     parents = model.body_parentid
     length = np.linalg.norm(model.body_pos, axis=1)
     pairs = [
@@ -235,27 +259,17 @@ def bones(model: Any) -> np.ndarray:
 
 def curves(t: np.ndarray, states: np.ndarray, names: Sequence[str]) -> Iterator[np.ndarray]:
     """Yield pictures of curves that grow, one panel per coordinate of states ``(T, S)``."""
-    figure, moving = _sheet(layout="constrained"), Moves()
+    figure, moving = sheet(layout="constrained"), Moves()
     panels = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     for panel, name, column in zip(panels, names, states.T, strict=True):
         panel.plot(t, column, color=FIXED, alpha=0.3, linewidth=1)
         panel.set_ylabel(name)
         (line,) = panel.plot([], color=BODY)
-        moving[line] = partial(_grow, line, t, column)
+        moving[line] = trail(line, t, column)
     panels[-1].set_xlabel("step")
     return frames(Scene(figure, moving), range(len(states)))
 
 
-def _grow(line: Any, t: np.ndarray, values: np.ndarray, row: int) -> None:
-    line.set_data(t[: row + 1], values[: row + 1])
-
-
-def _sheet(dpi: int = 80, **look: Any) -> Figure:
-    height, width = SIZE
-    figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, **look)
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _solid(model: Any) -> np.ndarray:
-    return np.flatnonzero(model.geom_type != 0)  # all but planes
+def solid(model: Any) -> np.ndarray:
+    """Return the numbers of an ``MjModel``'s geoms but planes."""
+    return np.flatnonzero(model.geom_type != 0)

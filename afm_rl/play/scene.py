@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import trimesh
 
-from afm_rl.film import BONE, bones
+from afm_rl.film import BONE, bones, solid
 
 COLOURS = {"alone": (213, 94, 0), "AFM": (0, 114, 178)}
 LANE = 1.6  # m from the middle to either robot
@@ -20,8 +20,7 @@ class MuJoCoFigure:
     def __init__(self, server: Any, name: str, inner: Any, place: np.ndarray) -> None:
         self.inner, self.place, model = inner, place, inner.model
         self.root = server.scene.add_frame(f"/{name}", show_axes=False, position=place)
-        solid = np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
-        shaped = {*model.geom_bodyid[solid].tolist(), *bones(model)[:, 0].tolist()}
+        shaped = {*model.geom_bodyid[solid(model)].tolist(), *bones(model)[:, 0].tolist()}
         self.bodies = {
             body: server.scene.add_frame(f"/{name}/{body}", show_axes=False) for body in shaped
         }
@@ -29,7 +28,7 @@ class MuJoCoFigure:
             bone = trimesh.creation.cylinder(BONE, segment=[np.zeros(3), model.body_pos[child]])
             own = f"/{name}/{parent}/bone{child}"
             server.scene.add_mesh_simple(own, bone.vertices, bone.faces, color=COLOURS[name])
-        for geom in solid:
+        for geom in solid(model):
             shape, own = shape_of(model, geom), f"/{name}/{model.geom_bodyid[geom]}/{geom}"
             look = {"color": COLOURS[name], "wxyz": model.geom_quat[geom]}
             spot = model.geom_pos[geom]

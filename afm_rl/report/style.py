@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 
+from afm_rl.film import sheet
 from afm_rl.report.runs import with_scenarios
 
 Look = dict[str, Any]
@@ -128,9 +128,7 @@ def excerpt(missions: pd.DataFrame, scenarios: int) -> tuple[pd.DataFrame, dict[
 
 def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:
     """Return an empty white figure of ``width`` by ``height`` inches."""
-    figure = Figure((width, height), dpi=dpi, layout="constrained", facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
+    return sheet(width, height, dpi, layout="constrained", facecolor="white")
 
 
 def dress(axes: Any, x: str = "", y: str = "", lines: Any = None, size: float = SMALL) -> None:

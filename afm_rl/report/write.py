@@ -10,14 +10,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from jinja2 import Environment, StrictUndefined
 from torch.utils.tensorboard import SummaryWriter
 
 from afm_rl.errors import ArtefactError, ConfigurationError
+from afm_rl.film import ENCODERS, shown
 from afm_rl.report.figures import draw_report, draw_run, read_excerpts
 from afm_rl.report.learning import recovery_table
 from afm_rl.report.runs import Runs, steps_of, with_scenarios
+from afm_rl.report.scenes import films_of
 from afm_rl.report.statistics import aggregate, budget_notes, compare, count_budgets
 from afm_rl.report.tables import (
     comparison_tables,
@@ -170,6 +173,57 @@ def write_run(
     for picture in draw_run(missions, steps, measures, tracks) if figures else ():
         written.append(folder / "figures" / f"{picture.name}.png")
         write_whole(written[-1], picture.png)
+        echo(f"wrote {written[-1]}")
+    return written
+
+
+def write_films(
+    folder: Path,
+    runs: Runs,
+    tracks: Sequence[DrawableTrack] = (),
+    form: str = "gif",
+    echo: Callable[[str], object] = print,
+    draw: Callable[[pd.DataFrame], Iterable[np.ndarray]] | None = None,
+) -> list[Path]:
+    """Write a film of each method's first mission, ``METHOD.gif`` or ``METHOD.mp4``.
+
+    Of several methods on a map, one more film shows all of them at once (``all_methods.gif``),
+    six at most, until soon after the last one finished. A film has at most 150 frames, 15 a
+    second, whatever the length of the mission. Files of the same name are replaced; each is
+    written whole or not at all.
+
+    Args:
+        folder: where to; made if it is not there.
+        runs: the results; see :data:`~afm_rl.report.scenes.COLUMNS` for what their steps must have.
+        tracks: tracks to draw, found by name.
+        form: ``"gif"`` or ``"mp4"``.
+        echo: receives one line per film.
+        draw: returns pictures of a mission's steps, for robots that are not on a map.
+
+    Returns:
+        The files written.
+
+    Raises:
+        ConfigurationError: if there are no steps, a column is missing, or the folder cannot be
+            written.
+    """
+    first = runs.with_steps.drop_duplicates("method")
+    if first.empty:
+        where = ", ".join(map(str, runs.folders))
+        raise ConfigurationError(f"{where}: no steps.parquet; films are drawn from it")
+    steps = runs.steps(first)
+    each = steps_of(steps, first["mission"])
+    missions = {m.method: each.get(m.mission, steps.iloc[:0]) for m in first.itertuples()}
+    films: Iterable[tuple[str, Iterable[np.ndarray]]]
+    if draw is None:
+        films = films_of(first, missions, {track.name: track for track in tracks})
+    else:
+        films = ((name, draw(rows.iloc[shown(len(rows))])) for name, rows in missions.items())
+    names = dict(zip(("", *missions), folder_names(["all_methods", *missions]), strict=True))
+    written = []
+    for method, pictures in films:
+        written.append(folder / f"{names[method]}.{form}")
+        write_whole(written[-1], ENCODERS[form](pictures))
         echo(f"wrote {written[-1]}")
     return written
 

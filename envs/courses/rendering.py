@@ -6,14 +6,12 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 from torch import Tensor
 
 from afm_rl.envs.courses.track import Track
 from afm_rl.errors import check_count
-from afm_rl.film import picture
+from afm_rl.film import picture, sheet
 
 LINE = "#999999"
 DPI = 64  # a power of two, so that sizes in inches are exact
@@ -57,8 +55,7 @@ class TrackCanvas:
         size = 16 * torch.ceil((high - low) * metre / 16)
         middle, half = (low + high) / 2, size / metre / 2
         (left, bottom), (right, top) = (middle - half).tolist(), (middle + half).tolist()
-        self.figure = Figure(figsize=(float(size[0]) / DPI, float(size[1]) / DPI), dpi=DPI)
-        FigureCanvasAgg(self.figure)
+        self.figure = sheet(*(size / DPI).tolist(), DPI)
         axes = self.figure.add_axes((0, 0, 1, 1), xlim=(left, right), ylim=(bottom, top))
         axes.set_axis_off()
         x, y = torch.cat([track.centerline, track.centerline[:1]]).unbind(-1)

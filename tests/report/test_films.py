@@ -6,12 +6,12 @@ import io
 import numpy as np
 import pandas as pd
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from afm_rl.errors import ConfigurationError
 from afm_rl.film import ENCODERS, FRAMES, check_video, frames, shown
 from afm_rl.report import read_runs, write_films
-from afm_rl.report.film import map_scene, space_scene
+from afm_rl.report.scenes import map_scene, space_scene
 from afm_rl.storage.manifest import write_manifest
 from afm_rl.storage.measures import Measure, Measures
 
@@ -32,12 +32,11 @@ def fly(ticks=30, method="physics"):
     """Tables of one flight."""
     t, phase = np.arange(ticks), (np.arange(ticks) >= 10).astype(int)
     x, y = 2 * np.cos(0.05 * t), 2 * np.sin(0.05 * t)
-    names = ("mission", "t", "x", "y", "z", "goal_x", "goal_y", "goal_z")
-    values = [np.zeros(ticks, dtype=int), t, x, y, 0.1 * phase, x, y, np.zeros(ticks)]
-    thrust = {"planned_thrust": np.full(ticks, 0.3), "executed_thrust": 0.3 - 0.15 * phase}
-    rest = {"misaligned": phase, "regime_active": phase, "phase": phase, "error": 0.0 * t}
-    squares = {f"square_error_{axis}": 0.0 * t for axis in "xyz"} | {"loss": 0.0 * t}
-    steps = pd.DataFrame(dict(zip(names, values, strict=True)) | thrust | rest | squares)
+    steps = pd.DataFrame({"mission": 0, "t": t, "x": x, "y": y, "z": 0.1 * phase})
+    steps = steps.assign(goal_x=x, goal_y=y, goal_z=0.0, planned_thrust=0.3)
+    steps = steps.assign(executed_thrust=0.3 - 0.15 * phase, misaligned=phase, regime_active=phase)
+    steps = steps.assign(phase=phase, error=0.0, loss=0.0)
+    steps[[f"square_error_{axis}" for axis in "xyz"]] = 0.0
     row = {"mission": 0, "method": method, "track": "circle", "mass": 0.5, "seed": 0, "mse": 0.1}
     row |= {"mse_z": 0.3, "peak_z": 0.1, "steps": ticks - 1, "finished": True, "seconds": 1.0}
     return pd.DataFrame([row]), steps
@@ -45,13 +44,9 @@ def fly(ticks=30, method="physics"):
 
 def pictures(data):
     """Return the pictures of a GIF ``(N, H, W, 3)`` and how long each is shown (ms)."""
-    film = Image.open(io.BytesIO(data))
-    shown, durations = [], []
-    for number in range(film.n_frames):
-        film.seek(number)
-        shown.append(np.asarray(film.convert("RGB")))
-        durations.append(film.info["duration"])
-    return np.stack(shown), durations
+    film = ImageSequence.all_frames(Image.open(io.BytesIO(data)))
+    shown = np.stack([np.asarray(frame.convert("RGB")) for frame in film])
+    return shown, [frame.info["duration"] for frame in film]
 
 
 def artists(scene, kind):

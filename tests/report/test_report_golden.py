@@ -21,7 +21,7 @@ from afm_rl.report import (
 )
 from afm_rl.report.comparison import draw_profile, draw_progress, ratios
 from afm_rl.report.figures import read_excerpts
-from afm_rl.report.film import map_scene, space_scene
+from afm_rl.report.scenes import map_scene, space_scene
 from afm_rl.report.statistics import count_budgets
 from afm_rl.report.style import method_styles
 from afm_rl.storage.measures import Measure, Measures

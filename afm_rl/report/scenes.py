@@ -1,10 +1,9 @@
-"""Films of missions, drawn from the table of steps: robots on a map, or in space."""
+"""Scenes of films, drawn from the table of steps: robots on a map, or in space."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,95 +14,48 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch, Polygon
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.film import ENCODERS, Moves, Scene, frames, shown
+from afm_rl.film import Moves, Scene, frames, shown, trail
 from afm_rl.report import style
 from afm_rl.report.learning import last_step
-from afm_rl.report.runs import Runs, action_names, steps_of
+from afm_rl.report.runs import action_names
 from afm_rl.report.space_plot import GOAL, POSITION, dress_space, mark_regimes
 from afm_rl.report.style import BEFORE, CHANGED, EXECUTED, FEW, PLANNED, REFERENCE, START, TARGET
 from afm_rl.report.trajectory import DrawableTrack, changed_stretch, draw_road, positions, view
-from afm_rl.report.write import folder_names
-from afm_rl.storage.files import write_whole
 
 COLUMNS = ("x", "y", "goal_x", "goal_y", "error", "misaligned", "regime_active")  # at least
 BODY = np.array([[1.0, 0.0], [-0.8, 0.65], [-0.4, 0.0], [-0.8, -0.65]])  # seen from above
 GRID = 0.16  # inches: sides of pictures are multiples of 16 pixels, as video codecs want them
 
 
-def write_films(
-    folder: Path,
-    runs: Runs,
-    tracks: Sequence[DrawableTrack] = (),
-    form: str = "gif",
-    echo: Callable[[str], object] = print,
-    draw: Callable[[pd.DataFrame], Iterable[np.ndarray]] | None = None,
-) -> list[Path]:
-    """Write a film of each method's first mission, ``METHOD.gif`` or ``METHOD.mp4``.
+def films_of(
+    missions: pd.DataFrame, steps: Mapping[str, pd.DataFrame], roads: Mapping[str, DrawableTrack]
+) -> Iterator[tuple[str, Iterator[np.ndarray]]]:
+    """Yield the pictures of each method's mission, under its name.
 
-    Of several methods on a map, one more film shows all of them at once (``all_methods.gif``),
-    six at most, until soon after the last one finished. A film has at most 150 frames, 15 a
-    second, whatever the length of the mission. Files of the same name are replaced; each is
-    written whole or not at all.
-
-    Args:
-        folder: where to; made if it is not there.
-        runs: the results; see :data:`COLUMNS` for what their steps must have.
-        tracks: tracks to draw, found by name.
-        form: ``"gif"`` or ``"mp4"``.
-        echo: receives one line per film.
-        draw: returns pictures of a mission's steps, for robots that are not on a map.
-
-    Returns:
-        The files written.
+    Of several methods on a map, first those of all that are in the first scenario, six at most,
+    under the name "", until soon after the last one finished.
 
     Raises:
-        ConfigurationError: if there are no steps, a column is missing, or the folder cannot be
-            written.
+        ConfigurationError: if a column of :data:`COLUMNS` is missing.
     """
-    first = runs.with_steps.drop_duplicates("method")
-    if first.empty:
-        where = ", ".join(map(str, runs.folders))
-        raise ConfigurationError(f"{where}: no steps.parquet; films are drawn from it")
-    steps, roads = runs.steps(first), {track.name: track for track in tracks}
-    rows = steps_of(steps, first["mission"])
-    space = {"z", "goal_z"} <= set(steps.dropna(axis=1, how="all"))
-    together, *names = folder_names(["all_methods", *first["method"]])
-    written: list[Path] = []
-
-    def write(name: str, pictures: Iterable[np.ndarray]) -> None:
-        written.append(folder / f"{name}.{form}")
-        write_whole(written[-1], ENCODERS[form](pictures))
-        echo(f"wrote {written[-1]}")
-
-    scenario = first["scenario"].iloc[0]
-    beside = first[first["scenario"] == scenario][:FEW]
-    if draw is None and len(beside) > 1 and not space:
-        end = last_step(beside)
-        parts = {m.method: _checked(rows, m.mission, steps) for m in beside.itertuples()}
-        parts = {name: own[own["t"] <= end] for name, own in parts.items()}
-        scene = map_scene(scenario, parts, roads.get(beside["track"].iloc[0]))
-        write(together, frames(scene, shown(max(map(len, parts.values())))))
-    for mission, name in zip(first.itertuples(), names, strict=True):
-        if draw is not None:
-            own = rows[mission.mission]
-            write(name, draw(own.iloc[shown(len(own))]))
-            continue
-        own, title = _checked(rows, mission.mission, steps), f"{mission.method}: {mission.scenario}"
-        road = roads.get(mission.track)
-        scene = space_scene(title, own) if space else map_scene(title, {mission.method: own}, road)
-        write(name, frames(scene, shown(len(own))))
-    return written
-
-
-def _checked(rows: dict[int, pd.DataFrame], mission: int, steps: pd.DataFrame) -> pd.DataFrame:
-    """Return the steps of a mission, if they can be filmed."""
-    own = rows.get(mission, steps.iloc[:0])
-    missing = [name for name in COLUMNS if name not in own or own[name].isna().all()]
+    tables = steps.values()
+    missing = [k for k in COLUMNS if any(k not in rows or rows[k].isna().all() for rows in tables)]
     if missing:
         raise ConfigurationError(
             f"video: the steps lack {', '.join(missing)}; films are drawn of robots with positions"
         )
-    return own
+    space = any({"z", "goal_z"} <= set(rows.dropna(axis=1, how="all")) for rows in tables)
+    scenario = missions["scenario"].iloc[0]
+    beside = missions[missions["scenario"] == scenario][:FEW]
+    if len(beside) > 1 and not space:
+        end, road = last_step(beside), roads.get(beside["track"].iloc[0])
+        runs = {name: steps[name].loc[steps[name]["t"] <= end] for name in beside["method"]}
+        yield "", frames(map_scene(scenario, runs, road), shown(max(map(len, runs.values()))))
+    for mission in missions.itertuples():
+        name, rows, road = mission.method, steps[mission.method], roads.get(mission.track)
+        title = f"{name}: {mission.scenario}"
+        scene = space_scene(title, rows) if space else map_scene(title, {name: rows}, road)
+        yield name, frames(scene, shown(len(rows)))
 
 
 def map_scene(
@@ -167,15 +119,15 @@ def _robot(
         body.set_xy(path[row] + 0.022 * span * BODY @ np.array([[cos, sin], [-sin, cos]]))
 
     moving: Moves = {
-        before: lambda row: before.set_data(*path[: row + 1].T),
-        under: lambda row: under.set_data(*changed[: row + 1].T),
+        before: trail(before, *path.T),
+        under: trail(under, *changed.T),
         body: turn,
     }
     handles: dict[str, Artist] = {"nominal": before, "changed regime": under}
     if alone:
         goals = steps[["goal_x", "goal_y"]].to_numpy()
         (target,) = axes.plot([], [], **TARGET, zorder=5)
-        moving[target] = lambda row: target.set_data(*goals[row : row + 1].T)
+        moving[target] = trail(target, *goals.T, longest=1)
         handles["target"] = target
     if alone and {"v", "omega"} <= set(action_names(steps)):
         looks = {"planned": PLANNED, "executed": EXECUTED}
@@ -233,9 +185,9 @@ def space_scene(title: str, steps: pd.DataFrame) -> Scene:
     handles |= {name: Line2D([], [], **look) for name, look in looks.items()}
     style.legend_above(figure, [*handles.values()], [*handles], title)
     moving: Moves = {
-        line: lambda row: line.set_data_3d(*path[: row + 1].T),
-        goal: lambda row: goal.set_data_3d(*wanted[row : row + 1].T),
-        robot: lambda row: robot.set_data_3d(*path[row : row + 1].T),
+        line: trail(line, *path.T),
+        goal: trail(goal, *wanted.T, longest=1),
+        robot: trail(robot, *path.T, longest=1),
     }
     return Scene(figure, moving | cursors | _words(space, steps, True))
 
