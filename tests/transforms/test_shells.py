@@ -5,13 +5,11 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from puck import Puck, push
 from shells import BOX, EPISODE, MODEL, plans_of, pucks, wrapper
 from tensordict import TensorDict
 from torchrl.data import Bounded
 from torchrl.envs.utils import step_mdp
 
-from afm_rl import ActionFlowWrapper
 from afm_rl.correction import LeastSquares
 from afm_rl.errors import ConfigurationError
 from afm_rl.transforms import ActionFlowPolicy, ActionFlowTransform
