@@ -11,6 +11,7 @@ from tensordict import TensorDict
 
 from afm_rl.cli.overrides import checked
 from afm_rl.dynamics import Dubins
+from afm_rl.learning import GaussianNLLLoss
 from afm_rl.missions import build
 
 LOW, HIGH = BOX = torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5])  # of the ground robot
@@ -32,6 +33,13 @@ SMALL = {
     "robot.data.rounds": [64, 64],
     "robot.data.fit.epochs": 1,
 }
+
+
+def loss_by_row(model):
+    """Return the loss of each transition."""
+    loss = GaussianNLLLoss(model)
+    loss.reduction = "none"
+    return loss
 
 
 def shrink(cfg, more=()):

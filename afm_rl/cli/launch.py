@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from afm_rl.cli.error_messages import explain
 from afm_rl.cli.methods import check_had, jobs_of
+from afm_rl.cli.overrides import values_of
 from afm_rl.envs import load_track
 from afm_rl.errors import AFMError, ConfigurationError, check_count, check_flag
 from afm_rl.film import check_video
@@ -56,8 +57,8 @@ def launch(cfg: DictConfig) -> None:
 
     Everything is built and checked before anything is trained.
     """
-    film = check_settings(cfg)
     hydra = HydraConfig.get()
+    film = check_settings(cfg, hydra.overrides.task)
     folder = Path(hydra.runtime.output_dir)
     jobs = jobs_of(cfg, cast(DictConfig, hydra))
     agents = [build(job) for job in {job.label: job for job in jobs.values()}.values()]
@@ -83,7 +84,7 @@ def sweep(
     executor: Executor,
 ) -> None:
     """Run the jobs of a sweep, and report on them."""
-    film = check_settings(cfg)
+    film = check_settings(cfg, cfg.hydra.overrides.task)
     common = set.intersection(*map(set, overrides))
     jobs, failures = dict[str, DictConfig](), dict[str, str]()
     for one, given in zip(configs, overrides, strict=True):
@@ -105,8 +106,12 @@ def sweep(
         raise failed
 
 
-def check_settings(cfg: DictConfig) -> str | None:
+def check_settings(cfg: DictConfig, given: Sequence[str]) -> str | None:
     """Check the settings that are not of the missions.
+
+    Args:
+        cfg: all settings.
+        given: those of the command line.
 
     Returns:
         The format of films; None for no films.
@@ -114,6 +119,8 @@ def check_settings(cfg: DictConfig) -> str | None:
     torch.set_num_threads(check_count("threads", cfg.threads, high=256))
     for name in ("overwrite", "progress", "figures", "tensorboard"):
         check_flag(name, cfg[name])
+    if cfg.overwrite and not values_of("overwrite", given):
+        raise ConfigurationError("overwrite=True: counts on the command line only")
     if not isinstance(cfg.cache, str):
         raise ConfigurationError(f"cache={cfg.cache!r}: expected a folder")
     check_options(Checkpoints.__init__, cfg.checkpoints)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import os
 import re
@@ -10,15 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.plugins import Plugins
-from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig
 
-from afm_rl.cli.composed import check_composed, check_sources, given_by
-from afm_rl.trust import check_trust, conf_folders, trusting
+from afm_rl.cli.sources import check_links, checked_files
+from afm_rl.trust import check_trust, trusting
 
 PARTS = ("dynamics", "updater", "corrector")
 OPTIONAL = "++"  # how Hydra is told to take a setting whether it is there or not
@@ -105,59 +99,27 @@ def has(settings: Mapping[str, Any], key: str) -> bool:
     return True
 
 
-class TrustedFolders(SearchPathPlugin):
-    """Lets Hydra find the settings of trusted packages, after those of this library."""
+def values_of(key: str, arguments: Sequence[str]) -> list[Any]:
+    """Return what a command line itself gives a setting.
 
-    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for folder in conf_folders():
-            search_path.append("trust", f"file://{folder}")
-
-
-def trusted_packages(arguments: Sequence[str]) -> list[str]:
-    """Return the packages that the command line itself trusts; files cannot.
-
-    >>> trusted_packages(["method=physics", "trust=[mine, my.models]"])
-    ['mine', 'my.models']
+    >>> values_of("trust", ["method=physics", "trust=[mine, my.models]"])
+    [['mine', 'my.models']]
     """
-    given = [text for text in arguments if re.match(r"\+{0,2}trust=", text)]
-    values = [each.value() for each in OverridesParser.create().parse_overrides(given)]
-    return [name for names in values for name in check_trust(names)]
+    texts = [text for text in arguments if re.match(rf"\+{{0,2}}{key}=", text)]
+    return [each.value() for each in OverridesParser.create().parse_overrides(texts)]
 
 
 @contextmanager
 def checked(arguments: Sequence[str]) -> Iterator[list[str]]:
-    """Let Hydra compose what a command asks for, and check it before anything in it is called.
+    """Let Hydra compose what a command asks for of files that are checked as they are read.
 
     Trusted is what the command line names, and ``AFM_RL_TRUST`` as it is now.
 
     Yields:
         The packages that are trusted.
     """
-    load = ConfigLoaderImpl.load_configuration
-
-    @functools.wraps(load)
-    def checking(
-        self: ConfigLoaderImpl,
-        config_name: str | None,
-        overrides: list[str],
-        *args: Any,
-        **how: Any,
-    ) -> DictConfig:
-        primary = config_name and self.repository.load_config(config_path=config_name)
-        if primary:
-            check_sources(primary.config)
-        cfg = load(self, config_name, overrides, *args, **how)
-        check_composed(cfg, overrides, given)
-        return cfg
-
     named = os.environ.get("AFM_RL_TRUST", "").split(",")
-    names = [*filter(None, named), *trusted_packages(arguments)]
-    given = given_by(arguments)
-    with trusting(names):
-        conf_folders()  # an error of a package is told here, not as one of Hydra's
-        Plugins.instance().register(TrustedFolders)
-        ConfigLoaderImpl.load_configuration = checking  # type: ignore[method-assign]
-        try:
-            yield names
-        finally:
-            ConfigLoaderImpl.load_configuration = load  # type: ignore[method-assign]
+    given = [name for names in values_of("trust", arguments) for name in check_trust(names)]
+    check_links(map(str, values_of(r"hydra\.(run|sweep)\.dir", arguments)))
+    with trusting(names := [*filter(None, named), *given]), checked_files():
+        yield names

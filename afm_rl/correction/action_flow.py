@@ -29,6 +29,10 @@ from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import ConfigurationError, check_number
 from afm_rl.options import option, options
 
+MOST_ODDS = 16.0  # what a long healthy time can make of the odds that nothing has changed
+LEAST_NOISE = 0.02  # floor of the noise, a share of the largest recent command
+LEAST_COMMAND = 0.25  # floor of that, a share of the largest action
+
 
 class ActionFlow(PairCorrector):
     r"""The flow from noise around the planned action to the action that has its effect.
@@ -55,7 +59,7 @@ class ActionFlow(PairCorrector):
         network: the network; None: the universal one that comes with the package.
 
     Raises:
-        ConfigurationError: for unknown hypotheses, ``noise`` below ``least_noise``, or a ``memory``
+        ConfigurationError: for unknown hypotheses, ``noise`` below .02, or a ``memory``
             that is shorter than hypotheses look back.
 
     >>> flow = ActionFlow(torch.tensor([-1.0, -1.5]), torch.tensor([1.0, 1.5]))
@@ -81,6 +85,8 @@ class ActionFlow(PairCorrector):
     cause: Tensor
     healthy: Tensor
     episodic = (*PairCorrector.episodic, "under_way")
+    place_scale = 0.3
+    """Distance to other ground, m."""
 
     @options("corrector")
     def __init__(
@@ -94,7 +100,6 @@ class ActionFlow(PairCorrector):
         rows: int | None = option(None, "pairs of a context window; None: 12, or more", ge=1),
         memory: int = option(80, "transitions that are remembered", ge=1),
         place: Sequence[int] = option((), "state coordinates in which the ground may differ", ge=0),
-        place_scale: float = option(0.5, "distance to other ground, in their unit", gt=0),
         plain: float = option(-6.0, "prior log-odds of linear models against the network"),
         samples: int = option(16, "starting points of the flow", ge=1),
         source_std: float = option(0.3, "of these, sigma, a share of the largest action", ge=0),
@@ -104,7 +109,6 @@ class ActionFlow(PairCorrector):
         cache: str | Path = option("~/.cache/afm_rl", "folder of what is compiled"),
         network: AxisNetwork | None = None,
         odds: float = option(1.0, "prior log-odds that nothing has changed", ge=0),
-        most_odds: float = option(16.0, "what a long healthy time can make of them", ge=0),
         discount: float = option(
             0.95,
             "of losses; .95: looks back on 20 steps",
@@ -113,8 +117,6 @@ class ActionFlow(PairCorrector):
         ),
         noise: float = option(0.05, "unexplained at first, a share of the largest action", ge=0),
         noise_rate: float = option(0.1, "share of its square renewed at every step", ge=0, le=1),
-        least_noise: float = option(0.02, "its floor, a share of the largest recent command", gt=0),
-        least_command: float = option(0.25, "its floor, a share of the largest action", gt=0, le=1),
         quiet: float = option(
             1.0, "innovation that needs no explanation, in standard deviations", ge=0
         ),
@@ -132,10 +134,9 @@ class ActionFlow(PairCorrector):
         super().__init__(action_low, action_high, rows, memory, len(place), quiet, delay, home)
         self.hypotheses = choose(hypotheses, bool(place), plain, longest_delay)
         self.models = tuple(row.name for row in self.hypotheses)
-        self.odds, self.most_odds, self.discount, self.tails = odds, most_odds, discount, tails
-        self.noise = check_number("corrector.noise", noise, low=least_noise)
-        self.noise_rate, self.least_noise = noise_rate, least_noise
-        self.least_command, self.place, self.place_scale = least_command, place, place_scale
+        self.odds, self.discount, self.tails, self.place = odds, discount, tails, place
+        self.noise = check_number("corrector.noise", noise, low=LEAST_NOISE)
+        self.noise_rate = noise_rate
         nominal, *others = self.hypotheses
         log_prior = torch.tensor([row.log_prior for row in others])
         prior = torch.cat([torch.full((1,), self.odds), log_prior.log_softmax(0)])
@@ -157,7 +158,7 @@ class ActionFlow(PairCorrector):
             "constant_delays": torch.tensor(constant),
             "delay_likelihood": likelihood,
             "delay_log_prior": delay_log_prior,
-            "farthest": most_odds / (1 + (delays > 0).unsqueeze(-1).to(prior)),
+            "farthest": MOST_ODDS / (1 + (delays > 0).unsqueeze(-1).to(prior)),
             "healthy": torch.tensor(
                 [float(row.kind in ("nominal", "healthy")) for row in self.hypotheses]
             ),
@@ -248,7 +249,7 @@ class ActionFlow(PairCorrector):
     def floor(self, parts: Fields) -> Tensor:
         """Return the least noise ``(*B, A)``: effects nearer than that are all the same."""
         largest = parts["pairs"][..., : self.action_size].abs().amax(-2)
-        return self.least_noise * largest.clamp(self.least_command, 1.0)
+        return LEAST_NOISE * largest.clamp(LEAST_COMMAND, 1.0)
 
     def weights(self, parts: Fields) -> Tensor:
         """Return the probabilities of the models ``(*B, M, A)``."""

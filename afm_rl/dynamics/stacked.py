@@ -14,6 +14,7 @@ from afm_rl.options import option, options
 
 SLOPE = 0.01  # of the LeakyReLU
 EPS = 1e-5  # of the layer norm: torch's own
+LEAST_STD = 1e-8  # in the features' units
 
 
 def stacked_mlp(
@@ -152,10 +153,9 @@ class RunningStats(nn.Module):
         self,
         size: int = option(..., "features, D", ge=1),
         lead: Sequence[int] = (),
-        min_std: float = option(1e-8, "least standard deviation, in the features' units", gt=0),
     ) -> None:
         super().__init__()
-        self.size, self.min_std = size, min_std
+        self.size = size
         for name, width in (("mean", size), ("scatter", size), ("count", 1)):
             self.register_buffer(name, torch.zeros(*lead, width))
 
@@ -168,7 +168,7 @@ class RunningStats(nn.Module):
     def std(self) -> Tensor:
         """Standard deviation ``(*L, D)``; 1 before the second sample."""
         variance = self.scatter / (self.count - 1).clamp_min(1)
-        return torch.where(self.count > 1, variance.sqrt().clamp_min(self.min_std), 1.0)
+        return torch.where(self.count > 1, variance.sqrt().clamp_min(LEAST_STD), 1.0)
 
     def forward(self, values: Tensor) -> Tensor:
         """Standardise ``(*L, *N, D)``."""

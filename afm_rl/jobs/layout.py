@@ -32,9 +32,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from yaml import YAMLError, safe_load
+from yaml import YAMLError
 
 from afm_rl.errors import ArtefactError
+from afm_rl.storage.files import read_yaml
 from afm_rl.storage.manifest import JOBS, MANIFEST, RECORD, read_verified
 
 LOG = "log.txt"
@@ -63,6 +64,6 @@ def recorded(folder: Path) -> list[str]:
     # Without a manifest it is about to be written anew.
     data = read_verified(folder, RECORD) if is_finished(folder) else path.read_bytes()
     try:
-        return [str(name) for name in safe_load(data)["jobs"]]
-    except (YAMLError, TypeError, KeyError, UnicodeDecodeError, RecursionError):
+        return [str(name) for name in read_yaml(data)["jobs"]]
+    except (YAMLError, TypeError, KeyError, UnicodeDecodeError):
         raise ArtefactError(f"{path}: damaged; delete it") from None

@@ -19,6 +19,8 @@ from afm_rl.progress import Bar
 from afm_rl.spaces.keys import as_keys
 from afm_rl.spaces.manifold import uniform
 
+HELD_OUT = 0.1  # share of transitions that only judges
+
 
 @dataclass(frozen=True)
 class FitReport:
@@ -62,7 +64,6 @@ def fit_ensemble(
         ge=0,
         le=1,
     ),
-    held_out: float = option(0.1, "share of transitions that only judges", gt=0, le=0.5),
     keys: tuple[NestedKey, NestedKey, NestedKey] = (
         "observation",
         "action",
@@ -109,7 +110,7 @@ def fit_ensemble(
     order = torch.randperm(len(state), generator=generator).to(state.device)
     state, action, after = state[order], action[order], after[order]
     change = model.manifold.difference(after, state)
-    samples = check_count("transitions", len(state), low=2) - max(1, round(held_out * len(state)))
+    samples = check_count("transitions", len(state), low=2) - max(1, round(HELD_OUT * len(state)))
     return fit_changes(
         model,
         state,

@@ -18,6 +18,7 @@ from afm_rl.regimes import Regime
 from afm_rl.spaces.manifold import uniform, wrap_angle
 
 Triple = tuple[Tensor, Tensor, Tensor]  # states, actions, next states
+DECAY = 5e-8  # lambda, weight of the squared parameters
 
 
 def fit_network(
@@ -29,7 +30,6 @@ def fit_network(
     *,
     epochs: int,
     lr: float,
-    l2: float,
 ) -> Network:
     r"""Return the network as it is best pushed: full-batch Adam on the one-step loss.
 
@@ -45,7 +45,7 @@ def fit_network(
         rows: states ``(*L, n, S)``, actions and next states, with l = prod(L).
         counts: which rows count, ``(*L, n)`` boolean; the others must be finite.
         dt: length of a row, h (s).
-        epochs, lr, l2: see :class:`~afm_rl.learning.KNODEUpdater`.
+        epochs, lr: see :class:`~afm_rl.learning.KNODEUpdater`.
 
     >>> from afm_rl.dynamics import Quadrotor
     >>> model = KNODE(Quadrotor())
@@ -54,7 +54,7 @@ def fit_network(
     >>> pushed = model.advance(state, action, 0.002)
     >>> pushed[:, 5] += 0.002 * 9.81  # the thrust does more than it should
     >>> start = model.draw(torch.randn(1, model.numbers))
-    >>> settings = {"epochs": 80, "lr": 0.01, "l2": 5e-8}
+    >>> settings = {"epochs": 80, "lr": 0.01}
     >>> rows, counts = (state, action, pushed), torch.ones(75, dtype=torch.bool)
     >>> found = fit_network(model, start, rows, counts, 0.002, **settings)
     >>> after = model.push_(Network(*(part[0] for part in found))).advance(state, action, 0.002)
@@ -63,7 +63,7 @@ def fit_network(
     """
     learnt = Network(*(nn.Parameter(part.detach().clone()) for part in network))
     # Weight decay of Adam is the gradient of the second term.
-    optimizer = torch.optim.Adam(learnt, lr=lr, weight_decay=2 * l2, fused=True)
+    optimizer = torch.optim.Adam(learnt, lr=lr, weight_decay=2 * DECAY, fused=True)
     counted = counts.reshape(len(learnt.inner), -1, 1).to(learnt.inner)
     share = counted / (model.state_size * counted.sum(1, keepdim=True).clamp_min(1.0))
     errors = first_order(model, rows, dt)

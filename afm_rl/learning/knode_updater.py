@@ -21,6 +21,8 @@ from afm_rl.options import option, options
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
 
+TRACE = ("next", "trace")  # the plant's own time steps, in a transition
+
 
 class Rows(NamedTuple):
     """Steps of flights: l missions, n flights of each, R steps."""
@@ -58,7 +60,7 @@ class KNODEUpdater(Learner):
     Rows are the plant's own time steps where the transition has a ``trace``: states
     ``(*B, K + 1, S)`` at K equal steps of the tick, start and end included. Without, there is
     one row per tick. Transitions that are refused (:class:`~afm_rl.learning.Learner`) or that
-    ``mask_key`` excludes are left out.
+    :attr:`mask_key` excludes are left out.
 
     Time is counted in calls since :meth:`start`, for all missions alike. Missions learn from
     their own rows only, in one batch.
@@ -89,15 +91,12 @@ class KNODEUpdater(Learner):
         latency: float = option(0.05, "flight time until a new network joins, s", ge=0),
         epochs: int = option(80, "full-batch steps of Adam", ge=1),
         lr: float = option(0.01, "step size", gt=0),
-        l2: float = option(5e-8, "weight of the squared parameters", ge=0),
         noise: float = option(1e-4, "noise of states, in their units", ge=0),
         published_random: bool = option(False, "the same random numbers for each network"),
-        trace_key: NestedKey = option(("next", "trace"), "entry of the plant's own time steps"),
-        mask_key: NestedKey | None = None,
         seed_key: NestedKey | None = option(None, "seeds of missions; None: all have the same"),
         seed: int = option(0, "of these numbers", ge=0),
     ) -> None:
-        super().__init__(loss, mask_key)
+        super().__init__(loss)
         if not isinstance(loss.model, KNODE):
             raise ConfigurationError(
                 f"updater: KNODEUpdater teaches a KNODE, got {type(loss.model).__name__}; choose "
@@ -110,11 +109,9 @@ class KNODEUpdater(Learner):
                 f"updater.window={window!r}: expected a multiple of the control tick, {dt:g} s"
             )
         self.first, self.delay = _ticks(begin, dt), _ticks(latency, dt)
-        self.epochs, self.lr, self.l2, self.noise = epochs, lr, l2, noise
+        self.epochs, self.lr, self.noise = epochs, lr, noise
         self.published_random = published_random
-        self.trace_key, self.seed_key = (
-            None if key is None else as_key(key) for key in (trace_key, seed_key)
-        )
+        self.seed_key = None if seed_key is None else as_key(seed_key)
         self.streams = Streams(salt=4, seed=seed)
         self.window, self.pending = (MissionState(_nothing(kind)) for kind in (Rows, Pending))
         self.tick, self.due = 0, -1
@@ -133,7 +130,7 @@ class KNODEUpdater(Learner):
 
     def _sound(self, tensordict: TensorDictBase) -> Tensor:
         """Return which transitions are sound ``(*B)``, the steps of their trace included."""
-        trace = tensordict.get(self.trace_key, None)
+        trace = tensordict.get(TRACE, None)
         sound = super()._sound(tensordict)
         return sound if trace is None else sound & whole(trace).all(-1)
 
@@ -162,7 +159,7 @@ class KNODEUpdater(Learner):
         """Return the rows of a transition, of which those of ``learn`` ``(*B)`` count."""
         batch, like = tensordict.batch_size, self.model.networks.inner
         state, action, after = (tensordict.get(key) for key in self.loss.in_keys)
-        trace = tensordict.get(self.trace_key, None)
+        trace = tensordict.get(TRACE, None)
         if trace is None:
             trace = torch.stack([state, after], -2)
         trace = trace.to(like)
@@ -188,7 +185,6 @@ class KNODEUpdater(Learner):
             *(model, model.draw(first[:, 0]), flat[:3], flat.counts, dt),
             epochs=self.epochs,
             lr=self.lr,
-            l2=self.l2,
         )
         taught = rows.counts.flatten(1).any(-1)  # nothing is learnt from nothing
         self.pending.keep(Pending(*network, taught))

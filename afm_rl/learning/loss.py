@@ -12,7 +12,7 @@ from torchrl.objectives import LossModule
 
 from afm_rl.dynamics import DynamicsModel
 from afm_rl.errors import check_instance
-from afm_rl.options import choice, option, options
+from afm_rl.options import option, options
 
 WRAP = option(True, "False: a turn across +-pi counts as one of 2 pi, as in the published runs")
 
@@ -26,14 +26,10 @@ class InPlaceLoss(LossModule):
 
     """
 
-    @options("loss")
-    def __init__(
-        self,
-        reduction: str = choice("mean", mean="", sum="", none="one value per batch element"),
-    ) -> None:
+    def __init__(self) -> None:
         self._in_keys: list[NestedKey] | None = None
         super().__init__()
-        self.reduction = reduction
+        self.reduction = "mean"
 
     @property
     def functional(self) -> bool:
@@ -77,9 +73,9 @@ def gaussian_nll(mean: Tensor, log_variance: Tensor, target: Tensor, beta: float
 class GaussianNLLLoss(InPlaceLoss):
     """Gaussian negative log-likelihood of the state change under a dynamics model.
 
-    The mean is taken over ensemble members and coordinates, the ``reduction`` over the
-    batch. Parameters stay where they are (the loss is not functional): planner, transform
-    and optimiser go on sharing one model.
+    The mean is taken over ensemble members, coordinates and the batch; where :attr:`reduction` is
+    "none", each element of the batch has its own. Parameters stay where they are (the loss is not
+    functional): planner, transform and optimiser go on sharing one model.
 
     Args:
         model: any :class:`~afm_rl.dynamics.DynamicsModel`.
@@ -113,8 +109,8 @@ class GaussianNLLLoss(InPlaceLoss):
     out_keys = ["loss_nll"]
 
     @options("loss")
-    def __init__(self, model: DynamicsModel, reduction: str = "mean", wrap: bool = WRAP) -> None:
-        super().__init__(reduction)
+    def __init__(self, model: DynamicsModel, wrap: bool = WRAP) -> None:
+        super().__init__()
         self.model = check_instance("loss.model", model, DynamicsModel)
         self.wrap = wrap
 

@@ -7,7 +7,7 @@ from functools import partial
 from typing import cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.optim import Optimizer
 
@@ -42,10 +42,9 @@ class OnlineUpdater(Learner):
         self,
         loss: GaussianNLLLoss,
         optimizer: Callable[..., Optimizer],
-        mask_key: NestedKey | None = None,
         wrap: bool = WRAP,
     ) -> None:
-        super().__init__(loss, mask_key)
+        super().__init__(loss)
         loss.wrap = wrap
         if not any(True for _ in loss.model.parameters()):
             raise ConfigurationError(
@@ -91,8 +90,8 @@ class StreamXUpdater(OnlineUpdater):
     * ``form="loss"``: the likelihood for everything, the literal reading: steps of one size
       however small the error.
 
-    Then the model's running statistics, if it has any, see the transition. Missions,
-    ``mask_key`` and faulty transitions are as in :class:`~afm_rl.learning.OnlineUpdater`.
+    Then the model's running statistics, if it has any, see the transition. Missions
+    and faulty transitions are as in :class:`~afm_rl.learning.OnlineUpdater`.
 
     Args:
         loss: a loss over an :class:`~afm_rl.dynamics.Ensemble`.
@@ -119,7 +118,6 @@ class StreamXUpdater(OnlineUpdater):
         form: str = choice("error", "what each member descends", error="", loss="its likelihood"),
         lr: float = option(1.0, "step size before the bound", gt=0),
         kappa: float = option(2.0, "strictness of the bound", gt=0),
-        mask_key: NestedKey | None = None,
         wrap: bool = True,
     ) -> None:
         if not isinstance(loss.model, Ensemble):
@@ -127,7 +125,7 @@ class StreamXUpdater(OnlineUpdater):
                 f"updater: {type(self).__name__} teaches an Ensemble, got "
                 f"{type(loss.model).__name__}; choose an ensemble, such as dynamics=pe_stream_x"
             )
-        super().__init__(loss, partial(ObGD, lr=lr, kappa=kappa, lead_dims=1), mask_key, wrap)
+        super().__init__(loss, partial(ObGD, lr=lr, kappa=kappa, lead_dims=1), wrap)
         self.form = form
 
     def _measure(self, transitions: TensorDictBase) -> dict[str, Tensor]:
@@ -192,8 +190,7 @@ class UnmatchedUpdater(Updater):
         scale: half range of each action, ``(A,)``.
 
     Raises:
-        ConfigurationError: for a scale that does not fit the model, or an updater with a
-            mask of its own.
+        ConfigurationError: for a scale that does not fit the model.
 
     >>> from functools import partial
     >>> from tensordict import TensorDict
@@ -220,11 +217,6 @@ class UnmatchedUpdater(Updater):
     ) -> None:
         super().__init__(loss)
         self.updater = check_instance("updater.updater", updater(loss), OnlineUpdater)
-        if self.updater.mask_key is not None:
-            raise ConfigurationError(
-                f"updater.updater.mask_key={self.updater.mask_key!r}: expected none; where to "
-                "learn is decided here, by updater.gate"
-            )
         self.updater.mask_key = "unmatched"
         self.register_buffer(
             "scale", check_half_range(scale, loss.model.action_size), persistent=False

@@ -111,6 +111,9 @@ def _lead(tensors: list[Tensor], dims: int) -> torch.Size:
     return lead
 
 
+TINY = 1e-8  # keeps a quotient finite
+
+
 class ResetAdam(Optimizer):
     r"""Adam that is created anew at every step, as in the published runs.
 
@@ -136,9 +139,8 @@ class ResetAdam(Optimizer):
         self,
         params: Iterable[nn.Parameter],
         lr: float = option(1e-3, "step size", gt=0),
-        eps: float = option(1e-8, "keeps the quotient finite", gt=0),
     ) -> None:
-        super().__init__(params, {"lr": lr, "eps": eps})
+        super().__init__(params, {"lr": lr})
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]
@@ -151,4 +153,4 @@ class ResetAdam(Optimizer):
                 if parameter.is_contiguous() and parameter.grad.is_contiguous():
                     both = [part.view(-1).split(self.piece) for (part,) in both]
                 for values, slopes in zip(*both, strict=True):
-                    values.addcdiv_(slopes, slopes.abs().add_(group["eps"]), value=-group["lr"])
+                    values.addcdiv_(slopes, slopes.abs().add_(TINY), value=-group["lr"])

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from afm_rl.dynamics import PhysicsModel
@@ -92,9 +92,8 @@ class PhysicsIdentifier(Learner):
         margin: float = option(3.0, "nats by which another candidate must be better", ge=0),
         lost: float = option(20.0, "nats that a simulation which breaks off loses", ge=0),
         most: int = option(1000, "candidates at most, all of which are simulated", ge=1),
-        mask_key: NestedKey | None = None,
     ) -> None:
-        super().__init__(loss, mask_key)
+        super().__init__(loss)
         model = loss.model
         if not isinstance(model, PhysicsModel):
             raise ConfigurationError(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, cast
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 
 from afm_rl.dynamics import Calibrated
@@ -131,7 +131,7 @@ class RLSUpdater(Learner):
 
     Missions learn from their own transitions, in one batch; with one calibration for all,
     simultaneous transitions count together. Transitions with a faulty or stale reading are
-    refused, see :class:`~afm_rl.learning.Learner`. Those that ``mask_key`` excludes are only
+    refused, see :class:`~afm_rl.learning.Learner`. Those that :attr:`mask_key` excludes are only
     measured.
 
     Args:
@@ -169,9 +169,8 @@ class RLSUpdater(Learner):
             "prior deviation of gains, ten times that of coupling and bias",
             gt=0,
         ),
-        mask_key: NestedKey | None = None,
     ) -> None:
-        super().__init__(loss, mask_key)
+        super().__init__(loss)
         if not isinstance(loss.model, Calibrated):
             raise ConfigurationError(
                 f"updater: RLSUpdater teaches a Calibrated model, got {type(loss.model).__name__}; "

@@ -15,7 +15,6 @@ from afm_rl.errors import check_instance
 from afm_rl.faults import count_repeats, trusted, whole
 from afm_rl.learning.loss import GaussianNLLLoss
 from afm_rl.mission_state import MissionState
-from afm_rl.options import option, options
 from afm_rl.spaces.keys import as_key
 
 
@@ -34,7 +33,7 @@ class Updater(nn.Module):
         loss: how well the model explains a transition.
 
     >>> from afm_rl.dynamics import Dubins
-    >>> updater = Updater(GaussianNLLLoss(Dubins(), reduction="none"))
+    >>> updater = Updater(GaussianNLLLoss(Dubins()))
     >>> td = TensorDict({"observation": torch.zeros(4, 3), "action": torch.ones(4, 2)}, [4])
     >>> updater(td.set(("next", "observation"), torch.zeros(4, 3)))["loss"].shape
     torch.Size([4])
@@ -124,7 +123,7 @@ class Learner(Updater, ABC):
     at either end (:mod:`afm_rl.faults`), are refused: they have no influence, their loss is
     reported as NaN, and :attr:`refused` counts them. Whether a reading is stale is what a
     :class:`~afm_rl.transforms.Guard` says at :attr:`sound_key`; without a guard repetitions are
-    counted here. Transitions that ``mask_key`` excludes are only measured.
+    counted here. Transitions that :attr:`mask_key` excludes are only measured.
 
     Args:
         loss: how well the model explains a transition.
@@ -138,14 +137,11 @@ class Learner(Updater, ABC):
     by_gradient = False
     """Whether learning needs the gradients of what is measured."""
 
-    @options("updater")
-    def __init__(
-        self,
-        loss: GaussianNLLLoss,
-        mask_key: NestedKey | None = option(None, "boolean entry (*B) or (*B, 1): learn here?"),
-    ) -> None:
+    mask_key: NestedKey | None = None
+    """Where a transition says whether to learn from it, ``(*B)`` or ``(*B, 1)``; None: from all."""
+
+    def __init__(self, loss: GaussianNLLLoss) -> None:
         super().__init__(loss)
-        self.mask_key = None if mask_key is None else as_key(mask_key)
         self.refused = 0
         self.readings = MissionState(Readings(torch.zeros(())))
         self.claim()

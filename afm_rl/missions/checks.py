@@ -114,14 +114,13 @@ def check_keys(
     group: str,
     part: Any,
     env: EnvBase,
-    names: Iterable[str] = ("seed_key", "mask_key", "regime_key"),
+    names: Iterable[str] = ("seed_key", "regime_key"),
 ) -> None:
     """Check that the entries that a part was told to read are there."""
     given = list(env.observation_spec.keys(True, True))
     for name in names:
         key = getattr(part, name, None)
-        bare = key[1:] if isinstance(key, tuple) and key[0] == "next" else key
-        if key is not None and unravel_key(bare) not in given:
+        if key is not None and unravel_key(key) not in given:
             raise ConfigurationError(
                 f"{group}.{name}={key!r}: expected one of {', '.join(map(repr, given))}"
             )

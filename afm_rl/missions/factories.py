@@ -167,17 +167,10 @@ def afm(
     robot: Robot,
     dynamics: Part,
     checkpoint: str | None = CHECKPOINT,
-    train: None = None,
     **settings: Any,
 ) -> Part:
-    """Return the universal action flow; ``train`` is null in settings that were stored earlier."""
-    if train is not None:
-        raise ConfigurationError(
-            f"corrector.train={train}: this flow is no longer refined on a robot; leave it out, or "
-            "give corrector.checkpoint"
-        )
-    place, scale = list(robot.place), robot.place_scale
-    flow = ActionFlow(*robot.action_box, place=place, place_scale=scale, **settings)
+    """Return the universal action flow."""
+    flow = ActionFlow(*robot.action_box, place=list(robot.place), **settings)
     if checkpoint is not None:
         _load(flow, checkpoint)
     return Part(flow)

@@ -84,8 +84,7 @@ class Robot:
         usual_high: its highest corner.
         hypotheses: those of :data:`~afm_rl.correction.hypotheses.CHOICES` that make sense for the
             robot; all if None.
-        place: indices of the state coordinates in which the ground may differ, if any.
-        place_scale: distance at which ground counts as other ground, in their unit.
+        place: indices of the state coordinates (m) in which the ground may differ, if any.
         reward: the reward of its task, ``reward(state, action, next_state, *task)``, if it has one
             to plan with; see :class:`~afm_rl.planning.KnownReward`.
         reward_reads: entries of the environment that it reads after the states, with their sizes.
@@ -118,7 +117,6 @@ class Robot:
     usual_high: Sequence[float] | None = None
     hypotheses: Sequence[str] | None = None
     place: Sequence[int] = ()
-    place_scale: float = 1.0
     reward: Callable[..., Tensor] | None = None
     reward_reads: Mapping[str, int] = field(default_factory=dict)
     observe: Callable[[Tensor], Tensor] | None = None
@@ -149,7 +147,6 @@ class Robot:
                 raise ConfigurationError(
                     f"robot.{name}={indices}: expected indices in 0..{size - 1}"
                 )
-        check_number("robot.place_scale", self.place_scale, low=0.0, open_low=True)
 
         if self.usual_low is not None or self.usual_high is not None:
             self._check_box("usual", self.model.action_size)

@@ -16,6 +16,8 @@ from afm_rl.options import option, options
 from afm_rl.spaces.keys import as_keys
 from afm_rl.spaces.manifold import wrap_angle
 
+GOAL_SIZE = 2  # coordinates that a goal gives
+
 
 class Cost(nn.Module, ABC):
     """Cost of one imagined step, given what the environment says of the task.
@@ -56,16 +58,15 @@ class GoalDistance(Cost):
         self,
         coordinates: Sequence[int] = option((0, 1), "coordinates of the state that count", ge=0),
         in_keys: Sequence[NestedKey] = option(("goal",), "entry of the goal"),
-        goal_size: int = option(2, "coordinates that the goal gives", ge=1),
         weights: Sequence[float] | None = option(None, "of the coordinates; None: 1", ge=0),
     ) -> None:
         super().__init__()
         self.coordinates, self.in_keys = list(coordinates), as_keys(in_keys)
-        self.in_sizes = [goal_size]
-        if goal_size > len(self.coordinates):
+        self.in_sizes = [GOAL_SIZE]
+        if len(self.coordinates) < GOAL_SIZE:
             raise ConfigurationError(
                 f"cost.coordinates={self.coordinates}: expected at least one per goal "
-                f"coordinate ({goal_size})"
+                f"coordinate ({GOAL_SIZE})"
             )
         weights = [1.0] * len(self.coordinates) if weights is None else list(weights)
         if len(weights) != len(self.coordinates):

@@ -14,7 +14,9 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from afm_rl.errors import ConfigurationError
 from afm_rl.options import option, options
 from afm_rl.planning.receding import SamplingPlanner, action_spec_of, moments
-from afm_rl.spaces.keys import as_key
+
+DECAY = 1.25  # gamma, by which the population shrinks
+MOMENTUM = 0.1  # alpha, weight of the old mean and deviation
 
 
 def coloured(noise: Tensor, beta: float) -> Tensor:
@@ -87,31 +89,28 @@ class ICEM(SamplingPlanner):
         keep: float = option(
             0.3, "share of the elites that stays for the next iteration", gt=0, le=1
         ),
-        decay: float = option(1.25, "gamma, by which the population shrinks", ge=1),
         sigma: float = option(0.5, "first deviation, half ranges of each action", ge=0, le=100),
         beta: float = option(1.0, "exponent of the spectrum; 0: white, 2: red", ge=0, le=100),
-        momentum: float = option(0.1, "alpha, weight of the old mean and deviation", ge=0, le=1),
         hold: int = option(
             1, "steps that each action lasts; plans are longer by this factor", ge=1
         ),
-        memory_key: NestedKey = option("icem", "where mean and elites are kept"),
         **settings: Any,
     ) -> None:
         kept = max(1, round(keep * elites))
-        memory_key = as_key(memory_key)
-        root = memory_key if isinstance(memory_key, tuple) else (memory_key,)
         size = len(action_spec_of(env).space.low)
         plan = (horizon, size)
-        memory = {(*root, "mean"): plan, (*root, "elites"): (kept, *plan)}
+        memory: dict[NestedKey, tuple[int, ...]] = {
+            ("icem", "mean"): plan,
+            ("icem", "elites"): (kept, *plan),
+        }
         if hold > 1:
-            memory[(*root, "held")] = (size + 1,)
+            memory["icem", "held"] = (size + 1,)
         super().__init__(env, memory, horizon, population, iterations, hold=hold, **settings)
         if population < 2 * elites:
             raise ConfigurationError(
                 f"planner.elites={elites}: expected at most half of planner.population={population}"
             )
-        self.elites, self.kept = elites, kept
-        self.decay, self.sigma, self.beta, self.momentum = decay, sigma, beta, momentum
+        self.elites, self.kept, self.sigma, self.beta = elites, kept, sigma, beta
         space = self.action_spec.space
         self.register_buffer("scale", self.sigma * (space.high - space.low) / 2)
 
@@ -124,7 +123,7 @@ class ICEM(SamplingPlanner):
         >>> ICEM(PlanningEnv(Dubins(), GoalDistance(), [-1.0, -1.5], [1.0, 1.5])).counts
         [100, 80, 64]
         """
-        sizes = (self.population * self.decay**-i for i in range(self.iterations))
+        sizes = (self.population * DECAY**-i for i in range(self.iterations))
         return [max(round(size), 2 * self.elites) for size in sizes]
 
     def _plan(self, td: TensorDictBase) -> tuple[Tensor, list[Tensor]]:
@@ -170,8 +169,8 @@ class ICEM(SamplingPlanner):
             here = sound[..., None, None]
             centre, spread = moments(chosen, finite.to(plans))
             best = torch.where(here, chosen[..., 0, :, :], best)
-            mean = torch.where(here, torch.lerp(centre, mean, self.momentum), mean)
-            std = torch.where(here, torch.lerp(spread, std, self.momentum), std)
+            mean = torch.where(here, torch.lerp(centre, mean, MOMENTUM), mean)
+            std = torch.where(here, torch.lerp(spread, std, MOMENTUM), std)
             few = torch.where(finite[..., None, None], chosen, best.unsqueeze(-3))
             few = few[..., : self.kept, :, :]
             elites, found = torch.where(here.unsqueeze(-3), few, elites), found | sound

@@ -1,4 +1,4 @@
-"""Policies that Stable-Baselines3 or CleanRL trained: their weights, read without a pickle."""
+"""Policies that Stable-Baselines3 or CleanRL trained: their weights, without their code."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from torch import Tensor
 
 from afm_rl.errors import ArtefactError, ConfigurationError
 from afm_rl.planning.policies import StoredPolicy
-from afm_rl.storage.torch_files import LARGEST, OPERATIONS, BoundedZip, read_saved
+from afm_rl.storage.torch_files import LARGEST, BoundedZip, read_saved
+
+OPERATIONS = 2**18  # of a normaliser's pickle, which are looked at
 
 
 def policy_from_sb3(file: str | Path, normaliser: str | Path | None = None) -> StoredPolicy:

@@ -15,8 +15,9 @@ from afm_rl.planning.costs import QuadraticCost
 from afm_rl.planning.planning_env import PlanningEnv
 from afm_rl.planning.receding import RecedingHorizonPlanner
 from afm_rl.planning.riccati import LQProblem, solve_lq
-from afm_rl.spaces.keys import as_key
 from afm_rl.spaces.manifold import Manifold, wrap_angle
+
+FIRST_ITERATIONS = 5  # linearisations at the first tick of a flight
 
 
 def linear_quadratic(
@@ -65,7 +66,7 @@ class MPC(RecedingHorizonPlanner):
     States and actions of the solution live in the tensordict, so every flight of a batch has
     its own and resets start afresh: append :meth:`make_tensordict_primer` to the
     environment. A flight whose memory is zero is new: it starts from the measured state held
-    and the middle of the action box, with ``first_iterations``.
+    and the middle of the action box, with five iterations.
 
     Args:
         env: a :class:`PlanningEnv` whose cost is a :class:`QuadraticCost`.
@@ -98,9 +99,7 @@ class MPC(RecedingHorizonPlanner):
         env: PlanningEnv,
         horizon: int = option(20, "stages, N", ge=1, le=10_000),
         iterations: int = option(1, "linearisations per tick", ge=1, le=10_000),
-        first_iterations: int = option(5, "those at the first tick of a flight", ge=1, le=10_000),
         bounded: Sequence[int] | None = option(None, "actions that plans bound; None: all"),
-        memory_key: NestedKey = option("mpc", "where states and actions of the plan are kept"),
         action_key: NestedKey = option("action", "where the action goes"),
     ) -> None:
         if not isinstance(env, PlanningEnv) or not isinstance(env.cost, QuadraticCost):
@@ -109,15 +108,13 @@ class MPC(RecedingHorizonPlanner):
                 f"planner: got {type(env).__name__}{cost}; MPC needs a PlanningEnv with a "
                 "quadratic cost, such as TrackingCost"
             )
-        memory_key, size = as_key(memory_key), env.dynamics.action_size
-        root = memory_key if isinstance(memory_key, tuple) else (memory_key,)
-        memory = {
-            (*root, "states"): (horizon + 1, env.dynamics.state_size),
-            (*root, "actions"): (horizon, size),
+        size = env.dynamics.action_size
+        memory: dict[NestedKey, tuple[int, ...]] = {
+            ("mpc", "states"): (horizon + 1, env.dynamics.state_size),
+            ("mpc", "actions"): (horizon, size),
         }
         super().__init__(env, memory, action_key)
-        self.horizon, self.stages = horizon, horizon + 1
-        self.iterations, self.first_iterations = iterations, first_iterations
+        self.horizon, self.stages, self.iterations = horizon, horizon + 1, iterations
         space = self.action_spec.space
         within = list(range(size)) if bounded is None else list(bounded)
         if not all(isinstance(i, int) and 0 <= i < size for i in within):
@@ -152,12 +149,12 @@ class MPC(RecedingHorizonPlanner):
         ]
         solved, rounds = torch.zeros_like(new), self.iterations
         if bool(new.any()):
-            rounds = max(rounds, self.first_iterations)
+            rounds = max(rounds, FIRST_ITERATIONS)
         for count in range(rounds):
             better, exact = self._improve(guess, task)
             sound = better[0].flatten(-2).isfinite().all(-1)
             sound = sound & better[1].flatten(-2).isfinite().all(-1)
-            wanted = torch.where(new, count < self.first_iterations, count < self.iterations)
+            wanted = torch.where(new, count < FIRST_ITERATIONS, count < self.iterations)
             use = sound & wanted
             guess = _choose(use, better, guess)
             solved = solved | use

@@ -6,14 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from afm_rl.compiling.machine_code import MachineCode
 from afm_rl.options import choice, option, options
 from afm_rl.planning.receding import SamplingPlanner, action_spec_of
-from afm_rl.spaces.keys import as_key
+
+CUT = 2.0  # standard deviations at which noise is cut off
+MEMORY = "mppi", "mean"  # where the mean plan is kept
 
 
 def smooth(
@@ -115,7 +117,6 @@ class MPPI(SamplingPlanner):
         temperature: float = option(0.001, "lambda, in units of the return", gt=0),
         sigma: float = option(1.0, "noise, in half ranges of each action", ge=0, le=100),
         beta: float = option(0.6, "weight of the new action in the smoothing", gt=0, le=1),
-        truncate: float = option(2.0, "standard deviations at which noise is cut off", gt=0),
         noise: str = choice("scaled", scaled="sigma applies", unit="deviation 1 for every action"),
         past: str = choice(
             "previous",
@@ -127,15 +128,14 @@ class MPPI(SamplingPlanner):
             within="smoothing goes on from the clamped action",
             end="candidates are clamped after it",
         ),
-        mean_key: NestedKey = option(("mppi", "mean"), "where the mean plan is kept"),
         compile: bool = option(False, "roll-outs as machine code, over equations; compiled once"),
         cache: str | Path = option("~/.cache/afm_rl", "folder of what is compiled"),
         **settings: Any,
     ) -> None:
-        memory = {as_key(mean_key): (horizon, *action_spec_of(env).shape)}
+        memory = {MEMORY: (horizon, *action_spec_of(env).shape)}
         super().__init__(env, memory, horizon, population, iterations, **settings)
         self.temperature, self.sigma, self.beta = temperature, sigma, beta
-        self.truncate, self.noise, self.past, self.clamp = truncate, noise, past, clamp
+        self.noise, self.past, self.clamp = noise, past, clamp
         self.compiles = compile
         self.__dict__["_machine_code"] = MachineCode(self, cache)
         space = self.action_spec.space
@@ -151,7 +151,7 @@ class MPPI(SamplingPlanner):
         low, high, scale = self._box(td)
         best = shifted
         for _ in range(self.iterations):
-            eps = self._noise(td, mean, self.population, self.truncate)
+            eps = self._noise(td, mean, self.population, CUT)
             raw = eps.mul_(rows_like(scale, eps)).add_(best.unsqueeze(-3))
             within = self.clamp == "within"
             plans = smooth(raw, past.unsqueeze(-2), self.beta, low, high, within)
@@ -169,7 +169,7 @@ class MPPI(SamplingPlanner):
     @property
     def _as_machine_code(self) -> bool:
         # Machine code holds the model as it is now. Networks gain nothing: their products are fast.
-        if not self.compiles or torch.compiler.is_compiling() or self.backend != "fast":
+        if not self.compiles or torch.compiler.is_compiling() or not self.fast:
             return False
         model = self.env.dynamics
         learned = any(True for _ in model.parameters())

@@ -20,7 +20,7 @@ from torchrl.modules.planners.common import (
 from afm_rl.compiling.devices import moved
 from afm_rl.compiling.tracing import all_hold, may_look
 from afm_rl.errors import ConfigurationError, check_instance
-from afm_rl.options import choice, option, options
+from afm_rl.options import option, options
 from afm_rl.spaces.keys import as_key
 from afm_rl.streams import Streams
 
@@ -189,9 +189,6 @@ class SamplingPlanner(RecedingHorizonPlanner):
         horizon: int = option(5, "steps of a plan, H", ge=1, le=10_000),
         population: int = option(300, "candidates per iteration, N", ge=1, le=1_000_000),
         iterations: int = option(1, "refinements per step", ge=1, le=10_000),
-        backend: str | None = choice(
-            None, "None: fast where there is `returns`", fast="calls it", env="steps"
-        ),
         seed_key: NestedKey | None = option(None, "missions of one seed share their noise"),
         box_key: NestedKey | None = option(None, "box to plan with; None: that of the actions"),
         action_key: NestedKey = option("action", "where the action goes"),
@@ -201,13 +198,7 @@ class SamplingPlanner(RecedingHorizonPlanner):
         super().__init__(env, memory, action_key)
         self.hold, self.horizon = hold, horizon
         self.population, self.iterations = population, iterations
-        if backend is None:
-            backend = "fast" if hasattr(env, "returns") else "env"
-        self.backend = backend
-        if self.backend == "fast" and not hasattr(env, "returns"):
-            raise ConfigurationError(
-                f"planner.backend='fast': {type(env).__name__} has no `returns`; use 'env'"
-            )
+        self.fast = hasattr(env, "returns")  # else it is stepped
         self.seed_key = None if seed_key is None else as_key(seed_key)
         self.in_keys = [*env.observation_spec.keys(True, True), *self.memory]
         if self.seed_key is not None:
@@ -269,7 +260,7 @@ class SamplingPlanner(RecedingHorizonPlanner):
     def _rolled_out(self, td: TensorDictBase, plans: Tensor) -> Tensor:
         if self.hold > 1:
             plans = plans.repeat_interleave(self.hold, -2)
-        if self.backend == "fast":
+        if self.fast:
             state, *task = self.env.entries(td)
             returns = self.env.returns(state, plans, *task)
             return returns.to(plans)  # states may be in double precision, plans in single

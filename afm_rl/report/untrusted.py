@@ -17,12 +17,11 @@ import pyarrow.parquet as parquet
 import yaml
 
 from afm_rl.errors import ConfigurationError
-from afm_rl.storage.files import plain_text
+from afm_rl.storage.files import plain_text, read_yaml
 
 WORDS = ["method", "track", "regime"]  # text, whatever they look like
 LONGEST = 500  # letters of a word
 MEGABYTE = 2**20
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def read_text(path: Path, most: int = 4 * MEGABYTE) -> str:
@@ -45,25 +44,16 @@ def read_text(path: Path, most: int = 4 * MEGABYTE) -> str:
         raise ConfigurationError(f"{path}: no UTF-8 text: {error.reason}") from error
 
 
-def read_settings(path: Path, deepest: int = 50) -> dict[str, Any]:
+def read_settings(path: Path) -> dict[str, Any]:
     """Return a YAML file that holds a mapping, ``${...}`` in it left as it is.
 
-    Values only: tags of other types are refused, and so are aliases, which grow without bounds,
-    and more than ``deepest`` levels.
+    Values only, see :func:`~afm_rl.storage.files.read_yaml`.
 
     Raises:
         ConfigurationError: if it cannot be read, or holds something else.
     """
-    text, depth = read_text(path), 0
     try:
-        for event in yaml.parse(text, LOADER):
-            depth += isinstance(event, yaml.CollectionStartEvent)
-            depth -= isinstance(event, yaml.CollectionEndEvent)
-            if isinstance(event, yaml.AliasEvent):
-                raise yaml.YAMLError("aliases (*name) are not read")
-            if depth > deepest:
-                raise yaml.YAMLError(f"more than {deepest} levels")
-        settings = yaml.load(text, LOADER)
+        settings = read_yaml(read_text(path))
     except (yaml.YAMLError, ValueError, OverflowError) as error:
         raise ConfigurationError(f"{path}: damaged: {_first_line(error)}") from error
     if not isinstance(settings, dict):

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, tables as CSV, and locks of folders."""
+"""Files that are written whole or not at all, YAML, tables as CSV, and locks of folders."""
 
 from __future__ import annotations
 
@@ -8,14 +8,48 @@ import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import yaml
 from filelock import FileLock, Timeout
 
 from afm_rl.errors import ConfigurationError
 
 if TYPE_CHECKING:
     import pandas as pd
+
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def read_yaml(text: str | bytes) -> Any:
+    """Return the values of a YAML text that anybody may have written.
+
+    ``${...}`` in it is left as it is; tags of other types are refused.
+
+    Raises:
+        yaml.YAMLError: if :func:`check_yaml` refuses it, or it is something else.
+
+    >>> read_yaml("seeds: [1, 2]")
+    {'seeds': [1, 2]}
+    """
+    check_yaml(text, LOADER)
+    return yaml.load(text, LOADER)
+
+
+def check_yaml(text: str | bytes, loader: Any, deepest: int = 50) -> None:
+    """Check that a YAML text has no aliases, which grow without bounds, and not too many levels.
+
+    Raises:
+        yaml.YAMLError: if it has.
+    """
+    depth = 0
+    for event in yaml.parse(text, loader):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent):
+            raise yaml.YAMLError("aliases (*name) are not read")
+        if depth > deepest:
+            raise yaml.YAMLError(f"more than {deepest} levels")
 
 
 def write_whole(path: Path, data: bytes) -> None:

@@ -149,4 +149,4 @@ def test_a_bug_is_not_dressed_up_as_a_mistake(afm_rl, tmp_path, quick, monkeypat
 def test_help_of_a_choice_says_what_its_settings_are_for(afm_rl):
     done = afm_rl("--help", "planner=icem")
     assert done.status == 0 and "_target_: afm_rl.planning.ICEM" in done.out
-    assert "decay: 1.25 # gamma, by which the population shrinks, >= 1" in done.out
+    assert "beta: 1.0 # exponent of the spectrum, [0, 100]; 0: white, 2: red" in done.out

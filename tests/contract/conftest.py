@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from harness import loss_by_row
 from pushing import push
 from tensordict import TensorDict
 
@@ -178,8 +179,8 @@ MODULES = {
     "CEM": Case(partial(planner, CEM, **FEW, elites=3), plan),
     "TorchRLMPPI": Case(partial(planner, TorchRLMPPI, **FEW, elites=3), plan),
     "ActionFlowPolicy": Case(policy, execute),
-    "GaussianNLLLoss": Case(lambda seed: GaussianNLLLoss(small(seed), reduction="none"), measure),
-    "CFMLoss": Case(lambda seed: CFMLoss(network(seed), reduction="none"), match),
+    "GaussianNLLLoss": Case(lambda seed: loss_by_row(small(seed)), measure),
+    "CFMLoss": Case(lambda seed: CFMLoss(network(seed)), match),
     "Updater": Case(partial(updater, Updater), learn),
     "OnlineUpdater": Case(partial(updater, OnlineUpdater, ADAM), learn),
     "RLSUpdater": Case(

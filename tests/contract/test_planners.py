@@ -64,10 +64,8 @@ class Slider(EnvBase):
 def test_an_environment_with_keys_of_its_own(kind, batch):
     env = Slider()
     check_env_specs(env)
-    more = {MPPI: "mean_key", ICEM: "memory_key"}
-    more = {more[kind]: ["my", "plan"]} if kind in more else {}
-    planner = kind(env, **SETTINGS, action_key=["robot", "push"], **more)
-    assert planner.backend == "env" and planner.out_keys[0] == ("robot", "push")
+    planner = kind(env, **SETTINGS, action_key=["robot", "push"])
+    assert not planner.fast and planner.out_keys[0] == ("robot", "push")
     whole = TransformedEnv(env, planner.make_tensordict_primer())
     td = whole.reset(TensorDict(batch_size=batch), set_state=False)
     for _ in range(8):
@@ -91,12 +89,13 @@ class Cliff(PlanningEnv):
 
 
 @pytest.mark.parametrize("kind", ALL)
-@pytest.mark.parametrize("backend", ["fast", "env"])
+@pytest.mark.parametrize("fast", [True, False])
 @pytest.mark.parametrize("beyond", [math.nan, math.inf, -math.inf])
-def test_nobody_steps_to_where_returns_are_not_finite(kind, backend, beyond):
+def test_nobody_steps_to_where_returns_are_not_finite(kind, fast, beyond):
     world = Cliff(beyond)
     elites = {} if kind is MPPI else {"elites": 8}
-    planner = kind(world, horizon=3, population=200, backend=backend, **elites)
+    planner = kind(world, horizon=3, population=200, **elites)
+    planner.fast = fast
     action = planner(world.start(planner, 30))["action"]
     assert action.isfinite().all() and (action <= 0.5).all()
     assert action.mean() > 0.1 and planner.discarded > 0

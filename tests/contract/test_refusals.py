@@ -63,7 +63,9 @@ REFUSED = {
     "planner.env: expected a EnvBase, got 2": lambda: ICEM(2),
     "planner.env: expected a EnvBase, got 3": lambda: CEM(3),
     "planner: got NoneType": lambda: MPC(None),
-    "key 5: expected a text": lambda: MPPI(PlanningEnv(Dubins(), GoalDistance(), *BOX), mean_key=5),
+    "key 5: expected a text": lambda: MPPI(
+        PlanningEnv(Dubins(), GoalDistance(), *BOX), action_key=5
+    ),
     "loss.model: expected a DynamicsModel, got None": lambda: GaussianNLLLoss(None),
     "updater.loss: expected a GaussianNLLLoss, got None": lambda: Updater(None),
     "updater.optimizer=None": lambda: OnlineUpdater(GaussianNLLLoss(ensemble()), None),

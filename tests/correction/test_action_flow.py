@@ -67,7 +67,7 @@ def test_a_transition_becomes_a_pair(line, reached, corrected, pair):
     ],
 )
 def test_until_a_change_is_known_models_are_held_together(before, after, expected):
-    flow = flow_of(1, odds=1.0, most_odds=16.0)
+    flow = flow_of(1, odds=1.0)
     rows = [flow.models.index(name) for name in ("nothing has changed", "recent", "delay_1")]
     losses = torch.full((2, len(flow.models), 1), 9.0)
     losses[0, rows[0]], losses[1, rows, 0] = before, torch.tensor(after)
@@ -84,7 +84,7 @@ def test_a_model_falls_behind_only_while_an_axis_is_in_doubt():
 
 @pytest.mark.parametrize(("largest", "floor"), [(0.1, 0.005), (0.5, 0.01), (3.0, 0.02)])
 def test_the_least_noise_is_a_share_of_the_largest_command(largest, floor):
-    flow = flow_of(1, least_noise=0.02, least_command=0.25)
+    flow = flow_of(1)
     parts = flow.unpack(flow.begin(torch.zeros(1)), 1)
     parts["pairs"][3, 0] = -largest
     torch.testing.assert_close(flow.floor(parts), torch.tensor([floor]))

@@ -57,7 +57,9 @@ def least_squares(form):
 
 def ground(**settings):
     high = torch.tensor([1.0, 1.5])
-    return ActionFlow(-high, high, place=[0, 1], **settings)
+    flow = ActionFlow(-high, high, place=[0, 1], **settings)
+    flow.place_scale = 0.5
+    return flow
 
 
 CASES = {

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from afm_rl.dynamics.stacked import RunningStats
+from afm_rl.dynamics.stacked import LEAST_STD, RunningStats
 from afm_rl.errors import ConfigurationError
 
 
@@ -59,10 +59,10 @@ def test_they_go_on_from_where_they_are_told():
 
 
 def test_nothing_is_divided_by_zero():
-    stats = RunningStats(1, min_std=0.5)
+    stats = RunningStats(1)
     assert torch.equal(stats(torch.tensor([3.0])), torch.tensor([3.0]))  # nothing seen
     stats.update_(torch.full((5, 1), 2.0))
-    assert torch.equal(stats.std, torch.tensor([0.5]))
+    assert torch.equal(stats.std, torch.tensor([LEAST_STD]))
 
 
 def test_impossible_settings_are_refused():

@@ -4,13 +4,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from harness import loss_by_row
 from tensordict import TensorDict
 from torch import nn
 
 from afm_rl.dynamics import KNODE, Quadrotor
 from afm_rl.dynamics.quadrotor import quadrotor_path
 from afm_rl.dynamics.residual import Network
-from afm_rl.learning import GaussianNLLLoss, KNODEUpdater
+from afm_rl.learning import GaussianNLLLoss, KNODEUpdater, knode_fit
 from afm_rl.learning.knode_fit import first_order, fit_network
 from afm_rl.missions.state import Loop, StepLog, restore, snapshot
 from afm_rl.spaces.airframe import QuadrotorBody
@@ -248,22 +249,25 @@ def test_the_fast_gradient_is_the_exact_one_to_first_order(frame):
     assert (found[0] - found[1]).norm() < 0.05 * found[1].norm()
 
 
-def test_the_weights_decay():
+def test_the_weights_decay(monkeypatch):
     (td,) = stream(1)
     rows = td["observation"], td["action"], td["next", "observation"]
     model = KNODE(Quadrotor())
     start = model.draw(torch.randn(1, model.numbers))
     none = torch.zeros(3, dtype=torch.bool)  # no row counts
     settings = {"epochs": 5, "lr": 0.01}
-    still, less = (fit_network(model, start, rows, none, 0.05, l2=l2, **settings) for l2 in (0, 1))
-    assert torch.equal(still.inner, start.inner)
-    assert less.inner.abs().sum() < start.inner.abs().sum()
+    decayed = []
+    for share in (0.0, 1.0):
+        monkeypatch.setattr(knode_fit, "DECAY", share)
+        decayed.append(fit_network(model, start, rows, none, 0.05, **settings).inner)
+    assert torch.equal(decayed[0], start.inner)
+    assert decayed[1].abs().sum() < start.inner.abs().sum()
 
 
 def test_the_loss_is_measured_before_learning():
     ticks = stream(3)
     model, updater = teach(latency=0.0)
     for td in ticks:
-        expected = GaussianNLLLoss(KNODE(Quadrotor()), reduction="none")(td)["loss_nll"]
+        expected = loss_by_row(KNODE(Quadrotor()))(td)["loss_nll"]
         torch.testing.assert_close(updater(td)["loss"], expected.detach())
     assert model.networks.inner.any() and updater.learns

@@ -70,7 +70,6 @@ REFUSED = [
     (lambda: identify(scale=[1.0, 2.0]), "expected 1 positive numbers"),
     (lambda: beside([1.0]), "updater.scale=.*expected 2 positive numbers"),
     (lambda: beside([1.0, 0.0]), "updater.scale="),
-    (lambda: beside(updater=partial(GRADIENT, mask_key="mine")), "updater.updater.mask_key='mine'"),
     (lambda: beside(updater=lambda loss: loss), "updater.updater"),
     (
         lambda: pretrain_knode(KNODE(Quadrotor()).expand_(4), Quadrotor(), BOX, BOX),

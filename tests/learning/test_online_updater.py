@@ -48,7 +48,8 @@ def test_missions_learn_as_if_they_were_alone(missions, make_ensemble, transitio
 
 @pytest.mark.parametrize("shape", [(4,), (4, 1)])
 def test_masked_missions_do_not_learn_but_are_measured(missions, transitions, shape):
-    updater = updater_of(missions, mask_key=["learn", "here"])
+    updater = updater_of(missions)
+    updater.mask_key = "learn", "here"
     td = transition(*transitions(4, dtype=torch.float64))
     td["learn", "here"] = torch.tensor([True, False, True, False]).reshape(shape)
     before = [weights(missions, index) for index in range(4)]

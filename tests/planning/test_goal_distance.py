@@ -12,7 +12,7 @@ def cost_of(cost, state, goal):
 
 def test_only_the_chosen_coordinates_count():
     assert float(cost_of(GoalDistance([0, 1]), [1.0, 2.0, 3.0], [4.0, 6.0])) == 5.0
-    assert float(cost_of(GoalDistance([2], goal_size=1), [1.0, 2.0, 3.0], [5.0])) == 2.0
+    assert float(cost_of(GoalDistance([2, 1]), [1.0, 2.0, 3.0], [5.0, 2.0])) == 2.0
 
 
 def test_a_coordinate_without_a_goal_is_driven_to_zero():

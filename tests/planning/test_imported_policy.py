@@ -132,7 +132,12 @@ def model(weights=None, **settings):
 
 def described(operations):
     """Weights that the operations of a pickle describe."""
-    return zipped({"archive/data.pkl": b"\x80\x02" + operations, "archive/data/0": bytes(8)})
+    return zipped(archive(operations))
+
+
+def archive(operations):
+    pickled = b"\x80\x02" + operations
+    return {"archive/data.pkl": pickled, "archive/version": "3\n", "archive/data/0": bytes(8)}
 
 
 def encrypted(content):
@@ -160,8 +165,15 @@ def shrunk(name, members):
 LAST, NAN = "action_net.weight", float("nan")
 NOISY = {"actor.mu.0.weight": torch.ones(1, 3), "actor.log_std": torch.ones(1)}
 PAIRS = b")" + b"q\1h\1\x86" * 100  # a pair of pairs of pairs ...: 2^100 leaves
-STORAGE = b"(X\7\0\0\0storagectorch\nFloatStorage\nX\1\0\0\0%btQ"
-TENSOR = b"}X\1\0\0\0a" + b"ctorch._utils\n_rebuild_tensor_v2\n(" + STORAGE % b"0" + b"K\0%b%btRs."
+STORAGE = b"(X\7\0\0\0storagectorch\nFloatStorage\nX\1\0\0\x000X\3\0\0\0cpuK\2tQ"
+TENSOR = (
+    b"ctorch._utils\n_rebuild_tensor_v2\n("
+    + STORAGE
+    + b"K\0%b%b\x89ccollections\nOrderedDict\n)RtR"
+)
+NAMED = b"}X\1\0\0\0a" + TENSOR + b"s."
+CALL = b"}X\1\0\0\0ac%b\n%b\nJ\xff\xff\xff\x7f\x85Rs."  # of 2^31 - 1
+NUMBERED = b"(" + b"".join(b"M" + struct.pack("<H", n) + b"N" for n in range(3000)) + b"u"
 HOSTILE = {
     "deep": lambda: zipped(model(text="[" * 10**6)),
     "deep and whole": lambda: zipped(model(text="[" * 10**5 + "]" * 10**5)),
@@ -191,19 +203,30 @@ HOSTILE = {
     "pairs as a name": lambda: zipped(model(described(b"}" + PAIRS + b"K\1s."))),
     "pairs as a function": lambda: zipped(model(described(PAIRS + b")R."))),
     "pairs as a storage": lambda: zipped(model(described(PAIRS + b"Q."))),
-    "pairs as a size": lambda: zipped(model(described(TENSOR % (PAIRS, b")")))),
+    "pairs as a size": lambda: zipped(model(described(NAMED % (PAIRS, b")")))),
     "a long text as a size": lambda: zipped(
-        model(described(TENSOR % (b"(J\xff\xff\xff\x7fX\1\0\0\0at", b")")))
+        model(described(NAMED % (b"(J\xff\xff\xff\x7fX\1\0\0\0at", b")")))
     ),
     "a size below zero": lambda: zipped(
-        model(described(TENSOR % (b"J\xff\xff\xff\xff\x85", b"K\1\x85")))
+        model(described(NAMED % (b"J\xff\xff\xff\xff\x85", b"K\1\x85")))
     ),
-    "a stride too long": lambda: zipped(model(described(TENSOR % (b"K\2\x85", b"K\x09\x85")))),
+    "a stride too long": lambda: zipped(model(described(NAMED % (b"K\2\x85", b"K\x09\x85")))),
+    "two gigabytes": lambda: zipped(model(described(CALL % (b"builtins", b"bytearray")))),
+    "a storage of two gigabytes": lambda: zipped(
+        model(described(CALL % (b"torch.storage", b"UntypedStorage")))
+    ),
+    "a tensor larger than its numbers": lambda: zipped(
+        model(described(NAMED % (b"J\xff\xff\xff\x7f\x85", b"K\1\x85")))
+    ),
+    "the same large dictionary often": lambda: zipped(
+        model(described(b"}" + NUMBERED + b"q\1" + b"ccollections\nOrderedDict\nh\1\x85R" * 3000))
+    ),
+    "tuples in tuples": lambda: zipped(model(described(b"})" + b"\x85" * 10**6 + b"K\1s."))),
     "no end": lambda: zipped(model(described(b"}" * 10**6))),
     "zeros": lambda: shrunk("policy.pth", model()),
     "zeros in the settings": lambda: shrunk("data", model()),
     "zeros in a tensor": lambda: zipped(
-        model(shrunk("archive/data/0", {"archive/data.pkl": b"\x80\2" + TENSOR % (b")", b")")}))
+        model(shrunk("archive/data/0", archive(NAMED % (b")", b")"))))
     ),
     "contents": lambda: contents(64),
     "encrypted": lambda: encrypted(zipped(model())),
@@ -269,6 +292,17 @@ def test_nothing_in_a_file_runs(tmp_path):
         policy_from_sb3(tmp_path / "sound.zip", tmp_path / "seen.pkl")
     assert policy_from_sb3(tmp_path / "sound.zip").observation_size == 3
     assert not (tmp_path / "harm").exists()
+
+
+def test_what_torch_before_1_6_wrote_is_refused_with_the_lines_that_convert_it(tmp_path):
+    file, box = tmp_path / "agent.pth", gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    weights = {"actor_mean.0.weight": torch.ones(1, 3)}
+    torch.save(weights, file, _use_new_zipfile_serialization=False)
+    with pytest.raises(ArtefactError, match="torch before 1.6 wrote it: ") as refused:
+        policy_from_cleanrl(file, box)
+    lines = re.search(r"wrote it: (.*)'\)\)", str(refused.value))[1]
+    exec(lines, {"torch": torch, "FILE": file})
+    assert policy_from_cleanrl(file, box)(torch.full((3,), 0.25)) == 0.75
 
 
 def test_files_that_hold_no_policy_are_refused(tmp_path):

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.errors import ConfigurationError
-from afm_rl.planning import MPC, GoalDistance, PlanningEnv, TrackingCost
+from afm_rl.planning import MPC, GoalDistance, PlanningEnv, TrackingCost, mpc
 from afm_rl.spaces.manifold import Manifold
 
 DT, HORIZON = 0.1, 12
@@ -93,9 +93,10 @@ def ipopt(casadi, start, guess):
 
 
 @pytest.mark.parametrize(("iterations", "tolerance"), [(20, 1e-6), (1, 0.05)])
-def test_a_flight_equals_an_exact_solver(pendulum, iterations, tolerance):
+def test_a_flight_equals_an_exact_solver(pendulum, iterations, tolerance, monkeypatch):
+    monkeypatch.setattr(mpc, "FIRST_ITERATIONS", 30)
     casadi = pytest.importorskip("casadi")
-    planner = MPC(pendulum, HORIZON, iterations, first_iterations=30)
+    planner = MPC(pendulum, HORIZON, iterations)
     td = situation(planner, memory=0.0, dtype=torch.float64)
     td["observation"], td["reference"] = torch.tensor([0.9, 0.3]).double(), torch.zeros(1)
     saturated = 0
@@ -125,10 +126,11 @@ def test_it_gets_the_pendulum_up_and_holds_it(pendulum):
     torch.testing.assert_close(td["observation"], torch.zeros(2).double(), rtol=0, atol=1e-2)
 
 
-def test_a_warm_start_beats_a_cold_one(pendulum):
+def test_a_warm_start_beats_a_cold_one(pendulum, monkeypatch):
     best, _ = balance(pendulum, MPC(pendulum, HORIZON, iterations=10), 15)
     warm, _ = balance(pendulum, MPC(pendulum, HORIZON), 15)
-    cold, _ = balance(pendulum, MPC(pendulum, HORIZON, first_iterations=1), 15, warm=False)
+    monkeypatch.setattr(mpc, "FIRST_ITERATIONS", 1)
+    cold, _ = balance(pendulum, MPC(pendulum, HORIZON), 15, warm=False)
     worse, better = (
         max(abs(a - b) for a, b in zip(found, best, strict=True)) for found in (cold, warm)
     )
@@ -217,18 +219,17 @@ def test_without_a_finite_solution_the_previous_plan_stands(box, fault, cold, wh
         assert planner.planning(td).isfinite().all()
 
 
-def test_new_flights_iterate_as_long_as_they_are_told(pendulum):
+def test_new_flights_iterate_five_times(pendulum, monkeypatch):
     td = situation(MPC(pendulum, HORIZON), 2, dtype=torch.float64)
     td["mpc", "states"][0] = td["mpc", "actions"][0] = 0.0
-    short, long = MPC(pendulum, HORIZON, first_iterations=1), MPC(pendulum, HORIZON)
-    few, many = plan(short, td)[1], plan(long, td)[1]
+    many = plan(MPC(pendulum, HORIZON), td)[1]
+    monkeypatch.setattr(mpc, "FIRST_ITERATIONS", 1)
+    few = plan(MPC(pendulum, HORIZON), td)[1]
     torch.testing.assert_close(few[1], many[1])
     assert (few[0] - many[0]).abs().max() > 1e-3
 
 
 def test_plans_that_are_not_minima_are_counted(box, monkeypatch):
-    from afm_rl.planning import mpc
-
     planner = car(box)
     td = situation(planner, 3)
     td["reference"] *= 50

@@ -6,7 +6,6 @@ from harness import situation
 from torchrl.envs import TransformedEnv
 
 from afm_rl.dynamics import Dubins
-from afm_rl.errors import ConfigurationError
 from afm_rl.planning import MPPI, GoalDistance, PlanningEnv
 
 SMALL = {"horizon": 4, "population": 32}
@@ -24,8 +23,9 @@ def plan(planner, td):
 def test_both_backends_plan_the_same(box, settings):
     # In double precision: plans of several iterations amplify how sums are rounded.
     world = PlanningEnv(Dubins().double(), GoalDistance(), *(end.double() for end in box))
-    fast, slow = (MPPI(world, backend=name, **SMALL, **settings) for name in ("fast", "env"))
-    assert MPPI(world, **SMALL).backend == "fast"
+    fast, slow = (MPPI(world, **SMALL, **settings) for _ in range(2))
+    assert fast.fast
+    slow.fast = False
     for batch in [(), (3,), (2, 2)]:
         td = robots(*batch).double()
         torch.testing.assert_close(plan(fast, td), plan(slow, td), rtol=0, atol=1e-10)
@@ -35,11 +35,9 @@ def test_an_environment_without_returns_is_stepped(world):
     wrapped = TransformedEnv(world)
     wrapped.__class__ = type("Plain", (TransformedEnv,), {"__getattr__": _without_returns})
     planner = MPPI(wrapped, **SMALL)
-    assert planner.backend == "env"
+    assert not planner.fast
     expected = plan(MPPI(world, **SMALL), robots(3))
     torch.testing.assert_close(plan(planner, robots(3)), expected, rtol=0, atol=1e-5)
-    with pytest.raises(ConfigurationError, match="has no `returns`; use 'env'"):
-        MPPI(wrapped, backend="fast")
 
 
 def _without_returns(self, name):

@@ -59,7 +59,6 @@ class CFMLoss(InPlaceLoss):
     Args:
         network: the network to train.
         saturation: mode of the intended actions.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"``.
         seed: of the times and starting points.
 
     Keys (change them with ``set_keys``): ``executed``, ``effective``, ``std`` ``(*B, K, A)`` and
@@ -92,10 +91,9 @@ class CFMLoss(InPlaceLoss):
         self,
         network: AxisNetwork,
         saturation: str = SATURATION,
-        reduction: str = "mean",
         seed: int = option(0, "of the points on the paths", ge=0),
     ) -> None:
-        super().__init__(reduction)
+        super().__init__()
         self.network = check_instance("loss.network", network, AxisNetwork)
         self.saturation = saturation
         self._generator = torch.Generator().manual_seed(seed)
