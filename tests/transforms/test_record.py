@@ -26,7 +26,7 @@ def record(shell, file):
     list(shell(plans_of(STEPS), torch.float32, gain=GAINS, ends=ends, record=file))
 
 
-@pytest.mark.parametrize("name", SHELLS.keys() - {"controller"})
+@pytest.mark.parametrize("name", sorted(SHELLS.keys() - {"controller"}))
 def test_what_is_recorded_is_a_log(tmp_path, name, monkeypatch, capsys):
     record(SHELLS[name], tmp_path / "drive" / "log.csv")
     table = pd.read_csv(tmp_path / "drive" / "log.csv")
