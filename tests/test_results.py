@@ -135,7 +135,7 @@ def test_what_others_can_say_or_see_may_not(code):
     assert not is_a_matter_of_taste(code)
 
 
-@pytest.mark.parametrize("module", [digests, results])
+@pytest.mark.parametrize("module", [digests, results, of_benchmarks("rooms")])
 def test_examples_in_docstrings(module):
     assert doctest.testmod(module).failed == 0
 
