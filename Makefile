@@ -38,8 +38,9 @@ test: $(VENV)/.with-test ## Run the tests; ALL=1 adds those marked slow, COVER=1
 	@OMP_NUM_THREADS=1 MPLBACKEND=Agg $(BIN)/pytest -q -n 2 --dist worksteal --durations=10 \
 		$(if $(ALL),,-m "not slow") $(if $(COVER),$(COVERED))
 
-lint: $(VENV)/.with-test ## Check style, format and spelling
+lint: $(VENV)/.with-test ## Check style, format, spelling, and that no room outgrows its budget
 	@$(BIN)/ruff check --quiet . && $(BIN)/ruff format --quiet --check . && $(BIN)/codespell
+	@$(BIN)/python benchmarks/house.py --check
 	@echo "lint: clean"
 
 # Tools that read sources follow folders, not the map that turns envs/ into afm_rl.envs. They get a

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import subprocess
 from collections.abc import Iterable, Iterator
 from functools import cache
 from itertools import count
@@ -136,6 +137,11 @@ def names_of(node: ast.AST, numbers: Iterator[str]) -> Names:
                 names[name] = name
     arguments = ast.iter_child_nodes(getattr(node, "args", node))
     return names | {a.arg: a.arg for a in arguments if isinstance(a, ast.arg)}
+
+
+def git(root: Path, *arguments: str) -> list[str]:
+    """Return the lines that git prints in a checkout."""
+    return subprocess.check_output(["git", *arguments], cwd=root, text=True).splitlines()
 
 
 def packed(code: dict[str, str]) -> dict[str, str]:

@@ -1,11 +1,12 @@
-"""Count the house: what it holds, what its parts load, and the way of one action through it.
+"""Count the house: its rooms, what imports load, and the way of one action through it.
 
-    python benchmarks/house.py [ROOT] [--time]
+    python benchmarks/house.py [ROOT]
+    python benchmarks/house.py --check   # is each room as large as its budget?
+    python benchmarks/house.py --write   # lower the budgets to what there is
 
-Lines, classes and constants are those of ``afm_rl`` and ``envs`` in ROOT. A constant is a name in
-capitals that a module assigns, once for each. Three programs run: fifty steps of a pendulum behind
-``ActionFlowTransform``, fifty behind ``ActionFlowWrapper``, and a mission by the command line.
-``--time`` runs ``make test`` and ``.ci/run``, too.
+`rooms.py` says what a room is, and its size. Where a room shrinks, its budget follows in the same
+commit. It rises by hand, where another one falls by as much. Programs run for the other counts:
+imports, fifty steps of a pendulum behind ``ActionFlowTransform``, and a mission.
 """
 
 from __future__ import annotations
@@ -18,15 +19,19 @@ import re
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
-import pandas as pd
-
-from afm_rl.report.tables import markdown
+import networkx as nx
+import rooms
+from digests import git
+from results import lay_out
+from rooms import Source
 
 HERE = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(HERE / "docs" / "theme"))
+from layers import imported  # noqa: E402
+
 TRANSFORM = """
 import torch
 from torchrl.envs import GymEnv, TransformedEnv, step_mdp
@@ -48,24 +53,6 @@ for _ in range(50):
     td = trace(env.step, env.rand_action(td))
     corrected += td["next", "afm", "misaligned"].item()
     td = step_mdp(td)
-"""
-WRAPPER = """
-import gymnasium
-from afm_rl import ActionFlowWrapper
-
-class Reversed(gymnasium.ActionWrapper):
-    def action(self, action):
-        return -action
-
-env = ActionFlowWrapper(Reversed(gymnasium.make("InvertedPendulum-v5")), model="mujoco")
-env.action_space.seed(0)
-env.reset(seed=0)
-corrected = 0
-for _ in range(50):
-    _, _, ended, _, info = trace(env.step, env.action_space.sample())
-    corrected += info["afm"]["corrects"]
-    if ended:
-        env.reset()
 """
 COMMAND = """
 import tempfile
@@ -89,7 +76,7 @@ sys.setprofile(None)
 assert not ends, f"never reached: {ends}"
 """
 BEGIN = """
-import json, sys
+import json, os, sys
 called, stacks = {}, set()
 
 def trace(step, action):
@@ -106,73 +93,45 @@ def trace(step, action):
 END = """
 assert globals().get("corrected", 1) > 0, "nothing was corrected"
 loaded = [m.__file__ for name, m in sys.modules.items() if name.partition(".")[0] == "afm_rl"]
-called = {file: sorted(lines) for file, lines in called.items()}
-print(json.dumps({"loaded": loaded, "stacks": sorted(stacks), "called": called}))
+kinds = {"loaded": filter(None, loaded), "stacks": stacks, "called": called}
+print(json.dumps({
+    kind: {os.path.realpath(file): sorted(called.get(file, [])) for file in files}
+    for kind, files in kinds.items()
+}))
 """
-BEYOND = {"diagnosis", "learning", "missions", "planning", "report"}
-BEFORE = {  # of commit bbecb0c
-    "`ActionFlowTransform` loads: files; lines; of five rooms": "78; 12,900; planning",
-    "`ActionFlowWrapper` loads: files; lines; of five rooms": (
-        "113; 19,188; diagnosis, learning, planning"
-    ),
-    "`afm_rl` and `envs`: files; lines": "209; 34,905",
-    "classes": "246",
-    "module constants": "348",
-    "all tracked `.py`: lines": "67,892",
-    "tests: lines": "26,677",
-    "docs: words": "23,032",
-    "one corrected action: files; their lines; lines of the functions it calls": (
-        "25; 4,853; 1,648"
-    ),
-    "from the command line to the executed action: files": "15",
-    "`make test`: minutes": "8",
-    "`.ci/run`: minutes": "12",
+IMPORTS = {
+    "ActionFlowTransform": "from afm_rl.transforms import ActionFlowTransform",
+    "ActionFlowWrapper": "from afm_rl import ActionFlowWrapper; ActionFlowWrapper",
 }
+HYPOTHESES = "from afm_rl.correction.hypotheses import choose; print(len(choose(None, False, 0)))"
+CORE = re.compile(
+    r"afm_rl/(correction/(?!training|classical|paper_flow)"
+    r"|dynamics/inverse\.py|transforms/(action_flow|loop)\.py)"
+)
+SAYING_NOTHING = {"part", "own", "given", "most", "found", "known", "one", "whole", "rest"}
 
 
-def run(program: str, root: Path = HERE) -> dict[str, dict[str, list[int]]]:
-    """Run a program with the package in a folder.
+def run(program: str, root: Path) -> str:
+    """Return what a program prints that imports the package of a checkout."""
+    with tempfile.TemporaryDirectory() as folder:
+        lay_out(root, Path(folder))
+        command, env = [sys.executable, "-c", program], {**os.environ, "PYTHONPATH": folder}
+        return subprocess.check_output(command, env=env, cwd=folder, text=True)
+
+
+def trace(program: str, root: Path, files: Iterable[str]) -> dict[str, dict[str, list[int]]]:
+    """Run a program, and return which of some files it needs.
 
     Returns:
-        Files of the package, from ``root``: those that are ``loaded``, those on the ``stacks`` of
-        a mission, and those with functions that the last step ``called``, with the first lines of
-        these functions.
+        Those that are ``loaded``, those on the ``stacks`` of a mission, and those with functions
+        that the last step ``called``, with the first lines of these functions.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        package = Path(folder, "afm_rl")  # laid out as the wheel is
-        package.mkdir()
-        for part in (*(root / "afm_rl").iterdir(), root / "envs", root / "conf"):
-            (package / part.name).symlink_to(part.resolve())
-        settings = {**os.environ, "PYTHONPATH": folder, "OMP_NUM_THREADS": "1"}
-        command = [sys.executable, "-c", BEGIN + program + END]
-        out = subprocess.check_output(command, env=settings, cwd=folder, text=True)
-        kinds = json.loads(out.splitlines()[-1])
-        return {
-            kind: {
-                str(Path(file).resolve().relative_to(root)): kinds["called"].get(file, [])
-                for file in files
-                if file and file.startswith(folder)
-            }
-            for kind, files in kinds.items()
-        }
-
-
-def rooms(files: Iterable[str]) -> set[str]:
-    """Return the folders, and the modules beside them, that files lie in."""
-    return {Path(file).parts[1].removesuffix(".py") for file in files if file.startswith("afm_rl/")}
-
-
-def constants(tree: ast.Module) -> int:
-    """Return how many names in capitals a module assigns."""
-    named = [
-        name.id
-        for node in tree.body
-        if isinstance(node, ast.Assign | ast.AnnAssign)
-        for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
-        for name in ast.walk(target)
-        if isinstance(name, ast.Name)
-    ]
-    return sum(name.lstrip("_").isupper() for name in named)
+    kinds = json.loads(run(BEGIN + program + END, root).splitlines()[-1])
+    paths = {str(root / file): file for file in files}
+    return {
+        kind: {paths[path]: lines for path, lines in begun.items() if path in paths}
+        for kind, begun in kinds.items()
+    }
 
 
 def of_functions(tree: ast.Module, begun: list[int]) -> int:
@@ -186,61 +145,87 @@ def of_functions(tree: ast.Module, begun: list[int]) -> int:
     return len(lines)
 
 
-def minutes(root: Path, command: list[str]) -> str:
-    """Return how long a command takes."""
-    start = time.perf_counter()
-    subprocess.run(command, cwd=root, check=True, stdout=subprocess.DEVNULL)
-    return f"{(time.perf_counter() - start) / 60:.1f}"
+def says_nothing(node: ast.AST) -> bool:
+    """Return whether a variable or an argument has a name that says nothing."""
+    match node:
+        case ast.Name(name, ast.Store()) | ast.arg(name):
+            return name in SAYING_NOTHING
+    return False
 
 
-def count(root: Path) -> dict[str, str]:
+def is_option(node: ast.AST) -> bool:
+    """Return whether an option is described."""
+    return isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("choice", "option")
+
+
+def circles(trees: dict[str, ast.Module]) -> int:
+    """Return how many groups of modules import each other, wherever in a module that is done."""
+    files = {}
+    for file in trees:
+        name = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+        files[name if name.startswith("afm_rl") else f"afm_rl.{name}"] = file
+    imports = [(file, name) for file, tree in trees.items() for name in imported(tree)]
+    graph = nx.DiGraph((file, files[name]) for file, name in imports if name in files)
+    return sum(len(group) > 1 for group in nx.strongly_connected_components(graph))
+
+
+def count(root: Path, files: dict[str, Source]) -> dict[str, str]:
     """Return the rows of the table."""
-    names = subprocess.check_output(["git", "ls-files"], cwd=root, text=True).splitlines()
-    texts = {name: (root / name).read_text() for name in names if name.endswith((".py", ".md"))}
-    code = {name: text for name, text in texts.items() if name.endswith(".py")}
-    trees = {n: ast.parse(t) for n, t in code.items() if n.startswith(("afm_rl/", "envs/"))}
-    nodes = [node for tree in trees.values() for node in ast.walk(tree)]
-    pages = [t for n, t in texts.items() if re.match(r"(README|docs/.*)\.md", n)]
+    texts = {n: (root / n).read_text() for n in git(root, "ls-files", "*.py", "*.md")}
+    trees = {name: ast.parse(text) for name, text in texts.items() if name.endswith(".py")}
+    package = {name: trees[name] for name in trees if name.startswith(("afm_rl/", "envs/"))}
+    pages = [text for name, text in texts.items() if re.match(r"(README|docs/.*)\.md", name)]
     words = [len(re.sub("<!--.*?-->", "", text).split()) for text in pages]
 
-    def lines(files: Iterable[str]) -> str:
-        return f"{sum(code[file].count(chr(10)) for file in files):,}"
+    def lines(names: Iterable[str]) -> str:
+        return f"{sum(files[name].lines for name in names):,}"
 
-    def load(program: str) -> tuple[str, dict[str, list[int]]]:
-        ran = run(program, root)
-        beyond = ", ".join(sorted(rooms(ran["loaded"]) & BEYOND)) or "none"
-        return f"{len(ran['loaded'])}; {lines(ran['loaded'])}; {beyond}", ran["called"]
+    def nodes(is_one: Callable[[ast.AST], bool], among: dict[str, ast.Module]) -> str:
+        return f"{sum(is_one(node) for tree in among.values() for node in ast.walk(tree)):,}"
 
-    transform, called = load(TRANSFORM)
-    stacks = run(COMMAND, root)["stacks"]
+    rows = {}
+    for name, program in IMPORTS.items():
+        loaded = trace(program, root, files)["loaded"]
+        rows[f"importing `{name}` loads: files; code lines"] = f"{len(loaded)}; {lines(loaded)}"
+    called = trace(TRANSFORM, root, files)["called"]
+    stacks = trace(COMMAND, root, files)["stacks"]
     of_called = sum(of_functions(trees[file], begun) for file, begun in called.items())
-    return {
-        "`ActionFlowTransform` loads: files; lines; of five rooms": transform,
-        "`ActionFlowWrapper` loads: files; lines; of five rooms": load(WRAPPER)[0],
-        "`afm_rl` and `envs`: files; lines": f"{len(trees)}; {lines(trees)}",
-        "classes": f"{sum(isinstance(node, ast.ClassDef) for node in nodes)}",
-        "module constants": f"{sum(map(constants, trees.values()))}",
-        "all tracked `.py`: lines": lines(code),
-        "tests: lines": lines(n for n in code if n.startswith("tests/")),
-        "docs: words": f"{sum(words):,}",
-        "one corrected action: files; their lines; lines of the functions it calls": (
+    return rows | {
+        "core: code lines": lines(filter(CORE.match, package)),
+        "one corrected action: files; code lines; lines of the functions it calls": (
             f"{len(called)}; {lines(called)}; {of_called:,}"
         ),
         "from the command line to the executed action: files": f"{len(stacks)}",
+        "options": nodes(is_option, package),
+        "hypotheses": run(HYPOTHESES, root).strip(),
+        "circles of imports": f"{circles(package)}",
+        "names that say nothing": nodes(says_nothing, trees),
+        "docs: words": f"{sum(words):,}",
     }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("root", type=Path, nargs="?", default=HERE)
-    parser.add_argument("--time", action="store_true", help="run make test and .ci/run, too")
+    parser.add_argument("--check", action="store_true", help="compare rooms with their budgets")
+    parser.add_argument("--write", action="store_true", help="lower budgets to what there is")
     options = parser.parse_args()
-    rows = count(options.root.resolve())
-    for name, command in (("make test", ["make", "test"]), (".ci/run", [".ci/run"])):
-        if options.time:
-            rows[f"`{name}`: minutes"] = minutes(options.root, command)
-    table = {"": list(rows), "before": [BEFORE[name] for name in rows], "now": list(rows.values())}
-    print(markdown("house", pd.DataFrame(table)))
+    root = options.root.resolve()
+    files = rooms.sources(root)
+    now = rooms.sizes(files)
+    if options.write:
+        rooms.lower(root, now)
+    if options.check or options.write:
+        sys.exit("\n".join(rooms.faults(now, *rooms.load(root))))
+    import pandas as pd  # both take longer than the check
+
+    from afm_rl.report.tables import markdown
+
+    ends = {name: row.get("end", "") for name, row in rooms.load(HERE)[0].items()}
+    sizes = {name: f"{size:,}" for name, size in now.items()}
+    for title, texts in ("rooms", sizes), ("house", count(root, files)):
+        rows = [(name, text, ends.get(name, "")) for name, text in texts.items()]
+        print(markdown(title, pd.DataFrame(rows, columns=["", "now", "at the end"])))
 
 
 if __name__ == "__main__":

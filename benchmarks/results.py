@@ -2,6 +2,7 @@
 
     python benchmarks/results.py                      # list them
     python benchmarks/results.py --renew NAME ...     # measure again; `all`: whatever is stale
+    python benchmarks/results.py --carry NAME ...     # the code changed, no number did; `all`, too
     python benchmarks/results.py --write              # put what the files say into the pages
 
 A result is a file, `benchmarks/results/NAME.json`. By hand: its ``commands``, as a page prints
@@ -18,6 +19,12 @@ cell, without its interval; such a mark does not begin a line, where it would en
 
 ``--renew`` works in `outputs/results/NAME`, beside links to the repository. If it is ended, the
 same command goes on there, unless code that was read has changed.
+
+``--carry`` makes a stale result fresh without measuring it again. By hand, a result has ``short``:
+its own commands at a small size, which print their numbers to the last bit, and no times. They run
+in the last commit that has the stored digests, and here. Where they print the same, and read each
+file that differs, the digests of today are written, and what was run: ``carried``. Times and films
+cannot be carried: such results have no short commands.
 """
 
 from __future__ import annotations
@@ -25,6 +32,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import ctypes
+import difflib
 import fnmatch
 import hashlib
 import importlib.util
@@ -36,12 +44,15 @@ import resource
 import shutil
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Callable, Iterable
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from digests import digest, packed, unpacked
+from digests import digest, digest_of, git, packed, unpacked
 
 ROOT = Path(__file__).resolve().parents[1]
 MARK = re.compile(
@@ -85,10 +96,9 @@ def pages() -> list[Path]:
 
 def code_now() -> dict[str, str]:
     """Return the digest of every file that may count: all of the repository but its texts."""
-    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
-    files = subprocess.check_output(listed, cwd=ROOT, text=True).splitlines()
+    files = git(ROOT, "ls-files", "--cached", "--others", "--exclude-standard")
     counted = (f for f in files if not f.startswith(("docs/", "benchmarks/results/")))
-    return {f: digest(ROOT / f)[:8] for f in counted if not f.endswith(".md")}
+    return {f: digest(ROOT / f)[:8] for f in counted if f[-3:] != ".md" and (ROOT / f).is_file()}
 
 
 def asked(result: Result) -> str:
@@ -105,7 +115,7 @@ def reasons(result: Result) -> tuple[str, str]:
     why = f"never renewed, of {result.get('commit', 'no commit')}" if old is None else ""
     if changed:
         why = changed[0] + (f" and {len(changed) - 1} more changed" if changed[1:] else " changed")
-    elif old not in (None, asked(result)):
+    if old not in (None, asked(result)):
         why = "its commands changed"
     need = result.get("need", {})
     absent = [file for file, value in need.items() if digest(ROOT / file) != value]
@@ -179,33 +189,22 @@ def renew(name: str) -> None:
         raise SystemExit(f"{name}: cannot be renewed here: it {reasons(result)[1]}")
     folder = ROOT / "outputs" / "results" / name
     begun = begin(name, result, folder)
-    settings = {"PYTHONPATH": f"{folder / 'hook'}", "RESULTS_READ": f"{folder / READ}"}
-    settings |= {"AFM_RL_CACHE": f"{folder / 'cache'}", "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
-    settings["PATH"] = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
-    printed, start = "", processor_seconds()
+    start = processor_seconds()
     try:
-        for command in result["commands"]:
-            print(f"{name}: {command}", flush=True)
-            printed += subprocess.check_output(
-                ["bash", "-c", command], cwd=folder, env=os.environ | settings, text=True
-            )
-    except subprocess.CalledProcessError as error:
-        print(error.output[-2000:])
-        raise SystemExit(f"{name}: ended with status {error.returncode}: {command}") from None
+        printed = run(name, result["commands"], folder)
     finally:
         begun["seconds"] += processor_seconds() - start
         (folder / BEGUN).write_text(json.dumps(begun), encoding="utf-8")
     digest.cache_clear()
-    files = files_in(folder / READ)
-    for pattern in result.get("reads", []):
-        files |= {*fnmatch.filter(begun["code"], pattern)}
+    files = files_in(folder / READ, ROOT) | files_like(result, begun["code"])
     code = {file: value for file, value in begun["code"].items() if file in files}
+    result.pop("carried", None)
     result |= {
         "figures": {file: digest(ROOT / file) for file in result["figures"]},
         "tables": tables_of(printed),
         "commit": commit_of([*code]),
         "versions": {"python": platform.python_version()}
-        | {part: version(part) for part in ("afm-rl", "torch", "torchrl", "mujoco")},
+        | {name: version(name) for name in ("afm-rl", "torch", "torchrl", "mujoco")},
         "machine": f"{processor()}, {os.cpu_count()} cores",
         "seconds": round(begun["seconds"]),
         "asked": begun["asked"],
@@ -215,33 +214,120 @@ def renew(name: str) -> None:
     write_pages()
 
 
+def run(name: str, commands: list[str], folder: Path) -> str:
+    """Return what commands print in the folder of a result."""
+    settings = {"PYTHONPATH": f"{folder / 'hook'}", "RESULTS_READ": f"{folder / READ}"}
+    settings |= {"AFM_RL_CACHE": f"{folder / 'cache'}", "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    settings["PATH"] = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
+    printed = ""
+    try:
+        for command in commands:
+            print(f"{name}: {command}", flush=True)
+            printed += subprocess.check_output(
+                ["bash", "-c", command], cwd=folder, env=os.environ | settings, text=True
+            )
+    except subprocess.CalledProcessError as error:
+        print(error.output[-2000:])
+        raise SystemExit(f"{name}: ended with status {error.returncode}: {command}") from None
+    return printed
+
+
 def begin(name: str, result: Result, folder: Path) -> Result:
     """Make the folder of a result, or find it; return what the code was when that was begun."""
     now = code_now()
     begun = {"code": now, "asked": asked(result), "seconds": 0.0}
     if (folder / BEGUN).is_file():
         earlier = json.loads((folder / BEGUN).read_text(encoding="utf-8"))
-        same = all(earlier["code"].get(file) == now.get(file) for file in files_in(folder / READ))
+        read = files_in(folder / READ, ROOT)
+        same = all(earlier["code"].get(file) == now.get(file) for file in read)
         if same and earlier["asked"] == begun["asked"]:
             return earlier
         print(f"{name}: begins anew, what it depends on has changed", flush=True)
-    shutil.rmtree(folder, ignore_errors=True)
-    (folder / "hook").mkdir(parents=True)
-    (folder / "hook" / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
-    for part in {Path(file).parts[0] for file in [*now, *result.get("need", {}), "docs"]}:
-        (folder / part).symlink_to(ROOT / part)
+    make_folder(folder, result, ROOT)
     (folder / BEGUN).write_text(json.dumps(begun), encoding="utf-8")
     return begun
 
 
-def files_in(read: Path) -> set[str]:
-    """Return the files of the repository in the list that was written while commands ran."""
+def make_folder(folder: Path, result: Result, checkout: Path) -> None:
+    """Make the folder of a result anew, with links to a checkout, whose package is imported."""
+    shutil.rmtree(folder, ignore_errors=True)
+    lay_out(checkout, folder / "hook")
+    (folder / "hook" / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
+    for name in {Path(file).parts[0] for file in [*code_now(), *result.get("need", {}), "docs"]}:
+        at_hand = checkout if (checkout / name).exists() else ROOT
+        (folder / name).symlink_to(at_hand / name)
+
+
+def lay_out(checkout: Path, folder: Path) -> None:
+    """Link the package of a checkout into a folder, as it is installed."""
+    (folder / "afm_rl").mkdir(parents=True)
+    for path in [*(checkout / "afm_rl").glob("*"), checkout / "envs", checkout / "conf"]:
+        (folder / "afm_rl" / path.name).symlink_to(path)
+
+
+def carry(name: str) -> None:
+    """Write the digests of today, if short commands print what they did at the stored ones."""
+    digest.cache_clear()
+    result, now = load(name), code_now()
+    why, why_not = reasons(result)
+    code = unpacked(result.get("code", {}))
+    changed = {file for file, value in code.items() if now.get(file) != value}
+    if not changed or why_not or result.get("asked") != asked(result):
+        raise SystemExit(f"{name}: nothing to carry over: {why_not or why or 'it is fresh'}")
+    if not result.get("short"):
+        raise SystemExit(f"{name}: cannot be carried over: it has no short commands")
+    commit, read = commit_with(code), set[str]()
+    with tempfile.TemporaryDirectory() as place:
+        folder, checkout = Path(place, "folder"), Path(place, "checkout").resolve()
+        git(ROOT, "archive", f"--output={place}/files.tar", commit)
+        shutil.unpack_archive(f"{place}/files.tar", checkout)
+
+        def printed(root: Path) -> list[str]:
+            make_folder(folder, result, root)
+            lines = run(name, result["short"], folder).splitlines()
+            read.update(files_in(folder / READ, root))
+            return lines
+
+        differing = [*difflib.unified_diff(printed(checkout), printed(ROOT), commit, "now", n=0)]
+    if differing:
+        raise SystemExit("\n".join([f"{name}: not carried over, it prints:", *differing[:20]]))
+    if unread := sorted(changed - read):
+        raise SystemExit(f"{name}: not carried over: no short command reads {', '.join(unread)}")
+    files = read.union(code, files_like(result, now))
+    code = {file: value for file, value in now.items() if file in files}
+    step = {"from": commit, "to": commit_of([*code]), "short": result["short"]}
+    save(name, result | {"code": packed(code), "carried": [*result.get("carried", []), step]})
+
+
+def commit_with(code: dict[str, str]) -> str:
+    """Return the last commit whose files have some digests."""
+    for commit in git(ROOT, "rev-list", "HEAD"):
+        entries = (line.split("\t") for line in git(ROOT, "ls-tree", "-r", commit))
+        blobs = {file: entry.split()[-1] for entry, file in entries}
+        if all(digest_in_git(blobs.get(file, ""), file)[:8] == code[file] for file in code):
+            return commit[:7]
+    raise SystemExit("nothing to carry over: no commit has the code that was measured")
+
+
+@cache
+def digest_in_git(blob: str, file: str) -> str:
+    content = subprocess.check_output(["git", "cat-file", "blob", blob], cwd=ROOT) if blob else b""
+    return digest_of(content, Path(file).suffix)
+
+
+def files_like(result: Result, files: Iterable[str]) -> set[str]:
+    """Return the files that C++ reads, unseen by Python."""
+    return {f for pattern in result.get("reads", []) for f in fnmatch.filter(files, pattern)}
+
+
+def files_in(read: Path, checkout: Path) -> set[str]:
+    """Return the files of a checkout in the list that was written while commands ran."""
     lines = read.read_text(encoding="utf-8").splitlines() if read.is_file() else []
     files = set()
     for line in lines:
         file = Path(importlib.util.source_from_cache(line) if line.endswith(".pyc") else line)
-        if file.resolve().is_relative_to(ROOT):
-            files.add(file.resolve().relative_to(ROOT).as_posix())
+        if file.resolve().is_relative_to(checkout):
+            files.add(file.resolve().relative_to(checkout).as_posix())
     return files
 
 
@@ -266,8 +352,7 @@ def processor_seconds() -> float:
 
 def commit_of(files: list[str]) -> str:
     """Return the last commit of some files, marked where they differ from it."""
-    log = ["git", "log", "-1", "--format=%h", "--", *files]
-    last = subprocess.check_output(log, cwd=ROOT, text=True).strip()
+    (last,) = git(ROOT, "log", "-1", "--format=%h", "--", *files)
     same = subprocess.run(["git", "diff", "--quiet", "HEAD", "--", *files], cwd=ROOT, check=False)
     return last + ("" if same.returncode == 0 else ", changed")
 
@@ -294,25 +379,31 @@ def where() -> dict[str, list[str]]:
     }
 
 
+def each(act: Callable[[str], None], chosen: list[str]) -> None:
+    """Renew or carry over the results of some names; `all`: those that are stale."""
+    stale = [name for name in names() if reasons(load(name))[0] and not reasons(load(name))[1]]
+    failed = []
+    for name in stale if chosen == ["all"] else chosen:
+        try:
+            act(name)
+        except KeyboardInterrupt:
+            raise SystemExit(f"{name}: ended; the same command goes on") from None
+        except SystemExit as end:
+            failed.append(str(end))
+    if failed:
+        raise SystemExit("\n".join(failed))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--renew", nargs="+", metavar="NAME", help="measure again; all: stale ones")
+    parser.add_argument("--carry", nargs="+", metavar="NAME", help="show that no number changed")
     parser.add_argument("--write", action="store_true", help="write the pages from the files")
     options = parser.parse_args()
     if options.write:
         write_pages()
-    elif options.renew:
-        stale = [name for name in names() if reasons(load(name))[0] and not reasons(load(name))[1]]
-        failed = []
-        for name in stale if options.renew == ["all"] else options.renew:
-            try:
-                renew(name)
-            except KeyboardInterrupt:
-                raise SystemExit(f"{name}: ended; the same command goes on") from None
-            except SystemExit as end:
-                failed.append(str(end))
-        if failed:
-            raise SystemExit("\n".join(failed))
+    elif options.renew or options.carry:
+        each(renew if options.renew else carry, options.renew or options.carry)
     else:
         for name, shown_on in where().items():
             result = load(name)

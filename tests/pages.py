@@ -1,8 +1,10 @@
 """What README and docs print: code, files and commands."""
 
+import importlib
 import json
 import re
 import shlex
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +23,15 @@ class Command(NamedTuple):
 
     page: Path
     words: tuple[str, ...]
+
+
+def of_benchmarks(name):
+    """Import a program of benchmarks/, whose neighbours it imports by their names."""
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    try:
+        return importlib.import_module(name)
+    finally:
+        del sys.path[0]
 
 
 def name_of(page):

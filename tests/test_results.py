@@ -5,18 +5,13 @@ import json
 import re
 import runpy
 import subprocess
-import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from pages import PAGES, ROOT, name_of
+from pages import PAGES, ROOT, name_of, of_benchmarks
 
-sys.path.insert(0, str(ROOT / "benchmarks"))
-import digests  # noqa: E402
-import results  # noqa: E402
-
-del sys.path[0]
+digests, results = of_benchmarks("digests"), of_benchmarks("results")
 table = runpy.run_path(str(ROOT / "benchmarks" / "missions.py"))["table"]
 
 NUMBER = re.compile(r"^[\s*~<>≤±+-]*[.\d][\d.,]*")
@@ -140,7 +135,7 @@ def test_what_others_can_say_or_see_may_not(code):
     assert not is_a_matter_of_taste(code)
 
 
-@pytest.mark.parametrize("module", [digests, results])
+@pytest.mark.parametrize("module", [digests, results, of_benchmarks("rooms")])
 def test_examples_in_docstrings(module):
     assert doctest.testmod(module).failed == 0
 
@@ -159,6 +154,12 @@ def test_a_table_of_missions():
         {"track": "ring", "a": "1.5 [1.0, 2.0] / 0.25", "b": "4.0 / 0.25"}
     ]
     assert table(missions, ["method"], [], ["steps:0"])["steps"].tolist() == ["2 [1, 2]", "4"]
+
+
+def commit(folder):
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b"]
+    for arguments in (["init", "-q"], ["add", "."], ["commit", "-qm", "a"]):
+        subprocess.run([*git, *arguments], cwd=folder, check=True)
 
 
 @pytest.fixture
@@ -197,9 +198,7 @@ def desk(tmp_path, monkeypatch):
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b"]
-    for arguments in (["init", "-q"], ["add", "."], ["commit", "-qm", "a"]):
-        subprocess.run([*git, *arguments], cwd=tmp_path, check=True)
+    commit(tmp_path)
     return tmp_path
 
 
@@ -226,6 +225,52 @@ def test_renewing_goes_on_notes_what_was_read_and_writes_the_page(desk):
     assert results.reasons(result) == ("used.py changed", "")
     with pytest.raises(SystemExit, match="status 3"):  # begins anew
         results.renew("one")
+
+
+@pytest.fixture
+def measured(desk):
+    """A result that is fresh, and in a commit."""
+    results.save("one", results.load("one") | {"short": ["python run.py || python run.py"]})
+    with pytest.raises(SystemExit, match="status 3"):
+        results.renew("one")
+    results.renew("one")
+    commit(desk)
+    return desk
+
+
+def test_a_result_is_carried_over_where_its_short_commands_print_the_same(measured):
+    before = results.load("one")
+    change(measured / "used.py", "y = 1\nx = y\n")
+    (measured / "forked.py").rename(measured / "moved.py")
+    change(measured / "run.py", (measured / "run.py").read_text().replace("forked", "moved"))
+    results.carry("one")
+    after = results.load("one")
+    assert results.reasons(after) == ("", "") and after["tables"] == before["tables"]
+    assert set(results.unpacked(after["code"])) == {"run.py", "used.py", "moved.py", "conf.yaml"}
+    (carried,) = after["carried"]
+    assert carried["from"] == digests.git(measured, "rev-parse", "HEAD")[0][:7]
+    assert carried["short"] == before["short"]
+    with pytest.raises(SystemExit, match="one: nothing to carry over: it is fresh"):
+        results.carry("one")
+
+
+@pytest.mark.parametrize(
+    ("short", "said"),
+    [
+        (
+            ["python run.py || python run.py"],
+            r"one: .*\n-\| \*\*a\*\* \| 1 .*\n\+.* \| 2 ",
+        ),
+        (["echo 1"], "one: not carried over: no short command reads used.py"),
+        ([], "one: cannot be carried over: it has no short commands"),
+    ],
+)
+def test_what_may_have_changed_is_not_carried_over(measured, short, said):
+    results.save("one", results.load("one") | {"short": short})
+    change(measured / "used.py", "x = 2\n")
+    with pytest.raises(SystemExit, match=re.compile(said, re.DOTALL)):
+        results.carry("one")
+    assert results.reasons(results.load("one")) == ("used.py changed", "")
 
 
 @pytest.mark.parametrize(
