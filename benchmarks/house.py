@@ -216,7 +216,7 @@ def main() -> None:
     if options.write:
         rooms.lower(root, now)
     if options.check or options.write:
-        sys.exit("\n".join(rooms.faults(now, *rooms.load(root))))
+        sys.exit("\n".join(rooms.faults(now, *rooms.load(root))) or None)
     import pandas as pd  # both take longer than the check
 
     from afm_rl.report.tables import markdown
