@@ -22,7 +22,6 @@ import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-import networkx as nx
 import rooms
 from digests import git
 from results import lay_out
@@ -30,7 +29,7 @@ from rooms import Source
 
 HERE = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(HERE / "docs" / "theme"))
-from layers import imported  # noqa: E402
+import layers  # noqa: E402
 
 TRANSFORM = """
 import torch
@@ -158,17 +157,6 @@ def is_option(node: ast.AST) -> bool:
     return isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("choice", "option")
 
 
-def circles(trees: dict[str, ast.Module]) -> int:
-    """Return how many groups of modules import each other, wherever in a module that is done."""
-    files = {}
-    for file in trees:
-        name = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-        files[name if name.startswith("afm_rl") else f"afm_rl.{name}"] = file
-    imports = [(file, name) for file, tree in trees.items() for name in imported(tree)]
-    graph = nx.DiGraph((file, files[name]) for file, name in imports if name in files)
-    return sum(len(group) > 1 for group in nx.strongly_connected_components(graph))
-
-
 def count(root: Path, files: dict[str, Source]) -> dict[str, str]:
     """Return the rows of the table."""
     texts = {n: (root / n).read_text() for n in git(root, "ls-files", "*.py", "*.md")}
@@ -198,7 +186,7 @@ def count(root: Path, files: dict[str, Source]) -> dict[str, str]:
         "from the command line to the executed action: files": f"{len(stacks)}",
         "options": nodes(is_option, package),
         "hypotheses": run(HYPOTHESES, root).strip(),
-        "circles of imports": f"{circles(package)}",
+        "circles of imports": f"{len(layers.circles())}",
         "names that say nothing": nodes(says_nothing, trees),
         "docs: words": f"{sum(words):,}",
     }
@@ -210,7 +198,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="compare rooms with their budgets")
     parser.add_argument("--write", action="store_true", help="lower budgets to what there is")
     options = parser.parse_args()
-    root = options.root.resolve()
+    root = layers.ROOT = options.root.resolve()
     files = rooms.sources(root)
     now = rooms.sizes(files)
     if options.write:

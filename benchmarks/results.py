@@ -277,12 +277,13 @@ def carry(name: str) -> None:
     if not result.get("short"):
         raise SystemExit(f"{name}: cannot be carried over: it has no short commands")
     commit, read = commit_with(code), set[str]()
-    with tempfile.TemporaryDirectory() as place:
-        folder, checkout = Path(place, "folder"), Path(place, "checkout").resolve()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as place:  # servers end later
+        checkout = Path(place, "checkout").resolve()
         git(ROOT, "archive", f"--output={place}/files.tar", commit)
         shutil.unpack_archive(f"{place}/files.tar", checkout)
 
         def printed(root: Path) -> list[str]:
+            folder = Path(place, f"beside_{root.name}")
             make_folder(folder, result, root)
             lines = run(name, result["short"], folder).splitlines()
             read.update(files_in(folder / READ, root))
