@@ -516,9 +516,11 @@ def test_the_wrapper_of_lerobot_has_its_interface_and_forgets_what_was_clipped()
     for arm.robot.clip in (math.inf, 1.0, math.inf, math.inf):
         arm.get_observation()
         assert arm.send_action(goals) == dict.fromkeys(goals, min(10.0, arm.robot.clip))
-    arm.send_action(goals)  # without an observation
-    # Not a number: before the first, after the clipped one, and without an observation.
-    assert [k for k, x in enumerate(readings) if math.isnan(x)] == [0, 3, 6]
+    for _ in range(2):  # without an observation
+        arm.send_action(goals)
+    # Not a number: before the first, after the clipped one, and once per step without observation.
+    assert [k for k, x in enumerate(readings) if math.isnan(x)] == [0, 3, 6, 7]
+    assert len(readings) == 8
 
 
 def test_lerobot_asks_for_no_more():

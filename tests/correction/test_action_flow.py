@@ -8,7 +8,7 @@ import torch
 
 from afm_rl.correction import ActionFlow, LeastSquares, PaperFlow
 from afm_rl.correction.achievable import MODES
-from afm_rl.correction.belief import Belief
+from afm_rl.correction.belief import Belief, mean_and_std
 from afm_rl.correction.network import AxisNetwork
 from afm_rl.correction.tick import points_of, probes_of
 from afm_rl.errors import ArtefactError
@@ -129,6 +129,39 @@ def test_models_that_take_a_new_delay_begin_as_good_as_the_best_that_had_it():
     assert torch.equal(found[flow.delays >= 0], losses[flow.delays >= 0])
     late, found = flow.delayed(belief, prior, torch.tensor(3))
     assert late == 3 and torch.equal(found, losses)
+
+
+@pytest.mark.parametrize(("healthy", "late"), [(0.2, 3), (0.3, 0)])
+def test_a_delay_is_believed_once_a_healthy_robot_is_less_than_a_quarter_as_probable(healthy, late):
+    flow = flow_of(1)
+    losses = torch.full((len(flow.models), 1), 50.0)
+    losses[0], losses[flow.models.index("delay_3")] = -math.log(healthy), -math.log(1 - healthy)
+    belief, prior = Belief(losses, losses, torch.ones(1)), torch.zeros_like(losses)
+    assert flow.delayed(belief, prior, torch.tensor(0))[0] == late
+
+
+@pytest.mark.parametrize(
+    ("before", "newest", "sudden"), [(4.0, 6.0, True), (4.0, 4.0, False), (6.0, 6.0, False)]
+)
+def test_a_change_is_sudden_if_only_the_newest_effect_misses_by_five_deviations(
+    before, newest, sudden
+):
+    flow = flow_of(1)
+    parts = flow.unpack(flow.begin(torch.zeros(1)), 1)
+    deviation = parts["noise"].item()
+    parts["pairs"][-2:, 1] = deviation * torch.tensor([before, newest])  # of commands of zero
+    assert flow.is_sudden(parts) == sudden
+
+
+def test_an_effect_is_as_uncertain_as_the_models_differ_and_as_nothing_explains(line):
+    flow, command = flow_of(1), torch.tensor([0.4])
+    memory = flow.begin(torch.zeros(1))
+    differ, noise = (flow.predict(memory, x * command, line(1))[1] for x in (1, 0))
+    torch.testing.assert_close(noise, flow.noise_in(memory), rtol=0.01, atol=0)  # at rest all agree
+    effects = flow.unpack(flow.executing(memory, command, command), 1)["forecasts"]
+    torch.testing.assert_close(
+        differ, torch.hypot(mean_and_std(effects, flow.weights_in(memory))[1], noise)
+    )
 
 
 @pytest.mark.parametrize("size", SIZES)

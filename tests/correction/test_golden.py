@@ -2,10 +2,13 @@
 
     python tests/correction/test_golden.py   # stores them anew; the commit says why they changed
 
-Ten effects of actuators and two amounts of noise are twenty rows of a batch; one robot has one
-action, one two, one six. What a place or a delay changes is asked of a ground robot.
+Eleven effects of actuators and two amounts of noise are the rows of a batch; one robot has one
+action, one two, one six. What a place or a delay changes is asked of a ground robot. Tables in
+``golden`` show one tick of some rows, from its fits to what is remembered.
 """
 
+import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -13,11 +16,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from afm_rl.correction import ActionFlow, L1Augmentation, LeastSquares
+from afm_rl.correction.achievable import attainable
+from afm_rl.correction.experts import MISSES
+from afm_rl.correction.linear import MIXING
 from afm_rl.dynamics import Dubins, KnownDynamics
 from afm_rl.spaces.manifold import Manifold
 
 FILE = Path(__file__).with_name("golden.safetensors")
+TABLES = FILE.with_name("golden")
 TICKS, CHANGE, NOISE = 36, 10, (1e-3, 0.05)
+SHOWN = CHANGE + 3  # the tick of the tables
 
 
 def before(sent, ticks):
@@ -38,6 +46,7 @@ EFFECTS = {
     "slow": lambda sent: sum(0.6 * 0.4**k * before(sent, k) for k in range(5)),
     "first reversed": first_alone,
     "swapped": lambda sent: sent[-1].flip(-1),
+    "dead": lambda sent: 0 * sent[-1],
     "dead zone": lambda sent: torch.where(sent[-1].abs() < 0.2, 0 * sent[-1], -sent[-1]),
 }
 
@@ -76,23 +85,37 @@ CASES = {
 }
 
 
-def answers(name):
-    """Drive every row; return the tick's answers, each ``(T, B, A)``."""
+# Of which a tick is shown, and of which robot.
+SITUATIONS = {
+    "healthy": "one action",
+    "reversed": "one action",
+    "slow": "one action",
+    "offset": "two actions",
+    "swapped": "two actions",
+    "dead": "two actions",
+    "two steps late": "six actions",
+    "first reversed": "six actions",
+}
+
+
+@cache
+def driven(name):
+    """Drive every row; return corrector, model, and memory, plan, box and answer of all ticks."""
     corrector, model = (part.double() for part in CASES[name]())
     draws = torch.Generator().manual_seed(0)
     size, rows, noise = corrector.lowest.shape[-1], len(EFFECTS) * len(NOISE), torch.tensor(NOISE)
     noise = noise.double().repeat(len(EFFECTS)).unsqueeze(-1)
     box = torch.stack(
         [corrector.denormalise(part) for part in (corrector.lowest, corrector.highest)]
-    )
+    ).expand(rows, 2, -1)
     state, plan = torch.zeros(rows, model.state_size).double(), torch.zeros(rows, size).double()
-    memory, sent, found = corrector.begin(state), [], []
+    memory, sent, ticks = corrector.begin(state), [], []
     for tick in range(TICKS):
         drawn = torch.rand(rows, size, generator=draws, dtype=torch.float64)
         plan = 0.7 * plan + 0.5 * (2 * drawn - 1)
-        memory, answer = corrector.correct(
-            memory, plan.clamp(-0.8, 0.8), model, box.expand(rows, 2, -1)
-        )
+        before, planned = memory, plan.clamp(-0.8, 0.8)
+        memory, answer = corrector.correct(before, planned, model, box)
+        ticks.append((before, planned, box, memory, answer))
         sent.append(corrector.sending(memory, answer.executed))
         parts = [effect(sent) for effect in EFFECTS.values()]
         rows_of = torch.arange(rows)
@@ -100,9 +123,16 @@ def answers(name):
         state = model(state, effects)
         state = state + noise * torch.randn(state.shape, generator=draws, dtype=torch.float64)
         memory = corrector.observe(memory, state)
-        found.append((answer.executed, answer.predicted, answer.noise))
-    executed, predicted, spread = map(torch.stack, zip(*found, strict=True))
-    return {"executed": executed, "predicted": predicted, "noise": spread}
+    return corrector, model, ticks
+
+
+def answers(name):
+    """Return the answers at all ticks, each ``(T, B, A)``."""
+    *_, found = zip(*driven(name)[-1], strict=True)
+    return {
+        part: torch.stack([getattr(answer, part) for answer in found])
+        for part in ("executed", "predicted", "noise")
+    }
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -113,6 +143,86 @@ def test_answers_are_those_that_were_stored(name):
         torch.testing.assert_close(values.float(), stored[f"{name}: {part}"], rtol=1e-4, atol=1e-4)
 
 
+def table(title, names, **columns):
+    """Return names and numbers ``(N, A)`` as text, the axes beside each other."""
+    head = "".join(f"{column:>{11 * x.shape[-1]}}" for column, x in columns.items())
+    rows = zip(names, torch.cat(list(columns.values()), -1).tolist(), strict=True)
+    lines = [name.ljust(20) + "".join(f" {x:10.6f}" for x in numbers) for name, numbers in rows]
+    return "\n".join([title.ljust(20) + head, *lines, ""])
+
+
+def tick_of(effect):
+    """Return in tables what a tick does three steps after a change."""
+    flow, model, ticks = driven(SITUATIONS[effect])
+    row = [len(NOISE) * list(EFFECTS).index(effect)]
+    before, plan, box, after = (part[row] for part in ticks[SHOWN][:4])
+    answer = [part[row] for part in ticks[SHOWN][4]]
+    memories = flow.detect(before, plan, model)[0], after
+    seen, then = (flow.unpack(memory, model.state_size) for memory in memories)
+    weights, noise, tick, size = flow.weights(seen), seen["noise"], flow.tick, flow.action_size
+    delay, place = seen["delay"].squeeze(-1).long(), flow.place_of(seen["state"])
+    fits = tick.fit(seen["pairs"], noise, place, delay)
+    models = tick.most_likely(fits, weights)
+    proposals, _ = tick.propose(models, plan, box)
+    expected = tick.expect(models, proposals)
+    wanted = attainable(plan, *tick.reach(models, expected.effect).unbind(1), tick.saturation)
+    loss, axis, whole = tick.rate(models, proposals, expected, wanted, noise)
+
+    linear, late = (
+        [x.name for x in flow.hypotheses if x.kind == kind] for kind in ("linear", "delayed gain")
+    )
+    matrix, variance = fits.lines.matrix[0], fits.lines.variance(plan.unsqueeze(1))[0, :, 0]
+    gains = matrix.diagonal(dim1=-2, dim2=-1)
+    mixing = [f"{name}, axis {k}" for name in linear[-MIXING:] for k in range(size)]
+    proposed = ["plan", "mean", *(f"flow {k}" for k in range(len(tick.points)))]
+    proposed += [*(f"nearest {k}" for k in range(MISSES)), "late", *linear]
+    rated = [part[0, : len(proposed)] for part in (proposals, loss, axis, whole)]
+    executed, predicted, spread, bounds = (part[0] for part in answer[:4])
+    actions = torch.stack([plan[0], wanted[0], executed, predicted, spread, *bounds])
+    limits = torch.cat([fits.rate_limits, fits.sensor_noise], 1)[0]
+    newest = then["pairs"][0, -1, : 3 * size].view(3, size)
+    one = [then[name].expand(1, size) for name in ("delay", "misaligned", "corrects", "usual")]
+    kept = torch.cat([then["noise"], then["acting"], newest, *one, then["under_way"][0]])
+    words = "noise, acting, command, effect, std, delay, misaligned, corrects, usual".split(", ")
+    words += [f"under way {k}" for k in range(len(then["under_way"][0]))]
+    belief = {"weight": weights[0], "loss": seen["losses"][0], "expects": then["forecasts"][0]}
+    fit = {"gain": gains, "offset": fits.lines.bias[0], "variance": variance}
+    delayed = {"gain": fits.gains[0], "variance": fits.gain_variances[0]}
+    rates = dict(zip(("action", "loss", "reached", "together"), rated, strict=True))
+    said = ["plan", "wanted", "executed", "predicted", "spread", "lowest effect", "highest effect"]
+    return "\n".join(
+        [
+            table("hypothesis", flow.models, **belief),
+            table("fit", linear, **fit),
+            table("map of all axes", mixing, gain=matrix[-MIXING:].flatten(0, 1)),
+            table("gain of late ones", late, **delayed),
+            table("limit", ["lowest", "highest", "sensor noise"], effect=limits),
+            table("proposal", proposed, **rates),
+            table("command", said, action=actions),
+            table("remembered", words, number=kept),
+        ]
+    )
+
+
+def file_of(effect):
+    return TABLES / f"{effect.replace(' ', '_')}.txt"
+
+
+def words_and_numbers(row):
+    words, *numbers = re.split(r" +(?=-?(?:\d+\.\d|inf))", row)
+    return words, [float(number) for number in numbers]
+
+
+@pytest.mark.parametrize("effect", SITUATIONS)
+def test_a_tick_does_what_was_stored(effect):
+    stored = file_of(effect).read_text(encoding="utf-8").splitlines()
+    for found, expected in zip(tick_of(effect).splitlines(), stored, strict=True):
+        words, numbers = words_and_numbers(expected)
+        assert words_and_numbers(found) == (words, pytest.approx(numbers, rel=1e-5, abs=2e-6))
+
+
 if __name__ == "__main__":
     found = {f"{name}: {part}": x.float() for name in CASES for part, x in answers(name).items()}
     save_file({name: x.contiguous() for name, x in found.items()}, FILE)
+    for effect in SITUATIONS:
+        file_of(effect).write_text(tick_of(effect), encoding="utf-8")

@@ -79,6 +79,8 @@ def test_bounds_are_optimistic_where_models_differ():
         ([[0.5, -0.5], [0.5, -0.5]], [24.9, 24.9], 0.5, -1.0),  # .1 * 25 ** .5 = .5
         ([[0.5, -0.5], [0.5, -0.5]], [25.1, 25.1], 0.5, 1.0),
         ([[0.5, -0.5], [0.5, 3.0]], [0.0, 25.1], 0.5, -1.0),  # what knows nothing says nothing
+        ([[0.5, 0.15], [0.5, 0.15]], [2.25, 2.25], 0.5, -1.0),  # .35 > 2 * .1 * 2.25 ** .5
+        ([[0.5, 0.25], [0.5, 0.25]], [2.25, 2.25], 0.5, 1.0),  # .25 is less than that
     ],
 )
 def test_no_command_is_farther_from_the_plan_than_the_evidence_reaches(
