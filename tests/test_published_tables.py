@@ -60,16 +60,16 @@ def test_the_printed_tables_have_what_the_text_claims_over_physics_alone(paper, 
     shown = claims(paper, ours)
     assert shown["its tables"].to_dict() == PRINTED
     assert (shown["gate as written"] == "-").all()
-    mine = shown[CODED].str.partition(" ")[0]
-    assert mine.to_dict() == PRINTED
-    assert shown.loc["fewer steps than Physics (%)", f"{CODED}: verdict"] == "holds"
-    assert shown.loc["success over Online PE (points)", f"{CODED}: verdict"] == "does not hold"
-    assert shown.loc["success over Physics (points)", f"{CODED}: verdict"] == "holds, but less"
+    assert shown[CODED].str.partition(" ")[0].to_dict() == PRINTED
+    verdicts = shown[CODED].str.partition(": ")[2]
+    assert verdicts["fewer steps than Physics (%)"] == "holds"
+    assert verdicts["success over Online PE (points)"] == "does not hold"
+    assert verdicts["success over Physics (points)"] == "holds, but less"
 
 
 def test_nothing_is_said_of_one_seed_or_of_some_scenarios(paper, ours):
-    verdicts = claims(paper, ours[ours["seed"] == 0])[f"{CODED}: verdict"]
-    assert set(verdicts) == {"one seed", "-"}
+    alone = claims(paper, ours[ours["seed"] == 0])[CODED]
+    assert (alone.str.endswith(": one seed") | (alone == "-")).all()
     assert (claims(paper, ours[ours["track"] == "ethz_1"])[CODED] == "-").all()
 
 
@@ -95,7 +95,7 @@ def test_a_method_that_is_ahead_where_it_matters(paper, ours):
     mine = (ours["method"] == "afm_paper_code") & ours["finished"]
     half = online["steps"].reindex(pd.MultiIndex.from_frame(ours[["scenario", "seed"]])) / 2
     shown = claims(paper, ours.assign(steps=ours["steps"].where(~mine, half.to_numpy())))
-    assert shown.loc["fewer steps than Online PE (%)", f"{CODED}: verdict"] == "holds"
+    assert shown.loc["fewer steps than Online PE (%)", CODED].endswith(": holds")
     assert shown.loc["Online PE is worst", CODED].startswith("+9")
 
 
@@ -114,9 +114,9 @@ def test_the_paper_s_tables_with_ours_beside_the_published(paper, ours):
     assert names == ["paper_claims", "paper_means", "paper_ethz_1", "paper_ethz_2"]
     cells = paper["tables"](ours)[2]
     row = cells.shown.set_index("regime").loc["1, -1"]
-    assert row["Physics"] == row["Physics, published"] == "1.00/827"
+    assert row["Physics (published)"] == "1.00/827 (1.00/827)"
     assert row["AFM, gate as written"] == "-"
-    assert row["AFM, gate as coded"] == row["AFM, published"] == "1.00/1826"
+    assert row["AFM, gate as coded (published)"] == "1.00/1826 (1.00/1826)"
     assert "ours: 3" in cells.note and "another one" not in cells.note
 
 

@@ -164,6 +164,15 @@ def verdict(size: float, low: float, high: float) -> str:
     return "does not hold" if high < size else "cannot be told"
 
 
+def shown(claim: Claim, effect: dict[str, float], judged: bool) -> str:
+    """Return an effect as text, with its interval and, of ours, what it says of the claim."""
+    text = interval_text(effect, "effect", claim.digits, sign="+")
+    if not judged:
+        return text
+    ends = effect["effect_low"], effect["effect_high"]
+    return f"{text}: {'one seed' if math.isnan(ends[0]) else verdict(claim.size, *ends)}"
+
+
 def claims_table(
     missions: pd.DataFrame, printed: pd.DataFrame, forms: dict[str, str], more: str = ""
 ) -> Table:
@@ -187,12 +196,6 @@ def claims_table(
             if len(samples) == scenarios:
                 effect = estimated(claim, samples)
             numbers.append({"claim": claim.words, "of": form, "claimed": claim.size, **effect})
-            signed = "" if math.isnan(effect["effect"]) else "+"
-            row[head] = interval_text(effect, "effect", claim.digits, sign=signed)
-            if form != AFM:
-                ends = effect["effect_low"], effect["effect_high"]
-                alone = math.isnan(ends[0])
-                said = ("one seed" if signed else "-") if alone else verdict(claim.size, *ends)
-                row[f"{head}: verdict"] = said
+            row[head] = "-" if math.isnan(effect["effect"]) else shown(claim, effect, form != AFM)
         rows.append(row)
     return Table("paper_claims", TITLE, NOTE + more, pd.DataFrame(numbers), pd.DataFrame(rows))

@@ -84,11 +84,11 @@ def cells_table(track: str, ours: pd.DataFrame) -> Table:
     for gains, group in numbers.groupby(["v_gain", "omega_gain"], sort=False):
         row, methods = {"regime": "{:g}, {:g}".format(*gains)}, group.set_index("method")
         for method in (name for name in HEADS if name in methods.index):
-            means = methods.loc[method]
-            row[HEADS[method]] = _both(means["ours_success_mean"], means["ours_steps_mean"])
-            if method != "afm_paper":
-                head = f"{'AFM' if method == CODED else HEADS[method]}, published"
-                row[head] = _both(means["success_mean"], means["steps_mean"])
+            measured, printed = (_both(methods.loc[method], whose) for whose in ("ours_", ""))
+            if method == "afm_paper":
+                row[HEADS[method]] = measured
+            else:
+                row[f"{HEADS[method]} (published)"] = f"{measured} ({printed})"
         rows.append(row)
     title = f"Tables {TRACKS[track]} of the paper: success/steps on {track}"
     note = (
@@ -99,7 +99,8 @@ def cells_table(track: str, ours: pd.DataFrame) -> Table:
     return Table(f"paper_{track}", title, note, numbers, pd.DataFrame(rows))
 
 
-def _both(success: float, steps: float) -> str:
+def _both(means: pd.Series, whose: str) -> str:
+    success, steps = (means[f"{whose}{name}_mean"] for name in MEASURES)
     return "-" if pd.isna(success) else f"{success:.2f}/{steps:.0f}"
 
 
