@@ -30,7 +30,7 @@ NOTE = (
     "Best of AFM and its ablations by success or by steps, as printed in bold: ties of success go "
     "to AFM. Worst: out of time, or the most steps of these. Ahead: by success, then by steps. "
     "Loss: the median after the change, until it is undone. Nominal level: that of the report's "
-    "recovery times; never counts 4999."
+    "recovery times; never counts as all of these steps."
 )
 
 
@@ -102,7 +102,6 @@ CLAIMS = [
     Claim("success over Physics (points)", "34.2", 34.2, OVER_PHYSICS, more_success, 1),
     Claim("success over Online PE (points)", "more", 0, OVER_ONLINE, more_success, 1),
     Claim("fewer steps than Physics (%)", "15.1", 15.1, OVER_PHYSICS, share_of_steps, 1),
-    Claim("fewer steps than Online PE (%)", "fewer", 0, OVER_ONLINE, share_of_steps, 1),
     Claim("variance of success, less than Physics", "0.05", 0.05, OVER_PHYSICS, less_variance, 3),
     Claim("out of time, less often than Physics", "10", 10, OVER_PHYSICS, less_often_late, 0),
     Claim("Online PE is worst", "9", 9, ABLATIONS, worst, 0),
@@ -122,10 +121,11 @@ def learning(steps: pd.DataFrame) -> pd.DataFrame:
         steps: with ``mission``, ``loss``, ``error`` and ``regime_active``.
     """
     rows = {}
-    for mission, own in steps.groupby("mission"):
-        times = recovery_times(own).query("of == 'model' and change == 1")["time"]
-        loss = own.loc[own["regime_active"] == 1, "loss"].median()
-        rows[mission] = {"loss": loss, "recovery": times.clip(upper=LAST).mean()}
+    for mission, course in steps.groupby("mission"):
+        changed = course[course["regime_active"] == 1]
+        times = recovery_times(course).query("of == 'model' and change == 1")["time"]
+        recovery = times.clip(upper=len(changed)).mean()
+        rows[mission] = {"loss": changed["loss"].median(), "recovery": recovery}
     return pd.DataFrame.from_dict(rows, "index", columns=["loss", "recovery"])
 
 
@@ -148,11 +148,11 @@ def estimated(claim: Claim, samples: list[np.ndarray]) -> dict[str, float]:
     """Return the effect with its interval, which is NaN where one seed shows none."""
 
     def effect(drawn: list[np.ndarray]) -> np.ndarray:
-        return claim.effect(np.stack([part.mean(-1) for part in drawn])).astype(float)
+        return claim.effect(np.stack([seeds.mean(-1) for seeds in drawn])).astype(float)
 
-    value = float(effect([np.moveaxis(part, 0, -1) for part in samples]))
+    value = float(effect([np.moveaxis(seeds, 0, -1) for seeds in samples]))
     low = high = math.nan
-    if not math.isnan(value) and any(len(part) > 1 for part in samples):
+    if not math.isnan(value) and any(len(seeds) > 1 for seeds in samples):
         low, high = np.nan_to_num(resampled_bounds(samples, effect), nan=value)
     return {"effect": value, "effect_low": float(low), "effect_high": float(high)}
 
