@@ -10,8 +10,6 @@ standard deviations of the training data; its mean over learners, with a 95 % in
 
 from __future__ import annotations
 
-import argparse
-
 import pandas as pd
 import torch
 from hydra import compose, initialize_config_module
@@ -25,14 +23,13 @@ from afm_rl.report.tables import interval_text, markdown
 
 LAYERS = {"two": [200, 200], "three": [200, 200, 200]}
 REVERSED = torch.tensor([-1.0, 1.0])
-HELD_OUT = 1000
+UPDATES, LEARNERS, HELD_OUT = (0, 200, 400), 8, 1000
 
 
-def pretrained(hidden: list[int], *settings: str) -> Agent:
+def pretrained(hidden: list[int]) -> Agent:
     """Return Online PE of the paper with hidden layers of these sizes."""
-    choices = ["agent=paper", "method=online_pe", f"dynamics.hidden={hidden}", *settings]
     with initialize_config_module("afm_rl.conf", version_base="1.3"):
-        cfg = compose("config", choices)
+        cfg = compose("config", ["agent=paper", "method=online_pe", f"dynamics.hidden={hidden}"])
         agent = build(cfg)
     prepare(agent, cfg.cache, echo=lambda line: None)
     return agent
@@ -50,35 +47,22 @@ def transitions(agent: Agent, *batch: int) -> TensorDict:
 
 
 @torch.no_grad()
-def errors(agent: Agent, updates: list[int], learners: int) -> dict[str, str]:
+def errors(agent: Agent) -> dict[str, str]:
     """Return the error after each number of updates, as text."""
     torch.manual_seed(0)
-    model, texts = agent.model.expand_(learners), {}
-    held_out = transitions(agent, learners, HELD_OUT)
-    for update in range(max(updates) + 1):
-        if update in updates:
+    model, texts = agent.model.expand_(LEARNERS), {}
+    held_out = transitions(agent, LEARNERS, HELD_OUT)
+    for update in range(max(UPDATES) + 1):
+        if update in UPDATES:
             expected, _ = model.forecast(held_out["observation"], held_out[agent.executed_key])
             missed = (held_out["next", "observation"] - expected)[..., 0] / model.target_std[0]
             values = pd.Series(missed.square().mean(-1).sqrt().tolist())
             means = estimate("error", values, pd.Series("all", values.index))
             texts[f"after {update}"] = interval_text(means, "error", 2)
-        agent.updater(transitions(agent, learners))
+        agent.updater(transitions(agent, LEARNERS))
     return texts
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--updates", nargs="+", type=int, default=[0, 200, 400])
-    parser.add_argument("--learners", type=int, default=8, help="each with data of its own")
-    parser.add_argument("--settings", nargs="*", default=[], help="of afm-rl")
-    options = parser.parse_args()
-    rows = [
-        {"hidden layers": name}
-        | errors(pretrained(hidden, *options.settings), options.updates, options.learners)
-        for name, hidden in LAYERS.items()
-    ]
-    print(markdown("error of the change of x", pd.DataFrame(rows)))
-
-
 if __name__ == "__main__":
-    main()
+    rows = [{"hidden layers": name} | errors(pretrained(hidden)) for name, hidden in LAYERS.items()]
+    print(markdown("error of the change of x", pd.DataFrame(rows)))

@@ -22,16 +22,12 @@ def paper():
 @pytest.fixture
 def ours(paper):
     """What was published, as three missions of each scenario that differ in their steps alone."""
-    published = paper["published"]().rename(columns={"method": "printed"})
-    labels = pd.DataFrame(paper["LABELS"].items(), columns=["method", "printed"])
-    means = published.merge(labels[labels["method"] != "afm_paper"])
-    missions = means.merge(pd.DataFrame({"seed": range(3)}), how="cross")
+    published = paper["published"]().replace({"method": {"afm": "afm_paper_code"}})
+    missions = published.merge(pd.DataFrame({"seed": range(3)}), how="cross")
     finished = missions["steps_mean"] < 4999
     steps = missions["steps_mean"].round().astype(int) + finished * 10 * (missions["seed"] - 1)
-    columns = ["method", "track", "v_gain", "omega_gain", "seed", "scenario"]
-    return missions[columns].assign(
-        success_rate=missions["success_mean"], steps=steps, finished=finished
-    )
+    missions = missions.assign(success_rate=missions["success_mean"], steps=steps)
+    return missions.assign(finished=finished).drop(columns=["success_mean", "steps_mean"])
 
 
 def claims(paper, missions):
