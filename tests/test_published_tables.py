@@ -1,69 +1,93 @@
-"""The paper's tables beside ours, as the example writes them."""
+"""The paper's claims and tables beside ours, as the examples write them."""
 
 import runpy
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
 
-from afm_rl.report.runs import scenario_names
-
 EXAMPLE = Path(__file__).parents[1] / "examples" / "paper" / "published_tables.py"
-STEPS = [100, 200, 4999]
+CODED = "gate as coded"
+# What the printed tables give for each claim of the text, in their order.
+PRINTED = ["+34.0", "-1.5", "+15.9", "+0.047", "+10", "+9", "+12", "+5", *4 * ["-"]]
 
 
 @pytest.fixture(scope="module")
 def paper():
-    return runpy.run_path(str(EXAMPLE))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(EXAMPLE.parent))
+        return runpy.run_path(str(EXAMPLE))
 
 
 @pytest.fixture
 def ours(paper):
-    """Three methods under all published regimes on both tracks, three seeds."""
-    regimes = paper["published"]()[["track", "v_gain", "omega_gain"]].drop_duplicates()
-    methods = pd.DataFrame({"method": ["physics", "afm_paper_code", "online_pe", "mine"]})
-    every = regimes.merge(methods, how="cross")
-    every = every.merge(pd.DataFrame({"seed": range(3)}), how="cross")
-    every = every[["method", "track", "v_gain", "omega_gain", "seed"]]
-    missions = every.assign(success_rate=[0.5, 0.75, 1.0] * 88, steps=STEPS * 88)
-    missions.loc[missions["method"] == "online_pe", "steps"] -= [30, 0, 0] * 22
-    return missions.assign(scenario=scenario_names(missions), finished=missions["steps"] < 4999)
+    """What was published, as three missions of each scenario that differ in their steps alone."""
+    published = paper["published"]().replace({"method": {"afm": "afm_paper_code"}})
+    missions = published.merge(pd.DataFrame({"seed": range(3)}), how="cross")
+    finished = missions["steps_mean"] < 4999
+    steps = missions["steps_mean"].round().astype(int) + finished * 10 * (missions["seed"] - 1)
+    missions = missions.assign(success_rate=missions["success_mean"], steps=steps)
+    return missions.assign(finished=finished).drop(columns=["success_mean", "steps_mean"])
 
 
-def test_the_published_figures_are_those_of_the_paper(paper):
-    figures = paper["published"]()
-    assert len(figures) == 5 * 22 and set(figures["method"]) <= set(paper["LABELS"].values())
-    means = figures.groupby("method")[["success_mean", "steps_mean"]].mean()
-    assert means.loc["afm", "success_mean"] == pytest.approx(0.8145, abs=1e-4)
-    assert means.loc["online_pe", "steps_mean"] == pytest.approx(3239.7, abs=0.1)
+def claims(paper, missions):
+    return paper["tables"](missions)[0].shown.set_index("claim")
+
+
+def test_the_printed_tables_have_what_the_text_claims_over_physics_alone(paper, ours):
+    shown = claims(paper, ours)
+    assert shown["its tables"].tolist() == PRINTED
+    assert (shown["gate as written"] == "-").all()
+    assert shown[CODED].str.partition(" ")[0].tolist() == PRINTED
+    verdicts = shown[CODED].str.partition(": ")[2]
+    assert verdicts["fewer steps than Physics (%)"] == "holds"
+    assert verdicts["success over Online PE (points)"] == "does not hold"
+    assert verdicts["success over Physics (points)"] == "holds, but less"
+
+
+def test_nothing_is_said_of_one_seed_or_of_some_scenarios(paper, ours):
+    alone = claims(paper, ours[ours["seed"] == 0])[CODED]
+    assert (alone.str.endswith(": one seed") | (alone == "-")).all()
+    assert (claims(paper, ours[ours["track"] == "ethz_1"])[CODED] == "-").all()
+
+
+VERDICTS = {(30, 36): "holds", (30, 33): "holds, but less", (-1, 36): "cannot be told"}
+VERDICTS |= {(-1, 33): "does not hold", (-2, -1): "does not hold"}
+
+
+@pytest.mark.parametrize(("ends", "said"), VERDICTS.items())
+def test_the_verdict_on_34_points_is_that_of_the_interval(paper, ends, said):
+    assert paper["claims_table"].__globals__["verdict"](34.2, *ends) == said
+
+
+def test_what_is_learnt_in_a_mission_shows_in_its_loss_and_its_recovery(paper):
+    active = [0] * 40 + [1] * 60 + [0] * 20
+    error, loss = [1e-3] * 40 + [1.0] * 25 + [1e-3] * 55, [-3.0] * 40 + [5.0] * 60 + [-3.0] * 20
+    steps = pd.DataFrame({"mission": 0, "regime_active": active, "error": error, "loss": loss})
+    never = steps.assign(mission=1, error=[1e-3] * 40 + [1.0] * 80)
+    learnt = paper["learning"](pd.concat([steps, never]))
+    assert learnt.to_dict("list") == {"loss": [5.0, 5.0], "recovery": [25.0, 60.0]}
 
 
 def test_the_paper_s_tables_with_ours_beside_the_published(paper, ours):
     names = [table.name for table in paper["tables"](ours)]
-    assert names == ["paper_means", *(f"paper_table_{number}" for number in (1, 2, 3, 4))]
-    means, first, _, third, _ = paper["tables"](ours)
-    row = first.shown[(first.shown["v_gain"] == "1") & (first.shown["omega_gain"] == "-1")]
-    assert row["Physics"].item() == f"0.75 ± 0.20 / 1766 ± {np.std(STEPS):.0f}"
-    assert row["Physics, published"].item() == "1.00 ± 0.00 / 827 ± 10"
-    assert row["AFM, gate as written"].item() == "-" and row["AFM, gate as coded"].item() != "-"
-    assert row["AFM, published"].item() == "1.00 ± 0.00 / 1826 ± 189"
-    assert {"PE", "Online PE"} <= set(third.shown) and "Physics" not in third.shown
-    assert "ours: 3" in first.note and "another one" not in third.note
-    assert not any("mine" in column for column in first.shown)
+    assert names == ["paper_claims", "paper_means", "paper_ethz_1", "paper_ethz_2"]
+    cells = paper["tables"](ours)[2]
+    row = cells.shown.set_index("regime").loc["1, -1"]
+    assert row["Physics (published)"] == "1.00/827 (1.00/827)"
+    assert row["AFM, gate as written"] == "-"
+    assert row["AFM, gate as coded (published)"] == "1.00/1826 (1.00/1826)"
+    assert "ours: 3" in cells.note and "another one" not in cells.note
 
 
-def test_the_means_and_their_paired_differences(paper, ours):
-    means = paper["tables"](ours)[0].shown.set_index("method")
-    assert means.loc["AFM, gate as coded", "steps - Online PE"].startswith("+10 [+")
-    assert means.loc["AFM, gate as coded", "success - Online PE"] == "+0.000"
-    assert means.loc["Online PE", "steps - Online PE"] == "-"
-    assert means.loc["Physics", "success, ours"].startswith("0.750 [")
-    assert means.loc["AFM, gate as written", "success, ours"] == "-"
-    assert means.loc["AFM+DR", ["success, published", "steps, published"]].tolist() == [
-        "0.836",
-        "3131",
-    ]
+def test_the_means_and_how_often_time_runs_out(paper, ours):
+    means = paper["tables"](ours.assign(flow_error=0.25))[1].shown.set_index("method")
+    assert means.loc["Physics", ["success, ours", "success, published"]].tolist() == ["0.475"] * 2
+    late = means[["out of time, ours", "out of time, published"]]
+    assert late.loc["AFM, gate as coded"].tolist() == late.loc["Online PE"].tolist() == ["5", "5"]
+    assert late.loc["Physics"].tolist() == ["15", "15"]
+    assert means.loc["AFM, gate as coded", "error of the flow"] == "0.250"
+    assert "AFM, gate as written" not in means.index
 
 
 def test_another_budget_is_not_left_unsaid(paper, ours):
@@ -73,7 +97,7 @@ def test_another_budget_is_not_left_unsaid(paper, ours):
 
 
 def test_other_regimes_make_no_tables(paper, ours):
-    assert paper["tables"](ours[ours["method"] == "mine"]) == []
+    assert paper["tables"](ours.assign(method="mine")) == []
     assert len(paper["tables"](ours[ours["track"] == "ethz_2"])) == 3
 
 

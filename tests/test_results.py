@@ -17,7 +17,6 @@ table = runpy.run_path(str(ROOT / "benchmarks" / "missions.py"))["table"]
 NUMBER = re.compile(r"^[\s*~<>≤±+-]*[.\d][\d.,]*")
 NOT_MEASURED = {  # tables of numbers outside marks: page, head: why
     ("README.md", "| | needs | tested with |"): "test_docs.py compares it",
-    ("paper.md", "| the paper | setting | value |"): "settings of the paper",
     ("quickstart.md", "| column of `steps.parquet` | what it says |"): "what 0 and 1 mean",
 }
 SHOWN_ALONE = {  # figures of no result: why

@@ -1,4 +1,4 @@
-"""Our means beside those that the paper printed: its tables 1 to 4, the means, and the quadrotor's.
+"""Our means beside those that the paper printed: claims, means, tables 1 to 4, the quadrotor's.
 
     python examples/paper/published_tables.py outputs/study/ugv_paper
 
@@ -13,41 +13,28 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pandas as pd
+from published_claims import AFM, LAST, claims_table, learning
 
 from afm_rl.report import read_runs
-from afm_rl.report.runs import scenario_names
+from afm_rl.report.runs import Runs, scenario_names
 from afm_rl.report.statistics import estimate, pair
 from afm_rl.report.tables import Table, interval_text, markdown
 from afm_rl.storage.files import write_whole
+from afm_rl.storage.manifest import COMPUTE
 from afm_rl.storage.measures import number
 
-LAST = 4999  # step of a published mission that ran out
-LABELS = {  # ours: the paper's
-    "afm_paper": "afm",
-    "afm_paper_code": "afm",
-    "afm_dr": "afm_dr",
-    "online_pe": "online_pe",
-    "frozen_pe": "frozen_pe",
-    "stream_x_pe": "stream_x_pe",
-    "physics": "physics",
-}
 MEASURES = {"success": "success_rate", "steps": "steps"}  # the paper's: our column
-CODED = "afm_paper_code"
-PRINTED = {  # number of a table: its track, and its methods after AFM
-    1: ("ethz_1", ["stream_x_pe", "physics"]),
-    2: ("ethz_2", ["stream_x_pe", "physics"]),
-    3: ("ethz_1", ["frozen_pe", "online_pe"]),
-    4: ("ethz_2", ["frozen_pe", "online_pe"]),
-}
 HEADS = {
     "afm_paper": "AFM, gate as written",
-    CODED: "AFM, gate as coded",
+    "afm_paper_code": "AFM, gate as coded",
     "afm_dr": "AFM+DR",
     "online_pe": "Online PE",
     "frozen_pe": "PE",
     "stream_x_pe": "stream-x PE",
     "physics": "Physics",
 }
+FORMS = {"afm_paper": "gate as written", "afm_paper_code": "gate as coded"}
+LABELS = {name: name for name in HEADS} | dict.fromkeys(FORMS, AFM)  # ours: the paper's
 TEXT = pd.DataFrame([{"method": "afm_dr", "success_mean": 0.836, "steps_mean": 3131.2}])
 FLIGHTS = ("physics", "online_knode", "afm_online_knode", "afm_physics", "oracle")
 JIAHAO = {  # Online-KNODE-MPC, Jiahao et al. 2022, table 1, circles of 2 m: m/s: m²
@@ -75,41 +62,36 @@ def budget_note(missions: pd.DataFrame) -> str:
     )
 
 
-def cells_table(number: int, ours: pd.DataFrame) -> Table:
-    """Return one of the paper's tables: a row per regime, success / steps of each method."""
-    track, others = PRINTED[number]
-    figures = published()
-    figures = figures[figures["track"] == track]
-    own = ours.groupby(["scenario", "method"])[list(MEASURES.values())]
-    own = own.agg(["mean", lambda values: values.std(ddof=0)])
-    rows, numbers = [], []
-    for scenario, group in figures.groupby("scenario", sort=False):
-        printed = group.set_index("method")
-        first = group.iloc[0]
-        row = {name: f"{first[name]:g}" for name in ("v_gain", "omega_gain")}
-        for method in ("afm_paper", CODED, *others):
-            numbers.append({"method": method, **printed.loc[LABELS[method]], "scenario": scenario})
-            row[HEADS[method]] = "-"
-            if (scenario, method) in own.index:
-                values = own.loc[(scenario, method)].to_list()
-                names = [f"ours_{name}" for name in list(figures)[-5:-1]]
-                numbers[-1] |= dict(zip(names, values, strict=True))
-                row[HEADS[method]] = _both(*values)
-            if method != "afm_paper":
-                head = f"{'AFM' if method == CODED else HEADS[method]}, published"
-                row[head] = _both(*printed.loc[LABELS[method]].iloc[-5:-1])
+def cells_table(track: str, ours: pd.DataFrame) -> Table:
+    """Return the paper's tables of a track: a row per regime, success/steps of each method."""
+    means = ours.groupby(["scenario", "method"])[list(MEASURES.values())]
+    means = means.agg(["mean", lambda values: values.std(ddof=0)])
+    means.columns = [f"ours_{name}_{kind}" for name in MEASURES for kind in ("mean", "std")]
+    labels = pd.DataFrame(LABELS.items(), columns=["method", "printed"])
+    numbers = published().query("track == @track").rename(columns={"method": "printed"})
+    numbers = numbers.merge(labels).merge(means, "left", on=["scenario", "method"])
+    rows = []
+    for gains, group in numbers.groupby(["v_gain", "omega_gain"], sort=False):
+        row, methods = {"regime": "{:g}, {:g}".format(*gains)}, group.set_index("method")
+        for method in (name for name in HEADS if name in methods.index):
+            measured, printed = (_both(methods.loc[method], whose) for whose in ("ours_", ""))
+            if method == "afm_paper":
+                row[HEADS[method]] = measured
+            else:
+                row[f"{HEADS[method]} (published)"] = f"{measured} ({printed})"
         rows.append(row)
-    title = f"Table {number} of the paper: success / steps on {track}"
+    title = f"The paper's tables of {track}: success/steps"
     note = (
-        f"Mean ± standard deviation over the seeds of a regime ({_seeds(ours)}; published: five). "
-        "The deviation divides by n, which is what the published ones fit. A dash: not run."
+        f"Means over the seeds of a regime ({_seeds(ours)}; published: five); standard deviations, "
+        "divided by n as the published ones, are in the CSV file. A dash: not run."
         + budget_note(ours)
     )
-    return Table(f"paper_table_{number}", title, note, pd.DataFrame(numbers), pd.DataFrame(rows))
+    return Table(f"paper_{track}", title, note, numbers, pd.DataFrame(rows))
 
 
-def _both(success: float, success_std: float, steps: float, steps_std: float) -> str:
-    return f"{success:.2f} ± {success_std:.2f} / {steps:.0f} ± {steps_std:.0f}"
+def _both(means: pd.Series, whose: str) -> str:
+    success, steps = (means[f"{whose}{name}_mean"] for name in MEASURES)
+    return "-" if pd.isna(success) else f"{success:.2f}/{steps:.0f}"
 
 
 def _seeds(missions: pd.DataFrame) -> str:
@@ -120,62 +102,56 @@ def _seeds(missions: pd.DataFrame) -> str:
 
 
 def means_table(ours: pd.DataFrame) -> Table:
-    """Return the means over all scenarios, and the paired differences from Online PE."""
+    """Return the means over all scenarios, and in how many of them time runs out."""
     figures = published().rename(columns={"method": "printed"})
     rows, numbers = [], []
-    for method, name in LABELS.items():
-        own = ours[ours["method"] == method]
-        same = figures[figures["scenario"].isin(own["scenario"])] if len(own) else figures
-        whole = own["scenario"].nunique() in (0, figures["scenario"].nunique())
-        printed = same[same["printed"] == name] if name != "afm_dr" else TEXT.head(int(whole))
-        figure = {"method": method, "missions": len(own)}
+    for method in (name for name in HEADS if name in set(ours["method"])):
+        missions = ours[ours["method"] == method]
+        printed = figures[figures["scenario"].isin(missions["scenario"])]
+        complete = len(printed) == len(figures)
+        printed = printed[printed["printed"] == LABELS[method]]
+        printed = TEXT.head(int(complete)) if method == "afm_dr" else printed
+        late = ~missions.groupby("scenario")["finished"].any()
+        figure = {"method": method, "missions": len(missions), "late": int(late.sum())}
         figure |= printed[["success_mean", "steps_mean"]].mean()
-        row = {"method": HEADS[method], "missions": str(len(own))}
-        pairs = pair(ours, method, "online_pe")
+        row = {"method": HEADS[method]}
         for head, column in MEASURES.items():
             digits = 3 if head == "success" else 0
-            row[f"{head}, ours"] = row[f"{head} - Online PE"] = "-"
-            if len(own):
-                figure |= estimate(column, own[column], own["scenario"])
-                row[f"{head}, ours"] = interval_text(figure, column, digits)
-            if len(pairs) and method != "online_pe":
-                apart = pairs[column] - pairs[f"{column}_other"]
-                figure |= estimate(f"{column}_apart", apart, pairs["scenario"])
-                row[f"{head} - Online PE"] = interval_text(
-                    figure, f"{column}_apart", digits, sign="+"
-                )
+            figure |= estimate(column, missions[column], missions["scenario"])
+            row[f"{head}, ours"] = interval_text(figure, column, digits)
             row[f"{head}, published"] = number(figure[f"{head}_mean"], digits)
-        order = ["ours", "published", "- Online PE"]
-        heads = [
-            f"{head} {end}" if end[0] == "-" else f"{head}, {end}"
-            for head in MEASURES
-            for end in order
-        ]
-        rows.append({name: row[name] for name in ("method", "missions", *heads)})
+        row["out of time, ours"] = str(figure["late"])
+        ended = (printed["steps_mean"] >= LAST).sum()
+        row["out of time, published"] = str(ended) if method != "afm_dr" else "-"
+        if "flow_error" in missions:
+            figure["flow_error"] = missions["flow_error"].mean()
+            row["error of the flow"] = number(figure["flow_error"], 3)
+        rows.append(row)
         numbers.append(figure)
     note = (
         "Means over the scenarios that were run (all: 22), with 95 % stratified bootstrap "
-        "intervals "
-        f"(strata: scenarios; {_seeds(ours)} seeds of a scenario); published: means of the printed "
-        "tables over the same scenarios, of AFM+DR that of the text, over all. Differences from "
-        "Online PE are paired by scenario and seed." + budget_note(ours)
+        f"intervals (strata: scenarios; {_seeds(ours)} seeds of a scenario); published: means of "
+        "the printed tables over the same scenarios, of AFM+DR that of the text, over all. Out of "
+        "time: scenarios in which no seed reached every target. Error of the flow: of its action, "
+        "root mean square, held out." + budget_note(ours)
     )
     title = "All scenarios: success and steps"
     return Table("paper_means", title, note, pd.DataFrame(numbers), pd.DataFrame(rows))
 
 
 def tables(missions: pd.DataFrame) -> list[Table]:
-    """Return the means and the paper's four tables; none without missions of a published one."""
+    """Return claims, means and the paper's tables; none without missions of a published method."""
     ours = missions[missions["method"].isin(list(LABELS))]
-    ours = ours[ours["scenario"].isin(published()["scenario"])]
+    figures = published()
+    ours = ours[ours["scenario"].isin(figures["scenario"])]
     if ours.empty:
         return []
-    found = [means_table(ours)]
-    for place, (track, _) in PRINTED.items():
-        there = ours[ours["track"] == track]
-        if len(there):
-            found.append(cells_table(place, there))
-    return found
+    measured = ours.assign(success=ours["success_rate"], late=~ours["finished"].astype(bool))
+    printed = figures.rename(columns={f"{name}_mean": name for name in MEASURES})
+    printed = printed.assign(seed=0, late=printed["steps"] >= LAST)
+    claims = claims_table(measured, printed, FORMS, budget_note(ours))
+    cells = [cells_table(str(track), rows) for track, rows in ours.groupby("track")]
+    return [claims, means_table(ours), *cells]
 
 
 def flights_table(missions: pd.DataFrame) -> Table:
@@ -217,6 +193,17 @@ def flights_table(missions: pd.DataFrame) -> Table:
     return Table("paper_quadrotor", title, note, pd.DataFrame(numbers), shown)
 
 
+def with_learning(runs: Runs) -> pd.DataFrame:
+    """Return the missions with what was learnt in each, and the flow's error where it is known."""
+    steps = runs.steps(columns=["loss", "error", "regime_active"])
+    missions = runs.missions.join(learning(steps), on="mission")
+    errors: dict[str, float] = {}
+    for file in filter(Path.is_file, (folder / COMPUTE for folder in runs.folders)):
+        taken = pd.read_csv(file).set_index("method").reindex(columns=["flow_error"])
+        errors |= taken["flow_error"].dropna()
+    return missions.assign(flow_error=missions["method"].map(errors)) if errors else missions
+
+
 def of_folders(folders: Sequence[Path]) -> Iterator[Table]:
     """Yield the tables of each kind of mission that there is."""
     kinds: dict[bool, list[Path]] = {False: [], True: []}
@@ -224,8 +211,8 @@ def of_folders(folders: Sequence[Path]) -> Iterator[Table]:
         kinds["mse" in read_runs([folder]).missions].append(folder)
     for flies, some in kinds.items():
         if some:
-            missions = read_runs(some).missions
-            yield from [flights_table(missions)] if flies else tables(missions)
+            runs = read_runs(some)
+            yield from [flights_table(runs.missions)] if flies else tables(with_learning(runs))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The paper's figures, as the example draws them."""
+"""The paper's figures and tables of a folder of results, as the examples make them."""
 
 import runpy
 import sys
@@ -25,6 +25,13 @@ def paper():
 @pytest.fixture
 def runs(run_folder):
     return read_runs([run_folder(tracks=("ethz_1", "ethz_2"), seeds=2)])
+
+
+def test_the_tables_of_a_folder_have_what_its_missions_learnt(paper, runs):
+    tables = paper["published"].__globals__
+    learnt = tables["with_learning"](runs).groupby("method")["recovery"].unique()
+    assert learnt["oracle"] == [0.0] and (learnt["physics"] > 100).all()
+    assert next(tables["of_folders"](runs.folders)).name == "paper_claims"
 
 
 def test_losses_are_means_over_missions_on_their_way(paper):
