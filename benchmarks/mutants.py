@@ -126,8 +126,9 @@ def tested(folder: str, file: str) -> tuple[str, str]:
         def pytest_collectreport(self, report: pytest.CollectReport) -> None:
             failed.extend([f"import of {report.nodeid}"] if report.failed else [])
 
-    options = ["-x", "-q", "-m", "not slow", "--timeout=0", "-p", "no:cacheprovider"]
-    status = pytest.main([*options, *tests_of(file)], plugins=[Notes()])
+    options = ["-x", "-q", "-m", "not slow", "-k", "not processes"]  # a daemon may have none
+    options += ["--timeout=0", "-p", "no:cacheprovider", *tests_of(file)]
+    status = pytest.main(options, plugins=[Notes()])
     return ("lives", "") if status == 0 else ("killed", (failed or ["import"])[0])
 
 
