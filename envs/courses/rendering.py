@@ -55,7 +55,7 @@ class TrackCanvas:
         size = 16 * torch.ceil((high - low) * metre / 16)
         middle, half = (low + high) / 2, size / metre / 2
         (left, bottom), (right, top) = (middle - half).tolist(), (middle + half).tolist()
-        self.figure = sheet(*(size / DPI).tolist(), DPI)
+        self.figure = sheet(float(size[0]) / DPI, float(size[1]) / DPI, DPI)
         axes = self.figure.add_axes((0, 0, 1, 1), xlim=(left, right), ylim=(bottom, top))
         axes.set_axis_off()
         x, y = torch.cat([track.centerline, track.centerline[:1]]).unbind(-1)
