@@ -1,5 +1,8 @@
 """Options: each is written once, in the signature that takes it, with its unit, range and reason.
 
+Or in a record, a ``TypedDict``, of which each field is an option of whatever takes ``**settings:
+Unpack[...]`` of it.
+
 What is checked of a value, the argument's line in the documentation, its comment in ``conf`` and
 the tests of what is refused follow from there.
 """
@@ -8,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, wraps
-from inspect import Parameter, cleandoc, signature
+from inspect import Parameter, Signature, cleandoc, signature
 from math import inf
 from types import EllipsisType, NoneType, SimpleNamespace, UnionType
 from typing import Any, NamedTuple, TypeVar, Union, cast, get_args, get_origin, get_type_hints
@@ -86,6 +89,45 @@ class Option(NamedTuple):
         return checked
 
 
+class Default(NamedTuple):
+    """The default of a field of a record, for which a ``TypedDict`` has no place; else None."""
+
+    default: Any
+
+
+@cache
+def fields_of(record: Any) -> dict[str, tuple[Option, Any]]:
+    """Return the options that a record has as fields, and their types, by name.
+
+    >>> class Limits(TypedDict, total=False):
+    ...     reach: Annotated[float, Default(1.0), Interval(gt=0, le=2), "of an arm, m"]
+    >>> fields_of(Limits)["reach"][0].text
+    'of an arm, m, (0, 2]'
+    """
+    fields = {}
+    for name, hint in get_type_hints(record, include_extras=True).items():
+        kind, *notes = get_args(hint)
+        (about,) = (note for note in notes if isinstance(note, str))
+        pairs = ((key, getattr(note, key, None)) for note in notes for key in NOTED)
+        noted: Any = {"default": None, **{key: each for key, each in pairs if each is not None}}
+        fields[name] = cast(Option, option(about=about, **noted)), kind
+    return fields
+
+
+def filled(record: Any, owner: str, settings: Mapping[str, Any]) -> Any:
+    """Return all settings of a record, checked, those that are not given with their defaults.
+
+    Raises:
+        ConfigurationError: for one that may not be given, naming it and its owner.
+    """
+    for name in settings:
+        check_choice(f"{owner}: option", name, fields_of(record))
+    return {
+        name: each.check(f"{owner}.{name}", kind, settings.get(name, each.default))
+        for name, (each, kind) in fields_of(record).items()
+    }
+
+
 class Taken(NamedTuple):
     """What a function takes."""
 
@@ -98,6 +140,7 @@ class Taken(NamedTuple):
 
 
 NOTHING = Taken("", {}, dict, (), {})
+NOTED = ("default", "ge", "gt", "le")
 
 
 def option(
@@ -172,7 +215,13 @@ def options(
         function.__kwdefaults__ = {name: plain[name] for name in by_name if name in plain}
         hints = {name: function.__annotations__[name] for name in own}
         hinted = SimpleNamespace(__annotations__=hints)
-        kinds = cache(lambda: get_type_hints(hinted, function.__globals__))  # when first needed
+        record = record_in(function)
+        shared = {} if record is None else fields_of(record)
+        own |= {name: each for name, (each, _) in shared.items()}
+        shared_kinds = {name: kind for name, (_, kind) in shared.items()}
+        kinds = cache(  # when first needed
+            lambda: get_type_hints(hinted, function.__globals__) | shared_kinds
+        )
 
         def check(name: str, value: Any) -> Any:
             if name in parts and value is not None:
@@ -186,10 +235,31 @@ def options(
             return function(*map(check, names, args), *args[len(names) :], **settings)
 
         checked.options = Taken(group, own, kinds, takers, parts)  # type: ignore[attr-defined]
+        if record is not None:
+            checked.__signature__ = with_fields(signature(function), record)  # type: ignore[attr-defined]
         checked.__doc__ = with_arguments(function.__doc__ or "", own)
         return checked
 
     return decorate
+
+
+def record_in(function: Any) -> Any:
+    """Return the record whose fields a function takes by name, ``**settings: Unpack[...]``."""
+    for name, text in function.__annotations__.items():
+        if str(text).startswith("Unpack["):
+            hinted = SimpleNamespace(__annotations__={name: text})
+            return get_args(get_type_hints(hinted, function.__globals__)[name])[0]
+    return None
+
+
+def with_fields(taking: Signature, record: Any) -> Signature:
+    """Return a signature with the fields of a record in the place of ``**settings``."""
+    *named, _ = taking.parameters.values()
+    fields = [
+        Parameter(name, Parameter.KEYWORD_ONLY, default=each.default, annotation=kind)
+        for name, (each, kind) in fields_of(record).items()
+    ]
+    return taking.replace(parameters=[*named, *fields])
 
 
 def options_of(target: Any) -> dict[str, Option]:
@@ -197,6 +267,8 @@ def options_of(target: Any) -> dict[str, Option]:
 
     Those of its bases, and of what further settings are handed to, are among them.
     """
+    if hasattr(target, "__total__"):  # a TypedDict
+        return {name: each for name, (each, _) in fields_of(target).items()}
     sources = [target]
     if isinstance(target, type):
         sources = [vars(base).get("__init__") for base in target.__mro__]

@@ -30,7 +30,9 @@ class Case(NamedTuple):
     @property
     def values(self):
         """Values that are allowed, and that are not."""
-        each, text = self.function.options.own[self.name], self.function.__annotations__[self.name]
+        taken = self.function.options
+        each, kind = taken.own[self.name], taken.kinds()[self.name]
+        text = getattr(kind, "__name__", "") + str(kind)
         kind = next((kind for kind in NEVER if kind in text), None)
         if kind is None or (kind == "str" and not each.choices):
             return [], []

@@ -34,6 +34,7 @@ from afm_rl.missions.robot import Robot
 from afm_rl.options import option, options
 from afm_rl.planning.costs import KnownReward
 from afm_rl.storage.artefacts import load_artefact
+from afm_rl.transforms.loop_options import LoopOptions
 
 CHECKPOINT = option(None, "file of weights of your own; None: none")
 
@@ -162,7 +163,7 @@ def no_correction(robot: Robot, dynamics: Part) -> Part:
     return Part(None)
 
 
-@options("corrector", ActionFlow)
+@options("corrector", ActionFlow, LoopOptions)
 def afm(
     robot: Robot,
     dynamics: Part,
@@ -176,7 +177,7 @@ def afm(
     return Part(flow)
 
 
-@options("corrector", PaperFlow, train=train_flow)
+@options("corrector", PaperFlow, LoopOptions, train=train_flow)
 def paper_flow(
     robot: Robot,
     dynamics: Part,
@@ -210,13 +211,13 @@ def paper_flow(
     return Part(flow, Training("flow", flow, fit, "action units", shape))
 
 
-@options("corrector", LeastSquares)
+@options("corrector", LeastSquares, LoopOptions)
 def least_squares(robot: Robot, dynamics: Part, **settings: Any) -> LeastSquares:
     """Return least squares with forgetting, which need no training."""
     return LeastSquares(*robot.action_box, **settings)
 
 
-@options("corrector", L1Augmentation)
+@options("corrector", L1Augmentation, LoopOptions)
 def l1(robot: Robot, dynamics: Part, dt: float | None = None, **settings: Any) -> L1Augmentation:
     """Return L1 adaptive augmentation, which needs no training."""
     step: Any = robot.dt if dt is None else dt  # None is refused, by name
