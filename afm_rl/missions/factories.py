@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from torch import nn
@@ -31,12 +31,12 @@ from afm_rl.errors import AFMError, ConfigurationError, check_count, check_insta
 from afm_rl.learning import pretrain_ensemble, pretrain_knode
 from afm_rl.missions.collected import fit_collected
 from afm_rl.missions.robot import Robot
-from afm_rl.options import option, options
+from afm_rl.options import options
 from afm_rl.planning.costs import KnownReward
 from afm_rl.storage.artefacts import load_artefact
 from afm_rl.transforms.loop_options import LoopOptions
 
-CHECKPOINT = option(None, "file of weights of your own; None: none")
+Checkpoint = Annotated[str | None, "file of weights of your own; None: none"]
 
 
 class Training(NamedTuple):
@@ -119,7 +119,7 @@ def ensemble(robot: Robot, pretrain: Mapping[str, Any], **settings: Any) -> Part
 def knode(
     robot: Robot,
     pretrain: Mapping[str, Any] | None = None,
-    randomised: bool = option(False, "pre-train on flights under regimes of the prior"),
+    randomised: Annotated[bool, "pre-train on flights under regimes of the prior"] = False,
     **settings: Any,
 ) -> Part:
     """Return a quadrotor's physics plus networks; ``pretrain`` says how the first one is trained.
@@ -167,7 +167,7 @@ def no_correction(robot: Robot, dynamics: Part) -> Part:
 def afm(
     robot: Robot,
     dynamics: Part,
-    checkpoint: str | None = CHECKPOINT,
+    checkpoint: Checkpoint = None,
     **settings: Any,
 ) -> Part:
     """Return the universal action flow."""
@@ -182,8 +182,8 @@ def paper_flow(
     robot: Robot,
     dynamics: Part,
     train: Mapping[str, Any],
-    checkpoint: str | None = CHECKPOINT,
-    clamp: bool = option(True, "keep its actions in the robot's box; the published runs did not"),
+    checkpoint: Checkpoint = None,
+    clamp: Annotated[bool, "keep actions in the robot's box; the published runs did not"] = True,
     **settings: Any,
 ) -> Part:
     """Return the published flow, to be trained over a model whose states are plain numbers.

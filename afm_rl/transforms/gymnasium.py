@@ -210,7 +210,8 @@ class GymnasiumShell(Shell):
         if loop.options["delay_compensation"]:
             states, steps = loop.arrival(memory)
         else:
-            states, steps = self._states, loop.corrector.under_way(memory)[2] * self.enabled
+            states, steps = self._states, loop.corrector.under_way(memory)[2]
+            steps = steps * loop.options["enabled"]
         self._info |= {"delay": steps.numpy().copy(), "observation": observations}
         rows = (steps > 0).numpy() & (True if over is None else ~over)
         if not loop.options["delay_compensation"] or not rows.any():

@@ -310,9 +310,8 @@ class CorrectionLoop:
             low: lowest action.
             high: highest action.
         """
-        centres = {"rate": plan + correction, "most": plan}
-        for name, centre in centres.items():
-            limit = self.options[name]
+        rate, most = self.options["rate"], self.options["most"]
+        for limit, centre in ((rate, plan + correction), (most, plan)):
             if limit is not None:  # what comes last holds in any case
                 reach = 0.5 * (high - low) * torch.as_tensor(limit).to(high)
                 executed = executed.clamp(centre - reach, centre + reach)

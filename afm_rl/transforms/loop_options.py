@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Any, TypedDict
 
-from annotated_types import Interval
+from annotated_types import Gt, Le
 
 from afm_rl.options import Default
 
-Limit = float | Sequence[float] | None
+Limit = Annotated[float | Sequence[float] | None, Gt(0), Le(2)]
 
 
 class LoopOptions(TypedDict, total=False):
@@ -29,26 +29,14 @@ class LoopOptions(TypedDict, total=False):
     """
 
     enabled: Annotated[bool, Default(True), "False: watch, gather evidence, correct nothing"]
-    most: Annotated[
-        Limit,
-        Interval(gt=0, le=2),
-        "how far from the plan, half ranges, one number or one per axis; None: no limit",
-    ]
-    rate: Annotated[
-        Limit, Interval(gt=0, le=2), "how much that may change in a step, likewise; None: no limit"
-    ]
+    most: Annotated[Limit, "how far from the plan, half ranges, all or each axis; None: no limit"]
+    rate: Annotated[Limit, "how much that may change in a step, likewise; None: no limit"]
     extend_action_box: Annotated[
-        bool,
-        Default(True),
-        "tell planners of effects beyond the action box, if the model can predict them",
+        bool, Default(True), "tell planners of effects beyond the box, if the model predicts them"
     ]
-    delay: Annotated[
-        int | Sequence[int] | None, "known steps from an action to its effect, of all or each axis"
-    ]
+    delay: Annotated[int | Sequence[int] | None, "known steps to its effect, of all or each axis"]
     delay_compensation: Annotated[
-        bool,
-        Default(True),
-        "what is observed when the next action acts is shown (a Smith predictor); False: measured",
+        bool, Default(True), "show what is observed when the action acts; False: what was measured"
     ]
     belief: Annotated[bool, Default(False), "tell the belief, too"]
     keep_memory_on_reset: Annotated[
